@@ -1,0 +1,1 @@
+"""Ground floor: values and maths. No disk, no plots, no third-party model."""

@@ -1,0 +1,69 @@
+"""The pinhole camera. OpenCV axes: x right, y down, z forward; an integer pixel is a pixel centre."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from p2p_lib.core.errors import BadInput
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics in pixels and picture size in pixels, no distortion."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy)
+        if not np.isfinite(values).all() or self.fx <= 0 or self.fy <= 0:
+            raise BadInput("camera", f"fx, fy, cx, cy = {values}", "finite numbers, focal lengths above 0 (pixels)")
+        if self.width < 1 or self.height < 1:
+            raise BadInput("camera", f"{self.width}x{self.height}", "a picture size of at least 1x1 pixels")
+
+    @classmethod
+    def from_K(cls, K: np.ndarray, width: int, height: int, name: str = "K") -> Camera:
+        """From a 3x3 matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; ``name`` is what errors call it."""
+        K = np.asarray(K, float)
+        if K.shape != (3, 3):
+            raise BadInput(name, f"shape {K.shape}", "a 3x3 camera matrix")
+        if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or abs(K[2, 2] - 1) > 1e-6:
+            raise BadInput(name, " ".join(f"{x:g}" for x in K.ravel()), "fx 0 cx 0 fy cy 0 0 1 with fx, fy > 0")
+        return cls(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), int(width), int(height))
+
+    @property
+    def K(self) -> np.ndarray:
+        """(3, 3) camera matrix."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def project(self, p_cam: np.ndarray) -> np.ndarray:
+        """Points (..., 3) in metres to pixels (..., 2); points at or behind the camera give NaN."""
+        p_cam = np.asarray(p_cam, float)
+        z = np.where(p_cam[..., 2] > 1e-9, p_cam[..., 2], np.nan)
+        return np.stack([self.fx * p_cam[..., 0] / z + self.cx, self.fy * p_cam[..., 1] / z + self.cy], -1)
+
+    def unproject(self, uv_px: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+        """Pixels (..., 2) and depth along the optical axis (...,) to points (..., 3) in metres."""
+        uv_px, z = np.asarray(uv_px, float), np.asarray(depth_m, float)
+        x = (uv_px[..., 0] - self.cx) / self.fx * z
+        y = (uv_px[..., 1] - self.cy) / self.fy * z
+        return np.stack([x, y, z], -1)
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """(H, W, 3) float32: the point at unit depth behind every pixel."""
+        v, u = np.mgrid[: self.height, : self.width]
+        return self.unproject(np.stack([u, v], -1), np.ones((self.height, self.width))).astype(np.float32)
+
+    def inside(self, uv_px: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+        """Which pixels (..., 2) lie in the picture; NaN does not."""
+        u, v = uv_px[..., 0], uv_px[..., 1]
+        in_u = (u >= margin_px) & (u <= self.width - 1 - margin_px)
+        return in_u & (v >= margin_px) & (v <= self.height - 1 - margin_px)

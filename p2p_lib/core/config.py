@@ -1,0 +1,274 @@
+"""Every parameter of the method, one frozen dataclass per stage, and the two presets.
+
+``paper`` does what the paper's text says; where the text is silent it takes the authors' released
+value. ``default`` is whatever measures best here. ``p2p_lib.core.config.diff("paper", "default")``
+shows how they differ. Presets choose parameters, never backends: the tracker, the detector and the
+source of masks are chosen by name elsewhere.
+
+Each field's metadata says its symbol or meaning, its unit, and whose value it is:
+``paper`` (its text), ``release`` (the authors' released configuration) or ``ours``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+import tomllib
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from p2p_lib.core.errors import BadInput, MissingData
+
+
+def _p(default: Any, meaning: str, unit: str = "", source: str = "ours", **bounds: float) -> Any:
+    """A field with its meaning; ``low``/``high`` bound it (inclusive), ``choices`` lists strings."""
+    return field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **bounds})
+
+
+def _section(stage: type) -> str:
+    """The key of a stage's table: ``KeypointMapConfig`` is ``keypoint_map``."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", stage.__name__.removesuffix("Config")).lower()
+
+
+class _Checked:
+    """Refuses values of another type or out of bounds when made."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value, meta = getattr(self, f.name), f.metadata
+            name = f"config {_section(type(self))}.{f.name}"
+            kind = type(f.default)
+            if kind is float and type(value) is int:
+                object.__setattr__(self, f.name, float(value))
+            elif type(value) is not kind:
+                raise BadInput(name, f"{value!r} ({type(value).__name__})", f"a {kind.__name__}: {meta['meaning']}")
+            if "choices" in meta and value not in meta["choices"]:
+                raise BadInput(name, repr(value), "one of " + ", ".join(meta["choices"]))
+            if kind in (int, float) and not meta.get("low", float("-inf")) <= value <= meta.get("high", float("inf")):
+                bounds = f"{meta.get('low', '-inf')} to {meta.get('high', 'inf')} {meta['unit']}".strip()
+                raise BadInput(name, value, f"a value in {bounds}: {meta['meaning']}")
+
+
+@dataclass(frozen=True)
+class PipelineConfig(_Checked):
+    object_frame: str = _p(
+        "centroid",
+        "where the object frame starts: at the camera (paper, T_cam_obj = I) or at the first masked cloud's centroid",
+        choices=("camera", "centroid"),
+    )
+    min_mask_px: int = _p(100, "smaller masks count as hidden", "px", "release", low=1)
+    depth_min_m: float = _p(0.1, "nearer depth is invalid", "m", "release", low=0)
+    depth_max_m: float = _p(2.5, "farther depth is invalid", "m", low=0.1)
+    recovered_frames: int = _p(5, "frames after a return that are marked recovered", "frames", low=0)
+    recover_min_inliers: int = _p(8, "agreeing points that a return after hiding or loss needs", "points", low=3)
+    degraded_inliers: int = _p(8, "a pose from fewer agreeing points is degraded", "points", low=3)
+
+
+@dataclass(frozen=True)
+class TrackingConfig(_Checked):
+    window_px: int = _p(15, "side of the Lucas-Kanade window", "px", low=5, high=63)
+    levels: int = _p(3, "pyramid levels above full resolution", low=0, high=6)
+    forward_backward_px: float = _p(0.7, "largest forward-backward error of a visible point", "px", low=0.05)
+    redetect_every: int = _p(5, "search the whole frame for invisible points every n frames", "frames", low=1)
+    features: int = _p(600, "SIFT features per searched frame", "points", low=10)
+    contrast: float = _p(0.02, "SIFT contrast threshold", low=0)
+    ratio: float = _p(0.75, "nearest to second-nearest descriptor distance of a match", low=0.1, high=1)
+    forget_after: int = _p(0, "SH(n): drop points after n invisible frames; 0 = never", "frames", low=0)
+
+
+@dataclass(frozen=True)
+class SamplingConfig(_Checked):
+    candidates: int = _p(512, "N_k, candidates from the detector", "points", "release", low=1)
+    points: int = _p(30, "K, points chosen at a keyframe", "points", "release", low=1)
+    score_weight: float = _p(0.3, "lambda of the objective", "", "release", low=0, high=1)
+    cluster_weight: float = _p(0.5, "beta of the objective", "", "release", low=0)
+    r_ideal_px: float = _p(20.0, "r_ideal of the objective (the paper gives none)", "px", low=1)
+    r_min_px: float = _p(5.0, "r_min of the objective", "px", "release", low=0)
+    edge_margin_px: int = _p(2, "distance to the mask's border", "px", "release", low=0)
+    depth_edge_m: float = _p(0.01, "a larger depth step in the 3x3 neighbourhood is an edge", "m", "release", low=0)
+
+
+@dataclass(frozen=True)
+class KeypointMapConfig(_Checked):
+    keyframe_angle_deg: float = _p(10.0, "turn since the nearest keyframe that asks for points", "deg", "paper", low=0)
+    keyframe_min_points: int = _p(25, "fewer visible points ask for points", "points", "paper", low=0)
+    cooldown: int = _p(5, "frames between keyframes asked for by too few points", "frames", low=0)
+    streak: int = _p(3, "N_streak, verified frames in a row before promotion", "frames", "paper", low=1)
+    stable_rotation_deg: float = _p(2.0, "pose change between frames that still counts", "deg", "paper", low=0)
+    stable_translation_m: float = _p(0.01, "pose change between frames that still counts", "m", "paper", low=0)
+    max_uncertainty: float = _p(0.3, "track uncertainty that still counts", "", "paper", low=0, high=1)
+    min_observations: int = _p(4, "observations before promotion", "frames", "release", low=1)
+    max_spread_m: float = _p(0.008, "median absolute deviation of the observations", "m", "paper", low=0)
+    pending_ttl: int = _p(30, "frames a point may stay pending", "frames", "release", low=1)
+    max_points: int = _p(300, "cap of the map; the least seen are retired first", "points", low=10)
+
+
+@dataclass(frozen=True)
+class RegistrationConfig(_Checked):
+    multi_hypothesis: bool = _p(True, "sequential RANSAC; off: SVD, outlier removal, SVD (the ablation)", "", "paper")
+    iterations: int = _p(100, "RANSAC samples per hypothesis", "", "release", low=1)
+    sample_size: int = _p(4, "points per RANSAC sample", "points", "release", low=3)
+    inlier_m: float = _p(0.006, "largest residual of an inlier", "m", "release", low=1e-5)
+    min_inliers: int = _p(5, "fewest inliers of a hypothesis", "points", "release", low=3)
+    max_hypotheses: int = _p(10, "H, hypotheses at most", "", "release", low=1)
+    motion_priors: bool = _p(True, "the last pose and constant velocity compete as hypotheses")
+    noise_per_m2: float = _p(0.0, "inlier_m grows by this times the range squared; 0 = one constant", "1/m", low=0)
+
+
+@dataclass(frozen=True)
+class TsdfConfig(_Checked):
+    enabled: bool = _p(True, "build a surface per object", "", "paper")
+    voxel_m: float = _p(0.005, "edge of a voxel", "m", "release", low=2e-4)
+    truncation_voxels: float = _p(5.0, "tau in voxels", "voxels", "release", low=1)
+    max_voxels: int = _p(8_000_000, "cap of one volume; parts beyond it are left out", "voxels", low=1000)
+    padding_m: float = _p(0.02, "room around new surface when the volume grows", "m", low=0)
+    carve: bool = _p(False, "free-space carving by depth behind the object, outside the mask")
+
+
+@dataclass(frozen=True)
+class RefinementConfig(_Checked):
+    enabled: bool = _p(True, "refine the pose on the TSDF", "", "paper")
+    iterations: int = _p(8, "L, Levenberg-Marquardt steps at most", "", "release", low=1)
+    damping: float = _p(1e-4, "initial damping", "", "release", low=0)
+    max_points: int = _p(1500, "depth points at most", "points", "release", low=10)
+    gradient_voxels: float = _p(0.5, "step of the numeric gradient", "voxels", "release", low=0.01)
+    mad_trim: float = _p(2.5, "residuals beyond this many MADs are left out", "", "release", low=0.5)
+    huber_m: float = _p(0.01, "Huber threshold of the surface residual", "m", "release", low=1e-5)
+    max_step_m: float = _p(0.02, "largest translation of one step", "m", "release", low=0)
+    max_step_rad: float = _p(0.2, "largest rotation of one step", "rad", "release", low=0)
+    keypoint_weight: float = _p(0.0, "weight of keypoint residuals beside the surface; 0 = surface alone (paper)", low=0)
+
+
+@dataclass(frozen=True)
+class FactorGraphConfig(_Checked):
+    enabled: bool = _p(True, "optimise keyframe poses and keypoints at each new keyframe", "", "paper")
+    prior: bool = _p(True, "L_prior, anchors the first keyframe", "", "paper")
+    between: bool = _p(True, "L_reg, relative poses from registration", "", "paper")
+    observations: bool = _p(True, "L_obs, bearing and range of the keypoints", "", "paper")
+    bearing_sigma_rad: float = _p(0.01, "noise of a bearing", "rad", "release", low=1e-6)
+    range_sigma_m: float = _p(0.01, "noise of a range", "m", "release", low=1e-6)
+    huber: float = _p(1.345, "Huber threshold in standard deviations", "", "release", low=0.1)
+    between_sigma_rad: float = _p(0.02, "noise of a relative rotation", "rad", low=1e-6)
+    between_sigma_m: float = _p(0.005, "noise of a relative translation", "m", low=1e-6)
+    iterations: int = _p(20, "Levenberg-Marquardt steps at most", "", "release", low=1)
+    max_keyframes: int = _p(0, "keyframes kept, the most redundant are culled; 0 = all", low=0)
+
+
+@dataclass(frozen=True)
+class Config:
+    """All stages together. Immutable; :meth:`with_values` makes a changed copy."""
+
+    preset: str = "default"
+    seed: int = 0
+    pipeline: PipelineConfig = PipelineConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    sampling: SamplingConfig = SamplingConfig()
+    keypoint_map: KeypointMapConfig = KeypointMapConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    tsdf: TsdfConfig = TsdfConfig()
+    refinement: RefinementConfig = RefinementConfig()
+    factor_graph: FactorGraphConfig = FactorGraphConfig()
+
+    def with_values(self, values: dict[str, Any], source: str = "") -> Config:
+        """A copy with ``{"stage.key": value}`` replaced. Strings are read as TOML values.
+
+        Raises :class:`BadInput` for an unknown stage or key (naming the nearest known one) or a
+        value that does not fit. ``source`` says where the values came from, for the message.
+        """
+        stages: dict[str, dict[str, Any]] = {}
+        top: dict[str, Any] = {}
+        known = {**{f"{s}.{f.name}": f for s in _STAGES for f in fields(getattr(self, s))}, "seed": None}
+        for key, value in values.items():
+            if key not in known:
+                raise _unknown(f"{source}: configuration key" if source else "configuration key", key, known)
+            if key == "seed":
+                top["seed"] = _whole_number("config seed", value)
+                continue
+            stage, name = key.split(".", 1)
+            stages.setdefault(stage, {})[name] = _parse(value, type(known[key].default))
+        return replace(self, **top, **{s: replace(getattr(self, s), **v) for s, v in stages.items()})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Nested plain values, as written to ``config.toml`` and to provenance."""
+        return dataclasses.asdict(self)
+
+    def to_toml(self) -> str:
+        """As TOML that :func:`from_toml` reads back to an equal configuration."""
+        lines = [f'preset = "{self.preset}"', f"seed = {self.seed}"]
+        for stage in _STAGES:
+            lines += ["", f"[{stage}]"]
+            part = getattr(self, stage)
+            lines += [f"{f.name} = {_toml_value(getattr(part, f.name))}" for f in fields(part)]
+        return "\n".join(lines) + "\n"
+
+
+_STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.default))
+
+#: What ``paper`` changes against the defaults above: all of ours is taken out again.
+_PAPER: dict[str, Any] = {
+    "pipeline.object_frame": "camera",
+    "keypoint_map.cooldown": 0,
+    "registration.motion_priors": False,
+}
+_PRESETS: dict[str, dict[str, Any]] = {"default": {}, "paper": _PAPER}
+
+
+def preset(name: str = "default", seed: int = 0) -> Config:
+    """The configuration called ``default`` or ``paper``."""
+    if name not in _PRESETS:
+        raise _unknown("preset", name, _PRESETS)
+    return replace(Config().with_values(_PRESETS[name]), preset=name, seed=_whole_number("config seed", seed))
+
+
+def diff(a: str = "paper", b: str = "default") -> dict[str, tuple[Any, Any]]:
+    """``{"stage.key": (value in a, value in b)}`` for every parameter that differs."""
+    left, right = preset(a).as_dict(), preset(b).as_dict()
+    return {
+        f"{s}.{k}": (left[s][k], right[s][k]) for s in _STAGES for k in left[s] if left[s][k] != right[s][k]
+    }
+
+
+def from_toml(path: str | Path, base: Config | None = None) -> Config:
+    """Read ``[stage] key = value`` from a TOML file over ``base`` (or over the file's own ``preset``)."""
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        raise MissingData(str(path), "no such configuration file", "Give --config an existing TOML file.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadInput(str(path), f"unreadable TOML ({error})", "[stage] tables of key = value") from None
+    named = table.pop("preset", None)
+    base = preset(named) if named is not None else base or preset()
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        values |= {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value}
+    return base.with_values(values, source=str(path))
+
+
+def _unknown(what: str, key: str, known: Any) -> BadInput:
+    near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.4)
+    expected = f"one of {', '.join(known)}" if len(known) < 8 else "a stage.key of the configuration"
+    return BadInput(what, repr(key), expected, f"Did you mean {near[0]!r}?" if near else "")
+
+
+def _whole_number(name: str, value: Any) -> int:
+    try:
+        return int(str(value))
+    except ValueError:
+        raise BadInput(name, repr(value), "a whole number") from None
+
+
+def _parse(value: Any, kind: type) -> Any:
+    """A command-line string as a TOML value; anything unreadable stays a string and fails the type check."""
+    if not isinstance(value, str) or kind is str:
+        return value.strip("\"'") if isinstance(value, str) else value
+    try:
+        return tomllib.loads(f"x = {value.strip().lower()}")["x"]
+    except tomllib.TOMLDecodeError:
+        return value
+
+
+def _toml_value(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else repr(value)

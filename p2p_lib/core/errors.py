@@ -1,0 +1,44 @@
+"""What can go wrong, said so that the reader knows what to do next.
+
+The command line prints the message on one line and leaves with ``exit_code``.
+"""
+
+from __future__ import annotations
+
+
+class P2PError(Exception):
+    """Any error the user can mend. ``str(error)`` is one line."""
+
+    exit_code = 2
+
+
+class BadInput(P2PError, ValueError):
+    """A value does not fit: names the thing, what came, what was expected, what to do."""
+
+    def __init__(self, name: str, got: object, expected: str, fix: str = ""):
+        self.name, self.got, self.expected, self.fix = name, got, expected, fix
+        super().__init__(_sentence(f"{name}: got {got}, expected {expected}", fix))
+
+
+class MissingData(P2PError, FileNotFoundError):
+    """A file or folder is not there (or cannot be read)."""
+
+    def __init__(self, name: str, expected: str, fix: str = ""):
+        self.name, self.expected, self.fix = name, expected, fix
+        self._text = _sentence(f"{name}: {expected}", fix)
+        super().__init__(self._text)
+
+    def __str__(self) -> str:
+        return self._text
+
+
+class MissingBackend(P2PError, ImportError):
+    """An optional package or checkpoint was asked for by name and is not installed."""
+
+    def __init__(self, name: str, missing: str, fix: str):
+        self.missing, self.fix = missing, fix
+        super().__init__(_sentence(f"{name}: {missing}", fix), name=name)
+
+
+def _sentence(what: str, fix: str) -> str:
+    return " ".join(f"{what}. {fix}".split()) if fix else " ".join(what.split())

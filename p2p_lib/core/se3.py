@@ -1,0 +1,149 @@
+"""Rigid transformations SE(3), batched over leading axes.
+
+A transformation ``T_a_b`` is a (..., 4, 4) float64 array that takes coordinates in frame b to
+coordinates in frame a: ``p_a = T_a_b @ p_b``. Points are rows, (..., N, 3). Tangent vectors are
+(..., 6), rotation first, then translation, applied on the right: ``T @ exp(xi)``, as in gtsam.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from p2p_lib.core.errors import BadInput
+
+IDENTITY = np.eye(4)
+IDENTITY.setflags(write=False)
+
+# Below this squared angle the closed forms lose digits and their Taylor series are exact.
+_SMALL_SQ = 1e-8
+
+
+def from_rt(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Rotation (..., 3, 3) and translation (..., 3) to a (..., 4, 4) transformation."""
+    R, t = np.asarray(R, float), np.asarray(t, float)
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def inverse(T_a_b: np.ndarray) -> np.ndarray:
+    """T_b_a, by transposing the rotation (exact for a rigid transformation)."""
+    Rt = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    return from_rt(Rt, -(Rt @ T_a_b[..., :3, 3:])[..., 0])
+
+
+def transform(T_a_b: np.ndarray, p_b: np.ndarray) -> np.ndarray:
+    """p_a of points p_b: (..., 4, 4) and (..., N, 3) to (..., N, 3)."""
+    return p_b @ np.swapaxes(T_a_b[..., :3, :3], -1, -2) + T_a_b[..., None, :3, 3]
+
+
+def hat(w: np.ndarray) -> np.ndarray:
+    """Skew matrix (..., 3, 3) with ``hat(a) @ b = a x b``."""
+    w = np.asarray(w, float)
+    W = np.zeros((*w.shape[:-1], 3, 3))
+    W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
+    W[..., 1, 0], W[..., 2, 0], W[..., 2, 1] = w[..., 2], -w[..., 1], w[..., 0]
+    return W
+
+
+def exp(xi: np.ndarray) -> np.ndarray:
+    """Exponential map: tangent (..., 6) [rotation rad, translation m] to (..., 4, 4)."""
+    xi = np.asarray(xi, float)
+    w, v = xi[..., :3], xi[..., 3:]
+    sq = np.sum(w * w, -1)
+    small = sq < _SMALL_SQ
+    angle = np.sqrt(np.where(small, 1.0, sq))
+    a = np.where(small, 1 - sq / 6, np.sin(angle) / angle)
+    b = np.where(small, 0.5 - sq / 24, (1 - np.cos(angle)) / angle**2)
+    c = np.where(small, 1 / 6 - sq / 120, (angle - np.sin(angle)) / angle**3)
+    W = hat(w)
+    W2 = W @ W
+    eye = np.eye(3)
+    R = eye + a[..., None, None] * W + b[..., None, None] * W2
+    V = eye + b[..., None, None] * W + c[..., None, None] * W2
+    return from_rt(R, (V @ v[..., None])[..., 0])
+
+
+def log(T: np.ndarray) -> np.ndarray:
+    """Logarithm map: (..., 4, 4) to tangent (..., 6), inverse of :func:`exp` for angles < pi."""
+    T = np.asarray(T, float)
+    w = so3_log(T[..., :3, :3])
+    sq = np.sum(w * w, -1)
+    small = sq < _SMALL_SQ
+    angle = np.sqrt(np.where(small, 1.0, sq))
+    half = angle / 2
+    d = np.where(small, 1 / 12 + sq / 720, (1 - half / np.tan(half)) / angle**2)
+    W = hat(w)
+    V_inv = np.eye(3) - 0.5 * W + d[..., None, None] * (W @ W)
+    return np.concatenate([w, (V_inv @ T[..., :3, 3:])[..., 0]], -1)
+
+
+def so3_log(R: np.ndarray) -> np.ndarray:
+    """Rotation vector (..., 3) of rotation matrices (..., 3, 3); stable at angles 0 and pi.
+
+    Goes through the unit quaternion, picking for each matrix the largest of its four components.
+    """
+    R = np.asarray(R, float)
+    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    x, y, z = (R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    xy, xz, yz = (R[..., i, j] + R[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
+    squares = np.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], -1)
+    columns = np.stack(
+        [
+            np.stack([squares[..., 0], x, y, z], -1),
+            np.stack([x, squares[..., 1], xy, xz], -1),
+            np.stack([y, xy, squares[..., 2], yz], -1),
+            np.stack([z, xz, yz, squares[..., 3]], -1),
+        ],
+        -2,
+    )
+    best = np.argmax(squares, -1)[..., None, None]
+    q = np.take_along_axis(columns, np.broadcast_to(best, (*best.shape[:-2], 1, 4)), -2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    q = np.where(q[..., :1] < 0, -q, q)
+    s = np.linalg.norm(q[..., 1:], axis=-1)
+    small = s < 1e-9
+    factor = np.where(small, 2.0, 2 * np.arctan2(s, q[..., 0]) / np.where(small, 1.0, s))
+    return factor[..., None] * q[..., 1:]
+
+
+def angle_rad(T: np.ndarray) -> np.ndarray:
+    """Rotation angle (...,) in [0, pi] of (..., 4, 4) or (..., 3, 3)."""
+    return np.linalg.norm(so3_log(T[..., :3, :3]), axis=-1)
+
+
+def adjoint(T: np.ndarray) -> np.ndarray:
+    """Ad_T (..., 6, 6), rotation first: ``T exp(xi) T^-1 = exp(Ad_T xi)``."""
+    R = T[..., :3, :3]
+    A = np.zeros((*T.shape[:-2], 6, 6))
+    A[..., :3, :3] = A[..., 3:, 3:] = R
+    A[..., 3:, :3] = hat(T[..., :3, 3]) @ R
+    return A
+
+
+def interpolate(T_a_b: np.ndarray, T_a_c: np.ndarray, s: float | np.ndarray) -> np.ndarray:
+    """The pose a share s of the way from b to c along the geodesic (constant twist)."""
+    step = log(inverse(T_a_b) @ T_a_c)
+    return T_a_b @ exp(np.asarray(s)[..., None] * step)
+
+
+def orthonormalised(T: np.ndarray) -> np.ndarray:
+    """The rigid transformation nearest to T (rotation by SVD, proper)."""
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    U = U * np.where(np.arange(3) == 2, np.linalg.det(U @ Vt)[..., None, None], 1.0)
+    return from_rt(U @ Vt, T[..., :3, 3])
+
+
+def check(name: str, T: np.ndarray, tolerance: float = 1e-4) -> np.ndarray:
+    """T as (4, 4) float64 if it is a rigid transformation, else :class:`BadInput` naming it."""
+    T = np.asarray(T, float)
+    if T.shape != (4, 4):
+        raise BadInput(name, f"shape {T.shape}", "a 4x4 transformation")
+    if not np.isfinite(T).all():
+        raise BadInput(name, "NaN or infinite entries", "a finite 4x4 transformation")
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > tolerance or np.linalg.det(R) < 0:
+        raise BadInput(name, "a matrix that is not a rotation", "an orthonormal, right-handed 3x3 block")
+    if np.abs(T[3] - IDENTITY[3]).max() > tolerance:
+        raise BadInput(name, f"last row {T[3].tolist()}", "0 0 0 1")
+    return T

@@ -1,0 +1,138 @@
+"""The values that pass between the stages: frames, tracks, pose estimates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.errors import BadInput
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One RGB-D picture.
+
+    rgb      (H, W, 3) uint8, red first
+    depth_m  (H, W) float32, metres along the optical axis, registered to rgb; 0 = no measurement
+    time_s   seconds, increasing within a sequence
+    """
+
+    index: int
+    time_s: float
+    rgb: np.ndarray
+    depth_m: np.ndarray
+
+    def __post_init__(self) -> None:
+        rgb, depth = self.rgb, self.depth_m
+        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+            raise BadInput(f"frame {self.index} colour", f"{rgb.shape} {rgb.dtype}", "(H, W, 3) uint8")
+        if depth.shape != rgb.shape[:2]:
+            got = "x".join(map(str, depth.shape[::-1]))
+            want = f"{rgb.shape[1]}x{rgb.shape[0]} as the colour picture"
+            raise BadInput(f"frame {self.index} depth", got, want, "Register the depth to the colour camera first.")
+        if not np.isfinite(self.time_s):
+            raise BadInput(f"frame {self.index} time_s", self.time_s, "a finite time in seconds")
+        # A sensor's NaN, infinity and negative readings all mean "no measurement", which is 0 here.
+        clean = depth.astype(np.float32, copy=False)
+        bad = ~((clean >= 0) & (clean < np.inf))
+        object.__setattr__(self, "depth_m", np.where(bad, np.float32(0), clean) if bad.any() else clean)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.depth_m.shape
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """What a 2D point tracker says of its live queries at one frame (paper: u_t, delta_t, sigma_t).
+
+    ids          (N,) int64, as returned when the queries were added
+    uv_px        (N, 2) float64; where not visible: the tracker's best guess or NaN
+    visible      (N,) bool
+    uncertainty  (N,) float in [0, 1]
+    """
+
+    ids: np.ndarray
+    uv_px: np.ndarray
+    visible: np.ndarray
+    uncertainty: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        if self.uv_px.shape != (n, 2) or self.visible.shape != (n,) or self.uncertainty.shape != (n,):
+            raise BadInput(
+                "tracks",
+                f"{n} ids, uv_px {self.uv_px.shape}, visible {self.visible.shape}",
+                "(N,), (N, 2), (N,), (N,)",
+            )
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, ids: np.ndarray) -> Tracks:
+        """The rows of these ids, in this order. ``self.ids`` is sorted, as trackers return it."""
+        ids = np.asarray(ids, np.int64)
+        at = np.searchsorted(self.ids, ids)
+        if len(ids) and (len(self.ids) == 0 or (self.ids[np.minimum(at, len(self.ids) - 1)] != ids).any()):
+            raise BadInput("track ids", "ids the tracker does not hold", "ids returned by add() and not dropped")
+        return Tracks(ids, self.uv_px[at], self.visible[at], self.uncertainty[at])
+
+
+class Status(StrEnum):
+    """What a pose estimate is worth; `WITH_POSE` lists those that carry a pose."""
+
+    INITIALISING = "initialising"  # the object has not been seen yet, or its map is still being started
+    TRACKED = "tracked"
+    DEGRADED = "degraded"  # a pose, but weakly supported: `reason` says by what
+    OCCLUDED = "occluded"  # nothing of the object is visible
+    LOST = "lost"  # something is visible, but no pose was found
+    RECOVERED = "recovered"  # the first frames after occluded or lost
+
+
+#: Statuses that carry a pose of this very frame.
+WITH_POSE = frozenset({Status.TRACKED, Status.DEGRADED, Status.RECOVERED})
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """One object's pose at one frame, or the honest absence of it.
+
+    T_cam_obj       (4, 4) or None. None whenever the status is not one of :data:`WITH_POSE`
+    covariance      (6, 6) or None: right tangent of T_cam_obj, [rotation rad, translation m]
+    confidence      in [0, 1]; 0 without a pose
+    reason          why the status is what it is, in words; empty when tracked
+    last_T_cam_obj  the newest pose known, and last_seen_s its time: for those who want to guess
+    """
+
+    object: str
+    frame_index: int
+    time_s: float
+    status: Status
+    T_cam_obj: np.ndarray | None = None
+    confidence: float = 0.0
+    covariance: np.ndarray | None = None
+    reason: str = ""
+    visible_points: int = 0
+    inliers: int = 0
+    last_T_cam_obj: np.ndarray | None = None
+    last_seen_s: float = float("nan")
+    keyframe: bool = False
+    extra: dict = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        name = f"estimate of {self.object!r} at frame {self.frame_index}"
+        if (self.T_cam_obj is not None) != (self.status in WITH_POSE):
+            came = "a pose" if self.T_cam_obj is not None else "no pose"
+            raise BadInput(name, f"{came} with status {self.status}", "a pose exactly when tracked, degraded, recovered")
+        if self.T_cam_obj is not None:
+            object.__setattr__(self, "T_cam_obj", se3.check(name, self.T_cam_obj))
+        if not 0 <= self.confidence <= 1:
+            raise BadInput(f"{name}: confidence", self.confidence, "a number in [0, 1]")
+        if self.covariance is not None and (
+            self.covariance.shape != (6, 6) or not np.isfinite(self.covariance).all()
+        ):
+            raise BadInput(f"{name}: covariance", f"shape {self.covariance.shape}", "a finite (6, 6) matrix or None")
