@@ -138,7 +138,9 @@ class RefinementConfig(_Checked):
     huber_m: float = _p(0.01, "Huber threshold of the surface residual", "m", "release", low=1e-5)
     max_step_m: float = _p(0.02, "largest translation of one step", "m", "release", low=0)
     max_step_rad: float = _p(0.2, "largest rotation of one step", "rad", "release", low=0)
-    keypoint_weight: float = _p(0.0, "weight of keypoint residuals beside the surface; 0 = surface alone (paper)", low=0)
+    keypoint_weight: float = _p(
+        0.0, "weight of keypoint residuals beside the surface; 0 = surface alone (paper)", low=0
+    )
 
 
 @dataclass(frozen=True)
@@ -225,9 +227,7 @@ def preset(name: str = "default", seed: int = 0) -> Config:
 def diff(a: str = "paper", b: str = "default") -> dict[str, tuple[Any, Any]]:
     """``{"stage.key": (value in a, value in b)}`` for every parameter that differs."""
     left, right = preset(a).as_dict(), preset(b).as_dict()
-    return {
-        f"{s}.{k}": (left[s][k], right[s][k]) for s in _STAGES for k in left[s] if left[s][k] != right[s][k]
-    }
+    return {f"{s}.{k}": (left[s][k], right[s][k]) for s in _STAGES for k in left[s] if left[s][k] != right[s][k]}
 
 
 def from_toml(path: str | Path, base: Config | None = None) -> Config:

@@ -127,12 +127,12 @@ class PoseEstimate:
         name = f"estimate of {self.object!r} at frame {self.frame_index}"
         if (self.T_cam_obj is not None) != (self.status in WITH_POSE):
             came = "a pose" if self.T_cam_obj is not None else "no pose"
-            raise BadInput(name, f"{came} with status {self.status}", "a pose exactly when tracked, degraded, recovered")
+            raise BadInput(
+                name, f"{came} with status {self.status}", "a pose exactly when tracked, degraded, recovered"
+            )
         if self.T_cam_obj is not None:
             object.__setattr__(self, "T_cam_obj", se3.check(name, self.T_cam_obj))
         if not 0 <= self.confidence <= 1:
             raise BadInput(f"{name}: confidence", self.confidence, "a number in [0, 1]")
-        if self.covariance is not None and (
-            self.covariance.shape != (6, 6) or not np.isfinite(self.covariance).all()
-        ):
+        if self.covariance is not None and (self.covariance.shape != (6, 6) or not np.isfinite(self.covariance).all()):
             raise BadInput(f"{name}: covariance", f"shape {self.covariance.shape}", "a finite (6, 6) matrix or None")
