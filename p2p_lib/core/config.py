@@ -114,7 +114,12 @@ class RegistrationConfig(_Checked):
     min_inliers: int = _p(5, "fewest inliers of a hypothesis", "points", "release", low=3)
     max_hypotheses: int = _p(10, "H, hypotheses at most", "", "release", low=1)
     motion_priors: bool = _p(True, "the last pose and constant velocity compete as hypotheses")
-    noise_per_m2: float = _p(0.0, "inlier_m grows by this times the range squared; 0 = one constant", "1/m", low=0)
+    noise_m: float = _p(0.001, "noise of a measured point at range 0", "m", low=1e-6)
+    noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
+    inlier_sigmas: float = _p(3.0, "inlier_m grows to this many sigmas of that noise; 0 = one constant", low=0)
+    surface_margin_m: float = _p(2e-4, "surface scores nearer than this are equal; 0 = minimum (paper)", "m", low=0)
+    min_support: int = _p(8, "inliers that let a hypothesis compete on the surface", "points", "release", low=0)
+    min_support_share: float = _p(0.25, "or this share of the best supported", "", "release", low=0, high=1)
 
 
 @dataclass(frozen=True)
@@ -213,6 +218,9 @@ _PAPER: dict[str, Any] = {
     "pipeline.object_frame": "camera",
     "keypoint_map.cooldown": 0,
     "registration.motion_priors": False,
+    "registration.inlier_sigmas": 0.0,
+    "registration.surface_margin_m": 0.0,
+    "registration.min_support": 0,
 }
 _PRESETS: dict[str, dict[str, Any]] = {"default": {}, "paper": _PAPER}
 

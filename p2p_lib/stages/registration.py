@@ -1,0 +1,306 @@
+"""Frame-to-map registration: from 3D correspondences to several candidate poses (paper: "Frame-to-Map Registration").
+
+:func:`generate` runs sequential RANSAC + SVD; which of its hypotheses is right is told by the dense
+surface, which is measured elsewhere and weighed here, by :func:`select`. :func:`covariance` says how
+well the correspondences determine each direction of the chosen pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.config import RegistrationConfig
+
+# A set of points determines the turn about its long axis when noise of a third of the inlier
+# threshold turns it by less than this; below, the set counts as collinear.
+_DETERMINED_RAD = 0.35
+# Weight (m^2) that holds a refit at its prior's rotation where the points say nothing (a line's
+# roll). Points spread over a centimetre outweigh it a thousandfold.
+_PRIOR_INERTIA_M2 = 1e-6
+# What is known of a pose before any point is seen: keeps covariances finite.
+_UNKNOWN_RAD, _UNKNOWN_M = np.pi, 1.0
+_REFITS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A candidate pose T^C_O with the correspondences that speak for it.
+
+    T_cam_obj   (4, 4)
+    inliers     (N,) bool, the consensus set; False for rows that were not finite
+    residual_m  (N,) distance between p_cam and T_cam_obj p_obj; infinite for rows that were not finite
+    origin      "ransac 1", "ransac 2", ..., "svd", or the name of the prior it was refit from
+    """
+
+    T_cam_obj: np.ndarray
+    inliers: np.ndarray
+    residual_m: np.ndarray
+    origin: str
+
+    @property
+    def support(self) -> int:
+        """The number of inliers."""
+        return int(self.inliers.sum())
+
+
+def fit_rigid(p_obj: np.ndarray, p_cam: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """The T_cam_obj (..., 4, 4) that minimises sum of w |p_cam - T p_obj|^2 (paper: eq. corres_svd).
+
+    p_obj, p_cam (..., N, 3) finite, weights (..., N) at least 0. Always a proper rotation: never a
+    reflection. Where the points leave directions free (collinear, coincident, fewer than three) the
+    rotation is one of the many that fit.
+    """
+    return _fit(p_obj, p_cam, weights)[0]
+
+
+def generate(
+    p_obj: np.ndarray,
+    p_cam: np.ndarray,
+    config: RegistrationConfig,
+    rng: np.random.Generator,
+    *,
+    sigma_m: np.ndarray | None = None,
+    priors: Mapping[str, np.ndarray] | None = None,
+) -> list[Hypothesis]:
+    """The hypotheses that correspondences p_obj, p_cam (N, 3) support, the largest consensus first.
+
+    Sequential RANSAC: the transformation with the most inliers, its consensus set removed, and again
+    on the rest. With ``config.motion_priors`` each pose in ``priors`` ({"last pose": T_cam_obj, ...})
+    competes too, refit on the points that agree with it. With ``config.multi_hypothesis`` off, one
+    hypothesis: SVD on all, outliers removed by the fixed threshold, second SVD.
+
+    sigma_m (N,) is the noise of each p_cam, :func:`noise_m` where None; it sets the thresholds and the
+    weights when ``config.inlier_sigmas`` is above 0. Rows that are not finite are ignored. Too few
+    or collinear points: an empty list.
+    """
+    p_obj, p_cam = np.asarray(p_obj, float).reshape(-1, 3), np.asarray(p_cam, float).reshape(-1, 3)
+    sigma_m = noise_m(p_cam, config) if sigma_m is None else np.asarray(sigma_m, float)
+    usable = np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1) & np.isfinite(sigma_m) & (sigma_m > 0)
+    matches = _Matches.of(p_obj[usable], p_cam[usable], sigma_m[usable], config)
+    if len(matches.p_obj) < max(3, config.min_inliers):
+        return []
+    if config.multi_hypothesis:
+        found = _sequential(matches, config, rng)
+        found += _from_priors(matches, priors or {}, config) if config.motion_priors else []
+    else:
+        found = _svd_twice(matches, config)
+    distinct = _without_duplicates(found, matches, config)[: config.max_hypotheses]
+    return [_spread(hypothesis, usable) for hypothesis in distinct]
+
+
+def noise_m(p_cam: np.ndarray, config: RegistrationConfig) -> np.ndarray:
+    """Standard deviation (N,) of measured points: that of a depth sensor, growing with the range squared."""
+    return config.noise_m + config.noise_per_m2 * np.asarray(p_cam, float)[:, 2] ** 2
+
+
+def select(
+    hypotheses: Sequence[Hypothesis], surface_scores_m: np.ndarray | None, config: RegistrationConfig
+) -> tuple[Hypothesis | None, str]:
+    """The hypothesis to go on with, and why.
+
+    surface_scores_m (H,): mean absolute TSDF value of the masked depth points under each pose, in
+    metres; None while there is no surface. The paper takes the minimum. Ours (``surface_margin_m``
+    above 0): the best supported hypothesis stands unless another, itself supported, lies nearer to
+    the surface by more than the margin; below it the surface cannot tell them apart.
+    """
+    if not hypotheses:
+        return None, "no hypothesis: too few correspondences agree"
+    support = np.array([h.support for h in hypotheses])
+    spread = np.array([np.mean(h.residual_m[h.inliers]) for h in hypotheses])
+    champion = int(np.lexsort((spread, -support))[0])
+    if len(hypotheses) == 1:
+        return hypotheses[0], "the only hypothesis"
+    if surface_scores_m is None or not np.isfinite(surface_scores_m).any():
+        return hypotheses[champion], "most inliers, there is no surface yet"
+    scores = np.where(np.isfinite(surface_scores_m), surface_scores_m, np.inf)
+    supported = support >= min(config.min_support, config.min_support_share * support.max())
+    best = int(np.argmin(np.where(supported, scores, np.inf)))
+    if scores[best] + config.surface_margin_m < scores[champion] or config.surface_margin_m == 0:
+        return hypotheses[best], f"nearest to the surface ({1e3 * scores[best]:.2f} mm)"
+    return hypotheses[champion], f"most inliers, the surface scores differ by under {1e3 * config.surface_margin_m:g} mm"
+
+
+def covariance(
+    hypothesis: Hypothesis, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray | float
+) -> np.ndarray:
+    """(6, 6) covariance of the pose: right tangent of T_cam_obj, [rotation rad, translation m].
+
+    The inverse of the information that the inliers carry when each p_cam (N, 3) has noise sigma_m
+    (isotropic, per row or one for all), inflated when the residuals are larger than that noise
+    explains. Finite and positive definite for any input: directions that the points leave free get
+    the variance of not knowing (pi rad, 1 m).
+    """
+    p_obj, p_cam = np.asarray(p_obj, float), np.asarray(p_cam, float)
+    sigma_m = np.broadcast_to(np.asarray(sigma_m, float), p_obj.shape[:1])
+    rows = hypothesis.inliers & np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1) & (sigma_m > 0)
+    p, weight = p_obj[rows], 1 / sigma_m[rows] ** 2
+    residual = p_cam[rows] - se3.transform(hypothesis.T_cam_obj, p)
+    jacobian = np.concatenate([-se3.hat(p), np.broadcast_to(np.eye(3), (len(p), 3, 3))], -1)
+    information = np.einsum("n,nki,nkj->ij", weight, jacobian, jacobian)
+    degrees_of_freedom = 3 * len(p) - 6
+    excess = np.sum(weight[:, None] * residual**2) / degrees_of_freedom if degrees_of_freedom > 0 else 1.0
+    unknown = np.diag(np.repeat([_UNKNOWN_RAD**-2, _UNKNOWN_M**-2], 3))
+    result = np.linalg.inv(information / max(excess, 1.0) + unknown)
+    return (result + result.T) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """The finite correspondences, with the residual that still counts and the weight of each."""
+
+    p_obj: np.ndarray
+    p_cam: np.ndarray
+    limit_m: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def of(cls, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray, config: RegistrationConfig) -> _Matches:
+        if config.inlier_sigmas > 0 and len(p_obj):
+            limit = np.maximum(config.inlier_m, config.inlier_sigmas * sigma_m)
+            return cls(p_obj, p_cam, limit, (np.median(sigma_m) / sigma_m) ** 2)
+        return cls(p_obj, p_cam, np.full(len(p_obj), config.inlier_m), np.ones(len(p_obj)))
+
+    def residual_m(self, T_cam_obj: np.ndarray) -> np.ndarray:
+        """(..., n) of poses (..., 4, 4)."""
+        error = se3.transform(T_cam_obj, self.p_obj) - self.p_cam
+        return np.sqrt(np.einsum("...i,...i->...", error, error))
+
+
+def _fit(
+    p_obj: np.ndarray, p_cam: np.ndarray, weights: np.ndarray | None = None, R_prior: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The best T_cam_obj (..., 4, 4) and the inertia (...,) in m^2 of the points about their long axis."""
+    p_obj, p_cam = np.asarray(p_obj, float), np.asarray(p_cam, float)
+    w = np.ones(p_obj.shape[:-1]) if weights is None else np.asarray(weights, float)
+    total = np.maximum(w.sum(-1), np.finfo(float).tiny)[..., None]
+    mean_obj = np.einsum("...n,...ni->...i", w, p_obj) / total
+    mean_cam = np.einsum("...n,...ni->...i", w, p_cam) / total
+    centred = (p_cam - mean_cam[..., None, :]) * w[..., None]
+    H = np.swapaxes(centred, -1, -2) @ (p_obj - mean_obj[..., None, :])
+    if R_prior is not None:
+        H = H + _PRIOR_INERTIA_M2 * R_prior
+    U, s, Vt = np.linalg.svd(H)
+    proper = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    U[..., 2] *= proper[..., None]
+    R = U @ Vt
+    t = mean_cam - np.einsum("...ij,...j->...i", R, mean_obj)
+    return se3.from_rt(R, t), s[..., 1] + proper * s[..., 2]
+
+
+def _determined(inertia_m2: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
+    return inertia_m2 > (limit_m / 3 / _DETERMINED_RAD) ** 2
+
+
+def _sequential(matches: _Matches, config: RegistrationConfig, rng: np.random.Generator) -> list[Hypothesis]:
+    pool = np.ones(len(matches.p_obj), bool)
+    found: list[Hypothesis] = []
+    while len(found) < config.max_hypotheses and pool.sum() >= max(config.sample_size, config.min_inliers):
+        T = _ransac(matches, np.flatnonzero(pool), config, rng)
+        hypothesis = None if T is None else _refit(T, matches, pool, f"ransac {len(found) + 1}", config)
+        if hypothesis is None:
+            break
+        found.append(hypothesis)
+        pool &= ~hypothesis.inliers
+    return found
+
+
+def _ransac(
+    matches: _Matches, pool: np.ndarray, config: RegistrationConfig, rng: np.random.Generator
+) -> np.ndarray | None:
+    """The T_cam_obj with the most inliers in ``pool`` (indices), of all samples at once; None without any."""
+    order = rng.random((config.iterations, len(pool)), np.float32)
+    sample = pool[np.argpartition(order, config.sample_size - 1, axis=1)[:, : config.sample_size]]
+    sample = sample[_lengths_agree(matches, sample)]
+    if not len(sample):
+        return None
+    T, inertia = _fit(matches.p_obj[sample], matches.p_cam[sample])
+    T = T[_determined(inertia, matches.limit_m[sample].mean(-1))]
+    if not len(T):
+        return None
+    relative = matches.residual_m(T)[:, pool] / matches.limit_m[pool]
+    agrees = relative <= 1
+    # Equal counts are told apart by how well their inliers fit: a share below 1 of one inlier.
+    looseness = np.sum(np.where(agrees, relative, 0), 1) / (len(pool) + 1)
+    return T[np.argmax(agrees.sum(1) - looseness)]
+
+
+def _lengths_agree(matches: _Matches, sample: np.ndarray) -> np.ndarray:
+    """Which samples (S, k) keep the distances between successive points: no rigid motion fits the others."""
+    after = np.roll(sample, 1, axis=1)
+    length_obj = np.linalg.norm(matches.p_obj[sample] - matches.p_obj[after], axis=-1)
+    length_cam = np.linalg.norm(matches.p_cam[sample] - matches.p_cam[after], axis=-1)
+    return (np.abs(length_obj - length_cam) <= matches.limit_m[sample] + matches.limit_m[after]).all(1)
+
+
+def _refit(
+    T: np.ndarray,
+    matches: _Matches,
+    pool: np.ndarray,
+    origin: str,
+    config: RegistrationConfig,
+    R_prior: np.ndarray | None = None,
+) -> Hypothesis | None:
+    """Refits on the inliers while their number does not fall; None if too few or collinear remain."""
+    residual = matches.residual_m(T)
+    inliers = pool & (residual <= matches.limit_m)
+    inertia = np.inf
+    for _ in range(_REFITS):
+        if inliers.sum() < config.min_inliers:
+            return None
+        next_T, next_inertia = _fit(
+            matches.p_obj[inliers], matches.p_cam[inliers], matches.weight[inliers], R_prior
+        )
+        next_residual = matches.residual_m(next_T)
+        next_inliers = pool & (next_residual <= matches.limit_m)
+        if next_inliers.sum() < inliers.sum():
+            break
+        unchanged = np.array_equal(next_inliers, inliers)
+        T, residual, inliers, inertia = next_T, next_residual, next_inliers, next_inertia
+        if unchanged:
+            break
+    if R_prior is None and not _determined(inertia, np.median(matches.limit_m[inliers])):
+        return None
+    return Hypothesis(T, inliers, residual, origin)
+
+
+def _from_priors(
+    matches: _Matches, priors: Mapping[str, np.ndarray], config: RegistrationConfig
+) -> list[Hypothesis]:
+    everything = np.ones(len(matches.p_obj), bool)
+    usable = {name: np.asarray(T, float) for name, T in priors.items() if np.isfinite(T).all()}
+    refits = [_refit(T, matches, everything, name, config, T[:3, :3]) for name, T in usable.items()]
+    return [hypothesis for hypothesis in refits if hypothesis is not None]
+
+
+def _svd_twice(matches: _Matches, config: RegistrationConfig) -> list[Hypothesis]:
+    T, _ = _fit(matches.p_obj, matches.p_cam)
+    kept = matches.residual_m(T) <= matches.limit_m
+    if kept.sum() < config.min_inliers:
+        return []
+    T, inertia = _fit(matches.p_obj[kept], matches.p_cam[kept])
+    if not _determined(inertia, matches.limit_m.mean()):
+        return []
+    residual = matches.residual_m(T)
+    return [Hypothesis(T, residual <= matches.limit_m, residual, "svd")]
+
+
+def _without_duplicates(
+    found: list[Hypothesis], matches: _Matches, config: RegistrationConfig
+) -> list[Hypothesis]:
+    """Drops poses that move no point by a tenth of the threshold from where an earlier one puts it."""
+    if len(found) < 2:
+        return found
+    placed = se3.transform(np.stack([h.T_cam_obj for h in found]), matches.p_obj)
+    apart = np.abs(placed[:, None] - placed[None]).max((2, 3)) > config.inlier_m / 10
+    return [h for k, h in enumerate(found) if apart[k, :k].all()]
+
+
+def _spread(hypothesis: Hypothesis, usable: np.ndarray) -> Hypothesis:
+    """The hypothesis with its rows put back among those that were not finite."""
+    inliers, residual = np.zeros(len(usable), bool), np.full(len(usable), np.inf)
+    inliers[usable], residual[usable] = hypothesis.inliers, hypothesis.residual_m
+    return Hypothesis(hypothesis.T_cam_obj, inliers, residual, hypothesis.origin)
