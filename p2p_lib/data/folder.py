@@ -1,0 +1,39 @@
+"""A plain folder of one's own: ``rgb/``, ``depth/`` and ``cam_K.txt``; no truth.
+
+``masks/`` is optional: one folder per object (named by it), or one label image per picture (0 = background,
+k = object k). A single mask is taken as the first picture's. ``times.txt`` (seconds, one a line) is optional;
+pictures whose names are nanoseconds need none.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from p2p_lib.data import images
+
+
+def recognises(folder: Path) -> bool:
+    """Whether a folder has ``rgb/``."""
+    return (folder / "rgb").is_dir()
+
+
+def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> images.ImageSequence:
+    """The sequence in this folder; arguments as of :func:`~p2p_lib.data.sequence.open_sequence`."""
+    rgb_files, depth_files, camera, times_s = images.pictures(folder)
+    where = images.masks_folder(folder, masks) if masks else folder / "masks"
+    found = None
+    if masks or where.is_dir():
+        found = images.find_masks(where, rgb_files, (camera.height, camera.width), first_frame_alone=True)
+    return images.ImageSequence(
+        name=name,
+        format="folder",
+        path=folder,
+        camera=camera,
+        objects=found.objects if found else ("object",),
+        rgb_files=rgb_files,
+        depth_files=depth_files,
+        times_s=times_s,
+        depth_scale=depth_scale or images.DEPTH_SCALE,
+        mask_files=found,
+        own_masks=found,
+    )
