@@ -108,11 +108,13 @@ class KeypointMapConfig(_Checked):
 @dataclass(frozen=True)
 class RegistrationConfig(_Checked):
     multi_hypothesis: bool = _p(True, "sequential RANSAC; off: SVD, outlier removal, SVD (the ablation)", "", "paper")
-    iterations: int = _p(100, "RANSAC samples per hypothesis", "", "release", low=1)
+    iterations: int = _p(400, "RANSAC samples per hypothesis at most", low=1)
     sample_size: int = _p(4, "points per RANSAC sample", "points", "release", low=3)
     inlier_m: float = _p(0.006, "largest residual of an inlier", "m", "release", low=1e-5)
     min_inliers: int = _p(5, "fewest inliers of a hypothesis", "points", "release", low=3)
     max_hypotheses: int = _p(10, "H, hypotheses at most", "", "release", low=1)
+    max_uncertainty: float = _p(0.5, "tracks more uncertain than this are left out", low=0, high=1)
+    min_promoted: int = _p(12, "with fewer visible keypoints, pending ones help out", "points", "release", low=3)
     motion_priors: bool = _p(True, "the last pose and constant velocity compete as hypotheses")
     noise_m: float = _p(0.001, "noise of a measured point at range 0", "m", low=1e-6)
     noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
@@ -217,6 +219,7 @@ _STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.def
 _PAPER: dict[str, Any] = {
     "pipeline.object_frame": "camera",
     "keypoint_map.cooldown": 0,
+    "registration.iterations": 100,
     "registration.motion_priors": False,
     "registration.inlier_sigmas": 0.0,
     "registration.surface_margin_m": 0.0,

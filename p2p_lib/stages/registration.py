@@ -24,6 +24,9 @@ _PRIOR_INERTIA_M2 = 1e-6
 # What is known of a pose before any point is seen: keeps covariances finite.
 _UNKNOWN_RAD, _UNKNOWN_M = np.pi, 1.0
 _REFITS = 4
+# RANSAC draws this many samples at once, and stops when the chance that no sample so far was free of
+# outliers, taking the best consensus for the truth, is below this.
+_BATCH, _MISSED = 100, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +124,10 @@ def select(
     best = int(np.argmin(np.where(supported, scores, np.inf)))
     if scores[best] + config.surface_margin_m < scores[champion] or config.surface_margin_m == 0:
         return hypotheses[best], f"nearest to the surface ({1e3 * scores[best]:.2f} mm)"
-    return hypotheses[champion], f"most inliers, the surface scores differ by under {1e3 * config.surface_margin_m:g} mm"
+    return hypotheses[champion], "most inliers, the surface does not tell the hypotheses apart"
 
 
-def covariance(
-    hypothesis: Hypothesis, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray | float
-) -> np.ndarray:
+def covariance(hypothesis: Hypothesis, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray | float) -> np.ndarray:
     """(6, 6) covariance of the pose: right tangent of T_cam_obj, [rotation rad, translation m].
 
     The inverse of the information that the inliers carry when each p_cam (N, 3) has noise sigma_m
@@ -211,21 +212,39 @@ def _sequential(matches: _Matches, config: RegistrationConfig, rng: np.random.Ge
 def _ransac(
     matches: _Matches, pool: np.ndarray, config: RegistrationConfig, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """The T_cam_obj with the most inliers in ``pool`` (indices), of all samples at once; None without any."""
-    order = rng.random((config.iterations, len(pool)), np.float32)
-    sample = pool[np.argpartition(order, config.sample_size - 1, axis=1)[:, : config.sample_size]]
+    """The T_cam_obj with the most inliers in ``pool`` (indices); None without any.
+
+    Samples come in batches until a better consensus is unlikely to have been missed.
+    """
+    best, best_score, missed = None, -np.inf, 1.0
+    for drawn in range(0, config.iterations, _BATCH):
+        size = min(_BATCH, config.iterations - drawn)
+        T, score = _best_of_batch(matches, pool, size, config.sample_size, rng)
+        if score > best_score:
+            best, best_score = T, score
+            share = np.ceil(score) / len(pool)
+            missed = 1 - share**config.sample_size
+        if missed ** (drawn + size) < _MISSED:
+            break
+    return best
+
+
+def _best_of_batch(
+    matches: _Matches, pool: np.ndarray, size: int, sample_size: int, rng: np.random.Generator
+) -> tuple[np.ndarray | None, float]:
+    """The best pose of ``size`` samples and its inliers, less a share of one for how loosely they fit."""
+    order = rng.random((size, len(pool)), np.float32)
+    sample = pool[np.argpartition(order, sample_size - 1, axis=1)[:, :sample_size]]
     sample = sample[_lengths_agree(matches, sample)]
-    if not len(sample):
-        return None
     T, inertia = _fit(matches.p_obj[sample], matches.p_cam[sample])
     T = T[_determined(inertia, matches.limit_m[sample].mean(-1))]
     if not len(T):
-        return None
+        return None, -np.inf
     relative = matches.residual_m(T)[:, pool] / matches.limit_m[pool]
     agrees = relative <= 1
-    # Equal counts are told apart by how well their inliers fit: a share below 1 of one inlier.
-    looseness = np.sum(np.where(agrees, relative, 0), 1) / (len(pool) + 1)
-    return T[np.argmax(agrees.sum(1) - looseness)]
+    score = agrees.sum(1) - np.sum(np.where(agrees, relative, 0), 1) / (len(pool) + 1)
+    best = np.argmax(score)
+    return T[best], float(score[best])
 
 
 def _lengths_agree(matches: _Matches, sample: np.ndarray) -> np.ndarray:
@@ -251,9 +270,7 @@ def _refit(
     for _ in range(_REFITS):
         if inliers.sum() < config.min_inliers:
             return None
-        next_T, next_inertia = _fit(
-            matches.p_obj[inliers], matches.p_cam[inliers], matches.weight[inliers], R_prior
-        )
+        next_T, next_inertia = _fit(matches.p_obj[inliers], matches.p_cam[inliers], matches.weight[inliers], R_prior)
         next_residual = matches.residual_m(next_T)
         next_inliers = pool & (next_residual <= matches.limit_m)
         if next_inliers.sum() < inliers.sum():
@@ -267,9 +284,7 @@ def _refit(
     return Hypothesis(T, inliers, residual, origin)
 
 
-def _from_priors(
-    matches: _Matches, priors: Mapping[str, np.ndarray], config: RegistrationConfig
-) -> list[Hypothesis]:
+def _from_priors(matches: _Matches, priors: Mapping[str, np.ndarray], config: RegistrationConfig) -> list[Hypothesis]:
     everything = np.ones(len(matches.p_obj), bool)
     usable = {name: np.asarray(T, float) for name, T in priors.items() if np.isfinite(T).all()}
     refits = [_refit(T, matches, everything, name, config, T[:3, :3]) for name, T in usable.items()]
@@ -288,9 +303,7 @@ def _svd_twice(matches: _Matches, config: RegistrationConfig) -> list[Hypothesis
     return [Hypothesis(T, residual <= matches.limit_m, residual, "svd")]
 
 
-def _without_duplicates(
-    found: list[Hypothesis], matches: _Matches, config: RegistrationConfig
-) -> list[Hypothesis]:
+def _without_duplicates(found: list[Hypothesis], matches: _Matches, config: RegistrationConfig) -> list[Hypothesis]:
     """Drops poses that move no point by a tenth of the threshold from where an earlier one puts it."""
     if len(found) < 2:
         return found
