@@ -1,0 +1,128 @@
+"""Where to put new points (paper: section "Sampling Strategy and Keypoints Map").
+
+Candidates come from a detector with a score in [0, 1]; the greedy objective
+J_k = lambda s_k + (1 - lambda) min(d_k / r_ideal, 1) - beta rho(d_k) picks among them, where d_k is
+the distance to all points chosen so far and to those stored and visible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.config import SamplingConfig
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Points a detector offers: uv_px (N, 2) and score (N,) in [0, 1] (paper: p_k, s_k)."""
+
+    uv_px: np.ndarray
+    score: np.ndarray
+
+    def select(self, keep: np.ndarray) -> Candidates:
+        """The candidates at these indices or under this mask."""
+        return Candidates(self.uv_px[keep], self.score[keep])
+
+
+class Detector(Protocol):
+    """Offers candidates inside a mask."""
+
+    name: str
+
+    def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
+        """Candidates in ``mask`` (H, W) bool, best first."""
+
+
+class CornerDetector:
+    """Embedded detector: SIFT blobs, which the embedded tracker can re-detect, and corners, which it follows best.
+
+    The score is the feature's strength relative to the strongest of its kind, blobs above corners.
+    """
+
+    name = "corners"
+
+    def __init__(self, config: SamplingConfig, rng: np.random.Generator | None = None):
+        self._limit = config.candidates
+        self._sift = cv2.SIFT_create(config.candidates, contrastThreshold=0.01)
+
+    def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
+        """Candidates in the mask, best first."""
+        x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
+        if not w:
+            return Candidates(np.zeros((0, 2)), np.zeros(0))
+        x0, y0 = max(0, x - 16), max(0, y - 16)
+        crop = (slice(y0, y + h + 16), slice(x0, x + w + 16))
+        gray = cv2.cvtColor(frame.rgb[crop], cv2.COLOR_RGB2GRAY)
+        inside = np.ascontiguousarray(mask[crop]).astype(np.uint8)
+        blobs = self._sift.detect(gray, inside)
+        uv = [cv2.KeyPoint.convert(blobs).reshape(-1, 2)]
+        response = np.array([p.response for p in blobs])
+        score = [0.5 + 0.5 * response / response.max()] if len(blobs) else []
+        corners, quality = cv2.goodFeaturesToTrackWithQuality(gray, self._limit, 0.01, 3, inside, blockSize=5)[:2]
+        if corners is not None:
+            uv.append(corners.reshape(-1, 2))
+            score.append(0.5 * quality.ravel() / quality.max())
+        if not score:
+            return Candidates(np.zeros((0, 2)), np.zeros(0))
+        uv_px, score = np.concatenate(uv).astype(float) + [x0, y0], np.concatenate(score).astype(float)
+        order = np.argsort(-score, kind="stable")[: self._limit]
+        return Candidates(uv_px[order], score[order])
+
+
+#: Detectors by the name that --detector takes.
+DETECTORS = {"corners": CornerDetector}
+
+
+def make_detector(name: str, config: SamplingConfig, rng: np.random.Generator | None = None) -> Detector:
+    """The detector called ``name``; unknown names are refused with the list of those there are."""
+    if name not in DETECTORS:
+        raise BadInput("detector", repr(name), "one of " + ", ".join(DETECTORS))
+    return DETECTORS[name](config, rng)
+
+
+def objective(score: np.ndarray, d_px: np.ndarray, config: SamplingConfig) -> np.ndarray:
+    """J of candidates with score (N,) at distance d_px (N,) from everything chosen or stored."""
+    lam = config.score_weight
+    spread = np.minimum(d_px / config.r_ideal_px, 1)
+    crowding = np.maximum(0, (config.r_min_px - d_px) / config.r_min_px) if config.r_min_px > 0 else 0.0
+    return lam * score + (1 - lam) * spread - config.cluster_weight * crowding
+
+
+def choose(candidates: Candidates, stored_px: np.ndarray, count: int, config: SamplingConfig) -> np.ndarray:
+    """Indices of up to ``count`` candidates, greedily maximising :func:`objective`.
+
+    ``stored_px`` (M, 2) are the map's points visible in this frame. Candidates nearer than r_min to
+    anything chosen or stored are never taken: the objective already ranks them last.
+    """
+    n = len(candidates.score)
+    if not n:
+        return np.zeros(0, int)
+    d = np.full(n, np.inf)
+    if len(stored_px):
+        d = np.linalg.norm(candidates.uv_px[:, None] - stored_px[None], axis=-1).min(1)
+    chosen: list[int] = []
+    free = np.ones(n, bool)
+    for _ in range(min(count, n)):
+        J = np.where(free & (d >= config.r_min_px), objective(candidates.score, d, config), -np.inf)
+        best = int(J.argmax())
+        if J[best] == -np.inf:
+            break
+        chosen.append(best)
+        free[best] = False
+        d = np.minimum(d, np.linalg.norm(candidates.uv_px - candidates.uv_px[best], axis=1))
+    return np.array(chosen, int)
+
+
+def usable_region(frame: Frame, mask: np.ndarray, config: SamplingConfig) -> np.ndarray:
+    """Where a point can be lifted: in the mask, off its border, with depth, off depth edges. (H, W) bool."""
+    size = 2 * config.edge_margin_px + 1
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0)
+    ones = np.ones((3, 3), np.uint8)
+    step_m = cv2.dilate(frame.depth_m, ones) - cv2.erode(frame.depth_m, ones)
+    return (inner > 0) & (frame.depth_m > 0) & (step_m < config.depth_edge_m)

@@ -1,0 +1,231 @@
+"""One object's side of the algorithm: its map, its surface, its graph, and what its next pose is.
+
+``Point2Pose.step`` tracks all objects' points in one pass and hands each object its share; here the
+share becomes a pose: lift, register, select, refine, judge, and extend the map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import Config
+from p2p_lib.core.stopwatch import Stopwatch
+from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status, Tracks
+from p2p_lib.stages import registration
+from p2p_lib.stages.keypoint_map import KeypointMap
+from p2p_lib.stages.lifting import lift
+from p2p_lib.stages.registration import Hypothesis
+from p2p_lib.stages.sampling import Detector, choose, usable_region
+from p2p_lib.stages.tracking import PointTracker
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one frame shows of one object; rows as in its map.
+
+    mask     (H, W) bool, None where nobody knows it
+    tracks   of the map's points
+    p_cam    (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
+    """
+
+    frame: Frame
+    mask: np.ndarray | None
+    tracks: Tracks
+    p_cam: np.ndarray
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(N,) bool: points with a 3D observation."""
+        return np.isfinite(self.p_cam[:, 0])
+
+
+class TrackedObject:
+    """State and behaviour of one object. ``step`` is called once a frame."""
+
+    def __init__(
+        self,
+        name: str,
+        camera: Camera,
+        config: Config,
+        tracker: PointTracker,
+        detector: Detector,
+        rng: np.random.Generator,
+        stopwatch: Stopwatch,
+    ):
+        self.name, self.camera, self.config = name, camera, config
+        self.tracker, self.detector = tracker, detector
+        self.map = KeypointMap(config.keypoint_map)
+        self.keyframes: list[np.ndarray] = []
+        self._rng, self._stopwatch = rng, stopwatch
+        self._T_last: np.ndarray | None = None  # newest pose, of whatever frame
+        self._last_seen_s = float("nan")
+        self._T_before: np.ndarray | None = None  # pose of the frame before, None after a gap
+        self._status = Status.INITIALISING
+        self._since_keyframe = 0
+        self._recovering = 0  # frames that are still marked recovered
+
+    def step(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> PoseEstimate:
+        """This object's estimate at a frame, given its mask and everybody's tracks."""
+        view = self._observe(frame, mask, tracks.select(self.map.ids))
+        if not len(self.map):
+            return self._start(view)
+        if mask is not None and mask.sum() < self.config.pipeline.min_mask_px:
+            return self._without_pose(view, Status.OCCLUDED, f"{int(mask.sum())} mask pixels")
+        with self._stopwatch("registration"):
+            hypothesis, reason = self._register(view)
+        if hypothesis is None:
+            nothing = mask is None and not view.seen.any()
+            return self._without_pose(view, Status.OCCLUDED if nothing else Status.LOST, reason)
+        return self._accept(view, hypothesis)
+
+    def _observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> View:
+        """Lift the visible points of this object that lie in its mask."""
+        p_cam = np.full((len(tracks), 3), np.nan)
+        rows = np.flatnonzero(tracks.visible)
+        if mask is not None and len(rows):
+            px = np.clip(np.rint(tracks.uv_px[rows]).astype(int), 0, np.array(mask.shape[::-1]) - 1)
+            rows = rows[mask[px[:, 1], px[:, 0]]]
+        p_cam[rows] = self._lift(frame, tracks.uv_px[rows])
+        return View(frame, mask, tracks, p_cam)
+
+    def _lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
+        pipe = self.config.pipeline
+        return lift(
+            frame, uv_px, self.camera, (pipe.depth_min_m, pipe.depth_max_m), self.config.sampling.depth_edge_m
+        )
+
+    def _start(self, view: View) -> PoseEstimate:
+        """The first frame: fix the object frame and found the map on the first points."""
+        pipe = self.config.pipeline
+        if view.mask is None or view.mask.sum() < pipe.min_mask_px:
+            return self._without_pose(view, Status.INITIALISING, "not seen yet")
+        uv_px, p_cam = self._sample(view)
+        if len(uv_px) < self.config.registration.min_inliers:
+            return self._without_pose(view, Status.INITIALISING, f"only {len(uv_px)} points to start from")
+        T_cam_obj = np.eye(4)
+        if pipe.object_frame == "centroid":
+            depth = np.where(view.mask & (view.frame.depth_m > 0), view.frame.depth_m, np.nan)
+            v, u = np.nonzero(np.isfinite(depth))
+            T_cam_obj[:3, 3] = np.median(self.camera.unproject(np.stack([u, v], -1), depth[v, u]), 0)
+        self.map.add(self.tracker.add(uv_px), se3.transform(se3.inverse(T_cam_obj), p_cam), promoted=True)
+        self.keyframes.append(T_cam_obj)
+        return self._with_pose(view, T_cam_obj, Status.TRACKED, len(uv_px), 1.0, keyframe=True)
+
+    def _register(self, view: View) -> tuple[Hypothesis | None, str]:
+        """Hypotheses from the keypoints, and the best of them; rows as in the map."""
+        cfg = self.config.registration
+        use = view.seen & (view.tracks.uncertainty <= cfg.max_uncertainty)
+        if (use & self.map.promoted).sum() >= cfg.min_promoted:
+            use &= self.map.promoted
+        p_cam = np.where(use[:, None], view.p_cam, np.nan)
+        hypotheses = registration.generate(self.map.p_obj, p_cam, cfg, self._rng, priors=self._priors())
+        return registration.select(hypotheses, None, cfg)
+
+    def _priors(self) -> dict[str, np.ndarray]:
+        """Where the object should be if it went on as it did; empty after a gap."""
+        if self._status not in WITH_POSE or self._T_last is None:
+            return {}
+        priors = {"last pose": self._T_last}
+        if self._T_before is not None:
+            priors["constant velocity"] = self._T_last @ se3.inverse(self._T_before) @ self._T_last
+        return priors
+
+    def _accept(self, view: View, hypothesis: Hypothesis) -> PoseEstimate:
+        """Judge the pose; if it stands, take the frame's observations into the map."""
+        pipe, T_cam_obj = self.config.pipeline, hypothesis.T_cam_obj
+        returning = self._status not in WITH_POSE
+        if returning and hypothesis.support < pipe.recover_min_inliers:
+            return self._without_pose(view, Status.LOST, f"only {hypothesis.support} points agree on a return")
+        self._recovering = pipe.recovered_frames if returning else max(self._recovering - 1, 0)
+        status, reason = Status.RECOVERED if self._recovering else Status.TRACKED, ""
+        if hypothesis.support < pipe.degraded_inliers:
+            status, reason = Status.DEGRADED, f"only {hypothesis.support} points agree"
+        used = view.seen & self.map.promoted
+        agreement = (hypothesis.inliers & used).sum() / max(used.sum(), 1)
+        with self._stopwatch("map"):
+            keyframe = self._update_map(view, T_cam_obj, used, hypothesis.inliers)
+        return self._with_pose(view, T_cam_obj, status, hypothesis.support, agreement, reason, keyframe)
+
+    def _update_map(self, view: View, T_cam_obj: np.ndarray, used: np.ndarray, agrees: np.ndarray) -> bool:
+        """Verify pending points, count who agreed, and add points where a keyframe is due; True at a keyframe."""
+        cfg = self.config.keypoint_map
+        self.map.count(used, agrees)
+        self.tracker.reject(self.map.ids[used & ~agrees])
+        p_obj = se3.transform(se3.inverse(T_cam_obj), view.p_cam)
+        self.map.observe(p_obj, view.tracks.uncertainty, self._moved_little(T_cam_obj))
+        visible = int((view.seen & (agrees | ~self.map.promoted)).sum())
+        self.tracker.drop(self.map.retire())
+        self._since_keyframe += 1
+        turned = np.degrees(se3.angle_rad(se3.inverse(np.stack(self.keyframes)) @ T_cam_obj).min())
+        starved = visible < cfg.keyframe_min_points and self._since_keyframe > cfg.cooldown
+        if view.mask is None or self._recovering or not (turned > cfg.keyframe_angle_deg or starved):
+            return False
+        uv_px, p_cam = self._sample(view)
+        self.map.add(self.tracker.add(uv_px), se3.transform(se3.inverse(T_cam_obj), p_cam))
+        self.keyframes.append(T_cam_obj)
+        self._since_keyframe = 0
+        return True
+
+    def _moved_little(self, T_cam_obj: np.ndarray) -> bool:
+        """The appendix's "Pose Stability" check against the frame before."""
+        if self._status not in WITH_POSE or self._T_last is None:
+            return False
+        step = se3.log(se3.inverse(self._T_last) @ T_cam_obj)
+        cfg = self.config.keypoint_map
+        turned, moved = np.degrees(np.linalg.norm(step[:3])), np.linalg.norm(T_cam_obj[:3, 3] - self._T_last[:3, 3])
+        return bool(turned < cfg.stable_rotation_deg and moved < cfg.stable_translation_m)
+
+    def _sample(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """New points where the objective wants them: uv_px (K, 2) and p_cam (K, 3)."""
+        with self._stopwatch("sampling"):
+            cfg = self.config.sampling
+            candidates = self.detector.detect(view.frame, usable_region(view.frame, view.mask, cfg))
+            p_cam = self._lift(view.frame, candidates.uv_px)
+            liftable = np.isfinite(p_cam[:, 0])
+            candidates, p_cam = candidates.select(liftable), p_cam[liftable]
+            chosen = choose(candidates, view.tracks.uv_px[view.seen], cfg.points, cfg)
+            return candidates.uv_px[chosen], p_cam[chosen]
+
+    def _with_pose(
+        self,
+        view: View,
+        T_cam_obj: np.ndarray,
+        status: Status,
+        support: int,
+        confidence: float,
+        reason: str = "",
+        keyframe: bool = False,
+    ) -> PoseEstimate:
+        self._T_before = self._T_last if self._status in WITH_POSE else None
+        self._T_last, self._last_seen_s, self._status = T_cam_obj, view.frame.time_s, status
+        return PoseEstimate(
+            self.name,
+            view.frame.index,
+            view.frame.time_s,
+            status,
+            T_cam_obj,
+            float(confidence),
+            reason=reason,
+            visible_points=int(view.seen.sum()),
+            inliers=support,
+            last_T_cam_obj=T_cam_obj,
+            last_seen_s=view.frame.time_s,
+            keyframe=keyframe,
+        )
+
+    def _without_pose(self, view: View, status: Status, reason: str) -> PoseEstimate:
+        self._status = status
+        return PoseEstimate(
+            self.name,
+            view.frame.index,
+            view.frame.time_s,
+            status,
+            reason=reason,
+            visible_points=int(view.seen.sum()),
+            last_T_cam_obj=self._T_last,
+            last_seen_s=self._last_seen_s,
+        )
