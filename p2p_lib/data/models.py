@@ -1,0 +1,103 @@
+"""Object models for scoring: where they are and their vertices, in metres.
+
+Tracking never sees them: ADD and ADD-S are measured over all vertices of the true model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.data.sequence import Sequence
+
+#: What a model's folder is searched for, best first: the points that YCBInEOAT scores with, then meshes.
+PREFERRED = ("points.xyz", "textured_simple.obj", "textured.obj", "*.xyz", "*.obj", "*.ply")
+SUFFIXES = (".xyz", ".obj", ".ply")
+# No object that a camera at arm's length tracks is larger: such a model is in millimetres.
+LARGEST_M = 10.0
+
+
+def find_models(sequence: Sequence) -> dict[str, Path]:
+    """Object to model file, for those objects that have one in the sequence's ``models/<obj>/``."""
+    if sequence.path is None:
+        return {}
+    found = {name: model_in(sequence.path / "models" / name) for name in sequence.objects}
+    return {name: path for name, path in found.items() if path is not None}
+
+
+def model_in(folder: Path) -> Path | None:
+    """The model file of a folder, None where there is none."""
+    return next((p for pattern in PREFERRED for p in sorted(folder.glob(pattern))), None)
+
+
+def parse_models(assignments: Iterable[str], objects: Iterable[str]) -> dict[str, Path]:
+    """``NAME=PATH`` of the command line to object and model file; PATH may be a model's folder.
+
+    Raises :class:`BadInput` for a name that is none of ``objects``, :class:`MissingData` for a file not there.
+    """
+    objects, models = tuple(objects), {}
+    for assignment in assignments:
+        name, equals, where = assignment.partition("=")
+        if not equals or not where:
+            raise BadInput(
+                "model", repr(assignment), "NAME=PATH, such as " + f"{(objects or ('object',))[0]}=model.obj"
+            )
+        if name not in objects:
+            raise BadInput(
+                "model", f"the name {name!r}", "one of the objects: " + (", ".join(objects) or "there are none")
+            )
+        path = Path(where).expanduser()
+        file = model_in(path) if path.is_dir() else path
+        if file is None or not file.is_file():
+            raise MissingData(str(path), f"no such model, expected a file {', '.join(SUFFIXES)} (or a folder with one)")
+        models[name] = file
+    return models
+
+
+def load_points(path: str | Path) -> np.ndarray:
+    """(V, 3) all vertices of a model in its own frame, metres, in the file's order.
+
+    .xyz has x y z in its first columns, .obj its ``v`` lines, .ply its vertices.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingData(str(path), "no such model file")
+    readers = {".xyz": _read_xyz, ".obj": _read_obj, ".ply": _read_ply}
+    if path.suffix.lower() not in readers:
+        raise BadInput(str(path), f"a file of kind {path.suffix or 'unknown'!r}", "a model: " + ", ".join(SUFFIXES))
+    try:
+        points = readers[path.suffix.lower()](path)
+    except (ValueError, IndexError, KeyError, OSError) as error:
+        raise BadInput(
+            str(path), f"an unreadable model ({' '.join(str(error).split())[:80]})", "x y z of each vertex"
+        ) from None
+    if points.ndim != 2 or points.shape[1:] != (3,) or len(points) < 1 or not np.isfinite(points).all():
+        got = "no vertices" if points.size == 0 else f"{points.shape} values, some not finite"
+        raise BadInput(str(path), got, "at least one vertex of three finite coordinates")
+    size = float(np.ptp(points, axis=0).max())
+    if size > LARGEST_M:
+        raise BadInput(
+            str(path), f"a model {size:.4g} m large", "vertices in metres", "Is it in millimetres? Divide by 1000."
+        )
+    return points
+
+
+def _read_xyz(path: Path) -> np.ndarray:
+    rows = [line.split()[:3] for line in path.read_text().splitlines() if line.strip() and line.lstrip()[0] != "#"]
+    return np.array(rows, float)
+
+
+def _read_obj(path: Path) -> np.ndarray:
+    # Not through a mesh library: those merge, split or reorder vertices, and ADD is a mean over them.
+    with path.open("rb") as file:
+        rows = [line.split()[1:4] for line in file if line.startswith((b"v ", b"v\t"))]
+    return np.array(rows, float)
+
+
+def _read_ply(path: Path) -> np.ndarray:
+    import trimesh
+
+    return np.asarray(trimesh.load(path, process=False).vertices, float)
