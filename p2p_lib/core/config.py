@@ -139,15 +139,16 @@ class RefinementConfig(_Checked):
     enabled: bool = _p(True, "refine the pose on the TSDF", "", "paper")
     iterations: int = _p(8, "L, Levenberg-Marquardt steps at most", "", "release", low=1)
     damping: float = _p(1e-4, "initial damping", "", "release", low=0)
-    max_points: int = _p(1500, "depth points at most", "points", "release", low=10)
+    max_points: int = _p(700, "depth points at most", "points", low=10)
     gradient_voxels: float = _p(0.5, "step of the numeric gradient", "voxels", "release", low=0.01)
     mad_trim: float = _p(2.5, "residuals beyond this many MADs are left out", "", "release", low=0.5)
     huber_m: float = _p(0.01, "Huber threshold of the surface residual", "m", "release", low=1e-5)
     max_step_m: float = _p(0.02, "largest translation of one step", "m", "release", low=0)
     max_step_rad: float = _p(0.2, "largest rotation of one step", "rad", "release", low=0)
-    keypoint_weight: float = _p(
-        0.0, "weight of keypoint residuals beside the surface; 0 = surface alone (paper)", low=0
-    )
+    tolerance_m: float = _p(2e-5, "a smaller displacement of the cloud ends the iterations", "m", low=0)
+    min_strength: float = _p(0.02, "directions that the shape holds less firmly are not moved by it; 0 = all", low=0)
+    independent_points: int = _p(100, "what the correlated depth points are worth together", "points", low=1)
+    keypoint_weight: float = _p(1.0, "weight of keypoint residuals beside the surface; 0 = surface alone", low=0)
 
 
 @dataclass(frozen=True)
@@ -221,6 +222,9 @@ _PAPER: dict[str, Any] = {
     "keypoint_map.cooldown": 0,
     "registration.iterations": 100,
     "registration.motion_priors": False,
+    "refinement.max_points": 1500,
+    "refinement.min_strength": 0.0,
+    "refinement.keypoint_weight": 0.0,
     "registration.inlier_sigmas": 0.0,
     "registration.surface_margin_m": 0.0,
     "registration.min_support": 0,

@@ -1,0 +1,352 @@
+"""SDF refinement: Levenberg-Marquardt of a pose on the fused surface (paper: SDF Refinement).
+
+Minimises, over D in SE(3), the Huber loss of the surface's signed distance at the measured points,
+``sum rho_H(Phi(T^-1 D^-1 p)^2)``, with ``T <- D T``. The increment is parameterised on the right,
+``D = T exp(xi) T^-1``, which makes ``D T = T exp(xi)``: the same pose, in the house's tangent.
+
+Ours beyond the paper: directions that the shape leaves free are not moved by it, keypoint residuals
+can join (texture holds what shape leaves free), and the result says how well each direction is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import RefinementConfig
+
+#: Fewer points on the observed surface than this determine nothing.
+MIN_POINTS = 10
+#: Damping is raised or lowered by this factor as steps fail or succeed.
+_DAMPING_FACTOR = 5.0
+#: A MAD smaller than this share of a millimetre would trim a noise-free cloud to nothing.
+_MAD_FLOOR_M = 2e-4
+#: Standard deviations given to directions that nothing determines: the largest step's.
+_MAD_TO_SIGMA = 1.4826
+
+
+class Surface(Protocol):
+    """What refinement asks of a volume; :class:`p2p_lib.stages.tsdf.TsdfVolume` is one."""
+
+    tau_m: float
+
+    def query(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def query_with_gradient(
+        self, p_obj: np.ndarray, step_voxels: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Map points met again: p_obj (M, 3) in the map, p_cam (M, 3) as measured, sigma_m (M,) of each coordinate."""
+
+    p_obj: np.ndarray
+    p_cam: np.ndarray
+    sigma_m: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """A refined pose and what is known about it.
+
+    T_cam_obj    (4, 4); the input's where nothing could be refined
+    covariance   (6, 6) right tangent of T_cam_obj, [rotation rad, translation m], or None where not refined
+    rms_m        root mean square distance of the used points to the surface; NaN where none
+    inliers      share of the given points that lie on observed surface and were not trimmed
+    iterations   Levenberg-Marquardt steps tried
+    converged    whether it stopped because the step had become small
+    strengths    (6,) ascending: how firmly the shape holds each of :attr:`directions`, as the mean squared
+                 change of the points' distance per squared displacement; a plane has three at 0, a can one
+    directions   (6, 6) rows: unit tangents about the cloud's centre, rotation scaled by the cloud's radius
+    reason       why the pose was left alone, or what was held; empty otherwise
+    """
+
+    T_cam_obj: np.ndarray
+    covariance: np.ndarray | None = None
+    rms_m: float = float("nan")
+    inliers: float = 0.0
+    iterations: int = 0
+    converged: bool = False
+    strengths: np.ndarray | None = None
+    directions: np.ndarray | None = None
+    reason: str = ""
+
+    @property
+    def refined(self) -> bool:
+        """Whether the surface took part at all."""
+        return self.covariance is not None
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """Gauss-Newton system of the surface at one pose, about the cloud's centre, rotations times radius (metres)."""
+
+    H: np.ndarray
+    g: np.ndarray
+    cost: float
+    cut_m: float
+    used: int
+    rms_m: float
+    sigma_m: float
+
+
+def refine(
+    T_cam_obj: np.ndarray,
+    p_cam: np.ndarray,
+    volume: Surface,
+    config: RefinementConfig,
+    *,
+    keypoints: Keypoints | None = None,
+) -> Refinement:
+    """Refine T_cam_obj so that the measured points p_cam (N, 3) lie on the volume's surface.
+
+    Points that are not finite or fall where nothing was observed take no part. Never raises for bad
+    numbers: with fewer than ten usable points the input pose comes back with the reason.
+    """
+    T_cam_obj = np.asarray(T_cam_obj, float)
+    if not np.isfinite(T_cam_obj).all():
+        return Refinement(T_cam_obj, reason="the pose to refine is not finite")
+    p_cam = _usable(p_cam, config.max_points)
+    keypoints = _usable_keypoints(keypoints, config.keypoint_weight)
+    if len(p_cam) < MIN_POINTS:
+        return Refinement(T_cam_obj, reason=f"{len(p_cam)} depth points, {MIN_POINTS} are needed")
+    problem = _Problem.about(T_cam_obj, p_cam, volume, config, keypoints)
+    if problem is None:
+        return Refinement(T_cam_obj, reason=f"fewer than {MIN_POINTS} depth points lie on observed surface")
+    return problem.solve(T_cam_obj)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    p_cam: np.ndarray
+    volume: Surface
+    config: RefinementConfig
+    keypoints: Keypoints | None
+    centre: np.ndarray  # of the cloud, object frame
+    radius: float  # of the cloud: turns a rotation into the displacement it causes
+
+    @classmethod
+    def about(cls, T_cam_obj, p_cam, volume, config, keypoints) -> _Problem | None:
+        p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
+        _, valid = volume.query(p_obj)
+        if valid.sum() < MIN_POINTS:
+            return None
+        centre = p_obj[valid].mean(0)
+        radius = float(np.sqrt(((p_obj[valid] - centre) ** 2).sum(-1).mean()))
+        return cls(p_cam, volume, config, keypoints, centre, max(radius, 1e-4))
+
+    def solve(self, T: np.ndarray) -> Refinement:
+        config = self.config
+        damping, converged, tries = config.damping, False, 0
+        surface = self.surface(T)
+        while tries < config.iterations and surface is not None:
+            tries += 1
+            H, g = self.joint(T, surface)
+            step = self.clipped(self.step(H, g, damping))
+            T_new = self.moved(T, step)
+            better = self.cost(T_new, surface) < self.cost(T, surface)
+            small = max(np.linalg.norm(step[:3]), np.linalg.norm(step[3:])) < config.tolerance_m
+            if better:
+                T, damping = T_new, damping / _DAMPING_FACTOR
+                surface = self.surface(T)
+            else:
+                damping = max(damping, 1e-6) * _DAMPING_FACTOR**2
+            if small:
+                converged = True
+                break
+        if surface is None:
+            return Refinement(T, iterations=tries, reason="the cloud left the observed surface")
+        return self.result(T, surface, tries, converged)
+
+    # -- the two kinds of residual -----------------------------------------------------------------
+
+    def surface(self, T: np.ndarray) -> _Linear | None:
+        """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points count."""
+        p_obj = se3.transform(se3.inverse(T), self.p_cam)
+        value, gradient, valid = self.volume.query_with_gradient(p_obj, self.config.gradient_voxels)
+        # Beyond the truncation the distance is not known and its gradient is 0.
+        valid &= np.abs(value) < 0.98 * self.volume.tau_m
+        if valid.sum() < MIN_POINTS:
+            return None
+        r, q, n = value[valid], p_obj[valid] - self.centre, gradient[valid]
+        middle = np.median(r)
+        sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(r - middle))), _MAD_FLOOR_M)
+        cut = abs(float(middle)) + self.config.mad_trim * sigma
+        keep = np.abs(r) <= cut
+        r, q, n = r[keep], q[keep], n[keep]
+        J = surface_jacobian(q, n)
+        J[:, :3] /= self.radius
+        w = np.minimum(1.0, self.config.huber_m / np.maximum(np.abs(r), 1e-12))
+        Jw = J * w[:, None]
+        count = len(r)
+        return _Linear(Jw.T @ J / count, Jw.T @ r / count, 0.0, cut, count, float(np.sqrt((r * r).mean())), sigma)
+
+    def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations of T^-1 p_cam - p_obj in standard deviations, same variables."""
+        k = self.keypoints
+        q = se3.transform(se3.inverse(T), k.p_cam)
+        J = np.concatenate([se3.hat(q - self.centre) / self.radius, np.broadcast_to(-np.eye(3), (len(q), 3, 3))], -1)
+        r = q - k.p_obj
+        scale = self.config.keypoint_weight * _huber_weight(np.linalg.norm(r, axis=-1) / k.sigma_m) / k.sigma_m**2
+        return np.einsum("mia,m,mib->ab", J, scale, J), np.einsum("mia,m,mi->a", J, scale, r)
+
+    # -- solving -------------------------------------------------------------------------------
+
+    def joint(self, T: np.ndarray, surface: _Linear) -> tuple[np.ndarray, np.ndarray]:
+        """Information and gradient: the surface's in the directions it determines, the keypoints' in all."""
+        P = self.determined(surface)
+        worth = self.worth(surface)
+        H, g = worth * P @ surface.H @ P, worth * P @ surface.g
+        if self.keypoints is not None:
+            H_k, g_k = self.keypoint_system(T)
+            H, g = H + H_k, g + g_k
+        return H, g
+
+    def worth(self, surface: _Linear) -> float:
+        """Independent observations per squared metre: depth errors of neighbours are correlated."""
+        return min(surface.used, self.config.independent_points) / surface.sigma_m**2
+
+    def determined(self, surface: _Linear) -> np.ndarray:
+        """Projection onto the directions that the shape holds."""
+        strength, direction = np.linalg.eigh(surface.H)
+        held = direction[:, strength >= self.config.min_strength]
+        return held @ held.T
+
+    def step(self, H: np.ndarray, g: np.ndarray, damping: float) -> np.ndarray:
+        """Damped Gauss-Newton step in the subspace that holds any information."""
+        value, vector = np.linalg.eigh(H)
+        known = value > 1e-9 * max(value[-1], 1e-300)
+        inverse = np.where(known, 1 / np.where(known, value + damping * value[-1], 1.0), 0.0)
+        return -vector @ (inverse * (vector.T @ g))
+
+    def clipped(self, step: np.ndarray) -> np.ndarray:
+        turn, shift = np.linalg.norm(step[:3]) / self.radius, np.linalg.norm(step[3:])
+        largest = max(turn / self.config.max_step_rad, shift / self.config.max_step_m, 1.0)
+        return step / largest
+
+    def moved(self, T: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """T exp(xi) with xi about the cloud's centre."""
+        C = se3.from_rt(np.eye(3), self.centre)
+        D = C @ se3.exp(np.concatenate([step[:3] / self.radius, step[3:]])) @ se3.inverse(C)
+        return se3.orthonormalised(T @ D)
+
+    def cost(self, T: np.ndarray, at: _Linear) -> float:
+        """Huber loss truncated at ``at.cut_m``, where points off the observed surface count too, plus keypoints."""
+        value, valid = self.volume.query(se3.transform(se3.inverse(T), self.p_cam))
+        r = np.minimum(np.where(valid, np.abs(value), at.cut_m), at.cut_m)
+        d = self.config.huber_m
+        # Points that were never on the surface are a constant here: they do not move the minimum.
+        total = self.worth(at) * np.where(r < d, r * r, 2 * d * r - d * d).sum() / at.used
+        if self.keypoints is not None:
+            k = self.keypoints
+            e = np.linalg.norm(se3.transform(se3.inverse(T), k.p_cam) - k.p_obj, axis=-1) / k.sigma_m
+            total += self.config.keypoint_weight * np.where(e < _HUBER, e * e, 2 * _HUBER * e - _HUBER**2).sum()
+        return float(total)
+
+    def result(self, T: np.ndarray, surface: _Linear, tries: int, converged: bool) -> Refinement:
+        strengths, directions = np.linalg.eigh(surface.H)
+        H, _ = self.joint(T, surface)
+        scale = np.repeat([1 / self.radius, 1.0], 3)
+        free = 1 / np.repeat([self.config.max_step_rad * self.radius, self.config.max_step_m], 3) ** 2
+        cov = scale[:, None] * np.linalg.inv(H + np.diag(free)) * scale
+        to_origin = se3.adjoint(se3.from_rt(np.eye(3), self.centre))
+        cov = to_origin @ cov @ to_origin.T
+        held = int((strengths < self.config.min_strength).sum())
+        return Refinement(
+            T,
+            (cov + cov.T) / 2,
+            surface.rms_m,
+            surface.used / len(self.p_cam),
+            tries,
+            converged,
+            np.maximum(strengths, 0.0),
+            directions.T,
+            f"the shape leaves {held} of 6 directions free" if held else "",
+        )
+
+
+#: Huber threshold of keypoint residuals in standard deviations.
+_HUBER = 1.345
+
+
+def _huber_weight(e: np.ndarray) -> np.ndarray:
+    return np.minimum(1.0, _HUBER / np.maximum(e, 1e-12))
+
+
+def surface_jacobian(q: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """(N, 6) derivative of Phi at points q (N, 3) when the pose turns right by xi: q -> exp(-xi) q.
+
+    ``gradient`` (N, 3) is that of Phi at q. Rotation first, about q's origin.
+    """
+    return np.concatenate([np.cross(gradient, q), -gradient], -1)
+
+
+def surface_score(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
+    """(H,) mean absolute TSDF value in metres of the points p_cam (N, 3) under poses (H, 4, 4).
+
+    The paper's measure for choosing a hypothesis. A point that falls where nothing was observed counts
+    ``unseen`` times the truncation distance, so that no pose wins by turning away from the surface.
+    Infinite without any finite point.
+    """
+    T_cam_obj = np.asarray(T_cam_obj, float).reshape(-1, 4, 4)
+    p_cam = _usable(p_cam, len(p_cam))
+    if len(p_cam) == 0:
+        return np.full(len(T_cam_obj), np.inf)
+    value, valid = volume.query(se3.transform(se3.inverse(T_cam_obj), p_cam))
+    return np.where(valid, np.abs(value), unseen * volume.tau_m).mean(-1)
+
+
+def sample_cloud(
+    depth_m: np.ndarray,
+    mask: np.ndarray,
+    camera: Camera,
+    max_points: int,
+    *,
+    margin_px: int = 2,
+    depth_edge_m: float = 0.02,
+) -> np.ndarray:
+    """(N, 3) measured points of a masked depth picture in the camera frame, N <= max_points.
+
+    Leaves out a border of ``margin_px`` inside the mask, and pixels whose 3x3 neighbourhood holds an
+    invalid depth or a step beyond ``depth_edge_m``: both mix two surfaces. Deterministic, spread over
+    the whole mask. Empty where nothing is left.
+    """
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if len(rows) == 0 or max_points < 1:
+        return np.zeros((0, 3))
+    top, left = max(rows[0] - 1, 0), max(cols[0] - 1, 0)
+    cut = np.s_[top : rows[-1] + 2, left : cols[-1] + 2]
+    inside, depth = np.ascontiguousarray(mask[cut]).astype(np.uint8), np.ascontiguousarray(depth_m[cut], np.float32)
+    kernel = np.ones((2 * margin_px + 1,) * 2, np.uint8)
+    inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    around = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(depth, around), cv2.dilate(depth, around)
+    v, u = np.nonzero((inside > 0) & (low > 0) & (high - low <= depth_edge_m))
+    # A lattice of pixels, then an even thinning of what is left over.
+    stride = max(1, int(np.sqrt(len(u) / max_points)))
+    on = np.flatnonzero((u % stride == 0) & (v % stride == 0))
+    on = on[np.linspace(0, len(on) - 1, min(len(on), max_points)).astype(int)]
+    return camera.unproject(np.stack([u[on] + left, v[on] + top], -1), depth[v[on], u[on]].astype(float))
+
+
+def _usable(p_cam: np.ndarray, max_points: int) -> np.ndarray:
+    p_cam = np.asarray(p_cam, float).reshape(-1, 3)
+    p_cam = p_cam[np.isfinite(p_cam).all(-1)]
+    if len(p_cam) <= max_points:
+        return p_cam
+    return p_cam[np.linspace(0, len(p_cam) - 1, max_points).astype(int)]
+
+
+def _usable_keypoints(keypoints: Keypoints | None, weight: float) -> Keypoints | None:
+    if keypoints is None or weight == 0:
+        return None
+    finite = np.isfinite(keypoints.p_obj).all(-1) & np.isfinite(keypoints.p_cam).all(-1)
+    ok = finite & (keypoints.sigma_m > 0) & np.isfinite(keypoints.sigma_m)
+    return Keypoints(keypoints.p_obj[ok], keypoints.p_cam[ok], keypoints.sigma_m[ok]) if ok.sum() >= 3 else None
