@@ -42,13 +42,10 @@ def parse_models(assignments: Iterable[str], objects: Iterable[str]) -> dict[str
     for assignment in assignments:
         name, equals, where = assignment.partition("=")
         if not equals or not where:
-            raise BadInput(
-                "model", repr(assignment), "NAME=PATH, such as " + f"{(objects or ('object',))[0]}=model.obj"
-            )
+            raise BadInput("model", repr(assignment), "NAME=PATH")
         if name not in objects:
-            raise BadInput(
-                "model", f"the name {name!r}", "one of the objects: " + (", ".join(objects) or "there are none")
-            )
+            known = ", ".join(objects) or "there are none"
+            raise BadInput("model", f"the name {name!r}", f"one of the objects: {known}")
         path = Path(where).expanduser()
         file = model_in(path) if path.is_dir() else path
         if file is None or not file.is_file():
@@ -71,17 +68,15 @@ def load_points(path: str | Path) -> np.ndarray:
     try:
         points = readers[path.suffix.lower()](path)
     except (ValueError, IndexError, KeyError, OSError) as error:
-        raise BadInput(
-            str(path), f"an unreadable model ({' '.join(str(error).split())[:80]})", "x y z of each vertex"
-        ) from None
+        reason = " ".join(str(error).split())[:80]
+        raise BadInput(str(path), f"an unreadable model ({reason})", "x y z of each vertex") from None
     if points.ndim != 2 or points.shape[1:] != (3,) or len(points) < 1 or not np.isfinite(points).all():
         got = "no vertices" if points.size == 0 else f"{points.shape} values, some not finite"
         raise BadInput(str(path), got, "at least one vertex of three finite coordinates")
     size = float(np.ptp(points, axis=0).max())
     if size > LARGEST_M:
-        raise BadInput(
-            str(path), f"a model {size:.4g} m large", "vertices in metres", "Is it in millimetres? Divide by 1000."
-        )
+        fix = "Is it in millimetres? Divide by 1000."
+        raise BadInput(str(path), f"a model {size:.4g} m large", "vertices in metres", fix)
     return points
 
 

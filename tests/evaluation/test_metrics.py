@@ -53,7 +53,8 @@ def test_chunks_do_not_change_the_errors(monkeypatch):
 def test_adds_of_a_turned_can_is_small_where_add_is_large():
     angle = np.linspace(0, 2 * np.pi, 240, endpoint=False)
     ring = np.c_[np.cos(angle), np.sin(angle), np.zeros_like(angle)] * 0.04
-    can = np.concatenate([ring + [0, 0, z] for z in np.linspace(-0.06, 0.06, 20)])
+    heights = np.linspace(-0.06, 0.06, 20)
+    can = (ring[None] + heights[:, None, None] * np.array([0, 0, 1])).reshape(-1, 3)
     turned = se3.exp(np.array([[0, 0, np.pi / 3, 0, 0, 0]]))
     assert metrics.add_m(turned, np.eye(4)[None], can)[0] == pytest.approx(0.04, rel=1e-9)  # chord of 60 degrees
     assert metrics.adds_m(turned, np.eye(4)[None], can)[0] < 1e-9
