@@ -1,0 +1,8 @@
+"""Embedded synthetic sequences: procedural packages on a table, an RGB-D camera, exact truth.
+
+``scenario_dir("crossing", seed=0)`` gives a folder in the YCBMultiTrack layout, rendered at the first call.
+"""
+
+from p2p_lib.data.synthetic.generate import SCENARIOS, scenario_dir
+
+__all__ = ["SCENARIOS", "scenario_dir"]
