@@ -12,12 +12,13 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.config import Config
+from p2p_lib.core.config import Config, TsdfConfig
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status, Tracks
-from p2p_lib.stages import registration
+from p2p_lib.stages import refinement, registration
 from p2p_lib.stages.keypoint_map import KeypointMap
 from p2p_lib.stages.lifting import lift
+from p2p_lib.stages.refinement import Keypoints, Refinement
 from p2p_lib.stages.registration import Hypothesis
 from p2p_lib.stages.sampling import Detector, choose, usable_region
 from p2p_lib.stages.tracking import PointTracker
@@ -30,12 +31,14 @@ class View:
     mask     (H, W) bool, None where nobody knows it
     tracks   of the map's points
     p_cam    (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
+    cloud    (M, 3) dense depth points in the mask, camera frame (paper: P_cur)
     """
 
     frame: Frame
     mask: np.ndarray | None
     tracks: Tracks
     p_cam: np.ndarray
+    cloud: np.ndarray
 
     @property
     def seen(self) -> np.ndarray:
@@ -60,6 +63,7 @@ class TrackedObject:
         self.tracker, self.detector = tracker, detector
         self.map = KeypointMap(config.keypoint_map)
         self.keyframes: list[np.ndarray] = []
+        self.surface = make_volume(config.tsdf) if config.tsdf.enabled else None
         self._rng, self._stopwatch = rng, stopwatch
         self._T_last: np.ndarray | None = None  # newest pose, of whatever frame
         self._last_seen_s = float("nan")
@@ -76,11 +80,17 @@ class TrackedObject:
         if mask is not None and mask.sum() < self.config.pipeline.min_mask_px:
             return self._without_pose(view, Status.OCCLUDED, f"{int(mask.sum())} mask pixels")
         with self._stopwatch("registration"):
-            hypothesis, reason = self._register(view)
+            hypotheses = self._hypotheses(view)
+        with self._stopwatch("selection"):
+            hypothesis, reason = registration.select(
+                hypotheses, self._surface_scores(view, hypotheses), self.config.registration
+            )
         if hypothesis is None:
             nothing = mask is None and not view.seen.any()
             return self._without_pose(view, Status.OCCLUDED if nothing else Status.LOST, reason)
-        return self._accept(view, hypothesis)
+        with self._stopwatch("refinement"):
+            refined = self._refine(view, hypothesis)
+        return self._accept(view, hypothesis, refined)
 
     def _observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> View:
         """Lift the visible points of this object that lie in its mask."""
@@ -90,7 +100,11 @@ class TrackedObject:
             px = np.clip(np.rint(tracks.uv_px[rows]).astype(int), 0, np.array(mask.shape[::-1]) - 1)
             rows = rows[mask[px[:, 1], px[:, 0]]]
         p_cam[rows] = self._lift(frame, tracks.uv_px[rows])
-        return View(frame, mask, tracks, p_cam)
+        cloud = np.zeros((0, 3))
+        if mask is not None and self.surface is not None:
+            with self._stopwatch("refinement"):
+                cloud = refinement.sample_cloud(frame.depth_m, mask, self.camera, self.config.refinement.max_points)
+        return View(frame, mask, tracks, p_cam, cloud)
 
     def _lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
         pipe = self.config.pipeline
@@ -112,18 +126,33 @@ class TrackedObject:
             v, u = np.nonzero(np.isfinite(depth))
             T_cam_obj[:3, 3] = np.median(self.camera.unproject(np.stack([u, v], -1), depth[v, u]), 0)
         self.map.add(self.tracker.add(uv_px), se3.transform(se3.inverse(T_cam_obj), p_cam), promoted=True)
-        self.keyframes.append(T_cam_obj)
+        self._add_keyframe(view, T_cam_obj)
         return self._with_pose(view, T_cam_obj, Status.TRACKED, len(uv_px), 1.0, keyframe=True)
 
-    def _register(self, view: View) -> tuple[Hypothesis | None, str]:
-        """Hypotheses from the keypoints, and the best of them; rows as in the map."""
+    def _hypotheses(self, view: View) -> list[Hypothesis]:
+        """Candidate poses from the keypoints seen; rows as in the map."""
         cfg = self.config.registration
         use = view.seen & (view.tracks.uncertainty <= cfg.max_uncertainty)
         if (use & self.map.promoted).sum() >= cfg.min_promoted:
             use &= self.map.promoted
         p_cam = np.where(use[:, None], view.p_cam, np.nan)
-        hypotheses = registration.generate(self.map.p_obj, p_cam, cfg, self._rng, priors=self._priors())
-        return registration.select(hypotheses, None, cfg)
+        return registration.generate(self.map.p_obj, p_cam, cfg, self._rng, priors=self._priors())
+
+    def _surface_scores(self, view: View, hypotheses: list[Hypothesis]) -> np.ndarray | None:
+        """How far the dense points lie from the surface under each hypothesis; None without a surface."""
+        if len(hypotheses) < 2 or self.surface is None or self.surface.empty or not len(view.cloud):
+            return None
+        return refinement.surface_score(self.surface, view.cloud, np.stack([h.T_cam_obj for h in hypotheses]))
+
+    def _refine(self, view: View, hypothesis: Hypothesis) -> Refinement:
+        """The pose refined on the surface, jointly with the keypoints where the configuration says so."""
+        cfg, T_cam_obj = self.config.refinement, hypothesis.T_cam_obj
+        if not cfg.enabled or self.surface is None or self.surface.empty or not len(view.cloud):
+            return Refinement(T_cam_obj, reason="no surface")
+        at = hypothesis.inliers
+        sigma_m = registration.noise_m(view.p_cam[at], self.config.registration)
+        keypoints = Keypoints(self.map.p_obj[at], view.p_cam[at], sigma_m)
+        return refinement.refine(T_cam_obj, view.cloud, self.surface, cfg, keypoints=keypoints)
 
     def _priors(self) -> dict[str, np.ndarray]:
         """Where the object should be if it went on as it did; empty after a gap."""
@@ -134,9 +163,9 @@ class TrackedObject:
             priors["constant velocity"] = self._T_last @ se3.inverse(self._T_before) @ self._T_last
         return priors
 
-    def _accept(self, view: View, hypothesis: Hypothesis) -> PoseEstimate:
+    def _accept(self, view: View, hypothesis: Hypothesis, refined: Refinement) -> PoseEstimate:
         """Judge the pose; if it stands, take the frame's observations into the map."""
-        pipe, T_cam_obj = self.config.pipeline, hypothesis.T_cam_obj
+        pipe, T_cam_obj = self.config.pipeline, refined.T_cam_obj
         returning = self._status not in WITH_POSE
         if returning and hypothesis.support < pipe.recover_min_inliers:
             return self._without_pose(view, Status.LOST, f"only {hypothesis.support} points agree on a return")
@@ -166,9 +195,18 @@ class TrackedObject:
             return False
         uv_px, p_cam = self._sample(view)
         self.map.add(self.tracker.add(uv_px), se3.transform(se3.inverse(T_cam_obj), p_cam))
+        self._add_keyframe(view, T_cam_obj)
+        return True
+
+    def _add_keyframe(self, view: View, T_cam_obj: np.ndarray) -> None:
+        """Fuse the frame into the surface and remember its pose."""
         self.keyframes.append(T_cam_obj)
         self._since_keyframe = 0
-        return True
+        if self.surface is not None:
+            with self._stopwatch("fusion"):
+                pipe, depth_m = self.config.pipeline, view.frame.depth_m
+                usable = view.mask & (depth_m >= pipe.depth_min_m) & (depth_m <= pipe.depth_max_m)
+                self.surface.integrate(depth_m, view.frame.rgb, usable, self.camera, T_cam_obj, key=len(self.keyframes))
 
     def _moved_little(self, T_cam_obj: np.ndarray) -> bool:
         """The appendix's "Pose Stability" check against the frame before."""
@@ -229,3 +267,10 @@ class TrackedObject:
             last_T_cam_obj=self._T_last,
             last_seen_s=self._last_seen_s,
         )
+
+
+def make_volume(config: TsdfConfig):
+    """An empty surface. torch, which holds it, takes seconds to import: only when there is to be one."""
+    from p2p_lib.stages.tsdf import TsdfVolume
+
+    return TsdfVolume(config)

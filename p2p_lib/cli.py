@@ -1,0 +1,161 @@
+"""The command line: ``p2p run | eval | notebooks | doctor``. Thin: every command is one call into the library."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from p2p_lib import __version__
+from p2p_lib.core.errors import BadInput, P2PError
+
+EXIT_INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code (0 fine, 2 something to mend, 130 interrupted)."""
+    arguments = _parser().parse_args(argv)
+    try:
+        return arguments.command(arguments) or 0
+    except P2PError as error:
+        if arguments.debug:
+            raise
+        print(f"p2p {arguments.name}: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print(f"p2p {arguments.name}: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:  # the reader of our output (head, less) has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _run(a: argparse.Namespace) -> None:
+    from p2p_lib.run import run
+
+    result = run(
+        a.sequence,
+        a.out,
+        preset=a.preset,
+        config_file=a.config,
+        settings=_pairs("--set", a.set, "stage.key=value"),
+        seed=a.seed,
+        tracker=a.tracker,
+        masks=a.masks,
+        format=a.format,
+        depth_scale=a.depth_scale,
+        objects=a.objects.split(",") if a.objects else None,
+        start=a.start,
+        stop=a.stop,
+        models=_pairs("--models", a.models, "NAME=PATH"),
+        progress=not a.quiet,
+    )
+    if result.evaluation is not None:
+        print(result.evaluation.as_table())
+    print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
+    if result.interrupted:
+        raise KeyboardInterrupt
+
+
+def _eval(a: argparse.Namespace) -> None:
+    from p2p_lib.run import evaluate_run
+
+    evaluation = evaluate_run(a.run, _pairs("--models", a.models, "NAME=PATH"), a.align, a.min_visible_px)
+    print(json.dumps(evaluation.as_dict()) if a.json else evaluation.as_table())
+
+
+def _notebooks(a: argparse.Namespace) -> None:
+    from p2p_lib.notebooks import run_notebooks
+
+    only = tuple(part for part in a.only.split(",") if part)
+    run_notebooks(a.profile, only=only, jobs=a.jobs, parameters=_pairs("--parameter", a.parameter, "NAME=VALUE"))
+
+
+def _doctor(a: argparse.Namespace) -> int:
+    from p2p_lib.doctor import format_checks, run_doctor
+
+    checks = run_doctor()
+    print(format_checks(checks))
+    return 0 if all(check.ok or check.optional for check in checks) else 2
+
+
+def _pairs(option: str, given: list[str] | None, form: str) -> dict[str, str]:
+    """``["a=1", ...]`` to ``{"a": "1", ...}``."""
+    pairs = {}
+    for item in given or []:
+        name, equals, value = item.partition("=")
+        if not (name and equals and value):
+            raise BadInput(option, repr(item), form)
+        pairs[name] = value
+    return pairs
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the words of a command in one line."""
+
+    def error(self, message: str):
+        print(f"{self.prog}: {message}. See {self.prog} --help", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="p2p",
+        description="Point2Pose: 6D tracking and reconstruction of several unknown rigid objects in RGB-D video.",
+        epilog="Start with: p2p run synthetic/crossing --out out/crossing",
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    parser.set_defaults(debug=False)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+
+    p = _command(commands, "run", _run, "track the objects of a sequence and write poses, timings, scores")
+    p.add_argument("sequence", metavar="SEQ", help="a folder, or synthetic/NAME (embedded)")
+    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    p.add_argument("--format", help="layout: ycbineoat, ycbmultitrack, folder (default: recognised)")
+    p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
+    p.add_argument("--objects", metavar="A,B", help="track only these objects")
+    p.add_argument("--preset", default=None, help="paper or default: parameters only, never backends")
+    p.add_argument("--config", type=Path, metavar="FILE", help="TOML file with [stage] key = value")
+    p.add_argument("--set", action="append", metavar="STAGE.KEY=VALUE", help="change one parameter; repeatable")
+    p.add_argument("--tracker", default=None, metavar="NAME", help="2D point tracker (default: the embedded one)")
+    p.add_argument("--masks", default="dataset", metavar="SOURCE", help="dataset, or dataset:FOLDER")
+    p.add_argument("--seed", type=int, default=None, metavar="N", help="of every random choice (default 0)")
+    p.add_argument("--start", type=int, default=0, metavar="I", help="first frame")
+    p.add_argument("--stop", type=int, metavar="J", help="one past the last frame")
+    p.add_argument("--models", nargs="+", action="extend", metavar="NAME=PATH", help="models for scoring")
+    p.add_argument("--quiet", action="store_true", help="no progress bar")
+
+    p = _command(commands, "eval", _eval, "score a run against the truth of its sequence")
+    p.add_argument("run", type=Path, metavar="DIR", help="folder written by p2p run")
+    p.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    p.add_argument("--models", nargs="+", action="extend", metavar="NAME=PATH", help="models for scoring")
+    p.add_argument(
+        "--align",
+        choices=("first", "all"),
+        default="first",
+        help="object frame fixed at the first scored frame (default), or by one constant over all",
+    )
+    p.add_argument("--min-visible-px", type=int, default=300, metavar="N", help="smaller masks are not scored")
+
+    p = _command(commands, "notebooks", _notebooks, "run the notebooks headless and collect their results")
+    p.add_argument("--profile", choices=("quick", "full"), default="quick", help="size of the job (default quick)")
+    p.add_argument("--only", default="", metavar="00,03", help="only these notebooks")
+    p.add_argument("--jobs", type=int, default=1, metavar="N", help="notebooks at a time")
+    p.add_argument("--parameter", action="append", metavar="NAME=VALUE", help="change a notebook parameter; repeatable")
+
+    _command(commands, "doctor", _doctor, "check this installation and say how to mend it")
+    return parser
+
+
+def _command(commands, name: str, function, help: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    parser.set_defaults(command=function, name=name)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
