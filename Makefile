@@ -1,0 +1,36 @@
+# Everything happens in .venv, which `make setup` fills. P2P_PYTHON, P2P_TORCH: see tools/bootstrap.py.
+PYTHON ?= python3
+# Two threads: the matrices are small, more cost time, and results agree between machines. `make THREADS=8 figures` overrides.
+THREADS ?= 2
+export OMP_NUM_THREADS := $(THREADS)
+export OPENBLAS_NUM_THREADS := $(THREADS)
+export MKL_NUM_THREADS := $(THREADS)
+# ROS and others put packages of another Python there.
+unexport PYTHONPATH PYTHONHOME
+
+.PHONY: help setup reproduce test lab figures lock
+help: ## this list
+	@grep -E '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
+
+setup: ## set up .venv (about a minute the first time, instant when nothing has changed)
+	@$(PYTHON) tools/bootstrap.py
+
+reproduce: setup ## run every notebook on embedded data into out/quick (profile quick: CPU, no downloads)
+	@.venv/bin/p2p notebooks --profile quick
+
+figures: setup ## run every notebook on the data and backends present (profile full) and fill figures/
+	@.venv/bin/p2p notebooks --profile full
+
+test: setup ## linter, then all tests, every notebook included
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+	@.venv/bin/python -m pytest --durations=5
+
+lab: setup ## open JupyterLab on the notebooks
+	@.venv/bin/jupyter lab --notebook-dir=. notebooks/00_quickstart.ipynb
+
+lock: setup ## resolve requirements.lock anew from pyproject.toml and pins.txt (no host in it)
+	@.venv/bin/uv pip compile --quiet --upgrade --universal --python-version 3.11 --extra dev --constraint pins.txt \
+	    --no-emit-package p2p-lib --no-emit-index-url --no-annotate --no-header --output-file .venv/resolved pyproject.toml
+	@# What torch's CUDA build needs is pinned by torch itself, and its CPU build does without.
+	@grep -vE '^(nvidia-|cuda-|triton)' .venv/resolved > requirements.lock
