@@ -198,7 +198,7 @@ class MaskFiles:
     files: dict[str, tuple[Path, ...]]
     labels: dict[str, int | None]
     shape: tuple[int, int]
-    _counted: tuple[int, dict[str, int]] = field(default=(-1, {}))
+    _counts: dict[int, dict[str, int]] = field(default_factory=dict)
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -213,15 +213,14 @@ class MaskFiles:
         for name, path in at_i.items():
             label = self.labels[name]
             masks[name] = pictures[path] > 0 if label is None else pictures[path] == label
-        self._counted = (i, {name: int(np.count_nonzero(mask)) for name, mask in masks.items()})
+        self._counts[i] = {name: int(np.count_nonzero(mask)) for name, mask in masks.items()}
         return masks or None
 
     def count(self, i: int) -> dict[str, int] | None:
-        """Object to pixels at frame i; costs nothing right after :meth:`read`."""
-        at, counts = self._counted
-        if at != i:
-            counts = {name: int(np.count_nonzero(mask)) for name, mask in (self.read(i) or {}).items()}
-        return counts or None
+        """Object to pixels at frame i; costs nothing after :meth:`read`."""
+        if i not in self._counts:
+            self.read(i)
+        return self._counts[i] or None
 
 
 def find_masks(

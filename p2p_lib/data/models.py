@@ -5,7 +5,7 @@ Tracking never sees them: ADD and ADD-S are measured over all vertices of the tr
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -34,18 +34,26 @@ def model_in(folder: Path) -> Path | None:
 
 
 def parse_models(assignments: Iterable[str], objects: Iterable[str]) -> dict[str, Path]:
-    """``NAME=PATH`` of the command line to object and model file; PATH may be a model's folder.
+    """``NAME=PATH`` of the command line to object and model file; errors as of :func:`given_models`."""
+    given = {}
+    for assignment in assignments:
+        name, _, where = assignment.partition("=")
+        if not (name and where):
+            raise BadInput("model", repr(assignment), "NAME=PATH")
+        given[name] = where
+    return given_models(given, objects)
+
+
+def given_models(given: Mapping[str, str | Path], objects: Iterable[str]) -> dict[str, Path]:
+    """Object to model file of what was given; a path may be a model's folder.
 
     Raises :class:`BadInput` for a name that is none of ``objects``, :class:`MissingData` for a file not there.
     """
-    objects, models = tuple(objects), {}
-    for assignment in assignments:
-        name, equals, where = assignment.partition("=")
-        if not equals or not where:
-            raise BadInput("model", repr(assignment), "NAME=PATH")
-        if name not in objects:
-            known = ", ".join(objects) or "there are none"
-            raise BadInput("model", f"the name {name!r}", f"one of the objects: {known}")
+    known, models = tuple(objects), {}
+    for name, where in given.items():
+        if name not in known:
+            listed = ", ".join(known) or "there are none"
+            raise BadInput("model", f"the name {name!r}", f"one of the objects: {listed}")
         path = Path(where).expanduser()
         file = model_in(path) if path.is_dir() else path
         if file is None or not file.is_file():

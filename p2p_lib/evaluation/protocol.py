@@ -1,0 +1,238 @@
+"""Scoring a run: which frames count, how the object frame meets the model frame, and the summary.
+
+One rule everywhere. An object's frame is *scored* when its truth is valid there, the dataset's visibility
+labels hold and its visible mask has at least ``min_visible_px`` pixels. A scored frame without a pose is a
+failure: its error is infinite and counts as 0 in every area under a curve. Frames in which the object is
+hidden are not scored.
+
+The tracker's object frame is its own choice, so one rigid constant T_obj_model is free. ``first`` takes it
+from the first scored frame (the field's habit); ``all`` fits it over all scored frames, so that noise of the
+truth in one frame is told apart from tracking error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.data.models import given_models, load_points
+from p2p_lib.data.runs import NO_MASKS, ObjectRun, Run
+from p2p_lib.evaluation import metrics
+
+ALIGNMENTS = ("first", "all")
+MIN_VISIBLE_PX = 300
+SCORES = ("add_auc", "adds_auc", "add_auc_voc", "adds_auc_voc")
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectScore:
+    """One object's errors over its m scored frames, and their summary in percent.
+
+    frame_index, time_s  (m,) of the scored frames
+    add_m, adds_m        (m,) metres; infinite where there was no pose
+    T_obj_model          (4, 4) the constant that the alignment fixed; NaN where there was never a pose
+    lost                 scored frames without a pose
+    """
+
+    frame_index: np.ndarray
+    time_s: np.ndarray
+    add_m: np.ndarray
+    adds_m: np.ndarray
+    T_obj_model: np.ndarray
+    lost: int
+
+    def as_dict(self) -> dict[str, float | int]:
+        """The four areas under the curve, frames scored, frames lost."""
+        return {
+            "add_auc": metrics.auc_exact(self.add_m),
+            "adds_auc": metrics.auc_exact(self.adds_m),
+            "add_auc_voc": metrics.auc_voc(self.add_m),
+            "adds_auc_voc": metrics.auc_voc(self.adds_m),
+            "frames": len(self.add_m),
+            "lost": self.lost,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The scores of a run, and what ran. ``left_out`` gives the reason for each object without a score."""
+
+    objects: dict[str, ObjectScore]
+    left_out: dict[str, str]
+    hz: float | None
+    p95_ms: float | None
+    align: str
+    info: dict[str, Any] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as ``p2p eval --json`` prints them: areas in percent, the mean is over objects."""
+        objects = {name: score.as_dict() for name, score in self.objects.items()}
+        mean = {key: float(np.mean([o[key] for o in objects.values()])) for key in SCORES}
+        what_ran = {key: self.info.get(key) for key in ("tracker", "masks", "preset", "seed")}
+        return {"objects": objects, "mean": mean, "hz": self.hz, "p95_ms": self.p95_ms, **what_ran, "align": self.align}
+
+    def as_table(self) -> str:
+        """The same for people, with the reason for what is not there."""
+        plain = self.as_dict()
+        rows = [(name, o, f"{o['frames']:7d} {o['lost']:5d}") for name, o in plain["objects"].items()]
+        rows += [("mean", plain["mean"], "")] if len(rows) > 1 else []
+        width = max(len(name) for name, _, _ in [*rows, ("object", {}, "")])
+        lines = [f"{'object':{width}}  ADD-S    ADD  ADD-S voc  ADD voc   frames  lost"]
+        for name, o, counts in rows:
+            exact, voc = (
+                f"{o['adds_auc']:6.2f} {o['add_auc']:6.2f}",
+                f"{o['adds_auc_voc']:6.2f}   {o['add_auc_voc']:6.2f}",
+            )
+            lines.append(f"{name:{width}} {exact}     {voc}  {counts}".rstrip())
+        lines += [f"{name}: not scored, {reason}" for name, reason in self.left_out.items()]
+        if self.hz is not None:
+            lines.append(f"{self.hz:.1f} Hz, 95 % of the frames within {self.p95_ms:.1f} ms")
+        names = ("tracker", "masks", "preset", "seed")
+        lines.append(", ".join(f"{key} {plain[key]}" for key in names) + f", aligned by {self.align}")
+        return "\n".join(["AUC over 0 to 0.1 m in percent (exact, and in the VOC form)", *lines])
+
+
+def evaluate(
+    run: Run,
+    models: Mapping[str, str | Path | np.ndarray] | None = None,
+    align: str = "first",
+    min_visible_px: int = MIN_VISIBLE_PX,
+) -> Evaluation:
+    """Score every object of a run that has truth and a model.
+
+    models  object to model file or to (V, 3) points, over those that the run was made with
+
+    Raises :class:`BadInput` for an unknown alignment or object, :class:`MissingData` where nothing can be scored.
+    """
+    if align not in ALIGNMENTS:
+        raise BadInput("align", repr(align), "one of " + ", ".join(ALIGNMENTS))
+    points = run.points | _points(models or {}, tuple(run.objects))
+    scores, left_out = {}, {}
+    for name, obj in run.objects.items():
+        at = scored_frames(obj, min_visible_px)
+        if not obj.has_truth.any():
+            left_out[name] = "the sequence has no truth for it"
+        elif name not in points:
+            left_out[name] = f"no model: give --models {name}=PATH"
+        elif not at.any():
+            left_out[name] = f"in no frame it has truth and {min_visible_px} visible pixels"
+        else:
+            scores[name] = score(obj, at, points[name], align)
+    if not scores:
+        raise MissingData(str(run.path), "nothing to score: " + "; ".join(f"{k}: {v}" for k, v in left_out.items()))
+    return Evaluation(scores, left_out, *rate(run.timings), align, run.info)
+
+
+def scored_frames(obj: ObjectRun, min_visible_px: int = MIN_VISIBLE_PX) -> np.ndarray:
+    """(n,) bool: the rule. Where the dataset has no masks at all, truth and labels alone decide."""
+    seen = (obj.visible_px >= min_visible_px) | (obj.visible_px == NO_MASKS)
+    return obj.has_truth & obj.labelled & seen
+
+
+def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) -> ObjectScore:
+    """One object's errors over its scored frames (n,) bool, after alignment."""
+    T_cam_obj, T_cam_model = obj.T_cam_obj[scored], obj.T_cam_model[scored]
+    has_pose = obj.has_pose[scored]
+    T_obj_model = np.full((4, 4), np.nan)
+    if has_pose.any():
+        fit = align_first if align == "first" else align_all
+        T_obj_model = fit(T_cam_obj[has_pose], T_cam_model[has_pose], points)
+    T_pred = T_cam_obj @ T_obj_model
+    return ObjectScore(
+        frame_index=obj.frame_index[scored],
+        time_s=obj.time_s[scored],
+        add_m=metrics.add_m(T_pred, T_cam_model, points),
+        adds_m=metrics.adds_m(T_pred, T_cam_model, points),
+        T_obj_model=T_obj_model,
+        lost=int((~has_pose).sum()),
+    )
+
+
+def align_first(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """T_obj_model (4, 4) from the first of the (m, 4, 4) poses, so that its error is zero.
+
+    The prediction at t is then T_cam_obj(t) inv(T_cam_obj(f)) T_cam_model(f). f is the object's first scored
+    frame; where the object has no pose there, the first scored frame that has one (those before are failures).
+    """
+    return se3.inverse(T_cam_obj[0]) @ T_cam_model[0]
+
+
+def align_all(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """T_obj_model (4, 4) that fits all (m, 4, 4) poses best, with few of them wild.
+
+    Every frame proposes Y_t = inv(T_cam_obj) T_cam_model. With M = mean of p p' over the homogeneous model points
+    and M = L L', the root mean square distance of the points under X and under Y_t is the Frobenius norm of
+    (X - Y_t) L. The constant minimises the sum of these distances, each cut off at 0.1 m where a pose
+    scores nothing anyway: it starts at the best of the proposals and is refined by reweighted least squares,
+    each step of which is closed form (the rigid transformation nearest to the weighted mean).
+    """
+    Y = (se3.inverse(T_cam_obj) @ T_cam_model)[:, :3]
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
+    L = _square_root(homogeneous.T @ homogeneous / len(points))
+    best = _best_proposal(Y, L)
+    distances = _distances(best, Y, L)
+    for _ in range(200):
+        # 1e-9 m: a frame that fits exactly would otherwise have an infinite weight.
+        weights = (distances < metrics.MAX_M) / np.maximum(distances, 1e-9)
+        if not weights.any():
+            break
+        X = _nearest_rigid(np.einsum("t,tij->ij", weights / weights.sum(), Y), points)
+        moved = _distances(X, Y, L)
+        gain = _cost(distances) - _cost(moved)
+        if gain <= 0:
+            break
+        best, distances = X, moved
+        if gain < 1e-9 * len(Y):
+            break
+    return se3.from_rt(best[:, :3], best[:, 3])
+
+
+def _square_root(M: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(M)
+    return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def _distances(X: np.ndarray, Y: np.ndarray, L: np.ndarray) -> np.ndarray:
+    """Root mean square distance (..., m) in metres of the model's points under X (..., 3, 4) and under each Y."""
+    return np.linalg.norm((X[..., None, :, :] - Y) @ L, axis=(-2, -1))
+
+
+def _cost(distances: np.ndarray) -> np.ndarray:
+    return np.minimum(distances, metrics.MAX_M).sum(-1)
+
+
+def _best_proposal(Y: np.ndarray, L: np.ndarray) -> np.ndarray:
+    """The frame whose constant suits the others best; of long runs 400 evenly spread ones are tried, the first too."""
+    tried = np.unique(np.linspace(0, len(Y) - 1, 400).astype(int))
+    return Y[tried[int(np.argmin([_cost(_distances(Y[t], Y, L)) for t in tried]))]]
+
+
+def _nearest_rigid(mean: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The rigid (3, 4) that moves the points nearest, in the mean square, to where the affine ``mean`` moves them."""
+    centre = points.mean(0)
+    spread = (points - centre).T @ (points - centre) / len(points)
+    # A thousandth of isotropic spread: decides the turn about an axis on which all points lie, and nothing else.
+    spread += np.eye(3) * (np.trace(spread) * 1e-3 + 1e-12)
+    U, _, Vt = np.linalg.svd(mean[:, :3] @ spread)
+    R = U * [1, 1, np.linalg.det(U @ Vt)] @ Vt
+    return np.c_[R, mean[:, :3] @ centre + mean[:, 3] - R @ centre]
+
+
+def rate(timings: Mapping[str, np.ndarray]) -> tuple[float | None, float | None]:
+    """Frames per second of processing over all frames, keyframes included, and the 95th percentile in ms."""
+    total_ms = timings.get("total_ms", np.empty(0))
+    if not len(total_ms) or not total_ms.sum() > 0:
+        return None, None
+    return float(1000 * len(total_ms) / total_ms.sum()), float(np.percentile(total_ms, 95))
+
+
+def _points(models: Mapping[str, str | Path | np.ndarray], objects: tuple[str, ...]) -> dict[str, np.ndarray]:
+    given = {name: model for name, model in models.items() if isinstance(model, np.ndarray)}
+    paths = {name: model for name, model in models.items() if not isinstance(model, np.ndarray)}
+    return given | {name: load_points(path) for name, path in given_models(paths, objects).items()}
