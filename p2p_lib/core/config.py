@@ -109,7 +109,7 @@ class KeypointMapConfig(_Checked):
 class RegistrationConfig(_Checked):
     multi_hypothesis: bool = _p(True, "sequential RANSAC; off: SVD, outlier removal, SVD (the ablation)", "", "paper")
     iterations: int = _p(400, "RANSAC samples per hypothesis at most", low=1)
-    sample_size: int = _p(4, "points per RANSAC sample", "points", "release", low=3)
+    sample_size: int = _p(3, "points per RANSAC sample", "points", low=3)
     inlier_m: float = _p(0.006, "largest residual of an inlier", "m", "release", low=1e-5)
     min_inliers: int = _p(5, "fewest inliers of a hypothesis", "points", "release", low=3)
     max_hypotheses: int = _p(10, "H, hypotheses at most", "", "release", low=1)
@@ -145,7 +145,7 @@ class RefinementConfig(_Checked):
     huber_m: float = _p(0.01, "Huber threshold of the surface residual", "m", "release", low=1e-5)
     max_step_m: float = _p(0.02, "largest translation of one step", "m", "release", low=0)
     max_step_rad: float = _p(0.2, "largest rotation of one step", "rad", "release", low=0)
-    tolerance_m: float = _p(2e-5, "a smaller displacement of the cloud ends the iterations", "m", low=0)
+    tolerance: float = _p(0.5, "a smaller gain ends the iterations", "squared standard deviations", low=0)
     min_strength: float = _p(0.02, "directions that the shape holds less firmly are not moved by it; 0 = all", low=0)
     independent_points: int = _p(100, "what the correlated depth points are worth together", "points", low=1)
     keypoint_weight: float = _p(1.0, "weight of keypoint residuals beside the surface; 0 = surface alone", low=0)
@@ -221,6 +221,7 @@ _PAPER: dict[str, Any] = {
     "pipeline.object_frame": "camera",
     "keypoint_map.cooldown": 0,
     "registration.iterations": 100,
+    "registration.sample_size": 4,
     "registration.motion_priors": False,
     "refinement.max_points": 1500,
     "refinement.min_strength": 0.0,

@@ -13,8 +13,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-import torch.nn.functional as F
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
@@ -22,6 +20,7 @@ from p2p_lib.core.config import TsdfConfig
 from p2p_lib.core.errors import BadInput
 
 if TYPE_CHECKING:
+    import torch
     import trimesh
 
 #: The grid's sides are multiples of this many voxels, so that it grows seldom.
@@ -44,14 +43,14 @@ class _View:
 
     depth_m   (h+2, w+2) float32 with a border; -inf where nothing is to be fused
     gate_m    least projective distance that is fused: -tau inside the mask, +tau where a pixel only carves
-    rgb       (h+2, w+2, 3) uint8
+    rgbw      (h+2, w+2, 4) uint8: colour and 1
     corner    column and row of the cut's first inner pixel
     lo, hi    voxel box [lo, hi) in lattice indices; fixed when first fused, so that taking out mirrors putting in
     """
 
     depth_m: np.ndarray
     gate_m: np.ndarray | None
-    rgb: np.ndarray
+    rgbw: np.ndarray
     corner: tuple[int, int]
     camera: Camera
     T_cam_obj: np.ndarray
@@ -79,6 +78,8 @@ class TsdfVolume:
         shape: tuple[int, int, int] | None = None,
         device: str = "cpu",
     ):
+        import torch
+
         self.config, self.device = config, torch.device(device)
         self.voxel_m, self.tau_m = config.voxel_m, config.voxel_m * config.truncation_voxels
         self.grows = shape is None
@@ -129,6 +130,8 @@ class TsdfVolume:
 
     def _allocate(self, lo: np.ndarray, shape: np.ndarray) -> None:
         """Fresh arrays over lattice box [lo, lo + shape), with what the old ones held copied in."""
+        import torch
+
         old = (self._sum, self._weight, self._colour, self._value) if hasattr(self, "_sum") else ()
         start = self.lo - lo
         self.lo = np.array(lo, int)
@@ -141,6 +144,11 @@ class TsdfVolume:
         for new, was in zip((self._sum, self._weight, self._colour, self._value), old, strict=False):
             box = tuple(slice(int(a), int(a) + n) for a, n in zip(start, was.shape[:3], strict=True))
             new[box] = was
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        import torch
+
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
 
     # -- fusing --------------------------------------------------------------------------------
 
@@ -233,12 +241,13 @@ class TsdfVolume:
         gate = None
         if self.config.carve:
             gate = np.pad(np.where(inside[cut], -self.tau_m, self.tau_m).astype(np.float32), 1)
-        colour = np.pad(np.asarray(rgb)[cut], ((1, 1), (1, 1), (0, 0)))
+        rgbw = np.ones((*depth.shape, 4), np.uint8)
+        rgbw[1:-1, 1:-1, :3] = np.asarray(rgb)[cut]
         corner = (int(cols[0]), int(rows[0]))
         own = np.where(inside[cut], depth[1:-1, 1:-1], -np.inf)
         region = self._region(np.pad(own, 1, constant_values=-np.inf), corner, camera, T_cam_obj)
         centre = se3.transform(T_cam_obj, region.mean(0)[None])[0]
-        view = _View(depth, gate, colour, corner, camera, T_cam_obj, centre, float(weight), self.lo, self.lo)
+        view = _View(depth, gate, rgbw, corner, camera, T_cam_obj, centre, float(weight), self.lo, self.lo)
         lo, hi = self._grow(region, view, T_cam_obj)
         return replace(view, lo=lo, hi=hi)
 
@@ -313,9 +322,9 @@ class TsdfVolume:
         size = view.hi - view.lo
         if (size <= 0).any():
             return 0
-        depth = torch.from_numpy(view.depth_m).to(self.device).reshape(-1)
-        gate = None if view.gate_m is None else torch.from_numpy(view.gate_m).to(self.device).reshape(-1)
-        rgb = torch.from_numpy(view.rgb.reshape(-1, 3)).to(self.device)
+        depth = self._tensor(view.depth_m).view(-1)
+        gate = None if view.gate_m is None else self._tensor(view.gate_m).view(-1)
+        rgbw = self._tensor(view.rgbw).view(-1, 4)
         step = max(1, _SLAB // int(size[1] * size[2]))
         touched = 0
         for x in range(int(view.lo[0]), int(view.hi[0]), step):
@@ -328,7 +337,7 @@ class TsdfVolume:
             at = self._flat_index(lo, hi).index_select(0, hit)
             self._accumulate(at, phi, weight)
             near = (phi < 1).nonzero().view(-1)
-            seen = rgb.index_select(0, pixel.index_select(0, hit.index_select(0, near))).float()
+            seen = rgbw.index_select(0, pixel.index_select(0, hit.index_select(0, near))).float()
             self._tint(at.index_select(0, near), seen, weight)
             touched += len(hit)
         return touched
@@ -346,12 +355,9 @@ class TsdfVolume:
 
         def affine(row: int) -> torch.Tensor:
             x, y, z = (
-                torch.from_numpy(A[row, axis] * np.arange(lo[axis], hi[axis]) + (b[row] if axis == 0 else 0.0))
-                .float()
-                .to(self.device)
-                for axis in range(3)
+                self._tensor((A[row, axis] * np.arange(lo[axis], hi[axis])).astype(np.float32)) for axis in range(3)
             )
-            return (x[:, None] + y)[:, :, None] + z
+            return (x.add_(b[row])[:, None] + y)[:, :, None] + z
 
         u, v, z = affine(0), affine(1), affine(2)
         behind = z <= 1e-6
@@ -364,10 +370,11 @@ class TsdfVolume:
 
     def _flat_index(self, lo: np.ndarray, hi: np.ndarray) -> torch.Tensor:
         """Position in the flattened arrays of every voxel in lattice box [lo, hi)."""
+        import torch
+
         _, ny, nz = self.shape
-        i, j, k = (
-            torch.arange(int(a - o), int(b - o), device=self.device) for a, b, o in zip(lo, hi, self.lo, strict=True)
-        )
+        first, last = (lo - self.lo).tolist(), (hi - self.lo).tolist()
+        i, j, k = (torch.arange(a, b, device=self.device) for a, b in zip(first, last, strict=True))
         return ((i[:, None] * ny + j)[:, :, None] * nz + k).view(-1)
 
     def _accumulate(self, at: torch.Tensor, phi: torch.Tensor, weight: float) -> None:
@@ -383,9 +390,8 @@ class TsdfVolume:
         # 0 / 0 is NaN, which is what an unobserved voxel holds.
         self._value.view(-1).index_copy_(0, at, new_sum.div_(new_weight))
 
-    def _tint(self, at: torch.Tensor, rgb: torch.Tensor, weight: float) -> None:
-        seen = torch.cat([rgb, torch.ones_like(rgb[:, :1])], 1).mul_(weight)
-        self._colour.view(-1, 4).index_add_(0, at, seen)
+    def _tint(self, at: torch.Tensor, rgbw: torch.Tensor, weight: float) -> None:
+        self._colour.view(-1, 4).index_add_(0, at, rgbw, alpha=weight)
 
     # -- asking --------------------------------------------------------------------------------
 
@@ -419,12 +425,14 @@ class TsdfVolume:
         last = np.array(self.shape) - 1.0
         if (last < 1).any() or not len(index):
             return np.zeros(len(index)), np.zeros(len(index), bool)
-        inside = ((index >= 0) & (index <= last)).all(-1)
+        from torch.nn.functional import grid_sample
+
         # grid_sample wants the last axis first and indices scaled to [-1, 1].
-        grid = np.where(inside[:, None], index, 0.0)[:, ::-1] * (2 / last[::-1]) - 1
-        grid = torch.from_numpy(grid.astype(np.float32)).to(self.device).view(1, 1, 1, -1, 3)
-        value = F.grid_sample(self._value[None, None], grid, align_corners=True).view(-1).cpu().numpy().astype(float)
-        valid = inside & ~np.isnan(value)
+        grid = (index[:, ::-1] * (2 / last[::-1]) - 1).astype(np.float32)
+        low, middle, high = (np.abs(grid) <= 1).T
+        grid = self._tensor(grid).view(1, 1, 1, -1, 3)
+        value = grid_sample(self._value[None, None], grid, align_corners=True).view(-1).cpu().numpy().astype(float)
+        valid = low & middle & high & ~np.isnan(value)
         return np.where(valid, value * self.tau_m, 0.0), valid
 
     def mesh(self, min_weight: float = 1.0, min_component: float = 0.1) -> trimesh.Trimesh:
