@@ -23,7 +23,7 @@ _DETERMINED_RAD = 0.35
 _PRIOR_INERTIA_M2 = 1e-6
 # What is known of a pose before any point is seen: keeps covariances finite.
 _UNKNOWN_RAD, _UNKNOWN_M = np.pi, 1.0
-_REFITS = 4
+_REFITS = 5
 # RANSAC draws this many samples at once, and stops when the chance that no sample so far was free of
 # outliers, taking the best consensus for the truth, is below this.
 _BATCH, _MISSED = 100, 1e-3
@@ -263,22 +263,22 @@ def _refit(
     config: RegistrationConfig,
     R_prior: np.ndarray | None = None,
 ) -> Hypothesis | None:
-    """Refits on the inliers while their number does not fall; None if too few or collinear remain."""
-    residual = matches.residual_m(T)
-    inliers = pool & (residual <= matches.limit_m)
-    inertia = np.inf
+    """Refits on the inliers until they stay the same; None if too few or collinear remain.
+
+    Fitting and choosing inliers in turn lowers the truncated cost, sum of w min(r, limit)^2, at each step.
+    """
+    inliers = pool & (matches.residual_m(T) <= matches.limit_m)
     for _ in range(_REFITS):
         if inliers.sum() < config.min_inliers:
             return None
-        next_T, next_inertia = _fit(matches.p_obj[inliers], matches.p_cam[inliers], matches.weight[inliers], R_prior)
-        next_residual = matches.residual_m(next_T)
-        next_inliers = pool & (next_residual <= matches.limit_m)
-        if next_inliers.sum() < inliers.sum():
+        fitted = inliers
+        T, inertia = _fit(matches.p_obj[fitted], matches.p_cam[fitted], matches.weight[fitted], R_prior)
+        residual = matches.residual_m(T)
+        inliers = pool & (residual <= matches.limit_m)
+        if np.array_equal(inliers, fitted):
             break
-        unchanged = np.array_equal(next_inliers, inliers)
-        T, residual, inliers, inertia = next_T, next_residual, next_inliers, next_inertia
-        if unchanged:
-            break
+    if inliers.sum() < config.min_inliers:
+        return None
     if R_prior is None and not _determined(inertia, np.median(matches.limit_m[inliers])):
         return None
     return Hypothesis(T, inliers, residual, origin)
