@@ -17,15 +17,21 @@ from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
-from p2p_lib.stages.sampling import make_detector
-from p2p_lib.stages.tracking import make_tracker
+from p2p_lib.stages.sampling import DEFAULT_DETECTOR, make_detector
+from p2p_lib.stages.tracking import DEFAULT_TRACKER, make_tracker
 from p2p_lib.tracked_object import TrackedObject
 
 
 class Point2Pose:
     """Causal 6D tracking of any number of unknown rigid objects in one RGB-D stream."""
 
-    def __init__(self, camera: Camera, config: Config | None = None, tracker: str = "lk", detector: str = "corners"):
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        tracker: str = DEFAULT_TRACKER,
+        detector: str = DEFAULT_DETECTOR,
+    ):
         self.camera = camera
         self.config = config or preset()
         self._rng = np.random.default_rng(self.config.seed)
@@ -68,9 +74,7 @@ class Point2Pose:
             tracks = self._track(frame, masks)
             return {name: obj.step(frame, masks[name], tracks) for name, obj in self.objects.items()}
 
-    def _masks(
-        self, frame: Frame, masks: Mapping[str, np.ndarray] | None
-    ) -> dict[str, np.ndarray | None]:
+    def _masks(self, frame: Frame, masks: Mapping[str, np.ndarray] | None) -> dict[str, np.ndarray | None]:
         """Every object's checked mask in this frame; None for one of which nobody knows."""
         if frame.shape != (self.camera.height, self.camera.width):
             got = f"{frame.shape[1]}x{frame.shape[0]}"

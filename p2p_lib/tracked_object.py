@@ -108,9 +108,7 @@ class TrackedObject:
 
     def _lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
         pipe = self.config.pipeline
-        return lift(
-            frame, uv_px, self.camera, (pipe.depth_min_m, pipe.depth_max_m), self.config.sampling.depth_edge_m
-        )
+        return lift(frame, uv_px, self.camera, (pipe.depth_min_m, pipe.depth_max_m), self.config.sampling.depth_edge_m)
 
     def _start(self, view: View) -> PoseEstimate:
         """The first frame: fix the object frame and found the map on the first points."""

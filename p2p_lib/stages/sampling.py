@@ -70,13 +70,15 @@ class CornerDetector:
             score.append(0.5 * quality.ravel() / quality.max())
         if not score:
             return Candidates(np.zeros((0, 2)), np.zeros(0))
-        uv_px, score = np.concatenate(uv).astype(float) + [x0, y0], np.concatenate(score).astype(float)
+        uv_px, score = np.concatenate(uv) + np.array([x0, y0], float), np.concatenate(score).astype(float)
         order = np.argsort(-score, kind="stable")[: self._limit]
         return Candidates(uv_px[order], score[order])
 
 
 #: Detectors by the name that --detector takes.
 DETECTORS = {"corners": CornerDetector}
+#: The one that runs when none is named.
+DEFAULT_DETECTOR = "corners"
 
 
 def make_detector(name: str, config: SamplingConfig, rng: np.random.Generator | None = None) -> Detector:

@@ -191,6 +191,8 @@ class LkTracker:
 
 #: Trackers by the name that --tracker takes.
 TRACKERS = {"lk": LkTracker}
+#: The one that runs when none is named.
+DEFAULT_TRACKER = "lk"
 
 
 def make_tracker(name: str, config: TrackingConfig, rng: np.random.Generator | None = None) -> PointTracker:
