@@ -34,7 +34,8 @@ class Camera:
         K = np.asarray(K, float)
         if K.shape != (3, 3):
             raise BadInput(name, f"shape {K.shape}", "a 3x3 camera matrix")
-        if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or abs(K[2, 2] - 1) > 1e-6:
+        pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
+        if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K - pinhole).max() > 1e-6:
             raise BadInput(name, " ".join(f"{x:g}" for x in K.ravel()), "fx 0 cx 0 fy cy 0 0 1 with fx, fy > 0")
         return cls(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), int(width), int(height))
 

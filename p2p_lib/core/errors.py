@@ -10,10 +10,17 @@ class P2PError(Exception):
     """Any error the user can mend. ``str(error)`` is one line."""
 
     exit_code = 2
+    _parts: tuple[str, ...] = ()  # what __init__ takes
+
+    def __reduce__(self):
+        # A worker process hands its error to the parent as a pickle, which makes it anew.
+        return (type(self), tuple(getattr(self, p) for p in self._parts)) if self._parts else super().__reduce__()
 
 
 class BadInput(P2PError, ValueError):
     """A value does not fit: names the thing, what came, what was expected, what to do."""
+
+    _parts = ("name", "got", "expected", "fix")
 
     def __init__(self, name: str, got: object, expected: str, fix: str = ""):
         self.name, self.got, self.expected, self.fix = name, got, expected, fix
@@ -22,6 +29,8 @@ class BadInput(P2PError, ValueError):
 
 class MissingData(P2PError, FileNotFoundError):
     """A file or folder is not there (or cannot be read)."""
+
+    _parts = ("name", "expected", "fix")
 
     def __init__(self, name: str, expected: str, fix: str = ""):
         self.name, self.expected, self.fix = name, expected, fix
@@ -34,6 +43,8 @@ class MissingData(P2PError, FileNotFoundError):
 
 class MissingBackend(P2PError, ImportError):
     """An optional package or checkpoint was asked for by name and is not installed."""
+
+    _parts = ("name", "missing", "fix")
 
     def __init__(self, name: str, missing: str, fix: str):
         self.missing, self.fix = missing, fix

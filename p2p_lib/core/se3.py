@@ -54,7 +54,7 @@ def exp(xi: np.ndarray) -> np.ndarray:
     small = sq < _SMALL_SQ
     angle = np.sqrt(np.where(small, 1.0, sq))
     a = np.where(small, 1 - sq / 6, np.sin(angle) / angle)
-    b = np.where(small, 0.5 - sq / 24, (1 - np.cos(angle)) / angle**2)
+    b = np.where(small, 0.5 - sq / 24, 2 * (np.sin(angle / 2) / angle) ** 2)  # 1 - cos would lose digits
     c = np.where(small, 1 / 6 - sq / 120, (angle - np.sin(angle)) / angle**3)
     W = hat(w)
     W2 = W @ W

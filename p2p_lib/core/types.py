@@ -33,6 +33,8 @@ class Frame:
             got = "x".join(map(str, depth.shape[::-1]))
             want = f"{rgb.shape[1]}x{rgb.shape[0]} as the colour picture"
             raise BadInput(f"frame {self.index} depth", got, want, "Register the depth to the colour camera first.")
+        if not np.issubdtype(depth.dtype, np.floating):
+            raise BadInput(f"frame {self.index} depth", depth.dtype, "metres as floats", "Apply the depth scale first.")
         if not np.isfinite(self.time_s):
             raise BadInput(f"frame {self.index} time_s", self.time_s, "a finite time in seconds")
         # A sensor's NaN, infinity and negative readings all mean "no measurement", which is 0 here.
@@ -64,11 +66,8 @@ class Tracks:
     def __post_init__(self) -> None:
         n = len(self.ids)
         if self.uv_px.shape != (n, 2) or self.visible.shape != (n,) or self.uncertainty.shape != (n,):
-            raise BadInput(
-                "tracks",
-                f"{n} ids, uv_px {self.uv_px.shape}, visible {self.visible.shape}",
-                "(N,), (N, 2), (N,), (N,)",
-            )
+            got = f"uv_px {self.uv_px.shape}, visible {self.visible.shape}, uncertainty {self.uncertainty.shape}"
+            raise BadInput("tracks", f"{n} ids, {got}", "(N,), (N, 2), (N,), (N,)")
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -132,7 +131,7 @@ class PoseEstimate:
             )
         if self.T_cam_obj is not None:
             object.__setattr__(self, "T_cam_obj", se3.check(name, self.T_cam_obj))
-        if not 0 <= self.confidence <= 1:
-            raise BadInput(f"{name}: confidence", self.confidence, "a number in [0, 1]")
+        if not 0 <= self.confidence <= (self.T_cam_obj is not None):
+            raise BadInput(f"{name}: confidence", self.confidence, "a number in [0, 1], 0 without a pose")
         if self.covariance is not None and (self.covariance.shape != (6, 6) or not np.isfinite(self.covariance).all()):
             raise BadInput(f"{name}: covariance", f"shape {self.covariance.shape}", "a finite (6, 6) matrix or None")

@@ -1,0 +1,56 @@
+"""Messages of one line that name the thing, what came, what was expected, what to do."""
+
+import pickle
+
+import pytest
+
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
+
+EVERY = [
+    BadInput("depth", "3x2", "640x480", "Register it first."),
+    MissingData("cam_K.txt", "no such file", "Write one."),
+    MissingBackend("tapir", "package tapnet is missing", "pip install tapnet"),
+]
+
+
+@pytest.mark.parametrize("error", EVERY, ids=lambda e: type(e).__name__)
+def test_everything_that_can_be_mended_is_one_family(error):
+    assert isinstance(error, P2PError) and error.exit_code == 2
+    assert str(error) == error.args[0] and "\n" not in str(error)
+    assert error.fix in str(error)
+
+
+def test_each_is_also_what_python_calls_it():
+    for error, kind in zip(EVERY, (ValueError, FileNotFoundError, ImportError)):
+        assert isinstance(error, kind)
+
+
+def test_bad_input_says_name_got_expected_fix():
+    error = EVERY[0]
+    assert str(error) == "depth: got 3x2, expected 640x480. Register it first."
+    assert (error.name, error.got, error.expected, error.fix) == ("depth", "3x2", "640x480", "Register it first.")
+    assert str(BadInput("seed", 1.5, "a whole number")) == "seed: got 1.5, expected a whole number"
+
+
+def test_missing_data_says_where_and_how_to_mend():
+    assert str(EVERY[1]) == "cam_K.txt: no such file. Write one."
+    assert str(MissingData("cam_K.txt", "no such file")) == "cam_K.txt: no such file"
+
+
+def test_missing_backend_names_the_backend_and_the_command():
+    error = EVERY[2]
+    assert str(error) == "tapir: package tapnet is missing. pip install tapnet"
+    assert error.name == "tapir" and error.missing == "package tapnet is missing"
+
+
+def test_messages_with_line_breaks_become_one_line():
+    assert str(BadInput("file", "first\nsecond", "one\n  line")) == "file: got first second, expected one line"
+    assert str(MissingBackend("a", "b\nc", "d\ne")) == "a: b c. d e"
+    assert "\n" not in str(MissingData("a\nb", "c", "d\n"))
+
+
+@pytest.mark.parametrize("error", EVERY, ids=lambda e: type(e).__name__)
+def test_errors_cross_process_borders(error):
+    """A worker process hands its error to the parent as a pickle."""
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error) and str(again) == str(error)
