@@ -71,6 +71,7 @@ class TrackedObject:
         self._status = Status.INITIALISING
         self._since_keyframe = 0
         self._recovering = 0  # frames that are still marked recovered
+        self._carried = 0  # frames in a row that the surface alone carried
 
     def step(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> PoseEstimate:
         """This object's estimate at a frame, given its mask and everybody's tracks."""
@@ -134,7 +135,13 @@ class TrackedObject:
         if (use & self.map.promoted).sum() >= cfg.min_promoted:
             use &= self.map.promoted
         p_cam = np.where(use[:, None], view.p_cam, np.nan)
-        return registration.generate(self.map.p_obj, p_cam, cfg, self._rng, priors=self._priors())
+        priors = self._priors()
+        found = registration.generate(self.map.p_obj, p_cam, cfg, self._rng, priors=priors)
+        if found or not cfg.motion_priors or self._carried >= self.config.pipeline.carry_frames:
+            return found
+        # Too few points to register: the surface may carry the pose on for a while, from where it should be.
+        nobody, unknown = np.zeros(len(self.map), bool), np.full(len(self.map), np.inf)
+        return [Hypothesis(T_cam_obj, nobody, unknown, name) for name, T_cam_obj in priors.items()]
 
     def _surface_scores(self, view: View, hypotheses: list[Hypothesis]) -> np.ndarray | None:
         """How far the dense points lie from the surface under each hypothesis; None without a surface."""
@@ -167,6 +174,9 @@ class TrackedObject:
         returning = self._status not in WITH_POSE
         if returning and hypothesis.support < pipe.recover_min_inliers:
             return self._without_pose(view, Status.LOST, f"only {hypothesis.support} points agree on a return")
+        if not hypothesis.support and refined.inliers < pipe.carry_min_share:
+            return self._without_pose(view, Status.LOST, "too few points, and the surface does not fit either")
+        self._carried = 0 if hypothesis.support else self._carried + 1
         self._recovering = pipe.recovered_frames if returning else max(self._recovering - 1, 0)
         status, reason = Status.RECOVERED if self._recovering else Status.TRACKED, ""
         if hypothesis.support < pipe.degraded_inliers:

@@ -61,15 +61,15 @@ class CornerDetector:
         gray = cv2.cvtColor(frame.rgb[crop], cv2.COLOR_RGB2GRAY)
         inside = np.ascontiguousarray(mask[crop]).astype(np.uint8)
         blobs = self._sift.detect(gray, inside)
-        uv = [cv2.KeyPoint.convert(blobs).reshape(-1, 2)]
-        response = np.array([p.response for p in blobs])
-        score = [0.5 + 0.5 * response / response.max()] if len(blobs) else []
         corners, quality = cv2.goodFeaturesToTrackWithQuality(gray, self._limit, 0.01, 3, inside, blockSize=5)[:2]
+        uv, score = [np.zeros((0, 2))], [np.zeros(0)]
+        if blobs:
+            response = np.array([p.response for p in blobs])
+            uv.append(cv2.KeyPoint.convert(blobs))
+            score.append(0.5 + 0.5 * response / response.max())
         if corners is not None:
             uv.append(corners.reshape(-1, 2))
             score.append(0.5 * quality.ravel() / quality.max())
-        if not score:
-            return Candidates(np.zeros((0, 2)), np.zeros(0))
         uv_px, score = np.concatenate(uv) + np.array([x0, y0], float), np.concatenate(score).astype(float)
         order = np.argsort(-score, kind="stable")[: self._limit]
         return Candidates(uv_px[order], score[order])
