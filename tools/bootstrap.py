@@ -25,6 +25,8 @@ PYTHON = VENV / "bin" / "python"
 STAMP = VENV / ".p2p-stamp"
 LOCK, PINS = ROOT / "requirements.lock", ROOT / "pins.txt"
 UNFINISHED = "unfinished"
+# Where Debian and Fedora keep the certificates they trust, those of a company's proxy among them.
+CERTIFICATES = (Path("/etc/ssl/certs/ca-certificates.crt"), Path("/etc/pki/tls/certs/ca-bundle.crt"))
 SUPPORTED = ("3.12", "3.11", "3.13")
 # No "Build recommended" dialog (open3d's dash ships an old extension) and no question about news at the first start.
 JUPYTER_SETTINGS = {
@@ -120,6 +122,8 @@ def install_torch(uv, build):
 
 
 def install_packages(build):
+    if any(path.exists() for path in CERTIFICATES):
+        os.environ.setdefault("UV_SYSTEM_CERTS", "true")
     say("installer")
     pip = [PYTHON, "-m", "pip", "install", "-q", "--disable-pip-version-check"]
     if not run(*pip, "-c", PINS, "uv"):
@@ -164,7 +168,7 @@ def main():
         fcntl.flock(turn, fcntl.LOCK_EX)
         if STAMP.exists() and STAMP.read_text() == want and right_python():
             return
-        say("setting up (about a minute, 2.6 GB of disk; once)")
+        say("setting up in .venv (once; takes a minute or two)")
         create_venv()
         STAMP.write_text(f"{ROOT}\n{UNFINISHED}")
         install_packages(build)
