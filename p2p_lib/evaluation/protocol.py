@@ -85,10 +85,8 @@ class Evaluation:
         width = max(len(name) for name, _, _ in [*rows, ("object", {}, "")])
         lines = [f"{'object':{width}}  ADD-S    ADD  ADD-S voc  ADD voc   frames  lost"]
         for name, o, counts in rows:
-            exact, voc = (
-                f"{o['adds_auc']:6.2f} {o['add_auc']:6.2f}",
-                f"{o['adds_auc_voc']:6.2f}   {o['add_auc_voc']:6.2f}",
-            )
+            exact = f"{o['adds_auc']:6.2f} {o['add_auc']:6.2f}"
+            voc = f"{o['adds_auc_voc']:6.2f}   {o['add_auc_voc']:6.2f}"
             lines.append(f"{name:{width}} {exact}     {voc}  {counts}".rstrip())
         lines += [f"{name}: not scored, {reason}" for name, reason in self.left_out.items()]
         if self.hz is not None:
