@@ -32,6 +32,9 @@ def _section(stage: type) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "_", stage.__name__.removesuffix("Config")).lower()
 
 
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+
+
 class _Checked:
     """Refuses values of another type or out of bounds when made."""
 
@@ -43,7 +46,7 @@ class _Checked:
             if kind is float and type(value) is int:
                 object.__setattr__(self, f.name, float(value))
             elif type(value) is not kind:
-                raise BadInput(name, f"{value!r} ({type(value).__name__})", f"a {kind.__name__}: {meta['meaning']}")
+                raise BadInput(name, f"{value!r} ({type(value).__name__})", f"{_KINDS[kind]}: {meta['meaning']}")
             if "choices" in meta and value not in meta["choices"]:
                 raise BadInput(name, repr(value), "one of " + ", ".join(meta["choices"]))
             if kind in (int, float) and not meta.get("low", float("-inf")) <= value <= meta.get("high", float("inf")):
@@ -237,7 +240,7 @@ _PRESETS: dict[str, dict[str, Any]] = {"default": {}, "paper": _PAPER}
 
 def preset(name: str = "default", seed: int = 0) -> Config:
     """The configuration called ``default`` or ``paper``."""
-    if name not in _PRESETS:
+    if not isinstance(name, str) or name not in _PRESETS:
         raise _unknown("preset", name, _PRESETS)
     return replace(Config().with_values(_PRESETS[name]), preset=name, seed=_whole_number("config seed", seed))
 
@@ -252,16 +255,17 @@ def from_toml(path: str | Path, base: Config | None = None) -> Config:
     """Read ``[stage] key = value`` from a TOML file over ``base`` (or over the file's own ``preset``)."""
     path = Path(path)
     try:
-        table = tomllib.loads(path.read_text())
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise MissingData(str(path), "no such configuration file", "Give --config an existing TOML file.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise BadInput(str(path), f"unreadable TOML ({error})", "[stage] tables of key = value") from None
     named = table.pop("preset", None)
     base = preset(named) if named is not None else base or preset()
     values: dict[str, Any] = {}
     for key, value in table.items():
-        values |= {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value}
+        is_table = isinstance(value, dict) and (value or key in _STAGES)
+        values |= {f"{key}.{k}": v for k, v in value.items()} if is_table else {key: value}
     return base.with_values(values, source=str(path))
 
 
@@ -272,18 +276,19 @@ def _unknown(what: str, key: str, known: Any) -> BadInput:
 
 
 def _whole_number(name: str, value: Any) -> int:
-    try:
-        return int(str(value))
-    except ValueError:
-        raise BadInput(name, repr(value), "a whole number") from None
+    if not re.fullmatch(r"\s*\d+\s*", str(value)):
+        raise BadInput(name, repr(value), "a whole number from 0")
+    return int(value)
 
 
 def _parse(value: Any, kind: type) -> Any:
     """A command-line string as a TOML value; anything unreadable stays a string and fails the type check."""
     if not isinstance(value, str) or kind is str:
         return value.strip("\"'") if isinstance(value, str) else value
+    text = value.strip().lower()
     try:
-        return tomllib.loads(f"x = {value.strip().lower()}")["x"]
+        # TOML wants a digit before the point.
+        return tomllib.loads(f"x = {'0' * text.startswith('.')}{text}")["x"]
     except tomllib.TOMLDecodeError:
         return value
 
