@@ -10,6 +10,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from p2p_lib.data import images
+from p2p_lib.data.image_sequence import ImageSequence, pictures
+from p2p_lib.data.masks import find_masks, masks_folder
 
 
 def recognises(folder: Path) -> bool:
@@ -17,14 +19,14 @@ def recognises(folder: Path) -> bool:
     return (folder / "rgb").is_dir()
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> images.ImageSequence:
+def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; arguments as of :func:`~p2p_lib.data.sequence.open_sequence`."""
-    rgb_files, depth_files, camera, times_s = images.pictures(folder)
-    where = images.masks_folder(folder, masks) if masks else folder / "masks"
+    rgb_files, depth_files, camera, times_s = pictures(folder)
+    where = masks_folder(folder, masks) if masks else folder / "masks"
     found = None
     if masks or where.is_dir():
-        found = images.find_masks(where, rgb_files, (camera.height, camera.width), first_frame_alone=True)
-    return images.ImageSequence(
+        found = find_masks(where, rgb_files, (camera.height, camera.width), first_frame_alone=True)
+    return ImageSequence(
         name=name,
         format="folder",
         path=folder,

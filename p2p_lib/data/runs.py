@@ -15,9 +15,7 @@ from __future__ import annotations
 import csv
 import json
 import os
-import platform
 import re
-import subprocess
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -26,12 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib import __version__
-from p2p_lib.core import paths, se3
+from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.data.models import load_points
+from p2p_lib.data.provenance import provenance
 from p2p_lib.data.sequence import SYNTHETIC, ObjectTruth, Sequence
 
 #: One object at one frame, as stored in ``poses.npz`` (see :class:`ObjectRun`).
@@ -142,7 +140,7 @@ def load_run(folder: str | Path) -> Run:
         if f"{name}/frame_index" in columns
     }
     if not objects:
-        raise BadInput(str(folder), "a run without frames", "at least one frame", "It stopped at once: run it again.")
+        raise MissingData(str(folder), "a run without frames", "It was stopped at once: run it again.")
     points = {key.removesuffix("/points"): p for key, p in _load_npz(folder / "models.npz").items()}
     return Run(folder, info, objects, points, _load_timings(folder / "timings.csv"))
 
@@ -176,7 +174,7 @@ class RunWriter:
 
     Poses and timings are appended every frame. ``poses.npz`` is replaced as a whole, by rename, ever more
     rarely (after 1, 2, 4, ... 64, then every 50 or more frames) and when the run ends: by itself, by an error or by
-    Ctrl-C.
+    Ctrl-C. Whoever catches the interruption inside says so in ``info["stopped_by"]``.
 
     objects  those that are tracked (default: all of the sequence); others may appear among the estimates later
     models   object to model file; their points are kept with the run
@@ -275,7 +273,9 @@ class RunWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        self.info |= {"finished": kind is None, "stopped_by": kind and kind.__name__}
+        if kind is not None:
+            self.info["stopped_by"] = kind.__name__
+        self.info["finished"] = self.info["stopped_by"] is None
         self.flush()
 
     def _add_object(self, name: str) -> None:
@@ -324,28 +324,6 @@ class RunWriter:
     def _append(path: Path, line: str) -> None:
         with path.open("a") as file:
             file.write(line)
-
-
-def provenance() -> dict[str, Any]:
-    """The versions that matter for a number, and the commit where this is a checkout. Names no machine."""
-    import cv2
-
-    versions = {"p2p_lib": __version__, "python": platform.python_version()}
-    return {"versions": versions | {"numpy": np.__version__, "opencv": cv2.__version__}, **_commit()}
-
-
-def _commit() -> dict[str, Any]:
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(paths.PROJECT), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-    if not (paths.PROJECT / ".git").exists():
-        return {"commit": None, "modified": None}
-    try:
-        changed = git("status", "--porcelain", "--untracked-files=no", "--", "p2p_lib")
-        return {"commit": git("rev-parse", "HEAD"), "modified": bool(changed)}
-    except (OSError, subprocess.SubprocessError):
-        return {"commit": None, "modified": None}
 
 
 def quaternion_xyzw(T: np.ndarray) -> np.ndarray:

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.data import images
+from p2p_lib.data.image_sequence import ImageSequence, pictures
+from p2p_lib.data.masks import MaskFiles, find_masks, masks_folder
 from p2p_lib.data.sequence import ObjectTruth
 
 OBJECT = "object"
@@ -22,16 +24,16 @@ def recognises(folder: Path) -> bool:
     return (folder / "gt_mask").is_dir() or any((folder / "annotated_poses").glob("*.txt"))
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> images.ImageSequence:
+def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; arguments as of :func:`~p2p_lib.data.sequence.open_sequence`."""
-    rgb_files, depth_files, camera, times_s = images.pictures(folder)
+    rgb_files, depth_files, camera, times_s = pictures(folder)
     shape = camera.height, camera.width
 
-    def find(where: Path) -> images.MaskFiles:
-        return images.find_masks(where, rgb_files, shape, (OBJECT,))
+    def find(where: Path) -> MaskFiles:
+        return find_masks(where, rgb_files, shape, (OBJECT,))
 
     own = next((find(folder / m) for m in ("gt_mask", "masks") if (folder / m).is_dir()), None)
-    chosen = find(images.masks_folder(folder, masks)) if masks else own
+    chosen = find(masks_folder(folder, masks)) if masks else own
 
     def read_truth() -> dict[str, ObjectTruth]:
         if not (folder / "annotated_poses").is_dir():
@@ -40,7 +42,7 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
         files = images.check_paired(files, rgb_files)
         return {OBJECT: ObjectTruth(images.read_poses(files), np.ones(len(files), bool))}
 
-    return images.ImageSequence(
+    return ImageSequence(
         name=name,
         format="ycbineoat",
         path=folder,

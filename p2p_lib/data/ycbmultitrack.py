@@ -15,6 +15,8 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.data import images
+from p2p_lib.data.image_sequence import ImageSequence, pictures
+from p2p_lib.data.masks import MaskFiles, find_masks, masks_folder
 from p2p_lib.data.sequence import ObjectTruth
 
 DEPTH_INVALID = 65535
@@ -31,19 +33,19 @@ def _objects(folder: Path) -> tuple[str, ...]:
     return tuple(sorted(p.name for p in poses.iterdir() if p.is_dir())) if poses.is_dir() else ()
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> images.ImageSequence:
+def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; arguments as of :func:`~p2p_lib.data.sequence.open_sequence`."""
-    rgb_files, depth_files, camera, times_s = images.pictures(folder)
+    rgb_files, depth_files, camera, times_s = pictures(folder)
     shape = camera.height, camera.width
     objects = _objects(folder)
     if not objects:
         raise BadInput(str(folder / "annotated_poses"), "no folders", "one folder of poses for each object")
 
-    def find(where: Path) -> images.MaskFiles:
-        return images.find_masks(where, rgb_files, shape, objects)
+    def find(where: Path) -> MaskFiles:
+        return find_masks(where, rgb_files, shape, objects)
 
     own = find(folder / "masks") if (folder / "masks").is_dir() else None
-    chosen = find(images.masks_folder(folder, masks)) if masks else own
+    chosen = find(masks_folder(folder, masks)) if masks else own
 
     def read_truth() -> dict[str, ObjectTruth]:
         truth = {}
@@ -53,7 +55,7 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
             truth[obj] = ObjectTruth(poses, read_labels(folder, obj, len(rgb_files)))
         return truth
 
-    return images.ImageSequence(
+    return ImageSequence(
         name=name,
         format="ycbmultitrack",
         path=folder,

@@ -177,6 +177,14 @@ def test_an_interrupted_run_is_readable(table, tmp_path, error):
     assert len(np.loadtxt(tmp_path / "run" / "poses" / "box.txt")) == 83
 
 
+def test_an_interruption_that_was_caught_inside_is_not_forgotten(table, tmp_path):
+    with RunWriter(tmp_path / "run", open_sequence(table), preset(), "lk", "dataset") as w:
+        w.add(frame_at(0), {}, 5)
+        w.info["stopped_by"] = "KeyboardInterrupt"
+    info = load_run(tmp_path / "run").info
+    assert info["finished"] is False and info["stopped_by"] == "KeyboardInterrupt"
+
+
 def test_a_killed_run_is_readable(table, tmp_path):
     program = f"""
         import os, signal, numpy as np
@@ -238,7 +246,7 @@ def test_faults_of_runs(table, tmp_path):
             RunWriter(tmp_path / "run", open_sequence(table), preset(), "lk", "dataset", objects=(name,))
     with RunWriter(tmp_path / "empty", open_sequence(table), preset(), "lk", "dataset"):
         pass
-    with pytest.raises(BadInput, match=r"empty: got a run without frames"):
+    with pytest.raises(MissingData, match=r"empty: a run without frames"):
         load_run(tmp_path / "empty")
     write(tmp_path / "run", table)
     (tmp_path / "run" / "poses.npz").write_bytes(b"PK\x03\x04 cut")
