@@ -161,15 +161,14 @@ def test_all_absorbs_noise_of_the_first_truth_that_first_does_not():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_all_is_at_least_as_good_as_first(seed):
+def test_all_is_better_than_first_on_noisy_poses(seed):
     rng = np.random.default_rng(seed)
     truth = motion(rng)
     tracked = noisy(truth, rng, 0.1, 0.02)
     wild = rng.random(N) < 0.3
     tracked[wild] = motion(rng)[wild] @ se3.exp(rng.normal(0, 1, (int(wild.sum()), 6)))
     run = a_run(mug=object_run(tracked, truth))
-    # The fit minimises root mean square distances, ADD is a mean distance: they differ by a few tenths of a percent.
-    assert scores(run, align="all")["add_auc"] >= scores(run, align="first")["add_auc"] - 0.3
+    assert scores(run, align="all")["add_auc"] > scores(run, align="first")["add_auc"]
 
 
 def test_all_is_exact_and_not_spoiled_by_wild_frames():
