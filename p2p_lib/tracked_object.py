@@ -16,6 +16,7 @@ from p2p_lib.core.config import Config, TsdfConfig
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.stages import refinement, registration
+from p2p_lib.stages.factor_graph import ObjectGraph
 from p2p_lib.stages.keypoint_map import KeypointMap
 from p2p_lib.stages.lifting import lift
 from p2p_lib.stages.refinement import Keypoints, Refinement
@@ -62,8 +63,10 @@ class TrackedObject:
         self.name, self.camera, self.config = name, camera, config
         self.tracker, self.detector = tracker, detector
         self.map = KeypointMap(config.keypoint_map)
-        self.keyframes: list[np.ndarray] = []
         self.surface = make_volume(config.tsdf) if config.tsdf.enabled else None
+        self.graph = ObjectGraph(config.factor_graph)
+        self.keyframes = np.zeros((0, 4, 4))  # their T_cam_obj, as registered
+        self._map_covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
         self._rng, self._stopwatch = rng, stopwatch
         self._T_last: np.ndarray | None = None  # newest pose, of whatever frame
         self._last_seen_s = float("nan")
@@ -76,7 +79,7 @@ class TrackedObject:
     def step(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> PoseEstimate:
         """This object's estimate at a frame, given its mask and everybody's tracks."""
         view = self._observe(frame, mask, tracks.select(self.map.ids))
-        if not len(self.map):
+        if not len(self.keyframes):
             return self._start(view)
         if mask is not None and mask.sum() < self.config.pipeline.min_mask_px:
             return self._without_pose(view, Status.OCCLUDED, f"{int(mask.sum())} mask pixels")
@@ -116,17 +119,15 @@ class TrackedObject:
         pipe = self.config.pipeline
         if view.mask is None or view.mask.sum() < pipe.min_mask_px:
             return self._without_pose(view, Status.INITIALISING, "not seen yet")
-        uv_px, p_cam = self._sample(view)
-        if len(uv_px) < self.config.registration.min_inliers:
-            return self._without_pose(view, Status.INITIALISING, f"only {len(uv_px)} points to start from")
+        v, u = np.nonzero(self._measured(view))
+        if len(v) < pipe.min_mask_px:
+            return self._without_pose(view, Status.INITIALISING, f"only {len(v)} mask pixels with depth")
         T_cam_obj = np.eye(4)
         if pipe.object_frame == "centroid":
-            depth = np.where(view.mask & (view.frame.depth_m > 0), view.frame.depth_m, np.nan)
-            v, u = np.nonzero(np.isfinite(depth))
-            T_cam_obj[:3, 3] = np.median(self.camera.unproject(np.stack([u, v], -1), depth[v, u]), 0)
-        self.map.add(self.tracker.add(uv_px), se3.transform(se3.inverse(T_cam_obj), p_cam), promoted=True)
-        self._add_keyframe(view, T_cam_obj)
-        return self._with_pose(view, T_cam_obj, Status.TRACKED, len(uv_px), 1.0, keyframe=True)
+            p_cam = self.camera.unproject(np.stack([u, v], -1), view.frame.depth_m[v, u])
+            T_cam_obj[:3, 3] = np.median(p_cam, 0)
+        self._add_keyframe(view, T_cam_obj, np.zeros(0, bool))
+        return self._with_pose(view, T_cam_obj, Status.TRACKED, len(self.map), 1.0, self._map_covariance, keyframe=True)
 
     def _hypotheses(self, view: View) -> list[Hypothesis]:
         """Candidate poses from the keypoints seen; rows as in the map."""
@@ -183,38 +184,86 @@ class TrackedObject:
             status, reason = Status.DEGRADED, f"only {hypothesis.support} points agree"
         used = view.seen & self.map.promoted
         agreement = (hypothesis.inliers & used).sum() / max(used.sum(), 1)
+        covariance = self._covariance(view, hypothesis, refined)
         with self._stopwatch("map"):
-            keyframe = self._update_map(view, T_cam_obj, used, hypothesis.inliers)
-        return self._with_pose(view, T_cam_obj, status, hypothesis.support, agreement, reason, keyframe)
+            self._update_map(view, T_cam_obj, used, hypothesis.inliers)
+            keyframe = self._keyframe_due(view, T_cam_obj, hypothesis.inliers)
+        if keyframe:
+            good = view.seen & (hypothesis.inliers | ~self.map.promoted)
+            T_cam_obj = self._add_keyframe(view, T_cam_obj, good, covariance)
+        covariance = covariance + self._map_covariance
+        return self._with_pose(view, T_cam_obj, status, hypothesis.support, agreement, covariance, reason, keyframe)
 
-    def _update_map(self, view: View, T_cam_obj: np.ndarray, used: np.ndarray, agrees: np.ndarray) -> bool:
-        """Verify pending points, count who agreed, and add points where a keyframe is due; True at a keyframe."""
-        cfg = self.config.keypoint_map
+    def _covariance(self, view: View, hypothesis: Hypothesis, refined: Refinement) -> np.ndarray:
+        """(6, 6) of the pose relative to the map, right tangent of T_cam_obj."""
+        if refined.covariance is not None:
+            return refined.covariance
+        sigma_m = registration.noise_m(view.p_cam, self.config.registration)
+        return registration.covariance(hypothesis, self.map.p_obj, view.p_cam, sigma_m)
+
+    def _update_map(self, view: View, T_cam_obj: np.ndarray, used: np.ndarray, agrees: np.ndarray) -> None:
+        """Verify pending points, count which keypoints agreed, have the others looked for anew."""
         self.map.count(used, agrees)
         self.tracker.reject(self.map.ids[used & ~agrees])
         p_obj = se3.transform(se3.inverse(T_cam_obj), view.p_cam)
         self.map.observe(p_obj, view.tracks.uncertainty, self._moved_little(T_cam_obj))
-        visible = int((view.seen & (agrees | ~self.map.promoted)).sum())
-        self.tracker.drop(self.map.retire())
-        self._since_keyframe += 1
-        turned = np.degrees(se3.angle_rad(se3.inverse(np.stack(self.keyframes)) @ T_cam_obj).min())
-        starved = visible < cfg.keyframe_min_points and self._since_keyframe > cfg.cooldown
-        if view.mask is None or self._recovering or not (turned > cfg.keyframe_angle_deg or starved):
-            return False
-        uv_px, p_cam = self._sample(view)
-        self.map.add(self.tracker.add(uv_px), se3.transform(se3.inverse(T_cam_obj), p_cam))
-        self._add_keyframe(view, T_cam_obj)
-        return True
 
-    def _add_keyframe(self, view: View, T_cam_obj: np.ndarray) -> None:
-        """Fuse the frame into the surface and remember its pose."""
-        self.keyframes.append(T_cam_obj)
+    def _keyframe_due(self, view: View, T_cam_obj: np.ndarray, agrees: np.ndarray) -> bool:
+        """The appendix's "Sampling Criteria": a new view of the object, or too few points left."""
+        cfg = self.config.keypoint_map
+        self._since_keyframe += 1
+        turned = np.degrees(se3.angle_rad(se3.inverse(self.keyframes) @ T_cam_obj).min())
+        visible = int((view.seen & (agrees | ~self.map.promoted)).sum())
+        starved = visible < cfg.keyframe_min_points and self._since_keyframe > cfg.cooldown
+        return view.mask is not None and not self._recovering and (turned > cfg.keyframe_angle_deg or starved)
+
+    def _add_keyframe(
+        self, view: View, T_cam_obj: np.ndarray, good: np.ndarray, covariance: np.ndarray | None = None
+    ) -> np.ndarray:
+        """New points, a vertex of the graph, a view of the surface. Returns the pose as the graph corrects it.
+
+        good (N,) bool: points whose observation the pose agrees with.
+        """
+        uv_px, p_cam = self._sample(view)
+        new_ids = self.tracker.add(uv_px)
+        ids, p_cam_all = np.concatenate([self.map.ids[good], new_ids]), np.concatenate([view.p_cam[good], p_cam])
+        self.map.add(new_ids, se3.transform(se3.inverse(T_cam_obj), p_cam), promoted=not len(self.keyframes))
+        key, keyframes = len(self.keyframes), np.concatenate([self.keyframes, T_cam_obj[None]])
+        if self.config.factor_graph.enabled:
+            with self._stopwatch("graph"):
+                key, T_cam_obj = self._optimise(T_cam_obj, ids, p_cam_all, covariance)
+        self.keyframes = keyframes
         self._since_keyframe = 0
         if self.surface is not None:
             with self._stopwatch("fusion"):
-                pipe, depth_m = self.config.pipeline, view.frame.depth_m
-                usable = view.mask & (depth_m >= pipe.depth_min_m) & (depth_m <= pipe.depth_max_m)
-                self.surface.integrate(depth_m, view.frame.rgb, usable, self.camera, T_cam_obj, key=len(self.keyframes))
+                measured = self._measured(view)
+                self.surface.integrate(view.frame.depth_m, view.frame.rgb, measured, self.camera, T_cam_obj, key=key)
+        gone = self.map.retire()
+        self.graph.forget(gone)
+        self.tracker.drop(gone)
+        return T_cam_obj
+
+    def _optimise(
+        self, T_cam_obj: np.ndarray, ids: np.ndarray, p_cam: np.ndarray, covariance: np.ndarray | None
+    ) -> tuple[int, np.ndarray]:
+        """Add a vertex to the graph, solve, and carry the result into map and surface; its key and its pose."""
+        p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
+        sigma_m = registration.noise_m(p_cam, self.config.registration)
+        key = self.graph.add_keyframe(T_cam_obj, ids, p_cam, p_obj_init=p_obj, covariance=covariance, sigma_m=sigma_m)
+        result = self.graph.optimise()
+        if not result.ok:
+            return key, T_cam_obj
+        self.map.move(result.point_ids, result.p_obj)
+        if result.covariance is not None:
+            self._map_covariance = result.covariance
+        if self.surface is not None:
+            self.surface.move(dict(zip(result.keys.tolist(), result.T_cam_obj, strict=True)))
+        return key, result.T_cam_obj[-1]
+
+    def _measured(self, view: View) -> np.ndarray:
+        """(H, W) bool: pixels of the mask with a depth within range."""
+        pipe, depth_m = self.config.pipeline, view.frame.depth_m
+        return view.mask & (depth_m >= pipe.depth_min_m) & (depth_m <= pipe.depth_max_m)
 
     def _moved_little(self, T_cam_obj: np.ndarray) -> bool:
         """The appendix's "Pose Stability" check against the frame before."""
@@ -243,6 +292,7 @@ class TrackedObject:
         status: Status,
         support: int,
         confidence: float,
+        covariance: np.ndarray,
         reason: str = "",
         keyframe: bool = False,
     ) -> PoseEstimate:
@@ -255,6 +305,7 @@ class TrackedObject:
             status,
             T_cam_obj,
             float(confidence),
+            covariance,
             reason=reason,
             visible_points=int(view.seen.sum()),
             inliers=support,
