@@ -81,6 +81,13 @@ def torch_build():
     return "cuda" if answer("nvidia-smi", "-L") else "cpu"
 
 
+def stamp_of(root, build):
+    """Where and what a finished set-up is of; anything else in the stamp means: set up again."""
+    names = ("requirements.lock", "pins.txt", "pyproject.toml", "tools/bootstrap.py")
+    parts = [(root / name).read_bytes() for name in names]
+    return f"{root}\n{hashlib.sha256(build.encode().join(parts)).hexdigest()}"
+
+
 def right_python():
     """Whether .venv runs a Python that is supported and is the version that P2P_PYTHON asks for, if it does."""
     asked = os.environ.get("P2P_PYTHON")
@@ -162,8 +169,7 @@ def install_system_libraries():
 def main():
     start = time.monotonic()
     build = torch_build()
-    parts = [path.read_bytes() for path in (LOCK, PINS, ROOT / "pyproject.toml", Path(__file__))]
-    want = f"{ROOT}\n{hashlib.sha256(build.encode().join(parts)).hexdigest()}"
+    want = stamp_of(ROOT, build)
     with open(__file__) as turn:  # one set-up at a time; the others wait here and then find the stamp
         fcntl.flock(turn, fcntl.LOCK_EX)
         if STAMP.exists() and STAMP.read_text() == want and right_python():

@@ -1,0 +1,127 @@
+"""The house keeps its floors, each heavy library its one home, and nothing tells of the machine it was built on."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[1]
+PACKAGE = PROJECT / "p2p_lib"
+#: Ground to roof; the parts of one floor do not know each other.
+FLOORS = [
+    {"core"},
+    {"data", "stages"},
+    {"backends"},
+    {"tracked_object"},
+    {"pipeline"},
+    {"evaluation"},
+    {"run"},
+    {"report"},
+    {"notebooks", "doctor"},
+    {"cli"},
+]
+HOMES = {
+    "gtsam": ["stages/factor_graph.py"],
+    "matplotlib": ["report/*.py"],
+    "open3d": ["core/native.py"],
+    "papermill": ["notebooks.py"],
+}
+MACHINE = re.compile(r"(?<![\w./~-])/(work|tmp|root|farm|home/[a-z]\w*|opt|mnt|Users)/\w")
+REGISTRY = re.compile(r"https?://[^\s\"']*(/simple\b|/packages/[0-9a-f]{2}/|/whl/)|index-url[ =]+http|pypi\.org")
+LAZY = ("torch", "open3d", "matplotlib", "pandas", "scipy", "skimage", "papermill", "gtsam", "trimesh")
+
+
+def part(module: str) -> str:
+    """The part of the house that a module of ours belongs to."""
+    return module.split(".")[1]
+
+
+def imports(path: Path) -> list[str]:
+    """Full names of the modules that a file imports anywhere."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found += [name.name for name in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import; say from p2p_lib... so that the floor is plain"
+            whole = {"p2p_lib"} >= {node.module}
+            found += [f"{node.module}.{name.name}" for name in node.names] if whole else [node.module]
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) == "import_module":
+            found += [node.args[0].value] if isinstance(node.args[0], ast.Constant) else []
+    return found
+
+
+def sources() -> list[Path]:
+    return [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
+
+
+def tracked_files() -> list[Path]:
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=PROJECT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    return [PROJECT / name for name in listed.stdout.split("\0") if name and (PROJECT / name).is_file()]
+
+
+def test_every_part_has_a_floor():
+    parts = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in sources()}
+    assert parts <= set().union(*FLOORS), "give the new part its floor in FLOORS"
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_down(path):
+    floor = {name: level for level, names in enumerate(FLOORS) for name in names}
+    mine = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    for module in imports(path):
+        if module.startswith("p2p_lib.") and module != "p2p_lib.__version__" and part(module) != mine:
+            assert floor[part(module)] < floor[mine], f"{mine} (floor {floor[mine]}) imports {module}"
+
+
+@pytest.mark.parametrize("library", HOMES)
+def test_heavy_library_has_one_home(library):
+    users = {path for path in sources() if library in {module.split(".")[0] for module in imports(path)}}
+    homes = {path for pattern in HOMES[library] for path in PACKAGE.glob(pattern)}
+    assert users <= homes, f"{library} is used outside its home: {sorted(map(str, users - homes))}"
+
+
+HELP = "from p2p_lib.cli import main\ntry: main(['--help'])\nexcept SystemExit as end: assert not end.code"
+
+
+@pytest.mark.parametrize("code", ["import p2p_lib", HELP], ids=["import p2p_lib", "p2p --help"])
+def test_loads_nothing_heavy(code):
+    report = f"import sys\n{code}\nprint('LOADED', *[m for m in {LAZY!r} if m in sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", report], capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-1] == "LOADED"
+
+
+def test_every_module_imports_without_torch_open3d_and_plots():
+    """Importing any file of ours alone must not load them; report may plot."""
+    names = [".".join(path.relative_to(PROJECT).with_suffix("").parts) for path in sources()]
+    names = [name.removesuffix(".__init__") for name in names if part(name) not in ("report", "backends")]
+    code = f"import importlib, sys\nfor n in {names!r}: importlib.import_module(n)\n"
+    code += "print('LOADED', *[m for m in ('torch', 'open3d', 'matplotlib', 'papermill') if m in sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ran.stdout.splitlines()[-1:] == ["LOADED"], ran.stdout[-500:] + ran.stderr[-500:]
+
+
+def test_files_tell_nothing_of_a_machine_or_registry():
+    told = []
+    for path in tracked_files():
+        if path.suffix in {".png", ".jpg", ".npz", ".npy", ".pdf", ".mp4"} or path == Path(__file__):
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            if MACHINE.search(line) or REGISTRY.search(line):
+                told.append(f"{path.relative_to(PROJECT)}:{number}: {line.strip()[:80]}")
+    assert not told, "\n".join(told)
+
+
+def test_the_patterns_see_what_they_look_for():
+    for text in ('open("/root/x")', "cd /work/main", "PATH=/home/ann/bin", "/opt/wheels"):
+        assert MACHINE.search(text), text
+    for text in ("https://pypi.org/simple", "--index-url https://a.b/c", "http://host/packages/0a/ff/x.whl"):
+        assert REGISTRY.search(text), text
+    for text in ("out/work/x", "~/tmp/x", "docs/home/ann", "https://github.com/a/tmp/b"):
+        assert not MACHINE.search(text), text
+    assert {"ast", "pytest"} <= set(imports(Path(__file__)))

@@ -1,0 +1,213 @@
+"""The set-up: its lock, its stamp, its refusals. Real installations are measured in environment.md."""
+
+import ast
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+PROJECT = Path(__file__).resolve().parents[1]
+PYPROJECT = tomllib.loads((PROJECT / "pyproject.toml").read_text())
+LOCK = (PROJECT / "requirements.lock").read_text()
+REQUIRED = set("jupyterlab numpy torch opencv-python-headless gtsam open3d trimesh matplotlib pandas papermill".split())
+#: Import name to distribution, where they differ; and what comes as a part of another.
+DISTRIBUTIONS = {"cv2": "opencv-python-headless", "skimage": "scikit-image", "PIL": "pillow"}
+PARTS = {"IPython": "jupyterlab", "jupyter_client": "jupyterlab", "nbconvert": "jupyterlab", "nbformat": "papermill"}
+PARTS["nbclient"] = "papermill"
+
+
+@pytest.fixture(scope="module")
+def bootstrap():
+    spec = importlib.util.spec_from_file_location("bootstrap", PROJECT / "tools" / "bootstrap.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """What the bootstrap reads, in a folder with a space in its name."""
+    folder = tmp_path / "a clone"
+    (folder / "tools").mkdir(parents=True)
+    for name in ("tools/bootstrap.py", "pyproject.toml", "requirements.lock", "pins.txt"):
+        shutil.copy(PROJECT / name, folder / name)
+    return folder
+
+
+def call(checkout: Path, **environment: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, checkout / "tools" / "bootstrap.py"],
+        env={"PATH": os.environ["PATH"], **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def declared() -> dict[str, Requirement]:
+    return {need.name: need for need in map(Requirement, PYPROJECT["project"]["dependencies"])}
+
+
+def imported() -> set[str]:
+    """Distributions that p2p_lib imports, by name, anywhere."""
+    modules = set()
+    for path in (PROJECT / "p2p_lib").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                modules |= {name.name.split(".")[0] for name in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                modules.add(node.module.split(".")[0])
+    return {PARTS.get(m) or DISTRIBUTIONS.get(m, m) for m in modules - set(sys.stdlib_module_names) - {"p2p_lib"}}
+
+
+def test_declared_is_what_is_used():
+    assert declared().keys() >= REQUIRED
+    optional = imported() - declared().keys()
+    assert not optional, f"imported, not declared in pyproject.toml: {sorted(optional)}"
+    idle = declared().keys() - imported() - REQUIRED - {"libusb-package"}
+    assert not idle, f"declared, imported nowhere: {sorted(idle)}"
+
+
+def test_lock_pins_everything_declared_and_names_no_host():
+    assert "://" not in LOCK and "--" not in LOCK
+    pins: dict[str, list[Requirement]] = {}
+    for line in LOCK.splitlines():
+        pin = Requirement(line)
+        assert re.fullmatch(r"==[\w.+]+", str(pin.specifier)), f"not pinned: {line}"
+        pins.setdefault(pin.name, []).append(pin)
+    dev = map(Requirement, PYPROJECT["project"]["optional-dependencies"]["dev"])
+    for need in [*declared().values(), *dev]:
+        assert need.name in pins, f"{need.name}: run make lock"
+        for pin in pins[need.name]:
+            version = str(pin.specifier).removeprefix("==")
+            assert need.specifier.contains(version), f"{need} but the lock has {version}: run make lock"
+
+
+def test_lock_fits_every_python():
+    for version in ("3.11.7", "3.12.1", "3.13.0"):
+        environment = {"python_full_version": version, "python_version": version[:4], "sys_platform": "linux"}
+        fitting = [p for p in map(Requirement, LOCK.splitlines()) if not p.marker or p.marker.evaluate(environment)]
+        names = [pin.name for pin in fitting]
+        assert len(names) == len(set(names)) and declared().keys() <= set(names)
+
+
+def test_torch_is_pinned_once_and_without_its_cuda_parts():
+    hand = [line.split()[0] for line in (PROJECT / "pins.txt").read_text().splitlines() if line.startswith("torch")]
+    assert hand == re.findall(r"(?m)^torch==\S+", LOCK)
+    assert not re.search(r"(?m)^(nvidia-|cuda-|triton)", LOCK)
+
+
+def test_wrong_python_is_refused_in_one_line(checkout):
+    ended = call(checkout, P2P_PYTHON="no-such-python")
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("p2p: needs Python 3.11, 3.12 or 3.13; found no-such-python. Set P2P_PYTHON=")
+    assert not (checkout / ".venv" / "bin").exists()
+
+
+def test_unknown_torch_build_is_refused(checkout):
+    ended = call(checkout, P2P_TORCH="gpu")
+    assert ended.returncode == 1 and "P2P_TORCH: got 'gpu', expected auto, cpu or cuda" in ended.stderr
+
+
+def test_second_call_is_instant_and_changes_nothing(checkout, bootstrap):
+    make_whole(checkout, bootstrap)
+    before = sorted(checkout.rglob("*"))
+    start = time.monotonic()
+    ended = call(checkout, P2P_TORCH="cpu")
+    assert ended.returncode == 0 and ended.stdout == "" and ended.stderr == ""
+    assert sorted(checkout.rglob("*")) == before
+    assert time.monotonic() - start < 5  # an installation takes far longer, a busy machine not
+
+
+@pytest.mark.parametrize("changed", ["requirements.lock", "pyproject.toml", "pins.txt", "tools/bootstrap.py"])
+def test_a_change_sets_up_anew(checkout, bootstrap, changed):
+    make_whole(checkout, bootstrap)
+    with open(checkout / changed, "a") as file:
+        file.write("\n")
+    ended = call(checkout, P2P_TORCH="cpu", P2P_PYTHON="no-such-python")
+    assert "setting up" in ended.stdout
+
+
+def test_a_killed_setup_begins_anew(checkout, bootstrap, monkeypatch):
+    make_whole(checkout, bootstrap)
+    use(bootstrap, checkout, monkeypatch)
+    monkeypatch.delenv("P2P_PYTHON", raising=False)
+    monkeypatch.setattr(bootstrap, "answer", lambda *command: "3.12")
+    commands = []
+    monkeypatch.setattr(bootstrap, "run", lambda *command, **_: commands.append(command) or True)
+    bootstrap.create_venv()
+    assert commands == []  # whole: kept
+    bootstrap.STAMP.write_text(f"{checkout}\n{bootstrap.UNFINISHED}")
+    bootstrap.create_venv()
+    assert commands[0][1:] == ("-m", "venv", "--clear", checkout / ".venv")
+
+
+@pytest.mark.parametrize(
+    ("links", "index", "build", "expected"),
+    [
+        (True, True, "cpu", ["download", "wheel"]),
+        (False, True, "cpu", ["download", "cpu"]),
+        (False, False, "cpu", ["download", "cpu"]),
+        (True, True, "cuda", ["auto"]),
+    ],
+)
+def test_order_in_which_torch_is_sought(checkout, bootstrap, monkeypatch, links, index, build, expected):
+    use(bootstrap, checkout, monkeypatch)
+    (checkout / ".venv").mkdir()
+    tried = []
+
+    def run(*command, **_):
+        words = [str(word) for word in command]
+        if "download" in words:
+            tried.append("download")
+            assert words[-1] == "torch==2.13.0+cpu" and "--no-index" in words
+            if links:
+                (Path(words[words.index("-d") + 1]) / "torch.whl").touch()
+            return links
+        backend = [word.partition("=")[2] for word in words if word.startswith("--torch-backend")]
+        tried.append(backend[0] if backend else "wheel")
+        return index
+
+    monkeypatch.setattr(bootstrap, "run", run)
+    bootstrap.install_torch(["uv", "pip", "install", "--python", "python"], build)
+    assert tried == expected
+
+
+def test_make_alone_lists_the_targets():
+    make = shutil.which("make")
+    if make is None:
+        pytest.skip("no make on this machine")
+    shown = subprocess.run(
+        [make, "--no-print-directory"], cwd=PROJECT, capture_output=True, text=True, check=True
+    ).stdout
+    for target in ("setup", "reproduce", "test", "lab", "figures"):
+        assert f"make {target}" in shown
+
+
+def test_ci_calls_make_test():
+    script = PROJECT / ".ci" / "run"
+    assert os.access(script, os.X_OK)
+    assert script.read_text().splitlines()[-1] == "exec make test"
+
+
+def use(bootstrap, checkout: Path, monkeypatch) -> None:
+    """Let the imported bootstrap work on this checkout."""
+    monkeypatch.setattr(bootstrap, "ROOT", checkout)
+    monkeypatch.setattr(bootstrap, "VENV", checkout / ".venv")
+    monkeypatch.setattr(bootstrap, "PYTHON", checkout / ".venv" / "bin" / "python")
+    monkeypatch.setattr(bootstrap, "STAMP", checkout / ".venv" / ".p2p-stamp")
+
+
+def make_whole(checkout: Path, bootstrap) -> None:
+    """A .venv as a finished set-up for the CPU leaves it, without its packages."""
+    (checkout / ".venv" / "bin").mkdir(parents=True)
+    (checkout / ".venv" / "bin" / "python").symlink_to(sys.executable)
+    (checkout / ".venv" / ".p2p-stamp").write_text(bootstrap.stamp_of(checkout, "cpu"))
