@@ -60,7 +60,7 @@ def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, 
     still = bool((scenario.T_world_cam == scenario.T_world_cam[0]).all())
     room = _room(scenario, 0) if still else None
     work = partial(_write_frame, folder, scenario, sensor, seed, truth, room)
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0)))) as pool:
         rows = list(_progress(pool.map(work, range(scenario.frames)), scenario.frames, title))
     _write_truth(folder, scenario, truth, rows)
 

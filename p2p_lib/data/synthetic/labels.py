@@ -61,7 +61,7 @@ def lid(rng: np.random.Generator, size: int, contrast: float = 1.0) -> np.ndarra
 
 
 def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: tuple[int, int], octaves: int) -> np.ndarray:
-    """(height, width) float32 in about [-1, 1]: octaves of interpolated noise, ``cells`` (across, down) the coarsest."""
+    """(height, width) float32 in about [-1, 1]: octaves of noise, the coarsest of ``cells`` (across, down)."""
     total, weight = np.zeros((height, width), np.float32), 0.0
     for k in range(octaves):
         grid = rng.uniform(-1, 1, (cells[1] * 2**k, cells[0] * 2**k)).astype(np.float32)

@@ -32,8 +32,8 @@ class Sensor:
     blur_samples      pictures averaged for it
     """
 
-    axial_per_m: float = 0.003
-    correlation_px: float = 1.0
+    axial_per_m: float = 0.004
+    correlation_px: float = 1.5
     disparity_step_px: float = 1 / 32
     baseline_m: float = 0.05
     lateral_px: float = 0.6
@@ -74,7 +74,7 @@ def measured_depth(picture: Picture, camera: Camera, sensor: Sensor, rng: np.ran
         incidence = np.degrees(np.arccos(np.clip(picture.cos_incidence, 0, 1)))
         lost = np.clip((incidence - sensor.grazing_deg) / 10 + 0.5, 0, 1)
         hole |= rng.random((H, W), np.float32) < lost
-    depth = _ragged(exact, sensor.lateral_px, rng) if sensor.lateral_px else exact
+    depth = _ragged(exact, sensor, rng) if sensor.lateral_px else exact
     if sensor.axial_per_m:
         depth = depth + sensor.axial_per_m * depth**2 * _correlated(H, W, sensor.correlation_px, rng)
     if sensor.disparity_step_px and sensor.baseline_m:
@@ -111,13 +111,14 @@ def _edges(depth_m: np.ndarray, step_m: float) -> np.ndarray:
     return cv2.dilate(z, square) - cv2.erode(z, square) > step_m
 
 
-def _ragged(depth_m: np.ndarray, sigma_px: float, rng: np.random.Generator) -> np.ndarray:
-    """Depth looked up at randomly displaced pixels where that crosses an edge; even surface stays as it is."""
+def _ragged(depth_m: np.ndarray, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """Depth looked up at randomly displaced pixels beside edges; even surface stays as it is."""
     H, W = depth_m.shape
-    v, u = np.mgrid[:H, :W]
-    shift = np.round(sigma_px * _correlated(2 * H, W, 1.0, rng)).astype(int).reshape(2, H, W)
-    moved = depth_m[np.clip(v + shift[0], 0, H - 1), np.clip(u + shift[1], 0, W - 1)]
-    return np.where(_edges(depth_m, 0.02), moved, depth_m)
+    v, u = np.nonzero(_edges(depth_m, sensor.edge_m))
+    shift = np.round(sensor.lateral_px * rng.standard_normal((2, len(v)))).astype(int)
+    ragged = depth_m.copy()
+    ragged[v, u] = depth_m[np.clip(v + shift[0], 0, H - 1), np.clip(u + shift[1], 0, W - 1)]
+    return ragged
 
 
 def _correlated(height: int, width: int, radius_px: float, rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Scenarios: what stands where at which frame. A scenario is a value; making one draws labels and paths from its seed."""
+"""Scenarios: what stands where at which frame. Making one draws labels and paths from its seed."""
 
 from __future__ import annotations
 
@@ -43,9 +43,12 @@ class Scenario:
 
 
 def crossing(seed: int, frames: int = 300, contrast: float = 1.0) -> Scenario:
-    """A carton and a tin that pass in front of each other twice; in between a board sweeps over first the tin, then
-    the carton, and hides each completely while it moves on by at least 10 cm and 30 degrees. Both turn by over 90
-    degrees. ``frames`` stretches time, ``contrast`` fades the labels, ``seed`` varies labels and paths."""
+    """A carton and a tin that pass in front of each other twice and are hidden once each.
+
+    In between, a board sweeps over first the tin, then the carton, and hides each completely while it
+    moves by at least 10 cm and turns by at least 30 degrees: the tin back to where it was seen before, the
+    carton on. Both turn by more than 90 degrees in all. ``frames`` stretches time, ``contrast`` fades the labels.
+    """
     rng = np.random.default_rng([seed, 1])
     camera = Camera(615.0, 615.0, 319.5, 239.5, 640, 480)
     eye = np.array([0.0, -0.62, 0.42])
@@ -54,27 +57,30 @@ def crossing(seed: int, frames: int = 300, contrast: float = 1.0) -> Scenario:
     board = shapes.slab(rng, (0.16, 0.012, 0.20))
     # frame   x      y      z     yaw  pitch  roll (degrees); metres, model centre in the world
     path_carton = [
-        (0, -0.17, -0.01, 0.130, -20, 4, -3),
-        (45, -0.08, -0.09, 0.135, 12, -6, 5),
-        (85, 0.07, -0.07, 0.130, 45, 5, 4),
-        (120, 0.17, 0.00, 0.150, 72, 8, -6),
-        (160, 0.20, 0.06, 0.165, 86, -4, -8),
-        (205, 0.05, 0.01, 0.135, 38, -6, 6),
-        (262, -0.06, 0.06, 0.140, 20, 4, 4),
-        (299, -0.16, 0.02, 0.130, 0, -4, -4),
+        (0, -0.17, -0.01, 0.130, -30, 4, -3),
+        (45, -0.08, -0.09, 0.135, 32, -6, 5),
+        (85, 0.07, -0.07, 0.130, 85, 5, 4),
+        (120, 0.17, 0.00, 0.150, 126, 8, -6),
+        (160, 0.20, 0.06, 0.165, 138, -4, -8),
+        (205, 0.05, 0.01, 0.135, 184, -6, 6),
+        (262, -0.06, 0.06, 0.140, 248, 4, 4),
+        (299, -0.16, 0.02, 0.130, 300, -4, -4),
     ]
     path_tin = [
         (0, 0.16, 0.04, 0.120, 0, -8, 6),
-        (45, 0.09, 0.09, 0.150, 30, 6, -8),
-        (85, -0.06, 0.08, 0.135, 62, 10, 4),
-        (116, -0.16, 0.05, 0.130, 78, -6, 8),
-        (156, -0.02, -0.03, 0.120, 122, 4, -4),
-        (200, -0.12, -0.06, 0.115, 150, -8, 6),
-        (250, -0.03, -0.12, 0.120, 175, 6, 8),
-        (299, 0.15, -0.05, 0.130, 205, -6, -6),
+        (45, 0.09, 0.09, 0.150, 56, 6, -8),
+        (85, -0.06, 0.08, 0.135, 112, 10, 4),
+        (116, -0.16, 0.05, 0.130, 150, -6, 8),
+        (156, -0.02, -0.03, 0.120, 106, 4, -4),
+        (200, -0.12, -0.06, 0.115, 60, -8, 6),
+        (250, -0.03, -0.12, 0.120, -10, 6, 8),
+        (299, 0.15, -0.05, 0.130, -80, -6, -6),
     ]
     mirrored = -1.0 if rng.uniform() < 0.5 else 1.0
-    T_carton, T_tin = (_path(_varied(rng, keys, mirrored), frames) for keys in (path_carton, path_tin))
+    # The carton's wide panel is what shows before and after it is hidden.
+    yaw_carton, yaw_tin = rng.choice([20, 200]) + rng.uniform(-20, 20), rng.uniform(-180, 180)
+    T_carton = _path(_varied(rng, path_carton, yaw_carton, mirrored), frames)
+    T_tin = _path(_varied(rng, path_tin, yaw_tin, mirrored), frames)
     T_board = _sweep(eye, frames, (T_tin, 119, 153), (T_carton, 162, 200), mirrored)
     T_world_cam = np.broadcast_to(_look_at(eye, np.array([0, 0.03, 0.12])), (frames, 4, 4))
     bodies = (Body("box", carton, T_carton), Body("can", tin, T_tin), Body("board", board, T_board, labelled=False))
@@ -96,12 +102,12 @@ def _room(rng: np.random.Generator) -> tuple[Mesh, ...]:
     return table, wall
 
 
-def _varied(rng: np.random.Generator, keys: list[tuple], mirrored: float) -> np.ndarray:
-    """Keys (K, 7) moved by about a centimetre and a few degrees, and perhaps mirrored left to right."""
+def _varied(rng: np.random.Generator, keys: list[tuple], yaw_deg: float, mirrored: float) -> np.ndarray:
+    """Keys (K, 7) moved by about a centimetre and a few degrees, turned by a yaw, perhaps mirrored left to right."""
     keys = np.array(keys, float)
     keys[:, 1:4] += rng.uniform(-0.008, 0.008, (len(keys), 3))
-    keys[:, 4] += rng.uniform(-180, 180)
     keys[:, 4:] += rng.uniform(-3, 3, (len(keys), 3))
+    keys[:, 4] += yaw_deg
     keys[:, [1, 4, 6]] *= mirrored
     return keys
 

@@ -68,7 +68,7 @@ class Mesh:
         return levels
 
     def sample(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """n points (n, 3) and normals (n, 3) on the surface, even in area, in model coordinates."""
+        """Draws n points (n, 3) and normals (n, 3) on the surface, even in area, in model coordinates."""
         area = np.linalg.norm(self._doubled_area_normals, axis=1)
         # One point per equal share of area: even cover with fewer points than independent draws.
         at = (np.arange(n) + rng.uniform(0, 1, n)) / n * area.sum()
