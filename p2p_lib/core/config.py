@@ -107,7 +107,7 @@ class KeypointMapConfig(_Checked):
     min_observations: int = _p(4, "observations before promotion", "frames", "release", low=1)
     max_spread_m: float = _p(0.008, "median absolute deviation of the observations", "m", "paper", low=0)
     pending_ttl: int = _p(30, "frames a point may stay pending", "frames", "release", low=1)
-    max_points: int = _p(300, "cap of the map; the least seen are retired first", "points", low=10)
+    max_points: int = _p(300, "cap of the keypoints; the least seen for their time go first", "points", low=10)
 
 
 @dataclass(frozen=True)
@@ -162,13 +162,18 @@ class FactorGraphConfig(_Checked):
     prior: bool = _p(True, "L_prior, anchors the first keyframe", "", "paper")
     between: bool = _p(True, "L_reg, relative poses from registration", "", "paper")
     observations: bool = _p(True, "L_obs, bearing and range of the keypoints", "", "paper")
-    bearing_sigma_rad: float = _p(0.01, "noise of a bearing", "rad", "release", low=1e-6)
-    range_sigma_m: float = _p(0.01, "noise of a range", "m", "release", low=1e-6)
+    bearing_sigma_rad: float = _p(0.0015, "noise of a bearing: about a pixel", "rad", low=1e-6)
+    range_sigma_m: float = _p(0.003, "noise of a range where the caller gives none", "m", low=1e-6)
     huber: float = _p(1.345, "Huber threshold in standard deviations", "", "release", low=0.1)
-    between_sigma_rad: float = _p(0.02, "noise of a relative rotation", "rad", low=1e-6)
-    between_sigma_m: float = _p(0.005, "noise of a relative translation", "m", low=1e-6)
-    iterations: int = _p(20, "Levenberg-Marquardt steps at most", "", "release", low=1)
-    max_keyframes: int = _p(0, "keyframes kept, the most redundant are culled; 0 = all", low=0)
+    between_sigma_rad: float = _p(0.1, "noise of a relative rotation where the caller gives none", "rad", low=1e-6)
+    between_sigma_m: float = _p(0.02, "noise of a relative translation, at the object", "m", low=1e-6)
+    prior_sigma_rad: float = _p(1e-4, "noise of the first pose, which defines the object frame", "rad", low=1e-7)
+    prior_sigma_m: float = _p(1e-4, "noise of the first pose, which defines the object frame", "m", low=1e-7)
+    damping: float = _p(1e-4, "lambda_0 of Levenberg-Marquardt", low=0)
+    iterations: int = _p(5, "Levenberg-Marquardt steps at most", low=1)
+    relative_tolerance: float = _p(1e-3, "a smaller relative decrease of the loss ends the steps", low=0)
+    max_keyframes: int = _p(40, "keyframes kept, the most alike are merged; 0 = all", low=0)
+    suspect_sigmas: float = _p(4.0, "median misfit in standard deviations of a keypoint to be retired", low=1)
 
 
 @dataclass(frozen=True)
@@ -234,6 +239,14 @@ _PAPER: dict[str, Any] = {
     "registration.inlier_sigmas": 0.0,
     "registration.surface_margin_m": 0.0,
     "registration.min_support": 0,
+    "factor_graph.bearing_sigma_rad": 0.01,
+    "factor_graph.range_sigma_m": 0.01,
+    "factor_graph.between_sigma_rad": 0.02,
+    "factor_graph.between_sigma_m": 0.005,
+    "factor_graph.damping": 0.1,
+    "factor_graph.iterations": 20,
+    "factor_graph.relative_tolerance": 1e-5,
+    "factor_graph.max_keyframes": 0,
 }
 _PRESETS: dict[str, dict[str, Any]] = {"default": {}, "paper": _PAPER}
 

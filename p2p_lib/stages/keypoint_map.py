@@ -71,6 +71,7 @@ class KeypointMap:
         tight = spread < cfg.max_spread_m
         self.p_obj[ready[tight]] = centre[tight]
         self.promoted[ready[tight]] = True
+        self._age[ready[tight]] = 0
         return self.ids[ready[tight]]
 
     def count(self, used: np.ndarray, agreed: np.ndarray) -> None:
@@ -80,25 +81,25 @@ class KeypointMap:
 
     def move(self, ids: np.ndarray, p_obj: np.ndarray) -> None:
         """Set keypoints to p_obj (N, 3), as the factor graph found them. Unknown ids are passed over."""
-        order = np.argsort(self.ids)
-        at = order[np.clip(np.searchsorted(self.ids, ids, sorter=order), 0, max(len(order) - 1, 0))]
-        known = self.ids[at] == ids
-        self.p_obj[at[known]] = p_obj[known]
+        known, order = np.isin(ids, self.ids), np.argsort(self.ids)
+        at = order[np.searchsorted(self.ids, ids[known], sorter=order)]
+        self.p_obj[at] = p_obj[known]
 
     def retire(self) -> np.ndarray:
-        """Remove pending points past their time, keypoints that mostly disagree, and what exceeds the cap.
+        """Remove pending points past their time, keypoints that mostly disagree, and keypoints beyond the cap.
 
-        Returns the ids removed, for the tracker to drop.
+        Those that agreed in the smallest share of the frames since their promotion go first: a cap on the
+        count alone would close the map of an object that turns to new points. The pending are bounded by
+        their time. Returns the ids removed, for the tracker to drop.
         """
         cfg = self.config
         stale = ~self.promoted & (self._age > cfg.pending_ttl)
         seen = self._agreed + self._disagreed
         wrong = self.promoted & (seen >= 10) & (self._agreed < 0.3 * seen)
         gone = stale | wrong
-        excess = int((~gone).sum()) - cfg.max_points
-        if excess > 0:
-            worth = np.where(gone, np.inf, self._agreed - np.where(self.promoted, 0, 1))
-            gone[np.argsort(worth, kind="stable")[:excess]] = True
+        kept = np.flatnonzero(self.promoted & ~gone)
+        worth = (self._agreed[kept] + 1) / (self._age[kept] + 1)
+        gone[kept[np.argsort(worth, kind="stable")[: max(len(kept) - cfg.max_points, 0)]]] = True
         removed = self.ids[gone]
         for name, value in list(vars(self).items()):
             if isinstance(value, np.ndarray):

@@ -100,7 +100,8 @@ def choose(candidates: Candidates, stored_px: np.ndarray, count: int, config: Sa
     """Indices of up to ``count`` candidates, greedily maximising :func:`objective`.
 
     ``stored_px`` (M, 2) are the map's points visible in this frame. Candidates nearer than r_min to
-    anything chosen or stored are never taken: the objective already ranks them last.
+    anything chosen or stored are never taken, which is stricter than the paper's cost beta rho: with a
+    high score that alone would still let them in.
     """
     n = len(candidates.score)
     if not n:
@@ -127,4 +128,4 @@ def usable_region(frame: Frame, mask: np.ndarray, config: SamplingConfig) -> np.
     inner = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0)
     ones = np.ones((3, 3), np.uint8)
     step_m = cv2.dilate(frame.depth_m, ones) - cv2.erode(frame.depth_m, ones)
-    return (inner > 0) & (frame.depth_m > 0) & (step_m < config.depth_edge_m)
+    return (inner > 0) & (frame.depth_m > 0) & (step_m <= config.depth_edge_m)
