@@ -100,8 +100,7 @@ def _second_imager_blind(depth_m: np.ndarray, f_times_b: float) -> np.ndarray:
     z = np.where(depth_m > 0, depth_m, np.inf)
     column = np.arange(depth_m.shape[1]) - f_times_b / z
     nearest = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
-    # Half a pixel of slack: a slanted surface seen at sub-pixel steps does not hide itself.
-    return column > nearest + 0.5
+    return column > nearest
 
 
 def _edges(depth_m: np.ndarray, step_m: float) -> np.ndarray:

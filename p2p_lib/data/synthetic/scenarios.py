@@ -9,6 +9,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
 from p2p_lib.data.synthetic import labels, shapes
 from p2p_lib.data.synthetic.render import Light
 from p2p_lib.data.synthetic.shapes import Mesh
@@ -49,6 +50,8 @@ def crossing(seed: int, frames: int = 300, contrast: float = 1.0) -> Scenario:
     moves by at least 10 cm and turns by at least 30 degrees: the tin back to where it was seen before, the
     carton on. Both turn by more than 90 degrees in all. ``frames`` stretches time, ``contrast`` fades the labels.
     """
+    if frames < 2 or not 0 <= contrast <= 1:
+        raise BadInput("crossing", f"frames {frames}, contrast {contrast}", "at least 2 frames, contrast from 0 to 1")
     rng = np.random.default_rng([seed, 1])
     camera = Camera(615.0, 615.0, 319.5, 239.5, 640, 480)
     eye = np.array([0.0, -0.62, 0.42])
