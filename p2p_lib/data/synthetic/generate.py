@@ -240,7 +240,7 @@ def _alone(folder: Path) -> Iterator[Path]:
 
 
 def _progress(items: Iterator, total: int, title: str) -> Iterator:
-    """A progress bar that shows only when the work takes longer than a moment."""
+    """A progress bar, shown on a terminal only and only when the work takes longer than a moment."""
     from tqdm import tqdm
 
-    return tqdm(items, total=total, desc=title, unit="frame", delay=2.0, leave=False)
+    return tqdm(items, total=total, desc=title, unit="frame", delay=2.0, leave=False, disable=None)

@@ -14,7 +14,7 @@ from p2p_lib.data.synthetic.render import Picture
 
 @dataclass(frozen=True)
 class Sensor:
-    """Sensor model; every number 0 switches its effect off. The defaults are those of a D435 at 640x480.
+    """Sensor model; 0 switches an effect off. The defaults are about those of a RealSense D435 at 640x480.
 
     axial_per_m       standard deviation of the depth noise at 1 m, in m; grows with the range squared
     correlation_px    the noise is even over about this radius (stereo matches windows, not pixels)
