@@ -19,3 +19,27 @@ def cache_dir() -> Path:
 def data_dir() -> Path | None:
     """The user's datasets: ``$P2P_DATA``, or None where it is not set."""
     return Path(os.environ["P2P_DATA"]).expanduser() if os.environ.get("P2P_DATA") else None
+
+
+def figure_dir() -> Path:
+    """Where pictures go: ``$P2P_FIGURES``, else ``figures/`` of the project."""
+    return _given("P2P_FIGURES") or _home() / "figures"
+
+
+def table_dir() -> Path:
+    """Where tables go: ``$P2P_TABLES``, else ``out/tables/`` of the project."""
+    return _given("P2P_TABLES") or _home() / "out" / "tables"
+
+
+def run_dir(name: str) -> Path:
+    """Where a notebook keeps the run ``name``: below ``$P2P_RUNS``, else ``out/runs/`` of the project."""
+    return (_given("P2P_RUNS") or _home() / "out" / "runs") / name
+
+
+def _given(variable: str) -> Path | None:
+    return Path(os.environ[variable]).expanduser() if os.environ.get(variable) else None
+
+
+def _home() -> Path:
+    """The checkout; the current folder where the package was installed without one."""
+    return PROJECT if (PROJECT / "pyproject.toml").is_file() else Path.cwd()
