@@ -66,6 +66,8 @@ class PipelineConfig(_Checked):
     depth_max_m: float = _p(2.5, "farther depth is invalid", "m", low=0.1)
     recovered_frames: int = _p(5, "frames after a return that are marked recovered", "frames", low=0)
     recover_min_inliers: int = _p(8, "agreeing points that a return after hiding or loss needs", "points", low=3)
+    max_jump_m: float = _p(0.08, "a larger move between frames needs as many points as a return", "m", "release", low=0)
+    max_jump_deg: float = _p(25.0, "a larger turn between frames does too", "deg", "release", low=0)
     carry_frames: int = _p(60, "frames in a row that the surface may carry without registered points", "frames", low=0)
     carry_min_share: float = _p(0.6, "share of the depth points on the surface that it needs for that", low=0, high=1)
     degraded_inliers: int = _p(8, "a pose from fewer agreeing points is degraded", "points", low=3)
