@@ -7,25 +7,43 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame
 
+#: The 3x3 neighbourhood, its middle first: (9, 2) pixels.
+_OFFSETS = np.array([(0, 0), (-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)])
+#: 1, x, y, xx, yy, xy of each, (9, 6).
+_MOMENTS = np.stack([np.ones(9), *_OFFSETS.T, *_OFFSETS.T**2, _OFFSETS.prod(1)], -1)
+# Holds the slope back where few or collinear readings would let noise choose it; nine readings outweigh it twelvefold.
+_RIDGE = 0.5
+
 
 def lift(frame: Frame, uv_px: np.ndarray, camera: Camera, range_m: tuple[float, float], edge_m: float) -> np.ndarray:
     """Points p_cam (N, 3) behind pixels uv_px (N, 2); NaN rows where there is no trustworthy depth.
 
-    Depth is the mean of the valid readings in the 3x3 neighbourhood that lie within ``edge_m`` of the
-    nearest pixel's, which averages sensor noise without mixing two surfaces. Depth outside
-    ``range_m`` = (nearest, farthest) is invalid.
+    Depth is that of a plane, least squares through the readings in the 3x3 neighbourhood that lie within
+    ``edge_m`` of the nearest pixel's: it averages sensor noise without mixing two surfaces, and gives a
+    slanted surface its depth at the pixel's fraction too. Depth outside ``range_m`` = (nearest, farthest)
+    is invalid.
     """
     p_cam = np.full((len(uv_px), 3), np.nan)
     rows = np.flatnonzero(camera.inside(uv_px))
-    if not len(rows):
-        return p_cam
     px = np.rint(uv_px[rows]).astype(int)
-    offset = np.array([(0, 0), (-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)])
-    x = np.clip(px[:, :1] + offset[:, 0], 0, camera.width - 1)
-    y = np.clip(px[:, 1:] + offset[:, 1], 0, camera.height - 1)
+    last = [camera.width - 1, camera.height - 1]
+    at = px[:, None] + _OFFSETS
+    x, y = np.moveaxis(np.clip(at, 0, last), -1, 0)
     z = frame.depth_m[y, x].astype(float)
     same_surface = (z >= range_m[0]) & (z <= range_m[1]) & (np.abs(z - z[:, :1]) <= edge_m)
+    same_surface &= ((at >= 0) & (at <= last)).all(-1)
     ok = same_surface[:, 0]
-    depth = (z * same_surface).sum(1)[ok] / same_surface.sum(1)[ok]
-    p_cam[rows[ok]] = camera.unproject(uv_px[rows[ok]], depth)
+    rows, uv = rows[ok], uv_px[rows[ok]]
+    p_cam[rows] = camera.unproject(uv, _plane_depth(uv - px[ok], z[ok], same_surface[ok]))
     return p_cam
+
+
+def _plane_depth(d_px: np.ndarray, z: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Depth (N,) at d_px (N, 2) from the middle, of planes through the readings z (N, 9) that are ``used``."""
+    n, x, y, xx, yy, xy = (used @ _MOMENTS).T
+    mean, xz, yz = ((z - z[:, :1]) * used @ _MOMENTS[:, :3]).T
+    mean, x, y = mean / n, x / n, y / n
+    xx, yy, xy = xx - n * x * x + _RIDGE, yy - n * y * y + _RIDGE, xy - n * x * y
+    xz, yz = xz - n * x * mean, yz - n * y * mean
+    slope = np.stack([yy * xz - xy * yz, xx * yz - xy * xz]) / (xx * yy - xy * xy)
+    return z[:, 0] + mean + slope[0] * (d_px[:, 0] - x) + slope[1] * (d_px[:, 1] - y)

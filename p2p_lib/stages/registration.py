@@ -113,7 +113,7 @@ def select(
     if not hypotheses:
         return None, "no hypothesis: too few correspondences agree"
     support = np.array([h.support for h in hypotheses])
-    spread = np.array([np.mean(h.residual_m[h.inliers]) for h in hypotheses])
+    spread = np.array([h.residual_m[h.inliers].mean() if h.support else np.inf for h in hypotheses])
     champion = int(np.lexsort((spread, -support))[0])
     if len(hypotheses) == 1:
         return hypotheses[0], "the only hypothesis"
