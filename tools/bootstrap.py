@@ -124,7 +124,8 @@ def install_torch(uv, build):
                     return
     say(f"{torch}, {build} build from PyTorch's index")
     backend = {"cpu": "cpu", "cuda": "auto"}[build]  # auto: the CUDA version that fits the driver
-    if not run(*uv, "--no-deps", f"--torch-backend={backend}", torch, UV_HTTP_RETRIES="1"):
+    # Where nobody watches the download there is no need to read why it cannot be had.
+    if not run(*uv, "--no-deps", f"--torch-backend={backend}", torch, quiet="-q" in uv, UV_HTTP_RETRIES="1"):
         say("that index cannot be reached; PyPI's build follows (CUDA, 2.6 GB, runs without a GPU as well)")
 
 
