@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,17 +21,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         return arguments.command(arguments) or 0
-    except P2PError as error:
-        if arguments.debug:
-            raise
-        print(f"p2p {arguments.name}: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print(f"p2p {arguments.name}: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
     except BrokenPipeError:  # the reader of our output (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except (P2PError, OSError) as error:  # OSError: a full disk, a folder that may not be written
+        if arguments.debug:
+            traceback.print_exc()
+        else:
+            print(f"p2p {arguments.name}: {error}", file=sys.stderr)
+        return P2PError.exit_code
+    except KeyboardInterrupt:
+        print(f"p2p {arguments.name}: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
 
 
 def _run(a: argparse.Namespace) -> None:
