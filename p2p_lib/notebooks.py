@@ -110,9 +110,9 @@ def run_notebooks(
     Args:
         profile: ``quick`` or ``full``, handed to each notebook as ``PROFILE``.
         only: numbers or names of notebooks; all by default.
-        out: folder of the results, default ``out/<profile>``. Notebooks find the folders of their pictures and
-            tables in ``$P2P_FIGURES`` and ``$P2P_TABLES``. Pictures of the full profile go to ``figures/`` of the
-            project unless ``out`` is given.
+        out: folder of the results, default ``out/<profile>``. Notebooks find the folders of their pictures, tables
+            and runs in ``$P2P_FIGURES``, ``$P2P_TABLES`` and ``$P2P_RUNS``. Pictures of the full profile go to
+            ``figures/`` of the project unless ``out`` is given.
         jobs: how many run at a time.
         parameters: further parameters; a string is read as the kind of value the notebook has. Unknown ones are
             refused before anything runs.
@@ -134,7 +134,7 @@ def run_notebooks(
     plans = [(path, _fitting_parameters(path, given)) for path in paths]
     home = (out or PROJECT / "out" / profile).resolve()
     figures = PROJECT / "figures" if profile == "full" and out is None else home / "figures"
-    places = {"P2P_FIGURES": figures, "P2P_TABLES": home / "tables"}
+    places = {"P2P_FIGURES": figures, "P2P_TABLES": home / "tables", "P2P_RUNS": home / "runs"}
     for place in (home / "notebooks", *places.values()):
         place.mkdir(parents=True, exist_ok=True)
     for path in paths:  # nothing of an earlier run passes for one of this

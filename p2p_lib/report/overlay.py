@@ -134,19 +134,19 @@ def draw_points(
 
 
 def value_colours(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """(N, 3) uint8: dark blue at ``low`` or below to yellow at ``high`` or above (cividis); NaN is grey."""
+    """(N, 3) uint8: dark blue at ``low`` or below to yellow at ``high`` or above (cividis); NaN is white."""
     values = np.asarray(values, float)
     level = np.clip((values - low) / (high - low), 0, 1)
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
     colours = table[np.rint(np.nan_to_num(level) * 255).astype(int)]
-    return np.where(np.isnan(level)[:, None], np.uint8(128), colours)
+    return np.where(np.isnan(level)[:, None], np.uint8(255), colours)
 
 
 def depth_picture(depth_m: np.ndarray) -> np.ndarray:
-    """Depth (H, W) as a picture: near is yellow, far is dark blue (cividis), no measurement is grey."""
+    """Depth (H, W) as a picture: near is yellow, far is dark blue (cividis), no measurement is white."""
     known = depth_m > 0
     if not known.any():
-        return np.full((*depth_m.shape, 3), 128, np.uint8)
+        return np.full((*depth_m.shape, 3), 255, np.uint8)
     near, far = np.quantile(depth_m[known], [0.005, 0.995])
     values = np.where(known, -depth_m, np.nan).ravel()
     return value_colours(values, -max(far, near + 1e-6), -near).reshape(*depth_m.shape, 3)

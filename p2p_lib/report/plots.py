@@ -62,7 +62,7 @@ def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
             _draw_errors(axes, name, run.objects[name], evaluation.objects[name], _colours(run)[name])
         for axis, unit in zip(axes, ("ADD [mm]", "rotation [°]", "translation [mm]")):
             axis.set_ylabel(unit)
-            _whole_decades(axis)
+            _logarithmic(axis)
         axes[0].legend(loc="upper left", ncols=len(names))
         axes[0].set_title(f"Error over time, {run.info['sequence']}, {_ALIGNED[evaluation.align]}")
         _draw_strip(axes[3], run)
@@ -160,13 +160,13 @@ def _draw_errors(axes: list[Axes], name: str, obj: ObjectRun, score: ObjectScore
         axes[0].plot(failed, np.full(len(failed), 0.97), "x", color=colour, markersize=4, transform=edge, clip_on=False)
 
 
-def _whole_decades(axis: Axes) -> None:
-    """A logarithmic scale: a drift of a millimetre and a flip of the object both belong into the picture."""
+def _logarithmic(axis: Axes) -> None:
+    """A drift of a millimetre and a flip of the object both belong into the picture; at least one decade is shown."""
     values = np.concatenate([line.get_ydata() for line in axis.get_lines() if line.get_marker() != "x"])
     values = values[np.isfinite(values)]
-    low, high = (np.floor(np.log10(values.min())), np.ceil(np.log10(values.max()))) if len(values) else (0, 1)
+    low, high = (values.min(), values.max()) if len(values) else (1.0, 10.0)
     axis.set_yscale("log")
-    axis.set_ylim(10.0**low, 10.0 ** max(high, low + 1))
+    axis.set_ylim(min(low / 1.6, high / 6), max(high * 1.6, low * 6))
     axis.yaxis.set_major_formatter("{x:g}")
     axis.yaxis.set_minor_formatter("")
 

@@ -34,7 +34,7 @@ def made(tmp_path_factory):
     """Truth as estimates wherever 300 pixels are visible, but for the box in four frames."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("P2P_CACHE", str(tmp_path_factory.mktemp("cache")))
-        sequence = open_sequence(scenario_dir("crossing", 0, frames=40))
+        sequence = open_sequence(scenario_dir("crossing", 0, frames=40, shutter_share=0.0))
     wrong = {5: TURN, 6: SHIFT, 7: TURN @ SHIFT, 8: None}
     folder = tmp_path_factory.mktemp("run")
     with RunWriter(folder, sequence, preset("default"), "lk", "dataset", models=find_models(sequence)) as writer:

@@ -146,18 +146,18 @@ def test_mask_is_tinted_inside_and_untouched_outside():
 
 def test_values_go_from_dark_to_light():
     colours = overlay.value_colours(np.array([-5, 0, 0.5, 1, 7, np.nan]), 0, 1)
-    assert (colours[0] == colours[1]).all() and (colours[3] == colours[4]).all() and (colours[5] == 128).all()
+    assert (colours[0] == colours[1]).all() and (colours[3] == colours[4]).all() and (colours[5] == 255).all()
     light = overlay.value_colours(np.linspace(0, 1, 50), 0, 1) @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(light) > -0.8).all() and light[-1] - light[0] > 150
 
 
-def test_near_is_lighter_than_far_and_unmeasured_is_grey():
+def test_near_is_lighter_than_far_and_unmeasured_is_white():
     depth = np.tile(np.linspace(0.4, 1.6, 64, dtype=np.float32), (8, 1))
     depth[:, 10] = 0
     image = overlay.depth_picture(depth)
     light = image[0] @ [0.2126, 0.7152, 0.0722]
-    assert light[0] > light[30] > light[-1] and (image[:, 10] == 128).all()
-    assert (overlay.depth_picture(np.zeros((4, 5))) == 128).all()
+    assert light[0] > light[30] > light[-1] and (image[:, 10] == 255).all()
+    assert (overlay.depth_picture(np.zeros((4, 5))) == 255).all()
 
 
 @pytest.mark.parametrize("width_px", [200, 333, 900])
