@@ -27,7 +27,7 @@ test: setup ## linter, then all tests, every notebook included
 	@.venv/bin/python -m pytest --durations=5
 
 lab: setup ## open JupyterLab on the notebooks
-	@P2P_FIGURES="$(CURDIR)/out/lab/figures" .venv/bin/jupyter lab $(if $(filter 0,$(shell id -u)),--allow-root) --notebook-dir=. notebooks/00_quickstart.ipynb
+	@P2P_FIGURES="$(CURDIR)/out/lab/figures" .venv/bin/jupyter lab $(if $(filter 0,$(shell id -u)),--allow-root) --log-level=WARN --notebook-dir=. notebooks/00_quickstart.ipynb
 
 lock: setup ## resolve requirements.lock anew from pyproject.toml and pins.txt (no host in it)
 	@.venv/bin/uv pip compile --quiet --upgrade --universal --python-version 3.11 --extra dev --constraint pins.txt \
