@@ -138,20 +138,27 @@ class TrackedObject:
         p_cam = np.where(use[:, None], view.p_cam, np.nan)
         priors = self._priors()
         found = registration.generate(self.map.p_obj, p_cam, cfg, self._rng, priors=priors)
-        found = [h for h in found if h.support >= self.config.pipeline.recover_min_inliers or not self._jumps(h)]
+        found = self._without_jumps(found)
         if found or not cfg.motion_priors or self._carried >= self.config.pipeline.carry_frames:
             return found
         # Too few points to register: the surface may carry the pose on for a while, from where it should be.
         nobody, unknown = np.zeros(len(self.map), bool), np.full(len(self.map), np.inf)
         return [Hypothesis(T_cam_obj, nobody, unknown, name) for name, T_cam_obj in priors.items()]
 
-    def _jumps(self, hypothesis: Hypothesis) -> bool:
-        """Whether the pose is farther from the last frame's than objects move between frames."""
-        if self._status not in WITH_POSE or self._T_last is None:
-            return False
-        pipe, T_last_now = self.config.pipeline, se3.inverse(self._T_last) @ hypothesis.T_cam_obj
-        moved_m = np.linalg.norm(hypothesis.T_cam_obj[:3, 3] - self._T_last[:3, 3])
-        return bool(moved_m > pipe.max_jump_m or np.degrees(se3.angle_rad(T_last_now)) > pipe.max_jump_deg)
+    def _without_jumps(self, found: list[Hypothesis]) -> list[Hypothesis]:
+        """Objects do not jump between frames: a hypothesis that does must have more support than any that does not.
+
+        It also needs as many points as a return. A box whose faces look alike flips otherwise.
+        """
+        if self._status not in WITH_POSE or self._T_last is None or not found:
+            return found
+        pipe, T_cam_obj = self.config.pipeline, np.stack([h.T_cam_obj for h in found])
+        moved_m = np.linalg.norm(T_cam_obj[:, :3, 3] - self._T_last[:3, 3], axis=1)
+        turned = np.degrees(se3.angle_rad(se3.inverse(self._T_last) @ T_cam_obj))
+        jumps = (moved_m > pipe.max_jump_m) | (turned > pipe.max_jump_deg)
+        support = np.array([h.support for h in found])
+        needed = max([pipe.recover_min_inliers, *(support[~jumps] + 1)])
+        return [h for h, jumped in zip(found, jumps, strict=True) if not jumped or h.support >= needed]
 
     def _surface_scores(self, view: View, hypotheses: list[Hypothesis]) -> np.ndarray | None:
         """How far the dense points lie from the surface under each hypothesis; None without a surface."""

@@ -72,6 +72,7 @@ PAPER_TEXT = {
     "registration.multi_hypothesis": True,
     "registration.motion_priors": False,
     "registration.surface_margin_m": 0.0,
+    "registration.surface_margin_share": 0.0,
     "registration.min_support": 0,  # the hypothesis of the smallest score, whatever its support
     "refinement.enabled": True,
     "refinement.keypoint_weight": 0.0,
