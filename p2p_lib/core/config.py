@@ -127,6 +127,7 @@ class RegistrationConfig(_Checked):
     noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
     inlier_sigmas: float = _p(3.0, "inlier_m grows to this many sigmas of that noise; 0 = one constant", low=0)
     surface_margin_m: float = _p(2e-4, "surface scores nearer than this are equal; 0 = minimum (paper)", "m", low=0)
+    surface_margin_share: float = _p(0.25, "or than this share of the best supported's", "", "release", low=0, high=1)
     min_support: int = _p(8, "inliers that let a hypothesis compete on the surface", "points", "release", low=0)
     min_support_share: float = _p(0.25, "or this share of the best supported", "", "release", low=0, high=1)
 
@@ -138,7 +139,8 @@ class TsdfConfig(_Checked):
     truncation_voxels: float = _p(5.0, "tau in voxels", "voxels", "release", low=1)
     max_voxels: int = _p(8_000_000, "cap of one volume; parts beyond it are left out", "voxels", low=1000)
     padding_m: float = _p(0.02, "room around new surface when the volume grows", "m", low=0)
-    carve: bool = _p(False, "free-space carving by depth behind the object, outside the mask")
+    max_moves: int = _p(10, "observations re-integrated per keyframe, the farthest moved first", low=0)
+    carve: bool = _p(True, "free-space carving by depth behind the object, outside the mask")
 
 
 @dataclass(frozen=True)
@@ -235,12 +237,14 @@ _PAPER: dict[str, Any] = {
     "registration.iterations": 100,
     "registration.sample_size": 4,
     "registration.motion_priors": False,
+    "tsdf.carve": False,
     "refinement.max_points": 1500,
     "refinement.huber_m": 0.01,
     "refinement.min_strength": 0.0,
     "refinement.keypoint_weight": 0.0,
     "registration.inlier_sigmas": 0.0,
     "registration.surface_margin_m": 0.0,
+    "registration.surface_margin_share": 0.0,
     "registration.min_support": 0,
     "factor_graph.bearing_sigma_rad": 0.01,
     "factor_graph.range_sigma_m": 0.01,

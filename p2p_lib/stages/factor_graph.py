@@ -135,7 +135,7 @@ class ObjectGraph:
         if not reason:
             try:
                 solution = _solve(self._keyframes, self._points, self._anchor, self.config)
-            except RuntimeError as error:  # what gtsam throws for an indeterminate system
+            except (RuntimeError, ValueError) as error:  # gtsam's, for an indeterminate system or impossible noise
                 reason = "gtsam: " + str(error).strip().splitlines()[0]
             else:
                 reason = _implausible(solution)
@@ -152,6 +152,7 @@ class ObjectGraph:
         self._new, self._last = [], solution
         result = self._result(True, solution.note)
         condense(self._keyframes, self._points, self.config.max_keyframes, self.config.suspect_sigmas)
+        self._drop_unseen()
         return result
 
     def _noise(self, sigma_rad: np.ndarray | float | None, sigma_m: np.ndarray | float | None) -> tuple[Any, Any]:
@@ -177,14 +178,15 @@ class ObjectGraph:
         """What keeps the graph from being solved, as far as its structure tells; empty if nothing does."""
         if not self._keyframes:
             return "no keyframes"
+        first = min(self._keyframes)
         for key in self._new:
             keyframe = self._keyframes[key]
-            if len(self._keyframes) == 1 or (self.config.between and keyframe.link):
+            if key == first or (self.config.between and keyframe.link):
                 continue
-            others = [k.ids for other, k in self._keyframes.items() if other != key]
-            shared = np.isin(keyframe.ids, np.concatenate(others)).sum() if self.config.observations else 0
+            earlier = np.concatenate([k.ids for other, k in self._keyframes.items() if other < key])
+            shared = int(np.isin(keyframe.ids, earlier).sum()) if self.config.observations else 0
             if shared < _ANCHORING_POINTS:
-                return f"{shared} points shared with other keyframes and no relative pose"
+                return f"{shared} points shared with earlier keyframes and no relative pose"
         return ""
 
     def _drop_unseen(self) -> None:
@@ -327,7 +329,7 @@ def _covariance(graph: Any, solved: Any, ordering: Any, newest: int) -> tuple[np
     """
     try:
         marginal = graph.linearize(solved).eliminateMultifrontal(ordering).marginalCovariance(_x(newest))
-    except RuntimeError:
+    except (RuntimeError, ValueError):
         return None, "no covariance: nothing anchors the graph"
     A = se3.adjoint(solved.atPose3(_x(newest)).matrix())
     covariance = A @ marginal @ A.T

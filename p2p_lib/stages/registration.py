@@ -106,9 +106,9 @@ def select(
     """The hypothesis to go on with, and why.
 
     surface_scores_m (H,): mean absolute TSDF value of the masked depth points under each pose, in
-    metres; None while there is no surface. The paper takes the minimum. Ours (``surface_margin_m``
-    above 0): the best supported hypothesis stands unless another, itself supported, lies nearer to
-    the surface by more than the margin; below it the surface cannot tell them apart.
+    metres; None while there is no surface. The paper takes the minimum. Ours (a surface margin above
+    0): the best supported hypothesis stands unless another, itself supported, lies nearer to the
+    surface by more than the margin; below it the surface cannot tell them apart.
     """
     if not hypotheses:
         return None, "no hypothesis: too few correspondences agree"
@@ -122,7 +122,8 @@ def select(
     scores = np.where(np.isfinite(surface_scores_m), surface_scores_m, np.inf)
     supported = support >= min(config.min_support, config.min_support_share * support.max())
     best = int(np.argmin(np.where(supported, scores, np.inf)))
-    if scores[best] + config.surface_margin_m < scores[champion] or config.surface_margin_m == 0:
+    clearly = min(scores[champion] - config.surface_margin_m, scores[champion] * (1 - config.surface_margin_share))
+    if scores[best] < clearly or config.surface_margin_m == config.surface_margin_share == 0:
         return hypotheses[best], f"nearest to the surface ({1e3 * scores[best]:.2f} mm)"
     return hypotheses[champion], "most inliers, the surface does not tell the hypotheses apart"
 
@@ -199,13 +200,17 @@ def _determined(inertia_m2: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
 def _sequential(matches: _Matches, config: RegistrationConfig, rng: np.random.Generator) -> list[Hypothesis]:
     pool = np.ones(len(matches.p_obj), bool)
     found: list[Hypothesis] = []
-    while len(found) < config.max_hypotheses and pool.sum() >= max(config.sample_size, config.min_inliers):
-        T = _ransac(matches, np.flatnonzero(pool), config, rng)
-        hypothesis = None if T is None else _refit(T, matches, pool, f"ransac {len(found) + 1}", config)
-        if hypothesis is None:
+    for _ in range(config.max_hypotheses):
+        if pool.sum() < max(config.sample_size, config.min_inliers):
             break
-        found.append(hypothesis)
+        T = _ransac(matches, np.flatnonzero(pool), config, rng)
+        refit = None if T is None else _refit(T, matches, pool, f"ransac {len(found) + 1}", config)
+        if refit is None:
+            break
+        hypothesis, determined = refit
         pool &= ~hypothesis.inliers
+        if determined:  # else a line of points, which must make room for what it hides
+            found.append(hypothesis)
     return found
 
 
@@ -236,10 +241,9 @@ def _best_of_batch(
     order = rng.random((size, len(pool)), np.float32)
     sample = pool[np.argpartition(order, sample_size - 1, axis=1)[:, :sample_size]]
     sample = sample[_lengths_agree(matches, sample)]
-    T, inertia = _fit(matches.p_obj[sample], matches.p_cam[sample])
-    T = T[_determined(inertia, matches.limit_m[sample].mean(-1))]
-    if not len(T):
+    if not len(sample):
         return None, -np.inf
+    T, _ = _fit(matches.p_obj[sample], matches.p_cam[sample])
     relative = matches.residual_m(T)[:, pool] / matches.limit_m[pool]
     agrees = relative <= 1
     score = agrees.sum(1) - np.sum(np.where(agrees, relative, 0), 1) / (len(pool) + 1)
@@ -262,8 +266,8 @@ def _refit(
     origin: str,
     config: RegistrationConfig,
     R_prior: np.ndarray | None = None,
-) -> Hypothesis | None:
-    """Refits on the inliers until they stay the same; None if too few or collinear remain.
+) -> tuple[Hypothesis, bool] | None:
+    """Refits on the inliers until they stay the same; None if too few remain. And: do they determine the turn?
 
     Fitting and choosing inliers in turn lowers the truncated cost, sum of w min(r, limit)^2, at each step.
     """
@@ -279,16 +283,15 @@ def _refit(
             break
     if inliers.sum() < config.min_inliers:
         return None
-    if R_prior is None and not _determined(inertia, np.median(matches.limit_m[inliers])):
-        return None
-    return Hypothesis(T, inliers, residual, origin)
+    hypothesis = Hypothesis(T, inliers, residual, origin)
+    return hypothesis, bool(_determined(inertia, np.median(matches.limit_m[inliers])))
 
 
 def _from_priors(matches: _Matches, priors: Mapping[str, np.ndarray], config: RegistrationConfig) -> list[Hypothesis]:
     everything = np.ones(len(matches.p_obj), bool)
     usable = {name: np.asarray(T, float) for name, T in priors.items() if np.isfinite(T).all()}
     refits = [_refit(T, matches, everything, name, config, T[:3, :3]) for name, T in usable.items()]
-    return [hypothesis for hypothesis in refits if hypothesis is not None]
+    return [refit[0] for refit in refits if refit is not None]
 
 
 def _svd_twice(matches: _Matches, config: RegistrationConfig) -> list[Hypothesis]:

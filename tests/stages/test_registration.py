@@ -303,12 +303,15 @@ def test_paper_takes_the_minimum_score() -> None:
     assert chosen.origin == "6" and "surface" in reason
 
 
-def test_default_needs_a_margin_and_support() -> None:
-    hypotheses = [made(80), made(6), made(12)]
-    margin = DEFAULT.surface_margin_m
-    chosen, reason = select(hypotheses, np.array([0.002, 0.0005, 0.002 - 0.9 * margin]), DEFAULT)
+@pytest.mark.parametrize(
+    ("score", "margin_m", "share"), [(0.0005, 2e-4, 0.25), (0.003, 2e-4, 0.25), (0.002, 3e-4, 0.0)]
+)
+def test_ours_needs_a_margin_and_support(score: float, margin_m: float, share: float) -> None:
+    config = replace(DEFAULT, surface_margin_m=margin_m, surface_margin_share=share)
+    hypotheses, margin = [made(80), made(6), made(12)], max(margin_m, share * score)
+    chosen, reason = select(hypotheses, np.array([score, 0.0001, score - 0.9 * margin]), config)
     assert chosen.origin == "80" and "most inliers" in reason
-    chosen, reason = select(hypotheses, np.array([0.002, 0.0005, 0.002 - 1.1 * margin]), DEFAULT)
+    chosen, reason = select(hypotheses, np.array([score, 0.0001, score - 1.1 * margin]), config)
     assert chosen.origin == "12" and "surface" in reason
 
 
@@ -320,7 +323,8 @@ def test_nothing_to_select_from() -> None:
 def test_unusable_scores_fall_back_on_inliers() -> None:
     assert select([made(10), made(20)], np.array([np.nan, np.nan]), DEFAULT)[0].origin == "20"
     assert select([made(10), made(20)], np.array([np.nan, 0.002]), PAPER)[0].origin == "20"
-    assert select([made(10), made(20)], np.array([0.002, np.nan]), PAPER)[0].origin == "10"
+    for config in (DEFAULT, PAPER):
+        assert select([made(10), made(20)], np.array([0.002, np.nan]), config)[0].origin == "10"
 
 
 # --- bad input ---------------------------------------------------------------------------------
@@ -349,6 +353,19 @@ def test_a_line_within_a_body_never_turns_the_pose(config) -> None:
         p_cam = se3.transform(T, p_obj) + 0.0005 * rng.normal(size=p_obj.shape)
         best = most_supported(generate(p_obj, p_cam, config, np.random.default_rng(seed)))
         assert error_deg_m(best.T_cam_obj, T)[0] < 1.5
+
+
+@BOTH
+def test_a_line_with_a_motion_of_its_own_does_not_hide_the_body(config) -> None:
+    """More points slide along an edge than move with the body: the body's pose is found."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        line = np.linspace(-0.1, 0.1, 60)[:, None] * np.array([[1.0, 0, 0]])
+        body, T = box_points(rng, 30), random_pose(rng)
+        p_obj = np.concatenate([line, body])
+        p_cam = np.concatenate([se3.transform(random_pose(rng), line), se3.transform(T, body)])
+        hypotheses = generate(p_obj, p_cam + 0.0005 * rng.normal(size=p_obj.shape), config, rng)
+        assert min(error_deg_m(h.T_cam_obj, T)[0] for h in hypotheses) < 1.5
 
 
 @BOTH
