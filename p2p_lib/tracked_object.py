@@ -122,12 +122,19 @@ class TrackedObject:
         v, u = np.nonzero(self._measured(view))
         if len(v) < pipe.min_mask_px:
             return self._without_pose(view, Status.INITIALISING, f"only {len(v)} mask pixels with depth")
+        points = self._sample(view)
+        few = len(points[0]) < self.config.registration.min_inliers
+        carried = self.surface is not None and self.config.registration.motion_priors
+        if few and not carried:
+            return self._without_pose(view, Status.INITIALISING, f"only {len(points[0])} points to start from")
         T_cam_obj = np.eye(4)
         if pipe.object_frame == "centroid":
             p_cam = self.camera.unproject(np.stack([u, v], -1), view.frame.depth_m[v, u])
             T_cam_obj[:3, 3] = np.median(p_cam, 0)
-        self._add_keyframe(view, T_cam_obj, np.zeros(0, bool))
-        return self._with_pose(view, T_cam_obj, Status.TRACKED, len(self.map), 1.0, self._map_covariance, keyframe=True)
+        self._add_keyframe(view, T_cam_obj, points, np.zeros(0, bool))
+        status, reason = (Status.DEGRADED, f"only {len(self.map)} points") if few else (Status.TRACKED, "")
+        # The first pose defines the object frame: it is right by definition, whatever the points are worth.
+        return self._with_pose(view, T_cam_obj, status, len(self.map), 1.0, self._map_covariance, reason, keyframe=True)
 
     def _hypotheses(self, view: View) -> list[Hypothesis]:
         """Candidate poses from the keypoints seen; rows as in the map."""
@@ -206,7 +213,7 @@ class TrackedObject:
             keyframe = self._keyframe_due(view, T_cam_obj, hypothesis.inliers)
         if keyframe:
             good = view.seen & (hypothesis.inliers | ~self.map.promoted)
-            T_cam_obj = self._add_keyframe(view, T_cam_obj, good, covariance)
+            T_cam_obj = self._add_keyframe(view, T_cam_obj, self._sample(view), good, covariance)
         covariance = covariance + self._map_covariance
         return self._with_pose(view, T_cam_obj, status, hypothesis.support, agreement, covariance, reason, keyframe)
 
@@ -234,13 +241,20 @@ class TrackedObject:
         return view.mask is not None and not self._recovering and (turned > cfg.keyframe_angle_deg or starved)
 
     def _add_keyframe(
-        self, view: View, T_cam_obj: np.ndarray, good: np.ndarray, covariance: np.ndarray | None = None
+        self,
+        view: View,
+        T_cam_obj: np.ndarray,
+        points: tuple[np.ndarray, np.ndarray],
+        good: np.ndarray,
+        covariance: np.ndarray | None = None,
     ) -> np.ndarray:
         """New points, a vertex of the graph, a view of the surface. Returns the pose as the graph corrects it.
 
-        good (N,) bool: points whose observation the pose agrees with.
+        points       uv_px (K, 2) and p_cam (K, 3) of the new points
+        good         (N,) bool: points of the map whose observation the pose agrees with
+        covariance   (6, 6) of the pose relative to the map; None at the first keyframe
         """
-        uv_px, p_cam = self._sample(view)
+        uv_px, p_cam = points
         new_ids = self.tracker.add(uv_px)
         ids, p_cam_all = np.concatenate([self.map.ids[good], new_ids]), np.concatenate([view.p_cam[good], p_cam])
         self.map.add(new_ids, se3.transform(se3.inverse(T_cam_obj), p_cam), promoted=not len(self.keyframes))

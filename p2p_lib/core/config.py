@@ -272,7 +272,7 @@ def diff(a: str = "paper", b: str = "default") -> dict[str, tuple[Any, Any]]:
 
 
 def from_toml(path: str | Path, base: Config | None = None) -> Config:
-    """Read ``[stage] key = value`` from a TOML file over ``base`` (or over the file's own ``preset``)."""
+    """Read ``[stage] key = value`` from a TOML file over ``base``, else over the file's own ``preset``."""
     path = Path(path)
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -280,8 +280,8 @@ def from_toml(path: str | Path, base: Config | None = None) -> Config:
         raise MissingData(str(path), "no such configuration file", "Give --config an existing TOML file.") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise BadInput(str(path), f"unreadable TOML ({error})", "[stage] tables of key = value") from None
-    named = table.pop("preset", None)
-    base = preset(named) if named is not None else base or preset()
+    named = table.pop("preset", "default")
+    base = base or preset(named)
     values: dict[str, Any] = {}
     for key, value in table.items():
         is_table = isinstance(value, dict) and (value or key in _STAGES)
