@@ -89,6 +89,7 @@ class TrackingConfig(_Checked):
 class SamplingConfig(_Checked):
     candidates: int = _p(512, "N_k, candidates from the detector", "points", "release", low=1)
     points: int = _p(30, "K, points chosen at a keyframe", "points", "release", low=1)
+    max_visible: int = _p(60, "points followed at a time; a keyframe adds no more than are missing", "points", low=3)
     score_weight: float = _p(0.3, "lambda of the objective", "", "release", low=0, high=1)
     cluster_weight: float = _p(0.5, "beta of the objective", "", "release", low=0)
     r_ideal_px: float = _p(20.0, "r_ideal of the objective (the paper gives none)", "px", low=1)
@@ -176,7 +177,7 @@ class FactorGraphConfig(_Checked):
     damping: float = _p(1e-4, "lambda_0 of Levenberg-Marquardt", low=0)
     iterations: int = _p(5, "Levenberg-Marquardt steps at most", low=1)
     relative_tolerance: float = _p(1e-3, "a smaller relative decrease of the loss ends the steps", low=0)
-    max_keyframes: int = _p(40, "keyframes kept, the most alike are merged; 0 = all", low=0)
+    max_keyframes: int = _p(30, "keyframes kept, the most alike are merged; 0 = all", low=0)
     suspect_sigmas: float = _p(4.0, "median misfit in standard deviations of a keypoint to be retired", low=1)
 
 
@@ -233,6 +234,7 @@ _STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.def
 #: What ``paper`` changes against the defaults above: all of ours is taken out again.
 _PAPER: dict[str, Any] = {
     "pipeline.object_frame": "camera",
+    "sampling.max_visible": 50,  # the release's
     "keypoint_map.cooldown": 0,
     "registration.iterations": 100,
     "registration.sample_size": 4,

@@ -20,6 +20,8 @@ from p2p_lib.core.config import FactorGraphConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.stages.keyframes import Keyframe, Link, condense, misfit
 
+# gtsam's keys: a letter in the highest byte.
+_X, _P = ord("x") << 56, ord("p") << 56
 # Points that a keyframe must share with the others where no relative pose holds it.
 _ANCHORING_POINTS = 3
 # A variance above this means that nothing determines the direction: a turn, or ten metres.
@@ -275,24 +277,25 @@ def _solve(
     params.setMaxIterations(config.iterations)
     params.setRelativeErrorTol(config.relative_tolerance)
     params.setOrdering(ordering)
-    solved = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+    error_before, solved = optimiser.error(), optimiser.optimize()
     covariance, note = _covariance(graph, solved, ordering, newest)
     return _Solution(
         {key: solved.atPose3(_x(key)).matrix() for key in keyframes},
         {i: solved.atPoint3(_p(i)) for i in points} if config.observations else {},
         covariance,
-        graph.error(values),
-        graph.error(solved),
+        error_before,
+        optimiser.error(),
         note,
     )
 
 
 def _x(key: int) -> int:
-    return (ord("x") << 56) + key
+    return _X + key
 
 
 def _p(point_id: int) -> int:
-    return (ord("p") << 56) + point_id
+    return _P + point_id
 
 
 def _robust(gaussian: Any, config: FactorGraphConfig) -> Any:
