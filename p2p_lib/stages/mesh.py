@@ -66,7 +66,7 @@ def _marching_cubes(volume: TsdfVolume, min_weight: float) -> tuple[np.ndarray, 
     mask = np.zeros(value.shape, bool)
     mask[1:, 1:, 1:] = cells
     vertices, faces, _, _ = marching_cubes(
-        np.where(observed, value, 1.0), 0.0, mask=mask, gradient_direction="ascent", allow_degenerate=False
+        np.where(observed, value, 1.0), 0.0, mask=mask, gradient_direction="descent", allow_degenerate=False
     )
     return vertices.astype(float), faces.astype(int)
 

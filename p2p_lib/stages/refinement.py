@@ -27,12 +27,15 @@ _DAMPING_FACTOR = 5.0
 #: A MAD smaller than this share of a millimetre would trim a noise-free cloud to nothing.
 _MAD_FLOOR_M = 2e-4
 _MAD_TO_SIGMA = 1.4826
+#: The map's noise is independent this many voxels apart.
+_PAIR_VOXELS = 3.0
 
 
 class Surface(Protocol):
     """What refinement asks of a volume; :class:`p2p_lib.stages.tsdf.TsdfVolume` is one."""
 
     tau_m: float
+    voxel_m: float
 
     def query(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance in metres and validity at points of the object frame."""
@@ -90,12 +93,16 @@ class _Linear:
 
     distance_m is that of every point, infinite off the observed surface. H and g are means over the
     points used; rotations are scaled by the cloud's radius, so that everything is in metres.
+
+    shape is what H would be without noise in the gradients. A noisy plane's normals wobble, and H takes
+    the wobble for shape; products of the Jacobians of two neighbours, whose noise is independent, do not.
     """
 
     T: np.ndarray
     distance_m: np.ndarray
     H: np.ndarray
     g: np.ndarray
+    shape: np.ndarray
     cut_m: float
     used: int
     rms_m: float
@@ -136,6 +143,7 @@ class _Problem:
     keypoints: Keypoints | None
     centre: np.ndarray  # of the cloud, object frame
     radius: float  # of the cloud: turns a rotation into the displacement it causes
+    pairs: np.ndarray  # (P, 2) rows of p_cam: neighbours far enough apart for their noise to be independent
 
     @classmethod
     def about(cls, T_cam_obj, p_cam, volume, config, keypoints) -> _Problem | None:
@@ -145,7 +153,8 @@ class _Problem:
             return None
         centre = p_obj[valid].mean(0)
         radius = float(np.sqrt(((p_obj[valid] - centre) ** 2).sum(-1).mean()))
-        return cls(p_cam, volume, config, keypoints, centre, max(radius, 1e-4))
+        pairs = _neighbours(p_cam, _PAIR_VOXELS * volume.voxel_m)
+        return cls(p_cam, volume, config, keypoints, centre, max(radius, 1e-4), pairs)
 
     def solve(self, T: np.ndarray) -> Refinement:
         config = self.config
@@ -184,7 +193,19 @@ class _Problem:
         J = surface_jacobian((p_obj[used] - self.centre) / self.radius, gradient[used])
         Jw = J * np.minimum(1.0, self.config.huber_m / np.maximum(np.abs(r), 1e-12))[:, None]
         n = len(used)
-        return _Linear(T, distance, Jw.T @ J / n, Jw.T @ r / n, cut, n, float(np.sqrt((r * r).mean())), sigma)
+        H, g, rms = Jw.T @ J / n, Jw.T @ r / n, float(np.sqrt((r * r).mean()))
+        return _Linear(T, distance, H, g, self.shape(used, J, H), cut, n, rms, sigma)
+
+    def shape(self, used: np.ndarray, J: np.ndarray, H: np.ndarray) -> np.ndarray:
+        """Mean product of neighbours' Jacobians; H itself where the points lie too far apart for pairs."""
+        row = np.full(len(self.p_cam), -1)
+        row[used] = np.arange(len(used))
+        a, b = row[self.pairs].T
+        both = (a >= 0) & (b >= 0)
+        if both.sum() < max(MIN_POINTS, len(used) // 4):
+            return H
+        S = J[a[both]].T @ J[b[both]] / both.sum()
+        return (S + S.T) / 2
 
     def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of T^-1 p_cam - p_obj in standard deviations, same variables."""
@@ -212,7 +233,7 @@ class _Problem:
 
     def determined(self, at: _Linear) -> np.ndarray:
         """Projection onto the directions that the shape holds."""
-        strength, direction = np.linalg.eigh(at.H)
+        strength, direction = np.linalg.eigh(at.shape)
         held = direction[:, strength >= self.config.min_strength]
         return held @ held.T
 
@@ -249,7 +270,7 @@ class _Problem:
 
     def result(self, at: _Linear, tries: int, converged: bool) -> Refinement:
         """The pose reached, its covariance moved from the cloud's centre to the object's origin."""
-        strengths, directions = np.linalg.eigh(at.H)
+        strengths, directions = np.linalg.eigh(at.shape)
         H, _ = self.joint(at)
         # What nothing determines is known to within the largest step.
         free = np.repeat([self.config.max_step_rad * self.radius, self.config.max_step_m], 3) ** -2.0
@@ -276,6 +297,23 @@ _HUBER = 1.345
 
 def _huber_weight(e: np.ndarray) -> np.ndarray:
     return np.minimum(1.0, _HUBER / np.maximum(e, 1e-12))
+
+
+def _neighbours(p_cam: np.ndarray, distance_m: float) -> np.ndarray:
+    """(P, 2) rows of points about ``distance_m`` apart, each point with one to its right and one below it."""
+    pairs = []
+    for along, across in ((0, 1), (1, 0)):
+        strip = np.floor(p_cam[:, across] / (distance_m / 2))
+        # Within a strip the keys run along it; strips lie farther apart than any pair.
+        key = strip * (np.ptp(p_cam[:, along]) + 4 * distance_m) + p_cam[:, along]
+        order = np.argsort(key)
+        nearest = np.searchsorted(key[order], key + distance_m)
+        first = np.flatnonzero(nearest < len(key))
+        pairs.append(np.stack([first, order[nearest[first]]], -1))
+    first, second = np.concatenate(pairs).T
+    apart = np.linalg.norm(p_cam[first] - p_cam[second], axis=-1)
+    near = (apart > distance_m / 2) & (apart < 2 * distance_m)
+    return np.stack([first[near], second[near]], -1)
 
 
 def _median(x: np.ndarray) -> float:

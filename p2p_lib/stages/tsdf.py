@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from p2p_lib.core import se3
@@ -33,6 +34,8 @@ _REGION_POINTS = 4000
 _DEPTH_GAP_M = 0.05
 #: Annotated poses of real datasets are rounded; fusing needs an affine map only, so they are taken as they come.
 _POSE_TOLERANCE = 5e-3
+#: Background nearer than this to the mask does not carve: mask and pose are good to a pixel or two.
+_CARVE_MARGIN_PX = 1
 #: A weight below this is what rounding leaves of observations that were all taken out again.
 _NO_WEIGHT = 1e-3
 
@@ -42,22 +45,33 @@ class _View:
     """One masked RGB-D observation, cut to its pixels, and the box of voxels it was fused into.
 
     depth_m   (h+2, w+2) float32 with a border; -inf where nothing is to be fused
-    gate_m    least projective distance that is fused: -tau inside the mask, +tau where a pixel only carves
+    inside    (h+2, w+2) bool: measured and inside the mask; depth elsewhere only carves
     rgbw      (h+2, w+2, 4) uint8: colour and 1
     corner    column and row of the cut's first inner pixel
     lo, hi    voxel box [lo, hi) in lattice indices; fixed when first fused, so that taking out mirrors putting in
     """
 
     depth_m: np.ndarray
-    gate_m: np.ndarray | None
+    inside: np.ndarray
     rgbw: np.ndarray
     corner: tuple[int, int]
     camera: Camera
     T_cam_obj: np.ndarray
-    centre_cam: np.ndarray
     weight: float
     lo: np.ndarray
     hi: np.ndarray
+
+    @property
+    def centre_cam(self) -> np.ndarray:
+        """(3,) middle of the cut's pixels at the median depth."""
+        (h, w), (left, top) = self.inside.shape, self.corner
+        return self.camera.unproject(np.array([left + w / 2, top + h / 2]), np.median(self.depth_m[self.inside]))
+
+
+def _clear_of(mask: np.ndarray) -> np.ndarray:
+    """Pixels beyond :data:`_CARVE_MARGIN_PX` of the mask."""
+    kernel = np.ones((2 * _CARVE_MARGIN_PX + 1,) * 2, np.uint8)
+    return cv2.dilate(mask.astype(np.uint8), kernel) == 0
 
 
 class TsdfVolume:
@@ -87,6 +101,7 @@ class TsdfVolume:
         if shape is not None and np.prod(shape) > config.max_voxels:
             raise BadInput("tsdf shape", "x".join(map(str, shape)), f"at most {config.max_voxels} voxels")
         self._views: dict[int, _View] = {}
+        self._empty = True
         self.lo = np.zeros(3, int)
         self._allocate(self.lo, np.zeros(3, int) if shape is None else np.asarray(shape, int))
 
@@ -100,7 +115,7 @@ class TsdfVolume:
     @property
     def empty(self) -> bool:
         """Whether no voxel has been observed."""
-        return not bool((self._weight > 0).any()) if self._weight.numel() else True
+        return self._empty
 
     @property
     def origin_m(self) -> np.ndarray:
@@ -196,8 +211,10 @@ class TsdfVolume:
         """Re-integrate the kept observations of keyframes that the graph has moved (T_cam_obj by key).
 
         Those whose cloud moved by more than half a voxel or 0.5 degrees, the farthest first and at most
-        ``limit`` of them; the rest stay where they are for a later call. Returns the keys moved.
+        ``limit`` of them (``config.max_moves`` unless given); the rest stay where they are for a later
+        call. Poses that are not finite are passed over. Returns the keys moved.
         """
+        limit = self.config.max_moves if limit is None else limit
         known = [key for key in poses if key in self._views]
         if not known:
             return []
@@ -217,8 +234,10 @@ class TsdfVolume:
     def _move_one(self, key: int, T_cam_obj: np.ndarray) -> None:
         view = self._views[key]
         self._fuse(view, -view.weight)
-        lo, hi = self._grow(self._region(view.depth_m, view.corner, view.camera, T_cam_obj), view, T_cam_obj)
-        self._views[key] = moved = replace(view, T_cam_obj=T_cam_obj, lo=lo, hi=hi)
+        moved = replace(view, T_cam_obj=T_cam_obj)
+        self._grow(moved)
+        lo, hi = self._frustum_box(moved)
+        self._views[key] = moved = replace(moved, lo=lo, hi=hi)
         self._fuse(moved, moved.weight)
 
     def _view(self, depth_m, rgb, mask, camera: Camera, T_cam_obj, weight: float) -> _View | None:
@@ -230,60 +249,75 @@ class TsdfVolume:
                 f"depth {depth_m.shape}, mask {mask.shape}, rgb {np.shape(rgb)}",
                 f"{want} as the camera",
             )
-        measured = (depth_m > 0) & (depth_m < np.inf)
-        inside = mask & measured
-        if not inside.any():
+        rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        if len(rows) == 0:
             return None
-        used = inside | measured if self.config.carve else inside
-        rows, cols = np.flatnonzero(used.any(1)), np.flatnonzero(used.any(0))
-        cut = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-        depth = np.pad(np.where(used[cut], depth_m[cut], -np.inf).astype(np.float32), 1, constant_values=-np.inf)
-        gate = None
+        picture = (depth_m, rgb, mask, camera, T_cam_obj, weight)
+        view = self._cut(cols[0], rows[0], cols[-1] + 1, rows[-1] + 1, *picture)
+        if not view.inside.any():
+            return None
+        self._grow(view)
         if self.config.carve:
-            gate = np.pad(np.where(inside[cut], -self.tau_m, self.tau_m).astype(np.float32), 1)
-        rgbw = np.ones((*depth.shape, 4), np.uint8)
-        rgbw[1:-1, 1:-1, :3] = np.asarray(rgb)[cut]
-        corner = (int(cols[0]), int(rows[0]))
-        own = np.where(inside[cut], depth[1:-1, 1:-1], -np.inf)
-        region = self._region(np.pad(own, 1, constant_values=-np.inf), corner, camera, T_cam_obj)
-        centre = se3.transform(T_cam_obj, region.mean(0)[None])[0]
-        view = _View(depth, gate, rgbw, corner, camera, T_cam_obj, centre, float(weight), self.lo, self.lo)
-        lo, hi = self._grow(region, view, T_cam_obj)
+            view = self._cut(*self._window(view), *picture)
+        lo, hi = self._frustum_box(view)
         return replace(view, lo=lo, hi=hi)
 
-    def _region(self, depth_m, corner, camera: Camera, T_cam_obj) -> np.ndarray:
+    def _cut(self, left, top, right, bottom, depth_m, rgb, mask, camera, T_cam_obj, weight: float) -> _View:
+        """The view of these columns and rows of a picture."""
+        cut = np.s_[top:bottom, left:right]
+        depth, mask = np.asarray(depth_m[cut], np.float32), mask[cut]
+        measured = (depth > 0) & (depth < np.inf)
+        inside = np.pad(mask & measured, 1)
+        used = inside[1:-1, 1:-1] | (measured & _clear_of(mask) if self.config.carve else False)
+        depth = np.pad(np.where(used, depth, -np.inf), 1, constant_values=-np.inf)
+        rgbw = np.ones((*inside.shape, 4), np.uint8)
+        rgbw[1:-1, 1:-1, :3] = rgb[cut]
+        return _View(depth, inside, rgbw, (left, top), camera, T_cam_obj, float(weight), self.lo, self.lo)
+
+    def _window(self, view: _View) -> tuple[int, int, int, int]:
+        """Columns and rows [left, top, right, bottom) that the grid projects to, all where it reaches the camera."""
+        corners = np.array(np.meshgrid(*zip(self.lo, self.lo + self.shape, strict=True), indexing="ij"))
+        p_cam = se3.transform(view.T_cam_obj, self.anchor_m + self.voxel_m * corners.reshape(3, -1).T)
+        width, height = view.camera.width, view.camera.height
+        if p_cam[:, 2].min() <= 0.01:
+            return 0, 0, width, height
+        uv = view.camera.project(p_cam)
+        left, top = np.clip(np.floor(uv.min(0)), 0, (width - 1, height - 1)).astype(int)
+        right, bottom = np.clip(np.ceil(uv.max(0)) + 1, (left + 1, top + 1), (width, height)).astype(int)
+        return int(left), int(top), int(right), int(bottom)
+
+    def _region(self, view: _View) -> np.ndarray:
         """(2, 3) robust bounds of the masked cloud in the object frame, unpadded.
 
         The largest run of depths without a gap, and of it all but the outermost half percent on each
         side: a mask that bleeds onto the background or a wild pixel does not move them.
         """
-        v, u = np.nonzero(depth_m > 0)
+        v, u = np.nonzero(view.inside)
         keep = np.linspace(0, len(u) - 1, min(len(u), _REGION_POINTS)).astype(int)
         v, u = v[keep], u[keep]
-        z = depth_m[v, u].astype(float)
+        z = view.depth_m[v, u].astype(float)
         ranked = np.sort(z)
-        breaks = np.flatnonzero(np.diff(ranked) > _DEPTH_GAP_M)
-        runs = np.split(ranked, breaks + 1)
-        run = max(runs, key=len)
+        run = max(np.split(ranked, np.flatnonzero(np.diff(ranked) > _DEPTH_GAP_M) + 1), key=len)
         own = (z >= run[0]) & (z <= run[-1])
-        uv_px = np.stack([u[own] - 1 + corner[0], v[own] - 1 + corner[1]], -1)
-        p_obj = se3.transform(se3.inverse(T_cam_obj), camera.unproject(uv_px, z[own]))
+        uv_px = np.stack([u[own] - 1 + view.corner[0], v[own] - 1 + view.corner[1]], -1)
+        p_obj = se3.transform(se3.inverse(view.T_cam_obj), view.camera.unproject(uv_px, z[own]))
         return np.percentile(p_obj, [0.5, 99.5], axis=0)
 
-    def _grow(self, region: np.ndarray, view: _View, T_cam_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Make room for ``region`` and return the part of the grid that the view can reach."""
-        if self.grows:
-            pad = max(self.config.padding_m, self.tau_m)
-            want_lo = np.floor((region[0] - pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
-            want_hi = np.ceil((region[1] + pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
-            old_lo, old_hi = self.lo, self.lo + self.shape
-            if self._weight.numel() == 0:
-                old_lo = (want_lo + want_hi) // 2 // BLOCK * BLOCK
-                old_hi = old_lo + BLOCK
-            lo, hi = self._capped(old_lo, old_hi, np.minimum(want_lo, old_lo), np.maximum(want_hi, old_hi))
-            if (lo != self.lo).any() or (hi - lo != self.shape).any():
-                self._allocate(lo, hi - lo)
-        return self._frustum_box(view, T_cam_obj)
+    def _grow(self, view: _View) -> None:
+        """Make room for the view's cloud."""
+        if not self.grows:
+            return
+        region = self._region(view)
+        pad = max(self.config.padding_m, self.tau_m)
+        want_lo = np.floor((region[0] - pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
+        want_hi = np.ceil((region[1] + pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
+        old_lo, old_hi = self.lo, self.lo + self.shape
+        if self._weight.numel() == 0:
+            old_lo = (want_lo + want_hi) // 2 // BLOCK * BLOCK
+            old_hi = old_lo + BLOCK
+        lo, hi = self._capped(old_lo, old_hi, np.minimum(want_lo, old_lo), np.maximum(want_hi, old_hi))
+        if (lo != self.lo).any() or (hi - lo != self.shape).any():
+            self._allocate(lo, hi - lo)
 
     def _capped(self, old_lo, old_hi, want_lo, want_hi) -> tuple[np.ndarray, np.ndarray]:
         """The largest share of the wanted growth, equal on all sides, that stays within ``max_voxels``."""
@@ -301,11 +335,11 @@ class TsdfVolume:
                 high = share
         return lo, hi
 
-    def _frustum_box(self, view: _View, T_cam_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _frustum_box(self, view: _View) -> tuple[np.ndarray, np.ndarray]:
         """Lattice box [lo, hi) of the grid's voxels that may lie behind the view's pixels, before depth + tau."""
         lo, hi = self.lo, self.lo + self.shape
         corners = np.array(np.meshgrid(*zip(lo, hi - 1, strict=True), indexing="ij")).reshape(3, -1).T
-        z = se3.transform(T_cam_obj, self.anchor_m + self.voxel_m * corners)[:, 2]
+        z = se3.transform(view.T_cam_obj, self.anchor_m + self.voxel_m * corners)[:, 2]
         far = min(float(view.depth_m.max()) + self.tau_m, z.max())
         near = max(z.min(), 0.0)
         if far <= near:
@@ -313,7 +347,7 @@ class TsdfVolume:
         h, w = view.depth_m.shape
         u, v = (view.corner[0] + np.array([-1.5, w - 1.5]), view.corner[1] + np.array([-1.5, h - 1.5]))
         uvz = np.array(np.meshgrid(u, v, [near, far], indexing="ij")).reshape(3, -1).T
-        p_obj = se3.transform(se3.inverse(T_cam_obj), view.camera.unproject(uvz[:, :2], uvz[:, 2]))
+        p_obj = se3.transform(se3.inverse(view.T_cam_obj), view.camera.unproject(uvz[:, :2], uvz[:, 2]))
         index = (p_obj - self.anchor_m) / self.voxel_m
         box_lo = np.clip(np.floor(index.min(0)).astype(int), lo, hi)
         return box_lo, np.clip(np.ceil(index.max(0)).astype(int) + 1, box_lo, hi)
@@ -323,7 +357,7 @@ class TsdfVolume:
         if (size <= 0).any():
             return 0
         depth = self._tensor(view.depth_m).view(-1)
-        gate = None if view.gate_m is None else self._tensor(view.gate_m).view(-1)
+        gate = self._tensor(np.where(view.inside, -self.tau_m, self.tau_m).astype(np.float32)).view(-1)
         rgbw = self._tensor(view.rgbw).view(-1, 4)
         step = max(1, _SLAB // int(size[1] * size[2]))
         touched = 0
@@ -332,7 +366,8 @@ class TsdfVolume:
             hi = np.array([min(x + step, view.hi[0]), *view.hi[1:]])
             pixel, z = self._project(view, lo, hi)
             d = depth.index_select(0, pixel).sub_(z)
-            hit = (d >= (-self.tau_m if gate is None else gate.index_select(0, pixel))).nonzero().view(-1)
+            least = gate.index_select(0, pixel) if self.config.carve else -self.tau_m
+            hit = (d >= least).nonzero().view(-1)
             phi = d.index_select(0, hit).div_(self.tau_m).clamp_(max=1.0)
             at = self._flat_index(lo, hi).index_select(0, hit)
             self._accumulate(at, phi, weight)
@@ -340,6 +375,10 @@ class TsdfVolume:
             seen = rgbw.index_select(0, pixel.index_select(0, hit.index_select(0, near))).float()
             self._tint(at.index_select(0, near), seen, weight)
             touched += len(hit)
+        if weight < 0:
+            self._empty = not bool((self._weight > 0).any())
+        elif touched:
+            self._empty = False
         return touched
 
     def _project(self, view: _View, lo: np.ndarray, hi: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
