@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import p2p_lib
+
 PROJECT = Path(__file__).resolve().parents[1]
 PYPROJECT = tomllib.loads((PROJECT / "pyproject.toml").read_text())
 LOCK = (PROJECT / "requirements.lock").read_text()
@@ -196,6 +198,18 @@ def test_ci_calls_make_test():
     script = PROJECT / ".ci" / "run"
     assert os.access(script, os.X_OK)
     assert script.read_text().splitlines()[-1] == "exec make test"
+
+
+def test_citation_names_the_papers_authors_and_this_version():
+    yaml = pytest.importorskip("yaml")
+    citation = yaml.safe_load((PROJECT / "CITATION.cff").read_text())
+    authors = [f"{a['given-names']} {a['family-names']}" for a in citation["preferred-citation"]["authors"]]
+    assert authors == ["Tzu-Yuan Lin", "Ho Jae Lee", "Kevin Doherty", "Yonghyeon Lee", "Sangbae Kim"]
+    assert citation["authors"] == [{"name": "Point2Pose suite contributors"}]
+    version = PYPROJECT["project"]["version"]
+    assert citation["version"] == p2p_lib.__version__ == version
+    assert f"## {version}" in (PROJECT / "CHANGELOG.md").read_text()
+    assert citation["license"] == PYPROJECT["project"]["license"] == "BSD-3-Clause"
 
 
 def use(bootstrap, checkout: Path, monkeypatch) -> None:
