@@ -67,6 +67,7 @@ class TrackedObject:
         self.graph = ObjectGraph(config.factor_graph)
         self.keyframes = np.zeros((0, 4, 4))  # their T_cam_obj, as registered
         self._map_covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
+        self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
         self._rng, self._stopwatch = rng, stopwatch
         self._T_last: np.ndarray | None = None  # newest pose, of whatever frame
         self._last_seen_s = float("nan")
@@ -211,6 +212,7 @@ class TrackedObject:
         with self._stopwatch("map"):
             self._update_map(view, T_cam_obj, used, hypothesis.inliers)
             keyframe = self._keyframe_due(view, T_cam_obj, hypothesis.inliers)
+        self._settle_surface()
         if keyframe:
             good = view.seen & (hypothesis.inliers | ~self.map.promoted)
             T_cam_obj = self._add_keyframe(view, T_cam_obj, self._sample(view), good, covariance)
@@ -286,9 +288,15 @@ class TrackedObject:
         self.map.move(result.point_ids, result.p_obj)
         if result.covariance is not None:
             self._map_covariance = result.covariance
-        if self.surface is not None:
-            self.surface.move(dict(zip(result.keys.tolist(), result.T_cam_obj, strict=True)))
+        self._corrected = dict(zip(result.keys.tolist(), result.T_cam_obj, strict=True))
         return key, result.T_cam_obj[-1]
+
+    def _settle_surface(self) -> None:
+        """Re-integrate some of the keyframes that the graph has moved: a few per frame, so that no frame waits long."""
+        if self.surface is not None and self._corrected:
+            with self._stopwatch("fusion"):
+                if not self.surface.move(self._corrected):
+                    self._corrected = {}
 
     def _measured(self, view: View) -> np.ndarray:
         """(H, W) bool: pixels of the mask with a depth within range."""
@@ -312,7 +320,8 @@ class TrackedObject:
             p_cam = self._lift(view.frame, candidates.uv_px)
             liftable = np.isfinite(p_cam[:, 0])
             candidates, p_cam = candidates.select(liftable), p_cam[liftable]
-            chosen = choose(candidates, view.tracks.uv_px[view.seen], cfg.points, cfg)
+            count = min(cfg.points, cfg.max_visible - int(view.seen.sum()))
+            chosen = choose(candidates, view.tracks.uv_px[view.seen], count, cfg)
             return candidates.uv_px[chosen], p_cam[chosen]
 
     def _with_pose(

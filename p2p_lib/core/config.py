@@ -140,7 +140,7 @@ class TsdfConfig(_Checked):
     truncation_voxels: float = _p(5.0, "tau in voxels", "voxels", "release", low=1)
     max_voxels: int = _p(8_000_000, "cap of one volume; parts beyond it are left out", "voxels", low=1000)
     padding_m: float = _p(0.02, "room around new surface when the volume grows", "m", low=0)
-    max_moves: int = _p(10, "observations re-integrated per keyframe, the farthest moved first", low=0)
+    max_moves: int = _p(1, "observations re-integrated per frame, the farthest moved first", low=0)
     carve: bool = _p(True, "free-space carving by depth behind the object, outside the mask")
 
 

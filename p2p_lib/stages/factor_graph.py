@@ -10,6 +10,7 @@ State is kept as plain arrays, so that a solve that fails leaves nothing behind.
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -77,6 +78,8 @@ class ObjectGraph:
         self._next_key = 0
         self._last: _Solution | None = None
         self._anchor = se3.IDENTITY
+        if config.enabled:  # its import takes a second that no frame should wait for
+            importlib.import_module("gtsam")
 
     def add_keyframe(
         self,
