@@ -1,7 +1,7 @@
 # Everything happens in .venv, which `make setup` fills. P2P_PYTHON, P2P_TORCH: see tools/bootstrap.py.
 PYTHON ?= python3
-# Two threads: the matrices are small, more cost time, and results agree between machines. `make THREADS=8 figures` overrides.
-THREADS ?= 2
+# One thread: the matrices are small, more cost time, and results agree between machines. `make THREADS=8 figures` overrides.
+THREADS ?= 1
 export OMP_NUM_THREADS := $(THREADS)
 export OPENBLAS_NUM_THREADS := $(THREADS)
 export MKL_NUM_THREADS := $(THREADS)

@@ -18,6 +18,9 @@ EXIT_INTERRUPTED = 130
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (0 fine, 2 something to mend, 130 interrupted)."""
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        # The matrices are small: more threads cost time, most of all where other programs run. Set it to override.
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     arguments = _parser().parse_args(argv)
     try:
         return arguments.command(arguments) or 0
