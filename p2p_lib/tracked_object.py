@@ -295,7 +295,7 @@ class TrackedObject:
         """Re-integrate some of the keyframes that the graph has moved: a few per frame, so that no frame waits long."""
         if self.surface is not None and self._corrected:
             with self._stopwatch("fusion"):
-                if not self.surface.move(self._corrected):
+                if not self.surface.move(self._corrected, self.config.tsdf.max_moves):
                     self._corrected = {}
 
     def _measured(self, view: View) -> np.ndarray:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import cv2
@@ -61,7 +62,7 @@ class _View:
     lo: np.ndarray
     hi: np.ndarray
 
-    @property
+    @cached_property
     def centre_cam(self) -> np.ndarray:
         """(3,) middle of the cut's pixels at the median depth."""
         (h, w), (left, top) = self.inside.shape, self.corner
@@ -211,10 +212,9 @@ class TsdfVolume:
         """Re-integrate the kept observations of keyframes that the graph has moved (T_cam_obj by key).
 
         Those whose cloud moved by more than half a voxel or 0.5 degrees, the farthest first and at most
-        ``limit`` of them (``config.max_moves`` unless given); the rest stay where they are for a later
+        ``limit`` of them (None: all); the rest stay where they are for a later
         call. Poses that are not finite are passed over. Returns the keys moved.
         """
-        limit = self.config.max_moves if limit is None else limit
         known = [key for key in poses if key in self._views]
         if not known:
             return []
