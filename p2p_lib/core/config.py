@@ -136,7 +136,7 @@ class RegistrationConfig(_Checked):
 @dataclass(frozen=True)
 class TsdfConfig(_Checked):
     enabled: bool = _p(True, "build a surface per object", "", "paper")
-    voxel_m: float = _p(0.005, "edge of a voxel", "m", "release", low=2e-4)
+    voxel_m: float = _p(0.003, "edge of a voxel", "m", low=2e-4)
     truncation_voxels: float = _p(5.0, "tau in voxels", "voxels", "release", low=1)
     max_voxels: int = _p(8_000_000, "cap of one volume; parts beyond it are left out", "voxels", low=1000)
     padding_m: float = _p(0.02, "room around new surface when the volume grows", "m", low=0)
@@ -156,7 +156,7 @@ class RefinementConfig(_Checked):
     max_step_m: float = _p(0.02, "largest translation of one step", "m", "release", low=0)
     max_step_rad: float = _p(0.2, "largest rotation of one step", "rad", "release", low=0)
     tolerance: float = _p(0.5, "a smaller gain ends the iterations", "squared standard deviations", low=0)
-    min_strength: float = _p(0.01, "directions that the shape holds less firmly are not moved by it; 0 = all", low=0)
+    min_strength: float = _p(0.003, "directions that the shape holds less firmly are not moved by it; 0 = all", low=0)
     independent_points: int = _p(30, "what the correlated depth points are worth together", "points", low=1)
     keypoint_weight: float = _p(1.0, "weight of keypoint residuals beside the surface; 0 = surface alone", low=0)
 
@@ -239,6 +239,7 @@ _PAPER: dict[str, Any] = {
     "registration.iterations": 100,
     "registration.sample_size": 4,
     "registration.motion_priors": False,
+    "tsdf.voxel_m": 0.005,
     "tsdf.carve": False,
     "refinement.max_points": 1500,
     "refinement.huber_m": 0.01,

@@ -24,11 +24,13 @@ from p2p_lib.core.config import RefinementConfig
 MIN_POINTS = 10
 #: Damping is raised or lowered by this factor as steps fail or succeed.
 _DAMPING_FACTOR = 5.0
-#: A MAD smaller than this share of a millimetre would trim a noise-free cloud to nothing.
-_MAD_FLOOR_M = 2e-4
+#: No map is exact to less than this share of its voxels, however little the points scatter.
+_SIGMA_FLOOR_VOXELS = 0.25
 _MAD_TO_SIGMA = 1.4826
 #: The map's noise is independent this many voxels apart.
 _PAIR_VOXELS = 3.0
+#: A strength must exceed this many standard deviations of what noise alone makes of it.
+_CLEAR_OF_NOISE = 3.0
 
 
 class Surface(Protocol):
@@ -65,8 +67,8 @@ class Refinement:
     inliers      share of the given points that lie on observed surface and were not trimmed
     iterations   Levenberg-Marquardt steps tried
     converged    whether it stopped because the step had become small
-    strengths    (6,) ascending: how firmly the shape holds each of :attr:`directions`, as the mean squared
-                 change of the points' distance per squared displacement; a plane has three at 0, a can one
+    strengths    (6,): how firmly the shape holds each of :attr:`directions`, as the mean squared change of the
+                 points' distance per squared displacement; a plane has three at 0, a can one
     directions   (6, 6) rows: unit tangents about the cloud's centre, rotation scaled by the cloud's radius
     reason       why the pose was left alone, or what was held; empty otherwise
     """
@@ -94,15 +96,18 @@ class _Linear:
     distance_m is that of every point, infinite off the observed surface. H and g are means over the
     points used; rotations are scaled by the cloud's radius, so that everything is in metres.
 
-    shape is what H would be without noise in the gradients. A noisy plane's normals wobble, and H takes
-    the wobble for shape; products of the Jacobians of two neighbours, whose noise is independent, do not.
+    strengths (6,) and directions (6, 6), columns, say how firmly the shape holds the pose: H per unit of
+    squared gradient, without the noise of the gradients. A noisy plane's normals wobble, and H takes the
+    wobble for shape; the products of two neighbours' Jacobians, whose noise is independent, do not. What
+    is left may still be chance: a strength that does not stand clear of it is 0.
     """
 
     T: np.ndarray
     distance_m: np.ndarray
     H: np.ndarray
     g: np.ndarray
-    shape: np.ndarray
+    strengths: np.ndarray
+    directions: np.ndarray
     cut_m: float
     used: int
     rms_m: float
@@ -159,11 +164,12 @@ class _Problem:
     def solve(self, T: np.ndarray) -> Refinement:
         config = self.config
         damping, converged, tries = config.damping, False, 0
-        at = self.surface(T)
+        # Wide at first: far from the solution, the few points that hold a direction look like outliers.
+        at = self.surface(T, self.volume.tau_m / 2)
         while tries < config.iterations and at is not None and not converged:
             tries += 1
             T_new = self.moved(at.T, self.clipped(self.step(*self.joint(at), damping)))
-            new = self.surface(T_new)
+            new = self.surface(T_new, self.volume.tau_m / 2 ** (tries + 1))
             gain = self.cost(at, at) - self.cost(new, at) if new is not None else -np.inf
             converged = abs(gain) < config.tolerance
             if gain > 0:
@@ -176,8 +182,11 @@ class _Problem:
 
     # -- the two kinds of residual -----------------------------------------------------------------
 
-    def surface(self, T: np.ndarray) -> _Linear | None:
-        """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points count."""
+    def surface(self, T: np.ndarray, widest_m: float = 0.0) -> _Linear | None:
+        """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points count.
+
+        Trims beyond so many MADs, but nothing within ``widest_m`` nor within Huber's threshold.
+        """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj, self.config.gradient_voxels)
         distance = np.where(valid, value, np.inf)
@@ -186,26 +195,33 @@ class _Problem:
         if len(near) < MIN_POINTS:
             return None
         middle = _median(value[near])
-        sigma = max(_MAD_TO_SIGMA * _median(np.abs(value[near] - middle)), _MAD_FLOOR_M)
-        cut = abs(middle) + self.config.mad_trim * sigma
+        scatter = _MAD_TO_SIGMA * _median(np.abs(value[near] - middle))
+        sigma = max(scatter, _SIGMA_FLOOR_VOXELS * self.volume.voxel_m)
+        cut = max(abs(middle) + self.config.mad_trim * sigma, self.config.huber_m, widest_m)
         used = near[np.abs(value[near]) <= cut]
         r = value[used]
         J = surface_jacobian((p_obj[used] - self.centre) / self.radius, gradient[used])
         Jw = J * np.minimum(1.0, self.config.huber_m / np.maximum(np.abs(r), 1e-12))[:, None]
-        n = len(used)
-        H, g, rms = Jw.T @ J / n, Jw.T @ r / n, float(np.sqrt((r * r).mean()))
-        return _Linear(T, distance, H, g, self.shape(used, J, H), cut, n, rms, sigma)
+        n, rms = len(used), float(np.sqrt((r * r).mean()))
+        return _Linear(T, distance, Jw.T @ J / n, Jw.T @ r / n, *self.shape(used, J), cut, n, rms, sigma)
 
-    def shape(self, used: np.ndarray, J: np.ndarray, H: np.ndarray) -> np.ndarray:
-        """Mean product of neighbours' Jacobians; H itself where the points lie too far apart for pairs."""
+    def shape(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Strengths (6,) ascending and directions (6, 6) columns, as :class:`_Linear` has them."""
+        H = J.T @ J / len(J)
         row = np.full(len(self.p_cam), -1)
         row[used] = np.arange(len(used))
         a, b = row[self.pairs].T
         both = (a >= 0) & (b >= 0)
-        if both.sum() < max(MIN_POINTS, len(used) // 4):
-            return H
-        S = J[a[both]].T @ J[b[both]] / both.sum()
-        return (S + S.T) / 2
+        count = int(both.sum())
+        steepness = max(np.trace(H[3:, 3:]), 1e-12)
+        if count < max(MIN_POINTS, len(used) // 4):
+            strength, direction = np.linalg.eigh(H)  # the points lie too far apart for pairs
+            return strength / steepness, direction
+        S = J[a[both]].T @ J[b[both]] / count
+        strength, direction = np.linalg.eigh((S + S.T) / 2)
+        wobble = np.einsum("ik,ij,jk->k", direction, H, direction) - strength
+        clear = strength > _CLEAR_OF_NOISE * np.abs(wobble) / np.sqrt(count)
+        return np.where(clear, np.maximum(strength, 0.0), 0.0) / steepness, direction
 
     def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of T^-1 p_cam - p_obj in standard deviations, same variables."""
@@ -233,8 +249,7 @@ class _Problem:
 
     def determined(self, at: _Linear) -> np.ndarray:
         """Projection onto the directions that the shape holds."""
-        strength, direction = np.linalg.eigh(at.shape)
-        held = direction[:, strength >= self.config.min_strength]
+        held = at.directions[:, at.strengths >= self.config.min_strength]
         return held @ held.T
 
     def step(self, H: np.ndarray, g: np.ndarray, damping: float) -> np.ndarray:
@@ -270,14 +285,13 @@ class _Problem:
 
     def result(self, at: _Linear, tries: int, converged: bool) -> Refinement:
         """The pose reached, its covariance moved from the cloud's centre to the object's origin."""
-        strengths, directions = np.linalg.eigh(at.shape)
         H, _ = self.joint(at)
         # What nothing determines is known to within the largest step.
         free = np.repeat([self.config.max_step_rad * self.radius, self.config.max_step_m], 3) ** -2.0
         metres = np.repeat([1 / self.radius, 1.0], 3)
         to_origin = se3.adjoint(se3.from_rt(np.eye(3), self.centre)) * metres
         covariance = to_origin @ np.linalg.inv(H + np.diag(free)) @ to_origin.T
-        held = int((strengths < self.config.min_strength).sum())
+        free_directions = int((at.strengths < self.config.min_strength).sum())
         return Refinement(
             at.T,
             (covariance + covariance.T) / 2,
@@ -285,9 +299,9 @@ class _Problem:
             at.used / len(self.p_cam),
             tries,
             converged,
-            np.maximum(strengths, 0.0),
-            directions.T,
-            f"the shape leaves {held} of 6 directions free" if held else "",
+            at.strengths,
+            at.directions.T,
+            f"the shape leaves {free_directions} of 6 directions free" if free_directions else "",
         )
 
 
