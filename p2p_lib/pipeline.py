@@ -95,7 +95,9 @@ class Point2Pose:
                 self._streaming = True
                 return Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
             known = [mask for mask in masks.values() if mask is not None]
-            return self.tracker.track(frame, np.logical_or.reduce(known) if len(known) == len(masks) > 0 else None)
+            search = np.logical_or.reduce(known) if len(known) == len(masks) > 0 else None
+            urgent = any(obj.awaited(masks[name]) for name, obj in self.objects.items())
+            return self.tracker.track(frame, search, urgent)
 
     def _checked(self, name: str, mask: np.ndarray) -> np.ndarray:
         mask = np.asarray(mask)

@@ -77,6 +77,11 @@ class TrackedObject:
         self._recovering = 0  # frames that are still marked recovered
         self._carried = 0  # frames in a row that the surface alone carried
 
+    def awaited(self, mask: np.ndarray | None) -> bool:
+        """Whether the object was hidden or lost until now and its mask says that it is back."""
+        away = len(self.keyframes) > 0 and self._status not in WITH_POSE
+        return away and mask is not None and mask.sum() >= self.config.pipeline.min_mask_px
+
     def step(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> PoseEstimate:
         """This object's estimate at a frame, given its mask and everybody's tracks."""
         view = self._observe(frame, mask, tracks.select(self.map.ids))

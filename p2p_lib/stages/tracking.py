@@ -30,11 +30,12 @@ class PointTracker(Protocol):
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids (N,) int64, increasing."""
 
-    def track(self, frame: Frame, search: np.ndarray | None = None) -> Tracks:
+    def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame; rows sorted by id.
 
-        ``search`` (H, W) bool says where the objects are known to be, if somebody knows; a tracker
-        may use it to spare itself work elsewhere. None means the whole picture.
+        search  (H, W) bool says where the objects are known to be, if somebody knows; a tracker may
+                use it to spare itself work elsewhere. None means the whole picture
+        urgent  the caller waits for invisible points to come back: worth more work in this frame
         """
 
     def drop(self, ids: np.ndarray) -> None:
@@ -91,14 +92,14 @@ class LkTracker:
         self._descriptors = np.concatenate([self._descriptors, descriptors])
         return ids
 
-    def track(self, frame: Frame, search: np.ndarray | None = None) -> Tracks:
+    def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame."""
         if self._gray is None:
             raise BadInput("tracker", "a frame to track before any start", "start(frame) first")
         previous, self._gray = self._gray, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         self._frames += 1
         self._follow(previous)
-        if self._frames % self.config.redetect_every == 0:
+        if urgent or self._frames % self.config.redetect_every == 0:
             self._redetect(search)
         self._hidden_for = np.where(self._visible, 0, self._hidden_for + 1)
         if self.config.forget_after:
