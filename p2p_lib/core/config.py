@@ -75,7 +75,7 @@ class PipelineConfig(_Checked):
 
 @dataclass(frozen=True)
 class TrackingConfig(_Checked):
-    window_px: int = _p(15, "side of the Lucas-Kanade window", "px", low=5, high=63)
+    window_px: int = _p(11, "side of the Lucas-Kanade window", "px", low=5, high=63)
     levels: int = _p(3, "pyramid levels above full resolution", low=0, high=6)
     forward_backward_px: float = _p(0.7, "largest forward-backward error of a visible point", "px", low=0.05)
     redetect_every: int = _p(5, "search the whole frame for invisible points every n frames", "frames", low=1)

@@ -49,7 +49,7 @@ class CornerDetector:
 
     def __init__(self, config: SamplingConfig, rng: np.random.Generator | None = None):
         self._limit = config.candidates
-        self._sift = cv2.SIFT_create(config.candidates, contrastThreshold=0.01)
+        self._sift = cv2.SIFT_create(config.candidates, contrastThreshold=0.01, enable_precise_upscale=True)
 
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Candidates in the mask, best first."""

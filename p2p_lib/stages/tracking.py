@@ -56,7 +56,7 @@ class LkTracker:
 
     def __init__(self, config: TrackingConfig, rng: np.random.Generator | None = None):
         self.config = config
-        self._sift = cv2.SIFT_create(config.features, contrastThreshold=config.contrast)
+        self._sift = cv2.SIFT_create(config.features, contrastThreshold=config.contrast, enable_precise_upscale=True)
         self._gray: np.ndarray | None = None
         self._clear()
 
