@@ -155,8 +155,8 @@ class RefinementConfig(_Checked):
     huber_m: float = _p(0.003, "Huber threshold of the surface residual", "m", low=1e-5)
     max_step_m: float = _p(0.02, "largest translation of one step", "m", "release", low=0)
     max_step_rad: float = _p(0.2, "largest rotation of one step", "rad", "release", low=0)
-    tolerance: float = _p(0.5, "a smaller gain ends the iterations", "squared standard deviations", low=0)
-    min_strength: float = _p(0.003, "directions that the shape holds less firmly are not moved by it; 0 = all", low=0)
+    tolerance: float = _p(0.2, "a smaller gain ends the iterations", "squared standard deviations", low=0)
+    min_strength: float = _p(0.0005, "directions that the shape holds less firmly are not moved by it; 0 = all", low=0)
     independent_points: int = _p(30, "what the correlated depth points are worth together", "points", low=1)
     keypoint_weight: float = _p(1.0, "weight of keypoint residuals beside the surface; 0 = surface alone", low=0)
 

@@ -8,7 +8,7 @@ out again and put back where the factor graph has moved its keyframe.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 
 #: The grid's sides are multiples of this many voxels, so that it grows seldom.
 BLOCK = 8
-#: Voxels handled at once while fusing: few enough for the temporaries to stay in the processor's cache.
-_SLAB = 1 << 17
+#: Voxels handled at once while fusing. On a CPU few enough for the temporaries to stay in its cache, and for
+#: torch not to share them among threads: on two busy cores, its threads wait for each other far longer than they work.
+_SLAB = {"cpu": 1 << 15, "cuda": 1 << 22}
 #: Depth pixels looked at to decide where the object is.
 _REGION_POINTS = 4000
 #: A jump in sorted depth that separates the object from whatever else the mask caught.
@@ -47,7 +48,7 @@ class _View:
 
     depth_m   (h+2, w+2) float32 with a border; -inf where nothing is to be fused
     inside    (h+2, w+2) bool: measured and inside the mask; depth elsewhere only carves
-    rgbw      (h+2, w+2, 4) uint8: colour and 1
+    rgbw      (4, h+2, w+2) uint8: colour and 1
     corner    column and row of the cut's first inner pixel
     lo, hi    voxel box [lo, hi) in lattice indices; fixed when first fused, so that taking out mirrors putting in
     """
@@ -67,6 +68,17 @@ class _View:
         """(3,) middle of the cut's pixels at the median depth."""
         (h, w), (left, top) = self.inside.shape, self.corner
         return self.camera.unproject(np.array([left + w / 2, top + h / 2]), np.median(self.depth_m[self.inside]))
+
+
+def _slabs(lo: np.ndarray, hi: np.ndarray, voxels: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Box [lo, hi) cut across x, and across y where a sheet is too large, into boxes of about so many voxels."""
+    nx, ny, nz = (hi - lo).tolist()
+    rows = min(ny, max(1, voxels // nz))
+    sheets = max(1, voxels // (rows * nz)) if rows == ny else 1
+    for x in range(0, nx, sheets):
+        for y in range(0, ny, rows):
+            end = [min(x + sheets, nx), min(y + rows, ny), nz]
+            yield lo + [x, y, 0], lo + end
 
 
 def _clear_of(mask: np.ndarray) -> np.ndarray:
@@ -102,7 +114,7 @@ class TsdfVolume:
         if shape is not None and np.prod(shape) > config.max_voxels:
             raise BadInput("tsdf shape", "x".join(map(str, shape)), f"at most {config.max_voxels} voxels")
         self._views: dict[int, _View] = {}
-        self._empty = True
+        self._total = 0.0  # of all weights
         self.lo = np.zeros(3, int)
         self._allocate(self.lo, np.zeros(3, int) if shape is None else np.asarray(shape, int))
 
@@ -116,7 +128,7 @@ class TsdfVolume:
     @property
     def empty(self) -> bool:
         """Whether no voxel has been observed."""
-        return self._empty
+        return self._total < _NO_WEIGHT
 
     @property
     def origin_m(self) -> np.ndarray:
@@ -142,7 +154,7 @@ class TsdfVolume:
         Averaged over the observations that met the voxel inside the truncation band; those that looked
         past it saw the colour of something else.
         """
-        return self._colour.cpu().numpy().copy()
+        return np.moveaxis(self._colour.cpu().numpy(), 0, -1).copy()
 
     def _allocate(self, lo: np.ndarray, shape: np.ndarray) -> None:
         """Fresh arrays over lattice box [lo, lo + shape), with what the old ones held copied in."""
@@ -154,12 +166,12 @@ class TsdfVolume:
         size = tuple(int(n) for n in shape)
         self._sum = torch.zeros(size, device=self.device)
         self._weight = torch.zeros(size, device=self.device)
-        self._colour = torch.zeros((*size, 4), device=self.device)
+        self._colour = torch.zeros((4, *size), device=self.device)
         # What queries read: kept up to date voxel by voxel while fusing.
         self._value = torch.full(size, float("nan"), device=self.device)
         for new, was in zip((self._sum, self._weight, self._colour, self._value), old, strict=False):
-            box = tuple(slice(int(a), int(a) + n) for a, n in zip(start, was.shape[:3], strict=True))
-            new[box] = was
+            box = (slice(int(a), int(a) + n) for a, n in zip(start, was.shape[-3:], strict=True))
+            new[..., *box] = was
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         import torch
@@ -270,8 +282,8 @@ class TsdfVolume:
         inside = np.pad(mask & measured, 1)
         used = inside[1:-1, 1:-1] | (measured & _clear_of(mask) if self.config.carve else False)
         depth = np.pad(np.where(used, depth, -np.inf), 1, constant_values=-np.inf)
-        rgbw = np.ones((*inside.shape, 4), np.uint8)
-        rgbw[1:-1, 1:-1, :3] = rgb[cut]
+        rgbw = np.ones((4, *inside.shape), np.uint8)
+        rgbw[:3, 1:-1, 1:-1] = np.moveaxis(np.asarray(rgb)[cut], -1, 0)
         return _View(depth, inside, rgbw, (left, top), camera, T_cam_obj, float(weight), self.lo, self.lo)
 
     def _window(self, view: _View) -> tuple[int, int, int, int]:
@@ -358,12 +370,9 @@ class TsdfVolume:
             return 0
         depth = self._tensor(view.depth_m).view(-1)
         gate = self._tensor(np.where(view.inside, -self.tau_m, self.tau_m).astype(np.float32)).view(-1)
-        rgbw = self._tensor(view.rgbw).view(-1, 4)
-        step = max(1, _SLAB // int(size[1] * size[2]))
+        rgbw = self._tensor(view.rgbw.astype(np.float32)).view(4, -1)
         touched = 0
-        for x in range(int(view.lo[0]), int(view.hi[0]), step):
-            lo = np.array([x, *view.lo[1:]])
-            hi = np.array([min(x + step, view.hi[0]), *view.hi[1:]])
+        for lo, hi in _slabs(view.lo, view.hi, _SLAB[self.device.type]):
             pixel, z = self._project(view, lo, hi)
             d = depth.index_select(0, pixel).sub_(z)
             least = gate.index_select(0, pixel) if self.config.carve else -self.tau_m
@@ -372,13 +381,11 @@ class TsdfVolume:
             at = self._flat_index(lo, hi).index_select(0, hit)
             self._accumulate(at, phi, weight)
             near = (phi < 1).nonzero().view(-1)
-            seen = rgbw.index_select(0, pixel.index_select(0, hit.index_select(0, near))).float()
-            self._tint(at.index_select(0, near), seen, weight)
+            at, pixel = at.index_select(0, near), pixel.index_select(0, hit.index_select(0, near))
+            for total, seen in zip(self._colour.view(4, -1), rgbw, strict=True):
+                total.index_add_(0, at, seen.index_select(0, pixel), alpha=weight)
             touched += len(hit)
-        if weight < 0:
-            self._empty = not bool((self._weight > 0).any())
-        elif touched:
-            self._empty = False
+        self._total += weight * touched
         return touched
 
     def _project(self, view: _View, lo: np.ndarray, hi: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
@@ -400,12 +407,12 @@ class TsdfVolume:
 
         u, v, z = affine(0), affine(1), affine(2)
         behind = z <= 1e-6
-        u.div_(z).round_().clamp_(0, w - 1)
-        v.div_(z).round_().clamp_(0, h - 1)
+        # Half a pixel more, cut off, is the nearest pixel; torch's own rounding is shared among threads.
+        u = u.div_(z).clamp_(0, w - 1).add_(0.5).int()
+        v = v.div_(z).clamp_(0, h - 1).add_(0.5).int()
         pixel = v.mul_(w).add_(u)
-        # A NaN (0/0 at the camera's centre) or a voxel behind it goes to the border as well.
-        pixel = pixel.masked_fill_(behind, 0.0) if bool(behind.any()) else pixel
-        return pixel.int().view(-1), z.view(-1)
+        # A voxel behind the camera goes to the border as well.
+        return (pixel.masked_fill_(behind, 0) if bool(behind.any()) else pixel).view(-1), z.view(-1)
 
     def _flat_index(self, lo: np.ndarray, hi: np.ndarray) -> torch.Tensor:
         """Position in the flattened arrays of every voxel in lattice box [lo, hi)."""
@@ -428,9 +435,6 @@ class TsdfVolume:
         count.index_copy_(0, at, new_weight)
         # 0 / 0 is NaN, which is what an unobserved voxel holds.
         self._value.view(-1).index_copy_(0, at, new_sum.div_(new_weight))
-
-    def _tint(self, at: torch.Tensor, rgbw: torch.Tensor, weight: float) -> None:
-        self._colour.view(-1, 4).index_add_(0, at, rgbw, alpha=weight)
 
     # -- asking --------------------------------------------------------------------------------
 
