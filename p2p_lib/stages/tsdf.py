@@ -77,8 +77,8 @@ def _slabs(lo: np.ndarray, hi: np.ndarray, voxels: int) -> Iterator[tuple[np.nda
     sheets = max(1, voxels // (rows * nz)) if rows == ny else 1
     for x in range(0, nx, sheets):
         for y in range(0, ny, rows):
-            end = [min(x + sheets, nx), min(y + rows, ny), nz]
-            yield lo + [x, y, 0], lo + end
+            start = np.array([x, y, 0])
+            yield lo + start, np.minimum(lo + start + np.array([sheets, rows, nz]), hi)
 
 
 def _clear_of(mask: np.ndarray) -> np.ndarray:
