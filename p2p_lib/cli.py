@@ -58,9 +58,12 @@ def _run(a: argparse.Namespace) -> None:
         models=_pairs("--models", a.models, "NAME=PATH"),
         progress=not a.quiet,
     )
+    print("\n".join(result.summary))
     if result.evaluation is not None:
         print(result.evaluation.as_table())
-    print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
+        print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
+    else:
+        print(f"Results in {a.out}. Not scored: {result.not_scored}")
     if result.interrupted:
         raise KeyboardInterrupt
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,18 +16,26 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import PoseEstimate
 from p2p_lib.data import sequence as sequences
 from p2p_lib.data.models import find_models, given_models
-from p2p_lib.data.runs import RunWriter, load_run
-from p2p_lib.evaluation.protocol import Evaluation, evaluate
+from p2p_lib.data.runs import Run, RunWriter, load_run
+from p2p_lib.evaluation.protocol import Evaluation, evaluate, rate
 from p2p_lib.pipeline import Point2Pose
+from p2p_lib.stages.mesh import save as save_mesh
 from p2p_lib.stages.tracking import DEFAULT_TRACKER
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """Where the results are; the evaluation where the sequence has truth and models; whether Ctrl-C ended it."""
+    """Where the results are, and what to say of them.
+
+    evaluation   where the sequence has truth and models; else ``not_scored`` says why there is none
+    summary      a line on the frames done, then one per object: frames with a pose, and what kept it from the others
+    interrupted  whether Ctrl-C ended the run
+    """
 
     path: Path
     evaluation: Evaluation | None
+    not_scored: str
+    summary: tuple[str, ...]
     interrupted: bool
 
 
@@ -102,7 +111,15 @@ def run(
         except KeyboardInterrupt:
             interrupted = True
             writer.info["stopped_by"] = "KeyboardInterrupt"
-    return RunResult(Path(out), _evaluation(out), interrupted)
+    if not writer.info["frames"]:
+        return RunResult(Path(out), None, "no frame was finished", (f"0 of {len(frames)} frames",), interrupted)
+    _save_meshes(method, Path(out))
+    done = load_run(out)
+    try:
+        evaluation, not_scored = evaluate(done), ""
+    except MissingData as error:
+        evaluation, not_scored = None, str(error)
+    return RunResult(Path(out), evaluation, not_scored, _summary(done, len(frames)), interrupted)
 
 
 def evaluate_run(
@@ -112,11 +129,28 @@ def evaluate_run(
     return evaluate(load_run(out), models, align, min_visible_px)
 
 
-def _evaluation(out: str | Path) -> Evaluation | None:
-    try:
-        return evaluate_run(out)
-    except MissingData:  # no truth or no models: nothing to say
-        return None
+def _save_meshes(method: Point2Pose, out: Path) -> None:
+    """``meshes/<object>.ply``: each object's surface in its own frame; nothing of one that was never seen."""
+    for name, obj in method.objects.items():
+        if obj.surface is None or obj.surface.empty:
+            continue
+        mesh = obj.surface.mesh()
+        if len(mesh.faces):
+            save_mesh(mesh, out / "meshes" / f"{name}.ply")
+
+
+def _summary(run: Run, wanted: int) -> tuple[str, ...]:
+    """How far the run came; per object how many frames have a pose and what mostly kept it from the others."""
+    count = len(next(iter(run.objects.values())))
+    hz, _ = rate(run.timings)
+    lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
+    for name, obj in run.objects.items():
+        without = Counter(
+            f"{s}: {r}" for s, r in zip(obj.status[~obj.has_pose], obj.reason[~obj.has_pose], strict=True)
+        )
+        most = f"; without one mostly {without.most_common(1)[0][0]}" if without else ""
+        lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{most}")
+    return tuple(lines)
 
 
 def _mask_folder(masks: str) -> str | None:

@@ -293,9 +293,16 @@ def from_toml(path: str | Path, base: Config | None = None) -> Config:
 
 
 def _unknown(what: str, key: str, known: Any) -> BadInput:
-    near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.4)
-    expected = f"one of {', '.join(known)}" if len(known) < 8 else "a stage.key of the configuration"
-    return BadInput(what, repr(key), expected, f"Did you mean {near[0]!r}?" if near else "")
+    stage, _, name = str(key).partition(".")
+    if name and stage in _STAGES:
+        known = [f.name for f in fields(getattr(Config, stage))]
+        expected = f"a key of [{stage}]: {', '.join(known)}"
+    else:
+        name = str(key)
+        expected = f"one of {', '.join(known)}" if len(known) < 8 else "a stage.key of the configuration"
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    prefix = f"{stage}." if stage in _STAGES and name != str(key) else ""
+    return BadInput(what, repr(key), expected, f"Did you mean {prefix + near[0]!r}?" if near else "")
 
 
 def _whole_number(name: str, value: Any) -> int:

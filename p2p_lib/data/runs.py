@@ -6,6 +6,7 @@
     run.json              what ran on what: sequence, objects, tracker, masks, preset, seed, versions, commit
     poses/<object>.txt    TUM: time_s tx ty tz qx qy qz qw of T_cam_obj; frames without a pose are left out
     poses.npz             everything of every frame, and the truth where the sequence has it
+    meshes/<object>.ply   the reconstructed surface in the object frame, vertex colours (written at the end)
     models.npz            the models' points, so that a run can be scored by itself
     timings.csv           milliseconds of every frame and stage
 """
@@ -353,7 +354,7 @@ def _clear(out: Path) -> None:
         raise BadInput(str(out), "a file", "a folder for the results")
     (out / "poses").mkdir(parents=True, exist_ok=True)
     old = [out / name for name in ("run.json", "config.toml", "poses.npz", "models.npz", "timings.csv")]
-    for path in [*old, *(out / "poses").glob("*.txt")]:
+    for path in [*old, *(out / "poses").glob("*.txt"), *(out / "meshes").glob("*.ply")]:
         path.unlink(missing_ok=True)
 
 
