@@ -14,7 +14,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
 from p2p_lib.stages.sampling import DEFAULT_DETECTOR, make_detector
@@ -42,12 +42,17 @@ class Point2Pose:
         self._first_masks: dict[str, np.ndarray] = {}
         self._streaming = False
 
-    def add_object(self, name: str, mask: np.ndarray | None = None) -> None:
+    def add_object(self, name: str, mask: np.ndarray | None = None, clicks: np.ndarray | None = None) -> None:
         """Follow one more object from the next frame on.
 
-        mask  (H, W) bool: where it is in the next frame. Without one the object is started by the
-              first mask that ``step`` gets for it.
+        mask    (H, W) bool: where it is in the next frame. Without one the object is started by the
+                first mask that ``step`` gets for it.
+        clicks  (N, 2) pixels on the object in the next frame, for a segmenter. This version has none:
+                raises :class:`MissingBackend`.
         """
+        if clicks is not None:
+            fix = "Give add_object(name, mask=...), or masks to step."
+            raise MissingBackend("segmenter", "clicks need one, and this version has none", fix)
         if name in self.objects:
             raise BadInput("add_object", repr(name), "a name not in use", f"In use: {', '.join(self.objects)}.")
         if mask is not None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.data.synthetic import shapes
 from p2p_lib.data.synthetic.noise import Sensor, measured_colour, measured_depth
@@ -438,3 +438,10 @@ def test_time_is_told_stage_by_stage():
     ms = method.stopwatch.last_ms
     assert {"tracking", "registration", "refinement", "map", "total"} <= set(ms)
     assert ms["total"] >= max(v for k, v in ms.items() if k != "total") > 0
+
+
+def test_clicks_ask_for_a_segmenter_and_leave_no_object_behind():
+    method = Point2Pose(Camera(600, 600, 320, 240, 640, 480))
+    with pytest.raises(MissingBackend, match="clicks need one.*mask="):
+        method.add_object("left", clicks=np.array([[10, 10]]))
+    assert not method.objects
