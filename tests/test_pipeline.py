@@ -442,6 +442,6 @@ def test_time_is_told_stage_by_stage():
 
 def test_clicks_ask_for_a_segmenter_and_leave_no_object_behind():
     method = Point2Pose(Camera(600, 600, 320, 240, 640, 480))
-    with pytest.raises(MissingBackend, match="clicks need one.*mask="):
+    with pytest.raises(MissingBackend, match=r"clicks need one.*mask="):
         method.add_object("left", clicks=np.array([[10, 10]]))
     assert not method.objects
