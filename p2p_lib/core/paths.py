@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import os
+import sysconfig
 from pathlib import Path
 
 #: The checkout this package runs from (notebooks/, data_manifests/, figures/ and out/ are beside it).
 PROJECT = Path(__file__).resolve().parents[2]
+
+#: The file of ``data_manifests/`` that holds the paper's numbers instead of a dataset.
+PAPER_REPORTED = "paper_reported.json"
+
+
+def manifest_dir() -> Path:
+    """``data_manifests/`` of the checkout; where there is none, the copy that the wheel installs."""
+    beside = PROJECT / "data_manifests"
+    return beside if beside.is_dir() else Path(sysconfig.get_path("data")) / "share" / "p2p_lib" / "data_manifests"
 
 
 def cache_dir() -> Path:
