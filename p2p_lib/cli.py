@@ -1,4 +1,4 @@
-"""The command line: ``p2p run | eval | notebooks | doctor``. Thin: every command is one call into the library."""
+"""The command line ``p2p``. Thin: every command is one call into the library."""
 
 from __future__ import annotations
 
@@ -75,6 +75,23 @@ def _eval(a: argparse.Namespace) -> None:
     print(json.dumps(evaluation.as_dict()) if a.json else evaluation.as_table())
 
 
+def _eval_tracks(a: argparse.Namespace) -> None:
+    from p2p_lib.run import evaluate_tracker
+
+    score = evaluate_tracker(
+        a.sequence,
+        a.tracker,
+        seed=a.seed,
+        models=_pairs("--models", a.models, "NAME=PATH"),
+        count=a.queries,
+        search=a.search == "masks",
+        format=a.format,
+        depth_scale=a.depth_scale,
+        settings=_pairs("--set", a.set, "stage.key=value"),
+    )
+    print(json.dumps(score.as_dict()) if a.json else score.as_table())
+
+
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.notebooks import run_notebooks
 
@@ -147,6 +164,20 @@ def _parser() -> argparse.ArgumentParser:
         help="object frame fixed at the first scored frame (default), or by one constant over all",
     )
     p.add_argument("--min-visible-px", type=int, default=300, metavar="N", help="smaller masks are not scored")
+
+    p = _command(commands, "eval-tracks", _eval_tracks, "score a 2D point tracker against true tracks")
+    p.add_argument("sequence", metavar="SEQ", help="a folder with true poses, or synthetic/NAME (embedded)")
+    p.add_argument("--tracker", default=None, metavar="NAME", help="2D point tracker (default: the embedded one)")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="of the queries and the tracker (default 0)")
+    p.add_argument("--queries", type=int, default=256, metavar="N", help="points to follow (default 256)")
+    p.add_argument(
+        "--search", choices=("picture", "masks"), default="picture", help="where invisible points are sought"
+    )
+    p.add_argument("--models", nargs="+", action="extend", metavar="NAME=PATH", help="meshes; else by measured depth")
+    p.add_argument("--format", help="layout: ycbineoat, ycbmultitrack, folder (default: recognised)")
+    p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
+    p.add_argument("--set", action="append", metavar="STAGE.KEY=VALUE", help="change one parameter; repeatable")
+    p.add_argument("--json", action="store_true", help="one JSON object instead of a table")
 
     p = _command(commands, "notebooks", _notebooks, "run the notebooks headless and collect their results")
     p.add_argument("--profile", choices=("quick", "full"), default="quick", help="size of the job (default quick)")

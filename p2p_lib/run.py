@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
+from p2p_lib.backends.registry import make_tracker
 from p2p_lib.core import config as configuration
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
@@ -18,6 +20,7 @@ from p2p_lib.data import sequence as sequences
 from p2p_lib.data.models import find_models, given_models
 from p2p_lib.data.runs import Run, RunWriter, load_run
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, rate
+from p2p_lib.evaluation.tracker_score import TrackerScore, score_tracker
 from p2p_lib.pipeline import Point2Pose
 from p2p_lib.stages.mesh import save as save_mesh
 from p2p_lib.stages.tracking import DEFAULT_TRACKER
@@ -127,6 +130,28 @@ def evaluate_run(
 ) -> Evaluation:
     """Score a run folder; what ``p2p eval`` prints."""
     return evaluate(load_run(out), models, align, min_visible_px)
+
+
+def evaluate_tracker(
+    sequence: str | Path,
+    tracker: str | None = None,
+    *,
+    seed: int = 0,
+    models: Mapping[str, str | Path] | None = None,
+    count: int = 256,
+    search: bool = False,
+    format: str | None = None,
+    depth_scale: float | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> TrackerScore:
+    """Score a 2D tracker against true tracks; what ``p2p eval-tracks`` prints.
+
+    The synthetic sequence is always that of seed 0; ``seed`` draws the queries and serves the tracker.
+    """
+    config = make_config(settings=settings, seed=seed)
+    opened = sequences.open_sequence(sequence, format, depth_scale)
+    method = make_tracker(tracker or DEFAULT_TRACKER, config.tracking, np.random.default_rng(config.seed))
+    return score_tracker(opened, method, config.seed, models, count, search)
 
 
 def _save_meshes(method: Point2Pose, out: Path) -> None:

@@ -16,21 +16,23 @@ from p2p_lib.data.sequence import Sequence
 #: What a model's folder is searched for, best first: the points that YCBInEOAT scores with, then meshes.
 PREFERRED = ("points.xyz", "textured_simple.obj", "textured.obj", "*.xyz", "*.obj", "*.ply")
 SUFFIXES = (".xyz", ".obj", ".ply")
+#: The same for a surface with faces.
+MESHES = ("textured_simple.obj", "textured.obj", "*.obj", "*.ply")
 # No object that a camera at arm's length tracks is larger: such a model is in millimetres.
 LARGEST_M = 10.0
 
 
-def find_models(sequence: Sequence) -> dict[str, Path]:
+def find_models(sequence: Sequence, preferred: tuple[str, ...] = PREFERRED) -> dict[str, Path]:
     """Object to model file, for those objects that have one in the sequence's ``models/<obj>/``."""
     if sequence.path is None:
         return {}
-    found = {name: model_in(sequence.path / "models" / name) for name in sequence.objects}
+    found = {name: model_in(sequence.path / "models" / name, preferred) for name in sequence.objects}
     return {name: path for name, path in found.items() if path is not None}
 
 
-def model_in(folder: Path) -> Path | None:
+def model_in(folder: Path, preferred: tuple[str, ...] = PREFERRED) -> Path | None:
     """The model file of a folder, None where there is none."""
-    return next((p for pattern in PREFERRED for p in sorted(folder.glob(pattern))), None)
+    return next((p for pattern in preferred for p in sorted(folder.glob(pattern))), None)
 
 
 def parse_models(assignments: Iterable[str], objects: Iterable[str]) -> dict[str, Path]:
@@ -44,7 +46,9 @@ def parse_models(assignments: Iterable[str], objects: Iterable[str]) -> dict[str
     return given_models(given, objects)
 
 
-def given_models(given: Mapping[str, str | Path], objects: Iterable[str]) -> dict[str, Path]:
+def given_models(
+    given: Mapping[str, str | Path], objects: Iterable[str], preferred: tuple[str, ...] = PREFERRED
+) -> dict[str, Path]:
     """Object to model file of what was given; a path may be a model's folder.
 
     Raises :class:`BadInput` for a name that is none of ``objects``, :class:`MissingData` for a file not there.
@@ -55,7 +59,7 @@ def given_models(given: Mapping[str, str | Path], objects: Iterable[str]) -> dic
             listed = ", ".join(known) or "there are none"
             raise BadInput("model", f"the name {name!r}", f"one of the objects: {listed}")
         path = Path(where).expanduser()
-        file = model_in(path) if path.is_dir() else path
+        file = model_in(path, preferred) if path.is_dir() else path
         if file is None or not file.is_file():
             raise MissingData(str(path), f"no such model, expected a file {', '.join(SUFFIXES)} (or a folder with one)")
         models[name] = file
@@ -86,6 +90,17 @@ def load_points(path: str | Path) -> np.ndarray:
         fix = "Is it in millimetres? Divide by 1000."
         raise BadInput(str(path), f"a model {size:.4g} m large", "vertices in metres", fix)
     return points
+
+
+def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) in metres and faces (F, 3) of a mesh file .obj or .ply; raises as :func:`load_points`."""
+    load_points(path)  # whatever is wrong with the file is said there
+    import trimesh
+
+    mesh = trimesh.load(Path(path), process=False, force="mesh", skip_materials=True)
+    if not len(getattr(mesh, "faces", ())):
+        raise BadInput(str(path), "a model without faces", "a mesh", "Give a mesh, or none to go by the depth.")
+    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
 
 
 def _read_xyz(path: Path) -> np.ndarray:

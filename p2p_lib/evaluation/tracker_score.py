@@ -1,0 +1,141 @@
+"""Measuring a 2D tracker on a sequence with truth: what ``p2p eval-tracks`` and the notebooks call."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.data.models import MESHES, find_models, given_models
+from p2p_lib.data.sequence import Sequence
+from p2p_lib.evaluation.point_tracks import (
+    THRESHOLDS_PX,
+    Redetections,
+    TapVid,
+    after_query,
+    redetections,
+    tapvid,
+)
+from p2p_lib.evaluation.true_tracks import Queries, TrueScene, TrueTracks, draw_queries, true_tracks
+from p2p_lib.stages.tracking import PointTracker
+
+
+@dataclass(frozen=True, eq=False)
+class TrackRun:
+    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms (T,).
+
+    Before its query a point is invisible and NaN. cpu_ms is the processor time of all threads in a frame,
+    new queries included; NaN in frames before the first query.
+    """
+
+    uv_px: np.ndarray
+    visible: np.ndarray
+    uncertainty: np.ndarray
+    cpu_ms: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerScore:
+    """A tracker's scores on one sequence, with what they were measured on."""
+
+    tapvid: TapVid
+    redetections: Redetections
+    truth: TrueTracks
+    run: TrackRun
+    queries: Queries
+    info: dict[str, Any]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as ``p2p eval-tracks --json`` prints them; shares in [0, 1], cost in milliseconds."""
+        scores, cost = asdict(self.tapvid), self.run.cpu_ms[np.isfinite(self.run.cpu_ms)]
+        for name in ("jaccard", "within"):
+            scores[name] = {f"{px}_px": value for px, value in zip(THRESHOLDS_PX, scores[name], strict=True)}
+        cpu_ms = {"mean": float(cost.mean()), "p95": float(np.percentile(cost, 95))} if len(cost) else {}
+        return {**self.info, **scores, "redetection": self.redetections.as_dict(), "cpu_ms": cpu_ms}
+
+    def as_table(self) -> str:
+        """The same for people."""
+        plain = self.as_dict()
+        again, cost = plain["redetection"], plain["cpu_ms"]
+        same = f"of the {again['returns_same_view']} within 40 degrees of a known view"
+        lines = (
+            f"{plain['tracker']} on {plain['sequence']}: {plain['queries']} queries, seed {plain['seed']}",
+            f"AJ {plain['aj']:.3f}   delta_avg {plain['delta_avg']:.3f}   OA {plain['oa']:.3f}",
+            f"found again after {again['returns']} returns: {again['found']:.3f}; {same}: {again['found_same_view']:.3f}",
+            f"CPU per frame: mean {cost['mean']:.1f} ms, p95 {cost['p95']:.1f} ms",
+            f"truth from {plain['truth']}",
+        )
+        return "\n".join(lines)
+
+
+def score_tracker(
+    sequence: Sequence,
+    tracker: PointTracker,
+    seed: int = 0,
+    models: Mapping[str, str | Path] | None = None,
+    count: int = 256,
+    search: bool = False,
+) -> TrackerScore:
+    """Draw queries, find their true tracks, run the tracker over them, and score it.
+
+    models  object to mesh, besides those in the sequence's ``models/``; the others go by measured depth
+    search  tell the tracker where the objects' masks are, as the pipeline does
+    """
+    meshes = find_models(sequence, MESHES) | given_models(models or {}, sequence.objects, MESHES)
+    scene = TrueScene(sequence, meshes)
+    queries = draw_queries(scene, np.random.default_rng(seed), count)
+    truth = true_tracks(scene, queries.points)
+    run = run_tracker(tracker, sequence, queries, search)
+    shape = sequence.camera.height, sequence.camera.width
+    scored = after_query(queries.frame, len(sequence)) & truth.known
+    info = {
+        "sequence": sequence.name,
+        "tracker": tracker.name,
+        "seed": seed,
+        "queries": len(queries),
+        "frames": len(sequence),
+        "search": "masks" if search else "whole picture",
+        "truth": ", ".join(f"{name}: {'mesh' if name in scene.by_mesh else 'depth'}" for name in scene.objects),
+    }
+    return TrackerScore(
+        tapvid(truth.uv_px, truth.visible, run.uv_px, run.visible, scored, shape),
+        redetections(truth.uv_px, truth.visible, truth.known, truth.view, run.uv_px, run.visible, queries.frame),
+        truth,
+        run,
+        queries,
+        info,
+    )
+
+
+def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, search: bool = False) -> TrackRun:
+    """Stream the sequence through the tracker in one pass, each query added at its frame.
+
+    A tracker that answers late is asked for the frame its tracks belong to; the last frames of the stream,
+    for which no answer comes, stay invisible.
+    """
+    total, n = len(sequence), len(queries)
+    uv, visible = np.full((total, n, 2), np.nan), np.zeros((total, n), bool)
+    uncertainty, cpu_ms = np.ones((total, n)), np.full(total, np.nan)
+    ids = np.full(n, -1)
+    for i in range(int(queries.frame.min()), total):
+        frame = sequence.frame(i)
+        where = np.logical_or.reduce([np.zeros(frame.shape, bool), *(sequence.masks(i) or {}).values()])
+        start, tracks = time.process_time(), None
+        if i == queries.frame.min():
+            tracker.start(frame)
+        else:
+            tracks = tracker.track(frame, where if search else None)
+        new = np.flatnonzero(queries.frame == i)
+        if len(new):
+            ids[new] = tracker.add(queries.uv_px[new])
+        cpu_ms[i] = 1e3 * (time.process_time() - start)
+        if tracks is not None:
+            of = i - tracker.latency_frames
+            rows = np.flatnonzero(np.isin(ids, tracks.ids) & (queries.frame < of))
+            told = tracks.select(ids[rows])
+            uv[of, rows], visible[of, rows], uncertainty[of, rows] = told.uv_px, told.visible, told.uncertainty
+    return TrackRun(uv, visible, uncertainty, cpu_ms)

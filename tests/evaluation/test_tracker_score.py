@@ -1,0 +1,127 @@
+"""The runner: who is asked what and when, which frames count, and what a perfect and a late tracker score."""
+
+import json
+
+import numpy as np
+import pytest
+
+from p2p_lib import cli
+from p2p_lib.backends.registry import TRACKERS, make_tracker
+from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.types import Tracks
+from p2p_lib.data.models import MESHES, find_models
+from p2p_lib.data.sequence import open_sequence
+from p2p_lib.evaluation.tracker_score import run_tracker, score_tracker
+from p2p_lib.evaluation.true_tracks import TrueScene, draw_queries
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    return open_sequence("synthetic/crossing")
+
+
+class Recorder:
+    """A tracker that keeps every query where it was, and a diary."""
+
+    name = "recorder"
+
+    def __init__(self, late=0):
+        self.latency_frames, self.diary = late, []
+        self._uv, self._frames = np.zeros((0, 2)), 0
+
+    def start(self, frame):
+        self.diary.append(("start", frame.index))
+
+    def add(self, uv_px):
+        self.diary.append(("add", len(uv_px)))
+        ids = len(self._uv) + np.arange(len(uv_px))
+        self._uv = np.concatenate([self._uv, uv_px])
+        return ids
+
+    def track(self, frame, search=None, urgent=False):
+        self.diary.append(("track", frame.index, None if search is None else int(search.sum())))
+        n = len(self._uv)
+        return Tracks(np.arange(n), self._uv + frame.index, np.ones(n, bool), np.zeros(n))
+
+
+@pytest.fixture(scope="module")
+def queries(crossing):
+    return draw_queries(TrueScene(crossing, find_models(crossing, MESHES)), np.random.default_rng(0), 16)
+
+
+def test_all_queries_in_one_pass_each_at_its_frame(crossing, queries):
+    tracker = Recorder()
+    run = run_tracker(tracker, crossing, queries)
+    adds = [k for k, entry in enumerate(tracker.diary) if entry[0] == "add"]
+    assert [tracker.diary[k] for k in adds] == [("add", 4)] * 4
+    assert [tracker.diary[k - 1][:2] for k in adds] == [("start", 0), ("track", 75), ("track", 150), ("track", 225)]
+    assert [entry[2] for entry in tracker.diary if entry[0] == "track"] == [None] * 299
+    for k, first in enumerate(queries.frame):
+        assert not run.visible[: first + 1, k].any() and run.visible[first + 1 :, k].all()
+        np.testing.assert_array_equal(run.uv_px[first + 1, k], queries.uv_px[k] + first + 1)
+        assert np.isnan(run.uv_px[: first + 1, k]).all()
+    assert np.isfinite(run.cpu_ms).all()
+
+
+def test_search_is_the_union_of_the_masks(crossing, queries):
+    tracker = Recorder()
+    run_tracker(tracker, crossing, queries, search=True)
+    told = {entry[1]: entry[2] for entry in tracker.diary if entry[0] == "track"}
+    for t in (1, 140, 299):
+        assert told[t] == np.logical_or.reduce(list(crossing.masks(t).values())).sum()
+
+
+def test_a_late_answer_belongs_to_an_earlier_frame(crossing, queries):
+    run = run_tracker(Recorder(late=3), crossing, queries)
+    first = queries.frame[0]
+    np.testing.assert_array_equal(run.uv_px[first + 1, 0], queries.uv_px[0] + first + 4)
+    assert not run.visible[-3:].any()
+
+
+def test_plain_lk_has_the_reference_parameters():
+    tracker = make_tracker("lk-plain", TrackingConfig(window_px=7, ratio=0.9))
+    assert tracker.name == "lk-plain" and tracker.latency_frames == 0
+    cfg = tracker.config
+    assert (cfg.window_px, cfg.levels, cfg.forward_backward_px) == (21, 3, 1.0) and cfg.redetect_every > 1e6
+
+
+def test_plain_lk_scores_as_lucas_kanade_does(crossing):
+    """It follows well and finds nothing again."""
+    score = score_tracker(crossing, make_tracker("lk-plain", TrackingConfig()), 1, count=48)
+    plain = score.as_dict()
+    assert 0.2 < plain["aj"] < plain["delta_avg"] < 0.6 and plain["jaccard"]["16_px"] > plain["jaccard"]["1_px"]
+    assert plain["redetection"]["returns"] > 10 and plain["redetection"]["found"] == 0
+    assert 0 < plain["cpu_ms"]["mean"] <= plain["cpu_ms"]["p95"] < 200
+    assert "48 queries, seed 1" in score.as_table()
+
+
+# --- p2p eval-tracks ----------------------------------------------------------------------------
+
+
+def test_the_command_prints_one_json_object(capsys):
+    assert cli.main("eval-tracks synthetic/crossing --tracker lk-plain --queries 8 --seed 2 --json".split()) == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert plain["tracker"] == "lk-plain" and plain["queries"] == 8 and plain["seed"] == 2
+    assert plain["search"] == "whole picture" and plain["truth"] == "box: mesh, can: mesh"
+    assert set(plain["jaccard"]) == {"1_px", "2_px", "4_px", "8_px", "16_px"}
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("synthetic/crossing --tracker lkk", "tracker: got 'lkk', expected one of lk, lk-plain"),
+        ("synthetic/crossing --models tin=x.obj", "model: got the name 'tin', expected one of the objects: box, can"),
+        ("synthetic/crossing --models can=nowhere.obj", "nowhere.obj: no such model"),
+        ("nowhere", "nowhere: no such folder"),
+        ("synthetic/crossing --set tracking.windo=3", "Did you mean 'tracking.window_px'"),
+    ],
+)
+def test_what_does_not_fit_is_said_in_one_line(capsys, words, complaint):
+    assert cli.main(["eval-tracks", *words.split()]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("p2p eval-tracks: ") and complaint in err and err.count("\n") == 1
+
+
+def test_every_tracker_says_its_name():
+    for name in ("lk", "lk-plain"):
+        assert name in TRACKERS and make_tracker(name, TrackingConfig()).name == name
