@@ -3,28 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.stages import tracking
-from p2p_lib.stages.tracking import LkTracker, PointTracker
-
-#: What OpenCV's own examples do: the reference that trackers are compared with. It never finds a point again.
-PLAIN_LK = {"window_px": 21, "levels": 3, "forward_backward_px": 1.0, "redetect_every": 1_000_000_000}
-
-
-def plain_lk(config: TrackingConfig, rng: np.random.Generator | None = None) -> PointTracker:
-    """Plain Lucas-Kanade: 21 px window, 3 levels, forward-backward 1 px, no re-detection."""
-    tracker = LkTracker(replace(config, **PLAIN_LK), rng)
-    tracker.name = "lk-plain"
-    return tracker
-
+from p2p_lib.stages.tracking import PointTracker
 
 #: Trackers by the name that --tracker takes.
-TRACKERS: dict[str, Callable[..., PointTracker]] = {**tracking.TRACKERS, "lk-plain": plain_lk}
+TRACKERS: dict[str, Callable[..., PointTracker]] = {**tracking.TRACKERS}
 
 
 def make_tracker(name: str, config: TrackingConfig, rng: np.random.Generator | None = None) -> PointTracker:

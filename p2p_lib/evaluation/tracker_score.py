@@ -65,7 +65,8 @@ class TrackerScore:
         lines = (
             f"{plain['tracker']} on {plain['sequence']}: {plain['queries']} queries, seed {plain['seed']}",
             f"AJ {plain['aj']:.3f}   delta_avg {plain['delta_avg']:.3f}   OA {plain['oa']:.3f}",
-            f"found again after {again['returns']} returns: {again['found']:.3f}; {same}: {again['found_same_view']:.3f}",
+            f"found again after {again['returns']} returns: {again['found']:.3f}; {same}: "
+            f"{again['found_same_view']:.3f}",
             f"CPU per frame: mean {cost['mean']:.1f} ms, p95 {cost['p95']:.1f} ms",
             f"truth from {plain['truth']}",
         )

@@ -78,16 +78,9 @@ def test_a_late_answer_belongs_to_an_earlier_frame(crossing, queries):
     assert not run.visible[-3:].any()
 
 
-def test_plain_lk_has_the_reference_parameters():
-    tracker = make_tracker("lk-plain", TrackingConfig(window_px=7, ratio=0.9))
-    assert tracker.name == "lk-plain" and tracker.latency_frames == 0
-    cfg = tracker.config
-    assert (cfg.window_px, cfg.levels, cfg.forward_backward_px) == (21, 3, 1.0) and cfg.redetect_every > 1e6
-
-
 def test_plain_lk_scores_as_lucas_kanade_does(crossing):
     """It follows well and finds nothing again."""
-    score = score_tracker(crossing, make_tracker("lk-plain", TrackingConfig()), 1, count=48)
+    score = score_tracker(crossing, make_tracker("lk", TrackingConfig()), 1, count=48)
     plain = score.as_dict()
     assert 0.2 < plain["aj"] < plain["delta_avg"] < 0.6 and plain["jaccard"]["16_px"] > plain["jaccard"]["1_px"]
     assert plain["redetection"]["returns"] > 10 and plain["redetection"]["found"] == 0
@@ -99,9 +92,9 @@ def test_plain_lk_scores_as_lucas_kanade_does(crossing):
 
 
 def test_the_command_prints_one_json_object(capsys):
-    assert cli.main("eval-tracks synthetic/crossing --tracker lk-plain --queries 8 --seed 2 --json".split()) == 0
+    assert cli.main("eval-tracks synthetic/crossing --tracker lk --queries 8 --seed 2 --json".split()) == 0
     plain = json.loads(capsys.readouterr().out)
-    assert plain["tracker"] == "lk-plain" and plain["queries"] == 8 and plain["seed"] == 2
+    assert plain["tracker"] == "lk" and plain["queries"] == 8 and plain["seed"] == 2
     assert plain["search"] == "whole picture" and plain["truth"] == "box: mesh, can: mesh"
     assert set(plain["jaccard"]) == {"1_px", "2_px", "4_px", "8_px", "16_px"}
 
@@ -109,7 +102,7 @@ def test_the_command_prints_one_json_object(capsys):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ("synthetic/crossing --tracker lkk", "tracker: got 'lkk', expected one of lk, lk-plain"),
+        ("synthetic/crossing --tracker lkk", "tracker: got 'lkk', expected one of lk, embedded"),
         ("synthetic/crossing --models tin=x.obj", "model: got the name 'tin', expected one of the objects: box, can"),
         ("synthetic/crossing --models can=nowhere.obj", "nowhere.obj: no such model"),
         ("nowhere", "nowhere: no such folder"),
@@ -123,5 +116,5 @@ def test_what_does_not_fit_is_said_in_one_line(capsys, words, complaint):
 
 
 def test_every_tracker_says_its_name():
-    for name in ("lk", "lk-plain"):
+    for name in ("lk", "embedded"):
         assert name in TRACKERS and make_tracker(name, TrackingConfig()).name == name

@@ -1,0 +1,397 @@
+"""The embedded 2D tracker: long-range, without weights, on the CPU.
+
+Every point keeps a few appearances of itself (:mod:`p2p_lib.stages.appearance`). From frame to frame
+Lucas-Kanade proposes its place, and alignment with the best fitting appearance decides: that takes the
+drift out, and a place that does not look like the point is not one. A point that is not where it
+should be is looked for where the visible points around it say it is, and, wherever in the picture it
+may be, at the corners whose descriptors look like those that once surrounded it
+(:mod:`p2p_lib.stages.features`). Whatever is found is verified by alignment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.stages import features
+from p2p_lib.stages.appearance import Alignment, Patches, align, take
+
+#: Corners remembered around an appearance, and neighbouring points.
+_ANCHORS, _NEIGHBOURS = 4, 8
+#: Levels on which the corners around a point are described; those searched are features.SCALES.
+_ANCHOR_SCALES = (1.0, 0.5)
+_EYE = np.eye(2, dtype=np.float32)
+
+
+@dataclass(eq=False)
+class _Points:
+    """N points with K appearances each, row by row. Offsets and warps are in pixels of the appearance's frame.
+
+    A warp C takes offsets in a point's first appearance to offsets in the newest frame, view[k] to
+    those in the frame of appearance k: C inv(view[k]) is how appearance k looks now.
+    """
+
+    ids: np.ndarray  # (N,) int64, increasing
+    uv: np.ndarray  # (N, 2) newest known place
+    warp: np.ndarray  # (N, 2, 2) C
+    visible: np.ndarray  # (N,) bool
+    sigma_px: np.ndarray  # (N,) standard deviation of uv
+    hidden_for: np.ndarray  # (N,) frames
+    coasting: np.ndarray  # (N,) frames since an appearance was last seen
+    count: np.ndarray  # (N,) appearances in use
+    view: np.ndarray  # (N, K, 2, 2)
+    view_sigma_px: np.ndarray  # (N, K) how well the point's place in the appearance is known
+    fine: Patches  # (N, K) at full resolution
+    coarse: Patches  # (N, K) at half resolution
+    anchor: np.ndarray  # (N, K, J, SIZE) descriptors of corners around the point; zero where there is none
+    anchor_frame: np.ndarray  # (N, K, J, 2, 2) their axes
+    anchor_offset: np.ndarray  # (N, K, J, 2) from corner to point
+    neighbour: np.ndarray  # (N, K, M) ids of points visible around it, -1 where none
+    neighbour_offset: np.ndarray  # (N, K, M, 2) from point to neighbour
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @classmethod
+    def new(cls, ids: np.ndarray, uv: np.ndarray, appearances: int) -> _Points:
+        """Points without an appearance yet."""
+        n, k = len(ids), appearances
+        zero, warp = np.zeros(n, np.int64), np.tile(_EYE, (n, 1, 1))
+        anchors, near = (n, k, _ANCHORS), (n, k, _NEIGHBOURS)
+        return cls(
+            ids, uv.astype(np.float32), warp, np.ones(n, bool), np.zeros(n, np.float32), zero, zero.copy(), zero.copy(),
+            np.tile(_EYE, (n, k, 1, 1)), np.zeros((n, k), np.float32), Patches.empty((n, k)), Patches.empty((n, k)),
+            np.zeros((*anchors, features.SIZE), np.float32), np.tile(_EYE, (*anchors, 1, 1)),
+            np.zeros((*anchors, 2), np.float32), np.full(near, -1, np.int64), np.zeros((*near, 2), np.float32),
+        )  # fmt: skip
+
+    def select(self, rows: np.ndarray) -> _Points:
+        return _Points(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def joined(self, other: _Points) -> _Points:
+        mine, theirs = ([getattr(p, f.name) for f in fields(self)] for p in (self, other))
+        return _Points(*(_concatenate(a, b) for a, b in zip(mine, theirs, strict=True)))
+
+    def rows(self, ids: np.ndarray) -> np.ndarray:
+        """Row of each id, any shape; -1 where it is not held."""
+        if not len(self):
+            return np.full(np.shape(ids), -1)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self) - 1)
+        return np.where(self.ids[at] == ids, at, -1)
+
+
+def _concatenate(a, b):
+    if isinstance(a, Patches):
+        return Patches(*(np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(Patches)))
+    return np.concatenate([a, b])
+
+
+class EmbeddedTracker:
+    """Long-range point tracker; see the module's text. Implements :class:`p2p_lib.stages.tracking.PointTracker`."""
+
+    name = "embedded"
+    latency_frames = 0
+
+    def __init__(self, config: TrackingConfig, rng: np.random.Generator | None = None):
+        self.config = config
+        self._gray: np.ndarray | None = None
+        self._clear()
+
+    def _clear(self) -> None:
+        self._next_id, self._frames = 0, 0
+        self._points = _Points.new(np.zeros(0, np.int64), np.zeros((0, 2)), self.config.appearances)
+
+    def start(self, frame: Frame) -> None:
+        """Begin a stream at this frame."""
+        self._clear()
+        self._see(frame)
+
+    def add(self, uv_px: np.ndarray) -> np.ndarray:
+        """Add queries (N, 2) in the newest frame; returns their ids."""
+        if self._gray is None:
+            raise BadInput("tracker", "queries before a frame", "start(frame) first")
+        uv = np.asarray(uv_px, np.float32).reshape(-1, 2)
+        ids = np.arange(self._next_id, self._next_id + len(uv))
+        self._next_id += len(uv)
+        held = len(self._points)
+        self._points = self._points.joined(_Points.new(ids, uv, self.config.appearances))
+        self._remember(held + np.arange(len(ids)))
+        return ids
+
+    def drop(self, ids: np.ndarray) -> None:
+        """Forget these queries for good."""
+        self._points = self._points.select(~np.isin(self._points.ids, ids))
+
+    def reject(self, ids: np.ndarray) -> None:
+        """Take these tracks for invisible until they are found again."""
+        self._points.visible &= ~np.isin(self._points.ids, ids)
+
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
+        """Look for invisible points where the caller expects them in the newest frame, among those it names.
+
+        ids, uv_px  (N,), (N, 2): all points of one rigid body, the visible ones too: they say how it is turned.
+        """
+        p = self._points
+        at = p.rows(ids)
+        expected = np.full((len(p), 2), np.nan, np.float32)
+        expected[at[at >= 0]] = uv_px[at >= 0]
+        wanted = at[at >= 0]
+        wanted = wanted[~p.visible[wanted] & np.isfinite(expected[wanted]).all(1)]
+        wanted = self._turn(wanted, self.config.tries)
+        rows, k, _, A = self._predict(wanted, expected)
+        self._take_back(rows, k, expected[rows], A, self.config.search_px)
+
+    def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
+        """Follow all live queries into the next frame."""
+        if self._gray is None:
+            raise BadInput("tracker", "a frame to track before any start", "start(frame) first")
+        previous = self._gray
+        self._see(frame)
+        self._frames += 1
+        self._follow(previous)
+        self._search_near(search)
+        self._search_everywhere(search, urgent)
+        p, cfg = self._points, self.config
+        p.hidden_for = np.where(p.visible, 0, p.hidden_for + 1)
+        if self._frames % cfg.renew_every == 0:
+            self._renew()
+        uv = np.where(p.visible[:, None], p.uv, np.nan).astype(float)
+        # A bounded, monotonous reading of the standard deviation: 1/2 at uncertain_px.
+        uncertainty = np.where(p.visible, p.sigma_px / (p.sigma_px + cfg.uncertain_px), 1.0)
+        return Tracks(p.ids.copy(), uv, p.visible.copy(), uncertainty.astype(float))
+
+    def _see(self, frame: Frame) -> None:
+        self._gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        self._fine = self._gray.astype(np.float32)
+        self._coarse = cv2.pyrDown(self._gray).astype(np.float32)
+
+    def _follow(self, previous: np.ndarray) -> None:
+        """Lucas-Kanade proposes, the appearance that fits best decides."""
+        p, cfg = self._points, self.config
+        at = np.flatnonzero(p.visible)
+        if not len(at):
+            return
+        flow = {"winSize": (cfg.window_px, cfg.window_px), "maxLevel": cfg.levels}
+        here = p.uv[at]
+        there, found, _ = cv2.calcOpticalFlowPyrLK(previous, self._gray, here, None, **flow)
+        there = np.where(found > 0, there, here)
+        k = self._fitting(at)
+        seen = align(self._fine, p.fine[at, k], there, p.warp[at] @ np.linalg.inv(p.view[at, k]), cfg.iterations)
+        moved_px = np.linalg.norm(seen.uv_px - there, axis=1)
+        good = (seen.ncc >= cfg.min_ncc) & (moved_px < cfg.search_px)
+        self._settle(at[good], k[good], seen, good)
+        self._coast(at[~good], previous, here[~good], there[~good], seen.ncc[~good], flow)
+
+    def _fitting(self, at: np.ndarray) -> np.ndarray:
+        """The appearance of each point that its present warp distorts least; the older in doubt."""
+        p = self._points
+        A = p.warp[at][:, None] @ np.linalg.inv(p.view[at])
+        squared = A @ A.transpose(0, 1, 3, 2) - _EYE
+        distortion = np.sqrt((squared**2).sum((2, 3))) + 0.1 * np.arange(A.shape[1])
+        distortion[np.arange(A.shape[1]) >= p.count[at][:, None]] = np.inf
+        return distortion.argmin(1)
+
+    def _settle(self, at: np.ndarray, k: np.ndarray, seen: Alignment, rows: np.ndarray) -> None:
+        """Points ``at`` are where ``seen`` (its ``rows``) found their appearances k."""
+        p = self._points
+        p.uv[at], p.warp[at] = seen.uv_px[rows], seen.A[rows] @ p.view[at, k]
+        p.sigma_px[at] = np.hypot(seen.sigma_px[rows], p.view_sigma_px[at, k])
+        p.visible[at], p.coasting[at] = True, 0
+
+    def _coast(self, at, previous, here, there, ncc, flow) -> None:
+        """Points that changed their looks go on by Lucas-Kanade alone for a while, if it comes home again."""
+        p, cfg = self._points, self.config
+        if not len(at):
+            return
+        home, found, _ = cv2.calcOpticalFlowPyrLK(self._gray, previous, there, None, **flow)
+        error_px = np.linalg.norm(home - here, axis=1)
+        h, w = self._gray.shape
+        ok = (found[:, 0] > 0) & (error_px < cfg.forward_backward_px) & (ncc > cfg.coast_ncc)
+        ok &= (there >= 0).all(1) & (there <= [w - 1, h - 1]).all(1) & (p.coasting[at] < cfg.coast_frames)
+        p.uv[at] = there
+        p.visible[at] = ok
+        p.coasting[at] += 1
+        p.sigma_px[at] = np.hypot(p.sigma_px[at], cfg.coast_sigma_px)
+
+    def _search_near(self, search: np.ndarray | None) -> None:
+        """Look for invisible points where the visible ones around them say."""
+        p = self._points
+        wanted = np.flatnonzero(~p.visible)
+        if not len(wanted) or not p.visible.any():
+            return
+        rows, k, uv, A = self._predict(wanted, np.where(p.visible[:, None], p.uv, np.nan))
+        keep = self._inside(uv, search)
+        rows, k, uv, A = rows[keep], k[keep], uv[keep], A[keep]
+        turn = np.isin(rows, self._turn(rows, self.config.tries))
+        self._take_back(rows[turn], k[turn], uv[turn], A[turn], self.config.search_px)
+
+    def _turn(self, rows: np.ndarray, count: int) -> np.ndarray:
+        """At most ``count`` of these points: those that vanished last, and of the others everyone in turn."""
+        if len(rows) <= count:
+            return rows
+        late = self._points.hidden_for[rows] > 2
+        order = np.argsort(late * (1 + (self._points.ids[rows] * 7919 + self._frames * 104729) % 1000), kind="stable")
+        return np.sort(rows[order[:count]])
+
+    def _predict(self, wanted: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Places of points from those around them: rows, appearance, uv_px, A of the points that have enough.
+
+        known  (N, 2) places of the points that may vouch for others, NaN where not
+        """
+        p = self._points
+        if not len(wanted):
+            return wanted, wanted, np.zeros((0, 2), np.float32), np.zeros((0, 2, 2), np.float32)
+        at = p.rows(p.neighbour[wanted])
+        now = known[at]
+        use = (at >= 0) & np.isfinite(now[..., 0]) & (p.neighbour[wanted] >= 0)
+        k = use.sum(2).argmax(1)
+        i = np.arange(len(wanted))
+        uv, A, ok = _carried(p.neighbour_offset[wanted, k], now[i, k], use[i, k])
+        return wanted[ok], k[ok], uv[ok], A[ok]
+
+    def _search_everywhere(self, search: np.ndarray | None, urgent: bool) -> None:
+        """Look for invisible points at corners that look like those once around them."""
+        p, cfg = self._points, self.config
+        wanted = np.flatnonzero(~p.visible & (p.hidden_for >= 1))
+        if not len(wanted) or not (urgent or self._frames % cfg.redetect_every == 0):
+            return
+        # A level a time keeps the cost even; who waits for a return gets them all.
+        turn = (self._frames // cfg.redetect_every) % len(features.SCALES)
+        scales = features.SCALES if urgent else features.SCALES[turn : turn + 1]
+        found = features.detect(self._gray, search, cfg.features, scales)
+        if len(found) < 2:
+            return
+        wanted = self._turn(wanted, cfg.tries)
+        i, k, j = np.nonzero(p.anchor[wanted].any(-1))
+        best, distance, rival = features.nearest(p.anchor[wanted[i], k, j], found, 4.0)
+        alike = distance < cfg.ratio * rival
+        i, k, j, best = i[alike], k[alike], j[alike], best[alike]
+        score = (distance / rival)[alike]
+        A = found.frames[best] @ np.linalg.inv(p.anchor_frame[wanted[i], k, j])
+        uv = found.uv_px[best] + (A @ p.anchor_offset[wanted[i], k, j][..., None])[..., 0]
+        keep = self._inside(uv, search)
+        order = np.flatnonzero(keep)[np.argsort(score[keep], kind="stable")]
+        for _ in range(cfg.candidates):
+            # The best corner of each point first; whoever is not found by it tries its next.
+            order = order[~p.visible[wanted[i[order]]]]
+            _, first = np.unique(i[order], return_index=True)
+            pick = order[first]
+            self._take_back(wanted[i[pick]], k[pick], uv[pick], A[pick], cfg.search_px)
+            order = np.delete(order, first)
+
+    def _inside(self, uv: np.ndarray, search: np.ndarray | None) -> np.ndarray:
+        """Whether places (N, 2) lie in the picture, and in the region searched."""
+        h, w = self._gray.shape
+        inside = (uv >= 0).all(1) & (uv <= [w - 1, h - 1]).all(1)
+        if search is not None:
+            px = np.clip(np.rint(uv), 0, [w - 1, h - 1]).astype(int)
+            inside &= search[px[:, 1], px[:, 0]]
+        return inside
+
+    def _take_back(self, at: np.ndarray, k: np.ndarray, uv: np.ndarray, A: np.ndarray, reach_px: float) -> None:
+        """Align points' appearances k from about uv and A, coarse to fine; those that fit are visible again."""
+        p, cfg = self._points, self.config
+        if not len(at):
+            return
+        rough = align(self._coarse, p.coarse[at, k], uv / 2, A, cfg.iterations)
+        seen = align(self._fine, p.fine[at, k], 2 * rough.uv_px, rough.A, cfg.iterations)
+        good = (seen.ncc >= cfg.return_ncc) & (np.linalg.norm(seen.uv_px - uv, axis=1) < reach_px)
+        good &= seen.sigma_px < cfg.return_sigma_px
+        self._settle(at[good], k[good], seen, good)
+
+    def _renew(self) -> None:
+        """Remember how points look whose view has changed much since any appearance of theirs."""
+        p, cfg = self._points, self.config
+        at = np.flatnonzero(p.visible & (p.coasting == 0))
+        if not len(at):
+            return
+        k = self._fitting(at)
+        A = p.warp[at] @ np.linalg.inv(p.view[at, k])
+        stretch = np.linalg.svd(A, compute_uv=False)
+        far = (stretch.max(1) > cfg.renew_stretch) | (stretch.min(1) < 1 / cfg.renew_stretch)
+        far &= p.sigma_px[at] < cfg.return_sigma_px
+        self._remember(self._turn(at[far], cfg.tries))
+
+    def _remember(self, rows: np.ndarray) -> None:
+        """Store the present looks of these points as one more appearance; a full set gives up its last but first."""
+        p = self._points
+        if not len(rows):
+            return
+        slots = p.view.shape[1]
+        k = np.where(p.count[rows] < slots, p.count[rows], 1 + (self._frames // self.config.renew_every) % (slots - 1))
+        uv = p.uv[rows]
+        p.view[rows, k], p.view_sigma_px[rows, k] = p.warp[rows], p.sigma_px[rows]
+        p.fine[rows, k], p.coarse[rows, k] = take(self._fine, uv), take(self._coarse, uv / 2)
+        p.count[rows] = np.minimum(p.count[rows] + 1, slots)
+        self._remember_neighbours(rows, k)
+        self._remember_corners(rows, k)
+
+    def _remember_neighbours(self, rows: np.ndarray, k: np.ndarray) -> None:
+        p = self._points
+        around = np.flatnonzero(p.visible)
+        gap = np.linalg.norm(p.uv[rows][:, None] - p.uv[around][None], axis=-1)
+        gap[rows[:, None] == around[None]] = np.inf
+        near = np.argsort(gap, 1, kind="stable")[:, :_NEIGHBOURS]
+        ok = np.take_along_axis(gap, near, 1) < self.config.neighbour_px
+        m = near.shape[1]
+        p.neighbour[rows, k], p.neighbour_offset[rows, k] = -1, 0
+        p.neighbour[rows, k, :m] = np.where(ok, p.ids[around[near]], -1)
+        p.neighbour_offset[rows, k, :m] = p.uv[around[near]] - p.uv[rows][:, None]
+
+    def _remember_corners(self, rows: np.ndarray, k: np.ndarray) -> None:
+        p, reach = self._points, self.config.anchor_px
+        region = np.zeros(self._gray.shape, np.uint8)
+        px = np.clip(np.rint(p.uv[rows]).astype(int), 0, np.array(region.shape[::-1]) - 1)
+        region[px[:, 1], px[:, 0]] = 1
+        region = cv2.dilate(region, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+        p.anchor[rows, k] = 0
+        each = _ANCHORS // len(_ANCHOR_SCALES)
+        for level, scale in enumerate(_ANCHOR_SCALES):
+            found = features.detect(self._gray, region, 4 * self.config.features, (scale,))
+            if not len(found):
+                continue
+            offset = p.uv[rows][:, None] - found.uv_px[None]
+            gap = np.linalg.norm(offset, axis=-1)
+            near = np.argsort(gap, 1, kind="stable")[:, :each]
+            i, rank = np.nonzero(np.take_along_axis(gap, near, 1) <= reach / scale)
+            at, j = near[i, rank], level * each + rank
+            p.anchor[rows[i], k[i], j] = found.descriptors[at]
+            p.anchor_frame[rows[i], k[i], j] = found.frames[at]
+            p.anchor_offset[rows[i], k[i], j] = offset[i, at]
+
+
+def _carried(offset: np.ndarray, now: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where points are and how they are warped, by an affine motion of the points around them.
+
+    offset  (N, M, 2) from the point to each neighbour when its appearance was taken
+    now     (N, M, 2) where the neighbours are, used where ``use`` (N, M)
+
+    Returns uv_px (N, 2), A (N, 2, 2) and whether the neighbours agree on it (N,). The affine part is
+    held to a similarity where the neighbours are too few or too much in line to tell.
+    """
+    n = len(offset)
+    now = np.where(use[..., None], now, 0)
+    weight = use / (1 + (offset**2).sum(-1) / 30**2)
+    for _ in range(3):
+        total = np.maximum(weight.sum(1), 1e-6)[:, None]
+        centre, there = (weight[..., None] * offset).sum(1) / total, (weight[..., None] * now).sum(1) / total
+        x, y = offset - centre[:, None], now - there[:, None]
+        S = np.einsum("nm,nmi,nmj->nij", weight, y, x)
+        V = np.einsum("nm,nmi,nmj->nij", weight, x, x)
+        size = np.maximum(np.trace(V, axis1=1, axis2=2), 1e-6)
+        a, b = (S[:, 0, 0] + S[:, 1, 1]) / size, (S[:, 1, 0] - S[:, 0, 1]) / size
+        similar = np.stack([np.stack([a, -b], -1), np.stack([b, a], -1)], -2)
+        ridge = (0.02 * size + 25 * total[:, 0] * 0.2)[:, None, None] * _EYE
+        A = (S + similar @ ridge) @ np.linalg.inv(V + ridge)
+        off = np.linalg.norm(y - x @ A.transpose(0, 2, 1), axis=-1)
+        typical = np.maximum(np.sqrt((weight * off**2).sum(1) / total[:, 0]), 0.3)
+        weight = use / (1 + (offset**2).sum(-1) / 30**2) / (1 + (off / typical[:, None]) ** 2)
+    uv = there - (A @ centre[..., None])[..., 0]
+    agree = (use & (off < 3)).sum(1) >= 3
+    det = np.linalg.det(A) if n else np.zeros(0)
+    return uv, A, agree & (det > 0.1) & (det < 10)
