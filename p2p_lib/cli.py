@@ -137,9 +137,9 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
 
     p = _command(commands, "run", _run, "track the objects of a sequence and write poses, timings, scores")
-    p.add_argument("sequence", metavar="SEQ", help="a folder, or synthetic/NAME (embedded)")
+    p.add_argument("sequence", metavar="SEQ", help="a folder, synthetic/NAME (embedded), or a name below $P2P_DATA")
     p.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
-    p.add_argument("--format", help="layout: ycbineoat, ycbmultitrack, folder (default: recognised)")
+    p.add_argument("--format", help="layout: ho3d, bop, ycbmultitrack, ycbineoat, folder (default: recognised)")
     p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
     p.add_argument("--objects", metavar="A,B", help="track only these objects")
     p.add_argument("--preset", default=None, help="paper or default: parameters only, never backends")

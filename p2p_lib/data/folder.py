@@ -38,4 +38,5 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
         depth_scale=depth_scale or images.DEPTH_SCALE,
         mask_files=found,
         own_masks=found,
+        model_places={name: (folder / "models" / name,) for name in (found.objects if found else ("object",))},
     )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -22,8 +22,10 @@ class ImageSequence:
     """A :class:`~p2p_lib.data.sequence.Sequence` of image files; the layouts differ in where these lie.
 
     depth_invalid  raw depth value that means "no measurement" besides 0
+    read_depth     reads a depth file: path, (height, width), depth_scale, depth_invalid to (H, W) metres
     mask_files     what :meth:`masks` gives; ``own_masks`` the dataset's own, which scoring counts
     read_truth     called once, when truth is first asked for
+    model_places   object to the files and folders where its model may lie, best first
     """
 
     name: str
@@ -36,9 +38,11 @@ class ImageSequence:
     times_s: np.ndarray
     depth_scale: float = images.DEPTH_SCALE
     depth_invalid: int | None = None
+    read_depth: Callable[[Path, tuple[int, int], float, int | None], np.ndarray] = images.read_depth_m
     mask_files: MaskFiles | None = None
     own_masks: MaskFiles | None = None
     read_truth: Callable[[], dict[str, ObjectTruth]] = dict
+    model_places: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.rgb_files)
@@ -60,7 +64,7 @@ class ImageSequence:
         if rgb.shape[:2] != self.shape:
             got, want = (f"{w}x{h}" for h, w in (rgb.shape[:2], self.shape))
             raise BadInput(str(self.rgb_files[i]), f"{got} pixels", f"{want} as the first picture")
-        depth_m = images.read_depth_m(self.depth_files[i], self.shape, self.depth_scale, self.depth_invalid)
+        depth_m = self.read_depth(self.depth_files[i], self.shape, self.depth_scale, self.depth_invalid)
         return Frame(i, float(self.times_s[i]), rgb, depth_m)
 
     def masks(self, i: int) -> dict[str, np.ndarray] | None:

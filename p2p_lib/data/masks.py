@@ -16,10 +16,10 @@ from p2p_lib.data.images import LOSSLESS, check_paired, check_size, list_files, 
 class MaskFiles:
     """Masks on disk: for each object its files, and the label that means it (None: anything but 0).
 
-    An object has one file a frame, or a single one for the first frame alone.
+    An object has one file a frame (None: it is not in this picture), or a single one for the first frame alone.
     """
 
-    files: dict[str, tuple[Path, ...]]
+    files: dict[str, tuple[Path | None, ...]]
     labels: dict[str, int | None]
     shape: tuple[int, int]
     _counts: dict[int, dict[str, int]] = field(default_factory=dict)
@@ -32,7 +32,8 @@ class MaskFiles:
     def read(self, i: int) -> dict[str, np.ndarray] | None:
         """Object to (H, W) bool at frame i; None where no object has a mask for it."""
         at_i = {name: files[i] for name, files in self.files.items() if i < len(files)}
-        pictures = {path: read_labels(path, self.shape) for path in set(at_i.values())}
+        pictures = {path: read_labels(path, self.shape) for path in set(at_i.values()) if path}
+        pictures[None] = np.zeros(self.shape, np.uint8)
         masks = {}
         for name, path in at_i.items():
             label = self.labels[name]

@@ -23,16 +23,18 @@ LARGEST_M = 10.0
 
 
 def find_models(sequence: Sequence, preferred: tuple[str, ...] = PREFERRED) -> dict[str, Path]:
-    """Object to model file, for those objects that have one in the sequence's ``models/<obj>/``."""
-    if sequence.path is None:
-        return {}
-    found = {name: model_in(sequence.path / "models" / name, preferred) for name in sequence.objects}
+    """Object to model file, for those objects that have one where the sequence's layout keeps it."""
+    found = {}
+    for name, places in sequence.model_places.items():
+        found[name] = next(filter(None, (model_in(place, preferred) for place in places)), None)
     return {name: path for name, path in found.items() if path is not None}
 
 
-def model_in(folder: Path, preferred: tuple[str, ...] = PREFERRED) -> Path | None:
-    """The model file of a folder, None where there is none."""
-    return next((p for pattern in preferred for p in sorted(folder.glob(pattern))), None)
+def model_in(place: Path, preferred: tuple[str, ...] = PREFERRED) -> Path | None:
+    """The model file of a folder, or the file itself; None where there is none of the preferred kinds."""
+    if place.is_file():
+        return place if any(place.match(pattern) for pattern in preferred) else None
+    return next((p for pattern in preferred for p in sorted(place.glob(pattern))), None)
 
 
 def parse_models(assignments: Iterable[str], objects: Iterable[str]) -> dict[str, Path]:
@@ -69,7 +71,8 @@ def given_models(
 def load_points(path: str | Path) -> np.ndarray:
     """(V, 3) all vertices of a model in its own frame, metres, in the file's order.
 
-    .xyz has x y z in its first columns, .obj its ``v`` lines, .ply its vertices.
+    .xyz has x y z in its first columns, .obj its ``v`` lines, .ply its vertices. A model beside a
+    ``models_info.json`` is BOP's, which are in millimetres.
     """
     path = Path(path)
     if not path.is_file():
@@ -78,7 +81,7 @@ def load_points(path: str | Path) -> np.ndarray:
     if path.suffix.lower() not in readers:
         raise BadInput(str(path), f"a file of kind {path.suffix or 'unknown'!r}", "a model: " + ", ".join(SUFFIXES))
     try:
-        points = readers[path.suffix.lower()](path)
+        points = readers[path.suffix.lower()](path) * unit_m(path)
     except (ValueError, IndexError, KeyError, OSError) as error:
         reason = " ".join(str(error).split())[:80]
         raise BadInput(str(path), f"an unreadable model ({reason})", "x y z of each vertex") from None
@@ -100,7 +103,12 @@ def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     mesh = trimesh.load(Path(path), process=False, force="mesh", skip_materials=True)
     if not len(getattr(mesh, "faces", ())):
         raise BadInput(str(path), "a model without faces", "a mesh", "Give a mesh, or none to go by the depth.")
-    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    return np.asarray(mesh.vertices, float) * unit_m(Path(path)), np.asarray(mesh.faces)
+
+
+def unit_m(path: Path) -> float:
+    """Metres per unit of a model file: BOP's are in millimetres."""
+    return 0.001 if (path.parent / "models_info.json").is_file() else 1.0
 
 
 def _read_xyz(path: Path) -> np.ndarray:

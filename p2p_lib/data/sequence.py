@@ -6,6 +6,7 @@ one line in :data:`FORMATS`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -19,6 +20,8 @@ from p2p_lib.core.types import Frame
 
 #: Layouts by name, in the order in which they are tried on a folder.
 FORMATS: dict[str, str] = {
+    "ho3d": "p2p_lib.data.ho3d",
+    "bop": "p2p_lib.data.bop",
     "ycbmultitrack": "p2p_lib.data.ycbmultitrack",
     "ycbineoat": "p2p_lib.data.ycbineoat",
     "folder": "p2p_lib.data.folder",
@@ -50,9 +53,10 @@ class Sequence(Protocol):
     """RGB-D frames of one video, with masks and truth where the dataset has them.
 
     name     what results call it
-    path     its folder (models are looked for there), None where it has none
+    path     its folder, None where it has none
     objects  names of the objects it knows; a single unnamed one is called ``object``
     truth    per object, empty where there is none; read when first asked for
+    model_places  object to the files and folders where its model may lie, best first
     """
 
     name: str
@@ -60,6 +64,7 @@ class Sequence(Protocol):
     path: Path | None
     camera: Camera
     objects: tuple[str, ...]
+    model_places: Mapping[str, tuple[Path, ...]]
 
     @property
     def truth(self) -> dict[str, ObjectTruth]:
@@ -91,7 +96,9 @@ def open_sequence(
     seed: int = 0,
     masks: str | Path | None = None,
 ) -> Sequence:
-    """A sequence from a folder, or the embedded ``synthetic/NAME``.
+    """A sequence from a folder, the embedded ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
+
+    Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one.
 
     format       one of :data:`FORMATS`; by default the layout is recognised
     depth_scale  metres per raw unit of the depth images (default 0.001: millimetres)
@@ -111,13 +118,24 @@ def open_sequence(
 
         folder, format = scenario_dir(name.removeprefix(SYNTHETIC), seed), format or "ycbmultitrack"
     else:
-        folder = Path(path_or_name).expanduser()
+        folder, format = _find(path_or_name, format)
         name = folder.resolve().name
-        if not folder.is_dir():
-            fix = f"Give a folder, or an embedded sequence such as {SYNTHETIC}crossing."
-            raise MissingData(str(path_or_name), "no such folder", fix)
     loader = import_module(FORMATS[format or recognise(folder)])
     return loader.load(folder, name=name, depth_scale=depth_scale, masks=masks)
+
+
+def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:
+    """An existing folder, and the layout where its dataset's manifest says it."""
+    folder = Path(path_or_name).expanduser()
+    if folder.is_dir():
+        return folder, format
+    from p2p_lib.data.manifests import find_sequence
+
+    found = find_sequence(str(path_or_name))
+    if found is None:
+        fix = f"Give a folder, an embedded sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
+        raise MissingData(str(path_or_name), "no such folder, and no sequence of this name below $P2P_DATA", fix)
+    return found[0], format or found[1].format
 
 
 def recognise(folder: Path) -> str:

@@ -2,7 +2,8 @@
 
 ``rgb/``, ``depth/`` (uint16 millimetres), ``cam_K.txt``, ``gt_mask/`` (masks from the arm's kinematics),
 ``annotated_poses/*.txt`` (4x4 T_cam_model, metres, OpenCV axes; the i-th belongs to the i-th picture).
-``masks/``, a separate download, serves where ``gt_mask/`` is not there.
+``masks/``, a separate download, serves where ``gt_mask/`` is not there. Models lie in ``models/object/``, or by
+their YCB name in ``models/`` of the dataset, one folder above: the sequence's name begins with the object's.
 """
 
 from __future__ import annotations
@@ -17,6 +18,13 @@ from p2p_lib.data.masks import MaskFiles, find_masks, masks_folder
 from p2p_lib.data.sequence import ObjectTruth
 
 OBJECT = "object"
+YCB_NAMES = {
+    "mustard": "006_mustard_bottle",
+    "cracker_box": "003_cracker_box",
+    "sugar_box": "004_sugar_box",
+    "bleach": "021_bleach_cleanser",
+    "tomato_soup_can": "005_tomato_soup_can",
+}
 
 
 def recognises(folder: Path) -> bool:
@@ -55,4 +63,11 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
         mask_files=chosen,
         own_masks=own or chosen,
         read_truth=read_truth,
+        model_places={OBJECT: _models(folder)},
     )
+
+
+def _models(folder: Path) -> tuple[Path, ...]:
+    at = folder.resolve()
+    known = [at.parent / "models" / ycb for begins, ycb in YCB_NAMES.items() if at.name.startswith(begins)]
+    return folder / "models" / OBJECT, *known

@@ -3,6 +3,7 @@
 ``rgb/``, ``depth/`` (uint16 millimetres, 65535 = invalid), ``cam_K.txt``, and for every object
 ``annotated_poses/<obj>/*.txt`` (4x4 T_cam_model, metres), ``masks/<obj>/*.png`` (visible part) and two labels
 a frame, ``is_mask_visible/<obj>/is_mask_visible.npy`` and ``is_obj_in_image_labels/<obj>/is_obj_in_image.npy``.
+Models lie in ``models/<obj>/`` of the sequence or of the dataset, one folder above.
 
 The recorded truth is held constant while an object is occluded: it counts only where both labels hold.
 """
@@ -69,6 +70,9 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
         mask_files=chosen,
         own_masks=own or chosen,
         read_truth=read_truth,
+        model_places={
+            obj: tuple(root / "models" / obj for root in (folder, folder.resolve().parent)) for obj in objects
+        },
     )
 
 

@@ -80,9 +80,21 @@ def test_models_are_found_in_the_sequence(tmp_path):
         (tmp_path / "models" / name).mkdir(parents=True, exist_ok=True)
         (tmp_path / "models" / name / file).write_text("")
     (tmp_path / "models" / "empty").mkdir()
-    found = find_models(SimpleNamespace(path=tmp_path, objects=("box", "can", "empty", "mug")))
-    assert found == {"box": tmp_path / "models/box/mesh.ply", "can": tmp_path / "models/can/points.xyz"}
-    assert find_models(SimpleNamespace(path=None, objects=("box",))) == {}
+    places = {name: (tmp_path / "models" / name,) for name in ("box", "can", "empty", "mug")}
+    places["cup"] = (tmp_path / "none", tmp_path / "models/can/a.obj", tmp_path / "models/can")
+    found = find_models(SimpleNamespace(model_places=places))
+    expected = {"box": "box/mesh.ply", "can": "can/points.xyz", "cup": "can/a.obj"}
+    assert found == {name: tmp_path / "models" / file for name, file in expected.items()}
+    assert find_models(SimpleNamespace(model_places={})) == {}
+
+
+def test_bops_models_are_in_millimetres(tmp_path):
+    mesh = trimesh.Trimesh(POINTS * 1000, [[0, 1, 3]], process=False)
+    (tmp_path / "obj_000001.ply").write_bytes(mesh.export(file_type="ply"))
+    with pytest.raises(BadInput, match="vertices in metres"):
+        load_points(tmp_path / "obj_000001.ply")
+    (tmp_path / "models_info.json").write_text("{}")
+    np.testing.assert_allclose(load_points(tmp_path / "obj_000001.ply"), POINTS, atol=1e-8)
 
 
 def test_assignments(tmp_path):

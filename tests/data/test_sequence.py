@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 from p2p_lib.core import se3
+from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.types import PoseEstimate, Status
+from p2p_lib.data.models import find_models
+from p2p_lib.data.runs import RunWriter, load_run
 from p2p_lib.data.sequence import FORMATS, ObjectTruth, open_sequence
+from p2p_lib.evaluation.protocol import scored_frames
 
 W, H, N = 48, 32, 4
 K = np.array([[40.0, 0, 23.5], [0, 41.0, 15.5], [0, 0, 1]])
@@ -302,3 +307,37 @@ def test_unknown_names(tmp_path):
     for scale in (0, -1, 1000, float("nan")):
         with pytest.raises(BadInput, match=r"depth_scale: got .* expected metres per raw unit.*Millimetres are 0\.001"):
             open_sequence(tmp_path, depth_scale=scale)
+
+
+def test_ycbmultitrack_truth_held_while_hidden_is_not_scored(ycbmultitrack, tmp_path):
+    """The dataset repeats a hidden object's last pose: those frames must not count, whatever a tracker says there."""
+    s = open_sequence(ycbmultitrack)
+    with RunWriter(tmp_path / "run", s, preset("default"), "none", "dataset") as writer:
+        for i in range(len(s)):
+            held = se3.exp(np.array([0, 0, 0, 0.1, 0, 1.0]))
+            writer.add(s.frame(i), {"can": PoseEstimate("can", i, float(i), Status.TRACKED, held, 1.0)}, 1.0)
+    can = load_run(tmp_path / "run").objects["can"]
+    assert can.has_truth.all() and can.has_pose.all()
+    assert scored_frames(can, 0).tolist() == [True, False, True, False]
+
+
+def test_ycbmultitrack_models_of_the_whole_dataset(ycbmultitrack):
+    beside = ycbmultitrack.parent / "models" / "can"
+    beside.mkdir(parents=True)
+    (beside / "textured.obj").write_text("v 0 0 0\n")
+    assert find_models(open_sequence(ycbmultitrack)) == {"can": beside / "textured.obj"}
+    own = ycbmultitrack / "models" / "can"
+    own.mkdir(parents=True)
+    (own / "points.xyz").write_text("0 0 0\n")
+    assert find_models(open_sequence(ycbmultitrack)) == {"can": own / "points.xyz"}
+
+
+@pytest.mark.parametrize("name", ["mustard0_first400", "mustard_easy_00_02", "bleach_hard_00_03_chaitanya", "other"])
+def test_ycbineoat_models_by_the_sequences_name(ycbineoat, name):
+    folder = ycbineoat.rename(ycbineoat.parent / name)
+    for ycb in ("006_mustard_bottle", "021_bleach_cleanser"):
+        (ycbineoat.parent / "models" / ycb).mkdir(parents=True)
+        (ycbineoat.parent / "models" / ycb / "textured_simple.obj").write_text("v 0 0 0\n")
+    found = find_models(open_sequence(folder))
+    expected = {"m": "006_mustard_bottle", "b": "021_bleach_cleanser"}.get(name[0])
+    assert [path.parent.name for path in found.values()] == ([expected] if expected else [])
