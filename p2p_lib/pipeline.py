@@ -19,7 +19,7 @@ from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
 from p2p_lib.stages.sampling import DEFAULT_DETECTOR, make_detector
-from p2p_lib.stages.tracking import DEFAULT_TRACKER
+from p2p_lib.stages.tracking import DEFAULT_TRACKER, PointTracker
 from p2p_lib.tracked_object import TrackedObject
 
 
@@ -30,7 +30,7 @@ class Point2Pose:
         self,
         camera: Camera,
         config: Config | None = None,
-        tracker: str = DEFAULT_TRACKER,
+        tracker: str | PointTracker = DEFAULT_TRACKER,
         detector: str = DEFAULT_DETECTOR,
     ):
         self.camera = camera

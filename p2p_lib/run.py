@@ -19,11 +19,13 @@ from p2p_lib.core.types import PoseEstimate
 from p2p_lib.data import sequence as sequences
 from p2p_lib.data.models import find_models, given_models
 from p2p_lib.data.runs import Run, RunWriter, load_run
+from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, score_tracker
+from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.pipeline import Point2Pose
 from p2p_lib.stages.mesh import save as save_mesh
-from p2p_lib.stages.tracking import DEFAULT_TRACKER
+from p2p_lib.stages.tracking import DEFAULT_TRACKER, PointTracker
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def run(
         sequence = sequences.open_sequence(sequence, format, depth_scale, config.seed, masks=folder)
     chosen = _chosen(sequence, objects)
     frames = _frames(len(sequence), start, stop)
-    method = Point2Pose(sequence.camera, config, tracker or DEFAULT_TRACKER)
+    method = Point2Pose(sequence.camera, config, _tracker(tracker, sequence, config, models))
     for name in chosen:
         method.add_object(name)
     known = find_models(sequence) | given_models(models or {}, sequence.objects)
@@ -150,8 +152,18 @@ def evaluate_tracker(
     """
     config = make_config(settings=settings, seed=seed)
     opened = sequences.open_sequence(sequence, format, depth_scale)
-    method = make_tracker(tracker or DEFAULT_TRACKER, config.tracking, np.random.default_rng(config.seed))
+    named = _tracker(tracker, opened, config, models)
+    method = make_tracker(named, config.tracking, np.random.default_rng(config.seed))
     return score_tracker(opened, method, config.seed, models, count, search)
+
+
+def _tracker(
+    name: str | None, sequence: sequences.Sequence, config: Config, models: Mapping[str, str | Path] | None
+) -> str | PointTracker:
+    """The name of a tracker, but the tracker itself where it must know the sequence: ``oracle``."""
+    if name != OracleTracker.name:
+        return name or DEFAULT_TRACKER
+    return OracleTracker(TrueScene.of(sequence, models), config.oracle, config.seed)
 
 
 def _save_meshes(method: Point2Pose, out: Path) -> None:

@@ -103,6 +103,16 @@ class TrackingConfig(_Checked):
 
 
 @dataclass(frozen=True)
+class OracleConfig(_Checked):
+    """Of the tracker ``oracle``, which knows the truth; no part of the method."""
+
+    noise_px: float = _p(0.5, "standard deviation of a visible point's position, per axis", "px", low=0)
+    dropout: float = _p(0.0, "share of the visible points called invisible in a frame", low=0, high=1)
+    outliers: float = _p(0.0, "share of the visible points reported at a wrong place in a frame", low=0, high=1)
+    outlier_px: float = _p(30.0, "how far off those are", "px", low=0)
+
+
+@dataclass(frozen=True)
 class SamplingConfig(_Checked):
     candidates: int = _p(512, "N_k, candidates from the detector", "points", "release", low=1)
     points: int = _p(30, "K, points chosen at a keyframe", "points", "release", low=1)
@@ -206,6 +216,7 @@ class Config:
     seed: int = 0
     pipeline: PipelineConfig = PipelineConfig()
     tracking: TrackingConfig = TrackingConfig()
+    oracle: OracleConfig = OracleConfig()
     sampling: SamplingConfig = SamplingConfig()
     keypoint_map: KeypointMapConfig = KeypointMapConfig()
     registration: RegistrationConfig = RegistrationConfig()

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.data.models import MESHES, find_models, given_models
 from p2p_lib.data.sequence import Sequence
 from p2p_lib.evaluation.point_tracks import (
     THRESHOLDS_PX,
@@ -61,12 +60,11 @@ class TrackerScore:
         """The same for people."""
         plain = self.as_dict()
         again, cost = plain["redetection"], plain["cpu_ms"]
-        same = f"of the {again['returns_same_view']} within 40 degrees of a known view"
+        same = f"of the {again['returns_same_view']} within 40 degrees of a view seen: {again['found_same_view']:.3f}"
         lines = (
             f"{plain['tracker']} on {plain['sequence']}: {plain['queries']} queries, seed {plain['seed']}",
             f"AJ {plain['aj']:.3f}   delta_avg {plain['delta_avg']:.3f}   OA {plain['oa']:.3f}",
-            f"found again after {again['returns']} returns: {again['found']:.3f}; {same}: "
-            f"{again['found_same_view']:.3f}",
+            f"found again after {again['returns']} returns: {again['found']:.3f}; {same}",
             f"CPU per frame: mean {cost['mean']:.1f} ms, p95 {cost['p95']:.1f} ms",
             f"truth from {plain['truth']}",
         )
@@ -86,8 +84,7 @@ def score_tracker(
     models  object to mesh, besides those in the sequence's ``models/``; the others go by measured depth
     search  tell the tracker where the objects' masks are, as the pipeline does
     """
-    meshes = find_models(sequence, MESHES) | given_models(models or {}, sequence.objects, MESHES)
-    scene = TrueScene(sequence, meshes)
+    scene = TrueScene.of(sequence, models)
     queries = draw_queries(scene, np.random.default_rng(seed), count)
     truth = true_tracks(scene, queries.points)
     run = run_tracker(tracker, sequence, queries, search)

@@ -18,7 +18,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingData
 from p2p_lib.core.native import load_open3d
 from p2p_lib.core.types import Frame
-from p2p_lib.data.models import load_mesh
+from p2p_lib.data.models import MESHES, find_models, given_models, load_mesh
 from p2p_lib.data.sequence import Sequence
 from p2p_lib.stages.lifting import lift
 
@@ -86,6 +86,14 @@ class TrueScene:
         self.sequence = sequence
         self.objects = tuple(sequence.truth)
         self._scenes = {name: _ray_scene(*load_mesh(path)) for name, path in (meshes or {}).items()}
+
+    @classmethod
+    def of(cls, sequence: Sequence, models: Mapping[str, str | Path] | None = None) -> TrueScene:
+        """With the meshes in the sequence's ``models/``, and those given (files or folders, by object)."""
+        meshes = find_models(sequence, MESHES)
+        # A cloud of points serves for scoring poses, but is no surface.
+        given = {name: path for name, path in (models or {}).items() if Path(path).suffix.lower() != ".xyz"}
+        return cls(sequence, meshes | given_models(given, sequence.objects, MESHES))
 
     @property
     def by_mesh(self) -> tuple[str, ...]:
