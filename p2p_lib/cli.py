@@ -99,6 +99,41 @@ def _notebooks(a: argparse.Namespace) -> None:
     run_notebooks(a.profile, only=only, jobs=a.jobs, parameters=_pairs("--parameter", a.parameter, "NAME=VALUE"))
 
 
+def _data_list(a: argparse.Namespace) -> None:
+    from p2p_lib.data.inventory import overview
+
+    print(overview())
+
+
+def _data_info(a: argparse.Namespace) -> None:
+    from p2p_lib.data.inventory import describe, manifest
+
+    print(describe(manifest(a.dataset)))
+
+
+def _data_fetch(a: argparse.Namespace) -> None:
+    from p2p_lib.data.inventory import fetch, manifest
+
+    for line in fetch(manifest(a.dataset), tuple(part for part in a.only.split(",") if part), not a.quiet):
+        print(line, flush=True)
+
+
+def _data_verify(a: argparse.Namespace) -> int:
+    from p2p_lib.data.inventory import manifest, verify
+
+    good = True
+    for check in verify(manifest(a.dataset), a.every_frame):
+        print(f"{'ok   ' if check.ok else 'WRONG'}  {check.what}: {check.text}", flush=True)
+        good &= check.ok
+    return 0 if good else P2PError.exit_code
+
+
+def _data_where(a: argparse.Namespace) -> None:
+    from p2p_lib.data.inventory import where
+
+    print(where(a.dataset))
+
+
 def _doctor(a: argparse.Namespace) -> int:
     from p2p_lib.doctor import format_checks, run_doctor
 
@@ -185,6 +220,21 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="notebooks at a time")
     p.add_argument("--parameter", action="append", metavar="NAME=VALUE", help="change a notebook parameter; repeatable")
 
+    p = commands.add_parser("data", help="datasets and checkpoints: what they are, where, whether whole")
+    data = p.add_subparsers(metavar="ACTION", required=True, parser_class=_Parser)
+    _command(data, "list", _data_list, "list every dataset and checkpoint that is known")
+    p = _command(data, "info", _data_info, "say what a dataset is, its licence and how to get it")
+    p.add_argument("dataset", metavar="NAME")
+    p = _command(data, "fetch", _data_fetch, "download into $P2P_DATA, check and unpack; unpack what was had by hand")
+    p.add_argument("dataset", metavar="NAME")
+    p.add_argument("--only", default="", metavar="PART,PART", help="only the files whose names contain one of these")
+    p.add_argument("--quiet", action="store_true", help="no progress bar")
+    p = _command(data, "verify", _data_verify, "check what is on disk: checksums, sequences, frames, truth")
+    p.add_argument("dataset", metavar="NAME")
+    p.add_argument("--every-frame", action="store_true", help="read every picture, not only the first and the last")
+    p = _command(data, "where", _data_where, "print the folder of a dataset, checkpoint or sequence")
+    p.add_argument("dataset", metavar="NAME")
+
     _command(commands, "doctor", _doctor, "check this installation and say how to mend it")
     return parser
 
@@ -192,7 +242,7 @@ def _parser() -> argparse.ArgumentParser:
 def _command(commands, name: str, function, help: str) -> argparse.ArgumentParser:
     parser = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    parser.set_defaults(command=function, name=name)
+    parser.set_defaults(command=function, name=parser.prog.partition(" ")[2])
     return parser
 
 
