@@ -58,7 +58,7 @@ def tar_member(name, kind=tarfile.REGTYPE, link=""):
 TARS = {
     "traversal": tar_member("../evil"),
     "traversal inside": tar_member("seq/../../evil"),
-    "absolute": tar_member("/tmp/p2p_evil"),
+    "absolute": tar_member("/dev/shm/p2p_evil"),
     "symbolic link": tar_member("seq/link", tarfile.SYMTYPE, "/etc"),
     "symbolic link inside": tar_member("seq/link", tarfile.SYMTYPE, "cam_K.txt"),
     "hard link": tar_member("seq/link", tarfile.LNKTYPE, "../../outside"),
@@ -92,7 +92,7 @@ def zip_member(name, mode=stat.S_IFREG | 0o644):
 ZIPS = {
     "traversal": zip_member("../evil"),
     "traversal inside": zip_member("seq/../../evil"),
-    "absolute": zip_member("/tmp/p2p_evil"),
+    "absolute": zip_member("/dev/shm/p2p_evil"),
     "symbolic link": zip_member("seq/link", stat.S_IFLNK | 0o777),
     "device": zip_member("seq/null", stat.S_IFCHR | 0o666),
     "backslash": zip_member("..\\..\\evil"),
