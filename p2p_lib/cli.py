@@ -69,10 +69,23 @@ def _run(a: argparse.Namespace) -> None:
 
 
 def _eval(a: argparse.Namespace) -> None:
-    from p2p_lib.run import evaluate_run
+    from p2p_lib.run import evaluate_poses, evaluate_run
 
-    evaluation = evaluate_run(a.run, _pairs("--models", a.models, "NAME=PATH"), a.align, a.min_visible_px)
+    options = _pairs("--models", a.models, "NAME=PATH"), a.align, a.min_visible_px
+    if (a.run is None) == (a.poses is None) or (a.poses is None) != (a.sequence is None):
+        raise BadInput("arguments", "no clear choice", "either the folder of a run, or --poses with --sequence")
+    if a.poses is not None:
+        evaluation = evaluate_poses(a.poses, a.sequence, *options, format=a.format)
+    else:
+        evaluation = evaluate_run(a.run, *options)
     print(json.dumps(evaluation.as_dict()) if a.json else evaluation.as_table())
+
+
+def _export(a: argparse.Namespace) -> None:
+    from p2p_lib.run import export_run
+
+    for path in export_run(a.run, a.format, a.out, a.frame):
+        print(path)
 
 
 def _eval_tracks(a: argparse.Namespace) -> None:
@@ -189,7 +202,10 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--quiet", action="store_true", help="no progress bar")
 
     p = _command(commands, "eval", _eval, "score a run against the truth of its sequence")
-    p.add_argument("run", type=Path, metavar="DIR", help="folder written by p2p run")
+    p.add_argument("run", type=Path, nargs="?", metavar="DIR", help="folder written by p2p run")
+    p.add_argument("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)")
+    p.add_argument("--sequence", metavar="SEQ", help="the sequence that --poses belongs to")
+    p.add_argument("--format", help="layout of --sequence (default: recognised)")
     p.add_argument("--json", action="store_true", help="one JSON object instead of a table")
     p.add_argument("--models", nargs="+", action="extend", metavar="NAME=PATH", help="models for scoring")
     p.add_argument(
@@ -213,6 +229,16 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
     p.add_argument("--set", action="append", metavar="STAGE.KEY=VALUE", help="change one parameter; repeatable")
     p.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+
+    p = _command(commands, "export", _export, "write a run's poses as BOP, TUM or a dataset keeps them")
+    p.add_argument("run", type=Path, metavar="DIR", help="folder written by p2p run")
+    p.add_argument("--format", required=True, choices=("bop", "tum", "poses"), help="BOP CSV, TUM, or 4x4 files")
+    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
+    p.add_argument(
+        "--frame",
+        choices=("object", "model"),
+        help="the tracker's own object frame, or the model's by the truth of the first scored frame (default for bop)",
+    )
 
     p = _command(commands, "notebooks", _notebooks, "run the notebooks headless and collect their results")
     p.add_argument("--profile", choices=("quick", "full"), default="quick", help="size of the job (default quick)")

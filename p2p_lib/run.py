@@ -17,10 +17,12 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import PoseEstimate
 from p2p_lib.data import sequence as sequences
+from p2p_lib.data.export import export
+from p2p_lib.data.imported import as_run, read_poses
 from p2p_lib.data.models import find_models, given_models
 from p2p_lib.data.runs import Run, RunWriter, load_run
 from p2p_lib.evaluation.oracle import OracleTracker
-from p2p_lib.evaluation.protocol import Evaluation, evaluate, rate
+from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, score_tracker
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.pipeline import Point2Pose
@@ -132,6 +134,39 @@ def evaluate_run(
 ) -> Evaluation:
     """Score a run folder; what ``p2p eval`` prints."""
     return evaluate(load_run(out), models, align, min_visible_px)
+
+
+def evaluate_poses(
+    poses: str | Path,
+    sequence: str | Path | sequences.Sequence,
+    models: Mapping[str, str | Path] | None = None,
+    align: str = "first",
+    min_visible_px: int = 300,
+    format: str | None = None,
+) -> Evaluation:
+    """Score any method's poses (see :mod:`p2p_lib.data.imported`) by the rules of a run of ours."""
+    if isinstance(sequence, str | Path):
+        sequence = sequences.open_sequence(sequence, format)
+    known = find_models(sequence) | given_models(models or {}, sequence.objects)
+    run = as_run(read_poses(poses, sequence), sequence, known, path=Path(poses))
+    return evaluate(run, None, align, min_visible_px)
+
+
+def export_run(folder: str | Path, format: str, out: str | Path, frame: str | None = None) -> list[Path]:
+    """Write a run's poses in another tool's form; what ``p2p export`` does.
+
+    frame  "object": T_cam_obj, the tracker's own frame; "model": T_cam_model, by the truth of the first scored frame
+           as scoring fixes it. By default the model's for ``bop``, which knows no other, else the object's
+    """
+    frames = ("object", "model")
+    if frame not in (None, *frames):
+        raise BadInput("frame", repr(frame), " or ".join(frames))
+    run = load_run(folder)
+    in_model = (frame or ("model" if format == "bop" else "object")) == "model"
+    T_obj_model = model_frames(run) if in_model else None
+    path = run.info.get("path")
+    there = path is not None and Path(path).is_dir()
+    return export(run, out, format, T_obj_model, sequences.open_sequence(path, run.info["format"]) if there else None)
 
 
 def evaluate_tracker(

@@ -53,6 +53,11 @@ class ImageSequence:
         return self.read_truth()
 
     @property
+    def frame_names(self) -> tuple[str, ...]:
+        """What each frame's picture is called, without its ending."""
+        return tuple(path.stem for path in self.rgb_files)
+
+    @property
     def shape(self) -> tuple[int, int]:
         """(height, width) in pixels."""
         return self.camera.height, self.camera.width

@@ -253,7 +253,7 @@ class RunWriter:
             rows[n] = self._row(estimate, visible_px.get(name, 0) if visible_px else NO_MASKS)
             self._reasons[name][n:] = [estimate.reason]
             if estimate.T_cam_obj is not None:
-                self._append(self._pose_file(name), _tum_line(frame.time_s, estimate.T_cam_obj))
+                self._append(self._pose_file(name), tum_line(frame.time_s, estimate.T_cam_obj))
         self._times.append((frame.index, frame.time_s))
         self._add_timing(frame, total_ms, any(e.keyframe for e in estimates.values()), stages_ms or {})
         if n + 1 >= self._flush_at:
@@ -334,7 +334,8 @@ def quaternion_xyzw(T: np.ndarray) -> np.ndarray:
     return np.concatenate([w / 2 * np.sinc(half / np.pi), np.cos(half)], -1)
 
 
-def _tum_line(time_s: float, T_cam_obj: np.ndarray) -> str:
+def tum_line(time_s: float, T_cam_obj: np.ndarray) -> str:
+    """One line of a TUM trajectory: time_s tx ty tz qx qy qz qw, metres, with its line end."""
     numbers = np.concatenate([T_cam_obj[:3, 3], quaternion_xyzw(T_cam_obj)])
     return f"{time_s:.9f} " + " ".join(f"{x:.9f}" for x in numbers) + "\n"
 

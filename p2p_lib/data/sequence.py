@@ -56,6 +56,7 @@ class Sequence(Protocol):
     path     its folder, None where it has none
     objects  names of the objects it knows; a single unnamed one is called ``object``
     truth    per object, empty where there is none; read when first asked for
+    times_s  (N,) seconds, increasing; frame_names what each frame's picture is called
     model_places  object to the files and folders where its model may lie, best first
     """
 
@@ -64,7 +65,13 @@ class Sequence(Protocol):
     path: Path | None
     camera: Camera
     objects: tuple[str, ...]
+    times_s: np.ndarray
     model_places: Mapping[str, tuple[Path, ...]]
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """What each frame's picture is called, without its ending."""
+        ...
 
     @property
     def truth(self) -> dict[str, ObjectTruth]:

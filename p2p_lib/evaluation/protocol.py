@@ -161,6 +161,20 @@ def align_first(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarr
     return se3.inverse(T_cam_obj[0]) @ T_cam_model[0]
 
 
+def model_frames(run: Run, min_visible_px: int = MIN_VISIBLE_PX) -> dict[str, np.ndarray]:
+    """Object to T_obj_model (4, 4) by :func:`align_first`, for those with a pose in a scored frame.
+
+    Raises :class:`MissingData` where there is none of these.
+    """
+    usable = {name: scored_frames(obj, min_visible_px) & obj.has_pose for name, obj in run.objects.items()}
+    if not any(at.any() for at in usable.values()):
+        fix = "Take the tracker's own object frame."
+        raise MissingData(str(run.path), "no scored frame with truth and a pose, so no model frame", fix)
+    unused = np.empty((0, 3))
+    found = {name: run.objects[name] for name, at in usable.items() if at.any()}
+    return {n: align_first(o.T_cam_obj[usable[n]], o.T_cam_model[usable[n]], unused) for n, o in found.items()}
+
+
 def align_all(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray) -> np.ndarray:
     """T_obj_model (4, 4) that fits all (m, 4, 4) poses best, with few of them wild.
 
