@@ -14,19 +14,20 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from p2p_lib.backends.packages import INSTALL, PIP, command, cotracker_folder, install_command
 from p2p_lib.core import native
 from p2p_lib.core.paths import PROJECT, cache_dir, data_dir
 
 #: Distributions whose module has another name.
 MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-image": "skimage"}
-INSTALL = "{uv} pip install --python {python} "
 #: Optional backend: module, what it serves, remedy.
 OPTIONAL = {
-    "transformers": ("transformers", "segmentation and features by neural networks", INSTALL + "transformers"),
-    "tapnet": ("tapnet", "2D tracker", INSTALL + "--no-deps 'tapnet @ git+https://github.com/google-deepmind/tapnet'"),
-    "rerun": ("rerun", "viewer for debugging", INSTALL + "rerun-sdk"),
-    "pyrealsense2": ("pyrealsense2", "live camera", INSTALL + "pyrealsense2"),
-    "dask": ("dask.distributed", "runs on a cluster", INSTALL + "'dask[distributed]'"),
+    "transformers": ("transformers", "segmentation and features by neural networks", INSTALL["transformers"]),
+    "tapnet": ("tapnet", "2D trackers tapir and tapnextpp", INSTALL["tapnet"]),
+    "torchvision": ("torchvision", "2D tracker tapnextpp", INSTALL["torchvision"]),
+    "rerun": ("rerun", "viewer for debugging", PIP + "rerun-sdk"),
+    "pyrealsense2": ("pyrealsense2", "live camera", PIP + "pyrealsense2"),
+    "dask": ("dask.distributed", "runs on a cluster", PIP + "'dask[distributed]'"),
 }
 FREE_GB = 5.0
 # How long a package may take to load before something is taken to be wrong with it.
@@ -131,23 +132,14 @@ def _optional(name: str, module: str, serves: str, remedy: str) -> Check:
         there = importlib.util.find_spec(module) is not None
     except ModuleNotFoundError:  # its parent package is missing
         there = False
-    uv = shutil.which("uv", path=str(Path(sys.executable).parent)) or "uv"
-    remedy = remedy.format(uv=_from_here(uv), python=_from_here(sys.executable))
-    return Check(name, there, True, serves + ("" if there else "; not installed"), remedy)
-
-
-def _from_here(path: str) -> str:
-    """The path as seen from the project's folder where it lies below it."""
-    return str(Path(path).relative_to(PROJECT)) if Path(path).is_relative_to(PROJECT) else path
+    return Check(name, there, True, serves + ("" if there else "; not installed"), command(remedy))
 
 
 def _cotracker() -> Check:
     """CoTracker comes through torch.hub, which keeps it under its own cache folder."""
-    home = os.environ.get("TORCH_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torch"
-    there = any((Path(home).expanduser() / "hub").glob("facebookresearch_co-tracker_*"))
-    load = "import torch; torch.hub.load('facebookresearch/co-tracker', 'cotracker3_online')"
-    remedy = f'{_from_here(sys.executable)} -c "{load}"'
-    return Check("cotracker", there, True, "2D tracker, weights CC BY-NC" + ("" if there else "; not there"), remedy)
+    there, remedy = cotracker_folder() is not None, install_command("co-tracker")
+    serves = "2D tracker cotracker3, CC BY-NC: not for commercial use"
+    return Check("cotracker", there, True, serves + ("" if there else "; not there"), remedy)
 
 
 def _data() -> Check:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from p2p_lib.backends import cotracker, tapir, tapnextpp
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.stages import tracking
@@ -13,7 +14,12 @@ from p2p_lib.stages.short_horizon import ShortHorizon
 from p2p_lib.stages.tracking import PointTracker
 
 #: Trackers by the name that --tracker takes.
-TRACKERS: dict[str, Callable[..., PointTracker]] = {**tracking.TRACKERS}
+TRACKERS: dict[str, Callable[..., PointTracker]] = {
+    **tracking.TRACKERS,
+    "tapir": tapir.load,
+    "tapnextpp": tapnextpp.load,
+    "cotracker3": cotracker.load,
+}
 
 
 def make_tracker(
