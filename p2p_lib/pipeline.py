@@ -8,7 +8,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -42,6 +43,7 @@ class Point2Pose:
         self.stopwatch = Stopwatch()
         self._first_masks: dict[str, np.ndarray] = {}
         self._streaming = False
+        self._waiting: deque[tuple[Frame, dict[str, np.ndarray | None]]] = deque()  # frames without an answer yet
 
     def add_object(self, name: str, mask: np.ndarray | None = None, clicks: np.ndarray | None = None) -> None:
         """Follow one more object from the next frame on.
@@ -74,11 +76,33 @@ class Point2Pose:
 
         masks  object -> (H, W) bool, the object's visible pixels. An object that is left out is hidden
                in this frame; None says that nobody knows, and every object goes by its points alone.
+
+        Where the 2D tracker answers late, so does this: the estimates are of the frame ``latency_frames`` ago,
+        as each says, and there are none for the first of the stream until then.
         """
         with self.stopwatch.frame():
-            masks = self._masks(frame, masks)
-            tracks = self._track(frame, masks)
-            return {name: obj.step(frame, masks[name], tracks) for name, obj in self.objects.items()}
+            return self._advance(frame, self._masks(frame, masks))
+
+    def finish(self) -> Iterator[dict[str, PoseEstimate]]:
+        """After the last frame: the estimates still owed, oldest first. None are unless the tracker answers late."""
+        waiting = list(self._waiting)
+        for _ in range(self.tracker.latency_frames if waiting else 0):
+            with self.stopwatch.frame():
+                owed = len(self._waiting) == self.tracker.latency_frames
+                estimates = self._advance(*waiting[-1])  # the last picture again
+            if owed:
+                yield estimates
+        self._waiting.clear()
+
+    def _advance(self, frame: Frame, masks: dict[str, np.ndarray | None]) -> dict[str, PoseEstimate]:
+        """Track into a frame, then estimate at the frame that the tracks are of."""
+        tracks = self._track(frame, masks)
+        self._waiting.append((frame, masks))
+        if len(self._waiting) <= self.tracker.latency_frames:
+            return {}
+        frame, masks = self._waiting.popleft()
+        # An object added since then is not in that frame's masks yet.
+        return {name: obj.step(frame, masks[name], tracks) for name, obj in self.objects.items() if name in masks}
 
     def _masks(self, frame: Frame, masks: Mapping[str, np.ndarray] | None) -> dict[str, np.ndarray | None]:
         """Every object's checked mask in this frame; None for one of which nobody knows."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from p2p_lib.backends.registry import make_tracker
 from p2p_lib.core import config as configuration
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.types import PoseEstimate
+from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.data import sequence as sequences
 from p2p_lib.data.export import export
 from p2p_lib.data.imported import as_run, read_poses
@@ -68,7 +68,7 @@ def run(
     config_file: Path | None = None,
     settings: Mapping[str, Any] | None = None,
     seed: int | None = None,
-    tracker: str | None = None,
+    tracker: str | PointTracker | None = None,
     masks: str = "dataset",
     format: str | None = None,
     depth_scale: float | None = None,
@@ -108,9 +108,7 @@ def run(
     interrupted = False
     with writer, tqdm(total=len(frames), unit="frame", disable=not progress, desc=sequence.name) as bar:
         try:
-            for i in frames:
-                frame, seen = sequence.frame(i), sequence.masks(i)
-                estimates = method.step(frame, None if seen is None else {n: seen[n] for n in chosen if n in seen})
+            for frame, estimates in _estimates(method, sequence, frames):
                 times = method.stopwatch.last_ms
                 writer.add(frame, estimates, times["total"], {k: v for k, v in times.items() if k != "total"})
                 bar.set_postfix_str(_postfix(times["total"], estimates), refresh=False)
@@ -127,6 +125,22 @@ def run(
     except MissingData as error:
         evaluation, not_scored = None, str(error)
     return RunResult(Path(out), evaluation, not_scored, _summary(done, len(frames)), interrupted)
+
+
+def _estimates(
+    method: Point2Pose, sequence: sequences.Sequence, frames: range
+) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
+    """Every frame with its estimates, which a late 2D tracker gives some frames later."""
+    waiting: deque[Frame] = deque()
+    for i in frames:
+        frame, seen = sequence.frame(i), sequence.masks(i)
+        waiting.append(frame)
+        known = None if seen is None else {name: seen[name] for name in method.objects if name in seen}
+        estimates = method.step(frame, known)
+        if len(waiting) > method.tracker.latency_frames:
+            yield waiting.popleft(), estimates
+    for estimates in method.finish():
+        yield waiting.popleft(), estimates
 
 
 def evaluate_run(
@@ -193,7 +207,10 @@ def evaluate_tracker(
 
 
 def _tracker(
-    name: str | None, sequence: sequences.Sequence, config: Config, models: Mapping[str, str | Path] | None
+    name: str | PointTracker | None,
+    sequence: sequences.Sequence,
+    config: Config,
+    models: Mapping[str, str | Path] | None,
 ) -> str | PointTracker:
     """The name of a tracker, but the tracker itself where it must know the sequence: ``oracle``."""
     if name != OracleTracker.name:

@@ -25,7 +25,7 @@ from p2p_lib.stages.tracking import PointTracker
 
 @dataclass(frozen=True, eq=False)
 class TrackRun:
-    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms (T,).
+    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms per picture.
 
     Before its query a point is invisible and NaN. cpu_ms is the processor time of all threads in a frame,
     new queries included; NaN in frames before the first query.
@@ -112,28 +112,28 @@ def score_tracker(
 def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, search: bool = False) -> TrackRun:
     """Stream the sequence through the tracker in one pass, each query added at its frame.
 
-    A tracker that answers late is asked for the frame its tracks belong to; the last frames of the stream,
-    for which no answer comes, stay invisible.
+    What a tracker says late is scored in the frame that it is of; for the last ones the last picture is repeated.
     """
-    total, n = len(sequence), len(queries)
+    total, n, late = len(sequence), len(queries), tracker.latency_frames
     uv, visible = np.full((total, n, 2), np.nan), np.zeros((total, n), bool)
-    uncertainty, cpu_ms = np.ones((total, n)), np.full(total, np.nan)
-    ids = np.full(n, -1)
-    for i in range(int(queries.frame.min()), total):
-        frame = sequence.frame(i)
-        where = np.logical_or.reduce([np.zeros(frame.shape, bool), *(sequence.masks(i) or {}).values()])
+    uncertainty, cpu_ms = np.ones((total, n)), np.full(total + late, np.nan)
+    ids, first = np.full(n, -1), int(queries.frame.min())
+    for i in range(first, total + late):
+        frame, answered = sequence.frame(min(i, total - 1)), i - late
+        masks = sequence.masks(frame.index) or {}
+        where = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
         start, tracks = time.process_time(), None
-        if i == queries.frame.min():
+        if i == first:
             tracker.start(frame)
         else:
             tracks = tracker.track(frame, where if search else None)
-        new = np.flatnonzero(queries.frame == i)
+        new = np.flatnonzero(queries.frame == answered)
         if len(new):
             ids[new] = tracker.add(queries.uv_px[new])
         cpu_ms[i] = 1e3 * (time.process_time() - start)
-        if tracks is not None:
-            of = i - tracker.latency_frames
-            rows = np.flatnonzero(np.isin(ids, tracks.ids) & (queries.frame < of))
+        if tracks is not None and answered >= first:
+            rows = np.flatnonzero(np.isin(ids, tracks.ids))
             told = tracks.select(ids[rows])
-            uv[of, rows], visible[of, rows], uncertainty[of, rows] = told.uv_px, told.visible, told.uncertainty
+            uv[answered, rows], visible[answered, rows] = told.uv_px, told.visible
+            uncertainty[answered, rows] = told.uncertainty
     return TrackRun(uv, visible, uncertainty, cpu_ms)

@@ -72,10 +72,16 @@ def test_search_is_the_union_of_the_masks(crossing, queries):
 
 
 def test_a_late_answer_belongs_to_an_earlier_frame(crossing, queries):
-    run = run_tracker(Recorder(late=3), crossing, queries)
-    first = queries.frame[0]
-    np.testing.assert_array_equal(run.uv_px[first + 1, 0], queries.uv_px[0] + first + 4)
-    assert not run.visible[-3:].any()
+    tracker = Recorder(late=3)
+    run = run_tracker(tracker, crossing, queries)
+    # Queries of frame 75 are added once the tracker has answered that frame.
+    adds = [k for k, entry in enumerate(tracker.diary) if entry[0] == "add"]
+    assert [tracker.diary[k - 1][1] for k in adds] == [3, 78, 153, 228]
+    for k, first in enumerate(queries.frame):
+        np.testing.assert_array_equal(run.uv_px[first + 1, k], queries.uv_px[k] + first + 4)
+        assert not run.visible[: first + 1, k].any() and run.visible[first + 1 :, k].all()
+    # The last picture is shown three times more.
+    assert [entry[1] for entry in tracker.diary[-4:]] == [299] * 4
 
 
 def test_plain_lk_scores_as_lucas_kanade_does(crossing):
