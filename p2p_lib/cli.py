@@ -49,6 +49,7 @@ def _run(a: argparse.Namespace) -> None:
         settings=_pairs("--set", a.set, "stage.key=value"),
         seed=a.seed,
         tracker=a.tracker,
+        detector=a.detector,
         masks=a.masks,
         format=a.format,
         depth_scale=a.depth_scale,
@@ -194,6 +195,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--config", type=Path, metavar="FILE", help="TOML file with [stage] key = value")
     p.add_argument("--set", action="append", metavar="STAGE.KEY=VALUE", help="change one parameter; repeatable")
     p.add_argument("--tracker", default=None, metavar="NAME", help="2D point tracker (default: the embedded one)")
+    p.add_argument("--detector", default=None, metavar="NAME", help="source of new points (default: corners)")
     p.add_argument("--masks", default="dataset", metavar="SOURCE", help="dataset, or dataset:FOLDER")
     p.add_argument("--seed", type=int, default=None, metavar="N", help="of every random choice (default 0)")
     p.add_argument("--start", type=int, default=0, metavar="I", help="first frame")

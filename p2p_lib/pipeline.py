@@ -13,13 +13,12 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from p2p_lib.backends.registry import make_tracker
+from p2p_lib.backends.registry import DEFAULT_DETECTOR, make_detector, make_tracker
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
-from p2p_lib.stages.sampling import DEFAULT_DETECTOR, make_detector
 from p2p_lib.stages.tracking import DEFAULT_TRACKER, PointTracker
 from p2p_lib.tracked_object import TrackedObject
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from p2p_lib.backends.registry import make_tracker
+from p2p_lib.backends.registry import DEFAULT_DETECTOR, make_tracker
 from p2p_lib.core import config as configuration
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
@@ -69,6 +69,7 @@ def run(
     settings: Mapping[str, Any] | None = None,
     seed: int | None = None,
     tracker: str | PointTracker | None = None,
+    detector: str | None = None,
     masks: str = "dataset",
     format: str | None = None,
     depth_scale: float | None = None,
@@ -90,7 +91,9 @@ def run(
         sequence = sequences.open_sequence(sequence, format, depth_scale, config.seed, masks=folder)
     chosen = _chosen(sequence, objects)
     frames = _frames(len(sequence), start, stop)
-    method = Point2Pose(sequence.camera, config, _tracker(tracker, sequence, config, models))
+    method = Point2Pose(
+        sequence.camera, config, _tracker(tracker, sequence, config, models), detector or DEFAULT_DETECTOR
+    )
     for name in chosen:
         method.add_object(name)
     known = find_models(sequence) | given_models(models or {}, sequence.objects)
@@ -105,6 +108,7 @@ def run(
         frames.stop,
         {name: path for name, path in known.items() if name in chosen},
     )
+    writer.info["detector"] = method.detector.name
     interrupted = False
     with writer, tqdm(total=len(frames), unit="frame", disable=not progress, desc=sequence.name) as bar:
         try:

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.config import SamplingConfig
-from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
 
 
@@ -73,19 +72,6 @@ class CornerDetector:
         uv_px, score = np.concatenate(uv) + np.array([x0, y0], float), np.concatenate(score).astype(float)
         order = np.argsort(-score, kind="stable")[: self._limit]
         return Candidates(uv_px[order], score[order])
-
-
-#: Detectors by the name that --detector takes.
-DETECTORS = {"corners": CornerDetector}
-#: The one that runs when none is named.
-DEFAULT_DETECTOR = "corners"
-
-
-def make_detector(name: str, config: SamplingConfig, rng: np.random.Generator | None = None) -> Detector:
-    """The detector called ``name``; unknown names are refused with the list of those there are."""
-    if name not in DETECTORS:
-        raise BadInput("detector", repr(name), "one of " + ", ".join(DETECTORS))
-    return DETECTORS[name](config, rng)
 
 
 def objective(score: np.ndarray, d_px: np.ndarray, config: SamplingConfig) -> np.ndarray:

@@ -6,7 +6,7 @@ What the weights would say is not looked at: shapes, coordinates, memory and lat
 import numpy as np
 import pytest
 
-from p2p_lib.backends import cotracker, tapir, tapnextpp
+from p2p_lib.backends import cotracker, packages, tapir, tapnextpp
 from p2p_lib.backends.rollouts import RolloutTracker
 from p2p_lib.core.errors import MissingBackend
 
@@ -131,15 +131,18 @@ def test_tapir_finds_a_still_point_where_it_is(tapir_model, frames):
 
 @pytest.fixture(scope="module")
 def tapnext_model():
-    """Heads are enlarged: with the initial ones every point would sit in the same place."""
+    """Two narrow layers of it. The class leaves its weights unset: drawn here so that points differ in what they do."""
     import torch
 
-    model = built(tapnextpp.new_model)
+    def small():
+        packages.load("torchvision", "tapnextpp", "torchvision")
+        module = packages.load("tapnet.tapnext.tapnext_torch", "tapnextpp", "tapnet")
+        return module.TAPNext(image_size=(256, 256), width=96, num_heads=4, lru_width=96, depth=2)
+
+    model = built(small)
     with torch.no_grad():
-        for parameter in (model.point_query_token, model.mask_token, model.image_pos_emb):
-            parameter.normal_(0, 0.5)
-        model.coordinate_head[-1].weight.mul_(40)
-        model.visible_head[-1].weight.mul_(40)
+        for parameter in model.parameters():
+            parameter.normal_(0, 0.3 if parameter.ndim > 1 else 0.1)
     return model
 
 

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from p2p_lib.backends.registry import make_detector
 from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
-from p2p_lib.stages.sampling import Candidates, choose, make_detector, objective, usable_region
+from p2p_lib.stages.sampling import Candidates, choose, objective, usable_region
 
 DEFAULT = SamplingConfig()
 
