@@ -23,7 +23,8 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import cache_dir
 from p2p_lib.data.synthetic.noise import Sensor, measured_colour, measured_depth
 from p2p_lib.data.synthetic.render import Picture, render
-from p2p_lib.data.synthetic.scenarios import FPS, SCENARIOS, Body, Scenario
+from p2p_lib.data.synthetic.scenarios import SCENARIOS
+from p2p_lib.data.synthetic.scene import FPS, Body, Scenario
 from p2p_lib.data.synthetic.shapes import Mesh
 
 _TRACKS_PER_OBJECT = 256

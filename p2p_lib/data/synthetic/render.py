@@ -16,6 +16,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.data.synthetic.environment import Environment, fresnel
 from p2p_lib.data.synthetic.shapes import Mesh
 
 _NEAR_M = 0.01
@@ -24,10 +25,17 @@ _INSIDE = -1e-9  # so that a pixel exactly on the edge between two faces belongs
 
 @dataclass(frozen=True)
 class Light:
-    """One distant light, and light from everywhere. ``towards`` points from the scene to the light (any length)."""
+    """One distant light, and light from everywhere.
+
+    towards      points from the scene to the light (any length)
+    ambient      share of the light that comes from everywhere
+    environment  what glossy surfaces mirror, and how blurred (glaze: a degree); None = nothing
+    """
 
     towards: tuple[float, float, float] = (-0.35, -0.8, 0.75)
     ambient: float = 0.5
+    environment: Environment | None = None
+    roughness_rad: float = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +65,6 @@ def render(
     light = light or Light()
     H, W = camera.height, camera.width
     T_cam_world = se3.inverse(np.asarray(T_world_cam, float))
-    towards = T_cam_world[:3, :3] @ (np.asarray(light.towards, float) / np.linalg.norm(light.towards))
     owner = np.zeros(H * W, np.uint8)
     if background is None:
         inv_depth = np.zeros(H * W)
@@ -70,19 +77,30 @@ def render(
     for k, (mesh, T_world_model) in enumerate(bodies, 1):
         T_cam_model = T_cam_world @ T_world_model
         drawn.append(_rasterise(mesh, T_cam_model, camera, inv_depth, owner, k))
-    for k, ((mesh, T_world_model), (pixel, face, planes)) in enumerate(zip(bodies, drawn, strict=True), 1):
-        last = owner[pixel] == k
-        pixel, face, planes = pixel[last], face[last], planes[last]
-        R = (T_cam_world @ T_world_model)[:3, :3]
-        rgb[pixel], cosine[pixel] = _shade(mesh, R, camera, pixel, face, planes, towards, light.ambient)
+    for k, ((mesh, T_world_model), fragments) in enumerate(zip(bodies, drawn, strict=True), 1):
+        seen = fragments.select(owner[fragments.pixel] == k)
+        shades = _shade(mesh, T_cam_world @ T_world_model, camera, seen, light, T_cam_world)
+        rgb[seen.pixel], cosine[seen.pixel] = shades
     depth = np.divide(1.0, inv_depth, out=np.zeros(H * W), where=inv_depth > 0)
     return Picture(rgb.reshape(H, W, 3), depth.reshape(H, W), owner.reshape(H, W), cosine.reshape(H, W))
 
 
+@dataclass(frozen=True, eq=False)
+class _Fragments:
+    """Pixels (N,) of a body, the faces (N,) they show, and the faces' planes (N, 3, 3), see _faces_in_view."""
+
+    pixel: np.ndarray
+    face: np.ndarray
+    planes: np.ndarray
+
+    def select(self, rows: np.ndarray) -> _Fragments:
+        return _Fragments(self.pixel[rows], self.face[rows], self.planes[rows])
+
+
 def _rasterise(
     mesh: Mesh, T_cam_model: np.ndarray, camera: Camera, inv_depth: np.ndarray, owner: np.ndarray, k: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draws one body into the depth buffer; returns the pixels it won, their faces and the faces' planes (N, 3, 3)."""
+) -> _Fragments:
+    """Draws one body into the depth buffer; returns the pixels it won."""
     faces, box, planes = _faces_in_view(mesh, T_cam_model, camera)
     width = box[:, 2] - box[:, 0] + 1
     count = width * (box[:, 3] - box[:, 1] + 1)
@@ -100,7 +118,7 @@ def _rasterise(
     pixel, first = np.unique(pixel[won], return_index=True)
     f = f[won[first]]
     owner[pixel] = k
-    return pixel, faces[f], planes[f]
+    return _Fragments(pixel, faces[f], planes[f])
 
 
 def _faces_in_view(mesh: Mesh, T_cam_model: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -142,38 +160,53 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _shade(
-    mesh: Mesh,
-    R_cam_model: np.ndarray,
-    camera: Camera,
-    pixel: np.ndarray,
-    face: np.ndarray,
-    planes: np.ndarray,
-    towards: np.ndarray,
-    ambient: float,
+    mesh: Mesh, T_cam_model: np.ndarray, camera: Camera, seen: _Fragments, light: Light, T_cam_world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colour (N, 3) and cosine of incidence (N,) of pixels on known faces."""
-    if not len(pixel):
+    if not len(seen.pixel):
         return np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
-    v, u = np.divmod(pixel, camera.width)
+    v, u = np.divmod(seen.pixel, camera.width)
+    planes, face, R = seen.planes, seen.face, T_cam_model[:3, :3]
     over_z = planes[..., 0] * u[:, None] + planes[..., 1] * v[:, None] + planes[..., 2]
     inv_z = over_z.sum(1, keepdims=True)
     weight = over_z / inv_z
+    # How the barycentric weights change from pixel to pixel, to the right and down.
+    slopes = [(planes[..., a] - weight * planes[..., a].sum(1, keepdims=True)) / inv_z for a in range(2)]
     corner_uv = mesh.uv[face]
     uv = np.einsum("nk,nkc->nc", weight, corner_uv)
     size = np.array(mesh.texture.shape[1::-1])
-    step = 0.0
-    for axis in range(2):
-        slope = (planes[..., axis] - weight * planes[..., axis].sum(1, keepdims=True)) / inv_z
-        step = np.maximum(step, np.linalg.norm(np.einsum("nk,nkc->nc", slope, corner_uv) * size, axis=1))
-    colour = _texture(mesh.mipmap, uv, np.log2(np.maximum(step, 1e-6)))
-    ray = camera.rays.reshape(-1, 3)[pixel]
+    steps = [np.linalg.norm(np.einsum("nk,nkc->nc", slope, corner_uv) * size, axis=1) for slope in slopes]
+    colour = _texture(mesh.mipmap, uv, np.log2(np.maximum(np.maximum(*steps), 1e-6)))
+    ray = camera.rays.reshape(-1, 3)[seen.pixel]
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-    cosine = -np.einsum("nc,nc->n", mesh.face_normals[face] @ R_cam_model.T, ray)
+    cosine = -np.einsum("nc,nc->n", mesh.face_normals[face] @ R.T, ray)
     side = np.where(cosine < 0, -1.0, 1.0)
-    normal = np.einsum("nk,nkc->nc", weight, mesh.normals[face]) @ R_cam_model.T
+    normal = np.einsum("nk,nkc->nc", weight, mesh.normals[face]) @ R.T
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    light = ambient + (1 - ambient) * np.maximum(0, side * (normal @ towards))
-    return colour * light[:, None].astype(np.float32), np.abs(cosine).astype(np.float32)
+    towards = T_cam_world[:3, :3] @ (np.asarray(light.towards, float) / np.linalg.norm(light.towards))
+    lit = light.ambient + (1 - light.ambient) * np.maximum(0, side * (normal @ towards))
+    colour = colour * lit[:, None].astype(np.float32)
+    if light.environment is not None and mesh.reflectance is not None:
+        bend = [np.linalg.norm(np.einsum("nk,nkc->nc", slope, mesh.normals[face]), axis=1) for slope in slopes]
+        spread = 2 * np.maximum(*bend) + light.roughness_rad
+        mirrored, share = _mirrored(light.environment, ray, normal, spread, T_cam_world, mesh.reflectance[face])
+        colour += share * (mirrored - colour)
+    return colour, np.abs(cosine).astype(np.float32)
+
+
+def _mirrored(
+    environment: Environment,
+    ray: np.ndarray,
+    normal: np.ndarray,
+    spread_rad: np.ndarray,
+    T_cam_world: np.ndarray,
+    reflectance: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What arrives by way of the surface (N, 3), and its share (N, 1): rays and normals (N, 3) in camera axes."""
+    cosine = -np.einsum("nc,nc->n", ray, normal)
+    away_world = (ray + 2 * cosine[:, None] * normal) @ T_cam_world[:3, :3]
+    share = np.where(reflectance > 0, fresnel(reflectance, cosine), 0)
+    return _texture(environment.mipmap, *environment.lookup(away_world, spread_rad)), share[:, None].astype(np.float32)
 
 
 def _texture(mipmap: list[np.ndarray], uv: np.ndarray, level: np.ndarray) -> np.ndarray:

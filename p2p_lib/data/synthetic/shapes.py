@@ -20,12 +20,13 @@ TEXELS_PER_M = 3000.0
 class Mesh:
     """A rigid surface with a picture on it. Faces are counter-clockwise seen from outside.
 
-    vertices  (V, 3) float64, metres, model frame
-    faces     (F, 3) int
-    uv        (F, 3, 2) texture coordinates per face corner, (0, 0) = bottom left of the texture
-    texture   (H, W, 3) uint8, RGB
-    normals   (F, 3, 3) unit normals per face corner for shading; None = those of the flat faces
-    closed    faces seen from behind are not drawn
+    vertices     (V, 3) float64, metres, model frame
+    faces        (F, 3) int
+    uv           (F, 3, 2) texture coordinates per face corner, (0, 0) = bottom left of the texture
+    texture      (H, W, 3) uint8, RGB
+    normals      (F, 3, 3) unit normals per face corner for shading; None = those of the flat faces
+    closed       faces seen from behind are not drawn
+    reflectance  (F,) share of light mirrored at normal incidence (glaze 0.05); None = matt all over
     """
 
     vertices: np.ndarray
@@ -34,6 +35,7 @@ class Mesh:
     texture: np.ndarray
     normals: np.ndarray | None = None
     closed: bool = True
+    reflectance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         F = len(self.faces)
@@ -105,7 +107,7 @@ def can(rng: np.random.Generator, radius_m: float, height_m: float, contrast: fl
 
     rows = max(2, round(height_m / 0.01))
     across, up = np.linspace(0, 1, segments + 1), np.linspace(0, 1, rows + 1)
-    side = _grid(across, up)
+    side = grid(across, up)
     angle = 2 * np.pi * side[..., 0]
     out = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
     points = out * radius_m + (side[..., 1:] - 0.5) * [0, 0, height_m]
@@ -120,7 +122,22 @@ def can(rng: np.random.Generator, radius_m: float, height_m: float, contrast: fl
         uv = ((flat * [sign, 1] * 0.98 / 2 + 0.5) * disc + [k * disc, 0]) / [W, H]
         parts.append((p, uv, np.broadcast_to([0.0, 0, sign], p.shape)))
     corners, uv, normals = (np.concatenate(a) for a in zip(*parts, strict=True))
-    return _welded(corners, uv, texture, normals)
+    return welded(corners, uv, texture, normals)
+
+
+def block(rng: np.random.Generator, radius_m: float, height_m: float, contrast: float = 1.0) -> Mesh:
+    """A leaning, five-sided stump with a slanted top: seven flat, printed faces, no two alike, and no symmetry.
+
+    Its sides lie on planes through one apex, so that they stay flat. Its origin is the middle of its height.
+    """
+    angle = np.radians(72 * np.arange(5) + rng.uniform(-20, 20, 5) + rng.uniform(0, 360))
+    foot = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * radius_m * rng.uniform(0.75, 1.25, 5)[:, None]
+    apex = np.r_[rng.uniform(-0.6, 0.6, 2) * radius_m, 2.6 * height_m]
+    slant = np.r_[rng.uniform(0.2, 0.35) * np.array([np.cos(angle[0] + 1), np.sin(angle[0] + 1)]), 1]
+    share = (height_m - foot @ slant) / ((apex - foot) @ slant)
+    top = foot + share[:, None] * (apex - foot)
+    around = [np.stack([foot[k], foot[k - 4], top[k - 4], top[k]]) for k in range(5)]
+    return _flat_faced([*around, top, foot[::-1]], [0, 0, -height_m / 2], rng, contrast)
 
 
 def plane(texture: np.ndarray, corners_m: np.ndarray) -> Mesh:
@@ -148,7 +165,7 @@ def load_mesh(path: str | Path) -> Mesh:
     return Mesh(np.asarray(m.vertices, float), faces, np.asarray(uv)[faces], np.array(image.convert("RGB")), normals)
 
 
-def _grid(across: np.ndarray, up: np.ndarray) -> np.ndarray:
+def grid(across: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Two counter-clockwise triangles per cell of a grid in the plane: (2 * cells, 3, 2)."""
     a0, u0 = np.meshgrid(across[:-1], up[:-1])
     a1, u1 = np.meshgrid(across[1:], up[1:])
@@ -169,7 +186,7 @@ def _carton(size_m: tuple, sides: list[np.ndarray], ends: list[np.ndarray]) -> M
     for k, ((right, up), panel) in enumerate(zip(frames, sides + ends, strict=True)):
         out = np.cross(right, up)
         w, h = np.abs(right) @ size, np.abs(up) @ size
-        cells = _grid(*(np.linspace(0, 1, max(1, round(s / 0.01)) + 1) for s in (w, h)))
+        cells = grid(*(np.linspace(0, 1, max(1, round(s / 0.01)) + 1) for s in (w, h)))
         p = (cells[..., :1] - 0.5) * w * right + (cells[..., 1:] - 0.5) * h * up + out * (np.abs(out) @ size) / 2
         left = 0 if k == 4 else left
         bottom = 0 if k >= 4 else len(low_row)
@@ -177,10 +194,34 @@ def _carton(size_m: tuple, sides: list[np.ndarray], ends: list[np.ndarray]) -> M
         left += panel.shape[1]
         parts.append((p, uv, np.broadcast_to(out, p.shape)))
     corners, uv, normals = (np.concatenate(a) for a in zip(*parts, strict=True))
-    return _welded(corners, uv, texture, normals)
+    return welded(corners, uv, texture, normals)
 
 
-def _welded(corners: np.ndarray, uv: np.ndarray, texture: np.ndarray, normals: np.ndarray) -> Mesh:
+def _flat_faced(faces: list[np.ndarray], shift: list[float], rng: np.random.Generator, contrast: float) -> Mesh:
+    """A solid of flat convex faces (corners (K, 3) counter-clockwise), each with a label of its own."""
+    panels, parts = [], []
+    for corners in faces:
+        right = (corners[1] - corners[0]) / np.linalg.norm(corners[1] - corners[0])
+        out = np.cross(right, corners[2] - corners[1])
+        out /= np.linalg.norm(out)
+        flat = (corners - corners[0]) @ np.stack([right, np.cross(out, right)], 1)
+        flat -= flat.min(0)
+        w, h = np.maximum(8, np.round(flat.max(0) * TEXELS_PER_M)).astype(int)
+        panels.append(labels.label(rng, w, h, contrast, front=len(panels) % 2 == 0))
+        fan = np.stack([[0, k, k + 1] for k in range(1, len(corners) - 1)])
+        parts.append((corners[fan] + shift, flat[fan] / flat.max(0), np.broadcast_to(out, (len(fan), 3, 3))))
+    bottom = np.cumsum([0, *(len(p) for p in panels)])
+    texture = np.full((bottom[-1], max(p.shape[1] for p in panels), 3), 128, np.uint8)
+    H, W = texture.shape[:2]
+    uvs = []
+    for panel, low, (_, uv, _) in zip(panels, bottom, parts, strict=False):
+        texture[H - low - len(panel) : H - low, : panel.shape[1]] = panel
+        uvs.append((uv * panel.shape[1::-1] + [0, low]) / [W, H])
+    corners, normals = (np.concatenate([p[k] for p in parts]) for k in (0, 2))
+    return welded(corners, np.concatenate(uvs), texture, normals)
+
+
+def welded(corners: np.ndarray, uv: np.ndarray, texture: np.ndarray, normals: np.ndarray) -> Mesh:
     """A mesh from loose triangles (F, 3, 3): corners at one place become one vertex."""
     flat = corners.reshape(-1, 3)
     _, first, index = np.unique(np.round(flat, 9), axis=0, return_index=True, return_inverse=True)
