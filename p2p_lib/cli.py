@@ -148,6 +148,13 @@ def _data_where(a: argparse.Namespace) -> None:
     print(where(a.dataset))
 
 
+def _data_convert_bag(a: argparse.Namespace) -> None:
+    from p2p_lib.data.realsense import convert_bag
+
+    count = convert_bag(a.recording, a.out, not a.quiet)
+    print(f"{count} frames in {a.out}. Next: put the masks into {a.out}/masks, then p2p run {a.out} --out DIR")
+
+
 def _doctor(a: argparse.Namespace) -> int:
     from p2p_lib.doctor import format_checks, run_doctor
 
@@ -260,6 +267,10 @@ def _parser() -> argparse.ArgumentParser:
     p = _command(data, "verify", _data_verify, "check what is on disk: checksums, sequences, frames, truth")
     p.add_argument("dataset", metavar="NAME")
     p.add_argument("--every-frame", action="store_true", help="read every picture, not only the first and the last")
+    p = _command(data, "convert-bag", _data_convert_bag, "turn a RealSense recording into a folder for p2p run")
+    p.add_argument("recording", type=Path, metavar="FILE", help="a .bag (or .db3)")
+    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    p.add_argument("--quiet", action="store_true", help="no progress bar")
     p = _command(data, "where", _data_where, "print the folder of a dataset, checkpoint or sequence")
     p.add_argument("dataset", metavar="NAME")
 

@@ -341,3 +341,14 @@ def test_ycbineoat_models_by_the_sequences_name(ycbineoat, name):
     found = find_models(open_sequence(folder))
     expected = {"m": "006_mustard_bottle", "b": "021_bleach_cleanser"}.get(name[0])
     assert [path.parent.name for path in found.values()] == ([expected] if expected else [])
+
+
+def test_folder_says_its_own_depth_scale(tmp_path):
+    folder = write_pictures(tmp_path / "own", depth_mm=5000)
+    (folder / "depth_scale.txt").write_text("0.0001\n")
+    np.testing.assert_allclose(open_sequence(folder).frame(0).depth_m, 0.5, rtol=1e-6)
+    np.testing.assert_allclose(open_sequence(folder, depth_scale=0.001).frame(0).depth_m, 5, rtol=1e-6)
+    for wrong in ("0", "1000", "0.001 0.001", "mm", ""):
+        (folder / "depth_scale.txt").write_text(wrong)
+        with pytest.raises(BadInput, match=r"depth_scale\.txt: got"):
+            open_sequence(folder)
