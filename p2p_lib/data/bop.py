@@ -163,5 +163,5 @@ def _truth(folder: Path, obj: str, numbers: list[int], listed, visible) -> Objec
 
 
 def _model_places(folder: Path, obj: str) -> tuple[Path, ...]:
-    root, kind = folder.resolve().parent.parent, "_".join(obj.split("_")[:2])
+    root, kind = images.full(folder).parent.parent, "_".join(obj.split("_")[:2])
     return (folder / "models" / obj, *(root / models / f"{kind}.ply" for models in ("models_eval", "models")))

@@ -105,7 +105,7 @@ def _masks(
     folder: Path, masks: str | Path | None, rgb_files: tuple[Path, ...], shape: tuple[int, int]
 ) -> MaskFiles | None:
     """Those asked for (a name beside ``evaluation/``, or a path), else the first of :data:`MASKS` that is there."""
-    root, sequence = folder.resolve().parent.parent, folder.resolve().name
+    root, sequence = images.full(folder).parent.parent, images.full(folder).name
     beside = [root / name / sequence for name in ([str(masks)] if masks else MASKS)]
     found = next((place for place in beside if place.is_dir()), masks_folder(folder, masks) if masks else None)
     return find_masks(found, rgb_files, shape, (OBJECT,)) if found else None
@@ -116,5 +116,5 @@ def _models(folder: Path, meta: dict) -> tuple[Path, ...]:
     own, known = folder / "models" / OBJECT, meta.get("objName")
     if not isinstance(known, str) or not re.fullmatch(r"[\w-]+", known):
         return (own,)
-    beside = folder.resolve().parent.parent / "models" / known
+    beside = images.full(folder).parent.parent / "models" / known
     return own, beside / "textured_simple.obj", beside

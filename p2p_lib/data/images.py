@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -21,6 +22,11 @@ NOT_RIGID = 0.01
 
 
 # --- files and their order -------------------------------------------------------------------------
+
+
+def full(folder: Path) -> Path:
+    """The folder's whole path, with links left as they are: datasets are often put together of links."""
+    return Path(os.path.abspath(folder))
 
 
 def list_files(folder: Path, suffixes: tuple[str, ...], what: str) -> tuple[Path, ...]:

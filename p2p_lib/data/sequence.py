@@ -6,6 +6,7 @@ one line in :data:`FORMATS`.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,6 +17,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.paths import data_dir
 from p2p_lib.core.types import Frame
 
 #: Layouts by name, in the order in which they are tried on a folder.
@@ -126,7 +128,7 @@ def open_sequence(
         folder, format = scenario_dir(name.removeprefix(SYNTHETIC), seed), format or "ycbmultitrack"
     else:
         folder, format = _find(path_or_name, format)
-        name = folder.resolve().name
+        name = os.path.basename(os.path.abspath(folder))
     loader = import_module(FORMATS[format or recognise(folder)])
     return loader.load(folder, name=name, depth_scale=depth_scale, masks=masks)
 
@@ -141,7 +143,8 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
     found = find_sequence(str(path_or_name))
     if found is None:
         fix = f"Give a folder, an embedded sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
-        raise MissingData(str(path_or_name), "no such folder, and no sequence of this name below $P2P_DATA", fix)
+        where = "$P2P_DATA is not set" if data_dir() is None else f"no sequence of this name below {data_dir()}"
+        raise MissingData(str(path_or_name), f"no such folder, and {where}", fix)
     return found[0], format or found[1].format
 
 

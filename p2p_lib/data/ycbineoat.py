@@ -68,6 +68,6 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
 
 
 def _models(folder: Path) -> tuple[Path, ...]:
-    at = folder.resolve()
+    at = images.full(folder)
     known = [at.parent / "models" / ycb for begins, ycb in YCB_NAMES.items() if at.name.startswith(begins)]
     return folder / "models" / OBJECT, *known

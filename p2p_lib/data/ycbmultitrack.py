@@ -71,7 +71,7 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
         own_masks=own or chosen,
         read_truth=read_truth,
         model_places={
-            obj: tuple(root / "models" / obj for root in (folder, folder.resolve().parent)) for obj in objects
+            obj: tuple(root / "models" / obj for root in (folder, images.full(folder).parent)) for obj in objects
         },
     )
 

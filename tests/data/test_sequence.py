@@ -338,6 +338,10 @@ def test_ycbineoat_models_by_the_sequences_name(ycbineoat, name):
     for ycb in ("006_mustard_bottle", "021_bleach_cleanser"):
         (ycbineoat.parent / "models" / ycb).mkdir(parents=True)
         (ycbineoat.parent / "models" / ycb / "textured_simple.obj").write_text("v 0 0 0\n")
+    link = ycbineoat.parent / "elsewhere" / "link"
+    link.parent.mkdir()
+    link.symlink_to(folder)
+    assert open_sequence(link).name == "link" and find_models(open_sequence(link)) == {}
     found = find_models(open_sequence(folder))
     expected = {"m": "006_mustard_bottle", "b": "021_bleach_cleanser"}.get(name[0])
     assert [path.parent.name for path in found.values()] == ([expected] if expected else [])
