@@ -74,7 +74,7 @@ def _eval(a: argparse.Namespace) -> None:
 
     options = _pairs("--models", a.models, "NAME=PATH"), a.align, a.min_visible_px
     if (a.run is None) == (a.poses is None) or (a.poses is None) != (a.sequence is None):
-        raise BadInput("arguments", "no clear choice", "either the folder of a run, or --poses with --sequence")
+        a.parser.error("needs either DIR, a run's folder, or --poses with --sequence")
     if a.poses is not None:
         evaluation = evaluate_poses(a.poses, a.sequence, *options, format=a.format)
     else:
@@ -281,7 +281,7 @@ def _parser() -> argparse.ArgumentParser:
 def _command(commands, name: str, function, help: str) -> argparse.ArgumentParser:
     parser = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    parser.set_defaults(command=function, name=parser.prog.partition(" ")[2])
+    parser.set_defaults(command=function, parser=parser, name=parser.prog.partition(" ")[2])
     return parser
 
 

@@ -237,8 +237,9 @@ def test_the_commands(table, tmp_path, capsys):
     assert main(words) == 0
     assert "imported" in capsys.readouterr().out
     for wrong in (["eval"], words[:3], ["eval", str(tmp_path / "run"), *words[1:]]):
-        assert main(wrong) == 2
-        assert "either the folder of a run, or --poses with --sequence" in capsys.readouterr().err
+        with pytest.raises(SystemExit):
+            main(wrong)
+        assert "either DIR, a run's folder, or --poses with --sequence. See p2p eval --help" in capsys.readouterr().err
 
 
 def test_without_truth_there_is_no_model_frame(table, tmp_path, capsys):
