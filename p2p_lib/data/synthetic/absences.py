@@ -75,10 +75,10 @@ def late_object(seed: int) -> Scenario:
 def three_objects(seed: int) -> Scenario:
     """A carton, a tin and a block, hidden by a hand one after the other."""
     rng = np.random.default_rng([seed, 1])
-    carton = Body("box", _carton(rng), _stay(rng, (-0.27, 0.02), (-0.18, 0.10), (70, 104)))
-    tin = Body("can", _tin(rng), _stay(rng, (-0.03, -0.02), (0.05, 0.07), (135, 169)))
-    block = Body("block", shapes.block(rng, 0.05, 0.11), _stay(rng, (0.27, 0.02), (0.18, 0.10), (200, 234)))
-    hidden = [(carton, 70, 104), (tin, 135, 169), (block, 200, 234)]
+    carton = Body("box", _carton(rng), _stay(rng, (-0.27, 0.02), (-0.18, 0.10), (95, 127)))
+    tin = Body("can", _tin(rng), _stay(rng, (-0.03, -0.02), (0.05, 0.07), (157, 189)))
+    block = Body("block", shapes.block(rng, 0.05, 0.11), _stay(rng, (0.27, 0.02), (0.18, 0.10), (219, 251)))
+    hidden = [(carton, 95, 127), (tin, 157, 189), (block, 219, 251)]
     return _scene(rng, (carton, tin, block), _standing(300), hidden)
 
 
