@@ -85,6 +85,28 @@ def _fetch_one(of: Manifest, file: RemoteFile, folder: Path, record: dict, progr
     return f"{file.path}: {human_size(size)}, {said}"
 
 
+def require(of: Manifest) -> list[Path]:
+    """The files of a manifest in their places, each with the sha256 that it must have.
+
+    A file that was put there by hand and whose checksum nobody knows is recorded: it holds from then on.
+    Raises :class:`MissingData` with the command that fetches it, :class:`BadInput` for a file that differs.
+    """
+    folder = folder_of(of)
+    record = _read_record(folder, of)
+    for file in of.files:
+        path = folder / file.path
+        if not path.is_file():
+            raise MissingData(of.name, f"{path} is not there", f"Run: p2p data fetch {of.name}")
+        digest, expected = sha256(path), file.sha256 or record.get(file.path, {}).get("sha256")
+        if expected is None:
+            record[file.path] = {"sha256": digest, "bytes": path.stat().st_size}
+            _write_record(folder, of, record)
+        elif digest != expected:
+            fix = f"Delete it and run: p2p data fetch {of.name}"
+            raise BadInput(str(path), f"sha256 {digest}", f"sha256 {expected}", fix)
+    return [folder / file.path for file in of.files]
+
+
 def _record_file(folder: Path, of: Manifest) -> Path:
     return folder / f".p2p-{of.name}.json"
 

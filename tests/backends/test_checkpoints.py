@@ -106,7 +106,7 @@ def test_a_missing_checkpoint_names_the_commands(name, tmp_path, monkeypatch):
     with pytest.raises(MissingBackend, match=rf"{name}: .*Run: export P2P_DATA=DIR; p2p data fetch {name}$"):
         make_tracker(name, TrackingConfig())
     monkeypatch.setenv("P2P_DATA", str(tmp_path))
-    with pytest.raises(MissingBackend, match=rf"{name}: its checkpoint is not there, .*Run: p2p data fetch {name}$"):
+    with pytest.raises(MissingBackend, match=rf"{name}: its checkpoint is missing, .*Run: p2p data fetch {name}$"):
         make_tracker(name, TrackingConfig())
 
 

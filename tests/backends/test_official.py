@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from p2p_lib.backends import cotracker, packages, tapir, tapnextpp
+from p2p_lib.backends.registry import make_tracker
 from p2p_lib.backends.rollouts import RolloutTracker
-from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.data.manifests import manifest
 
 UV = np.array([[100.0, 80], [320, 240], [600.5, 33.25], [17, 460], [411, 199]])
 
@@ -256,3 +259,33 @@ def test_cotracker_queries_are_in_the_frame_answered(cotracker_predictor, frames
         fresh.track(frame)
     for frame in frames[10:20]:
         np.testing.assert_array_equal(tracker.track(frame).select(late).uv_px, fresh.track(frame).select(ids).uv_px)
+
+
+# --- from file to tracker ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "file"),
+    [
+        ("tapir", tapir.new_model, "causal_bootstapir_checkpoint.pt"),
+        ("tapnextpp", tapnextpp.new_model, "tapnextpp_ckpt.pt"),
+        ("cotracker3", lambda: cotracker.new_predictor().model, "scaled_online.pth"),
+    ],
+)
+def test_a_checkpoint_of_the_official_class_is_loaded_by_name(name, make, file, tmp_path, monkeypatch):
+    import torch
+
+    model = built(make)
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    place = tmp_path / manifest(name).folder / file
+    place.parent.mkdir(parents=True)
+    prefix = "tapnext." if name == "tapnextpp" else ""  # as its trainer writes it
+    torch.save({"state_dict": {prefix + key: value for key, value in model.state_dict().items()}}, place)
+    tracker = make_tracker(name, TrackingConfig())
+    assert tracker.name == name and tracker.latency_frames == (7 if name == "cotracker3" else 0)
+    loaded = tracker._model if name == "tapir" else tracker._model.model
+    for (key, own), (other, theirs) in zip(loaded.state_dict().items(), model.state_dict().items(), strict=True):
+        assert key == other and torch.equal(own.cpu(), theirs)
+    place.write_bytes(place.read_bytes()[:-1] + b"\0\0")
+    with pytest.raises(BadInput, match="sha256"):
+        make_tracker(name, TrackingConfig())
