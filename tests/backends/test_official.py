@@ -78,7 +78,7 @@ def offline_tapir(model, frames, uv, size):
 
 @pytest.mark.parametrize("size", [256, 480])
 def test_tapir_streams_what_the_official_model_says_of_the_clip(tapir_model, frames, size):
-    frames = frames[:5]
+    frames = frames[: 5 if size == 256 else 3]
     told = followed(tapir.TapirTracker(tapir_model, size_px=size), frames)
     check_values(told, frames)
     uv, visible, uncertainty = offline_tapir(tapir_model, frames, UV, size)
@@ -204,8 +204,10 @@ def test_tapnext_later_queries_run_in_a_rollout_of_their_own(tapnext_model, fram
 
 @pytest.fixture(scope="module")
 def cotracker_predictor():
-    """The visibility head is enlarged, so that points differ."""
-    return built(cotracker.new_predictor)
+    """On pictures a quarter as wide as the model's own: sixteen times less work."""
+    predictor = built(cotracker.new_predictor)
+    predictor.interp_shape = predictor.model.model_resolution = (96, 128)
+    return predictor
 
 
 def official_cotracker(predictor, pictures, uv):
@@ -285,7 +287,7 @@ def test_a_checkpoint_of_the_official_class_is_loaded_by_name(name, make, file, 
     assert tracker.name == name and tracker.latency_frames == (7 if name == "cotracker3" else 0)
     loaded = tracker._model if name == "tapir" else tracker._model.model
     for (key, own), (other, theirs) in zip(loaded.state_dict().items(), model.state_dict().items(), strict=True):
-        assert key == other and torch.equal(own.cpu(), theirs)
+        assert key == other and own.cpu().numpy().tobytes() == theirs.numpy().tobytes()  # unset weights may be NaN
     place.write_bytes(place.read_bytes()[:-1] + b"\0\0")
     with pytest.raises(BadInput, match="sha256"):
         make_tracker(name, TrackingConfig())
