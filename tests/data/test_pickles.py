@@ -117,10 +117,10 @@ def test_faults_name_the_file(tmp_path, what):
 
 
 def test_damaged_files_never_raise_anything_else(tmp_path):
-    """Two thousand files with bytes changed at random: each is read as plain values or refused."""
+    """Five hundred files with bytes changed at random: each is read as plain values or refused."""
     rng = random.Random(0)
     refused = 0
-    for _ in range(2000):
+    for _ in range(500):
         data = bytearray(pickle.dumps(META, protocol=rng.choice([0, 2, 4])))
         for _ in range(rng.randint(1, 4)):
             data[rng.randrange(len(data))] = rng.randrange(256)
@@ -129,7 +129,7 @@ def test_damaged_files_never_raise_anything_else(tmp_path):
             load_plain(tmp_path / "m.pkl")
         except BadInput:
             refused += 1
-    assert 200 < refused < 2000
+    assert 50 < refused < 500
     assert np.dtype("f4") == np.float32 and np.zeros(2, "f4").tobytes() == bytes(8)  # NumPy is as it was
 
 
