@@ -76,7 +76,7 @@ def _eval(a: argparse.Namespace) -> None:
     if (a.run is None) == (a.poses is None) or (a.poses is None) != (a.sequence is None):
         a.parser.error("needs either DIR, a run's folder, or --poses with --sequence")
     if a.poses is not None:
-        evaluation = evaluate_poses(a.poses, a.sequence, *options, format=a.format)
+        evaluation = evaluate_poses(a.poses, a.sequence, *options, a.format, a.start, a.stop)
     else:
         evaluation = evaluate_run(a.run, *options)
     print(json.dumps(evaluation.as_dict()) if a.json else evaluation.as_table())
@@ -215,6 +215,8 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)")
     p.add_argument("--sequence", metavar="SEQ", help="the sequence that --poses belongs to")
     p.add_argument("--format", help="layout of --sequence (default: recognised)")
+    p.add_argument("--start", type=int, default=0, metavar="I", help="first frame of --sequence to score")
+    p.add_argument("--stop", type=int, metavar="J", help="one past the last frame to score")
     p.add_argument("--json", action="store_true", help="one JSON object instead of a table")
     p.add_argument("--models", nargs="+", action="extend", metavar="NAME=PATH", help="models for scoring")
     p.add_argument(

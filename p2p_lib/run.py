@@ -161,12 +161,15 @@ def evaluate_poses(
     align: str = "first",
     min_visible_px: int = 300,
     format: str | None = None,
+    start: int = 0,
+    stop: int | None = None,
 ) -> Evaluation:
-    """Score any method's poses (see :mod:`p2p_lib.data.imported`) by the rules of a run of ours."""
+    """Score any method's poses (see :mod:`p2p_lib.data.imported`) by the rules of a run of ours over these frames."""
     if isinstance(sequence, str | Path):
         sequence = sequences.open_sequence(sequence, format)
     known = find_models(sequence) | given_models(models or {}, sequence.objects)
-    run = as_run(read_poses(poses, sequence), sequence, known, path=Path(poses))
+    frames = _frames(len(sequence), start, stop)
+    run = as_run(read_poses(poses, sequence), sequence, known, path=Path(poses), frames=frames)
     return evaluate(run, None, align, min_visible_px)
 
 

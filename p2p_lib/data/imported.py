@@ -64,20 +64,22 @@ def as_run(
     models: Mapping[str, Path],
     method: str = "imported",
     path: Path | None = None,
+    frames: range | None = None,
 ) -> Run:
-    """A :class:`~p2p_lib.data.runs.Run` of such poses over a whole sequence, ready to be evaluated.
+    """A :class:`~p2p_lib.data.runs.Run` of such poses over a sequence, or ``frames`` of it, ready to be evaluated.
 
     models  object to model file; every object of the sequence is in the run: one without poses is lost throughout
     """
-    n = len(sequence)
-    visible = [sequence.visible_px(i) for i in range(n)]
+    at = np.arange(len(sequence)) if frames is None else np.array(frames)
+    n, nothing = len(at), np.full((len(sequence), 4, 4), np.nan)
+    visible = [sequence.visible_px(int(i)) for i in at]
     objects = {}
     for name in sequence.objects:
-        T, truth = poses.get(name, np.full((n, 4, 4), np.nan)), sequence.truth.get(name)
+        T, truth = poses.get(name, nothing)[at], sequence.truth.get(name)
         seen = np.isfinite(T).all((1, 2))
         columns = {
-            "frame_index": np.arange(n),
-            "time_s": np.asarray(sequence.times_s, float),
+            "frame_index": at,
+            "time_s": np.asarray(sequence.times_s, float)[at],
             "status": np.where(seen, str(Status.TRACKED), str(Status.LOST)),
             "T_cam_obj": T,
             "confidence": seen.astype(float),
@@ -85,8 +87,8 @@ def as_run(
             "visible_points": np.zeros(n, int),
             "inliers": np.zeros(n, int),
             "keyframe": np.zeros(n, bool),
-            "T_cam_model": truth.T_cam_model if truth else np.full((n, 4, 4), np.nan),
-            "labelled": truth.labelled if truth else np.zeros(n, bool),
+            "T_cam_model": truth.T_cam_model[at] if truth else nothing[at],
+            "labelled": truth.labelled[at] if truth else np.zeros(n, bool),
             "visible_px": np.array([NO_MASKS if v is None else v.get(name, 0) for v in visible]),
             "reason": np.where(seen, "", "no pose given"),
         }

@@ -190,6 +190,18 @@ def test_an_object_without_poses_is_lost_not_left_out(table, tmp_path):
     assert scores["mean"]["add_auc"] == pytest.approx(50)
 
 
+def test_only_some_frames(table, tmp_path):
+    """A run over part of a sequence, and another method's poses over the same part, get the same scores."""
+    run_on(table, tmp_path / "run")
+    export_run(tmp_path / "run", "poses", tmp_path / "out")
+    whole = evaluate_poses(tmp_path / "out", table)
+    part = evaluate_poses(tmp_path / "out", table, start=3, stop=9)
+    assert part.objects["can"].frame_index.tolist() == list(range(3, 9)) and part.objects["can"].lost == 2
+    assert whole.objects["can"].lost == 3
+    with pytest.raises(BadInput, match="0 <= start < stop within 12 frames"):
+        evaluate_poses(tmp_path / "out", table, start=9, stop=9)
+
+
 IDENTITY = "1 0 0 0\n0 1 0 0\n0 0 1 0.5\n0 0 0 1\n"
 FAULTS = {
     "no such folder": ({}, r"theirs: no such file or folder, expected poses"),
