@@ -21,9 +21,9 @@ _GRID = np.stack([_X, _Y])  # (2, P)
 _WEIGHT = np.exp(-0.5 * (_X**2 + _Y**2) / WINDOW_PX**2).astype(np.float32)
 _ROOT = np.sqrt(_WEIGHT / _WEIGHT.sum())
 #: Independent samples that a patch is worth: neighbouring pixels share their noise.
-_SAMPLES = 40.0
+_SAMPLES = 10.0
 #: Damping of an affine and of a translational step, in units of the normalised patch.
-_DAMP = np.diag(np.float32([1e-3] * 2 + [0.05] * 4))
+_DAMP = np.diag(np.float32([1e-4] * 2 + [0.05] * 4))
 
 
 @dataclass(eq=False)
@@ -33,12 +33,14 @@ class Patches:
     pixels    (N, P) weighted, zero mean, unit length
     solver    (N, 6, P) takes a difference of pixels to the step [translation px, affine]
     spread    (N, 2, 2) covariance of the translation per unit of the residual's variance, px^2
-    contrast  (N,) standard deviation of the grey values
+    mean      (N,) of the grey values
+    contrast  (N,) their standard deviation
     """
 
     pixels: np.ndarray
     solver: np.ndarray
     spread: np.ndarray
+    mean: np.ndarray
     contrast: np.ndarray
 
     def __len__(self) -> int:
@@ -55,7 +57,7 @@ class Patches:
     def empty(cls, shape: tuple[int, ...]) -> Patches:
         """Room for patches, ``shape`` of them."""
         p = _SIDE**2
-        return cls(*(np.zeros(shape + tail, np.float32) for tail in ((p,), (6, p), (2, 2), ())))
+        return cls(*(np.zeros(shape + tail, np.float32) for tail in ((p,), (6, p), (2, 2), (), ())))
 
 
 def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:
@@ -63,16 +65,16 @@ def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:
     n, side = len(uv_px), _SIDE + 2
     y, x = (a.ravel().astype(np.float32) for a in np.mgrid[:side, :side] - float(RADIUS + 1))
     raw = _sample(image, uv_px.astype(np.float32), np.stack([x, y])).reshape(n, side, side)
-    gx = 0.5 * (raw[:, 1:-1, 2:] - raw[:, 1:-1, :-2]).reshape(n, -1)
-    gy = 0.5 * (raw[:, 2:, 1:-1] - raw[:, :-2, 1:-1]).reshape(n, -1)
-    pixels, norm = _normalised(raw[:, 1:-1, 1:-1].reshape(n, -1))
+    gx = 0.5 * (raw[:, 1:-1, 2:] - raw[:, 1:-1, :-2]).reshape(n, _SIDE**2)
+    gy = 0.5 * (raw[:, 2:, 1:-1] - raw[:, :-2, 1:-1]).reshape(n, _SIDE**2)
+    pixels, mean, norm = _normalised(raw[:, 1:-1, 1:-1].reshape(n, _SIDE**2))
     J = np.stack([gx, gy, gx * _X, gx * _Y, gy * _X, gy * _Y], 1) * (_ROOT / norm[:, None, None])
     # What a change of offset or gain explains is not evidence of motion.
     J -= (J @ _ROOT)[..., None] * _ROOT
     J -= (J @ pixels[..., None]) * pixels[:, None]
     H = J @ J.transpose(0, 2, 1)
     inverse = np.linalg.inv(H + _DAMP)
-    return Patches(pixels, inverse @ J, inverse[:, :2, :2], norm)
+    return Patches(pixels, inverse @ J, inverse[:, :2, :2], mean, norm)
 
 
 @dataclass(eq=False)
@@ -81,13 +83,17 @@ class Alignment:
 
     uv_px     (N, 2), A (N, 2, 2): the patch's offset x lies at uv + A x
     ncc       (N,) weighted normalised cross correlation, -1 to 1; -1 where the search left the picture
-    sigma_px  (N,) standard deviation of the place, of the image noise alone
+    cov_px2   (N, 2, 2) covariance of the place: long along an edge
+    lighter   (N,) change of the mean grey value
+    stronger  (N,) ratio of the contrasts
     """
 
     uv_px: np.ndarray
     A: np.ndarray
     ncc: np.ndarray
-    sigma_px: np.ndarray
+    cov_px2: np.ndarray
+    lighter: np.ndarray
+    stronger: np.ndarray
 
 
 def align(image: np.ndarray, patches: Patches, uv_px: np.ndarray, A: np.ndarray, iterations: int) -> Alignment:
@@ -96,7 +102,7 @@ def align(image: np.ndarray, patches: Patches, uv_px: np.ndarray, A: np.ndarray,
     height, width = image.shape
     start, eye = uv.copy(), np.eye(2, dtype=np.float32)
     for _ in range(iterations):
-        seen, _ = _normalised(_sample(image, uv, A @ _GRID))
+        seen, *_ = _normalised(_sample(image, uv, A @ _GRID))
         step = (patches.solver @ (seen - patches.pixels)[..., None])[..., 0]
         # A step is trusted as far as the linearisation reaches: some pixels, some tenths of scale.
         shift = np.linalg.norm(step[:, :2], axis=1, keepdims=True)
@@ -104,17 +110,16 @@ def align(image: np.ndarray, patches: Patches, uv_px: np.ndarray, A: np.ndarray,
         D = np.clip(step[:, 2:], -0.25, 0.25).reshape(-1, 2, 2)
         A = A @ _inverse(eye + D)
         uv = uv - (A @ step[:, :2, None])[..., 0]
-    pixels, _ = _normalised(_sample(image, uv, A @ _GRID))
+    pixels, mean, contrast = _normalised(_sample(image, uv, A @ _GRID))
     ncc = np.einsum("np,np->n", pixels, patches.pixels)
     inside = (uv >= 0).all(1) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1)
     stretch = np.abs(np.linalg.det(A))
     sane = inside & np.isfinite(A).all((1, 2)) & (stretch > 0.05) & (stretch < 20)
     uv, A = np.where(sane[:, None], uv, start), np.where(sane[:, None, None], A, eye)
     ncc = np.where(sane, ncc, -1.0)
-    variance = 2 * np.maximum(1 - ncc, 0.003) / _SAMPLES
-    cov = A @ patches.spread @ A.transpose(0, 2, 1)
-    sigma_px = np.sqrt(variance * np.trace(cov, axis1=1, axis2=2))
-    return Alignment(uv, A, ncc, sigma_px)
+    variance = 2 * np.maximum(1 - ncc, 0.01) / _SAMPLES
+    cov = A @ (variance[:, None, None] * patches.spread) @ A.transpose(0, 2, 1)
+    return Alignment(uv, A, ncc, cov, mean - patches.mean, contrast / patches.contrast)
 
 
 def _sample(image: np.ndarray, uv: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -126,11 +131,12 @@ def _sample(image: np.ndarray, uv: np.ndarray, offsets: np.ndarray) -> np.ndarra
     return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted, zero mean, unit length; and the length before, which is the weighted standard deviation."""
-    centred = (raw - (raw @ (_ROOT**2))[:, None]) * _ROOT
+def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weighted, zero mean, unit length; and the weighted mean and standard deviation (N,) before."""
+    mean = raw @ (_ROOT**2)
+    centred = (raw - mean[:, None]) * _ROOT
     norm = np.sqrt(np.maximum(np.einsum("np,np->n", centred, centred), 1.0))
-    return centred / norm[:, None], norm
+    return centred / norm[:, None], mean, norm
 
 
 def _inverse(A: np.ndarray) -> np.ndarray:

@@ -40,14 +40,17 @@ class _Points:
     uv: np.ndarray  # (N, 2) newest known place
     warp: np.ndarray  # (N, 2, 2) C
     visible: np.ndarray  # (N,) bool
-    sigma_px: np.ndarray  # (N,) standard deviation of uv
+    cov: np.ndarray  # (N, 2, 2) covariance of uv, px^2
+    depth_m: np.ndarray  # (N,) where it was last visible; 0 where not measured
     hidden_for: np.ndarray  # (N,) frames
+    ncc: np.ndarray  # (N,) correlation with the appearance last seen
     coasting: np.ndarray  # (N,) frames since an appearance was last seen
     count: np.ndarray  # (N,) appearances in use
     view: np.ndarray  # (N, K, 2, 2)
-    view_sigma_px: np.ndarray  # (N, K) how well the point's place in the appearance is known
+    view_cov: np.ndarray  # (N, K, 2, 2) of the point's place in the appearance
     fine: Patches  # (N, K) at full resolution
     coarse: Patches  # (N, K) at half resolution
+    colour: np.ndarray  # (N, K, 2) chroma around the point
     anchor: np.ndarray  # (N, K, J, SIZE) descriptors of corners around the point; zero where there is none
     anchor_frame: np.ndarray  # (N, K, J, 2, 2) their axes
     anchor_offset: np.ndarray  # (N, K, J, 2) from corner to point
@@ -64,11 +67,32 @@ class _Points:
         zero, warp = np.zeros(n, np.int64), np.tile(_EYE, (n, 1, 1))
         anchors, near = (n, k, _ANCHORS), (n, k, _NEIGHBOURS)
         return cls(
-            ids, uv.astype(np.float32), warp, np.ones(n, bool), np.zeros(n, np.float32), zero, zero.copy(), zero.copy(),
-            np.tile(_EYE, (n, k, 1, 1)), np.zeros((n, k), np.float32), Patches.empty((n, k)), Patches.empty((n, k)),
-            np.zeros((*anchors, features.SIZE), np.float32), np.tile(_EYE, (*anchors, 1, 1)),
-            np.zeros((*anchors, 2), np.float32), np.full(near, -1, np.int64), np.zeros((*near, 2), np.float32),
-        )  # fmt: skip
+            ids=ids,
+            uv=uv.astype(np.float32),
+            warp=warp,
+            visible=np.ones(n, bool),
+            cov=np.zeros((n, 2, 2), np.float32),
+            depth_m=np.zeros(n, np.float32),
+            hidden_for=zero,
+            ncc=np.ones(n, np.float32),
+            coasting=zero.copy(),
+            count=zero.copy(),
+            view=np.tile(_EYE, (n, k, 1, 1)),
+            view_cov=np.zeros((n, k, 2, 2), np.float32),
+            fine=Patches.empty((n, k)),
+            coarse=Patches.empty((n, k)),
+            colour=np.zeros((n, k, 2), np.float32),
+            anchor=np.zeros((*anchors, features.SIZE), np.float32),
+            anchor_frame=np.tile(_EYE, (*anchors, 1, 1)),
+            anchor_offset=np.zeros((*anchors, 2), np.float32),
+            neighbour=np.full(near, -1, np.int64),
+            neighbour_offset=np.zeros((*near, 2), np.float32),
+        )
+
+    @property
+    def sigma_px(self) -> np.ndarray:
+        """(N,) standard deviation of uv."""
+        return np.sqrt(np.trace(self.cov, axis1=1, axis2=2))
 
     def select(self, rows: np.ndarray) -> _Points:
         return _Points(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -85,7 +109,7 @@ class _Points:
         return np.where(self.ids[at] == ids, at, -1)
 
 
-def _concatenate(a, b):
+def _concatenate(a: np.ndarray | Patches, b: np.ndarray | Patches) -> np.ndarray | Patches:
     if isinstance(a, Patches):
         return Patches(*(np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(Patches)))
     return np.concatenate([a, b])
@@ -143,8 +167,9 @@ class EmbeddedTracker:
         wanted = at[at >= 0]
         wanted = wanted[~p.visible[wanted] & np.isfinite(expected[wanted]).all(1)]
         wanted = self._turn(wanted, self.config.tries)
-        rows, k, _, A = self._predict(wanted, expected)
-        self._take_back(rows, k, expected[rows], A, self.config.search_px)
+        rows, k, _, A, _ = self._predict(wanted, expected)
+        seen, good = self._found(rows, k, expected[rows], A)
+        self._settle(rows[good], k[good], seen, good)
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame."""
@@ -156,11 +181,13 @@ class EmbeddedTracker:
         self._follow(previous)
         self._search_near(search)
         self._search_everywhere(search, urgent)
+        self._consult(search)
+        self._check_depth(frame.depth_m)
         p, cfg = self._points, self.config
         p.hidden_for = np.where(p.visible, 0, p.hidden_for + 1)
         if self._frames % cfg.renew_every == 0:
             self._renew()
-        uv = np.where(p.visible[:, None], p.uv, np.nan).astype(float)
+        uv = p.uv.astype(float)
         # A bounded, monotonous reading of the standard deviation: 1/2 at uncertain_px.
         uncertainty = np.where(p.visible, p.sigma_px / (p.sigma_px + cfg.uncertain_px), 1.0)
         return Tracks(p.ids.copy(), uv, p.visible.copy(), uncertainty.astype(float))
@@ -169,6 +196,15 @@ class EmbeddedTracker:
         self._gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         self._fine = self._gray.astype(np.float32)
         self._coarse = cv2.pyrDown(self._gray).astype(np.float32)
+        quarter = cv2.resize(frame.rgb, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+        self._chroma = cv2.cvtColor(quarter, cv2.COLOR_RGB2LAB)[..., 1:].astype(np.float32)
+
+    def _colour(self, uv: np.ndarray) -> np.ndarray:
+        """Chroma (N, 2) around places (N, 2)."""
+        if not len(uv):
+            return np.zeros((0, 2), np.float32)
+        x, y = (np.ascontiguousarray((uv[:, i] + 0.5) / 4 - 0.5, np.float32)[:, None] for i in (0, 1))
+        return cv2.remap(self._chroma, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
 
     def _follow(self, previous: np.ndarray) -> None:
         """Lucas-Kanade proposes, the appearance that fits best decides."""
@@ -183,7 +219,7 @@ class EmbeddedTracker:
         k = self._fitting(at)
         seen = align(self._fine, p.fine[at, k], there, p.warp[at] @ np.linalg.inv(p.view[at, k]), cfg.iterations)
         moved_px = np.linalg.norm(seen.uv_px - there, axis=1)
-        good = (seen.ncc >= cfg.min_ncc) & (moved_px < cfg.search_px)
+        good = (seen.ncc >= cfg.min_ncc) & (moved_px < cfg.search_px) & self._plausible(at, k, seen)
         self._settle(at[good], k[good], seen, good)
         self._coast(at[~good], previous, here[~good], there[~good], seen.ncc[~good], flow)
 
@@ -200,8 +236,8 @@ class EmbeddedTracker:
         """Points ``at`` are where ``seen`` (its ``rows``) found their appearances k."""
         p = self._points
         p.uv[at], p.warp[at] = seen.uv_px[rows], seen.A[rows] @ p.view[at, k]
-        p.sigma_px[at] = np.hypot(seen.sigma_px[rows], p.view_sigma_px[at, k])
-        p.visible[at], p.coasting[at] = True, 0
+        p.cov[at] = seen.cov_px2[rows] + p.view_cov[at, k]
+        p.visible[at], p.coasting[at], p.ncc[at] = True, 0, seen.ncc[rows]
 
     def _coast(self, at, previous, here, there, ncc, flow) -> None:
         """Points that changed their looks go on by Lucas-Kanade alone for a while, if it comes home again."""
@@ -216,19 +252,22 @@ class EmbeddedTracker:
         p.uv[at] = there
         p.visible[at] = ok
         p.coasting[at] += 1
-        p.sigma_px[at] = np.hypot(p.sigma_px[at], cfg.coast_sigma_px)
+        p.cov[at] += cfg.coast_sigma_px**2 / 2 * _EYE
 
     def _search_near(self, search: np.ndarray | None) -> None:
-        """Look for invisible points where the visible ones around them say."""
-        p = self._points
-        wanted = np.flatnonzero(~p.visible)
-        if not len(wanted) or not p.visible.any():
-            return
-        rows, k, uv, A = self._predict(wanted, np.where(p.visible[:, None], p.uv, np.nan))
-        keep = self._inside(uv, search)
-        rows, k, uv, A = rows[keep], k[keep], uv[keep], A[keep]
-        turn = np.isin(rows, self._turn(rows, self.config.tries))
-        self._take_back(rows[turn], k[turn], uv[turn], A[turn], self.config.search_px)
+        """Look for invisible points where the visible ones around them say, else where they were just now."""
+        p, cfg = self._points, self.config
+        wanted = np.flatnonzero(~p.visible & ~self._bare())
+        rows, k, uv, A, _ = self._predict(wanted, np.where(p.visible[:, None], p.uv, np.nan))
+        late = np.setdiff1d(wanted[p.hidden_for[wanted] <= cfg.linger_frames], rows)
+        k = np.concatenate([k, self._fitting(late)])
+        A = np.concatenate([A, p.warp[late] @ np.linalg.inv(p.view[late, k[len(rows) :]])])
+        rows, uv = np.concatenate([rows, late]), np.concatenate([uv, p.uv[late]])
+        pick = np.flatnonzero(self._inside(uv, search))
+        pick = pick[np.isin(rows[pick], self._turn(rows[pick], cfg.tries))]
+        rows, k = rows[pick], k[pick]
+        seen, good = self._found(rows, k, uv[pick], A[pick])
+        self._settle(rows[good], k[good], seen, good)
 
     def _turn(self, rows: np.ndarray, count: int) -> np.ndarray:
         """At most ``count`` of these points: those that vanished last, and of the others everyone in turn."""
@@ -238,26 +277,78 @@ class EmbeddedTracker:
         order = np.argsort(late * (1 + (self._points.ids[rows] * 7919 + self._frames * 104729) % 1000), kind="stable")
         return np.sort(rows[order[:count]])
 
-    def _predict(self, wanted: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Places of points from those around them: rows, appearance, uv_px, A of the points that have enough.
+    def _predict(self, wanted: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Places of points from those around them: rows, appearance, uv_px, A, sigma_px of those that have enough.
 
         known  (N, 2) places of the points that may vouch for others, NaN where not
         """
         p = self._points
         if not len(wanted):
-            return wanted, wanted, np.zeros((0, 2), np.float32), np.zeros((0, 2, 2), np.float32)
+            return wanted, wanted, np.zeros((0, 2), np.float32), np.zeros((0, 2, 2), np.float32), np.zeros(0)
         at = p.rows(p.neighbour[wanted])
         now = known[at]
         use = (at >= 0) & np.isfinite(now[..., 0]) & (p.neighbour[wanted] >= 0)
         k = use.sum(2).argmax(1)
         i = np.arange(len(wanted))
-        uv, A, ok = _carried(p.neighbour_offset[wanted, k], now[i, k], use[i, k])
-        return wanted[ok], k[ok], uv[ok], A[ok]
+        uv, A, sigma_px, ok = _carried(p.neighbour_offset[wanted, k], now[i, k], use[i, k], p.sigma_px[at[i, k]])
+        return wanted[ok], k[ok], uv[ok], A[ok], sigma_px[ok]
+
+    def _consult(self, search: np.ndarray | None) -> None:
+        """Hold every point against those around it: who strays is invisible, who is vague follows them.
+
+        A point without texture of its own is where they say, as long as it looks as bare there.
+        """
+        p, cfg = self._points, self.config
+        bare = self._bare()
+        sure = p.visible & ~bare
+        at, k, uv, A, sigma_px = self._predict(np.arange(len(p)), np.where(sure[:, None], p.uv, np.nan))
+        off = np.linalg.norm(p.uv[at] - uv, axis=1)
+        p.visible[at[sure[at] & (off > cfg.stray_px + 3 * np.hypot(sigma_px, p.sigma_px[at]))]] = False
+        seen, mine = p.visible[at][:, None, None], p.cov[at]
+        # What they say is worth less than its scatter: their errors have much in common. An invisible
+        # point is guessed to be there.
+        said = (2 * sigma_px**2 + 1)[:, None, None] * _EYE
+        gain = np.where(seen, mine @ np.linalg.inv(mine + said), _EYE)
+        p.uv[at] += (gain @ (uv - p.uv[at])[..., None])[..., 0]
+        p.cov[at] = np.where(seen, (_EYE - gain) @ mine, said)
+        vouched = sigma_px < cfg.return_sigma_px
+        # Lucas-Kanade and the neighbours agree on a point that no appearance shows: it looks like this now.
+        changed = p.visible[at] & (p.coasting[at] > 0) & (off < cfg.stray_px / 3) & vouched
+        rows = at[changed]
+        p.warp[rows] = A[changed] @ p.view[rows, k[changed]]
+        p.coasting[rows] = 0
+        self._remember(rows)
+        self._carry_bare(at, k, uv, A, bare[at] & vouched & self._inside(uv, search), bare)
+
+    def _carry_bare(self, at, k, uv, A, told: np.ndarray, bare: np.ndarray) -> None:
+        """Points without texture are visible where they were ``told`` to be, if that place is as even as theirs."""
+        p, cfg = self._points, self.config
+        p.visible &= ~bare
+        at, k, uv, A = at[told], k[told], uv[told], A[told]
+        seen = align(self._fine, p.fine[at, k], uv, A, 0)
+        good = self._plausible(at, k, seen) & (seen.stronger * p.fine.contrast[at, k] < 2 * cfg.bare_contrast)
+        at, k = at[good], k[good]
+        p.uv[at], p.warp[at] = uv[good], A[good] @ p.view[at, k]
+        p.visible[at], p.coasting[at], p.ncc[at] = True, 0, 1
+
+    def _check_depth(self, depth_m: np.ndarray) -> None:
+        """A point whose depth jumps has slid off its object or something has come before it."""
+        p, cfg = self._points, self.config
+        px = np.clip(np.rint(p.uv), 0, np.array(depth_m.shape[::-1]) - 1).astype(int)
+        now = depth_m[px[:, 1], px[:, 0]]
+        jumped = p.visible & (now > 0) & (p.depth_m > 0) & (np.abs(now - p.depth_m) > cfg.depth_jump_m)
+        # While a point is hidden its object goes anywhere: what it comes back to is not held against it.
+        p.visible[jumped] = False
+        p.depth_m = np.where(p.visible & (now > 0), now, np.where(p.visible, p.depth_m, 0)).astype(np.float32)
+
+    def _bare(self) -> np.ndarray:
+        """(N,) points whose surroundings were too even to be recognised."""
+        return self._points.fine.contrast[:, 0] < self.config.bare_contrast
 
     def _search_everywhere(self, search: np.ndarray | None, urgent: bool) -> None:
         """Look for invisible points at corners that look like those once around them."""
         p, cfg = self._points, self.config
-        wanted = np.flatnonzero(~p.visible & (p.hidden_for >= 1))
+        wanted = np.flatnonzero(~p.visible & (p.hidden_for >= 1) & ~self._bare())
         if not len(wanted) or not (urgent or self._frames % cfg.redetect_every == 0):
             return
         # A level a time keeps the cost even; who waits for a return gets them all.
@@ -275,14 +366,34 @@ class EmbeddedTracker:
         A = found.frames[best] @ np.linalg.inv(p.anchor_frame[wanted[i], k, j])
         uv = found.uv_px[best] + (A @ p.anchor_offset[wanted[i], k, j][..., None])[..., 0]
         keep = self._inside(uv, search)
-        order = np.flatnonzero(keep)[np.argsort(score[keep], kind="stable")]
-        for _ in range(cfg.candidates):
-            # The best corner of each point first; whoever is not found by it tries its next.
-            order = order[~p.visible[wanted[i[order]]]]
-            _, first = np.unique(i[order], return_index=True)
-            pick = order[first]
-            self._take_back(wanted[i[pick]], k[pick], uv[pick], A[pick], cfg.search_px)
-            order = np.delete(order, first)
+        # The best few corners of each point, then those that its neighbours support, then the best of each.
+        order = np.lexsort((score, i))[keep[np.lexsort((score, i))]]
+        rank = np.arange(len(order)) - np.searchsorted(i[order], i[order])
+        order = order[rank < cfg.candidates]
+        rows, k = wanted[i[order]], k[order]
+        seen, good = self._found(rows, k, uv[order], A[order])
+        good &= self._support(rows, k, seen, good) >= cfg.support
+        pick = np.flatnonzero(good)[np.argsort(-seen.ncc[good], kind="stable")]
+        pick = pick[np.unique(rows[pick], return_index=True)[1]]
+        self._settle(rows[pick], k[pick], seen, pick)
+
+    def _support(self, rows: np.ndarray, k: np.ndarray, seen: Alignment, good: np.ndarray) -> np.ndarray:
+        """How many neighbours are, or may be, where each finding expects them.
+
+        rows, k  point and appearance of each finding (H,); those that are ``good`` speak for one another.
+        """
+        p = self._points
+        may = np.full((len(p), 1 + self.config.candidates, 2), np.nan)
+        may[p.visible, 0] = p.uv[p.visible]
+        at = np.flatnonzero(good)
+        at = at[np.argsort(rows[at], kind="stable")]
+        may[rows[at], 1 + np.arange(len(at)) - np.searchsorted(rows[at], rows[at])] = seen.uv_px[at]
+        offset = p.neighbour_offset[rows, k]
+        expected = seen.uv_px[:, None] + offset @ seen.A.transpose(0, 2, 1)
+        neighbour = p.rows(p.neighbour[rows, k])
+        off = np.linalg.norm(may[neighbour] - expected[:, :, None], axis=-1)
+        near = np.nan_to_num(off, nan=np.inf).min(2) < 3 + 0.15 * np.linalg.norm(offset, axis=-1)
+        return (near & (neighbour >= 0)).sum(1)
 
     def _inside(self, uv: np.ndarray, search: np.ndarray | None) -> np.ndarray:
         """Whether places (N, 2) lie in the picture, and in the region searched."""
@@ -293,16 +404,27 @@ class EmbeddedTracker:
             inside &= search[px[:, 1], px[:, 0]]
         return inside
 
-    def _take_back(self, at: np.ndarray, k: np.ndarray, uv: np.ndarray, A: np.ndarray, reach_px: float) -> None:
-        """Align points' appearances k from about uv and A, coarse to fine; those that fit are visible again."""
+    def _found(self, at, k, uv, A) -> tuple[Alignment, np.ndarray]:
+        """Align points' appearances k from about uv and A, coarse to fine; and which of them look like the point."""
         p, cfg = self._points, self.config
-        if not len(at):
-            return
         rough = align(self._coarse, p.coarse[at, k], uv / 2, A, cfg.iterations)
         seen = align(self._fine, p.fine[at, k], 2 * rough.uv_px, rough.A, cfg.iterations)
-        good = (seen.ncc >= cfg.return_ncc) & (np.linalg.norm(seen.uv_px - uv, axis=1) < reach_px)
-        good &= seen.sigma_px < cfg.return_sigma_px
-        self._settle(at[good], k[good], seen, good)
+        good = (seen.ncc >= cfg.return_ncc) & (np.linalg.norm(seen.uv_px - uv, axis=1) < cfg.search_px)
+        sigma_px = np.sqrt(np.trace(seen.cov_px2, axis1=1, axis2=2))
+        good &= (sigma_px < cfg.return_sigma_px) & self._plausible(at, k, seen)
+        return seen, good
+
+    def _plausible(self, at: np.ndarray, k: np.ndarray, seen: Alignment) -> np.ndarray:
+        """Whether brightness, contrast, colour and foreshortening are those of the appearance, about."""
+        p, cfg = self._points, self.config
+        off = np.abs(self._colour(seen.uv_px) - p.colour[at, k]).max(1)
+        stretch = np.abs(np.linalg.det(seen.A))
+        return (
+            (off < cfg.colour_change)
+            & (np.abs(seen.lighter) < cfg.grey_change)
+            & (np.abs(np.log(seen.stronger)) < np.log(cfg.contrast_change))
+            & (np.abs(np.log(stretch)) < np.log(cfg.area_change))
+        )
 
     def _renew(self) -> None:
         """Remember how points look whose view has changed much since any appearance of theirs."""
@@ -314,6 +436,7 @@ class EmbeddedTracker:
         A = p.warp[at] @ np.linalg.inv(p.view[at, k])
         stretch = np.linalg.svd(A, compute_uv=False)
         far = (stretch.max(1) > cfg.renew_stretch) | (stretch.min(1) < 1 / cfg.renew_stretch)
+        far |= p.ncc[at] < cfg.renew_ncc
         far &= p.sigma_px[at] < cfg.return_sigma_px
         self._remember(self._turn(at[far], cfg.tries))
 
@@ -325,8 +448,9 @@ class EmbeddedTracker:
         slots = p.view.shape[1]
         k = np.where(p.count[rows] < slots, p.count[rows], 1 + (self._frames // self.config.renew_every) % (slots - 1))
         uv = p.uv[rows]
-        p.view[rows, k], p.view_sigma_px[rows, k] = p.warp[rows], p.sigma_px[rows]
+        p.view[rows, k], p.view_cov[rows, k] = p.warp[rows], p.cov[rows]
         p.fine[rows, k], p.coarse[rows, k] = take(self._fine, uv), take(self._coarse, uv / 2)
+        p.colour[rows, k] = self._colour(uv)
         p.count[rows] = np.minimum(p.count[rows] + 1, slots)
         self._remember_neighbours(rows, k)
         self._remember_corners(rows, k)
@@ -365,33 +489,39 @@ class EmbeddedTracker:
             p.anchor_offset[rows[i], k[i], j] = offset[i, at]
 
 
-def _carried(offset: np.ndarray, now: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _carried(
+    offset: np.ndarray, now: np.ndarray, use: np.ndarray, noise_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Where points are and how they are warped, by an affine motion of the points around them.
 
-    offset  (N, M, 2) from the point to each neighbour when its appearance was taken
-    now     (N, M, 2) where the neighbours are, used where ``use`` (N, M)
+    offset    (N, M, 2) from the point to each neighbour when its appearance was taken
+    now       (N, M, 2) where the neighbours are, used where ``use`` (N, M)
+    noise_px  (N, M) standard deviation of that
 
-    Returns uv_px (N, 2), A (N, 2, 2) and whether the neighbours agree on it (N,). The affine part is
-    held to a similarity where the neighbours are too few or too much in line to tell.
+    Returns uv_px (N, 2), A (N, 2, 2), sigma_px (N,) and whether the neighbours agree on it (N,). The affine
+    part is held to a similarity where the neighbours are too few or too much in line to tell.
     """
-    n = len(offset)
     now = np.where(use[..., None], now, 0)
-    weight = use / (1 + (offset**2).sum(-1) / 30**2)
-    for _ in range(3):
+    prior = use / (1 + (offset**2).sum(-1) / 30**2) / (1 + noise_px**2)
+    weight = prior
+    for _ in range(3):  # reweighted: a neighbour that went elsewhere does not count
         total = np.maximum(weight.sum(1), 1e-6)[:, None]
         centre, there = (weight[..., None] * offset).sum(1) / total, (weight[..., None] * now).sum(1) / total
         x, y = offset - centre[:, None], now - there[:, None]
-        S = np.einsum("nm,nmi,nmj->nij", weight, y, x)
-        V = np.einsum("nm,nmi,nmj->nij", weight, x, x)
+        S = (weight[..., None] * y).transpose(0, 2, 1) @ x
+        V = (weight[..., None] * x).transpose(0, 2, 1) @ x
         size = np.maximum(np.trace(V, axis1=1, axis2=2), 1e-6)
         a, b = (S[:, 0, 0] + S[:, 1, 1]) / size, (S[:, 1, 0] - S[:, 0, 1]) / size
         similar = np.stack([np.stack([a, -b], -1), np.stack([b, a], -1)], -2)
-        ridge = (0.02 * size + 25 * total[:, 0] * 0.2)[:, None, None] * _EYE
+        ridge = (0.02 * size + 5 * total[:, 0])[:, None, None] * _EYE
         A = (S + similar @ ridge) @ np.linalg.inv(V + ridge)
         off = np.linalg.norm(y - x @ A.transpose(0, 2, 1), axis=-1)
         typical = np.maximum(np.sqrt((weight * off**2).sum(1) / total[:, 0]), 0.3)
-        weight = use / (1 + (offset**2).sum(-1) / 30**2) / (1 + (off / typical[:, None]) ** 2)
+        weight = prior / (1 + (off / typical[:, None]) ** 2)
+    agree = (use & (off < 3)).sum(1)
+    stretch = np.linalg.det(A)
+    # The motion is affine only nearby: what the neighbours say is worth less the farther they are.
+    sigma_px = np.hypot(typical / np.sqrt(np.maximum(agree, 1)), 0.05 * np.linalg.norm(centre, axis=1))
     uv = there - (A @ centre[..., None])[..., 0]
-    agree = (use & (off < 3)).sum(1) >= 3
-    det = np.linalg.det(A) if n else np.zeros(0)
-    return uv, A, agree & (det > 0.1) & (det < 10)
+    ok = (agree >= 3) & (stretch > 0.1) & (stretch < 10)
+    return uv.astype(np.float32), A.astype(np.float32), sigma_px.astype(np.float32), ok

@@ -1,0 +1,173 @@
+"""The long-range tracker on a printed card whose motion is known exactly, hidden and back elsewhere."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.stages.embedded_tracker import EmbeddedTracker
+from p2p_lib.stages.lk_tracker import LkTracker
+
+SHAPE, HIDDEN, LENGTH = (300, 400), range(20, 55), 75
+CARD = (110, 140)
+
+
+def printed(seed: int, shape: tuple[int, int]) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    colour = [
+        sum(
+            cv2.resize(rng.normal(0, 1, (shape[0] // s, shape[1] // s)), shape[::-1], interpolation=cv2.INTER_CUBIC)
+            for s in (5, 11, 30)
+        )
+        for _ in range(3)
+    ]
+    return np.clip(128 + 32 * np.stack(colour, -1), 0, 255).astype(np.uint8)
+
+
+def motion(t: int) -> np.ndarray:
+    """(2, 3) of the card at frame t: it drifts and turns; while hidden it jumps, turns by 30 degrees, comes nearer."""
+    if t < HIDDEN.stop:
+        turn, scale, place = 0.6 * t, 1.0, np.array([110 + 1.5 * t, 130 + 0.5 * t])
+    else:
+        turn, scale, place = 42 - 0.5 * t, 1.2, np.array([290 - 0.5 * t, 180 - 0.5 * t])
+    M = cv2.getRotationMatrix2D((CARD[1] / 2, CARD[0] / 2), turn, scale)
+    M[:, 2] += place - np.array(CARD[::-1]) / 2
+    return M
+
+
+@cache
+def film(hide: bool = True) -> list[Frame]:
+    card, wall = printed(1, CARD), printed(2, SHAPE) // 2 + 60
+    rng, frames = np.random.default_rng(3), []
+    for t in range(LENGTH):
+        rgb, depth = wall.copy(), np.full(SHAPE, 1.5, np.float32)
+        if not (hide and t in HIDDEN):
+            here = cv2.warpAffine(np.ones(CARD, np.uint8), motion(t), SHAPE[::-1]) > 0
+            rgb[here] = cv2.warpAffine(card, motion(t), SHAPE[::-1])[here]
+            depth[here] = 1.0
+        noisy = np.clip(rgb + rng.normal(0, 3, rgb.shape), 0, 255).astype(np.uint8)
+        frames.append(Frame(t, t / 30, noisy, depth))
+    return frames
+
+
+def on_card() -> np.ndarray:
+    y, x = np.mgrid[18 : CARD[0] - 18 : 12, 18 : CARD[1] - 18 : 12]
+    return np.stack([x.ravel(), y.ravel()], -1).astype(float)
+
+
+def truth(t: int) -> np.ndarray:
+    return on_card() @ motion(t)[:, :2].T + motion(t)[:, 2]
+
+
+def follow(tracker, frames: list[Frame]) -> list[Tracks]:
+    tracker.start(frames[0])
+    tracker.add(truth(0))
+    return [tracker.track(frame) for frame in frames[1:]]
+
+
+@cache
+def followed() -> list[Tracks]:
+    return follow(EmbeddedTracker(TrackingConfig()), film())
+
+
+def error_px(tracks: Tracks, t: int) -> np.ndarray:
+    return np.linalg.norm(tracks.uv_px - truth(t), axis=1)
+
+
+def test_follows_without_drift():
+    tracks = followed()[HIDDEN.start - 2]
+    error = error_px(tracks, HIDDEN.start - 1)[tracks.visible]
+    assert tracks.visible.mean() > 0.9 and np.median(error) < 0.3 and (error < 2).mean() > 0.97
+
+
+def test_hidden_points_are_invisible():
+    shown = [followed()[t - 1].visible.mean() for t in HIDDEN]
+    assert max(shown[1:]) < 0.1 and np.mean(shown[3:]) < 0.05
+
+
+def test_points_come_back_elsewhere_turned_and_scaled():
+    back = HIDDEN.stop + 5
+    tracks = followed()[back - 1]
+    right = tracks.visible & (error_px(tracks, back) < 2)
+    assert right.mean() > 0.7 and (error_px(tracks, back)[tracks.visible] < 4).mean() > 0.95
+    plain = follow(LkTracker(TrackingConfig()), film())[back - 1]
+    assert (plain.visible & (error_px(plain, back) < 4)).mean() < 0.05
+
+
+def test_uncertainty_grows_with_the_error():
+    error, sigma = [], []
+    for t, tracks in enumerate(followed(), 1):
+        if t not in HIDDEN:
+            error.append(error_px(tracks, t)[tracks.visible])
+            sigma.append(tracks.uncertainty[tracks.visible])
+    error, sigma = np.concatenate(error), np.concatenate(sigma)
+    assert (0 <= sigma).all() and (sigma <= 1).all()
+    low, high = np.quantile(sigma, [0.3, 0.8])
+    assert np.mean(np.minimum(error[sigma > high], 8)) > 1.5 * np.mean(np.minimum(error[sigma < low], 8))
+
+
+def test_causal_bit_for_bit():
+    short = follow(EmbeddedTracker(TrackingConfig()), film()[:30])
+    for mine, whole in zip(short, followed()):
+        for name in ("ids", "uv_px", "visible", "uncertainty"):
+            np.testing.assert_array_equal(getattr(mine, name), getattr(whole, name))
+
+
+def test_a_jump_of_depth_ends_a_track():
+    frames = film(hide=False)[:6]
+    near = [Frame(f.index, f.time_s, f.rgb, f.depth_m - 0.3 * (f.index >= 4)) for f in frames]
+    tracks = follow(EmbeddedTracker(TrackingConfig()), near)
+    assert tracks[2].visible.mean() > 0.9 and tracks[3].visible.mean() < 0.05
+    assert tracks[4].visible.mean() > 0.7, "what looks right there comes back at the new depth"
+
+
+def test_rejected_points_are_looked_for_anew_and_dropped_ones_are_gone():
+    tracker = EmbeddedTracker(TrackingConfig())
+    tracker.start(film()[0])
+    ids = tracker.add(truth(0))
+    tracker.track(film()[1])
+    tracker.drop(ids[::2])
+    assert (tracker.add(truth(1)[:3]) == len(ids) + np.arange(3)).all()
+    tracker.reject(ids[1::4])
+    tracks = tracker.track(film()[2])
+    assert set(tracks.ids) == set(ids[1::2]) | {len(ids), len(ids) + 1, len(ids) + 2}
+    back = tracks.visible[np.isin(tracks.ids, ids[1::4])]
+    assert back.mean() > 0.8
+
+
+def test_suggested_places_are_verified():
+    frames = film()
+    tracker = EmbeddedTracker(TrackingConfig(redetect_every=1000))
+    tracker.start(frames[0])
+    ids = tracker.add(truth(0))
+    tracker.track(frames[1])
+    tracker.track(frames[HIDDEN.stop])  # far off: lost
+    lost = ~tracker.track(frames[HIDDEN.stop]).visible
+    assert lost.mean() > 0.8
+    tracker.suggest(ids, truth(HIDDEN.stop) + np.array([60.0, 0]))  # wrong
+    assert tracker.track(frames[HIDDEN.stop]).visible.mean() < 0.2
+    tracker.suggest(ids, truth(HIDDEN.stop) + 0.8)
+    tracks = tracker.track(frames[HIDDEN.stop])
+    assert tracks.visible.mean() > 0.7
+    assert np.median(error_px(tracks, HIDDEN.stop)[tracks.visible]) < 0.5
+
+
+@pytest.mark.parametrize("call", ["add", "track"])
+def test_nothing_before_start(call):
+    tracker = EmbeddedTracker(TrackingConfig())
+    with pytest.raises(BadInput, match="start"):
+        tracker.add(np.zeros((1, 2))) if call == "add" else tracker.track(film()[0])
+
+
+def test_blank_pictures_and_no_points():
+    blank = [Frame(t, t / 30, np.full((*SHAPE, 3), 80, np.uint8), np.ones(SHAPE, np.float32)) for t in range(4)]
+    tracker = EmbeddedTracker(TrackingConfig())
+    tracker.start(blank[0])
+    assert len(tracker.track(blank[1])) == 0
+    tracker.add(np.array([[5.0, 5.0], [200.0, 150.0]]))
+    tracks = tracker.track(blank[2], urgent=True)
+    assert len(tracks) == 2 and np.isfinite(tracks.uncertainty).all() and tracks.uncertainty.max() <= 1
