@@ -7,6 +7,7 @@ import json
 import os
 import sys
 import traceback
+import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -51,6 +52,8 @@ def _run(a: argparse.Namespace) -> None:
         tracker=a.tracker,
         detector=a.detector,
         masks=a.masks,
+        prompts=a.prompts,
+        save_masks=a.save_masks,
         format=a.format,
         depth_scale=a.depth_scale,
         objects=a.objects.split(",") if a.objects else None,
@@ -89,6 +92,13 @@ def _export(a: argparse.Namespace) -> None:
         print(path)
 
 
+def _eval_masks(a: argparse.Namespace) -> None:
+    from p2p_lib.run import evaluate_run_masks
+
+    evaluation = evaluate_run_masks(a.run, a.min_visible_px)
+    print(json.dumps(evaluation.as_dict()) if a.json else evaluation.as_table())
+
+
 def _eval_tracks(a: argparse.Namespace) -> None:
     from p2p_lib.run import evaluate_tracker
 
@@ -104,6 +114,20 @@ def _eval_tracks(a: argparse.Namespace) -> None:
         settings=_pairs("--set", a.set, "stage.key=value"),
     )
     print(json.dumps(score.as_dict()) if a.json else score.as_table())
+
+
+def _click(a: argparse.Namespace) -> None:
+    from p2p_lib.click import collect_clicks
+    from p2p_lib.data.sequence import open_sequence
+
+    sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed)
+    with collect_clicks(sequence, a.out, a.frame, a.port) as clicker:
+        print(f"Click in your browser at {clicker.url} and press Save there; Ctrl-C here gives up.", flush=True)
+        # Without a desktop a browser in text would take the terminal.
+        if not a.no_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+            webbrowser.open(clicker.url)
+        clicker.wait()
+    print(f"{len(clicker.prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --out DIR")
 
 
 def _notebooks(a: argparse.Namespace) -> None:
@@ -203,7 +227,13 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--set", action="append", metavar="STAGE.KEY=VALUE", help="change one parameter; repeatable")
     p.add_argument("--tracker", default=None, metavar="NAME", help="2D point tracker (default: the embedded one)")
     p.add_argument("--detector", default=None, metavar="NAME", help="source of new points (default: corners)")
-    p.add_argument("--masks", default="dataset", metavar="SOURCE", help="dataset, or dataset:FOLDER")
+    p.add_argument("--prompts", type=Path, metavar="FILE", help="clicks on the objects (see p2p click)")
+    p.add_argument(
+        "--masks",
+        metavar="SOURCE",
+        help="dataset, dataset:FOLDER, embedded, sam2 (default: dataset; with --prompts embedded)",
+    )
+    p.add_argument("--save-masks", action="store_true", help="keep the masks used as DIR/masks/OBJECT/*.png")
     p.add_argument("--seed", type=int, default=None, metavar="N", help="of every random choice (default 0)")
     p.add_argument("--start", type=int, default=0, metavar="I", help="first frame")
     p.add_argument("--stop", type=int, metavar="J", help="one past the last frame")
@@ -226,6 +256,11 @@ def _parser() -> argparse.ArgumentParser:
         help="object frame fixed at the first scored frame (default), or by one constant over all",
     )
     p.add_argument("--min-visible-px", type=int, default=300, metavar="N", help="smaller masks are not scored")
+
+    p = _command(commands, "eval-masks", _eval_masks, "score the masks that a run kept against the dataset's own")
+    p.add_argument("run", type=Path, metavar="DIR", help="folder written by p2p run --save-masks")
+    p.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    p.add_argument("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
 
     p = _command(commands, "eval-tracks", _eval_tracks, "score a 2D point tracker against true tracks")
     p.add_argument("sequence", metavar="SEQ", help="a folder with true poses, or synthetic/NAME (embedded)")
@@ -250,6 +285,16 @@ def _parser() -> argparse.ArgumentParser:
         choices=("object", "model"),
         help="the tracker's own object frame, or the model's by the truth of the first scored frame (default for bop)",
     )
+
+    p = _command(commands, "click", _click, "collect clicks on objects in the browser, for p2p run --prompts")
+    p.add_argument("sequence", metavar="SEQ", help="a folder, or synthetic/NAME (embedded)")
+    p.add_argument("--out", type=Path, required=True, metavar="FILE", help="the prompts; what it holds is shown first")
+    p.add_argument("--frame", type=int, default=0, metavar="I", help="frame to begin with (default 0)")
+    p.add_argument("--port", type=int, default=0, metavar="N", help="of the page (default: a free one)")
+    p.add_argument("--no-browser", action="store_true", help="only say where the page is")
+    p.add_argument("--format", help="layout (default: recognised)")
+    p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="of a synthetic sequence (default 0)")
 
     p = _command(commands, "notebooks", _notebooks, "run the notebooks headless and collect their results")
     p.add_argument("--profile", choices=("quick", "full"), default="quick", help="size of the job (default quick)")

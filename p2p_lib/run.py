@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,9 @@ import numpy as np
 from tqdm import tqdm
 
 from p2p_lib.backends.registry import DEFAULT_DETECTOR, make_tracker
+from p2p_lib.backends.segmenters import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core import config as configuration
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame, PoseEstimate
@@ -20,12 +22,15 @@ from p2p_lib.data import sequence as sequences
 from p2p_lib.data.export import export
 from p2p_lib.data.imported import as_run, read_poses
 from p2p_lib.data.models import find_models, given_models
+from p2p_lib.data.prompts import Prompt, load_prompts
 from p2p_lib.data.runs import Run, RunWriter, load_run
+from p2p_lib.evaluation.mask_score import MaskEvaluation, evaluate_masks
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, score_tracker
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.pipeline import Point2Pose
+from p2p_lib.stages.clicks import check_apart, check_clicks
 from p2p_lib.stages.mesh import save as save_mesh
 from p2p_lib.stages.tracking import DEFAULT_TRACKER, PointTracker
 
@@ -70,7 +75,9 @@ def run(
     seed: int | None = None,
     tracker: str | PointTracker | None = None,
     detector: str | None = None,
-    masks: str = "dataset",
+    masks: str | None = None,
+    prompts: str | Path | Iterable[Prompt] | None = None,
+    save_masks: bool = False,
     format: str | None = None,
     depth_scale: float | None = None,
     objects: Iterable[str] | None = None,
@@ -81,20 +88,31 @@ def run(
 ) -> RunResult:
     """Track the objects of a sequence and write a run folder (see :mod:`p2p_lib.data.runs`).
 
-    Each object is started by its first mask that is large enough. Arguments are those of ``p2p run``;
-    ``sequence`` may also be an open one. Raises :class:`P2PError` with a one-line message for anything
-    that does not fit; Ctrl-C ends the run early and is reported in the result.
+    ``masks`` says where masks come from: ``dataset``, ``dataset:FOLDER``, or a segmenter by name, which
+    starts from ``prompts`` (a file, or values). The default is the dataset's, or with prompts the
+    embedded segmenter. With the dataset's, each object is started by its first mask that is large enough.
+
+    Arguments are those of ``p2p run``; ``sequence`` may also be an open one. Raises :class:`P2PError` with a
+    one-line message for anything that does not fit; Ctrl-C ends the run early and is reported in the result.
     """
     config = make_config(preset, config_file, settings, seed)
+    prompts = load_prompts(prompts) if isinstance(prompts, str | Path) else tuple(prompts or ())
+    masks = _mask_source(masks, prompts)
+    segmenter = masks if masks in SEGMENTERS else None
     if isinstance(sequence, str | Path):
-        folder = _mask_folder(masks)
+        folder = None if segmenter else masks.partition(":")[2] or None
         sequence = sequences.open_sequence(sequence, format, depth_scale, config.seed, masks=folder)
-    chosen = _chosen(sequence, objects)
     frames = _frames(len(sequence), start, stop)
+    chosen = _chosen([p.name for p in prompts] if segmenter else sequence.objects, objects)
+    clicked = _by_frame([p for p in prompts if p.name in chosen], frames, sequence.camera)
     method = Point2Pose(
-        sequence.camera, config, _tracker(tracker, sequence, config, models), detector or DEFAULT_DETECTOR
+        sequence.camera,
+        config,
+        _tracker(tracker, sequence, config, models),
+        detector or DEFAULT_DETECTOR,
+        segmenter or DEFAULT_SEGMENTER,
     )
-    for name in chosen:
+    for name in () if segmenter else chosen:
         method.add_object(name)
     known = find_models(sequence) | given_models(models or {}, sequence.objects)
     writer = RunWriter(
@@ -109,10 +127,13 @@ def run(
         {name: path for name, path in known.items() if name in chosen},
     )
     writer.info["detector"] = method.detector.name
+    writer.info["prompts"] = [{"name": p.name, "frame": p.frame, "points": p.points_px.tolist()} for p in prompts]
     interrupted = False
     with writer, tqdm(total=len(frames), unit="frame", disable=not progress, desc=sequence.name) as bar:
         try:
-            for frame, estimates in _estimates(method, sequence, frames):
+            for frame, estimates in _estimates(method, sequence, frames, None if segmenter is None else clicked):
+                if save_masks:
+                    writer.add_masks(frame, method.masks)
                 times = method.stopwatch.last_ms
                 writer.add(frame, estimates, times["total"], {k: v for k, v in times.items() if k != "total"})
                 bar.set_postfix_str(_postfix(times["total"], estimates), refresh=False)
@@ -132,12 +153,20 @@ def run(
 
 
 def _estimates(
-    method: Point2Pose, sequence: sequences.Sequence, frames: range
+    method: Point2Pose,
+    sequence: sequences.Sequence,
+    frames: range,
+    clicked: Mapping[int, Mapping[str, np.ndarray]] | None,
 ) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
-    """Every frame with its estimates, which a late 2D tracker gives some frames later."""
+    """Every frame with its estimates, which a late 2D tracker gives some frames later.
+
+    clicked  frame to the clicks that start objects there; None: the sequence's masks do
+    """
     waiting: deque[Frame] = deque()
     for i in frames:
-        frame, seen = sequence.frame(i), sequence.masks(i)
+        frame, seen = sequence.frame(i), sequence.masks(i) if clicked is None else None
+        for name, clicks in (clicked or {}).get(i, {}).items():
+            method.add_object(name, clicks=clicks)
         waiting.append(frame)
         known = None if seen is None else {name: seen[name] for name in method.objects if name in seen}
         estimates = method.step(frame, known)
@@ -225,6 +254,11 @@ def _tracker(
     return OracleTracker(TrueScene.of(sequence, models), config.oracle, config.seed)
 
 
+def evaluate_run_masks(out: str | Path, min_visible_px: int = 300) -> MaskEvaluation:
+    """Score the masks that a run kept; what ``p2p eval-masks`` prints."""
+    return evaluate_masks(load_run(out), min_visible_px=min_visible_px)
+
+
 def _save_meshes(method: Point2Pose, out: Path) -> None:
     """``meshes/<object>.ply``: each object's surface in its own frame; nothing of one that was never seen."""
     for name, obj in method.objects.items():
@@ -249,21 +283,41 @@ def _summary(run: Run, wanted: int) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _mask_folder(masks: str) -> str | None:
-    kind, _, folder = masks.partition(":")
-    if kind != "dataset" or (":" in masks and not folder):
-        raise BadInput("masks", repr(masks), "dataset, or dataset:FOLDER")
-    return folder or None
+def _mask_source(masks: str | None, prompts: Sequence[Prompt]) -> str:
+    """The checked source of masks; None means the dataset, or with prompts the segmenter that is the default."""
+    source = masks or (DEFAULT_SEGMENTER if prompts else "dataset")
+    kind, colon, folder = source.partition(":")
+    if (kind != "dataset" or (colon and not folder)) and source not in SEGMENTERS:
+        raise BadInput("masks", repr(masks), f"dataset, dataset:FOLDER, or {', '.join(SEGMENTERS)}")
+    if source in SEGMENTERS and not prompts:
+        fix = "Make some with p2p click SEQ --out prompts.json and give them with --prompts."
+        raise BadInput("masks", f"{source!r} without prompts", "clicks for the segmenter to start from", fix)
+    if source not in SEGMENTERS and prompts:
+        raise BadInput("masks", f"{source!r} and prompts", "one of them", f"Segmenters: {', '.join(SEGMENTERS)}.")
+    return source
 
 
-def _chosen(sequence: sequences.Sequence, objects: Iterable[str] | None) -> tuple[str, ...]:
-    chosen = sequence.objects if objects is None else tuple(objects)
+def _chosen(known: Sequence[str], objects: Iterable[str] | None) -> tuple[str, ...]:
+    chosen = tuple(known) if objects is None else tuple(objects)
     for name in chosen:
-        if name not in sequence.objects:
-            raise BadInput("objects", repr(name), "some of " + ", ".join(sequence.objects))
+        if name not in known:
+            raise BadInput("objects", repr(name), "some of " + ", ".join(known))
     if not chosen:
-        raise BadInput(sequence.name, "no objects", "masks that show at least one", "Add masks/ to the folder.")
+        raise BadInput("objects", "none", "masks or prompts that show at least one", "Add masks/ or give --prompts.")
     return chosen
+
+
+def _by_frame(prompts: Sequence[Prompt], frames: range, camera: Camera) -> dict[int, dict[str, np.ndarray]]:
+    """Frame to the clicks in it by object; whatever can be wrong with them is said before the run begins."""
+    clicked: dict[int, dict[str, np.ndarray]] = {}
+    for prompt in prompts:
+        if prompt.frame not in frames:
+            got = f"frame {prompt.frame}"
+            raise BadInput(f"prompt of {prompt.name!r}", got, f"a frame of the run, {frames[0]} to {frames[-1]}")
+        clicks = check_clicks(prompt.name, prompt.points_px, camera)
+        check_apart(prompt.name, clicks, clicked.setdefault(prompt.frame, {}))
+        clicked[prompt.frame][prompt.name] = clicks
+    return clicked
 
 
 def _frames(count: int, start: int, stop: int | None) -> range:

@@ -17,6 +17,7 @@ from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.stages import refinement, registration
 from p2p_lib.stages.factor_graph import ObjectGraph
+from p2p_lib.stages.hints import Hint, surface_distance
 from p2p_lib.stages.keypoint_map import KeypointMap
 from p2p_lib.stages.lifting import lift
 from p2p_lib.stages.refinement import Keypoints, Refinement
@@ -81,6 +82,22 @@ class TrackedObject:
         """Whether the object was hidden or lost until now and its mask says that it is back."""
         away = len(self.keyframes) > 0 and self._status not in WITH_POSE
         return away and mask is not None and mask.sum() >= self.config.pipeline.min_mask_px
+
+    def hint(self, frame: Frame, tracks: Tracks) -> Hint:
+        """Where this object should be, by its tracks and what it knows, before anybody has segmented the frame."""
+        if not len(self.keyframes):
+            return Hint()
+        view = self._observe(frame, None, tracks.select(self.map.ids))
+        found = self._hypotheses(view)
+        best = max(found, key=lambda h: h.support, default=None)
+        away = self._status not in WITH_POSE
+        if best is None or (away and best.support < self.config.pipeline.recover_min_inliers):
+            return Hint()
+        distance_m = None
+        if self.surface is not None and not self.surface.empty:
+            corners = self.surface.corners_m()
+            distance_m = surface_distance(self.surface, corners, frame.depth_m, self.camera, best.T_cam_obj)
+        return Hint(view.tracks.uv_px[best.inliers], distance_m)
 
     def step(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> PoseEstimate:
         """This object's estimate at a frame, given its mask and everybody's tracks."""

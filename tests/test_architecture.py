@@ -20,7 +20,7 @@ FLOORS = [
     {"evaluation"},
     {"run"},
     {"report"},
-    {"notebooks", "doctor"},
+    {"notebooks", "doctor", "click"},
     {"cli"},
 ]
 HOMES = {

@@ -331,6 +331,103 @@ def test_debug_shows_where_it_went_wrong(sequence, tmp_path, capsys):
     assert err.startswith("Traceback") and "make_tracker" in err and "tracker: got 'nope'" in err
 
 
+# --- clicks ------------------------------------------------------------------------------------
+
+
+def clicks(folder: Path, *objects: tuple) -> list[str]:
+    """--prompts with a file of these (name, frame, points)."""
+    content = {"objects": [{"name": n, "frame": k, "points": points} for n, k, points in objects]}
+    (folder / "prompts.json").write_text(json.dumps(content))
+    return ["--prompts", str(folder / "prompts.json")]
+
+
+ON_BOARD = [[45, 40], [60, 50], [70, 70]]  # at frame 0; it moves by (2, 1) a frame
+
+
+def test_clicks_replace_masks(sequence, tmp_path, capsys):
+    shutil.rmtree(sequence / "gt_mask")
+    out = tmp_path / "out"
+    assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--save-masks") == 0
+    done = load_run(out)
+    assert done.info["masks"] == "embedded" and done.info["prompts"][0]["points"] == ON_BOARD
+    assert done.objects["object"].has_pose.all()
+    for k in range(FRAMES):
+        mask = cv2.imread(str(out / "masks" / "object" / f"{k:06d}.png"), cv2.IMREAD_UNCHANGED)
+        truth = np.zeros((H, W), bool)
+        truth[20 + k : 80 + k, 30 + 2 * k : 90 + 2 * k] = True
+        assert mask.shape == (H, W) and set(np.unique(mask)) == {0, 255}
+        assert ((mask > 0) & truth).sum() / ((mask > 0) | truth).sum() > 0.9
+    # The kept masks are a source of masks like any other, and a new run clears them away.
+    again = tmp_path / "again"
+    assert run(sequence, again, "--masks", f"dataset:{out / 'masks'}") == 0
+    assert load_run(again).objects["object"].has_pose.all() and not (again / "masks").exists()
+    assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--stop", "2") == 0
+    assert not list((out / "masks").rglob("*.png"))
+
+
+def test_what_counts_is_the_datasets_own_visibility(sequence, tmp_path, capsys):
+    """An object whose clicks come late was visible before all the same: those frames are failures."""
+    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("object", 4, [[60, 50], [70, 60]]))) == 0
+    capsys.readouterr()
+    assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 0
+    got = json.loads(capsys.readouterr().out)
+    assert got["objects"]["object"]["frames"] == FRAMES and got["objects"]["object"]["lost"] == 4
+    assert got["masks"] == "embedded"
+
+
+def test_masks_are_scored(sequence, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--save-masks") == 0
+    capsys.readouterr()
+    assert cli.main(["eval-masks", str(out), "--json"]) == 0
+    got = json.loads(capsys.readouterr().out)
+    assert got["mean_iou"] > 0.9 and got["objects"]["object"]["visible_frames"] == FRAMES and got["masks"] == "embedded"
+    assert cli.main(["eval-masks", str(out)]) == 0
+    assert "mean IoU" in capsys.readouterr().out
+
+
+def test_an_object_of_ones_own_is_tracked_without_score(sequence, tmp_path, capsys):
+    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("my board", 0, ON_BOARD))) == 0
+    assert "my board: a pose in 8 of 8 frames" in capsys.readouterr().out
+
+
+BAD_CLICKS = {
+    "no file": (["--prompts", "{seq}/none.json"], ["none.json", "p2p click SEQ --out"]),
+    "no JSON": (["--prompts", "{seq}/cam_K.txt"], ["cam_K.txt", "unreadable JSON"]),
+    "no prompts": (["--masks", "embedded"], ["masks: got 'embedded' without prompts", "p2p click", "--prompts"]),
+    "both": ([("object", 0, ON_BOARD), "--masks", "dataset"], ["masks: got 'dataset' and prompts", "embedded"]),
+    "outside": ([("object", 0, [[W, 10]])], ["clicks on 'object'", "(160, 10)", "160x120"]),
+    "late and outside": ([("object", 5, [[3, -9]])], ["clicks on 'object'", "(3, -9)"]),
+    "same click": ([("a", 0, ON_BOARD), ("b", 0, ON_BOARD[:1])], ["clicks on 'b'", "also one of 'a'"]),
+    "same name": ([("a", 0, ON_BOARD), ("a", 1, ON_BOARD)], ["'a' twice"]),
+    "frame not run": ([("object", 5, ON_BOARD), "--stop", "4"], ["prompt of 'object'", "frame 5", "0 to 3"]),
+    "unknown object": ([("object", 0, ON_BOARD), "--objects", "mug"], ["objects: got 'mug'", "object"]),
+    "no name of a file": ([("a/b", 0, ON_BOARD)], ["object name", "'a/b'"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CLICKS)
+def test_bad_clicks_are_answered_in_one_line(case, sequence, tmp_path, capsys):
+    given, expected = BAD_CLICKS[case]
+    prompts = [x for x in given if isinstance(x, tuple)]
+    words = [x.format(seq=sequence) for x in given if isinstance(x, str)]
+    assert run(sequence, tmp_path / "out", *(clicks(tmp_path, *prompts) if prompts else []), *words) == 2
+    line = one_line(capsys)
+    assert all(word in line for word in expected), line
+
+
+def test_clicks_without_depth_are_answered_in_one_line(sequence, tmp_path, capsys):
+    path = sequence / "depth" / "0000.png"
+    cv2.imwrite(str(path), np.zeros((H, W), np.uint16))
+    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("object", 0, ON_BOARD))) == 2
+    assert "clicks on 'object': got (45, 40) has no depth in frame 0" in one_line(capsys)
+
+
+def test_masks_that_were_not_kept_cannot_be_scored(done, capsys):
+    assert cli.main(["eval-masks", str(done)]) == 2
+    assert "--save-masks" in one_line(capsys, "eval-masks")
+
+
 # --- interruption ------------------------------------------------------------------------------
 
 

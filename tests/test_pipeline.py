@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.data.synthetic import shapes
 from p2p_lib.data.synthetic.noise import Sensor, measured_colour, measured_depth
@@ -82,6 +83,10 @@ def errors(estimates: list[dict[str, PoseEstimate]], name: str) -> tuple[np.ndar
     T_obj_model = se3.inverse(T_cam_obj[0]) @ T_cam_model[0]
     off = se3.inverse(T_cam_model) @ T_cam_obj @ T_obj_model
     return np.degrees(se3.angle_rad(off)), 1e3 * np.linalg.norm(off[:, :3, 3], axis=1)
+
+
+def iou(one: np.ndarray, other: np.ndarray) -> float:
+    return (one & other).sum() / max((one | other).sum(), 1)
 
 
 def statuses(estimates: list[dict[str, PoseEstimate]], name: str) -> list[str]:
@@ -405,7 +410,7 @@ def test_refusals_name_what_came_and_what_is_known():
     assert list(method.objects) == ["left"]
 
 
-@pytest.mark.parametrize("what", ["tracker", "detector"])
+@pytest.mark.parametrize("what", ["tracker", "detector", "segmenter"])
 def test_unknown_backends_are_refused(what):
     with pytest.raises(BadInput, match=f"{what}: got 'nope', expected one of "):
         Point2Pose(CAMERA, quick(), **{what: "nope"})
@@ -440,8 +445,98 @@ def test_time_is_told_stage_by_stage():
     assert ms["total"] >= max(v for k, v in ms.items() if k != "total") > 0
 
 
-def test_clicks_ask_for_a_segmenter_and_leave_no_object_behind():
-    method = Point2Pose(Camera(600, 600, 320, 240, 640, 480))
-    with pytest.raises(MissingBackend, match=r"clicks need one.*mask="):
-        method.add_object("left", clicks=np.array([[10, 10]]))
-    assert not method.objects
+# --- clicks ------------------------------------------------------------------------------------
+
+
+def clicks_on(mask: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Three pixels (x, y) well inside a mask."""
+    v, u = np.nonzero(cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)))
+    at = np.random.default_rng(seed).choice(len(v), 3, replace=False)
+    return np.stack([u[at], v[at]], 1)
+
+
+def test_three_clicks_serve_as_well_as_masks():
+    method = Point2Pose(CAMERA, preset())
+    for name, mask in film()[0][1].items():
+        method.add_object(name, clicks=clicks_on(mask))
+    estimates = []
+    for frame, masks in film():
+        estimates.append(method.step(frame))
+        for name, mask in masks.items():
+            assert iou(method.masks[name], mask & (frame.depth_m > 0)) > 0.85  # measured pixels alone are labelled
+        assert not (method.masks["left"] & method.masks["right"]).any()
+    assert_honest(estimates)
+    for name in TRUTH:
+        angle_deg, shift_mm = errors(estimates, name)
+        assert len(angle_deg) == LENGTH and angle_deg.max() < 4 and shift_mm.max() < 6
+
+
+def test_what_a_board_hides_is_absent_and_comes_back():
+    method = Point2Pose(CAMERA, preset())
+    frames = film(board=True)
+    for name, mask in frames[0][1].items():
+        method.add_object(name, clicks=clicks_on(mask))
+    estimates = []
+    for frame, _ in frames:
+        estimates.append(method.step(frame))
+        if frame.index in HIDDEN:
+            assert not any(mask.any() for mask in method.masks.values())
+    for name in TRUTH:
+        got = statuses(estimates, name)
+        assert {got[k] for k in HIDDEN} == {"occluded"}
+        assert got[-1] == "tracked" and "recovered" in got
+        assert iou(method.masks[name], frames[-1][1][name]) > 0.85
+
+
+def test_a_late_object_is_clicked_while_another_has_masks():
+    method = Point2Pose(CAMERA, quick())
+    method.add_object("left")
+    for frame, masks in film()[:12]:
+        if frame.index == 5:
+            method.add_object("right", clicks=clicks_on(masks["right"]))
+        estimates = method.step(frame, {"left": masks["left"]})
+        np.testing.assert_array_equal(method.masks["left"], masks["left"])
+    assert {str(e.status) for e in estimates.values()} == {"tracked"}
+    assert iou(method.masks["right"], masks["right"]) > 0.85
+    with pytest.raises(BadInput, match="mask of 'right': got a mask of an object with clicks"):
+        method.step(film()[12][0], film()[12][1])
+    method.remove_object("right")
+    assert set(method.step(film()[12][0], {"left": film()[12][1]["left"]})) == {"left"} == set(method.masks)
+
+
+def test_clicks_that_do_not_fit_are_refused_and_leave_no_object_behind():
+    method, masks = Point2Pose(CAMERA, quick()), film()[0][1]
+    good = clicks_on(masks["left"])
+    for clicks, what in {
+        ((400, 10),): r"\(400, 10\), expected pixels within 400x300",
+        ((-1, 10),): r"\(-1, 10\)",
+        ((np.nan, 10),): r"\(nan, 10\)",
+        ((1, 2, 3),): "at least one",
+        (): "at least one",
+        "left": "at least one",
+    }.items():
+        with pytest.raises(BadInput, match=f"clicks on 'cup'.*{what}"):
+            method.add_object("cup", clicks=clicks)
+    with pytest.raises(BadInput, match="object 'cup': got a mask and clicks"):
+        method.add_object("cup", mask=masks["left"], clicks=good)
+    with pytest.raises(BadInput, match="mask of 'cup': got an empty mask"):
+        method.add_object("cup", mask=np.zeros((300, 400), bool))
+    method.add_object("left", clicks=good)
+    with pytest.raises(BadInput, match="clicks on 'cup': got a click that is also one of 'left'"):
+        method.add_object("cup", clicks=[good[1] + 0.2, [10, 10]])
+    assert list(method.objects) == ["left"] == list(method.segmenter.names)
+
+
+def test_clicks_without_depth_are_refused_before_anything_is_done():
+    method, (frame, masks) = Point2Pose(CAMERA, quick()), film()[0]
+    clicks = clicks_on(masks["left"])
+    x, y = clicks[1]
+    hole = frame.depth_m.copy()
+    hole[y - 4 : y + 5, x - 4 : x + 5] = 0
+    method.add_object("left", clicks=clicks)
+    with pytest.raises(BadInput, match=rf"clicks on 'left': got \({x}, {y}\) has no depth in frame 0"):
+        method.step(Frame(0, 0.0, frame.rgb, hole))
+    other = Point2Pose(CAMERA, quick())
+    other.add_object("left", clicks=clicks)
+    # A frame with depth is taken as if nothing had been.
+    assert_same([method.step(f) for f, _ in film()[:4]], [other.step(f) for f, _ in film()[:4]])

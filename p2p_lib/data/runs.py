@@ -9,6 +9,7 @@
     meshes/<object>.ply   the reconstructed surface in the object frame, vertex colours (written at the end)
     models.npz            the models' points, so that a run can be scored by itself
     timings.csv           milliseconds of every frame and stage
+    masks/<object>/*.png  the masks that were used, 255 on the object (where asked for); named by frame index
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from p2p_lib.core import se3
@@ -260,6 +262,15 @@ class RunWriter:
             self.flush()
             self._flush_at = (n + 1) * 2 if n < 32 else n + 1 + max(50, n // 10)
 
+    def add_masks(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> None:
+        """Keep the masks (H, W) bool that served at a frame; all False for an object of which nothing is known."""
+        for name in self._rows:
+            mask = masks.get(name)
+            picture = np.zeros(frame.shape, np.uint8) if mask is None else mask.astype(np.uint8) * np.uint8(255)
+            path = self.path / "masks" / name / f"{frame.index:06d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+
     def flush(self) -> None:
         """Make everything so far readable on disk."""
         n = len(self._times)
@@ -355,7 +366,12 @@ def _clear(out: Path) -> None:
         raise BadInput(str(out), "a file", "a folder for the results")
     (out / "poses").mkdir(parents=True, exist_ok=True)
     old = [out / name for name in ("run.json", "config.toml", "poses.npz", "models.npz", "timings.csv")]
-    for path in [*old, *(out / "poses").glob("*.txt"), *(out / "meshes").glob("*.ply")]:
+    for path in [
+        *old,
+        *(out / "poses").glob("*.txt"),
+        *(out / "meshes").glob("*.ply"),
+        *(out / "masks").glob("*/*.png"),
+    ]:
         path.unlink(missing_ok=True)
 
 

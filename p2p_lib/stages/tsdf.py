@@ -135,6 +135,11 @@ class TsdfVolume:
         """(3,) centre of the first voxel in the object frame."""
         return self.anchor_m + self.voxel_m * self.lo
 
+    def corners_m(self) -> np.ndarray:
+        """(8, 3) corners of the grid in the object frame."""
+        corners = np.array(np.meshgrid(*zip(self.lo, self.lo + self.shape, strict=True), indexing="ij"))
+        return self.anchor_m + self.voxel_m * corners.reshape(3, -1).T
+
     @property
     def keys(self) -> tuple[int, ...]:
         """The keyframes whose observations are kept for re-integration, oldest first."""
@@ -288,8 +293,7 @@ class TsdfVolume:
 
     def _window(self, view: _View) -> tuple[int, int, int, int]:
         """Columns and rows [left, top, right, bottom) that the grid projects to, all where it reaches the camera."""
-        corners = np.array(np.meshgrid(*zip(self.lo, self.lo + self.shape, strict=True), indexing="ij"))
-        p_cam = se3.transform(view.T_cam_obj, self.anchor_m + self.voxel_m * corners.reshape(3, -1).T)
+        p_cam = se3.transform(view.T_cam_obj, self.corners_m())
         width, height = view.camera.width, view.camera.height
         if p_cam[:, 2].min() <= 0.01:
             return 0, 0, width, height
