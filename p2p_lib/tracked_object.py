@@ -84,13 +84,19 @@ class TrackedObject:
         return away and mask is not None and mask.sum() >= self.config.pipeline.min_mask_px
 
     def hint(self, frame: Frame, tracks: Tracks) -> Hint:
-        """Where this object should be, by its tracks and what it knows, before anybody has segmented the frame."""
+        """Where this object should be, by its tracks and what it knows, before anybody has segmented the frame.
+
+        While it is away, points that agree on no pose are somewhere else: they are to be looked for anew.
+        """
         if not len(self.keyframes):
             return Hint()
         view = self._observe(frame, None, tracks.select(self.map.ids))
         found = self._hypotheses(view)
         best = max(found, key=lambda h: h.support, default=None)
         away = self._status not in WITH_POSE
+        if away:
+            agrees = np.zeros(len(self.map), bool) if best is None else best.inliers
+            self.tracker.reject(self.map.ids[view.tracks.visible & ~agrees])
         if best is None or (away and best.support < self.config.pipeline.recover_min_inliers):
             return Hint()
         distance_m = None
