@@ -102,3 +102,24 @@ def test_a_run_writes_each_estimate_to_its_frame(crossing, tmp_path):
         np.testing.assert_array_equal(obj.frame_index, np.arange(12))
         np.testing.assert_array_equal(obj.T_cam_obj, other.objects[name].T_cam_obj)
         np.testing.assert_array_equal(obj.visible_px, other.objects[name].visible_px)
+
+
+def test_clicks_mean_the_frame_they_were_made_in(crossing):
+    """Segmentation waits with the estimates: the same masks and poses, some frames later."""
+    clicks = {}
+    for name, mask in crossing.masks(3).items():
+        v, u = np.nonzero(mask)
+        clicks[name] = np.stack([u, v], -1)[len(u) // 2 + np.array([-40, 0, 40])]
+    told = {}
+    for late in (0, 5):
+        method, told[late] = Point2Pose(crossing.camera, CONFIG, Late(late)), []
+        for t in range(10):
+            for name in clicks if t == 3 else ():
+                method.add_object(name, clicks=clicks[name])
+            told[late].append((method.step(crossing.frame(t)), method.masks))
+        told[late] += [(estimates, method.masks) for estimates in method.finish()]
+    assert_same([e for e, _ in told[0]], [e for e, _ in told[5][5:]])
+    for (_, one), (_, other) in zip(told[0], told[5][5:], strict=True):
+        assert one.keys() == other.keys()
+        assert all((one[name] == other[name]).all() for name in one)
+    assert all(mask.any() for mask in told[0][-1][1].values())
