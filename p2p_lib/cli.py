@@ -130,6 +130,18 @@ def _click(a: argparse.Namespace) -> None:
     print(f"{len(clicker.prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --out DIR")
 
 
+def _synth(a: argparse.Namespace) -> None:
+    from p2p_lib.data.synthetic import SCENARIOS, describe, write_sequence
+
+    if a.list:
+        print("\n".join(f"{name:18}{describe(name)}" for name in SCENARIOS))
+        return
+    if a.scenario is None or a.out is None:
+        raise BadInput("synth", "no scenario or no --out", "p2p synth SCENARIO --out DIR; p2p synth --list names them")
+    out = write_sequence(a.scenario, a.out, a.seed, a.noise, a.models or "", a.bop)
+    print(f"Written to {out}. Next: p2p run {out} --out RUN")
+
+
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.notebooks import run_notebooks
 
@@ -295,6 +307,15 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--format", help="layout (default: recognised)")
     p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of a synthetic sequence (default 0)")
+
+    p = _command(commands, "synth", _synth, "render a synthetic sequence in the YCBMultiTrack layout, with exact truth")
+    p.add_argument("scenario", nargs="?", metavar="SCENARIO", help="what happens; --list shows all")
+    p.add_argument("--list", action="store_true", help="list the scenarios")
+    p.add_argument("--out", type=Path, metavar="DIR", help="a new folder for the sequence")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="of labels, paths and noise (default 0)")
+    p.add_argument("--noise", default="realsense", metavar="NAME", help="exact, realsense (default) or hard")
+    p.add_argument("--models", type=Path, metavar="DIR", help="YCB models for the ycb_ scenarios (default: stand-ins)")
+    p.add_argument("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop")
 
     p = _command(commands, "notebooks", _notebooks, "run the notebooks headless and collect their results")
     p.add_argument("--profile", choices=("quick", "full"), default="quick", help="size of the job (default quick)")

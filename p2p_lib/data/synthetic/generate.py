@@ -21,7 +21,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import cache_dir
-from p2p_lib.data.synthetic.noise import Sensor, measured_colour, measured_depth
+from p2p_lib.data.synthetic.noise import NOISE, Sensor, kept_frames, measured_colour, measured_depth, measured_mask
 from p2p_lib.data.synthetic.render import Picture, render
 from p2p_lib.data.synthetic.scenarios import SCENARIOS
 from p2p_lib.data.synthetic.scene import FPS, Body, Scenario
@@ -62,8 +62,43 @@ def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, 
     room = _room(scenario, 0) if still else None
     work = partial(_write_frame, folder, scenario, sensor, seed, truth, room)
     with ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0)))) as pool:
-        rows = list(_progress(pool.map(work, range(scenario.frames)), scenario.frames, title))
-    _write_truth(folder, scenario, truth, rows)
+        frames = kept_frames(scenario.frames, sensor, np.random.default_rng([seed, 5]))
+        rows = list(_progress(pool.map(work, frames.tolist()), len(frames), title))
+    _write_truth(folder, scenario, truth, frames, rows)
+
+
+def write_sequence(
+    name: str, out: str | Path, seed: int = 0, noise: str = "realsense", models: str | Path = "", bop: bool = False
+) -> Path:
+    """What ``p2p synth`` does: a scenario as a YCBMultiTrack folder ``out``, which must not hold anything yet.
+
+    noise   a key of :data:`~p2p_lib.data.synthetic.noise.NOISE`
+    models  a folder of YCB models, for the scenarios that take them
+    bop     writes the BOP scene ``out/bop/test/000001`` and its models besides
+
+    ``scenario.json`` says what it is made of. Raises :class:`BadInput` for what does not fit.
+    """
+    out = Path(out).expanduser()
+    if noise not in NOISE:
+        raise BadInput("noise", repr(noise), "one of " + ", ".join(NOISE))
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise BadInput(str(out), "there is something already", "a new or empty folder")
+    own, _ = _settings(name, seed, {"models": str(models)} if models else {})
+    scenario = SCENARIOS[name](seed, **own)
+    write_scenario(out, scenario, NOISE[noise], seed, f"rendering {name}")
+    made = {"name": name, "seed": seed, "noise": noise, "sensor": asdict(NOISE[noise]), "objects": scenario.objects}
+    (out / _DONE).write_text(json.dumps(made | {"generator": generator_version()}, indent=1, sort_keys=True) + "\n")
+    if bop:
+        _write_bop(out)
+    return out
+
+
+def _write_bop(folder: Path) -> None:
+    from p2p_lib.data.bop_writer import write_models, write_scene
+    from p2p_lib.data.sequence import open_sequence
+
+    ids = write_scene(folder / "bop/test/000001", open_sequence(folder, format="ycbmultitrack"))
+    write_models(folder / "bop/models", {k: folder / f"models/{name}/textured.obj" for name, k in ids.items()})
 
 
 def generator_version() -> str:
@@ -152,9 +187,11 @@ def _write_frame(
     _save(folder / f"depth/{t:06d}.png", depth_mm, [cv2.IMWRITE_PNG_COMPRESSION, 2])
     rows = []
     for one in truth:
-        mask = (exact.label == one.label).astype(np.uint8) * 255
-        _save(folder / f"masks/{one.body.name}/{t:06d}.png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 2])
-        rows.append((int(np.count_nonzero(mask)), *one.tracks(scenario, t, exact)))
+        visible = exact.label == one.label
+        mask = measured_mask(visible, sensor, np.random.default_rng([seed, 6, t, one.label]))
+        where = folder / f"masks/{one.body.name}/{t:06d}.png"
+        _save(where, mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_COMPRESSION, 2])
+        rows.append((int(np.count_nonzero(visible)), *one.tracks(scenario, t, exact)))
     return rows
 
 
@@ -163,15 +200,15 @@ def _save(path: Path, picture: np.ndarray, options: list[int]) -> None:
         raise OSError(f"{path} could not be written: is the disk full?")
 
 
-def _write_truth(folder: Path, scenario: Scenario, truth: list[_Truth], rows: list) -> None:
+def _write_truth(folder: Path, scenario: Scenario, truth: list[_Truth], frames: np.ndarray, rows: list) -> None:
     """Camera, times, poses, labels, models and tracks: everything that is not a picture."""
     np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
-    np.savetxt(folder / "times.txt", np.arange(scenario.frames) / FPS, fmt="%.6f")
-    T_cam_world = se3.inverse(scenario.T_world_cam)
+    np.savetxt(folder / "times.txt", frames / FPS, fmt="%.6f")
+    T_cam_world = se3.inverse(scenario.T_world_cam[frames])
     for k, one in enumerate(truth):
         name = one.body.name
-        T_cam_model = T_cam_world @ one.body.T_world_model
-        for t, T in enumerate(T_cam_model):
+        T_cam_model = T_cam_world @ one.body.T_world_model[frames]
+        for t, T in zip(frames, T_cam_model, strict=True):
             np.savetxt(folder / f"annotated_poses/{name}/{t:06d}.txt", T, fmt="%.9f")
         uv = scenario.camera.project(se3.transform(T_cam_model, one.body.mesh.vertices))
         in_image = scenario.camera.inside(uv).any(1)
@@ -211,7 +248,8 @@ def _settings(name: str, seed: int, overrides: dict) -> tuple[dict, Sensor]:
         raise BadInput("synthetic sequence", repr(name), f"one of {known}")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise BadInput(f"synthetic/{name} seed", repr(seed), "a whole number, 0 or above")
-    own = {p.name: p.default for p in list(inspect.signature(SCENARIOS[name]).parameters.values())[1:]}
+    taken = list(inspect.signature(SCENARIOS[name]).parameters.values())[1:]
+    own = {p.name: p.default for p in taken if p.kind is not p.KEYWORD_ONLY}
     known = [*own, *(f.name for f in fields(Sensor))]
     for key in overrides:
         if key not in known:

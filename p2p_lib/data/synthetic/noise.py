@@ -30,6 +30,9 @@ class Sensor:
     exposure          largest relative change of brightness over time (slow)
     shutter_share     share of the frame time that the shutter is open: motion blur
     blur_samples      pictures averaged for it
+    mask_px           standard deviation of the displacement of the masks' outlines, which wobble smoothly
+    mask_loss         probability that an object's mask is missing in a frame
+    drop              probability that a frame is missing (never the first)
     """
 
     axial_per_m: float = 0.004
@@ -46,11 +49,15 @@ class Sensor:
     exposure: float = 0.04
     shutter_share: float = 0.0
     blur_samples: int = 6
+    mask_px: float = 0.0
+    mask_loss: float = 0.0
+    drop: float = 0.0
 
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            high = {"edge_loss": 1, "shutter_share": 1, "exposure": 0.9, "grazing_deg": 90}.get(f.name, np.inf)
+            shares = dict.fromkeys(("edge_loss", "shutter_share", "mask_loss", "drop"), 1)
+            high = (shares | {"exposure": 0.9, "grazing_deg": 90}).get(f.name, np.inf)
             if not np.isfinite(value) or not 0 <= value <= high:
                 raise BadInput(f"sensor {f.name}", value, f"a number from 0 to {high}")
         if self.blur_samples < 1:
@@ -59,6 +66,15 @@ class Sensor:
 
 #: Exact depth and clean colour.
 PERFECT = Sensor(**{f.name: 1 if f.name == "blur_samples" else 0 for f in fields(Sensor)})
+
+#: What ``p2p synth --noise`` takes.
+NOISE = {
+    "exact": PERFECT,
+    "realsense": Sensor(),
+    "hard": Sensor(
+        axial_per_m=0.006, exposure=0.15, shutter_share=0.4, mask_px=1.5, mask_loss=0.01, drop=0.02, edge_loss=0.8
+    ),
+}
 
 
 def measured_depth(picture: Picture, camera: Camera, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
@@ -93,6 +109,27 @@ def measured_colour(rgb: np.ndarray, sensor: Sensor, gain: float, rng: np.random
         variance = sensor.read_levels**2 + sensor.shot_levels**2 * np.clip(rgb, 0, 255) / 255
         rgb = rgb + np.sqrt(variance, dtype=np.float32) * rng.standard_normal(rgb.shape, np.float32)
     return np.clip(np.round(rgb), 0, 255).astype(np.uint8)
+
+
+def measured_mask(mask: np.ndarray, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """A segmenter's mask (H, W) bool of an exact one: its outline wobbles; now and then it is missing."""
+    if sensor.mask_loss and rng.random() < sensor.mask_loss:
+        return np.zeros_like(mask)
+    if not sensor.mask_px or not mask.any():
+        return mask
+    H, W = mask.shape
+    wobble = [sensor.mask_px * _correlated(H, W, 6.0, rng) for _ in range(2)]
+    v, u = np.mgrid[:H, :W].astype(np.float32)
+    at = u + wobble[0], v + wobble[1]
+    moved = cv2.remap(mask.astype(np.uint8), *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    return moved > 0
+
+
+def kept_frames(frames: int, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """The frames that arrive; the first always does."""
+    kept = rng.random(frames) >= sensor.drop
+    kept[0] = True
+    return np.flatnonzero(kept)
 
 
 def _second_imager_blind(depth_m: np.ndarray, f_times_b: float) -> np.ndarray:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
-from p2p_lib.data.synthetic import ablations, absences
+from p2p_lib.data.synthetic import ablations, absences, paper_subset
 from p2p_lib.data.synthetic.crossing import crossing
 from p2p_lib.data.synthetic.scene import Scenario
 
@@ -24,3 +25,12 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
         absences.moving_camera,
     )
 }
+SCENARIOS |= {name: partial(paper_subset.paper_sequence, parts=parts) for name, parts in paper_subset.SEQUENCES.items()}
+
+
+def describe(name: str) -> str:
+    """What happens in a scenario, in one line."""
+    if name in paper_subset.SEQUENCES:
+        parts = " and ".join(f"{part.model} ({part.motion})" for part in paper_subset.SEQUENCES[name])
+        return f"as in the paper's synthetic subset: {parts}, {paper_subset.FRAMES} frames."
+    return SCENARIOS[name].__doc__.splitlines()[0]

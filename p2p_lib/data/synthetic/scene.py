@@ -28,13 +28,14 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A scene in time. World: z up, the table top is z = 0. ``T_world_cam`` (T, 4, 4)."""
+    """A scene in time. World: z up, the table top is z = 0. ``T_world_cam`` (T, 4, 4); ``objects``: what they are."""
 
     camera: Camera
     T_world_cam: np.ndarray
     bodies: tuple[Body, ...]
     room: tuple[Mesh, ...]
     light: Light = field(default_factory=Light)
+    objects: str = "procedural"
 
     @property
     def frames(self) -> int:
