@@ -57,7 +57,7 @@ def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
     names = [name for name in run.objects if name in evaluation.objects]
     with style.applied():
         ratios = [3, 2, 2, 0.42 * len(run.objects)]
-        figure, axes = _panels(4, (_WIDTH_IN, 6.4), ratios)
+        figure, axes = panels(4, (_WIDTH_IN, 6.4), ratios)
         for name in names:
             _draw_errors(axes, name, run.objects[name], evaluation.objects[name], _colours(run)[name])
         for axis, unit in zip(axes, ("ADD [mm]", "rotation [°]", "translation [mm]")):
@@ -73,7 +73,7 @@ def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
 def status_strip(run: Run) -> Figure:
     """One line per object: what its pose estimate was worth at every moment."""
     with style.applied():
-        figure, (axis,) = _panels(1, (_WIDTH_IN, 1.0 + 0.32 * len(run.objects)), [1])
+        figure, (axis,) = panels(1, (_WIDTH_IN, 1.0 + 0.32 * len(run.objects)), [1])
         _draw_strip(axis, run)
         axis.set_title(f"Status over time, {run.info['sequence']}")
     return figure
@@ -82,7 +82,7 @@ def status_strip(run: Run) -> Figure:
 def accuracy_threshold(evaluation: Evaluation, max_m: float = metrics.MAX_M) -> Figure:
     """The share of scored frames with an error below a threshold; its area is the AUC in the legend (exact form)."""
     with style.applied():
-        figure, axes = _panels(2, (_WIDTH_IN, 2.9), [1, 1], side_by_side=True)
+        figure, axes = panels(2, (_WIDTH_IN, 2.9), [1, 1], side_by_side=True)
         colours = style.object_colours(evaluation.info.get("objects") or evaluation.objects)
         for axis, metric in zip(axes, ("add_m", "adds_m")):
             title = {"add_m": "ADD", "adds_m": "ADD-S"}[metric]
@@ -117,7 +117,7 @@ def stage_timings(run: Run) -> Figure:
     ms = {c: np.nan_to_num(run.timings[c]) for c in [*stages, "total_ms"]}
     order = [*sorted(stages, key=lambda c: -ms[c].mean()), "total_ms"]
     with style.applied():
-        figure, (axis,) = _panels(1, (_WIDTH_IN, 0.6 + 0.36 * len(order)), [1])
+        figure, (axis,) = panels(1, (_WIDTH_IN, 0.6 + 0.36 * len(order)), [1])
         for k, (which, colour, label) in enumerate(zip((~key, key), style.NEUTRAL, ("other frames", "keyframes"))):
             if not which.any():
                 continue
@@ -212,7 +212,7 @@ def _colours(run: Run) -> dict[str, str]:
     return style.object_colours(run.objects)
 
 
-def _panels(
+def panels(
     count: int, size_in: tuple[float, float], ratios: list[float], side_by_side: bool = False
 ) -> tuple[Figure, list[Axes]]:
     """A figure that no global state knows of, and its axes below each other (sharing time) or side by side."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +22,13 @@ HEADS = {
     "adds_auc_voc": "ADD-S AUC, VOC [%]",
     "add_auc_voc": "ADD AUC, VOC [%]",
 }
+
+
+def of_rows(rows: Iterable[Mapping[str, Any]]) -> DataFrame:
+    """A table of one row per mapping; the keys are its heads, units included."""
+    from pandas import DataFrame
+
+    return DataFrame(list(rows))
 
 
 def score_table(evaluation: Evaluation) -> DataFrame:
