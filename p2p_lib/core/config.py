@@ -211,12 +211,12 @@ class RefinementConfig(_Checked):
     max_points: int = _p(700, "depth points at most", "points", low=10)
     gradient_voxels: float = _p(0.5, "step of the numeric gradient", "voxels", "release", low=0.01)
     mad_trim: float = _p(2.5, "residuals beyond this many MADs are left out", "", "release", low=0.5)
-    huber_m: float = _p(0.003, "Huber threshold of the surface residual", "m", low=1e-5)
+    huber_m: float = _p(0.005, "Huber threshold of the surface residual", "m", low=1e-5)
     max_step_m: float = _p(0.02, "largest translation of one step", "m", "release", low=0)
     max_step_rad: float = _p(0.2, "largest rotation of one step", "rad", "release", low=0)
     tolerance: float = _p(0.2, "a smaller gain ends the iterations", "squared standard deviations", low=0)
     min_strength: float = _p(0.0005, "directions that the shape holds less firmly are not moved by it; 0 = all", low=0)
-    independent_points: int = _p(30, "what the correlated depth points are worth together", "points", low=1)
+    independent_points: int = _p(100, "what the correlated depth points are worth together", "points", low=1)
     keypoint_weight: float = _p(1.0, "weight of keypoint residuals beside the surface; 0 = surface alone", low=0)
 
 
