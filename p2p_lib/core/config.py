@@ -151,7 +151,13 @@ class SamplingConfig(_Checked):
     max_visible: int = _p(60, "points followed at a time; a keyframe adds no more than are missing", "points", low=3)
     score_weight: float = _p(0.3, "lambda of the objective", "", "release", low=0, high=1)
     cluster_weight: float = _p(0.5, "beta of the objective", "", "release", low=0)
-    r_ideal_px: float = _p(20.0, "r_ideal of the objective (the paper gives none)", "px", low=1)
+    r_ideal_px: float = _p(
+        20.0,
+        "r_ideal of the objective (the paper gives none; 10, 20 and 40 measure alike on synthetic/crossing seed 100, "
+        "ADD AUC 96.7, 96.4, 96.4, ADD-S 97.6, 97.8, 97.7, and at 20 thirty points cover the object)",
+        "px",
+        low=1,
+    )
     r_min_px: float = _p(5.0, "r_min of the objective", "px", "release", low=0)
     edge_margin_px: int = _p(2, "distance to the mask's border", "px", "release", low=0)
     depth_edge_m: float = _p(0.01, "a larger depth step in the 3x3 neighbourhood is an edge", "m", "release", low=0)

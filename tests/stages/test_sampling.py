@@ -59,18 +59,18 @@ def distance_to_nearest(p, others) -> float:
 
 
 def assert_greedy(candidates: Candidates, stored: np.ndarray, count: int, cfg: SamplingConfig, chosen: np.ndarray):
-    """Each choice has the largest J among those far enough from all before; it ends only when none is left."""
+    """Each choice has the largest J of those left, and more than nothing; it ends only when none has."""
     taken = [tuple(p) for p in stored]
     free = set(range(len(candidates.score)))
     slack = 1e-9  # distances computed another way differ in their last digits
     for k in [int(c) for c in chosen] + [None] * (count > len(chosen)):
         d = {i: distance_to_nearest(candidates.uv_px[i], taken) for i in free}
-        j = {i: papers_j(candidates.score[i], d[i], cfg) for i in free if d[i] >= cfg.r_min_px + slack}
+        j = {i: papers_j(candidates.score[i], d[i], cfg) for i in free}
         if k is None:
-            assert not j, "stopped while candidates were left"
+            assert max(j.values(), default=0.0) <= slack, "stopped while candidates were worth their costs"
             break
-        assert k in free and d[k] >= cfg.r_min_px - slack
-        assert papers_j(candidates.score[k], d[k], cfg) >= max(j.values(), default=-math.inf) - slack
+        assert k in free and j[k] > -slack
+        assert j[k] >= max(j.values()) - slack
         free.remove(k)
         taken.append(tuple(candidates.uv_px[k]))
 
@@ -106,10 +106,6 @@ def test_choice_is_greedy_in_the_papers_objective(seed, n, m, count, side_px, wh
     assert chosen.dtype.kind == "i" and len(set(chosen.tolist())) == len(chosen) <= min(count, n)
     assert_greedy(candidates, stored, count, cfg, chosen)
     np.testing.assert_array_equal(choose(candidates, stored, count, cfg), chosen)
-    # Nothing chosen lies too near to anything chosen or stored.
-    for i, k in enumerate(chosen):
-        others = [*stored, *uv[chosen[:i]]]
-        assert distance_to_nearest(uv[k], others) >= cfg.r_min_px - 1e-9
 
 
 def line(*x: float, score: float = 0.5) -> Candidates:
@@ -123,8 +119,9 @@ def test_no_candidates_no_choice():
 
 def test_one_candidate():
     assert choose(line(100), np.zeros((0, 2)), 5, DEFAULT).tolist() == [0]
-    assert choose(line(100), np.array([[104.9, 0]]), 5, DEFAULT).tolist() == []
-    assert choose(line(100), np.array([[105.0, 0]]), 5, DEFAULT).tolist() == [0]
+    # 0.3 * 0.5 + 0.7 d / 20 = 0.5 (5 - d) / 5 at d = 2.59 px: nearer than that crowding costs more than it is worth.
+    assert choose(line(100), np.array([[102.5, 0]]), 5, DEFAULT).tolist() == []
+    assert choose(line(100), np.array([[102.7, 0]]), 5, DEFAULT).tolist() == [0]
     assert choose(line(100), np.zeros((0, 2)), 0, DEFAULT).tolist() == []
 
 
@@ -136,7 +133,7 @@ def test_the_best_score_comes_first_then_the_far_ones():
 
 def test_stored_points_repel_like_chosen_ones():
     candidates = line(0, 30, 60)
-    assert choose(candidates, np.array([[0.0, 3.0], [61.0, 0.0]]), 3, DEFAULT).tolist() == [1]
+    assert choose(candidates, np.array([[0.0, 2.0], [61.0, 0.0]]), 3, DEFAULT).tolist() == [1]
     # All are far enough; the one farthest from what is stored is first, in spite of its lower score.
     candidates = Candidates(candidates.uv_px, np.array([0.9, 0.8, 0.7]))
     assert choose(candidates, np.array([[8.0, 0.0], [38.0, 0.0]]), 3, DEFAULT).tolist() == [2, 0, 1]
@@ -152,9 +149,28 @@ def test_spread_beats_score_and_the_weight_says_how_much():
         d = np.linalg.norm(uv[:, None] - uv[None], axis=-1) + 1e9 * np.eye(len(uv))
         return float(d.min(1).mean())
 
-    assert nearest_px(0.0) > nearest_px(0.8) > nearest_px(1.0) >= 5
+    assert nearest_px(0.0) > nearest_px(0.8) > nearest_px(1.0) > 0
+
+
+def test_the_cost_of_crowding_keeps_points_apart_as_much_as_it_weighs():
+    """lambda = 1 leaves score and crowding alone: what is taken at distance d < r_min scores more than its cost."""
+    rng = np.random.default_rng(1)
+    candidates = Candidates(rng.uniform(0, 60, (400, 2)), rng.uniform(0, 1, 400))
+    cfg, last = replace(DEFAULT, score_weight=1.0, r_min_px=8.0), 0.0
+
+    for beta in (0.0, 0.5, 2.0, 1e6):
+        uv = candidates.uv_px[choose(candidates, np.zeros((0, 2)), 30, replace(cfg, cluster_weight=beta))]
+        d = np.linalg.norm(uv[:, None] - uv[None], axis=-1) + 1e9 * np.eye(len(uv))
+        assert d.min() > last, f"beta {beta}"
+        last = d.min()
+    assert last > 8 - 1e-4, "no score outweighs an enormous cost"
+
+
+def test_the_best_score_is_taken_where_nothing_else_counts():
+    rng = np.random.default_rng(0)
+    candidates = Candidates(rng.uniform(0, 200, (400, 2)), rng.uniform(0, 1, 400))
     best = choose(candidates, np.zeros((0, 2)), 400, replace(DEFAULT, score_weight=1.0, r_min_px=0.0))
-    np.testing.assert_array_equal(best, np.argsort(-candidates.score))  # score alone
+    np.testing.assert_array_equal(best, np.argsort(-candidates.score))
 
 
 def test_candidates_are_selected_by_index_and_by_mask():
