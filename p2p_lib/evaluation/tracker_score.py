@@ -10,7 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from p2p_lib.backends.registry import make_tracker
+from p2p_lib.core.config import preset
+from p2p_lib.core.errors import MissingBackend
 from p2p_lib.data.sequence import Sequence
+from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.point_tracks import (
     THRESHOLDS_PX,
     Redetections,
@@ -71,6 +75,57 @@ class TrackerScore:
         return "\n".join(lines)
 
 
+@dataclass(frozen=True, eq=False)
+class TrackTask:
+    """What trackers are asked on a sequence, and the true answers."""
+
+    sequence: Sequence
+    scene: TrueScene
+    queries: Queries
+    truth: TrueTracks
+    seed: int
+
+    @classmethod
+    def of(
+        cls, sequence: Sequence, seed: int = 0, models: Mapping[str, str | Path] | None = None, count: int = 256
+    ) -> TrackTask:
+        """Draw queries by the seed and find their true tracks.
+
+        models  object to mesh, besides those in the sequence's ``models/``; the others go by measured depth
+        """
+        scene = TrueScene.of(sequence, models)
+        queries = draw_queries(scene, np.random.default_rng(seed), count)
+        return cls(sequence, scene, queries, true_tracks(scene, queries.points), seed)
+
+    @property
+    def scored(self) -> np.ndarray:
+        """(T, N) bool: after the query, where truth says whether the point is visible."""
+        return after_query(self.queries.frame, len(self.sequence)) & self.truth.known
+
+    def score(self, tracker: PointTracker, search: bool = False) -> TrackerScore:
+        """Run a tracker over the queries; ``search`` tells it where the objects' masks are, as the pipeline does."""
+        sequence, scene, queries, truth = self.sequence, self.scene, self.queries, self.truth
+        run = run_tracker(tracker, sequence, queries, search)
+        shape = sequence.camera.height, sequence.camera.width
+        info = {
+            "sequence": sequence.name,
+            "tracker": tracker.name,
+            "seed": self.seed,
+            "queries": len(queries),
+            "frames": len(sequence),
+            "search": "masks" if search else "whole picture",
+            "truth": ", ".join(f"{name}: {'mesh' if name in scene.by_mesh else 'depth'}" for name in scene.objects),
+        }
+        return TrackerScore(
+            tapvid(truth.uv_px, truth.visible, run.uv_px, run.visible, self.scored, shape),
+            redetections(truth.uv_px, truth.visible, truth.known, truth.view, run.uv_px, run.visible, queries.frame),
+            truth,
+            run,
+            queries,
+            info,
+        )
+
+
 def score_tracker(
     sequence: Sequence,
     tracker: PointTracker,
@@ -79,34 +134,30 @@ def score_tracker(
     count: int = 256,
     search: bool = False,
 ) -> TrackerScore:
-    """Draw queries, find their true tracks, run the tracker over them, and score it.
+    """Draw queries, find their true tracks, run the tracker over them, and score it: one :class:`TrackTask`."""
+    return TrackTask.of(sequence, seed, models, count).score(tracker, search)
 
-    models  object to mesh, besides those in the sequence's ``models/``; the others go by measured depth
-    search  tell the tracker where the objects' masks are, as the pipeline does
+
+def compare_trackers(
+    task: TrackTask,
+    contestants: Mapping[str, tuple[str, Mapping[str, Any]]],
+    left_out: Mapping[str, str] | None = None,
+) -> dict[str, TrackerScore | str]:
+    """The same queries to several trackers: a score by label, or the reason why there is none.
+
+    contestants  label to tracker and settings, e.g. ``"SH(10)": ("embedded", {"tracking.forget_after": 10})``
+    left_out     labels that are not to run, with the reason
     """
-    scene = TrueScene.of(sequence, models)
-    queries = draw_queries(scene, np.random.default_rng(seed), count)
-    truth = true_tracks(scene, queries.points)
-    run = run_tracker(tracker, sequence, queries, search)
-    shape = sequence.camera.height, sequence.camera.width
-    scored = after_query(queries.frame, len(sequence)) & truth.known
-    info = {
-        "sequence": sequence.name,
-        "tracker": tracker.name,
-        "seed": seed,
-        "queries": len(queries),
-        "frames": len(sequence),
-        "search": "masks" if search else "whole picture",
-        "truth": ", ".join(f"{name}: {'mesh' if name in scene.by_mesh else 'depth'}" for name in scene.objects),
-    }
-    return TrackerScore(
-        tapvid(truth.uv_px, truth.visible, run.uv_px, run.visible, scored, shape),
-        redetections(truth.uv_px, truth.visible, truth.known, truth.view, run.uv_px, run.visible, queries.frame),
-        truth,
-        run,
-        queries,
-        info,
-    )
+    return {label: (left_out or {}).get(label) or _try(task, *one) for label, one in contestants.items()}
+
+
+def _try(task: TrackTask, name: str, settings: Mapping[str, Any]) -> TrackerScore | str:
+    config = preset(seed=task.seed).with_values(dict(settings))
+    try:
+        known = OracleTracker(task.scene, config.oracle, task.seed) if name == OracleTracker.name else name
+        return task.score(make_tracker(known, config.tracking, np.random.default_rng(task.seed)))
+    except MissingBackend as error:
+        return str(error)
 
 
 def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, search: bool = False) -> TrackRun:

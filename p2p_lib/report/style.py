@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager
 
 from p2p_lib.core.types import Status
+from p2p_lib.evaluation.point_tracks import Outcome
 
 #: Objects, in the order in which a sequence names them.
 OBJECTS = ("#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#882255", "#6B4E23", "#222222")
@@ -22,6 +23,15 @@ STATUS: dict[Status, tuple[str, str]] = {
     Status.LOST: ("#D55E00", "xxxx"),
     Status.RECOVERED: ("#009E73", ""),
 }
+#: What came of asking for a 2D point: right is the quiet one, wrong the colour of lost.
+OUTCOMES: dict[Outcome, str] = {
+    Outcome.HIDDEN: "#FFFFFF",
+    Outcome.RIGHT: "#B3B3B3",
+    Outcome.MISSED: "#222222",
+    Outcome.WRONG: "#D55E00",
+}
+#: Methods side by side, in the order in which they are compared.
+METHODS = ("#0072B2", "#E69F00", "#CC79A7", "#222222", "#56B4E9", "#882255", "#6B4E23")
 #: The truth, wherever it stands beside an estimate.
 TRUTH = "#FFFFFF"
 #: x, y and z of a drawn frame.
