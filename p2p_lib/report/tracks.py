@@ -186,9 +186,11 @@ def reliability_plot(rows: Mapping[str, Reliability], uncertain_px: Mapping[str,
             if half_px := (uncertain_px or {}).get(label):
                 stated_px = half_px * row.uncertainty / (1 - row.uncertainty)
                 axis.plot(row.uncertainty, stated_px, "--", color=style.NEUTRAL[0], label="standard deviation stated")
-            axis.set(xlabel=r"uncertainty $\sigma_t$", ylabel="error [px]", yscale="log")
+            axis.set(xlabel=r"uncertainty $\sigma_t$", yscale="log")
+            axis.sharey(axes[0])
             axis.yaxis.set_major_formatter("{x:g}")
             axis.set_title(f"{label}: rank correlation {row.rank_correlation:.2f}")
+        axes[0].set_ylabel("error [px]")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower right", ncols=3, fontsize=8)
     return figure
 

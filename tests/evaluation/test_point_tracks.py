@@ -205,5 +205,5 @@ def test_reliability_of_an_honest_and_of_a_blind_tracker():
     assert honest.count.tolist() == [2000] * 10
     np.testing.assert_allclose(honest.median_px, 0.6745 * honest.uncertainty, rtol=0.1)
     np.testing.assert_allclose(honest.p90_px, 1.645 * honest.uncertainty, rtol=0.15)
-    assert honest.rank_correlation > 0.5 > 0.03 > abs(blind.rank_correlation)
+    assert honest.rank_correlation > 0.4 > 0.03 > abs(blind.rank_correlation)
     assert np.ptp(blind.median_px) < 0.3
