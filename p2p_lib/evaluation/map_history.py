@@ -62,7 +62,8 @@ def follow_map(
     keyframe, poses, T_obj_model = np.zeros(frames, bool), np.full((frames, 4, 4), np.nan), np.full((4, 4), np.nan)
     for t in range(frames):
         frame = sequence.frame(start + t)
-        masks = {name: (sequence.masks(start + t) or {})[name]} if t else None
+        shown = sequence.masks(start + t) or {}
+        masks = {name: shown[name]} if name in shown else {}  # left out: hidden
         estimate = method.step(frame, masks)[name]
         keyframe[t], points = estimate.keyframe, method.objects[name].map
         if estimate.T_cam_obj is not None:
