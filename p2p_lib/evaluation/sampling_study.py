@@ -123,14 +123,15 @@ def compare_choices(
 ) -> list[ChoiceScore]:
     """Every way to choose in every situation; ``frames_on`` is how long the points are then tracked, 0 for not."""
     return [
-        _score_choice(situation, label, *choice, tracker, frames_on, seed)
+        _score_choice(situation, label, *choice, follow, seed)
         for situation in situations
+        for follow in [_Following(situation, tracker, frames_on, seed)]
         for label, choice in choices.items()
     ]
 
 
 def _score_choice(
-    at: Situation, label: str, detector: str, settings: Mapping[str, Any], tracker: str, frames_on: int, seed: int
+    at: Situation, label: str, detector: str, settings: Mapping[str, Any], follow: _Following, seed: int
 ) -> ChoiceScore:
     sampling = at.config.with_values(dict(settings)).sampling
     candidates = at.candidates(detector, seed)
@@ -139,23 +140,33 @@ def _score_choice(
     every = max(len(u) // _DENSE, 1)
     surface = at.video.camera.unproject(np.stack([u, v], 1)[::every].astype(float), at.frame.depth_m[v, u][::every])
     turn_deg, error_m = conditioning(at.lift(uv_px), surface, at.config)
-    kept = _kept(at, uv_px, tracker, frames_on, seed) if frames_on else float("nan")
-    return ChoiceScore(label, uv_px, coverage(at.mask, uv_px, at.config.sampling.r_ideal_px), turn_deg, error_m, kept)
+    covered = coverage(at.mask, uv_px, at.config.sampling.r_ideal_px)
+    return ChoiceScore(label, uv_px, covered, turn_deg, error_m, follow.kept(uv_px))
 
 
-def _kept(at: Situation, uv_px: np.ndarray, tracker: str, frames_on: int, seed: int) -> float:
-    """Share of the points truly in sight ``frames_on`` frames later that the tracker has within 2 px."""
-    scene = TrueScene.of(at.video)
-    points = scene.lift(at.frame, np.full(len(uv_px), scene.objects.index(at.name)), uv_px)
-    follower = make_tracker(tracker, at.config.tracking, np.random.default_rng(seed))
-    follower.start(at.frame)
-    follower.add(uv_px)
-    for index in range(at.frame.index + 1, at.frame.index + frames_on + 1):
-        frame = at.video.frame(index)
-        tracks = follower.track(frame, (at.video.masks(index) or {}).get(at.name))
-    sight = scene.see(frame, points)
-    near = tracks.visible & (np.linalg.norm(tracks.uv_px - sight.uv_px, axis=1) < 2)
-    return float(near[sight.visible].mean()) if sight.visible.any() else float("nan")
+class _Following:
+    """The frames after a situation, read once, through which each choice of points is tracked."""
+
+    def __init__(self, at: Situation, tracker: str, frames_on: int, seed: int):
+        self._at, self._tracker, self._seed = at, tracker, seed
+        indices = range(at.frame.index + 1, at.frame.index + frames_on + 1)
+        self._frames = [(at.video.frame(i), (at.video.masks(i) or {}).get(at.name)) for i in indices]
+        self._scene = TrueScene.of(at.video) if frames_on else None
+
+    def kept(self, uv_px: np.ndarray) -> float:
+        """Share of the points truly in sight in the last frame that the tracker has within 2 px; NaN if none is."""
+        if self._scene is None:
+            return float("nan")
+        at = self._at
+        points = self._scene.lift(at.frame, np.full(len(uv_px), self._scene.objects.index(at.name)), uv_px)
+        follower = make_tracker(self._tracker, at.config.tracking, np.random.default_rng(self._seed))
+        follower.start(at.frame)
+        follower.add(uv_px)
+        for frame, mask in self._frames:
+            tracks = follower.track(frame, mask)
+        sight = self._scene.see(frame, points)
+        near = tracks.visible & (np.linalg.norm(tracks.uv_px - sight.uv_px, axis=1) < 2)
+        return float(near[sight.visible].mean()) if sight.visible.any() else float("nan")
 
 
 def open_views(video: Video, count: int, frames_on: int, min_px: int = 2000) -> list[Situation]:
