@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,14 +15,22 @@ from p2p_lib.data.synthetic.shapes import Mesh
 if TYPE_CHECKING:
     import trimesh
 
-#: From the camera's upper left, and much of it from everywhere: colours stay recognisable.
-_LIGHT = Light(towards=(-0.4, -0.5, 0.8), ambient=0.55)
+#: A reconstructed surface carries the light it was seen in: no second one.
+_AS_SEEN = Light(ambient=1.0)
+#: Towards the lamp of a clay model in camera coordinates: over the left shoulder.
+_LAMP, _CLAY = np.array([-0.7, -0.6, -0.5]), 225
 
 
-def draw_mesh(mesh: trimesh.Trimesh | Mesh, camera: Camera, T_cam_obj: np.ndarray) -> np.ndarray:
-    """A mesh on white, (H, W, 3) uint8: a reconstructed one with its vertex colours, or a synthetic body."""
+def draw_mesh(mesh: trimesh.Trimesh | Mesh, camera: Camera, T_cam_obj: np.ndarray, clay: bool = False) -> np.ndarray:
+    """A mesh on white, (H, W, 3) uint8: a reconstructed one with its vertex colours, or a synthetic body.
+
+    ``clay`` leaves the colours out: what remains is the shape.
+    """
     body = mesh if isinstance(mesh, Mesh) else _textured(mesh)
-    picture = render([(body, se3.IDENTITY)], camera, se3.inverse(T_cam_obj), _LIGHT)
+    if clay:
+        body = replace(body, texture=np.full((2, 2, 3), _CLAY, np.uint8))
+    lamp = Light(towards=tuple(T_cam_obj[:3, :3].T @ _LAMP), ambient=0.3) if clay else _AS_SEEN
+    picture = render([(body, se3.IDENTITY)], camera, se3.inverse(T_cam_obj), lamp)
     image = np.where((picture.label > 0)[..., None], picture.rgb, 255)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 

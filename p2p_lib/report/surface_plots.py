@@ -170,7 +170,7 @@ def slices_beside_exact(volume: TsdfVolume, body: Body, heights_m: Sequence[floa
     low = np.min([_around_surface(volume, z)[0] for z in heights_m], 0)
     high = np.max([_around_surface(volume, z)[1] for z in heights_m], 0)
     with style.applied():
-        figure, axes = _grid(len(heights_m), 3, (8.4, 2.55 * len(heights_m) + 0.3))
+        figure, axes = _grid(len(heights_m), 3, (8.6, 1.75 * len(heights_m) + 0.6))
         for row, z in zip(axes, heights_m, strict=True):
             points = slice_points(low, high, z)
             fused, exact = exact_distance(volume, body, points)
@@ -184,8 +184,8 @@ def slices_beside_exact(volume: TsdfVolume, body: Body, heights_m: Sequence[floa
             axis.set_title(title)
         for axis in axes[-1]:
             axis.set_xlabel("x [mm]")
-        figure.colorbar(left, ax=axes[:, :2], label="signed distance [mm]", shrink=0.6)
-        figure.colorbar(right, ax=axes[:, 2], label="difference [mm]", shrink=0.6)
+        figure.colorbar(left, ax=axes[:, :2], label="signed distance [mm]", shrink=0.8)
+        figure.colorbar(right, ax=axes[:, 2], label="difference [mm]", shrink=0.8)
     return figure
 
 
