@@ -112,6 +112,9 @@ class TrackedObject:
             return self._start(view)
         if mask is not None and mask.sum() < self.config.pipeline.min_mask_px:
             return self._without_pose(view, Status.OCCLUDED, f"{int(mask.sum())} mask pixels")
+        if mask is not None and self._status not in WITH_POSE:
+            # Found where the object is not, on its twin perhaps: let them be looked for elsewhere.
+            self.tracker.reject(self.map.ids[view.tracks.visible & ~view.seen])
         with self._stopwatch("registration"):
             hypotheses = self._hypotheses(view)
         with self._stopwatch("selection"):

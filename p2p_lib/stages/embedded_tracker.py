@@ -153,7 +153,10 @@ class EmbeddedTracker:
 
     def reject(self, ids: np.ndarray) -> None:
         """Take these tracks for invisible until they are found again."""
-        self._points.visible &= ~np.isin(self._points.ids, ids)
+        gone = np.isin(self._points.ids, ids)
+        self._points.visible &= ~gone
+        # Where it was is wrong: not the place to look first.
+        self._points.hidden_for[gone] = self.config.linger_frames + 1
 
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
         """Look for invisible points where the caller expects them in the newest frame, among those it names.
@@ -359,17 +362,18 @@ class EmbeddedTracker:
             return
         wanted = self._turn(wanted, cfg.tries)
         i, k, j = np.nonzero(p.anchor[wanted].any(-1))
-        best, distance, rival = features.nearest(p.anchor[wanted[i], k, j], found, 4.0)
-        alike = distance < cfg.ratio * rival
-        i, k, j, best = i[alike], k[alike], j[alike], best[alike]
-        score = (distance / rival)[alike]
+        best, distance, rival = features.nearest(p.anchor[wanted[i], k, j], found, 4.0, cfg.candidates)
+        which, rank = np.nonzero(distance < cfg.ratio * rival[:, None])
+        best, score = best[which, rank], (distance / rival[:, None])[which, rank]
+        i, k, j = i[which], k[which], j[which]
         A = found.frames[best] @ np.linalg.inv(p.anchor_frame[wanted[i], k, j])
         uv = found.uv_px[best] + (A @ p.anchor_offset[wanted[i], k, j][..., None])[..., 0]
         keep = self._inside(uv, search)
         # The best few corners of each point, then those that its neighbours support, then the best of each.
-        order = np.lexsort((score, i))[keep[np.lexsort((score, i))]]
+        order = np.lexsort((score, i))
+        order = order[keep[order]]
         rank = np.arange(len(order)) - np.searchsorted(i[order], i[order])
-        order = order[rank < cfg.candidates]
+        order = order[rank < 2 * cfg.candidates]
         rows, k = wanted[i[order]], k[order]
         seen, good = self._found(rows, k, uv[order], A[order])
         good &= self._support(rows, k, seen, good) >= cfg.support
@@ -383,7 +387,7 @@ class EmbeddedTracker:
         rows, k  point and appearance of each finding (H,); those that are ``good`` speak for one another.
         """
         p = self._points
-        may = np.full((len(p), 1 + self.config.candidates, 2), np.nan)
+        may = np.full((len(p), 1 + 2 * self.config.candidates, 2), np.nan)
         may[p.visible, 0] = p.uv[p.visible]
         at = np.flatnonzero(good)
         at = at[np.argsort(rows[at], kind="stable")]

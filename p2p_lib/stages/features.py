@@ -124,13 +124,20 @@ def _dominant(histogram: np.ndarray) -> np.ndarray:
     return 2 * np.pi * (peak + shift) / _DIRECTIONS
 
 
-def nearest(wanted: np.ndarray, found: Features, rival_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For descriptors (Q, SIZE): index of the nearest feature, its distance, and the distance of its rival.
+def nearest(
+    wanted: np.ndarray, found: Features, rival_px: float, count: int = 1
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For descriptors (Q, SIZE): their ``count`` nearest places, how far, and how far the next place is.
 
-    The rival is the nearest feature at another place: not within ``rival_px`` (of the feature's own
-    scale) of the nearest, where the same corner may have been found twice.
+    Returns indices of features (Q, count), distances (Q, count) and the distance (Q,) of the rival: the
+    nearest feature at none of those places. Features within ``rival_px`` (of their own scale) are one
+    place: the same corner may have been found twice. Two places serve where two objects look alike.
     """
     distance = np.sqrt(np.maximum(2 - 2 * wanted @ found.descriptors.T, 0))
-    rows, best = np.arange(len(wanted)), distance.argmin(1)
-    apart = np.abs(found.uv_px[None] - found.uv_px[best][:, None]).max(-1) > rival_px * found.scale[best][:, None]
-    return best, distance[rows, best], np.where(apart, distance, np.inf).min(1)
+    rows, best, away = np.arange(len(wanted)), [], []
+    for _ in range(count):
+        best.append(distance.argmin(1))
+        away.append(distance[rows, best[-1]])
+        apart = np.abs(found.uv_px[None] - found.uv_px[best[-1]][:, None]).max(-1)
+        distance = np.where(apart > rival_px * found.scale[best[-1]][:, None], distance, np.inf)
+    return np.stack(best, 1), np.stack(away, 1), distance.min(1)

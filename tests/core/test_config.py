@@ -15,8 +15,8 @@ STAGES = [f.name for f in dataclasses.fields(Config) if dataclasses.is_dataclass
 FIELDS = {f"{s}.{f.name}": f for s in STAGES for f in dataclasses.fields(getattr(Config(), s))}
 EVERY_FIELD = pytest.mark.parametrize("key", FIELDS)
 PRESETS = pytest.mark.parametrize("name", ["default", "paper"])
-UNITS = {"grey levels", 
-    "", "1/m", "deg", "frames", "m", "points", "px", "rad", "squared standard deviations", "voxels",
+UNITS = {
+    "", "1/m", "deg", "frames", "grey levels", "m", "points", "px", "rad", "squared standard deviations", "voxels",
 }  # fmt: skip
 
 

@@ -133,7 +133,8 @@ def test_rejected_points_are_looked_for_anew_and_dropped_ones_are_gone():
     tracker.drop(ids[::2])
     assert (tracker.add(truth(1)[:3]) == len(ids) + np.arange(3)).all()
     tracker.reject(ids[1::4])
-    tracks = tracker.track(film()[2])
+    for t in range(2, 7):
+        tracks = tracker.track(film()[t])
     assert set(tracks.ids) == set(ids[1::2]) | {len(ids), len(ids) + 1, len(ids) + 2}
     back = tracks.visible[np.isin(tracks.ids, ids[1::4])]
     assert back.mean() > 0.8

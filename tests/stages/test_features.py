@@ -24,6 +24,7 @@ def test_finds_corners_again_after_turn_and_scale(turn_deg, scale):
     before, after = features.detect(image, None, 200), features.detect(cv2.warpAffine(image, M, (320, 240)), None, 200)
     best, distance, rival = features.nearest(before.descriptors, after, 4.0)
     there = before.uv_px @ M[:, :2].T + M[:, 2]
+    best, distance = best[:, 0], distance[:, 0]
     error_px = np.linalg.norm(after.uv_px[best] - there, axis=1)
     sure = distance < 0.8 * rival
     assert sure.sum() > 40 and (error_px[sure] < 4).mean() > 0.75
@@ -39,7 +40,24 @@ def test_another_picture_matches_nothing():
     _, distance, rival = features.nearest(
         features.detect(picture(0), None, 200).descriptors, features.detect(picture(1), None, 200), 4.0
     )
-    assert (distance < 0.8 * rival).mean() < 0.06
+    assert (distance[:, 0] < 0.8 * rival).mean() < 0.06
+
+
+def test_two_places_that_look_alike_are_both_named():
+    card = picture()[60:160, 80:200]
+    twice = np.full((240, 320), 128, np.uint8)
+    twice[20:120, 20:140], twice[120:220, 180:300] = card, card
+    twice = np.clip(twice + np.random.default_rng(1).normal(0, 3, twice.shape), 0, 255).astype(np.uint8)
+    found = features.detect(twice, None, 200, (1.0,))
+    left = features.detect(card, None, 60, (1.0,))
+    left = left.descriptors[(np.abs(left.uv_px - [60, 50]) < [40, 30]).all(1)]
+    best, distance, rival = features.nearest(left, found, 4.0, 2)
+    apart = found.uv_px[best[:, 0]] - found.uv_px[best[:, 1]]
+    twins = (np.abs(np.abs(apart) - [160, 100]) < 3).all(1)
+    assert len(left) > 5 and twins.mean() > 0.8
+    assert (distance[twins, 1] < 0.8 * rival[twins]).mean() > 0.7
+    # With one place asked for, its twin is the rival.
+    np.testing.assert_array_equal(features.nearest(left, found, 4.0)[2][twins], distance[twins, 1])
 
 
 def test_stays_in_the_region():
