@@ -364,7 +364,7 @@ class EmbeddedTracker:
         i, k, j = np.nonzero(p.anchor[wanted].any(-1))
         best, distance, rival = features.nearest(p.anchor[wanted[i], k, j], found, 4.0, cfg.candidates)
         which, rank = np.nonzero(distance < cfg.ratio * rival[:, None])
-        best, score = best[which, rank], (distance / rival[:, None])[which, rank]
+        best, score = best[which, rank], distance[which, rank] / rival[which]
         i, k, j = i[which], k[which], j[which]
         A = found.frames[best] @ np.linalg.inv(p.anchor_frame[wanted[i], k, j])
         uv = found.uv_px[best] + (A @ p.anchor_offset[wanted[i], k, j][..., None])[..., 0]
