@@ -482,7 +482,9 @@ def p2p(*words: str, **more) -> subprocess.Popen:
 def test_ctrl_c(tmp_path):
     """The real thing: a process, a signal, what is on disk."""
     sequence, out = write_sequence(tmp_path / "long", frames=600), tmp_path / "out"
-    process = p2p("run", str(sequence), "--out", str(out), *POINTS_ALONE)
+    # A shell that runs its jobs in the background has them ignore the signal, and they hand that on.
+    heed = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    process = p2p("run", str(sequence), "--out", str(out), *POINTS_ALONE, **heed)
     deadline = time.monotonic() + 60
     timings = out / "timings.csv"
     while not (timings.is_file() and timings.read_text().count("\n") > 10):

@@ -14,7 +14,7 @@ _LOOSE = 1e-4
 #: A tie between a measured and an unmeasured pixel: depth is missing mostly beside silhouettes.
 _INTO_THE_UNMEASURED = 0.05
 #: The walk ends when the preconditioned residual falls below this.
-_SETTLED = 1e-4
+_SETTLED = 1e-6
 
 
 def ties(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
