@@ -273,6 +273,13 @@ class TrackedObject:
         starved = visible < cfg.keyframe_min_points and self._since_keyframe > cfg.cooldown
         return view.mask is not None and not self._recovering and (turned > cfg.keyframe_angle_deg or starved)
 
+    def _views_with(self, T_cam_obj: np.ndarray) -> np.ndarray:
+        """The keyframes' poses and this one; beyond the cap it takes the place of the one turned most alike."""
+        kept = self.keyframes
+        if len(kept) >= self.config.keypoint_map.max_views:
+            kept = np.delete(kept, se3.angle_rad(se3.inverse(kept) @ T_cam_obj).argmin(), 0)
+        return np.concatenate([kept, T_cam_obj[None]])
+
     def _add_keyframe(
         self,
         view: View,
@@ -291,11 +298,11 @@ class TrackedObject:
         new_ids = self.tracker.add(uv_px)
         ids, p_cam_all = np.concatenate([self.map.ids[good], new_ids]), np.concatenate([view.p_cam[good], p_cam])
         self.map.add(new_ids, se3.transform(se3.inverse(T_cam_obj), p_cam), promoted=not len(self.keyframes))
-        key, keyframes = len(self.keyframes), np.concatenate([self.keyframes, T_cam_obj[None]])
+        key, views = None, self._views_with(T_cam_obj)
         if self.config.factor_graph.enabled:
             with self._stopwatch("graph"):
                 key, T_cam_obj = self._optimise(T_cam_obj, ids, p_cam_all, covariance)
-        self.keyframes = keyframes
+        self.keyframes = views
         self._since_keyframe = 0
         if self.surface is not None:
             with self._stopwatch("fusion"):
@@ -309,11 +316,16 @@ class TrackedObject:
     def _optimise(
         self, T_cam_obj: np.ndarray, ids: np.ndarray, p_cam: np.ndarray, covariance: np.ndarray | None
     ) -> tuple[int, np.ndarray]:
-        """Add a vertex to the graph, solve, and carry the result into map and surface; its key and its pose."""
+        """Add a vertex to the graph, solve, and carry the result into map and surface; its key and its pose.
+
+        Only what the graph still holds can be moved later: pictures of keyframes that it has merged are let go.
+        """
         p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
         sigma_m = registration.noise_m(p_cam, self.config.registration)
         key = self.graph.add_keyframe(T_cam_obj, ids, p_cam, p_obj_init=p_obj, covariance=covariance, sigma_m=sigma_m)
         result = self.graph.optimise()
+        if self.surface is not None:
+            self.surface.keep_only(result.keys)
         if not result.ok:
             return key, T_cam_obj
         self.map.move(result.point_ids, result.p_obj)

@@ -175,6 +175,7 @@ class KeypointMapConfig(_Checked):
     min_observations: int = _p(4, "observations before promotion", "frames", "release", low=1)
     max_spread_m: float = _p(0.008, "median absolute deviation of the observations", "m", "paper", low=0)
     pending_ttl: int = _p(30, "frames a point may stay pending", "frames", "release", low=1)
+    max_views: int = _p(1000, "keyframe poses remembered to tell a new view; the most alike goes first", low=1)
     max_points: int = _p(300, "cap of the keypoints; the least seen for their time go first", "points", low=10)
 
 

@@ -81,6 +81,11 @@ class ObjectGraph:
         if config.enabled:  # its import takes a second that no frame should wait for
             importlib.import_module("gtsam")
 
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """The keyframes that are held, oldest first: those that were merged into others are not."""
+        return tuple(sorted(self._keyframes))
+
     def add_keyframe(
         self,
         T_cam_obj: np.ndarray,

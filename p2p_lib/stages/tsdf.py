@@ -8,7 +8,7 @@ out again and put back where the factor graph has moved its keyframe.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -224,6 +224,11 @@ class TsdfVolume:
         if view is not None:
             self._fuse(view, -view.weight)
         return view is not None
+
+    def keep_only(self, keys: Iterable[int]) -> None:
+        """Let go of the kept observations of all other keyframes: they stay fused, and cannot be moved any more."""
+        kept = set(map(int, keys))
+        self._views = {key: view for key, view in self._views.items() if key in kept}
 
     def move(self, poses: Mapping[int, np.ndarray], limit: int | None = None) -> list[int]:
         """Re-integrate the kept observations of keyframes that the graph has moved (T_cam_obj by key).

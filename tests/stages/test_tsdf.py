@@ -254,6 +254,17 @@ def test_moved_keyframes_give_the_volume_fused_at_the_new_poses():
     assert volume.move(dict(enumerate(poses))) == []
 
 
+def test_pictures_that_are_let_go_stay_fused_and_stay_where_they_are():
+    poses = around(4)
+    volume = fused(LUMP, poses)
+    before = volume.values()
+    volume.keep_only(np.array([1, 3, 99]))
+    assert volume.keys == (1, 3)
+    np.testing.assert_array_equal(volume.values(), before)
+    shifted = {key: T @ se3.exp([0, 0, 0, 0.01, 0, 0]) for key, T in enumerate(poses)}
+    assert sorted(volume.move(shifted)) == [1, 3]
+
+
 def test_small_moves_and_unknown_keyframes_are_left_alone_and_the_limit_takes_the_farthest():
     poses = around(3)
     volume = fused(LUMP, poses)
