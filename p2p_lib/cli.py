@@ -7,8 +7,8 @@ import json
 import os
 import sys
 import traceback
-import webbrowser
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from p2p_lib import __version__
@@ -117,17 +117,42 @@ def _eval_tracks(a: argparse.Namespace) -> None:
 
 
 def _click(a: argparse.Namespace) -> None:
-    from p2p_lib.click import collect_clicks
+    from p2p_lib.click import collect_clicks, wait_for_clicks
     from p2p_lib.data.sequence import open_sequence
 
     sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed)
-    with collect_clicks(sequence, a.out, a.frame, a.port) as clicker:
-        print(f"Click in your browser at {clicker.url} and press Save there; Ctrl-C here gives up.", flush=True)
-        # Without a desktop a browser in text would take the terminal.
-        if not a.no_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-            webbrowser.open(clicker.url)
-        clicker.wait()
-    print(f"{len(clicker.prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --out DIR")
+    page = collect_clicks(sequence, a.out, a.frame, a.port)
+    prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)
+    print(f"{len(prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --out DIR")
+
+
+def _live(a: argparse.Namespace) -> None:
+    from p2p_lib.data.cameras import open_camera
+    from p2p_lib.data.prompts import load_prompts
+    from p2p_lib.live import LiveCount, click_first, json_line, track_live
+    from p2p_lib.run import make_config
+
+    config = make_config(a.preset, a.config, _pairs("--set", a.set, "stage.key=value"), a.seed)
+    prompts, first = load_prompts(a.prompts) if a.prompts else (), None
+    backends = {"tracker": a.tracker, "detector": a.detector, "segmenter": a.masks}
+    camera, count = open_camera(a.camera, a.rate), LiveCount()
+    try:
+        if not prompts:  # standard output is for the poses
+            prompts, first = click_first(camera, lambda line: print(line, file=sys.stderr), not a.no_browser)
+        track_live(
+            camera,
+            prompts,
+            lambda estimate: print(json_line(estimate), flush=True),
+            config=config,
+            **{key: name for key, name in backends.items() if name},
+            first=first,
+            count=count,
+        )
+    except KeyboardInterrupt:
+        pass  # how one stops a camera
+    finally:
+        camera.close()
+    print(count, file=sys.stderr)
 
 
 def _synth(a: argparse.Namespace) -> None:
@@ -234,11 +259,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--format", help="layout: ho3d, bop, ycbmultitrack, ycbineoat, folder (default: recognised)")
     p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
     p.add_argument("--objects", metavar="A,B", help="track only these objects")
-    p.add_argument("--preset", default=None, help="paper or default: parameters only, never backends")
-    p.add_argument("--config", type=Path, metavar="FILE", help="TOML file with [stage] key = value")
-    p.add_argument("--set", action="append", metavar="STAGE.KEY=VALUE", help="change one parameter; repeatable")
-    p.add_argument("--tracker", default=None, metavar="NAME", help="2D point tracker (default: the embedded one)")
-    p.add_argument("--detector", default=None, metavar="NAME", help="source of new points (default: corners)")
+    _add_method(p)
     p.add_argument("--prompts", type=Path, metavar="FILE", help="clicks on the objects (see p2p click)")
     p.add_argument(
         "--masks",
@@ -246,7 +267,6 @@ def _parser() -> argparse.ArgumentParser:
         help="dataset, dataset:FOLDER, embedded, sam2 (default: dataset; with --prompts embedded)",
     )
     p.add_argument("--save-masks", action="store_true", help="keep the masks used as DIR/masks/OBJECT/*.png")
-    p.add_argument("--seed", type=int, default=None, metavar="N", help="of every random choice (default 0)")
     p.add_argument("--start", type=int, default=0, metavar="I", help="first frame")
     p.add_argument("--stop", type=int, metavar="J", help="one past the last frame")
     p.add_argument("--models", nargs="+", action="extend", metavar="NAME=PATH", help="models for scoring")
@@ -308,6 +328,14 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of a synthetic sequence (default 0)")
 
+    p = _command(commands, "live", _live, "track objects before a camera; a line of JSON per object and frame")
+    p.add_argument("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH")
+    p.add_argument("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)")
+    p.add_argument("--prompts", type=Path, metavar="FILE", help="clicks; without, the first picture is clicked on")
+    p.add_argument("--masks", metavar="NAME", help="segmenter: embedded (default) or sam2")
+    _add_method(p)
+    p.add_argument("--no-browser", action="store_true", help="only say where the page to click on is")
+
     p = _command(commands, "synth", _synth, "render a synthetic sequence in the YCBMultiTrack layout, with exact truth")
     p.add_argument("scenario", nargs="?", metavar="SCENARIO", help="what happens; --list shows all")
     p.add_argument("--list", action="store_true", help="list the scenarios")
@@ -344,6 +372,16 @@ def _parser() -> argparse.ArgumentParser:
 
     _command(commands, "doctor", _doctor, "check this installation and say how to mend it")
     return parser
+
+
+def _add_method(p: argparse.ArgumentParser) -> None:
+    """Which method with which parameters: what everything that tracks lets one choose."""
+    p.add_argument("--preset", default=None, help="paper or default: parameters only, never backends")
+    p.add_argument("--config", type=Path, metavar="FILE", help="TOML file with [stage] key = value")
+    p.add_argument("--set", action="append", metavar="STAGE.KEY=VALUE", help="change one parameter; repeatable")
+    p.add_argument("--tracker", default=None, metavar="NAME", help="2D point tracker (default: the embedded one)")
+    p.add_argument("--detector", default=None, metavar="NAME", help="source of new points (default: corners)")
+    p.add_argument("--seed", type=int, default=None, metavar="N", help="of every random choice (default 0)")
 
 
 def _command(commands, name: str, function, help: str) -> argparse.ArgumentParser:

@@ -7,6 +7,9 @@ A page of the standard library's web server, on this machine alone, shows the fr
 from __future__ import annotations
 
 import json
+import os
+import webbrowser
+from collections.abc import Callable
 from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -109,6 +112,17 @@ def collect_clicks(sequence: Sequence, path: str | Path, frame: int = 0, port: i
     ``port`` 0 takes a free one. Close it, or use it as a context manager, when done.
     """
     return Clicker(sequence, path, frame, port)
+
+
+def wait_for_clicks(clicker: Clicker, say: Callable[[str], object], open_browser: bool = True) -> tuple[Prompt, ...]:
+    """What the page saves: says where the page is, opens it where there is a desktop, waits, closes."""
+    with clicker:
+        say(f"Click in your browser at {clicker.url} and press Save there; Ctrl-C here gives up.")
+        # Without a desktop a browser in text would take the terminal.
+        if open_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+            webbrowser.open(clicker.url)
+        clicker.wait()
+    return clicker.prompts
 
 
 def _handler(clicker: Clicker) -> type[BaseHTTPRequestHandler]:

@@ -26,7 +26,7 @@ OPTIONAL = {
     "tapnet": ("tapnet", "2D trackers tapir and tapnextpp", INSTALL["tapnet"]),
     "torchvision": ("torchvision", "2D tracker tapnextpp", INSTALL["torchvision"]),
     "rerun": ("rerun", "viewer for debugging", PIP + "rerun-sdk"),
-    "pyrealsense2": ("pyrealsense2", "live camera", PIP + "pyrealsense2"),
+    "pyrealsense2": ("pyrealsense2", "RealSense cameras and recordings", PIP + "pyrealsense2"),
     "dask": ("dask.distributed", "runs on a cluster", PIP + "'dask[distributed]'"),
 }
 FREE_GB = 5.0

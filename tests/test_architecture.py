@@ -21,6 +21,7 @@ FLOORS = [
     {"run"},
     {"report"},
     {"notebooks", "doctor", "click"},
+    {"live"},
     {"cli"},
 ]
 HOMES = {

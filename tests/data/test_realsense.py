@@ -120,7 +120,33 @@ def test_what_cannot_be_used_is_refused(tmp_path):
 def test_without_the_library_it_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     (tmp_path / "a.bag").write_text("")
-    with pytest.raises(MissingBackend, match=r"pyrealsense2: reads RealSense recordings .*uv pip install"):
+    with pytest.raises(MissingBackend, match=r"pyrealsense2: reads RealSense cameras and recordings .*uv pip install"):
         realsense.convert_bag(tmp_path / "a.bag", tmp_path / "out")
     with pytest.raises(MissingData, match=r"b\.bag: no such recording"):
         realsense.convert_bag(tmp_path / "b.bag", tmp_path / "out")
+
+
+def test_a_recording_plays_as_a_camera_does(tmp_path):
+    bag = record(tmp_path / "a.bag")
+    camera = realsense.RealSenseCamera(bag)
+    try:
+        frames = list(iter(camera.read, None))
+    finally:
+        camera.close()
+    assert camera.camera.K.tolist() == [[50, 0, 31.5], [0, 51, 23.5], [0, 0, 1]]
+    # Which picture it is stands in its blue. Nobody waited for us: some may be missing, and the index says so.
+    numbers = np.array([int(frame.rgb[0, 0, 2]) - 10 for frame in frames])
+    assert len(frames) >= N // 2 and (np.diff(numbers) > 0).all()
+    np.testing.assert_allclose([f.time_s for f in frames], (numbers - numbers[0]) / 30, atol=1e-4)
+    for k, frame in zip(numbers, frames):
+        np.testing.assert_array_equal(frame.rgb, colour(k))
+        measured = frame.depth_m > 0
+        np.testing.assert_allclose(frame.depth_m[measured], depth(k)[measured] * 1e-4, atol=1e-6)
+        assert measured.sum() > 0.9 * (depth(k) > 0).sum()
+    assert camera.read() is None, "closed"
+
+
+def test_without_a_camera_it_says_so():
+    pytest.importorskip("pyrealsense2")
+    with pytest.raises(MissingData, match="realsense: no camera of colour and depth answers"):
+        realsense.RealSenseCamera()
