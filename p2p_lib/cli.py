@@ -8,6 +8,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -153,6 +154,16 @@ def _live(a: argparse.Namespace) -> None:
     finally:
         camera.close()
     print(count, file=sys.stderr)
+
+
+def _check(a: argparse.Namespace) -> int:
+    from p2p_lib.data.prompts import load_prompts
+    from p2p_lib.evaluation.own_data import Level, as_lines, check_folder
+
+    prompts = load_prompts(a.prompts) if a.prompts else ()
+    findings = check_folder(a.sequence, prompts=prompts, format=a.format, depth_scale=a.depth_scale)
+    print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings))
+    return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
 
 
 def _synth(a: argparse.Namespace) -> None:
@@ -335,6 +346,13 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--masks", metavar="NAME", help="segmenter: embedded (default) or sam2")
     _add_method(p)
     p.add_argument("--no-browser", action="store_true", help="only say where the page to click on is")
+
+    p = _command(commands, "check", _check, "look at data of your own: what is wrong with it and what to do")
+    p.add_argument("sequence", metavar="FOLDER", help="rgb/ depth/ cam_K.txt masks/, or any sequence")
+    p.add_argument("--prompts", type=Path, metavar="FILE", help="clicks, where there are no masks")
+    p.add_argument("--format", help="layout (default: recognised)")
+    p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
+    p.add_argument("--json", action="store_true", help="a JSON list instead of lines")
 
     p = _command(commands, "synth", _synth, "render a synthetic sequence in the YCBMultiTrack layout, with exact truth")
     p.add_argument("scenario", nargs="?", metavar="SCENARIO", help="what happens; --list shows all")

@@ -8,12 +8,17 @@ which are in millimetres otherwise.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.data import images
 from p2p_lib.data.image_sequence import ImageSequence, pictures
 from p2p_lib.data.masks import find_masks, masks_folder
+from p2p_lib.data.sequence import Sequence
 
 
 def recognises(folder: Path) -> bool:
@@ -42,6 +47,40 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
         own_masks=found,
         model_places={name: (folder / "models" / name,) for name in (found.objects if found else ("object",))},
     )
+
+
+def write(
+    sequence: Sequence, out: str | Path, frames: Iterable[int] | None = None, masks: Iterable[int] | None = None
+) -> Path:
+    """Some frames of any sequence as such a folder, as if one had recorded it: no truth, depth in millimetres.
+
+    frames  which (default: all); they are numbered anew
+    masks   of which of these, by their new numbers: all by default, ``()`` for none, ``(0,)`` for the first alone
+
+    Raises :class:`BadInput` where the folder is not empty.
+    """
+    out = Path(out)
+    if out.is_dir() and any(out.iterdir()):
+        raise BadInput(str(out), "a folder that is not empty", "a new one for the pictures")
+    frames = list(range(len(sequence)) if frames is None else frames)
+    wanted = set(range(len(frames)) if masks is None else masks)
+    for number, i in enumerate(frames):
+        frame = sequence.frame(i)
+        depth = np.rint(frame.depth_m / images.DEPTH_SCALE).astype(np.uint16)
+        _save(out / "rgb" / f"{number:06d}.png", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
+        _save(out / "depth" / f"{number:06d}.png", depth)
+        for name, mask in (sequence.masks(i) or {}).items() if number in wanted else ():
+            _save(out / "masks" / name / f"{number:06d}.png", mask.astype(np.uint8) * np.uint8(255))
+    np.savetxt(out / "cam_K.txt", sequence.camera.K, fmt="%.9g")
+    (out / "times.txt").write_text(
+        "".join(f"{t:.6f}\n" for t in sequence.times_s[frames] - sequence.times_s[frames[0]])
+    )
+    return out
+
+
+def _save(path: Path, picture: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
 
 
 def _depth_scale(path: Path) -> float:

@@ -1,0 +1,285 @@
+"""Looks at a sequence of one's own before anything is tracked and names what is wrong: what ``p2p check`` prints.
+
+What goes wrong with own data is known: depth in another unit, depth that was not registered to colour, the camera
+matrix of another resolution, times in milliseconds, masks that hold the table too, objects without anything to track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from p2p_lib.backends.registry import DEFAULT_DETECTOR, make_detector
+from p2p_lib.backends.segmenters import DEFAULT_SEGMENTER, make_segmenter
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import Config, preset
+from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.core.types import Frame
+from p2p_lib.data.prompts import Prompt
+from p2p_lib.data.sequence import Sequence, open_sequence
+from p2p_lib.evaluation.depth_colour import misfit
+from p2p_lib.evaluation.mask_rim import background_share
+from p2p_lib.stages.sampling import choose, usable_region
+
+#: Frames that are looked at, evenly spread.
+FRAMES = 12
+#: Of the picture's width: an offset between depth and colour that does not matter, and a principal point off centre.
+OFFSET_SHARE, CENTRE_SHARE = 0.01, 0.1
+#: How much better depth must fit elsewhere to be called not registered: 1.05 at most on good sequences looked at.
+GAIN = 1.2
+#: Whatever is recorded in front of a depth camera is this far away, in metres.
+NEAREST_M, FARTHEST_M = 0.05, 20.0
+#: Horizontal and vertical angles of view of any RGB-D camera, in degrees.
+VIEW_DEG = (20.0, 130.0)
+#: Frames per second that cameras have, and a gap as a multiple of the usual interval.
+RATES_HZ, GAP = (0.5, 500.0), 10.0
+#: Share of pictures that may equal the next one.
+REPEATED_SHARE = 0.3
+#: Share of a mask's rim that may lie on the background: 0.4 at most on good sequences looked at.
+RIM_SHARE = 0.5
+#: Shares of a mask, and of the picture, that should have a depth.
+MEASURED_SHARE = 0.5
+
+
+class Level(StrEnum):
+    """How bad a finding is: fine, worth a look, or to be mended before anything else."""
+
+    OK = "ok"
+    LOOK = "look"
+    WRONG = "WRONG"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at: its name, how it is, what was measured, and what to do about it."""
+
+    name: str
+    level: Level
+    text: str
+    fix: str = ""
+
+
+def check_folder(
+    sequence: str | Path | Sequence,
+    *,
+    prompts: Iterable[Prompt] = (),
+    format: str | None = None,
+    depth_scale: float | None = None,
+    config: Config | None = None,
+) -> list[Finding]:
+    """What is right and wrong with a sequence, in the order in which it should be mended.
+
+    prompts  clicks, for a sequence without masks: the embedded segmenter makes its first ones
+    config   whose limits count (default: the preset ``default``)
+
+    Files that cannot be read are findings too; nothing is raised for the data's sake.
+    """
+    config = config or preset()
+    try:
+        if isinstance(sequence, str | Path):
+            sequence = open_sequence(sequence, format, depth_scale)
+        chosen = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist()
+        frames = [sequence.frame(i) for i in chosen]
+        masks = [sequence.masks(i) or {} for i in chosen]
+        firsts = dict(_clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config))
+    except P2PError as error:
+        return [_unreadable(error)]
+    size = f"{len(sequence)} pictures of {sequence.camera.width}x{sequence.camera.height}"
+    findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at")]
+    findings += [_camera(sequence.camera), _times(sequence), _repeated(frames, sequence)]
+    findings += [_depth(frames), _registered(frames)]
+    if not firsts:
+        fix = f"Make clicks with p2p click and give them with --prompts, or put masks into {sequence.path}/masks."
+        return [*findings, Finding("masks", Level.LOOK, "none that show an object", fix)]
+    for name, (frame, mask) in firsts.items():
+        pairs = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
+        findings += [_range(name, frame, mask, config), _rim(name, [(frame, mask), *pairs], config)]
+        findings += [_points(name, frame, mask, config)]
+    return findings
+
+
+def as_lines(findings: Iterable[Finding]) -> str:
+    """The findings for people, each remedy under what it mends."""
+    findings = list(findings)
+    width = max(len(finding.name) for finding in findings)
+    lines = []
+    for finding in findings:
+        lines.append(f"{finding.level:7}{finding.name:{width}}  {finding.text}")
+        lines += [f"{'':7}{'':{width}}  -> {finding.fix}"] if finding.fix else []
+    wrong = [finding.name for finding in findings if finding.level is Level.WRONG]
+    lines.append(f"To mend first: {', '.join(wrong)}" if wrong else "Nothing is wrong with it as far as can be seen.")
+    return "\n".join(lines)
+
+
+def _unreadable(error: P2PError) -> Finding:
+    if isinstance(error, BadInput):
+        return Finding("files", Level.WRONG, f"{error.name}: got {error.got}, expected {error.expected}", error.fix)
+    return Finding("files", Level.WRONG, str(error))
+
+
+def _camera(camera: Camera) -> Finding:
+    """Whether K belongs to pictures of this size: its principal point is their middle, nearly."""
+    size, centre = np.array([camera.width, camera.height]), np.array([camera.cx, camera.cy]) + 0.5
+    view_deg = np.degrees(2 * np.arctan(size / 2 / [camera.fx, camera.fy]))
+    text = f"sees {view_deg[0]:.0f} x {view_deg[1]:.0f} degrees, centre at ({camera.cx:.0f}, {camera.cy:.0f})"
+    if (np.abs(centre / size - 0.5) > CENTRE_SHARE).any():
+        of = "x".join(f"{round(2 * c, -1):.0f}" for c in centre)
+        text = f"K has its centre at ({camera.cx:.0f}, {camera.cy:.0f}): that of pictures of about {of}"
+        factors = size / (2 * centre)
+        fix = f"Take K at {camera.width}x{camera.height}"
+        if abs(factors[0] / factors[1] - 1) < 0.1:
+            fix += f": for pictures scaled as a whole, its first two rows times {factors.mean():.3g}"
+        return Finding("camera", Level.WRONG, text, f"{fix}.")
+    if (view_deg < VIEW_DEG[0]).any() or (view_deg > VIEW_DEG[1]).any():
+        fix = "fx and fy are in pixels, at the size that the pictures have here."
+        return Finding("camera", Level.WRONG, f"{text}: no RGB-D camera does", fix)
+    return Finding("camera", Level.OK, text)
+
+
+def _times(sequence: Sequence) -> Finding:
+    """Whether the times are seconds, and without holes."""
+    steps_s = np.diff(sequence.times_s)
+    if not len(steps_s):
+        return Finding("times", Level.LOOK, "a single picture", "Tracking needs a video.")
+    usual_s, widest = float(np.median(steps_s)), int(steps_s.argmax())
+    text = f"{1 / usual_s:.3g} pictures per second, {sequence.times_s[-1] - sequence.times_s[0]:.1f} s"
+    if not RATES_HZ[0] <= 1 / usual_s <= RATES_HZ[1]:
+        unit = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+        guess = next((f" These look like {n}." for k, n in unit.items() if 1 <= k / usual_s <= RATES_HZ[1]), "")
+        text = f"{usual_s:.3g} s between pictures: {1 / usual_s:.3g} per second"
+        return Finding("times", Level.WRONG, text, f"times.txt holds seconds, one a line.{guess}")
+    if steps_s[widest] > GAP * usual_s:
+        text += f", but {steps_s[widest]:.2g} s between frames {widest} and {widest + 1}"
+        fix = "Pictures are missing there: what moved meanwhile has to be found again."
+        return Finding("times", Level.LOOK, text, fix)
+    return Finding("times", Level.OK, text)
+
+
+def _repeated(frames: list[Frame], sequence: Sequence) -> Finding:
+    """Whether pictures are copies of the one before: a recorder that was faster than its camera."""
+    pairs = [(f, sequence.frame(f.index + 1)) for f in frames if f.index + 1 < len(sequence)]
+    copies = [a.index for a, b in pairs if np.array_equal(a.rgb, b.rgb)]
+    frozen = [a.index for a, b in pairs if a.depth_m.any() and np.array_equal(a.depth_m, b.depth_m)]
+    if max(len(copies), len(frozen)) > REPEATED_SHARE * len(pairs):
+        what, of = ("colour", copies) if len(copies) >= len(frozen) else ("depth", frozen)
+        text = f"{len(of)} of {len(pairs)} {what} pictures equal the next one, that of frame {of[0]} for one"
+        return Finding("motion", Level.LOOK, text, "Record each picture once, with the time at which it was taken.")
+    return Finding("motion", Level.OK, "every picture looked at differs from the next")
+
+
+def _depth(frames: list[Frame]) -> Finding:
+    """Whether depth is in metres once the scale is applied."""
+    known = [frame.depth_m[frame.depth_m > 0] for frame in frames]
+    share = float(np.mean([len(d) / f.depth_m.size for d, f in zip(known, frames)]))
+    if not share:
+        return Finding("depth", Level.WRONG, "no measurement anywhere", "Look at the files in depth/: all are 0.")
+    median_m = float(np.median(np.concatenate(known)))
+    text = f"{median_m:.3g} m in the middle, {100 * share:.0f} % of the pixels measured"
+    if not NEAREST_M <= median_m <= FARTHEST_M:
+        factor = next((10.0**k for k in (-3, 3, -4, 4, -1, 1) if 0.15 <= median_m * 10.0**k <= 5), None)
+        guess = f" A scale {factor:g} times the present one would make it {median_m * factor:.2g} m." if factor else ""
+        fix = f"Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1).{guess}"
+        return Finding("depth", Level.WRONG, f"{text}: the unit is another", fix)
+    if share < MEASURED_SHARE / 2:
+        fix = "Keep the sensor's least distance, and out of the sun; glass, mirrors and black things have no depth."
+        return Finding("depth", Level.LOOK, text, fix)
+    return Finding("depth", Level.OK, text)
+
+
+def _registered(frames: list[Frame]) -> Finding:
+    """Whether depth was registered to the colour camera."""
+    name, width = "registration", frames[0].shape[1]
+    found = misfit(frames, OFFSET_SHARE * width)
+    if found is None:
+        return Finding(name, Level.OK, "too few edges in depth and colour to tell whether they agree")
+    if found.gain <= GAIN:
+        return Finding(name, Level.OK, "edges of depth lie on edges of colour")
+    where = f"shifted by ({found.du_px:+.0f}, {found.dv_px:+.0f}) px"
+    size = f"{found.scale:.2f} times as large and " if abs(found.scale - 1) > 0.03 else ""
+    fix = "Register depth to colour when recording (`align` in the camera's software; p2p data convert-bag does)."
+    text = f"depth lies beside colour: {size}{where}, its edges would fit {found.gain:.1f} times as well"
+    return Finding(name, Level.WRONG, text, fix)
+
+
+def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
+    """Whether an object is where depth counts, and measured."""
+    pipe, depth_m = config.pipeline, frame.depth_m[mask]
+    share = float((depth_m > 0).mean())
+    if share < MEASURED_SHARE:
+        fix = "Dark, shiny and transparent things have none; change the light or the distance, or spray it matt."
+        text = f"only {100 * share:.0f} % of its pixels in frame {frame.index} have a depth"
+        return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
+    median_m = float(np.median(depth_m[depth_m > 0]))
+    text = f"{median_m:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
+    if not pipe.depth_min_m <= median_m <= pipe.depth_max_m:
+        fix = f"If it was not, the depth scale is wrong; if it was, --set pipeline.depth_max_m={2 * median_m:.1f}."
+        limits = f"{pipe.depth_min_m:g} to {pipe.depth_max_m:g} m count"
+        return Finding(f"{name}: depth", Level.WRONG, f"{text}, but {limits}", fix)
+    return Finding(f"{name}: depth", Level.OK, text)
+
+
+def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Finding:
+    """Whether an object's masks hold background."""
+    seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.pipeline.min_mask_px]
+    shares = np.array([background_share(mask, frame.depth_m) for frame, mask in seen])
+    if np.isnan(shares).all():
+        return Finding(f"{name}: mask", Level.OK, "no depth along its rim to judge it by")
+    typical = float(np.nanmedian(shares))
+    text = f"{100 * typical:.0f} % of its rim lies on the background (median of {len(shares)} masks)"
+    if typical > RIM_SHARE:
+        worst = seen[int(np.nanargmax(shares))][0].index
+        fix = f"Draw it to the object's edge or a little inside; frame {worst} is the worst."
+        return Finding(f"{name}: mask", Level.WRONG, text, fix)
+    return Finding(f"{name}: mask", Level.OK, text)
+
+
+def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
+    """Whether an object has anything to track: points that can be lifted, with a contrast of their own."""
+    detector = make_detector(DEFAULT_DETECTOR, config.sampling, np.random.default_rng(config.seed))
+    found = detector.detect(frame, usable_region(frame, mask, config.sampling))
+    taken = choose(found, np.zeros((0, 2)), config.sampling.max_visible, config.sampling)
+    u, v = np.rint(found.uv_px[taken]).astype(int).T
+    contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]
+    count, needed = int((contrast >= config.tracking.bare_contrast).sum()), config.pipeline.recover_min_inliers
+    text = f"{count} places to track in frame {frame.index}"
+    if count < needed:
+        fix = "Come nearer, light it better, or begin with a textured side: then its surface alone carries the pose."
+        return Finding(f"{name}: points", Level.WRONG, f"{text}, {needed} are needed to find it again", fix)
+    return Finding(f"{name}: points", Level.OK, text)
+
+
+def _contrast(rgb: np.ndarray, side_px: int) -> np.ndarray:
+    """(H, W) standard deviation of brightness around each pixel, in grey levels."""
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    mean, square = cv2.blur(gray, (side_px, side_px)), cv2.blur(gray * gray, (side_px, side_px))
+    return np.sqrt(np.maximum(square - mean * mean, 0))
+
+
+def _first_masks(sequence: Sequence, config: Config) -> Iterator[tuple[str, tuple[Frame, np.ndarray]]]:
+    """Each object's first mask that is large enough to start from, with its frame."""
+    waiting = set(sequence.objects)
+    for i in range(len(sequence)):
+        masks = sequence.masks(i)
+        if masks is None or not waiting:
+            return
+        for name in sorted(waiting & masks.keys()):
+            if masks[name].sum() >= config.pipeline.min_mask_px:
+                waiting.discard(name)
+                yield name, (sequence.frame(i), masks[name])
+
+
+def _clicked(
+    sequence: Sequence, prompts: Iterable[Prompt], config: Config
+) -> Iterator[tuple[str, tuple[Frame, np.ndarray]]]:
+    """Each clicked object's first mask, as the embedded segmenter cuts it out."""
+    for prompt in prompts:
+        if prompt.frame >= len(sequence):
+            raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", f"below {len(sequence)}")
+        rng, frame = np.random.default_rng(config.seed), sequence.frame(prompt.frame)
+        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
+        yield prompt.name, (frame, segmenter.segment(frame, {prompt.name: prompt.points_px}) > 0)
