@@ -169,7 +169,7 @@ class Point2Pose:
         """All objects' points in a single pass of the 2D tracker."""
         with self.stopwatch("tracking"):
             if not self._streaming:
-                self.tracker.start(frame)
+                self.tracker.start(frame, self.camera)
                 self._streaming = True
                 return Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
             known = [mask for mask in masks.values() if mask is not None]

@@ -27,7 +27,7 @@ class Late:
         self._inner = make_tracker("embedded", config.tracking, np.random.default_rng(0))
         self._waiting, self._started = deque(), False
 
-    def start(self, frame):
+    def start(self, frame, camera=None):
         self._waiting.clear()
         self._started = False
         self._take(frame)

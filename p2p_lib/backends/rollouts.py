@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.backends.raster import in_picture
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame, Tracks
@@ -57,7 +58,7 @@ class RolloutTracker:
         self._new: list[np.ndarray] = []  # queries added since the last picture
         self._recent.clear()
 
-    def start(self, frame: Frame) -> None:
+    def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
         self._clear()
         self._recent.append(frame.rgb)

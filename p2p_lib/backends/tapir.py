@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.backends import checkpoints, packages
 from p2p_lib.backends.raster import from_raster, in_picture, square, to_raster
 from p2p_lib.core.config import TrackingConfig
@@ -59,7 +60,7 @@ class TapirTracker:
         self._features: Any = None  # of the queries
         self._state: list[dict[str, torch.Tensor]] = []
 
-    def start(self, frame: Frame) -> None:
+    def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
         self._clear()
         self._look(frame)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import OracleConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame, Tracks
@@ -36,7 +37,7 @@ class OracleTracker:
         self._ids = np.zeros(0, np.int64)
         self._points = NO_POINTS
 
-    def start(self, frame: Frame) -> None:
+    def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
         self._clear()
         self._frame = frame

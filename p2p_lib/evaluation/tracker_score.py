@@ -175,7 +175,7 @@ def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, sea
         where = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
         start, tracks = time.process_time(), None
         if i == first:
-            tracker.start(frame)
+            tracker.start(frame, sequence.camera)
         else:
             tracks = tracker.track(frame, where if search else None)
         new = np.flatnonzero(queries.frame == answered)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame, Tracks
@@ -34,7 +35,7 @@ class LkTracker:
         self._visible = np.zeros(0, bool)
         self._uncertainty = np.zeros(0)
 
-    def start(self, frame: Frame) -> None:
+    def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
         self._clear()
         self._gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.stages.tracking import PointTracker
 
@@ -34,10 +35,10 @@ class ShortHorizon:
         """(N,) bool: points that were forgotten."""
         return self._hidden_for >= self._forget_after
 
-    def start(self, frame: Frame) -> None:
+    def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
         self._clear()
-        self._tracker.start(frame)
+        self._tracker.start(frame, camera)
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids."""

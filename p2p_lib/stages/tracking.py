@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.stages.embedded_tracker import EmbeddedTracker
 from p2p_lib.stages.lk_tracker import LkTracker
@@ -21,7 +22,7 @@ class PointTracker(Protocol):
     name: str
     latency_frames: int  # how many frames late `track` answers; 0 = at once
 
-    def start(self, frame: Frame) -> None:
+    def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame, forgetting any earlier one."""
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ class Recorder:
         self.latency_frames, self.diary = late, []
         self._uv, self._frames = np.zeros((0, 2)), 0
 
-    def start(self, frame):
+    def start(self, frame, camera=None):
         self.diary.append(("start", frame.index))
 
     def add(self, uv_px):

@@ -20,7 +20,7 @@ class Script:
     def __init__(self, plan):
         self.plan, self.ids, self.t, self.rejected, self.suggested = np.asarray(plan, bool), [], 0, [], []
 
-    def start(self, frame):
+    def start(self, frame, camera=None):
         self.ids, self.t = [], 0
 
     def add(self, uv_px):

@@ -1,0 +1,255 @@
+"""Rigid bodies among tracked points: where they are, and where that puts each of their points.
+
+A point has a place on its body and the map that takes offsets in its first appearance to offsets on the
+body's surface there. The pose of the body then says where the point is to be seen, how its surroundings
+are warped, and whether its surface faces the camera. T_cam_body and body frames mean nothing outside
+the tracker: a body's frame is the camera's when the body was first met.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.stages.registration import fit_rigid
+
+#: Half the window in which the surface around a pixel is taken for a plane, in steps.
+_PLANE = 3
+_EYE2, _EYE3 = np.eye(2), np.eye(3)
+#: How far a body is thought to turn and move between frames beyond what it did before: rad, m.
+_PRIOR = np.diag(1 / np.repeat([0.15, 0.02], 3) ** 2)
+# A squared residual of a robust fit counts half at this many variances.
+_SOFT = 5.0
+
+
+def usual_camera(width: int, height: int) -> Camera:
+    """A camera with the field of view that most depth cameras have about, for pictures of an unknown one."""
+    return Camera(0.95 * width, 0.95 * width, (width - 1) / 2, (height - 1) / 2, width, height)
+
+
+def depth_noise_m(z_m: np.ndarray) -> np.ndarray:
+    """Standard deviation of a depth sensor at this range."""
+    return 0.001 + 0.0025 * z_m**2
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Measured surface at N pixels, as planes.
+
+    p_cam    (N, 3) NaN where there is no trustworthy depth
+    per_px   (N, 3, 2) displacement on the plane per pixel
+    sigma_m  (N,) standard deviation along the optical axis
+    """
+
+    p_cam: np.ndarray
+    per_px: np.ndarray
+    sigma_m: np.ndarray
+
+    def select(self, rows: np.ndarray) -> Surface:
+        """The pixels at these rows or under this mask."""
+        return Surface(self.p_cam[rows], self.per_px[rows], self.sigma_m[rows])
+
+
+def surface_at(depth_m: np.ndarray, camera: Camera, uv_px: np.ndarray, step_px: int = 1) -> Surface:
+    """The surface behind pixels (N, 2): planes through the readings around each that hang together with it.
+
+    step_px  between the 7 x 7 readings
+    """
+    uv = np.asarray(uv_px, float)
+    px = np.rint(uv).astype(int)
+    dy, dx = (step_px * a.ravel() for a in np.mgrid[-_PLANE : _PLANE + 1, -_PLANE : _PLANE + 1])
+    h, w = depth_m.shape
+    x, y = px[:, :1] + dx, px[:, 1:] + dy
+    inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
+    z = np.where(inside, depth_m[np.clip(y, 0, h - 1), np.clip(x, 0, w - 1)], 0).astype(float)
+    z0 = z[:, len(dx) // 2]
+    # The plane at the pixel itself: moments about it.
+    basis = np.stack([np.ones_like(x, float), x - uv[:, :1], y - uv[:, 1:]], -1)
+    off, limit, plane = z - z0[:, None], 0.015 * step_px, np.zeros((len(uv), 3))
+    for _ in range(2):
+        use = (z > 0) & (np.abs(off) < limit)
+        weighted = basis * use[..., None]
+        normal = weighted.transpose(0, 2, 1) @ basis + np.diag([1e-3, 3.0, 3.0])
+        plane = np.linalg.solve(normal, (weighted * (z - z0[:, None])[..., None]).sum(1)[..., None])[..., 0]
+        off, limit = z - z0[:, None] - (basis * plane[:, None]).sum(-1), 0.006
+    count = use.sum(1)
+    known = (z0 > 0) & (count >= 8)
+    at_m = np.where(known, z0 + plane[:, 0], np.nan)
+    spread = np.sqrt((use * off**2).sum(1) / np.maximum(count, 1))
+    rays = np.column_stack([(uv[:, 0] - camera.cx) / camera.fx, (uv[:, 1] - camera.cy) / camera.fy, np.ones(len(uv))])
+    across = np.zeros((len(uv), 3, 2))
+    across[:, 0, 0], across[:, 1, 1] = 1 / camera.fx, 1 / camera.fy
+    per_px = across * at_m[:, None, None] + rays[:, :, None] * plane[:, None, 1:]
+    # Readings nearby share their noise; where the plane does not fit, it is not known where the point is.
+    return Surface(rays * at_m[:, None], per_px, np.hypot(0.7 * depth_noise_m(at_m), spread))
+
+
+def projection(camera: Camera, p_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) of points (N, 3) and their Jacobian (N, 2, 3)."""
+    z = np.maximum(p_cam[:, 2], 0.05)
+    uv = p_cam[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    J = np.zeros((len(z), 2, 3))
+    J[:, 0, 0], J[:, 1, 1] = camera.fx / z, camera.fy / z
+    J[:, 0, 2], J[:, 1, 2] = -(uv[:, 0] - camera.cx) / z, -(uv[:, 1] - camera.cy) / z
+    return uv, J
+
+
+def _turning(arm: np.ndarray) -> np.ndarray:
+    """(N, 3, 6) change of points by a small motion [rotation, translation], arm (N, 3) from its centre."""
+    J = np.zeros((len(arm), 3, 6))
+    J[:, 0, 1], J[:, 0, 2], J[:, 1, 2] = arm[:, 2], -arm[:, 1], arm[:, 0]
+    J[:, 1, 0], J[:, 2, 0], J[:, 2, 1] = -arm[:, 2], arm[:, 1], -arm[:, 0]
+    J[:, 0, 3] = J[:, 1, 4] = J[:, 2, 5] = 1
+    return J
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A body's pose and who agrees with it.
+
+    T_cam_body  (4, 4)
+    covariance  (6, 6) of its turn and shift, in the camera's axes, about ``centre`` (3,), a point of the body
+    agrees      (N,) bool
+    """
+
+    T_cam_body: np.ndarray
+    covariance: np.ndarray
+    centre: np.ndarray
+    agrees: np.ndarray
+
+
+def fit_pose(
+    T_cam_body: np.ndarray,
+    p_body: np.ndarray,
+    map_cov: np.ndarray,
+    uv_px: np.ndarray,
+    cov_px2: np.ndarray,
+    z_m: np.ndarray,
+    camera: Camera,
+    iterations: int = 8,
+) -> Fit:
+    """The pose by points p_body (N, 3) with covariance map_cov (N, 3, 3), seen at uv_px (N, 2) and depth z_m (N,).
+
+    Robust Gauss-Newton on pixels and depth together, from about T_cam_body; depth 0 is not measured. What
+    lies along an edge, where cov_px2 (N, 2, 2) is long, hardly counts.
+    """
+    centre = p_body.mean(0)
+    R, at, turned = T_cam_body[:3, :3], T_cam_body[:3, :3] @ centre + T_cam_body[:3, 3], np.zeros(6)
+    start, arm = at, (p_body - centre) @ R.T
+    _, P = projection(camera, arm + at)
+    spread = R @ map_cov @ R.T
+    W = np.linalg.inv(cov_px2 + P @ spread @ P.transpose(0, 2, 1) + 0.3**2 * _EYE2)
+    z_weight = np.where(z_m > 0, 1 / (depth_noise_m(z_m) ** 2 + spread[:, 2, 2]), 0)
+    H = _PRIOR
+    for step in range(iterations + 1):
+        p_cam = arm + at
+        uv, P = projection(camera, p_cam)
+        r, r_z = uv_px - uv, np.where(z_m > 0, z_m - p_cam[:, 2], 0)
+        chi2, chi2_z = ((r[:, None] @ W)[:, 0] * r).sum(1), r_z**2 * z_weight
+        if step == iterations:
+            break
+        # While most are far off, far off is normal.
+        soft, soft_z = max(_SOFT, 2 * np.median(chi2)), max(_SOFT, 2 * np.median(chi2_z))
+        w, w_z = 1 / (1 + chi2 / soft) ** 2, z_weight / (1 + chi2_z / soft_z) ** 2
+        turning = _turning(arm)
+        J, J_z = P @ turning, turning[:, 2]
+        JW = ((w[:, None, None] * W) @ J).reshape(-1, 6)
+        H = _PRIOR + JW.T @ J.reshape(-1, 6) + (J_z * w_z[:, None]).T @ J_z
+        g = JW.T @ r.ravel() + J_z.T @ (w_z * r_z) - _PRIOR @ turned
+        delta = np.linalg.solve(H, g)
+        R, at = se3.exp(np.concatenate([delta[:3], np.zeros(3)]))[:3, :3] @ R, at + delta[3:]
+        arm, turned = (p_body - centre) @ R.T, np.concatenate([turned[:3] + delta[:3], at - start])
+        if step and np.abs(delta[:3]).max() < 3e-4 and np.abs(delta[3:]).max() < 1e-4 and soft == _SOFT:
+            iterations = step + 1
+    return Fit(se3.from_rt(R, at - R @ centre), np.linalg.inv(H), centre, (chi2 < 16) & (chi2_z < 25))
+
+
+def consensus(
+    p_body: np.ndarray, p_cam: np.ndarray, corner: np.ndarray, rng: np.random.Generator, samples: int, inlier_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rigid motion that most matches p_body, p_cam (M, 3) agree on: T_cam_body and who does (M,).
+
+    corner  (M,) what each match is made of: several of one corner count once
+    """
+    nobody = np.zeros(len(p_body), bool)
+    if len(p_body) < 3:
+        return np.eye(4), nobody
+    at = rng.integers(0, len(p_body), (samples, 3))
+    a, b = p_body[at], p_cam[at]
+    # Three points fit if the triangles are alike; most samples end here.
+    side_a, side_b = (np.linalg.norm(p - np.roll(p, 1, 1), axis=-1) for p in (a, b))
+    alike = (np.abs(side_a - side_b) < inlier_m).all(1) & (np.minimum(side_a, side_b) > 2 * inlier_m).all(1)
+    a, b = a[alike][:100], b[alike][:100]
+    if not len(a):
+        return np.eye(4), nobody
+    T = fit_rigid(a, b)
+    weight = 1 / np.bincount(corner, minlength=corner.max() + 1)[corner]
+    best = nobody
+    for _ in range(2):
+        off = np.linalg.norm(p_body @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3] - p_cam, axis=-1)
+        inliers = off < inlier_m
+        best = inliers[(inliers @ weight).argmax()]
+        if best.sum() < 3:
+            return np.eye(4), nobody
+        T = fit_rigid(p_body[best], p_cam[best])[None]
+    return T[0], best
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where points of posed bodies are to be seen.
+
+    uv_px  (N, 2), warp (N, 2, 2), cov_px2 (N, 2, 2); z_m (N,); cosine (N,) of the surface's normal and the view
+    """
+
+    uv_px: np.ndarray
+    warp: np.ndarray
+    cov_px2: np.ndarray
+    z_m: np.ndarray
+    cosine: np.ndarray
+
+
+def predict(
+    T: np.ndarray,
+    covariance: np.ndarray,
+    centre: np.ndarray,
+    p_body: np.ndarray,
+    map_cov: np.ndarray,
+    tangent: np.ndarray,
+    camera: Camera,
+) -> Prediction:
+    """Of points (N, 3) on bodies at T (N, 4, 4), covariance (N, 6, 6), centre (N, 3) as in Fit; tangent (N, 3, 2)."""
+    R = T[:, :3, :3]
+    p_cam = (R @ p_body[..., None])[..., 0] + T[:, :3, 3]
+    uv, P = projection(camera, p_cam)
+    across = R @ tangent
+    JT, PR = P @ _turning((R @ (p_body - centre)[..., None])[..., 0]), P @ R
+    cov = PR @ map_cov @ PR.transpose(0, 2, 1) + JT @ covariance @ JT.transpose(0, 2, 1)
+    normal = np.cross(across[..., 0], across[..., 1])
+    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(p_cam, axis=1)
+    cosine = (normal * p_cam).sum(1) / np.maximum(length, 1e-12)
+    return Prediction(uv, P @ across, cov, p_cam[:, 2], cosine)
+
+
+def tangent_steps(surface: Surface, camera: Camera, step_m: float) -> np.ndarray:
+    """(N, 2, 2) pixels per step of a square grid on each surface's tangent plane, step_m apart."""
+    u = surface.per_px[..., 0]
+    a = u / np.linalg.norm(u, axis=1, keepdims=True)
+    v = surface.per_px[..., 1]
+    b = v - (a * v).sum(1, keepdims=True) * a
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    return step_m * (projection(camera, surface.p_cam)[1] @ np.stack([a, b], -1))
+
+
+def linked(p: np.ndarray, reach_m: float) -> np.ndarray:
+    """(N,) label of each point's chain of points not farther than reach_m apart: the smallest row in it."""
+    near = np.linalg.norm(p[:, None] - p[None], axis=-1) <= reach_m
+    label = np.arange(len(p))
+    while True:
+        smaller = np.where(near, label[None], len(p)).min(1) if len(p) else label
+        if (smaller == label).all():
+            return label
+        label = smaller
