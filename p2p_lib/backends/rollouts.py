@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from p2p_lib.core.camera import Camera
 from p2p_lib.backends.raster import in_picture
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame, Tracks
 

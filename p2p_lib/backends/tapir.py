@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from p2p_lib.core.camera import Camera
 from p2p_lib.backends import checkpoints, packages
 from p2p_lib.backends.raster import from_raster, in_picture, square, to_raster
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame, Tracks

@@ -34,7 +34,10 @@ _STEPS_M = (0.0015, 0.003)
 class Body:
     """A rigid body: its newest pose, and the corners that were seen on it.
 
-    hidden_for  frames since the pose was known
+    hidden_for   frames since the pose was known
+    kept         whether enough of what it should show was there, when that was last looked at
+    descriptors  (L, scales, SIZE) of the corners, p_body (L, 3) their places
+    views        (V, 3) where the camera was when corners were taken, from the body's centre
     """
 
     fit: Fit
@@ -43,10 +46,11 @@ class Body:
     kept: bool = True
     descriptors: np.ndarray = field(default_factory=lambda: np.zeros((0, len(_STEPS_M), features.SIZE), np.float32))
     p_body: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    views: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # camera in the body's frame, relative to centre
+    views: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def posed(self) -> bool:
+        """Whether the pose is that of the newest frame."""
         return self.hidden_for == 0
 
     @property
@@ -95,7 +99,11 @@ class EmbeddedTracker:
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
-        self._points = self._points.select(~np.isin(self._points.ids, ids))
+        self._points = p = self._points.select(~np.isin(self._points.ids, ids))
+        # Bodies without points go, the others move up.
+        held = np.unique(p.body[p.body >= 0])
+        self._bodies = [self._bodies[b] for b in held]
+        p.body = np.where(p.body >= 0, np.searchsorted(held, p.body), -1)
 
     def reject(self, ids: np.ndarray) -> None:
         """Take these tracks for invisible until they are found again."""
@@ -112,7 +120,22 @@ class EmbeddedTracker:
         p.hidden_for[gone] = self.config.linger_frames + 1
 
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
-        """Ignored for now."""
+        """Look for bodies that are lost where the caller expects their points in the newest frame.
+
+        ids, uv_px  (N,), (N, 2): all points of one rigid body, the visible ones too: they say how it is turned.
+        """
+        p, cfg = self._points, self.config
+        at = p.rows(ids)
+        ok = (at >= 0) & np.isfinite(uv_px).all(1)
+        at, uv = at[ok], uv_px[ok]
+        z = self._depth_at(uv)
+        for b, body in enumerate(self._bodies):
+            own = np.flatnonzero((p.body[at] == b) & (z > 0))
+            if body.posed or len(own) < cfg.support:
+                continue
+            p_cam = self._camera.unproject(uv[own], z[own])
+            self._propose(body, p.p_body[at[own]], p_cam, np.arange(len(own)))
+        self._look(None)
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame."""
@@ -202,7 +225,7 @@ class EmbeddedTracker:
 
     def _pose(self, lost_only: bool = False) -> None:
         """Fit every body's pose to its points that were followed."""
-        p, cfg = self._points, self.config
+        p = self._points
         for b, body in enumerate(self._bodies):
             if lost_only and body.posed:
                 continue
@@ -254,9 +277,7 @@ class EmbeddedTracker:
         if len(strays) < 2 * cfg.body_points:
             return
         p_cam = self._camera.unproject(p.uv[strays], z)
-        T, agrees = rigid_bodies.consensus(
-            p.p_body[strays], p_cam, np.arange(len(strays)), self._rng, 300, cfg.body_m
-        )
+        T, agrees = rigid_bodies.consensus(p.p_body[strays], p_cam, np.arange(len(strays)), self._rng, 300, cfg.body_m)
         if agrees.sum() < 2 * cfg.body_points:
             return
         own = strays[agrees]
@@ -327,7 +348,9 @@ class EmbeddedTracker:
         """Where these points of bodies are, by their bodies' poses."""
         p = self._points
         fits = [body.fit for body in self._bodies]
-        T, cov, centre = (np.stack([getattr(f, n) for f in fits])[p.body[rows]] for n in ("T_cam_body", "covariance", "centre"))
+        T, cov, centre = (
+            np.stack([getattr(f, n) for f in fits])[p.body[rows]] for n in ("T_cam_body", "covariance", "centre")
+        )
         return rigid_bodies.predict(T, cov, centre, p.p_body[rows], p.map_cov[rows], p.tangent[rows], self._camera)
 
     def _exposed(self, seen: Prediction, search: np.ndarray | None) -> np.ndarray:
@@ -367,7 +390,7 @@ class EmbeddedTracker:
                 body.hidden_for = cfg.linger_frames + 1
 
     def _judge(self, search: np.ndarray | None) -> None:
-        """Hold every point of a body against its pose: who is turned away or hidden is invisible, who is vague follows."""
+        """Hold points against their bodies: what is turned away or hidden is invisible, what is vague follows."""
         p, cfg = self._points, self.config
         p.visible = p.verified.copy()
         posed = np.array([body.posed for body in self._bodies] + [False])
@@ -405,7 +428,9 @@ class EmbeddedTracker:
         measured = self._camera.unproject(p.uv[rows], z)
         expected = (R @ p.p_body[rows][..., None])[..., 0] + T[:, :3, 3]
         # Errors of successive frames have much in common.
-        noise = cfg.repeats * self._noise(p.uv[rows], z, p.cov[rows] + 0.3**2 * _EYE, 1.5 * rigid_bodies.depth_noise_m(z))
+        noise = cfg.repeats * self._noise(
+            p.uv[rows], z, p.cov[rows] + 0.3**2 * _EYE, 1.5 * rigid_bodies.depth_noise_m(z)
+        )
         held = R @ p.map_cov[rows] @ R.transpose(0, 2, 1)
         gain = held @ np.linalg.inv(held + noise)
         off = measured - expected
@@ -445,21 +470,22 @@ class EmbeddedTracker:
         uv, p_cam, descriptors = self._corners(search, cfg.features)
         if len(uv) <= cfg.candidates:
             return
-        scale = len(_STEPS_M)
         for body in lost:
             pick = self._rng.permutation(len(body.p_body))[: cfg.landmarks]
             pairs = [
                 features.match(body.descriptors[pick, i], descriptors[:, i], uv, 4.0, cfg.ratio, cfg.candidates)
-                for i in range(scale)
+                for i in range(len(_STEPS_M))
             ]
             which, corner = (np.concatenate([getattr(m, n) for m in pairs]) for n in ("wanted", "found"))
-            T, agrees = rigid_bodies.consensus(
-                body.p_body[pick[which]], p_cam[corner], corner, self._rng, 1000, cfg.body_m
-            )
-            if len(np.unique(corner[agrees])) >= cfg.support:
-                cov = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
-                body.fit = Fit(T, cov, body.fit.centre, np.ones(0, bool))
-                body.hidden_for = min(body.hidden_for, 2)
+            self._propose(body, body.p_body[pick[which]], p_cam[corner], corner)
+
+    def _propose(self, body: Body, p_body: np.ndarray, p_cam: np.ndarray, corner: np.ndarray) -> None:
+        """Let a lost body's points be looked for at the pose that matches p_body, p_cam (M, 3) agree on."""
+        cfg = self.config
+        T, agrees = rigid_bodies.consensus(p_body, p_cam, corner, self._rng, 1000, cfg.body_m)
+        if len(np.unique(corner[agrees])) >= cfg.support:
+            covariance = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
+            body.fit, body.hidden_for = Fit(T, covariance, body.fit.centre, np.ones(0, bool)), 1
 
     def _corners(self, region: np.ndarray | None, limit: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Corners in the picture where there is depth: uv (M, 2), p_cam (M, 3), descriptors (M, scales, SIZE)."""
@@ -560,10 +586,12 @@ class EmbeddedTracker:
         px = np.clip(np.rint(p.uv[rows]).astype(int), 0, np.array(region.shape[::-1]) - 1)
         region[px[:, 1], px[:, 0]] = 1
         region = cv2.dilate(region, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
-        uv, p_cam, descriptors = self._corners(region, self.config.features)
+        _, p_cam, descriptors = self._corners(region, self.config.features)
         T = body.fit.T_cam_body
         p_body = (p_cam - T[:3, 3]) @ T[:3, :3]
         gap = np.linalg.norm(p_body[:, None] - p.p_body[rows][None], axis=-1).min(1)
         near = gap < self.config.body_reach_m
-        body.descriptors = np.concatenate([body.descriptors, descriptors[near]])
-        body.p_body = np.concatenate([body.p_body, p_body[near]])
+        descriptors = np.concatenate([body.descriptors, descriptors[near]])
+        p_body = np.concatenate([body.p_body, p_body[near]])
+        keep = np.sort(self._rng.permutation(len(p_body))[: self.config.max_landmarks])
+        body.descriptors, body.p_body = descriptors[keep], p_body[keep]

@@ -95,7 +95,9 @@ class Matches:
     found: np.ndarray
 
 
-def match(wanted: np.ndarray, found: np.ndarray, uv_px: np.ndarray, rival_px: float, ratio: float, count: int) -> Matches:
+def match(
+    wanted: np.ndarray, found: np.ndarray, uv_px: np.ndarray, rival_px: float, ratio: float, count: int
+) -> Matches:
     """Pair descriptors wanted (Q, SIZE) with the ``count`` nearest places found (M, SIZE) at uv_px (M, 2).
 
     A pair counts if it is nearer than ``ratio`` times the rival: the nearest of all other places. What lies

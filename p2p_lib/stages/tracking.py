@@ -23,7 +23,10 @@ class PointTracker(Protocol):
     latency_frames: int  # how many frames late `track` answers; 0 = at once
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
-        """Begin a stream at this frame, forgetting any earlier one."""
+        """Begin a stream at this frame, forgetting any earlier one.
+
+        camera  that took the pictures, if somebody knows; a tracker may use it to reason in 3D
+        """
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids (N,) int64, increasing."""
