@@ -178,6 +178,28 @@ def _synth(a: argparse.Namespace) -> None:
     print(f"Written to {out}. Next: p2p run {out} --out RUN")
 
 
+def _benchmark(a: argparse.Namespace) -> None:
+    from p2p_lib.benchmark import plan_names, read_plan, run_benchmark
+    from p2p_lib.report.paper_tables import write_table
+
+    if a.list:
+        print("\n".join(f"{name:24}{read_plan(name).title}" for name in plan_names()))
+        return
+    if a.plan is None or a.out is None:
+        raise BadInput(
+            "benchmark", "no plan or no --out", "p2p benchmark PLAN --out DIR; p2p benchmark --list names them"
+        )
+    profile = "quick" if a.quick else "full"
+    options = {"jobs": a.jobs, "scheduler": a.scheduler, "retry": a.retry, "progress": not a.quiet}
+    benchmark = run_benchmark(a.plan, a.out, profile, **options)
+    print(write_table(benchmark))
+    print(
+        ", ".join(f"{count} {what}" for what, count in benchmark.counts().items()) + f". Tables in {benchmark.folder}"
+    )
+    if benchmark.interrupted:
+        raise KeyboardInterrupt
+
+
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.notebooks import run_notebooks
 
@@ -362,6 +384,16 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--noise", default="realsense", metavar="NAME", help="exact, realsense (default) or hard")
     p.add_argument("--models", type=Path, metavar="DIR", help="YCB models for the ycb_ scenarios (default: stand-ins)")
     p.add_argument("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop")
+
+    p = _command(commands, "benchmark", _benchmark, "run methods on sequences with seeds as a plan says; resumes")
+    p.add_argument("plan", nargs="?", metavar="PLAN", help="a TOML file, or a name that --list shows")
+    p.add_argument("--list", action="store_true", help="list the plans of the paper's tables and of the README")
+    p.add_argument("--out", type=Path, metavar="DIR", help="runs, records and tables; several plans may share it")
+    p.add_argument("--quick", action="store_true", help="a few frames of embedded data instead of the plan in full")
+    p.add_argument("--jobs", type=int, metavar="N", help="runs at a time on this machine (default: one a core)")
+    p.add_argument("--scheduler", metavar="tcp://HOST:PORT", help="of a Dask cluster whose workers see DIR, too")
+    p.add_argument("--retry", action="store_true", help="try again what failed before")
+    p.add_argument("--quiet", action="store_true", help="no progress bar")
 
     p = _command(commands, "notebooks", _notebooks, "run the notebooks headless and collect their results")
     p.add_argument("--profile", choices=("quick", "full"), default="quick", help="size of the job (default quick)")

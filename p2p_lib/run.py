@@ -220,7 +220,7 @@ def export_run(folder: str | Path, format: str, out: str | Path, frame: str | No
 
 
 def evaluate_tracker(
-    sequence: str | Path,
+    sequence: str | Path | sequences.Sequence,
     tracker: str | None = None,
     *,
     seed: int = 0,
@@ -233,12 +233,13 @@ def evaluate_tracker(
 ) -> TrackerScore:
     """Score a 2D tracker against true tracks; what ``p2p eval-tracks`` prints.
 
-    The synthetic sequence is always that of seed 0; ``seed`` draws the queries and serves the tracker.
+    A synthetic sequence named is always that of seed 0; ``seed`` draws the queries and serves the tracker.
     """
     config = make_config(settings=settings, seed=seed)
-    opened = sequences.open_sequence(sequence, format, depth_scale)
-    named = _tracker(tracker, opened, config, models)
-    method = make_tracker(named, config.tracking, np.random.default_rng(config.seed))
+    named = isinstance(sequence, str | Path)
+    opened = sequences.open_sequence(sequence, format, depth_scale) if named else sequence
+    chosen = _tracker(tracker, opened, config, models)
+    method = make_tracker(chosen, config.tracking, np.random.default_rng(config.seed))
     return score_tracker(opened, method, config.seed, models, count, search)
 
 

@@ -19,6 +19,7 @@ FLOORS = [
     {"pipeline"},
     {"evaluation"},
     {"run"},
+    {"benchmark"},
     {"report"},
     {"notebooks", "doctor", "click"},
     {"live"},

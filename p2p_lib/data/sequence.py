@@ -107,7 +107,8 @@ def open_sequence(
 ) -> Sequence:
     """A sequence from a folder, the embedded ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
 
-    Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one.
+    Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one; any
+    other folder by its path below ``$P2P_DATA``.
 
     format       one of :data:`FORMATS`; by default the layout is recognised
     depth_scale  metres per raw unit of the depth images (default 0.001: millimetres)
@@ -141,6 +142,9 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
     from p2p_lib.data.manifests import find_sequence
 
     found = find_sequence(str(path_or_name))
+    below = None if data_dir() is None else data_dir() / folder
+    if found is None and below is not None and below.is_dir():
+        return below, format
     if found is None:
         fix = f"Give a folder, an embedded sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
         where = "$P2P_DATA is not set" if data_dir() is None else f"no sequence of this name below {data_dir()}"

@@ -1,0 +1,9 @@
+"""Benchmarks: methods on sequences with seeds as a plan says, run on many cores or machines, as tidy tables.
+
+``run_benchmark("ycbineoat", "out/benchmark")`` runs what is not on disk yet and gives the results of all of it.
+"""
+
+from p2p_lib.benchmark.benchmark import Benchmark, run_benchmark
+from p2p_lib.benchmark.plan import Plan, plan_names, read_plan
+
+__all__ = ["Benchmark", "Plan", "plan_names", "read_plan", "run_benchmark"]

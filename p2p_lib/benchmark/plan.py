@@ -1,0 +1,174 @@
+"""What a benchmark is to run: methods on sequences with seeds, as a TOML file says it.
+
+A plan has the methods, and two scopes of what they run on: ``full`` (the data of the paper, where it is present) and
+``quick`` (embedded data, a few frames). Plans of this package lie in ``plans/`` and are known by their names.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from p2p_lib.backends.registry import DEFAULT_DETECTOR
+from p2p_lib.backends.segmenters import SEGMENTERS
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.stages.tracking import DEFAULT_TRACKER
+
+PROFILES = ("quick", "full")
+#: Where the plans of this package lie.
+PLANS = Path(__file__).parent / "plans"
+
+Text = Annotated[str, Field(min_length=1)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class _Strict(BaseModel):
+    """Values as written: no unknown key, no conversion, no change afterwards."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Method(_Strict):
+    """One way to run: a row or column of the table.
+
+    paper     the method of the paper's table that it stands beside ("Ours", "No SDF refinement"), "" for none
+    detector  the first of these that is installed
+    masks     dataset, dataset:FOLDER, or a segmenter, which starts from the sequence's clicks
+    settings  single parameters of the configuration, ``{"stage.key" = value}``
+    synthetic parameters of synthetic sequences; ``noise`` is one of exact, realsense, hard
+    scale     of the pictures, 1 = as they are
+    count     only so many of the objects, 0 = all
+    """
+
+    name: Text
+    paper: str = ""
+    preset: Text = "default"
+    tracker: Text = DEFAULT_TRACKER
+    detector: Text | list[Text] = DEFAULT_DETECTOR
+    masks: Text = "dataset"
+    settings: dict[str, Any] = {}
+    synthetic: dict[str, Any] = {}
+    scale: Annotated[float, Field(gt=0, le=1)] = 1.0
+    count: Count = 0
+
+
+class PlannedSequence(_Strict):
+    """One sequence to run on.
+
+    name       as ``p2p run`` takes it; ``DATASET/*`` stands for every sequence of a dataset that is present
+    objects    only these (default: all)
+    seed       of a synthetic sequence; None: that of the run
+    synthetic  parameters of a synthetic sequence; ``models = "DATASET"`` stands for that dataset's folder
+    models     object to model file or folder, relative to ``$P2P_DATA``, where the layout has none
+    clicks     object to pixels [u, v] in frame ``start``, for methods with a segmenter
+    column     of the paper's table; with several objects, ``columns`` has one for each
+    """
+
+    name: Text
+    objects: list[Text] = []
+    start: Count = 0
+    stop: Count | None = None
+    seed: Count | None = None
+    synthetic: dict[str, Any] = {}
+    models: dict[str, Text] = {}
+    clicks: dict[str, list[list[float]]] = {}
+    column: str = ""
+    columns: dict[str, str] = {}
+
+    def column_of(self, object: str) -> str:
+        """The column of the paper's table that this object belongs to, "" for none."""
+        return self.columns.get(object, self.column)
+
+
+class Scope(_Strict):
+    """What the methods run on. ``methods`` names some of them, none for all."""
+
+    seeds: Annotated[list[Count], Field(min_length=1)]
+    sequence: Annotated[list[PlannedSequence], Field(min_length=1)]
+    methods: list[str] = []
+    tracks: bool = True
+
+
+class Plan(_Strict):
+    """A benchmark.
+
+    name     of its file
+    paper    LaTeX label of the paper's table that it re-creates, "" for none
+    kind     how its table is arranged (see :mod:`p2p_lib.report.paper_tables`)
+    chamfer  whether reconstructions are scored as well
+    tracks   whether the 2D trackers are scored by themselves as well (a scope may leave it out)
+    """
+
+    name: Text
+    title: Text
+    paper: str = ""
+    kind: Literal["sequences", "objects", "methods", "returns", "rates"] = "methods"
+    chamfer: bool = False
+    tracks: bool = False
+    method: Annotated[list[Method], Field(min_length=1)]
+    quick: Scope
+    full: Scope
+
+    @field_validator("method")
+    @classmethod
+    def _distinct(cls, methods: list[Method]) -> list[Method]:
+        names = [method.name for method in methods]
+        if len(set(names)) < len(names):
+            raise ValueError("two methods have one name")
+        return methods
+
+    @model_validator(mode="after")
+    def _known(self) -> Plan:
+        for scope in (self.quick, self.full):
+            if unknown := set(scope.methods) - {method.name for method in self.method}:
+                raise ValueError(f"methods: no method is called {unknown.pop()!r}")
+        return self
+
+    def scope(self, profile: str) -> Scope:
+        """``quick`` or ``full``."""
+        if profile not in PROFILES:
+            raise BadInput("profile", repr(profile), "one of " + ", ".join(PROFILES))
+        return getattr(self, profile)
+
+    def methods(self, profile: str) -> list[Method]:
+        """The methods of a scope."""
+        wanted = self.scope(profile).methods
+        return [method for method in self.method if not wanted or method.name in wanted]
+
+
+def plan_names() -> list[str]:
+    """The plans of this package."""
+    return sorted(path.stem for path in PLANS.glob("*.toml"))
+
+
+def read_plan(plan: str | Path) -> Plan:
+    """The plan in a TOML file, or the one of this package that is called so.
+
+    Raises :class:`MissingData` where there is none, :class:`BadInput` with the key that does not fit.
+    """
+    path = Path(plan).expanduser()
+    if path.suffix != ".toml":
+        path = PLANS / f"{plan}.toml"
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, IsADirectoryError):
+        fix = "Give a TOML file, or one of " + ", ".join(plan_names()) + "."
+        raise MissingData(str(plan), "no such plan", fix) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadInput(str(path), f"unreadable TOML ({error})", "a plan (see p2p_lib/benchmark/plan.py)") from None
+    try:
+        return Plan.model_validate({"name": path.stem, **content})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the file"
+        raise BadInput(
+            f"plan {path.name}", f"{where}: {first['msg']}", "a plan (see p2p_lib/benchmark/plan.py)"
+        ) from None
+
+
+def uses_clicks(method: Method) -> bool:
+    """Whether its masks come from a segmenter."""
+    return method.masks in SEGMENTERS

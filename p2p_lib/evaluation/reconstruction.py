@@ -1,0 +1,132 @@
+"""Chamfer distance of a reconstructed mesh, in the two forms that the field's tables mix.
+
+Both place the mesh by the alignment of the poses, clean it, sample it, and let a short ICP take out what is left of the
+frame. They differ in the last step. ``BundleSDF``: half the sum of the two mean distances, over all samples of the
+mesh. ``release`` (the paper's): samples thinned to the same 5 mm grid as the reference, and one mean over both
+directions together, so that the larger cloud weighs more.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.data.models import load_mesh
+from p2p_lib.data.sequence import Sequence
+from p2p_lib.stages.registration import fit_rigid
+
+if TYPE_CHECKING:
+    import trimesh
+
+#: The two forms of the Chamfer distance.
+FORMS = ("BundleSDF", "release")
+GRID_M = 0.005
+SAMPLES = 99_999
+#: Samples of the true surface before it is thinned.
+REFERENCE_SAMPLES = 120_000
+FAR_M = 0.3  # vertices farther outside the reference's box are dropped
+NEAR_M = 0.1  # the largest component that comes this near to the model's origin is kept
+ICP_M = 0.02  # pairs farther apart are left out
+_ICP_STEPS = 30
+# A point is seen where the measured depth agrees with its own, in one of this many frames.
+_AGREES_M, _VIEWS = 0.007, 40
+
+
+def chamfer_cm(
+    mesh: trimesh.Trimesh, T_model_obj: np.ndarray, reference: np.ndarray, seed: int = 0
+) -> dict[str, float]:
+    """Both forms in centimetres.
+
+    mesh         in the object frame; T_model_obj (4, 4) takes it to the model's
+    reference    (M, 3) the true surface in the model frame: what could be seen of it, see :func:`seen_surface`
+
+    An empty dictionary where nothing of the mesh is near the reference.
+    """
+    import trimesh
+    from scipy.spatial import cKDTree
+
+    truth = thinned(reference)
+    mesh = _cleaned(mesh, T_model_obj, truth)
+    if mesh is None:
+        return {}
+    samples, _ = trimesh.sample.sample_surface(mesh, SAMPLES, seed=seed)
+    samples = se3.transform(_icp(thinned(samples), truth), samples)
+    tree = cKDTree(truth)
+    to_truth, to_mesh = tree.query(samples)[0], cKDTree(samples).query(truth)[0]
+    thin = thinned(samples)
+    both = np.concatenate([tree.query(thin)[0], cKDTree(thin).query(truth)[0]])
+    return dict(zip(FORMS, (100 * float(to_truth.mean() + to_mesh.mean()) / 2, 100 * float(both.mean())), strict=True))
+
+
+def thinned(points: np.ndarray, grid_m: float = GRID_M) -> np.ndarray:
+    """One point per cell of a grid: the mean of the (N, 3) points in it."""
+    cells = np.floor(points / grid_m).astype(np.int64)
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(cell.ravel(), points[:, k], len(count)) for k in range(3)], 1)
+    return sums / count[:, None]
+
+
+def seen_surface(
+    sequence: Sequence, name: str, model: Path | np.ndarray, frames: np.ndarray, seed: int = 0
+) -> tuple[np.ndarray, str]:
+    """The part of an object's true surface that these frames show, (M, 3) in the model frame, and where it is from.
+
+    ``visible_mesh.ply`` of the sequence where it is there (BundleSDF's download of HO3D has it); else the points of
+    the model, sampled densely where it is a mesh, at which in one of 40 frames of the (k,) ``frames`` the measured
+    depth agrees with the true pose.
+
+    model  a mesh, or (V, 3) points where there is none
+    """
+    given = sequence.path / "visible_mesh.ply" if sequence.path else None
+    if given and given.is_file():
+        return _sampled(given, seed), "visible_mesh.ply"
+    points = _sampled(model, seed) if isinstance(model, Path) else model
+    seen = np.zeros(len(points), bool)
+    for k in np.unique(frames[np.linspace(0, len(frames) - 1, min(_VIEWS, len(frames))).astype(int)]):
+        T_cam_model, depth_m = sequence.truth[name].T_cam_model[k], sequence.frame(int(k)).depth_m
+        p_cam = se3.transform(T_cam_model, points)
+        uv_px = sequence.camera.project(p_cam)
+        inside = sequence.camera.inside(uv_px)
+        u, v = np.where(inside, uv_px.T, 0).round().astype(int)
+        seen |= inside & (np.abs(depth_m[v, u] - p_cam[:, 2]) < _AGREES_M)
+    return points[seen], f"seen part of {model.name if isinstance(model, Path) else 'the model points'}"
+
+
+def _sampled(path: Path, seed: int) -> np.ndarray:
+    import trimesh
+
+    mesh = trimesh.Trimesh(*load_mesh(path), process=False)
+    return trimesh.sample.sample_surface(mesh, REFERENCE_SAMPLES, seed=seed)[0]
+
+
+def _cleaned(mesh: trimesh.Trimesh, T_model_obj: np.ndarray, truth: np.ndarray) -> trimesh.Trimesh | None:
+    """In the model frame, without what is far off; of its components the largest that is near the origin."""
+    import trimesh
+
+    vertices, faces = se3.transform(T_model_obj, np.asarray(mesh.vertices)), np.asarray(mesh.faces)
+    near = ((vertices > truth.min(0) - FAR_M) & (vertices < truth.max(0) + FAR_M)).all(1)
+    mesh = trimesh.Trimesh(vertices, faces[near[faces].all(1)], process=False)
+    parts = sorted(mesh.split(only_watertight=False), key=lambda part: -len(part.vertices))
+    at_origin = [part for part in parts if np.linalg.norm(part.vertices, axis=1).min() <= NEAR_M]
+    return next(iter(at_origin or parts), None)
+
+
+def _icp(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """T_target_source (4, 4) by point-to-point ICP from the identity; pairs beyond 2 cm are left out."""
+    from scipy.spatial import cKDTree
+
+    tree, T, last_m = cKDTree(target), np.eye(4), np.inf
+    for _ in range(_ICP_STEPS):
+        moved = se3.transform(T, source)
+        apart_m, nearest = tree.query(moved, distance_upper_bound=ICP_M)
+        paired = np.isfinite(apart_m)
+        if paired.sum() < 3:
+            return T
+        mean_m = float(np.sqrt((apart_m[paired] ** 2).mean()))
+        if abs(last_m - mean_m) < 1e-6:
+            return T
+        T, last_m = fit_rigid(source[paired], target[nearest[paired]]), mean_m
+    return T

@@ -1,0 +1,3 @@
+"""stub"""
+def write_table(benchmark):
+    return ""

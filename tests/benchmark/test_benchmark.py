@@ -1,0 +1,196 @@
+"""A benchmark runs what its plan says once, wherever it runs, and goes on after anything that ends it."""
+
+import csv
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from p2p_lib import cli
+from p2p_lib.benchmark import read_plan, run_benchmark
+from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.benchmark.jobs import jobs_of
+from p2p_lib.core.errors import BadInput
+from p2p_lib.evaluation import metrics
+from p2p_lib.run import evaluate_run
+
+
+def table(benchmark: Benchmark, name: str = "results") -> list[dict[str, str]]:
+    with (benchmark.folder / f"{name}.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def number(rows: list[dict], **wanted) -> float:
+    (found,) = (row for row in rows if all(row[key] == str(value) for key, value in wanted.items()))
+    return float(found["value"])
+
+
+EXACT = {"metric": "ADD AUC", "form": "exact", "failures": "zero", "align": "first"}
+
+
+def test_every_run_of_the_plan_is_there_and_scored_as_p2p_eval_does(whole):
+    assert whole.counts() == {"done": 8, "failed": 0, "not run": 0}
+    rows = table(whole)
+    for job, outcome in whole.results:
+        run = whole.out / "runs" / outcome.key
+        for align in ("first", "all"):
+            scores = evaluate_run(run, align=align).as_dict()["objects"]["object"]
+            mine = {"key": outcome.key, "failures": "zero", "align": align}
+            for metric, key in (("ADD AUC", "add_auc"), ("ADD-S AUC", "adds_auc")):
+                assert number(rows, **mine, metric=metric, form="exact") == pytest.approx(scores[key], abs=1e-9)
+                assert number(rows, **mine, metric=metric, form="VOC") == pytest.approx(scores[f"{key}_voc"], abs=1e-9)
+        assert not (run.parent / f".{outcome.key}").exists() and job.key == outcome.key
+
+
+def test_a_row_says_all_that_one_needs_to_compare_it(whole):
+    row = next(row for row in table(whole) if row["object"] == "object" and row["method"] == "No multi-hypothesis")
+    assert (row["tracker"], row["detector"], row["masks"], row["preset"]) == ("embedded", "corners", "dataset", "default")
+    assert row["unit"] == "%" and row["align"] in ("first", "all") and row["seed"] in "01" and row["frames"] == "6"
+    assert len(row["library"]) == 12 and len(row["commit"]) in (0, 40)
+    assert {row["column"] for row in table(whole) if row["object"]} == {"AP10", ""}
+
+
+def test_mean_and_pool_are_those_of_the_runs(whole):
+    rows = table(whole)
+    runs = [(job, o) for job, o in whole.results if job.method.name == "Ours" and job.seed == 1]
+    errors = [np.array(o.objects["object"].first["add_m"]) for _, o in runs]
+    assert [len(e) for e in errors] == [6, 5]
+    ours = {**EXACT, "method": "Ours", "seed": 1}
+    mean = np.mean([metrics.auc_exact(e) for e in errors])
+    assert number(rows, **ours, sequence="mean over sequences") == pytest.approx(mean)
+    pooled = {**ours, "form": "VOC", "sequence": "pooled over frames"}
+    assert number(rows, **pooled) == pytest.approx(metrics.auc_voc(np.concatenate(errors)))
+
+
+def test_the_summary_spreads_over_seeds(whole):
+    values = [number(table(whole), **EXACT, method="Ours", seed=s, sequence="mean over sequences") for s in (0, 1)]
+    (row,) = (
+        row
+        for row in table(whole, "summary")
+        if row["method"] == "Ours" and row["sequence"] == "mean over sequences" and EXACT.items() <= row.items()
+    )
+    assert row["seeds"] == "0 1"
+    assert [float(row[key]) for key in ("low", "high")] == [min(values), max(values)]
+    assert float(row["value"]) == pytest.approx(np.mean(values))
+    assert float(row["std"]) == pytest.approx(np.std(values, ddof=1))
+
+
+def test_nothing_on_disk_is_run_again(whole, plan, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in (whole.out / "records").iterdir()}
+    results = (whole.folder / "results.csv").read_bytes()
+    start = time.perf_counter()
+    again = run_benchmark(plan, whole.out, progress=False)
+    quick = run_benchmark(plan, whole.out, "quick", progress=False)
+    assert time.perf_counter() - start < 10, "two looks at the disk"
+    assert {path: path.stat().st_mtime_ns for path in (whole.out / "records").iterdir()} == before
+    assert (again.folder / "results.csv").read_bytes() == results
+    assert quick.counts()["done"] == 2, "the quick plan shares runs with the full one"
+
+
+def test_a_key_is_of_everything_that_decides_a_result(slides, plan, tmp_path, monkeypatch):
+    def keys(**changes: str) -> list[str]:
+        text = plan.read_text()
+        for old, new in changes.items():
+            assert old in text
+            text = text.replace(old, new)
+        (tmp_path / "slides.toml").write_text(text)
+        return [job.key for job in jobs_of(read_plan(tmp_path / "slides.toml"), "quick")]
+
+    same = keys()
+    assert keys(**{"A board that slides": "Another title", '"Ours"': '"Mine"'}) == same, "names decide nothing"
+    assert len(set(same)) == 2
+    assert keys(**{"seeds = [0]": "seeds = [4]"})[0] != same[0]
+    assert keys(**{'column = "AP10" }': "stop = 4 }"})[0] != same[0]
+    assert keys(**{'"factor_graph.enabled" = false': '"factor_graph.enabled" = true'})[0] != same[0]
+    copy = Path(shutil.copytree(slides[0], tmp_path / "copy"))
+    assert keys(**{str(slides[0]): str(copy)}) == same, "nor do folders"
+    pose = copy / "annotated_poses/0003.txt"
+    pose.write_text(pose.read_text().replace("1.0", "1.000000001"))
+    assert keys(**{str(slides[0]): str(copy)})[0] != same[0]
+    monkeypatch.setattr("p2p_lib.benchmark.jobs.library_version", lambda: "another")
+    assert keys()[0] != same[0]
+
+
+# --- whatever ends it ----------------------------------------------------------------------------
+
+
+def test_a_killed_benchmark_resumes_to_the_identical_table(whole, plan, tmp_path):
+    command = [sys.executable, "-m", "p2p_lib.cli", "benchmark", str(plan), "--out", str(tmp_path), "--jobs", "1"]
+    killed = subprocess.Popen([*command, "--quiet"], stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while len(list((tmp_path / "records").glob("*.json"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    killed.kill()
+    killed.wait()
+    kept = {path: path.read_bytes() for path in (tmp_path / "records").glob("*.json")}
+    assert 2 <= len(kept) < 8, "it was killed on the way"
+    assert not (tmp_path / "slides-full").exists()
+    done = run_benchmark(plan, tmp_path, progress=False, jobs=2)
+    assert {path: path.read_bytes() for path in kept} == kept, "what was done stays as it was"
+    assert (done.folder / "results.csv").read_bytes() == (whole.folder / "results.csv").read_bytes()
+    assert (done.folder / "summary.csv").read_bytes() == (whole.folder / "summary.csv").read_bytes()
+
+
+def test_a_failing_run_is_a_row_and_the_others_go_on(slides, plan, tmp_path):
+    broken = Path(shutil.copytree(slides[0], tmp_path / "broken"))
+    (broken / "rgb/0004.png").write_bytes(b"no picture")
+    (tmp_path / "plan.toml").write_text(plan.read_text().replace(str(slides[1]), str(broken)))
+    done = run_benchmark(tmp_path / "plan.toml", tmp_path / "out", progress=False, jobs=2)
+    assert done.counts() == {"done": 4, "failed": 4, "not run": 0}
+    rows = table(done)
+    failed = [row for row in rows if row["metric"] == "failed"]
+    assert len(failed) == 4 and all("0004.png" in row["reason"] and row["value"] == "" for row in failed)
+    ours = {"method": "Ours", "seed": 0}
+    alone = number(rows, **EXACT, **ours, sequence=str(slides[0]))
+    means = {**EXACT, **ours, "sequence": "mean over sequences"}
+    assert number(rows, **means) == pytest.approx(alone / 2), "a failure counts as 0"
+    assert number(rows, **{**means, "failures": "left out"}) == pytest.approx(alone), "or is left out"
+    assert "Traceback" in (tmp_path / "out/failures" / f"{failed[0]['key']}.txt").read_text()
+    # Mended, it is another sequence: it runs without being asked for again.
+    shutil.copy(slides[0] / "rgb/0004.png", broken / "rgb/0004.png")
+    assert run_benchmark(tmp_path / "plan.toml", tmp_path / "out", progress=False).counts()["done"] == 8
+
+
+def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp_path):
+    def kill_the_first() -> None:
+        while not (found := [p for p in multiprocessing.active_children() if p.pid]):
+            time.sleep(0.001)
+        os.kill(found[0].pid, signal.SIGKILL)
+
+    threading.Thread(target=kill_the_first, daemon=True).start()
+    done = run_benchmark(plan, tmp_path, "quick", progress=False, jobs=1)
+    assert done.counts() == {"done": 1, "failed": 1, "not run": 0}
+    (reason,) = (outcome.reason for _, outcome in done.results if outcome.status == "failed")
+    assert reason == "its process was ended by signal 9: out of memory?"
+    assert run_benchmark(plan, tmp_path, "quick", progress=False).counts()["failed"] == 1, "not without being told"
+    assert run_benchmark(plan, tmp_path, "quick", progress=False, retry=True).counts()["done"] == 2
+
+
+# --- on a cluster --------------------------------------------------------------------------------
+
+
+def test_a_cluster_finds_the_same_table(whole, plan, tmp_path, capsys):
+    distributed = pytest.importorskip("distributed", reason="extra cluster is not installed")
+    cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    with cluster:
+        address = cluster.scheduler_address
+        assert address.startswith("tcp://")
+        options = ["--out", str(tmp_path), "--scheduler", address, "--quiet"]
+        assert cli.main(["benchmark", str(plan), *options]) == 0
+    assert "8 done, 0 failed, 0 not run" in capsys.readouterr().out
+    assert (tmp_path / "slides-full/results.csv").read_bytes() == (whole.folder / "results.csv").read_bytes()
+
+
+def test_a_scheduler_that_does_not_answer_is_named(plan, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="extra cluster is not installed")
+    monkeypatch.setattr("p2p_lib.benchmark.execution._CONNECT_S", 1)
+    with pytest.raises(BadInput, match=r"scheduler: got tcp://127\.0\.0\.1:9 .*expected a Dask scheduler that answers"):
+        run_benchmark(plan, tmp_path, "quick", scheduler="tcp://127.0.0.1:9", progress=False)
