@@ -107,7 +107,8 @@ def run_benchmark(
     known = {key: outcome for key in wanted if (outcome := load_outcome(out, key))}
     known = {key: outcome for key, outcome in known.items() if not (retry and outcome.status == "failed")}
     todo = [job for key, job in wanted.items() if key not in known]
-    found, interrupted = _run(todo, out, jobs or len(os.sched_getaffinity(0)), scheduler, progress, plan.name)
+    at_a_time = jobs or (1 if plan.scope(profile).alone else len(os.sched_getaffinity(0)))
+    found, interrupted = _run(todo, out, at_a_time, scheduler, progress, plan.name)
     benchmark = Benchmark(plan, profile, out, _in_order(asked, known | found), interrupted)
     for name, content, columns in (
         ("results", benchmark.rows, rows.COLUMNS),

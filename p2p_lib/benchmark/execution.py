@@ -20,7 +20,8 @@ from p2p_lib.benchmark.worker import perform
 from p2p_lib.core.errors import BadInput, MissingBackend
 
 # Loaded once, in the process from which those of the runs are forked.
-_PRELOADED = ["p2p_lib.benchmark.worker", "p2p_lib.stages.factor_graph", "scipy.spatial", "scipy.optimize"]
+_PRELOADED = ["p2p_lib.benchmark.worker", "p2p_lib.stages.factor_graph", "torch", "scipy.spatial", "scipy.optimize"]
+_PRELOADED += ["trimesh", "skimage.measure"]
 # How long a scheduler may take to answer.
 _CONNECT_S = 20
 

@@ -20,7 +20,7 @@ import numpy as np
 from p2p_lib.backends.registry import make_detector
 from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, uses_clicks
 from p2p_lib.core.config import SamplingConfig
-from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.paths import data_dir
 from p2p_lib.data import manifests
 from p2p_lib.data.models import find_models
@@ -133,7 +133,9 @@ def _keyed(job: Job, missing: str, known: dict[tuple, str]) -> Job:
             "clicks": job.sequence.clicks if uses_clicks(method) else {},
             "chamfer": job.chamfer,
         }
-    except (MissingData, MissingBackend) as error:
+    except P2PError as error:
+        if isinstance(error, BadInput) and job.sequence.name.startswith(SYNTHETIC):
+            raise  # the plan's mistake; of files, it is theirs
         return Job(**{**_fields(job), "reason": str(error)})
     return Job(**{**_fields(job), "key": _sha(json.dumps(decides, sort_keys=True).encode())[:16]})
 

@@ -84,12 +84,18 @@ class PlannedSequence(_Strict):
 
 
 class Scope(_Strict):
-    """What the methods run on. ``methods`` names some of them, none for all."""
+    """What the methods run on.
+
+    methods  the names of some of them, none for all
+    tracks   whether 2D trackers are scored by themselves, where the plan wants it
+    alone    one run at a time, since times are measured
+    """
 
     seeds: Annotated[list[Count], Field(min_length=1)]
     sequence: Annotated[list[PlannedSequence], Field(min_length=1)]
     methods: list[str] = []
     tracks: bool = True
+    alone: bool = False
 
 
 class Plan(_Strict):
@@ -99,13 +105,13 @@ class Plan(_Strict):
     paper    LaTeX label of the paper's table that it re-creates, "" for none
     kind     how its table is arranged (see :mod:`p2p_lib.report.paper_tables`)
     chamfer  whether reconstructions are scored as well
-    tracks   whether the 2D trackers are scored by themselves as well (a scope may leave it out)
+    tracks   whether the 2D trackers are scored by themselves as well
     """
 
     name: Text
     title: Text
     paper: str = ""
-    kind: Literal["sequences", "objects", "methods", "returns", "rates"] = "methods"
+    kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs"] = "methods"
     chamfer: bool = False
     tracks: bool = False
     method: Annotated[list[Method], Field(min_length=1)]

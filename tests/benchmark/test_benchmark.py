@@ -52,7 +52,12 @@ def test_every_run_of_the_plan_is_there_and_scored_as_p2p_eval_does(whole):
 
 def test_a_row_says_all_that_one_needs_to_compare_it(whole):
     row = next(row for row in table(whole) if row["object"] == "object" and row["method"] == "No multi-hypothesis")
-    assert (row["tracker"], row["detector"], row["masks"], row["preset"]) == ("embedded", "corners", "dataset", "default")
+    assert (row["tracker"], row["detector"], row["masks"], row["preset"]) == (
+        "embedded",
+        "corners",
+        "dataset",
+        "default",
+    )
     assert row["unit"] == "%" and row["align"] in ("first", "all") and row["seed"] in "01" and row["frames"] == "6"
     assert len(row["library"]) == 12 and len(row["commit"]) in (0, 40)
     assert {row["column"] for row in table(whole) if row["object"]} == {"AP10", ""}

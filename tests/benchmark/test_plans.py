@@ -1,0 +1,125 @@
+"""The plans of the package: they fit the configuration, the paper's tables and the manifests."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from p2p_lib.backends.registry import DETECTORS, TRACKERS
+from p2p_lib.benchmark import plan_names, read_plan
+from p2p_lib.benchmark.jobs import jobs_of
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.data.manifests import manifest
+from p2p_lib.data.paper_reported import paper_reported
+from p2p_lib.data.synthetic import SCENARIOS
+from p2p_lib.evaluation.oracle import OracleTracker
+from p2p_lib.run import make_config
+
+PLANS = plan_names()
+
+
+def test_every_table_of_the_paper_has_a_plan():
+    planned = {read_plan(name).paper for name in PLANS}
+    assert {table.label for table in paper_reported().tables} <= planned
+    assert {"readme", "runtime", "long_range", "trackers"} <= set(PLANS)
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_methods_fit_configuration_and_registry(name):
+    for method in read_plan(name).method:
+        make_config(method.preset, settings=method.settings)
+        assert method.tracker in {*TRACKERS, OracleTracker.name}
+        assert {method.detector} if isinstance(method.detector, str) else set(method.detector) <= set(DETECTORS)
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_the_quick_form_is_small_and_embedded_and_the_full_one_has_three_seeds(name):
+    plan = read_plan(name)
+    assert all(s.name.startswith("synthetic/") and s.stop - s.start <= 80 for s in plan.quick.sequence)
+    assert plan.quick.seeds == [0] and len(plan.quick.sequence) == 1
+    assert len(plan.full.seeds) >= 3
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_sequences_are_known_and_columns_are_the_papers(name):
+    plan = read_plan(name)
+    table = paper_reported().table(plan.paper) if plan.paper else None
+    columns = {f"{c.sequence} {c.object}".strip() for c in table.columns} if table else set()
+    filled = []
+    for sequence in plan.full.sequence:
+        dataset, _, own = sequence.name.rpartition("/")
+        if dataset == "synthetic":
+            assert own in SCENARIOS
+        elif dataset and own != "*":
+            entries = {entry.name: entry for entry in manifest(dataset).sequences}
+            assert own in entries
+            assert sequence.column in ("", entries[own].paper)
+        filled += [sequence.column] if sequence.column else list(sequence.columns.values())
+    assert len(set(filled)) == len(filled) and set(filled) <= columns
+    if plan.kind == "sequences":
+        assert set(filled) == columns, "every column of the paper's table has its sequence"
+    if table and plan.kind == "methods":
+        assert {method.paper for method in plan.method} <= {row.method for row in table.rows}
+
+
+def test_plans_are_part_of_an_installation():
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    patterns = project["tool"]["setuptools"]["package-data"]["p2p_lib"]
+    root = Path(__file__).parents[2] / "p2p_lib"
+    assert {path.stem for pattern in patterns for path in root.glob(pattern)} >= set(PLANS)
+
+
+def test_what_is_not_there_says_why_and_costs_nothing(monkeypatch):
+    monkeypatch.delenv("P2P_DATA", raising=False)
+    jobs = jobs_of(read_plan("ycbineoat"), "full")
+    assert len(jobs) == 27 and not any(job.key for job in jobs)
+    assert all("$P2P_DATA is not set" in job.reason for job in jobs)
+    (real,) = {job.reason for job in jobs_of(read_plan("ycbmultitrack_real"), "full")}
+    assert "P2P_DATA" in real
+
+
+def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    for name in ("b_two", "a_one"):
+        (tmp_path / "YCBMultiTrack/real" / name / "rgb").mkdir(parents=True)
+    (tmp_path / "YCBMultiTrack/real/models").mkdir()
+    jobs = jobs_of(read_plan("ycbmultitrack_real"), "full")
+    names = list(dict.fromkeys(job.sequence.name for job in jobs))
+    assert names == ["ycbmultitrack_real/a_one", "ycbmultitrack_real/b_two"]
+    assert all("no files, expected colour pictures" in job.reason for job in jobs), "and what is wrong with it"
+
+
+def test_a_detector_of_choice_is_the_first_that_is_there(monkeypatch):
+    monkeypatch.delenv("P2P_DATA", raising=False)
+    chosen = {job.method.name: job.method.detector for job in jobs_of(read_plan("sampling"), "quick")}
+    assert chosen == {"Proposed": "corners", "Detector only": "corners", "Uniform sampling": "uniform"}
+
+
+SMALL = 'title = "t"\n[[method]]\nname = "Ours"\n[quick]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
+SMALL += '[full]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "Ours"', 'name = "Ours"\ntraker = "lk"', r"method\.0\.traker: Extra inputs"),
+        ("seeds = [0]", "seeds = [0.5]", r"quick\.seeds\.0: Input should be a valid integer"),
+        ("seeds = [0]", "seeds = []", r"quick\.seeds: List should have at least 1"),
+        ('name = "a" }', 'name = "a", stop = -1 }', r"quick\.sequence\.0\.stop"),
+        ("[quick]", '[[method]]\nname = "Ours"\n[quick]', "two methods have one name"),
+        ("seeds = [0]", 'seeds = [0]\nmethods = ["Theirs"]', "no method is called 'Theirs'"),
+        ('title = "t"', "title = ", "unreadable TOML"),
+    ],
+)
+def test_a_plan_that_does_not_fit_names_the_key(tmp_path, old, new, message):
+    assert old in SMALL
+    (tmp_path / "small.toml").write_text(SMALL)
+    assert read_plan(tmp_path / "small.toml").name == "small"
+    (tmp_path / "small.toml").write_text(SMALL.replace(old, new))
+    with pytest.raises(BadInput, match=message):
+        read_plan(tmp_path / "small.toml")
+
+
+def test_a_plan_that_is_not_there_lists_those_that_are():
+    with pytest.raises(MissingData, match=r"ycb: no such plan\. Give a TOML file, or one of ablation, .*ycbineoat"):
+        read_plan("ycb")
