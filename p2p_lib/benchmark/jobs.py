@@ -31,7 +31,7 @@ from p2p_lib.run import make_config
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 # What only shows results cannot change them.
-_WITHOUT = {"report", "notebooks.py", "doctor.py", "cli.py", "click.py"}
+_WITHOUT = {"report", "notebooks.py", "doctor.py", "cli.py", "click.py", "live.py"}
 _NUMERICS = ("numpy", "scipy", "opencv-python-headless", "gtsam")
 
 
