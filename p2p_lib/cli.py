@@ -62,6 +62,7 @@ def _run(a: argparse.Namespace) -> None:
         stop=a.stop,
         models=_pairs("--models", a.models, "NAME=PATH"),
         progress=not a.quiet,
+        say=partial(print, file=sys.stderr),
     )
     print("\n".join(result.summary))
     if result.evaluation is not None:
@@ -164,6 +165,20 @@ def _check(a: argparse.Namespace) -> int:
     findings = check_folder(a.sequence, prompts=prompts, format=a.format, depth_scale=a.depth_scale)
     print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings))
     return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
+
+
+def _view(a: argparse.Namespace) -> None:
+    if a.rerun is not None:
+        from p2p_lib.report.rerun_file import write_rerun
+
+        print(f"Written to {write_rerun(a.run, a.rerun)}. Next: rerun {a.rerun}")
+        return
+    from p2p_lib.core.browser import open_page
+    from p2p_lib.report.viewer import write_page
+
+    page = write_page(a.run, a.out)
+    opened = not a.no_browser and open_page(page.resolve().as_uri())
+    print(f"Written to {page}" + ("" if opened else ". Open it in a browser."))
 
 
 def _synth(a: argparse.Namespace) -> None:
@@ -375,6 +390,12 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--format", help="layout (default: recognised)")
     p.add_argument("--depth-scale", type=float, metavar="M", help="metres per raw depth unit (default 0.001)")
     p.add_argument("--json", action="store_true", help="a JSON list instead of lines")
+
+    p = _command(commands, "view", _view, "look at a run in 3D with a time slider, in the browser")
+    p.add_argument("run", type=Path, metavar="DIR", help="folder written by p2p run")
+    p.add_argument("--out", type=Path, metavar="FILE", help="the page (default DIR/view.html); it needs nothing else")
+    p.add_argument("--rerun", type=Path, metavar="FILE", help="instead: a Rerun recording, with video and tracks")
+    p.add_argument("--no-browser", action="store_true", help="write the page, do not open it")
 
     p = _command(commands, "synth", _synth, "render a synthetic sequence in the YCBMultiTrack layout, with exact truth")
     p.add_argument("scenario", nargs="?", metavar="SCENARIO", help="what happens; --list shows all")

@@ -7,8 +7,6 @@ A page of the standard library's web server, on this machine alone, shows the fr
 from __future__ import annotations
 
 import json
-import os
-import webbrowser
 from collections.abc import Callable
 from functools import lru_cache
 from http import HTTPStatus
@@ -20,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from p2p_lib.core.browser import open_page
 from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.data.prompts import Prompt, load_prompts, parse_prompts, save_prompts
 from p2p_lib.data.sequence import Sequence
@@ -118,9 +117,8 @@ def wait_for_clicks(clicker: Clicker, say: Callable[[str], object], open_browser
     """What the page saves: says where the page is, opens it where there is a desktop, waits, closes."""
     with clicker:
         say(f"Click in your browser at {clicker.url} and press Save there; Ctrl-C here gives up.")
-        # Without a desktop a browser in text would take the terminal.
-        if open_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-            webbrowser.open(clicker.url)
+        if open_browser:
+            open_page(clicker.url)
         clicker.wait()
     return clicker.prompts
 

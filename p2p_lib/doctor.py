@@ -25,7 +25,7 @@ OPTIONAL = {
     "transformers": ("transformers", "segmentation and features by neural networks", INSTALL["transformers"]),
     "tapnet": ("tapnet", "2D trackers tapir and tapnextpp", INSTALL["tapnet"]),
     "torchvision": ("torchvision", "2D tracker tapnextpp", INSTALL["torchvision"]),
-    "rerun": ("rerun", "viewer for debugging", PIP + "rerun-sdk"),
+    "rerun": ("rerun", "recordings to look at frame by frame, p2p view --rerun", PIP + "rerun-sdk"),
     "pyrealsense2": ("pyrealsense2", "RealSense cameras and recordings", PIP + "pyrealsense2"),
     "dask": ("dask.distributed", "runs on a cluster", PIP + "'dask[distributed]'"),
 }

@@ -305,6 +305,7 @@ def _kernel_manager(places: Mapping[str, Path], kernels: list[Any]) -> type:
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
         "OPEN3D_DISABLE_WEB_VISUALIZER": "true",
         "PYTHONHASHSEED": "0",
+        "P2P_PROGRESS": "off",  # a bar of the notebook's own is blank in a page
     }
 
     class Manager(AsyncKernelManager):

@@ -28,6 +28,7 @@ from p2p_lib.tracked_object import TrackedObject
 
 #: Object to (H, W) bool; None where nobody knows.
 Masks = dict[str, np.ndarray | None]
+NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
 class Point2Pose:
@@ -52,6 +53,7 @@ class Point2Pose:
         self.segmenter = segmenter
         self.objects: dict[str, TrackedObject] = {}
         self.masks: Masks = {}
+        self.tracks = NOTHING_TRACKED
         self.stopwatch = Stopwatch()
         self._first_masks: dict[str, np.ndarray] = {}
         self._streaming = False
@@ -105,7 +107,7 @@ class Point2Pose:
 
         Where the 2D tracker answers late, so does this: the estimates are of the frame ``latency_frames`` ago,
         as each says, and there are none for the first of the stream until then. ``self.masks`` keeps the masks
-        that they were made with, the segmenter's included.
+        that they were made with, the segmenter's included, and ``self.tracks`` everybody's 2D tracks.
         """
         with self.stopwatch.frame():
             return self._advance(frame, self._given(frame, masks), self._taken_clicks())
@@ -128,6 +130,7 @@ class Point2Pose:
         if len(self._waiting) <= self.tracker.latency_frames:
             return {}
         frame, masks, clicks = self._waiting.popleft()
+        self.tracks = tracks
         self.masks = masks | self._segment(frame, tracks, clicks)
         # An object added since then is not in that frame's masks yet.
         objects = {name: obj for name, obj in self.objects.items() if name in masks}
@@ -171,7 +174,7 @@ class Point2Pose:
             if not self._streaming:
                 self.tracker.start(frame, self.camera)
                 self._streaming = True
-                return Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
+                return NOTHING_TRACKED
             known = [mask for mask in masks.values() if mask is not None]
             search = np.logical_or.reduce(known) if len(known) == len(masks) > 0 else None
             urgent = any(obj.awaited(masks[name]) for name, obj in self.objects.items())

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from p2p_lib.backends.registry import DEFAULT_DETECTOR, make_tracker
 from p2p_lib.backends.segmenters import DEFAULT_SEGMENTER, SEGMENTERS
@@ -17,10 +16,12 @@ from p2p_lib.core import config as configuration
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.data import sequence as sequences
 from p2p_lib.data.export import export
 from p2p_lib.data.imported import as_run, read_poses
+from p2p_lib.data.keypoint_log import KeypointLog
 from p2p_lib.data.models import find_models, given_models
 from p2p_lib.data.prompts import Prompt, load_prompts
 from p2p_lib.data.runs import Run, RunWriter, load_run
@@ -85,6 +86,7 @@ def run(
     stop: int | None = None,
     models: Mapping[str, str | Path] | None = None,
     progress: bool = True,
+    say: Callable[[str], object] = lambda line: None,
 ) -> RunResult:
     """Track the objects of a sequence and write a run folder (see :mod:`p2p_lib.data.runs`).
 
@@ -92,7 +94,8 @@ def run(
     starts from ``prompts`` (a file, or values). The default is the dataset's, or with prompts the
     embedded segmenter. With the dataset's, each object is started by its first mask that is large enough.
 
-    Arguments are those of ``p2p run``; ``sequence`` may also be an open one. Raises :class:`P2PError` with a
+    Arguments are those of ``p2p run``; ``sequence`` may also be an open one. An earlier run in ``out`` is replaced, of
+    which ``say`` is told before anything is tracked. Raises :class:`P2PError` with a
     one-line message for anything that does not fit; Ctrl-C ends the run early and is reported in the result.
     """
     config = make_config(preset, config_file, settings, seed)
@@ -126,14 +129,17 @@ def run(
         frames.stop,
         {name: path for name, path in known.items() if name in chosen},
     )
+    if writer.replaced:
+        say(f"{out} held {writer.replaced}, which this one replaces.")
     writer.info["detector"] = method.detector.name
     writer.info["prompts"] = [{"name": p.name, "frame": p.frame, "points": p.points_px.tolist()} for p in prompts]
-    interrupted = False
-    with writer, tqdm(total=len(frames), unit="frame", disable=not progress, desc=sequence.name) as bar:
+    interrupted, keypoints = False, KeypointLog()
+    with writer, progress_bar(sequence.name, len(frames), shown=progress) as bar:
         try:
             for frame, estimates in _estimates(method, sequence, frames, None if segmenter is None else clicked):
                 if save_masks:
                     writer.add_masks(frame, method.masks)
+                _log_keypoints(keypoints, frame, method)
                 times = method.stopwatch.last_ms
                 writer.add(frame, estimates, times["total"], {k: v for k, v in times.items() if k != "total"})
                 bar.set_postfix_str(_postfix(times["total"], estimates), refresh=False)
@@ -144,6 +150,8 @@ def run(
     if not writer.info["frames"]:
         return RunResult(Path(out), None, "no frame was finished", (f"0 of {len(frames)} frames",), interrupted)
     _save_meshes(method, Path(out))
+    maps = {name: obj.map for name, obj in method.objects.items()}
+    keypoints.save(Path(out), {name: (m.ids, m.p_obj, m.promoted) for name, m in maps.items()})
     done = load_run(out)
     try:
         evaluation, not_scored = evaluate(done), ""
@@ -258,6 +266,14 @@ def _tracker(
 def evaluate_run_masks(out: str | Path, min_visible_px: int = 300) -> MaskEvaluation:
     """Score the masks that a run kept; what ``p2p eval-masks`` prints."""
     return evaluate_masks(load_run(out), min_visible_px=min_visible_px)
+
+
+def _log_keypoints(log: KeypointLog, frame: Frame, method: Point2Pose) -> None:
+    """Keep where each object's points were seen in the frame that has just been estimated."""
+    tracks = method.tracks
+    for name, obj in method.objects.items():
+        seen = tracks.visible & np.isin(tracks.ids, obj.map.ids)
+        log.add(frame.index, name, tracks.ids[seen], tracks.uv_px[seen])
 
 
 def _save_meshes(method: Point2Pose, out: Path) -> None:

@@ -1,8 +1,12 @@
 """Shared fixtures. The suite passes without any data beside the project; tests that want some say so."""
 
 import os
+import shutil
+import subprocess
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -15,3 +19,35 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"test data not present at {folder} (set P2P_SHARED_DATA)")
     return folder
+
+
+class Browser:
+    """A headless Chromium that looks at one page at a time."""
+
+    def __init__(self, program: str, home: Path):
+        # As root, in a container, without a GPU: the same everywhere.
+        self._words = [program, "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars"]
+        self._words += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run"]
+        self._words += [f"--user-data-dir={home}", "--host-resolver-rules=MAP * ~NOTFOUND"]  # nothing from outside
+
+    def dom(self, page: Path, wait_ms: int = 5000) -> str:
+        """What the page has become once its scripts have run."""
+        return self._look("--dump-dom", page, wait_ms).stdout.decode()
+
+    def screenshot(self, page: Path, to: Path, size: tuple[int, int] = (1000, 700), wait_ms: int = 5000) -> np.ndarray:
+        """(H, W, 3) uint8 of its window; also written to ``to``."""
+        self._look(f"--screenshot={to}", page, wait_ms, f"--window-size={size[0]},{size[1]}")
+        return cv2.cvtColor(cv2.imread(str(to)), cv2.COLOR_BGR2RGB)
+
+    def _look(self, how: str, page: Path, wait_ms: int, *more: str) -> subprocess.CompletedProcess:
+        words = [*self._words, f"--virtual-time-budget={wait_ms}", *more, how, page.resolve().as_uri()]
+        return subprocess.run(words, capture_output=True, timeout=180, check=True)
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory) -> Browser:
+    """Skips where there is no Chromium (Debian: apt-get install chromium)."""
+    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if program is None:
+        pytest.skip("no chromium on this machine (Debian: apt-get install chromium)")
+    return Browser(program, tmp_path_factory.mktemp("browser"))

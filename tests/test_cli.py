@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -151,6 +152,16 @@ def test_progress_goes_where_it_does_not_disturb(sequence, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert f"{FRAMES}/{FRAMES}" in err and "Hz" in err and "object tracked" in err
     assert "frame/s" not in out and "\r" not in out
+    assert err.count("\n") == 1 and "\r" not in err, "a terminal's bar would fill a log file"
+
+
+def test_replacing_a_run_is_said(sequence, tmp_path, capsys):
+    assert run(sequence, tmp_path / "out", "--seed", "4") == 0
+    assert "replaces" not in capsys.readouterr().err
+    assert run(sequence, tmp_path / "out", "--stop", "3") == 0
+    err = capsys.readouterr().err
+    assert re.search(rf"out held a run of slide \({FRAMES} frames, tracker \S+, seed 4\), which this one replaces", err)
+    assert len(load_run(tmp_path / "out").objects["object"]) == 3
 
 
 def test_without_truth_there_is_no_score_and_no_fuss(sequence, tmp_path, capsys):

@@ -11,9 +11,8 @@ import os
 import shutil
 from pathlib import Path
 
-from tqdm import tqdm
-
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.progress import progress_bar
 from p2p_lib.data.manifests import RemoteFile
 
 CHUNK = 1 << 16  # what a broken connection loses at most
@@ -104,9 +103,9 @@ class _Resuming:
         if left > shutil.disk_usage(self.part.parent).free:
             raise BadInput(response.url, f"{left} bytes", f"room for them in {self.part.parent}")
         name = self.part.name.removeprefix(".").removesuffix(".part")
-        shown = {"unit": "B", "unit_scale": True, "desc": name, "disable": not self.progress}
+        options = {"unit": "B", "unit_scale": True, "initial": begun, "shown": self.progress}
         with (
-            tqdm(total=begun + left or None, initial=begun, **shown) as bar,
+            progress_bar(name, begun + left or None, **options) as bar,
             self.part.open("ab" if begun else "wb") as sink,
         ):
             for chunk in response.iter_content(CHUNK):

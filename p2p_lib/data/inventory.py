@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
+from p2p_lib.core.progress import progress_bar
 from p2p_lib.data.archives import unpack
 from p2p_lib.data.download import download, sha256
 from p2p_lib.data.manifests import Manifest, RemoteFile, find_sequence, folder_of, manifest, names
@@ -77,7 +76,7 @@ def _fetch_one(of: Manifest, file: RemoteFile, folder: Path, record: dict, progr
     said = "checked" if expected else "its checksum is recorded"
     if file.unpack_to is not None and "unpacked" not in record[file.path]:
         into = folder / file.unpack_to
-        with tqdm(unit="B", unit_scale=True, desc=f"unpacking {file.path}", disable=not progress) as bar:
+        with progress_bar(f"unpacking {file.path}", unit="B", unit_scale=True, shown=progress) as bar:
             written = unpack(folder / file.path, into, bar.update)
         record[file.path]["unpacked"] = written
         _write_record(folder, of, record)

@@ -14,10 +14,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import Frame
 
 WAIT_MS = 200
@@ -51,7 +51,7 @@ def convert_bag(bag: str | Path, out: str | Path, progress: bool = True) -> int:
     if out.is_dir() and any(out.iterdir()):
         raise BadInput(str(out), "a folder that is not empty", "a new one for the pictures")
     times_s: list[float] = []
-    with tqdm(unit="frame", desc=bag.name, disable=not progress) as bar:
+    with progress_bar(bag.name, shown=progress) as bar:
         for colour, depth in _pairs(rs, bag):
             if not times_s:
                 for sub in ("rgb", "depth"):

@@ -7,6 +7,7 @@
     poses/<object>.txt    TUM: time_s tx ty tz qx qy qz qw of T_cam_obj; frames without a pose are left out
     poses.npz             everything of every frame, and the truth where the sequence has it
     meshes/<object>.ply   the reconstructed surface in the object frame, vertex colours (written at the end)
+    keypoints.npz         2D tracks and keypoint maps (:mod:`p2p_lib.data.keypoint_log`; written at the end)
     models.npz            the models' points, so that a run can be scored by itself
     timings.csv           milliseconds of every frame and stage
     masks/<object>/*.png  the masks that were used, 255 on the object (where asked for); named by frame index
@@ -31,6 +32,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame, PoseEstimate, Status
+from p2p_lib.data.keypoint_log import FILE as KEYPOINTS
 from p2p_lib.data.models import load_points
 from p2p_lib.data.provenance import provenance
 from p2p_lib.data.sequence import SYNTHETIC, ObjectTruth, Sequence
@@ -179,8 +181,9 @@ class RunWriter:
     rarely (after 1, 2, 4, ... 64, then every 50 or more frames) and when the run ends: by itself, by an error or by
     Ctrl-C. Whoever catches the interruption inside says so in ``info["stopped_by"]``.
 
-    objects  those that are tracked (default: all of the sequence); others may appear among the estimates later
-    models   object to model file; their points are kept with the run
+    objects   those that are tracked (default: all of the sequence); others may appear among the estimates later
+    models    object to model file; their points are kept with the run
+    replaced  what run was in the folder before, in words; empty where there was none
     """
 
     def __init__(
@@ -204,6 +207,7 @@ class RunWriter:
         self._timings: list[dict[str, str]] = []
         self._flush_at = 1
         points = {name: load_points(path) for name, path in (models or {}).items()}
+        self.replaced = _earlier(self.path)
         _clear(self.path)
         for name in sequence.objects if objects is None else objects:
             self._add_object(name)
@@ -360,12 +364,21 @@ def _inside(path: Path, folder: Path | None) -> str:
     return str(path.relative_to(folder)) if folder is not None and path.is_relative_to(folder) else str(path)
 
 
+def _earlier(out: Path) -> str:
+    """What run a folder holds that is about to go; empty where none does."""
+    try:
+        info = json.loads((out / "run.json").read_text())
+        return f"a run of {info['sequence']} ({info['frames']} frames, tracker {info['tracker']}, seed {info['seed']})"
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+
+
 def _clear(out: Path) -> None:
     """Make the folder, without the results of an earlier run; anything else in it stays."""
     if out.exists() and not out.is_dir():
         raise BadInput(str(out), "a file", "a folder for the results")
     (out / "poses").mkdir(parents=True, exist_ok=True)
-    old = [out / name for name in ("run.json", "config.toml", "poses.npz", "models.npz", "timings.csv")]
+    old = [out / name for name in ("run.json", "config.toml", "poses.npz", "models.npz", "timings.csv", KEYPOINTS)]
     for path in [
         *old,
         *(out / "poses").glob("*.txt"),
