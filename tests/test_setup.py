@@ -21,7 +21,7 @@ PYPROJECT = tomllib.loads((PROJECT / "pyproject.toml").read_text())
 LOCK = (PROJECT / "requirements.lock").read_text()
 REQUIRED = set("jupyterlab numpy torch opencv-python-headless gtsam open3d trimesh matplotlib pandas papermill".split())
 #: Import name to distribution, where they differ; and what comes as a part of another.
-DISTRIBUTIONS = {"cv2": "opencv-python-headless", "skimage": "scikit-image", "PIL": "pillow"}
+DISTRIBUTIONS = {"rerun": "rerun-sdk", "cv2": "opencv-python-headless", "skimage": "scikit-image", "PIL": "pillow"}
 PARTS = {"IPython": "jupyterlab", "jupyter_client": "jupyterlab", "nbconvert": "jupyterlab", "nbformat": "papermill"}
 PARTS["nbclient"] = "papermill"
 
