@@ -115,18 +115,28 @@ class TrackedObject:
         if mask is not None and self._status not in WITH_POSE:
             # Found where the object is not, on its twin perhaps: let them be looked for elsewhere.
             self.tracker.reject(self.map.ids[view.tracks.visible & ~view.seen])
-        with self._stopwatch("registration"):
-            hypotheses = self._hypotheses(view)
-        with self._stopwatch("selection"):
-            hypothesis, reason = registration.select(
-                hypotheses, self._surface_scores(view, hypotheses), self.config.registration
-            )
+        hypothesis, refined, reason = self._choose(view)
         if hypothesis is None:
             nothing = mask is None and not view.seen.any()
             return self._without_pose(view, Status.OCCLUDED if nothing else Status.LOST, reason)
-        with self._stopwatch("refinement"):
-            refined = self._refine(view, hypothesis)
         return self._accept(view, hypothesis, refined)
+
+    def _choose(self, view: View) -> tuple[Hypothesis | None, Refinement | None, str]:
+        """The hypothesis to go on with, refined, and why it was chosen."""
+        cfg = self.config.registration
+        with self._stopwatch("registration"):
+            hypotheses = registration.competing(self._hypotheses(view), cfg)
+        refined: dict[int, Refinement] = {}
+        with self._stopwatch("refinement"):
+            if cfg.refine_all:
+                refined = {id(h): self._refine(view, h) for h in hypotheses}
+        with self._stopwatch("selection"):
+            T_cam_obj = [refined[id(h)].T_cam_obj if cfg.refine_all else h.T_cam_obj for h in hypotheses]
+            chosen, reason = registration.select(hypotheses, self._surface_distances(view, T_cam_obj), cfg)
+        if chosen is None:
+            return None, None, reason
+        with self._stopwatch("refinement"):
+            return chosen, refined.get(id(chosen)) or self._refine(view, chosen), reason
 
     def _observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> View:
         """Lift the visible points of this object that lie in its mask."""
@@ -199,11 +209,11 @@ class TrackedObject:
         needed = max([pipe.recover_min_inliers, *(support[~jumps] + 1)])
         return [h for h, jumped in zip(found, jumps, strict=True) if not jumped or h.support >= needed]
 
-    def _surface_scores(self, view: View, hypotheses: list[Hypothesis]) -> np.ndarray | None:
-        """How far the dense points lie from the surface under each hypothesis; None without a surface."""
-        if len(hypotheses) < 2 or self.surface is None or self.surface.empty or not len(view.cloud):
+    def _surface_distances(self, view: View, T_cam_obj: list[np.ndarray]) -> np.ndarray | None:
+        """How far each dense point lies from the surface under each pose; None where there is nothing to compare."""
+        if len(T_cam_obj) < 2 or self.surface is None or self.surface.empty or not len(view.cloud):
             return None
-        return refinement.surface_score(self.surface, view.cloud, np.stack([h.T_cam_obj for h in hypotheses]))
+        return refinement.surface_distances(self.surface, view.cloud, np.stack(T_cam_obj))
 
     def _refine(self, view: View, hypothesis: Hypothesis) -> Refinement:
         """The pose refined on the surface, jointly with the keypoints where the configuration says so."""

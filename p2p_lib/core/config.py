@@ -202,8 +202,11 @@ class RegistrationConfig(_Checked):
     noise_m: float = _p(0.001, "noise of a measured point at range 0", "m", low=1e-6)
     noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
     inlier_sigmas: float = _p(3.0, "inlier_m grows to this many sigmas of that noise; 0 = one constant", low=0)
-    surface_margin_m: float = _p(2e-4, "surface scores nearer than this are equal; 0 = minimum (paper)", "m", low=0)
-    surface_margin_share: float = _p(0.25, "or than this share of the best supported's", "", "release", low=0, high=1)
+    refine_all: bool = _p(True, "refine every hypothesis on the surface before it judges them; off: the chosen one")
+    surface_sigmas: float = _p(
+        2.5, "standard errors by which the surface must prefer another than the best supported; 0 = least score", low=0
+    )
+    surface_margin_m: float = _p(2e-4, "and metres of mean distance", "m", low=0)
     min_support: int = _p(8, "inliers that let a hypothesis compete on the surface", "points", "release", low=0)
     min_support_share: float = _p(0.25, "or this share of the best supported", "", "release", low=0, high=1)
 
@@ -324,7 +327,8 @@ _PAPER: dict[str, Any] = {
     "refinement.keypoint_weight": 0.0,
     "registration.inlier_sigmas": 0.0,
     "registration.surface_margin_m": 0.0,
-    "registration.surface_margin_share": 0.0,
+    "registration.surface_sigmas": 0.0,
+    "registration.refine_all": False,
     "registration.min_support": 0,
     "factor_graph.bearing_sigma_rad": 0.01,
     "factor_graph.range_sigma_m": 0.01,

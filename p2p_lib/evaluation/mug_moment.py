@@ -24,8 +24,8 @@ from p2p_lib.data.synthetic.noise import Sensor
 from p2p_lib.data.synthetic.render import render
 from p2p_lib.data.synthetic.scene import FPS, Scenario
 from p2p_lib.stages.lifting import lift
-from p2p_lib.stages.refinement import Keypoints, refine, sample_cloud, surface_score
-from p2p_lib.stages.registration import Hypothesis, generate, noise_m, select
+from p2p_lib.stages.refinement import Keypoints, refine, sample_cloud, surface_distances
+from p2p_lib.stages.registration import Hypothesis, competing, generate, noise_m, select
 from p2p_lib.stages.sampling import choose, usable_region
 from p2p_lib.stages.tsdf import TsdfVolume
 
@@ -115,10 +115,11 @@ def mug_moment(
 class Decisions:
     """What each way to decide makes of one moment.
 
-    hypotheses, scores_m  all of them, and their mean absolute TSDF value in metres
+    hypotheses, scores_m  those with enough support, and their mean absolute TSDF value in metres
     refined, refined_scores_m  the poses after SDF refinement of each, and the same score
     chosen, reason        what the configured selection takes, and why
-    poses                 way to decide to T_cam_obj (4, 4); NaN where it finds none
+    poses                 way to decide to T_cam_obj (4, 4), refined only where it says so or by the configuration;
+                          NaN where it finds none
     """
 
     hypotheses: list[Hypothesis]
@@ -133,23 +134,25 @@ class Decisions:
 def decide(moment: Moment, config: Config, seed: int = 0) -> Decisions:
     """Ways to one pose on the same correspondences: one hypothesis, or several and the surface's word.
 
-    Besides the configured selection: the paper's least score, and the least score after each hypothesis was refined.
+    The paper's least score, the least score after each hypothesis was refined, and what the configuration says.
     """
     cfg, rng = config.registration, np.random.default_rng([seed, 8])
-    hypotheses = generate(moment.p_obj, moment.p_cam, cfg, rng)
+    found = generate(moment.p_obj, moment.p_cam, cfg, rng)
+    hypotheses = competing(found, cfg)
     single = generate(moment.p_obj, moment.p_cam, replace(cfg, multi_hypothesis=False), rng)
     T_raw = np.stack([h.T_cam_obj for h in hypotheses])
     T_refined = np.stack([_refined(moment, h, config) for h in hypotheses])
-    raw_m, refined_m = (surface_score(moment.surface, moment.cloud, T) for T in (T_raw, T_refined))
-    chosen, reason = select(hypotheses, raw_m, cfg)
+    raw_m, refined_m = (surface_distances(moment.surface, moment.cloud, T) for T in (T_raw, T_refined))
+    chosen, reason = select(hypotheses, refined_m if cfg.refine_all else raw_m, cfg)
+    at = next(i for i, h in enumerate(hypotheses) if h is chosen)
     poses = {
         "SVD, outliers out, SVD": single[0].T_cam_obj if single else np.full((4, 4), np.nan),
         "RANSAC: most inliers": select(hypotheses, None, cfg)[0].T_cam_obj,
-        "configured selection": chosen.T_cam_obj,
-        "least score": T_raw[np.argmin(raw_m)],
-        "refine all, least score": T_refined[np.argmin(refined_m)],
+        "least score": T_raw[np.argmin(raw_m.mean(1))],
+        "refine all, least score": T_refined[np.argmin(refined_m.mean(1))],
+        "configured selection": T_refined[at],
     }
-    return Decisions(hypotheses, raw_m, T_refined, refined_m, chosen, reason, poses)
+    return Decisions(hypotheses, raw_m.mean(1), T_refined, refined_m.mean(1), chosen, reason, poses)
 
 
 def _refined(moment: Moment, hypothesis: Hypothesis, config: Config) -> np.ndarray:

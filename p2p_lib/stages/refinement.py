@@ -344,19 +344,22 @@ def surface_jacobian(q: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x, -a, -b, -c], -1)
 
 
-def surface_score(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
-    """(H,) mean absolute TSDF value in metres of the points p_cam (N, 3) under poses (H, 4, 4).
+def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
+    """(H, N) absolute TSDF value in metres of the points p_cam (N, 3) under poses (H, 4, 4).
 
-    The paper's measure for choosing a hypothesis. A point that falls where nothing was observed counts
-    ``unseen`` times the truncation distance, so that no pose wins by turning away from the surface.
-    Infinite without any finite point.
+    Its mean over the points is the paper's measure for choosing a hypothesis. A point that falls where nothing was
+    observed counts ``unseen`` times the truncation distance, so that no pose wins by turning away from the surface.
+    Points that are not finite are left out.
     """
     T_cam_obj = np.asarray(T_cam_obj, float).reshape(-1, 4, 4)
-    p_cam = _usable(p_cam, len(p_cam))
-    if len(p_cam) == 0:
-        return np.full(len(T_cam_obj), np.inf)
-    value, valid = volume.query(se3.transform(se3.inverse(T_cam_obj), p_cam))
-    return np.where(valid, np.abs(value), unseen * volume.tau_m).mean(-1)
+    value, valid = volume.query(se3.transform(se3.inverse(T_cam_obj), _usable(p_cam, len(p_cam))))
+    return np.where(valid, np.abs(value), unseen * volume.tau_m)
+
+
+def surface_score(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
+    """(H,) mean of :func:`surface_distances`; infinite without any finite point."""
+    distance_m = surface_distances(volume, p_cam, T_cam_obj, unseen)
+    return distance_m.mean(1) if distance_m.size else np.full(len(distance_m), np.inf)
 
 
 def sample_cloud(

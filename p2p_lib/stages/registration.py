@@ -100,15 +100,21 @@ def noise_m(p_cam: np.ndarray, config: RegistrationConfig) -> np.ndarray:
     return config.noise_m + config.noise_per_m2 * np.asarray(p_cam, float)[:, 2] ** 2
 
 
+def competing(hypotheses: Sequence[Hypothesis], config: RegistrationConfig) -> list[Hypothesis]:
+    """Those with enough support to be judged by the surface, in the same order."""
+    most = max((h.support for h in hypotheses), default=0)
+    return [h for h in hypotheses if h.support >= min(config.min_support, config.min_support_share * most)]
+
+
 def select(
-    hypotheses: Sequence[Hypothesis], surface_scores_m: np.ndarray | None, config: RegistrationConfig
+    hypotheses: Sequence[Hypothesis], distance_m: np.ndarray | None, config: RegistrationConfig
 ) -> tuple[Hypothesis | None, str]:
     """The hypothesis to go on with, and why.
 
-    surface_scores_m (H,): mean absolute TSDF value of the masked depth points under each pose, in
-    metres; None while there is no surface. The paper takes the minimum. Ours (a surface margin above
-    0): the best supported hypothesis stands unless another, itself supported, lies nearer to the
-    surface by more than the margin; below it the surface cannot tell them apart.
+    distance_m (H, N): how far each of the masked depth points lies from the surface under each pose (absolute
+    TSDF value in metres); None while there is no surface. The paper takes the least mean. Ours
+    (``surface_sigmas`` above 0): the best supported hypothesis stands unless another is nearer by more than chance
+    and ``surface_margin_m``; below that the surface cannot tell them apart.
     """
     if not hypotheses:
         return None, "no hypothesis: too few correspondences agree"
@@ -117,13 +123,14 @@ def select(
     champion = int(np.lexsort((spread, -support))[0])
     if len(hypotheses) == 1:
         return hypotheses[0], "the only hypothesis"
-    if surface_scores_m is None or not np.isfinite(surface_scores_m).any():
+    if distance_m is None or not np.isfinite(distance_m).all(1).any() or not np.size(distance_m):
         return hypotheses[champion], "most inliers, there is no surface yet"
-    scores = np.where(np.isfinite(surface_scores_m), surface_scores_m, np.inf)
-    supported = support >= min(config.min_support, config.min_support_share * support.max())
-    best = int(np.argmin(np.where(supported, scores, np.inf)))
-    clearly = min(scores[champion] - config.surface_margin_m, scores[champion] * (1 - config.surface_margin_share))
-    if scores[best] < clearly or config.surface_margin_m == config.surface_margin_share == 0:
+    scores = np.where(np.isfinite(distance_m).all(1), distance_m.mean(1), np.inf)
+    best = int(np.argmin(scores))
+    # The same points under both poses: what counts is the difference that each of them sees.
+    nearer = distance_m[champion] - distance_m[best]
+    chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
+    if scores[champion] - scores[best] > max(chance, config.surface_margin_m) or config.surface_sigmas == 0:
         return hypotheses[best], f"nearest to the surface ({1e3 * scores[best]:.2f} mm)"
     return hypotheses[champion], "most inliers, the surface does not tell the hypotheses apart"
 

@@ -72,7 +72,8 @@ PAPER_TEXT = {
     "registration.multi_hypothesis": True,
     "registration.motion_priors": False,
     "registration.surface_margin_m": 0.0,
-    "registration.surface_margin_share": 0.0,
+    "registration.surface_sigmas": 0.0,
+    "registration.refine_all": False,
     "registration.min_support": 0,  # the hypothesis of the smallest score, whatever its support
     "refinement.enabled": True,
     "refinement.keypoint_weight": 0.0,

@@ -30,4 +30,5 @@ def test_one_hypothesis_fails_and_the_surface_finds_the_right_one(moment):
     decided = decide(moment, CONFIG, 1)
     assert moment.error(decided.poses["RANSAC: most inliers"])[0] > 15
     assert moment.error(decided.poses["refine all, least score"])[0] < 3
+    assert moment.error(decided.poses["configured selection"])[0] < 3 and "nearest to the surface" in decided.reason
     assert (decided.refined_scores_m <= decided.scores_m + 2e-4).all()

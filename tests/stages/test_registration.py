@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.stages import registration
-from p2p_lib.stages.registration import Hypothesis, fit_rigid, generate, select
+from p2p_lib.stages.registration import Hypothesis, competing, fit_rigid, generate, select
 
 DEFAULT, PAPER = preset("default").registration, preset("paper").registration
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=["default", "paper"])
@@ -254,12 +254,12 @@ class Mug:
         seen = rng.choice(np.flatnonzero(toward_camera), 1500, replace=False)
         self.depth_points = se3.transform(self.truth, self.surface[seen]) + 0.001 * rng.normal(size=(1500, 3))
 
-    def surface_scores_m(self, hypotheses: list[Hypothesis], truncation_m: float = 0.025) -> np.ndarray:
-        """Mean distance to the exact surface, cut at a TSDF's truncation."""
+    def distances_m(self, hypotheses: list[Hypothesis], truncation_m: float = 0.025) -> np.ndarray:
+        """Of the depth points to the exact surface, cut at a TSDF's truncation."""
         tree = cKDTree(self.surface)
         poses = [se3.inverse(h.T_cam_obj) for h in hypotheses]
         distance = [np.minimum(tree.query(se3.transform(T, self.depth_points))[0], truncation_m) for T in poses]
-        return np.mean(distance, axis=1)
+        return np.stack(distance)
 
 
 @BOTH
@@ -273,7 +273,7 @@ def test_mug_ours_is_right_and_a_single_hypothesis_fails(config) -> None:
     for seed in range(40):
         mug = Mug(seed)
         hypotheses = generate(mug.p_obj, mug.p_cam, config, np.random.default_rng(seed))
-        chosen, reason = select(hypotheses, mug.surface_scores_m(hypotheses), config)
+        chosen, reason = select(hypotheses, mug.distances_m(hypotheses), config)
         assert "surface" in reason and chosen.inliers[80:].sum() >= 12 and not chosen.inliers[:80].any()
         ours.append(error_deg_m(chosen.T_cam_obj, mug.truth)[0])
         cov = registration.covariance(chosen, mug.p_obj, mug.p_cam, 0.001)
@@ -299,20 +299,35 @@ def made(support: int, n: int = 100) -> Hypothesis:
 
 def test_paper_takes_the_minimum_score() -> None:
     hypotheses = [made(80), made(6), made(12)]
-    chosen, reason = select(hypotheses, np.array([0.0020, 0.00199, np.nan]), PAPER)
+    assert competing(hypotheses, PAPER) == hypotheses
+    chosen, reason = select(hypotheses, np.array([0.0020, 0.00199, np.nan])[:, None], PAPER)
     assert chosen.origin == "6" and "surface" in reason
 
 
-@pytest.mark.parametrize(
-    ("score", "margin_m", "share"), [(0.0005, 2e-4, 0.25), (0.003, 2e-4, 0.25), (0.002, 3e-4, 0.0)]
-)
-def test_ours_needs_a_margin_and_support(score: float, margin_m: float, share: float) -> None:
-    config = replace(DEFAULT, surface_margin_m=margin_m, surface_margin_share=share)
-    hypotheses, margin = [made(80), made(6), made(12)], max(margin_m, share * score)
-    chosen, reason = select(hypotheses, np.array([score, 0.0001, score - 0.9 * margin]), config)
-    assert chosen.origin == "80" and "most inliers" in reason
-    chosen, reason = select(hypotheses, np.array([score, 0.0001, score - 1.1 * margin]), config)
-    assert chosen.origin == "12" and "surface" in reason
+def test_only_the_supported_compete() -> None:
+    """With 8 inliers, or a quarter of the best supported's."""
+    assert [h.support for h in competing([made(n) for n in (80, 7, 12, 8)], DEFAULT)] == [80, 12, 8]
+    assert [h.support for h in competing([made(n) for n in (20, 5, 4)], DEFAULT)] == [20, 5]
+    assert competing([], DEFAULT) == []
+
+
+def test_ours_goes_by_the_surface_only_beyond_chance() -> None:
+    """Points whose preference is even but for a shift of the mean: the shift counts in its standard errors."""
+    hypotheses, rng = [made(80), made(12)], np.random.default_rng(0)
+    noise = rng.normal(0, 1e-3, 400)
+    noise = (noise - noise.mean()) / noise.std() * 1e-3
+    for sigmas, gap, wins in ((2.0, 2.5, True), (2.0, 1.5, False), (4.0, 2.5, False)):
+        config = replace(DEFAULT, surface_sigmas=sigmas, surface_margin_m=0.0)
+        nearer = noise + gap * 1e-3 / np.sqrt(400)
+        chosen, reason = select(hypotheses, np.stack([0.01 + nearer, np.full(400, 0.01)]), config)
+        assert chosen.origin == ("12" if wins else "80") and ("nearest" in reason) == wins
+
+
+@pytest.mark.parametrize(("gap_m", "wins"), [(0.9e-4, False), (1.1e-4, True)])
+def test_ours_needs_a_margin_in_metres_too(gap_m: float, wins: bool) -> None:
+    config = replace(DEFAULT, surface_margin_m=1e-4)
+    distance_m = np.tile([[0.002], [0.002 - gap_m]], 50)  # certain, but is it enough?
+    assert select([made(80), made(12)], distance_m, config)[0].origin == ("12" if wins else "80")
 
 
 def test_nothing_to_select_from() -> None:
@@ -321,10 +336,10 @@ def test_nothing_to_select_from() -> None:
 
 
 def test_unusable_scores_fall_back_on_inliers() -> None:
-    assert select([made(10), made(20)], np.array([np.nan, np.nan]), DEFAULT)[0].origin == "20"
-    assert select([made(10), made(20)], np.array([np.nan, 0.002]), PAPER)[0].origin == "20"
+    assert select([made(10), made(20)], np.full((2, 3), np.nan), DEFAULT)[0].origin == "20"
+    assert select([made(10), made(20)], np.array([[np.nan], [0.002]]), PAPER)[0].origin == "20"
     for config in (DEFAULT, PAPER):
-        assert select([made(10), made(20)], np.array([0.002, np.nan]), config)[0].origin == "10"
+        assert select([made(10), made(20)], np.array([[0.002], [np.nan]]), config)[0].origin == "10"
 
 
 # --- bad input ---------------------------------------------------------------------------------
