@@ -6,7 +6,7 @@ share becomes a pose: lift, register, select, refine, judge, and extend the map.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from p2p_lib.stages.refinement import Keypoints, Refinement
 from p2p_lib.stages.registration import Hypothesis
 from p2p_lib.stages.sampling import Detector, choose, usable_region
 from p2p_lib.stages.tracking import PointTracker
+
+#: A tentative pose finds points, which make a better one, which finds more.
+_SEEKING_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,7 @@ class TrackedObject:
         self._status = Status.INITIALISING
         self._since_keyframe = 0
         self._recovering = 0  # frames that are still marked recovered
+        self._start_px: int | None = None  # pixels of the mask in the frame before the first pose
         self._carried = 0  # frames in a row that the surface alone carried
 
     def awaited(self, mask: np.ndarray | None) -> bool:
@@ -115,17 +119,64 @@ class TrackedObject:
         if mask is not None and self._status not in WITH_POSE:
             # Found where the object is not, on its twin perhaps: let them be looked for elsewhere.
             self.tracker.reject(self.map.ids[view.tracks.visible & ~view.seen])
-        hypothesis, refined, reason = self._choose(view)
+        hypotheses, view = self._sought(view)
+        hypothesis, refined, reason = self._choose(view, hypotheses)
         if hypothesis is None:
             nothing = mask is None and not view.seen.any()
             return self._without_pose(view, Status.OCCLUDED if nothing else Status.LOST, reason)
         return self._accept(view, hypothesis, refined)
 
-    def _choose(self, view: View) -> tuple[Hypothesis | None, Refinement | None, str]:
+    def _sought(self, view: View) -> tuple[list[Hypothesis], View]:
+        """The hypotheses of a view; and the view itself, joined by keypoints that a tentative pose helped to find.
+
+        A few points that agree say where all the others should show, which the tracker checks by their looks:
+        that is how an object is back in the frame of its return.
+        """
+        with self._stopwatch("registration"):
+            hypotheses = self._hypotheses(view)
+        for _ in range(_SEEKING_ROUNDS):
+            tentative = self._tentative(view, hypotheses)
+            if tentative is None:
+                break
+            with self._stopwatch("tracking"):
+                told = self.tracker.suggest(self.map.ids, self._expected_px(view, tentative.T_cam_obj))
+            if told is None:
+                break
+            tracks, seen = told.select(self.map.ids), view.seen.sum()
+            view = replace(view, tracks=tracks, p_cam=self._lifted(view.frame, view.mask, tracks))
+            with self._stopwatch("registration"):
+                hypotheses = self._hypotheses(view)
+            if view.seen.sum() <= seen:
+                break
+        return hypotheses, view
+
+    def _tentative(self, view: View, hypotheses: list[Hypothesis]) -> Hypothesis | None:
+        """The pose by which to look for more keypoints; None where there are enough, or none to go by."""
+        pipe, returning = self.config.pipeline, self._status not in WITH_POSE
+        enough = not returning and (view.seen & self.map.promoted).sum() >= pipe.seek_below
+        if enough or not pipe.seek_inliers or view.mask is None or self.tracker.latency_frames:
+            return None
+        if returning and not hypotheses:
+            fewer = replace(self.config.registration, min_inliers=pipe.seek_inliers)
+            hypotheses = registration.generate(self.map.p_obj, view.p_cam, fewer, self._rng)
+        return max(hypotheses, key=lambda h: h.support, default=None)
+
+    def _expected_px(self, view: View, T_cam_obj: np.ndarray) -> np.ndarray:
+        """(N, 2) where a pose shows the keypoints; NaN for those that something hides, the object itself included."""
+        p_cam = se3.transform(T_cam_obj, self.map.p_obj)
+        uv_px = self.camera.project(p_cam)
+        at = np.flatnonzero(self.map.promoted & (p_cam[:, 2] > 0) & self.camera.inside(uv_px))
+        u, v = np.rint(uv_px[at]).astype(int).T
+        off_m = np.abs(view.frame.depth_m[v, u] - p_cam[at, 2])
+        at = at[view.mask[v, u] & (off_m < self.config.pipeline.seek_depth_m)]
+        expected = np.full_like(uv_px, np.nan)
+        expected[at] = uv_px[at]
+        return expected
+
+    def _choose(self, view: View, hypotheses: list[Hypothesis]) -> tuple[Hypothesis | None, Refinement | None, str]:
         """The hypothesis to go on with, refined, and why it was chosen."""
         cfg = self.config.registration
-        with self._stopwatch("registration"):
-            hypotheses = registration.competing(self._hypotheses(view), cfg)
+        hypotheses = registration.competing(hypotheses, cfg)
         refined: dict[int, Refinement] = {}
         with self._stopwatch("refinement"):
             if cfg.refine_all:
@@ -139,18 +190,22 @@ class TrackedObject:
             return chosen, refined.get(id(chosen)) or self._refine(view, chosen), reason
 
     def _observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> View:
-        """Lift the visible points of this object that lie in its mask."""
+        """One frame's share of this object."""
+        cloud = np.zeros((0, 3))
+        if mask is not None and self.surface is not None:
+            with self._stopwatch("refinement"):
+                cloud = refinement.sample_cloud(frame.depth_m, mask, self.camera, self.config.refinement.max_points)
+        return View(frame, mask, tracks, self._lifted(frame, mask, tracks), cloud)
+
+    def _lifted(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> np.ndarray:
+        """(N, 3) of the visible points that lie in the mask; NaN for the others."""
         p_cam = np.full((len(tracks), 3), np.nan)
         rows = np.flatnonzero(tracks.visible)
         if mask is not None and len(rows):
             px = np.clip(np.rint(tracks.uv_px[rows]).astype(int), 0, np.array(mask.shape[::-1]) - 1)
             rows = rows[mask[px[:, 1], px[:, 0]]]
         p_cam[rows] = self._lift(frame, tracks.uv_px[rows])
-        cloud = np.zeros((0, 3))
-        if mask is not None and self.surface is not None:
-            with self._stopwatch("refinement"):
-                cloud = refinement.sample_cloud(frame.depth_m, mask, self.camera, self.config.refinement.max_points)
-        return View(frame, mask, tracks, p_cam, cloud)
+        return p_cam
 
     def _lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
         pipe = self.config.pipeline
@@ -159,8 +214,11 @@ class TrackedObject:
     def _start(self, view: View) -> PoseEstimate:
         """The first frame: fix the object frame and found the map on the first points."""
         pipe = self.config.pipeline
+        coming = self._coming_into_view(view.mask)
         if view.mask is None or view.mask.sum() < pipe.min_mask_px:
             return self._without_pose(view, Status.INITIALISING, "not seen yet")
+        if coming:
+            return self._without_pose(view, Status.INITIALISING, "still coming into view")
         v, u = np.nonzero(self._measured(view))
         if len(v) < pipe.min_mask_px:
             return self._without_pose(view, Status.INITIALISING, f"only {len(v)} mask pixels with depth")
@@ -177,6 +235,12 @@ class TrackedObject:
         status, reason = (Status.DEGRADED, f"only {len(self.map)} points") if few else (Status.TRACKED, "")
         # The first pose defines the object frame: it is right by definition, whatever the points are worth.
         return self._with_pose(view, T_cam_obj, status, len(self.map), 1.0, self._map_covariance, reason, keyframe=True)
+
+    def _coming_into_view(self, mask: np.ndarray | None) -> bool:
+        """Whether the mask still grows: points on the first sliver of an object would all be at its rim."""
+        before, self._start_px = self._start_px, None if mask is None else int(mask.sum())
+        growth = self.config.pipeline.start_growth
+        return bool(growth) and before is not None and self._start_px is not None and self._start_px > growth * before
 
     def _hypotheses(self, view: View) -> list[Hypothesis]:
         """Candidate poses from the keypoints seen; rows as in the map."""

@@ -102,7 +102,7 @@ class RolloutTracker:
     def reject(self, ids: np.ndarray) -> None:
         """Ignored."""
 
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Ignored."""
 
     def _open(self) -> None:

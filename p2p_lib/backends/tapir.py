@@ -144,7 +144,7 @@ class TapirTracker:
     def reject(self, ids: np.ndarray) -> None:
         """Ignored: every frame is searched anew."""
 
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Ignored: every frame is searched anew."""
 
     def _look(self, frame: Frame) -> None:

@@ -65,6 +65,14 @@ class PipelineConfig(_Checked):
     depth_min_m: float = _p(0.1, "nearer depth is invalid", "m", "release", low=0)
     depth_max_m: float = _p(2.5, "farther depth is invalid", "m", low=0.1)
     recovered_frames: int = _p(5, "frames after a return that are marked recovered", "frames", low=0)
+    start_growth: float = _p(
+        1.1, "an object whose mask grows by more than this factor a frame is not started yet; 0 = at once", low=0
+    )
+    seek_inliers: int = _p(
+        3, "agreeing points of a tentative pose by which hidden keypoints are looked for; 0 = never", "points", low=0
+    )
+    seek_below: int = _p(25, "fewer seen keypoints are joined by those that a tentative pose shows", "points", low=0)
+    seek_depth_m: float = _p(0.015, "a keypoint farther from the depth measured there is hidden", "m", low=1e-4)
     recover_min_inliers: int = _p(8, "agreeing points that a return after hiding or loss needs", "points", low=3)
     max_jump_m: float = _p(0.08, "a larger move between frames needs as many points as a return", "m", "release", low=0)
     max_jump_deg: float = _p(25.0, "a larger turn between frames does too", "deg", "release", low=0)
@@ -316,6 +324,8 @@ _PAPER: dict[str, Any] = {
     "pipeline.object_frame": "camera",
     "sampling.max_visible": 50,  # the release's
     "keypoint_map.cooldown": 0,
+    "pipeline.start_growth": 0.0,
+    "pipeline.seek_inliers": 0,
     "registration.iterations": 100,
     "registration.sample_size": 4,
     "registration.motion_priors": False,

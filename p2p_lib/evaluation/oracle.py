@@ -75,7 +75,7 @@ class OracleTracker:
     def reject(self, ids: np.ndarray) -> None:
         """Ignored: it knows better."""
 
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Ignored: it knows better."""
 
     def _rng(self, kind: int) -> np.random.Generator:

@@ -119,7 +119,7 @@ class EmbeddedTracker:
         # Where it was is wrong: not the place to look first.
         p.hidden_for[gone] = self.config.linger_frames + 1
 
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks:
         """Look for bodies that are lost where the caller expects their points in the newest frame.
 
         ids, uv_px  (N,), (N, 2): all points of one rigid body, the visible ones too: they say how it is turned.
@@ -129,6 +129,7 @@ class EmbeddedTracker:
         ok = (at >= 0) & np.isfinite(uv_px).all(1)
         at, uv = at[ok], uv_px[ok]
         z = self._depth_at(uv)
+        lost = [body for body in self._bodies if not body.posed]
         for b, body in enumerate(self._bodies):
             own = np.flatnonzero((p.body[at] == b) & (z > 0))
             if body.posed or len(own) < cfg.support:
@@ -136,6 +137,11 @@ class EmbeddedTracker:
             p_cam = self._camera.unproject(uv[own], z[own])
             self._propose(body, p.p_body[at[own]], p_cam, np.arange(len(own)))
         self._look(None)
+        if any(body.posed for body in lost):
+            self._judge(None)
+            self._check_depth(self._depth_m)
+            p.hidden_for[p.visible] = 0
+        return self._told()
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame."""
@@ -155,10 +161,14 @@ class EmbeddedTracker:
         if self._frames % cfg.renew_every == 0:
             self._renew()
             self._survey()
-        uv = p.uv.astype(float)
+        return self._told()
+
+    def _told(self) -> Tracks:
+        """The points as the caller gets them."""
+        p = self._points
         # A bounded, monotonous reading of the standard deviation: 1/2 at uncertain_px.
-        uncertainty = np.where(p.visible, p.sigma_px / (p.sigma_px + cfg.uncertain_px), 1.0)
-        return Tracks(p.ids.copy(), uv, p.visible.copy(), uncertainty.astype(float))
+        uncertainty = np.where(p.visible, p.sigma_px / (p.sigma_px + self.config.uncertain_px), 1.0)
+        return Tracks(p.ids.copy(), p.uv.astype(float), p.visible.copy(), uncertainty.astype(float))
 
     def _see(self, frame: Frame) -> None:
         self._gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)

@@ -81,5 +81,5 @@ class LkTracker:
         """Take these tracks for invisible."""
         self._visible &= ~np.isin(self._ids, ids)
 
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Ignored: nothing brings an invisible point back."""

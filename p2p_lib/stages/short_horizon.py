@@ -51,12 +51,10 @@ class ShortHorizon:
         """Follow the points that are not forgotten; rows of all, sorted by id."""
         live = np.flatnonzero(~self._gone)
         told = self._tracker.track(frame, search, urgent).select(self._ids[live])
-        n = len(self._ids)
-        uv, visible, uncertainty = np.full((n, 2), np.nan), np.zeros(n, bool), np.ones(n)
-        uv[live], visible[live], uncertainty[live] = told.uv_px, told.visible, told.uncertainty
+        result = self._with_forgotten(told, live)
         self._hidden_for[live] = np.where(told.visible, 0, self._hidden_for[live] + 1)
         self._tracker.drop(self._ids[live][self._gone[live]])
-        return Tracks(self._ids.copy(), uv, visible, uncertainty)
+        return result
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
@@ -68,10 +66,23 @@ class ShortHorizon:
         """Handed on."""
         self._tracker.reject(self._known(ids))
 
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Handed on, for the points that are not forgotten."""
         known = np.isin(ids, self._known(ids))
-        self._tracker.suggest(ids[known], uv_px[known])
+        told = self._tracker.suggest(ids[known], uv_px[known])
+        if told is None:
+            return None
+        live = np.flatnonzero(~self._gone)
+        told = told.select(self._ids[live])
+        self._hidden_for[live[told.visible]] = 0
+        return self._with_forgotten(told, live)
+
+    def _with_forgotten(self, told: Tracks, live: np.ndarray) -> Tracks:
+        """The tracks of the ``live`` rows among those of all."""
+        n = len(self._ids)
+        uv, visible, uncertainty = np.full((n, 2), np.nan), np.zeros(n, bool), np.ones(n)
+        uv[live], visible[live], uncertainty[live] = told.uv_px, told.visible, told.uncertainty
+        return Tracks(self._ids.copy(), uv, visible, uncertainty)
 
     def _known(self, ids: np.ndarray) -> np.ndarray:
         return np.asarray(ids)[np.isin(ids, self._ids[~self._gone])]

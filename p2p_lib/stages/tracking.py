@@ -48,11 +48,11 @@ class PointTracker(Protocol):
         A tracker may use it, e.g. to look for the points anew; ignoring it is allowed.
         """
 
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> None:
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """The caller expects points ids (N,) of one rigid body at uv_px (N, 2) in the newest frame.
 
-        NaN where it expects none. A tracker may look there for those that it holds for invisible; what it
-        finds shows from the next frame on. Ignoring it is allowed.
+        NaN where it expects none. A tracker may look there for those that it holds for invisible. Returns the newest
+        frame's tracks with what it found, or None where it has nothing to add: ignoring it is allowed.
         """
 
 

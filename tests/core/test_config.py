@@ -61,6 +61,8 @@ def test_presets_choose_parameters_never_backends(key, name):
 #: What the paper's text says (main text and appendix).
 PAPER_TEXT = {
     "pipeline.object_frame": "camera",
+    "pipeline.start_growth": 0.0,
+    "pipeline.seek_inliers": 0,
     "keypoint_map.keyframe_angle_deg": 10.0,
     "keypoint_map.keyframe_min_points": 25,
     "keypoint_map.cooldown": 0,
