@@ -16,6 +16,7 @@ from p2p_lib.data.synthetic import shapes
 from p2p_lib.data.synthetic.noise import Sensor, measured_colour, measured_depth
 from p2p_lib.data.synthetic.render import render
 from p2p_lib.pipeline import Point2Pose
+from p2p_lib.stages.embedded_tracker import EmbeddedTracker
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -213,6 +214,43 @@ def test_no_keyframe_while_hidden_or_just_back(hidden_run):
             assert not (e.keyframe and (k in HIDDEN or e.status == Status.RECOVERED))
 
 
+class Shy(EmbeddedTracker):
+    """After the hiding it finds but ``left`` points by itself; the others when it is told where to look."""
+
+    def __init__(self, left: int):
+        super().__init__(preset().tracking)
+        self.left, self.told = left, []
+
+    def track(self, frame, search=None, urgent=False):
+        tracks = super().track(frame, search, urgent)
+        if frame.index < HIDDEN.stop:
+            return tracks
+        self.reject(tracks.ids[tracks.visible][self.left :])
+        return super().suggest(tracks.ids[:0], np.zeros((0, 2)))
+
+    def suggest(self, ids, uv_px):
+        tracks = super().suggest(ids, uv_px)
+        self.told.append((np.isfinite(uv_px[:, 0]).sum(), tracks.visible.sum()))
+        return tracks
+
+
+@pytest.mark.parametrize(("seeking", "left"), [(3, 4), (3, 2), (0, 4)])
+def test_a_few_points_tell_where_the_others_are(seeking, left):
+    """A rigid triple gives a pose, the pose places, and the tracker points there: back at once, with many."""
+    tracker, frames = Shy(left), [(f, {"left": m["left"]}) for f, m in film(board=True)]
+    method = Point2Pose(CAMERA, quick(**{"pipeline.seek_inliers": seeking}), tracker)
+    method.add_object("left")
+    estimates = [method.step(f, m) for f, m in frames[: HIDDEN.stop + 1]]
+    back = estimates[-1]["left"]
+    assert (back.status == Status.RECOVERED) == (seeking > 0 and left >= 3)
+    if back.status == Status.RECOVERED:
+        assert back.inliers >= 15
+        angle_deg, shift_mm = errors(estimates, "left")
+        assert angle_deg[-1] < 3 and shift_mm[-1] < 5
+    else:
+        assert back.T_cam_obj is None and back.inliers < 8
+
+
 def test_one_hides_the_other_goes_on():
     frames = [(f, {"right": m["right"]} if k in HIDDEN else m) for k, (f, m) in enumerate(film())]
     estimates = track(frames)
@@ -247,11 +285,18 @@ def test_a_late_object_starts_when_it_is_added():
     assert len(errors(estimates, "right")[0]) == LENGTH - 12
 
 
-def test_an_object_waits_for_its_first_mask():
-    frames = [(f, {"left": m["left"]} if k < 8 else m) for k, (f, m) in enumerate(film()[:16])]
+def test_an_object_waits_until_its_mask_has_come_and_stopped_growing():
+    """Frames 8 and 9 show a part of it only; only in 11 is it known that no more is to come."""
+    frames = [(f, {"left": m["left"]} if k < 8 else dict(m)) for k, (f, m) in enumerate(film()[:16])]
+    for k, share in ((8, 0.2), (9, 0.6)):
+        columns = np.flatnonzero(frames[k][1]["right"].any(0))
+        frames[k][1]["right"] = frames[k][1]["right"] & (np.arange(CAMERA.width) < np.quantile(columns, share))
     estimates = track(frames)
-    assert statuses(estimates, "right") == ["initialising"] * 8 + ["tracked"] * 8
+    assert statuses(estimates, "right") == ["initialising"] * 11 + ["tracked"] * 5
+    assert "coming into view" in estimates[9]["right"].reason
     assert_honest(estimates)
+    at_once = track(frames, config=quick().with_values({"pipeline.start_growth": 0.0}))
+    assert statuses(at_once, "right").index("tracked") < 11
 
 
 def test_the_first_mask_serves_the_next_frame_only():
