@@ -1,7 +1,7 @@
 """How a point looks: patches that are found again to a fraction of a pixel under an affine change of view.
 
 A patch is aligned by the inverse compositional algorithm (Baker and Matthews, "Lucas-Kanade 20 years
-on", IJCV 2004) with a window weight and invariance to gain and offset; all points in one batch. What
+on", IJCV 2004) with a window weight and invariance to gain, offset and slope of the light; all points in one batch. What
 does not change from frame to frame, the pseudo-inverse of its steepest descent images, is computed
 once when the patch is taken.
 """
@@ -20,6 +20,9 @@ _Y, _X = (a.ravel().astype(np.float32) for a in np.mgrid[-RADIUS : RADIUS + 1, -
 _GRID = np.stack([_X, _Y])  # (2, P)
 _WEIGHT = np.exp(-0.5 * (_X**2 + _Y**2) / WINDOW_PX**2).astype(np.float32)
 _ROOT = np.sqrt(_WEIGHT / _WEIGHT.sum())
+# A round body's shading stays where it is in the picture while its print moves on.
+_RAMPS = np.stack([_X, _Y]) * _ROOT
+_RAMPS /= np.linalg.norm(_RAMPS, axis=1, keepdims=True)
 #: Independent samples that a patch is worth: neighbouring pixels share their noise.
 _SAMPLES = 10.0
 #: Damping of an affine and of a translational step, in units of the normalised patch.
@@ -69,8 +72,9 @@ def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:
     gy = 0.5 * (raw[:, 2:, 1:-1] - raw[:, :-2, 1:-1]).reshape(n, _SIDE**2)
     pixels, mean, norm = _normalised(raw[:, 1:-1, 1:-1].reshape(n, _SIDE**2))
     J = np.stack([gx, gy, gx * _X, gx * _Y, gy * _X, gy * _Y], 1) * (_ROOT / norm[:, None, None])
-    # What a change of offset or gain explains is not evidence of motion.
+    # What a change of offset, slope or gain explains is not evidence of motion.
     J -= (J @ _ROOT)[..., None] * _ROOT
+    J -= (J @ _RAMPS.T) @ _RAMPS
     J -= (J @ pixels[..., None]) * pixels[:, None]
     H = J @ J.transpose(0, 2, 1)
     inverse = np.linalg.inv(H + _DAMP)
@@ -132,9 +136,10 @@ def _sample(image: np.ndarray, uv: np.ndarray, offsets: np.ndarray) -> np.ndarra
 
 
 def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted, zero mean, unit length; and the weighted mean and standard deviation (N,) before."""
+    """Weighted, without mean and slope, unit length; and the weighted mean and standard deviation (N,) before."""
     mean = raw @ (_ROOT**2)
     centred = (raw - mean[:, None]) * _ROOT
+    centred -= (centred @ _RAMPS.T) @ _RAMPS
     norm = np.sqrt(np.maximum(np.einsum("np,np->n", centred, centred), 1.0))
     return centred / norm[:, None], mean, norm
 

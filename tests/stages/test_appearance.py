@@ -41,6 +41,17 @@ def test_finds_an_affine_warp_whatever_the_light(gain, offset):
     np.testing.assert_allclose(np.median(seen.stronger), gain, rtol=0.1)
 
 
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (4.0, 0.0), (-2.0, 3.0)])
+def test_light_that_falls_off_across_a_patch_moves_nothing(slope):
+    """Shading of a round body stays in the picture while the body turns: it must not hold the points back."""
+    image, uv, t = texture(), grid(), np.array([2.0, -1.0])
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    lit = warped(image, np.eye(2), t) + slope[0] * (x - 160) + slope[1] * (y - 120)
+    seen = align(lit.astype(np.float32), take(image, uv), uv, start(len(uv)), 12)
+    error_px = np.linalg.norm(seen.uv_px - (uv + t), axis=1)
+    assert np.median(error_px) < 0.03 and (error_px < 0.2).mean() > 0.95 and np.median(seen.ncc) > 0.99
+
+
 def test_another_place_does_not_correlate():
     patches = take(texture(0), grid())
     seen = align(texture(1), patches, grid(), start(len(grid())), 8)
