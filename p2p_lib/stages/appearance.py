@@ -1,9 +1,9 @@
 """How a point looks: patches that are found again to a fraction of a pixel under an affine change of view.
 
 A patch is aligned by the inverse compositional algorithm (Baker and Matthews, "Lucas-Kanade 20 years
-on", IJCV 2004) with a window weight and invariance to gain, offset and slope of the light; all points in one batch. What
-does not change from frame to frame, the pseudo-inverse of its steepest descent images, is computed
-once when the patch is taken.
+on", IJCV 2004) with a window weight and invariance to gain, offset and slope of the light; all points
+in one batch. What does not change from frame to frame, the pseudo-inverse of its steepest descent
+images, is computed once when the patch is taken.
 """
 
 from __future__ import annotations
