@@ -194,24 +194,23 @@ def _synth(a: argparse.Namespace) -> None:
 
 
 def _benchmark(a: argparse.Namespace) -> None:
-    from p2p_lib.benchmark import plan_names, read_plan, run_benchmark
+    from p2p_lib.benchmark import plan_names, read_plan, run_benchmarks
     from p2p_lib.report.paper_tables import write_table
 
     if a.list:
         print("\n".join(f"{name:24}{read_plan(name).title}" for name in plan_names()))
         return
-    if a.plan is None or a.out is None:
+    if not a.plan or a.out is None:
         raise BadInput(
             "benchmark", "no plan or no --out", "p2p benchmark PLAN --out DIR; p2p benchmark --list names them"
         )
     profile = "quick" if a.quick else "full"
     options = {"jobs": a.jobs, "scheduler": a.scheduler, "retry": a.retry, "progress": not a.quiet}
-    benchmark = run_benchmark(a.plan, a.out, profile, **options)
-    print(write_table(benchmark))
-    print(
-        ", ".join(f"{count} {what}" for what, count in benchmark.counts().items()) + f". Tables in {benchmark.folder}"
-    )
-    if benchmark.interrupted:
+    benchmarks = run_benchmarks(a.plan, a.out, profile, **options)
+    for benchmark in benchmarks:
+        counts = ", ".join(f"{count} {what}" for what, count in benchmark.counts().items())
+        print(f"{write_table(benchmark)}\n{counts}. Tables in {benchmark.folder}\n")
+    if any(benchmark.interrupted for benchmark in benchmarks):
         raise KeyboardInterrupt
 
 
@@ -407,7 +406,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop")
 
     p = _command(commands, "benchmark", _benchmark, "run methods on sequences with seeds as a plan says; resumes")
-    p.add_argument("plan", nargs="?", metavar="PLAN", help="a TOML file, or a name that --list shows")
+    p.add_argument("plan", nargs="*", metavar="PLAN", help="TOML files, or names that --list shows")
     p.add_argument("--list", action="store_true", help="list the plans of the paper's tables and of the README")
     p.add_argument("--out", type=Path, metavar="DIR", help="runs, records and tables; several plans may share it")
     p.add_argument("--quick", action="store_true", help="a few frames of embedded data instead of the plan in full")

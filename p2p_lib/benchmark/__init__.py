@@ -3,7 +3,16 @@
 ``run_benchmark("ycbineoat", "out/benchmark")`` runs what is not on disk yet and gives the results of all of it.
 """
 
-from p2p_lib.benchmark.benchmark import Benchmark, run_benchmark
+from p2p_lib.benchmark.benchmark import Benchmark, load_benchmark, load_or_run_quick, run_benchmark, run_benchmarks
 from p2p_lib.benchmark.plan import Plan, plan_names, read_plan
 
-__all__ = ["Benchmark", "Plan", "plan_names", "read_plan", "run_benchmark"]
+__all__ = [
+    "Benchmark",
+    "Plan",
+    "load_benchmark",
+    "load_or_run_quick",
+    "plan_names",
+    "read_plan",
+    "run_benchmark",
+    "run_benchmarks",
+]

@@ -13,20 +13,22 @@ Several plans may share a DIR: a run that two of them ask for happens once.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from p2p_lib.benchmark import rows
 from p2p_lib.benchmark.execution import execute
-from p2p_lib.benchmark.jobs import Job, jobs_of
+from p2p_lib.benchmark.jobs import Job, jobs_of, open_planned
 from p2p_lib.benchmark.outcome import Outcome, load_outcome, replace_text, run_path, save_outcome
 from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.benchmark.rows import Row
 from p2p_lib.core.errors import BadInput
 from p2p_lib.data.runs import Run, load_run
+from p2p_lib.data.sequence import Sequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,11 @@ class Benchmark:
         return self.out / f"{self.plan.name}-{self.profile}"
 
     @property
+    def methods(self) -> tuple[str, ...]:
+        """The names of its methods, in the plan's order."""
+        return tuple(method.name for method in self.plan.methods(self.profile))
+
+    @property
     def rows(self) -> list[Row]:
         """One number each (see :mod:`p2p_lib.benchmark.rows`)."""
         return rows.result_rows(self.plan, self.profile, self.results)
@@ -68,18 +75,34 @@ class Benchmark:
         statuses = [outcome.status for _, outcome in self.results]
         return {status: statuses.count(status) for status in ("done", "failed", "not run")}
 
-    def run(self, method: str, sequence: str = "", seed: int | None = None) -> Run:
-        """The poses of a method's first finished run (on a sequence, with a seed)."""
+    def run(self, method: str, sequence: str = "") -> Run:
+        """The poses of a method's first finished run (on a sequence)."""
+        return load_run(run_path(self.out, self._finished(method, sequence)[0].key))
+
+    def video(self, method: str, sequence: str = "") -> Sequence:
+        """The sequence of that run."""
+        return open_planned(self._finished(method, sequence)[0])
+
+    def chamfer_cm(self, method: str, sequence: str, object: str, form: str = "BundleSDF") -> float | None:
+        """The Chamfer distance of an object in that run; None where it was not measured."""
+        return self._finished(method, sequence)[1].objects[object].chamfer_cm.get(form)
+
+    def _finished(self, method: str, sequence: str) -> tuple[Job, Outcome]:
         for job, outcome in self.results:
-            wanted = job.method.name == method and sequence in ("", job.sequence.name) and seed in (None, job.seed)
+            wanted = job.method.name == method and sequence in ("", job.sequence.name)
             if wanted and job.measure == "poses" and outcome.status == "done":
-                return load_run(run_path(self.out, job.key))
+                return job, outcome
         known = ", ".join(sorted({job.method.name for job, o in self.results if o.status == "done"})) or "none"
         raise BadInput("benchmark run", f"{method} {sequence}".strip(), f"a method that ran: {known}")
 
 
-def run_benchmark(
-    plan: str | Path | Plan,
+def run_benchmark(plan: str | Path | Plan, out: str | Path, profile: str = "full", **options: Any) -> Benchmark:
+    """One plan of :func:`run_benchmarks`."""
+    return run_benchmarks([plan], out, profile, **options)[0]
+
+
+def run_benchmarks(
+    plans: Iterable[str | Path | Plan],
     out: str | Path,
     profile: str = "full",
     *,
@@ -87,29 +110,88 @@ def run_benchmark(
     scheduler: str | None = None,
     retry: bool = False,
     progress: bool = True,
-) -> Benchmark:
-    """Run what is not on disk yet, keep it, and write the tables of the whole plan; what ``p2p benchmark`` does.
+) -> list[Benchmark]:
+    """Run what is not on disk yet, keep it, and write the tables of the plans; what ``p2p benchmark`` does.
 
-    plan       a TOML file, the name of a plan of this package, or a plan
+    plans      TOML files, names of plans of this package, or plans
     profile    ``full``, or ``quick``: a few frames of embedded data
-    jobs       runs at a time on this machine; default: one a core
+    jobs       runs at a time on this machine; default: one a core, or one where a plan measures times
     scheduler  address of a Dask scheduler, ``tcp://HOST:PORT``, whose workers see ``out`` under the same path
     retry      whether runs that failed before are tried again
 
     A kill loses the runs in progress alone. A run that fails is a row that says why. Raises :class:`BadInput` and
     :class:`MissingData` for a plan that cannot be read, and for a scheduler that does not answer.
     """
-    plan, out = plan if isinstance(plan, Plan) else read_plan(plan), Path(out).absolute()
     if jobs is not None and jobs < 1:
         raise BadInput("jobs", jobs, "at least 1")
-    asked = jobs_of(plan, profile)
-    wanted = {job.key: job for job in asked if job.key}
-    known = {key: outcome for key in wanted if (outcome := load_outcome(out, key))}
-    known = {key: outcome for key, outcome in known.items() if not (retry and outcome.status == "failed")}
-    todo = [job for key, job in wanted.items() if key not in known]
-    at_a_time = jobs or (1 if plan.scope(profile).alone else len(os.sched_getaffinity(0)))
-    found, interrupted = _run(todo, out, at_a_time, scheduler, progress, plan.name)
-    benchmark = Benchmark(plan, profile, out, _in_order(asked, known | found), interrupted)
+    waiting = [load_benchmark(plan, out, profile) for plan in plans]
+    found: dict[str, Outcome] = {}
+    interrupted = False
+    for alone in (False, True):
+        todo = {
+            job.key: job
+            for benchmark in waiting
+            for job, outcome in benchmark.results
+            if benchmark.plan.scope(profile).alone == alone and _to_run(job, outcome, retry) and job.key not in found
+        }
+        if todo and not interrupted:
+            at_a_time = min(jobs or (1 if alone else len(os.sched_getaffinity(0))), len(todo))
+            outcomes = execute(list(todo.values()), waiting[0].out, at_a_time, scheduler)
+            ran = _run(outcomes, len(todo), waiting[0].out, progress)
+            interrupted, found = len(ran) < len(todo), found | ran
+    return [_with_tables(benchmark, found, interrupted) for benchmark in waiting]
+
+
+def load_benchmark(plan: str | Path | Plan, out: str | Path, profile: str = "full") -> Benchmark:
+    """What is on disk of a plan; nothing is run. What is not there is ``not run``, with what would run it."""
+    plan, out = plan if isinstance(plan, Plan) else read_plan(plan), Path(out).absolute()
+    results = tuple(
+        (job, (job.key and load_outcome(out, job.key)) or _not_run(plan, job)) for job in jobs_of(plan, profile)
+    )
+    return Benchmark(plan, profile, out, results)
+
+
+def load_or_run_quick(
+    plans: Iterable[str], out: str | Path, profile: str, progress: bool = False
+) -> dict[str, Benchmark]:
+    """Plan to the results that ``out`` has of it in full; where it has none, or ``profile`` is quick, its quick form.
+
+    So a notebook shows what was run before, and something where nothing was.
+    """
+    names = list(plans)
+    full = {name: load_benchmark(name, out) for name in names} if profile == "full" else {}
+    full = {name: benchmark for name, benchmark in full.items() if benchmark.counts()["done"]}
+    quick = run_benchmarks([name for name in names if name not in full], out, "quick", progress=progress)
+    return {name: full[name] for name in names if name in full} | {b.plan.name: b for b in quick}
+
+
+def _to_run(job: Job, outcome: Outcome, retry: bool) -> bool:
+    return bool(job.key) and (outcome.status == "not run" or (retry and outcome.status == "failed"))
+
+
+def _run(outcomes: Iterator[tuple[Job, Outcome]], total: int, out: Path, progress: bool) -> dict[str, Outcome]:
+    """Keep each outcome as it comes; Ctrl-C ends it with those that came."""
+    found: dict[str, Outcome] = {}
+    with tqdm(total=total, unit="run", disable=not progress) as bar:
+        try:
+            for job, outcome in outcomes:
+                if outcome.status != "not run":
+                    save_outcome(out, outcome)
+                found[job.key] = outcome
+                failed = sum(o.status == "failed" for o in found.values())
+                bar.set_postfix_str(f"{job.method.name} on {job.sequence.name}" + f", {failed} failed" * bool(failed))
+                bar.update()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            outcomes.close()
+    return found
+
+
+def _with_tables(benchmark: Benchmark, found: Mapping[str, Outcome], interrupted: bool) -> Benchmark:
+    """With what was found since, its tables written."""
+    results = tuple((job, found.get(job.key, outcome)) for job, outcome in benchmark.results)
+    benchmark = replace(benchmark, results=results, interrupted=interrupted)
     for name, content, columns in (
         ("results", benchmark.rows, rows.COLUMNS),
         ("summary", benchmark.summary, rows.SUMMARY_COLUMNS),
@@ -119,33 +201,6 @@ def run_benchmark(
     return benchmark
 
 
-def _run(
-    todo: list[Job], out: Path, at_a_time: int, scheduler: str | None, progress: bool, title: str
-) -> tuple[dict[str, Outcome], bool]:
-    """Run jobs and keep each outcome as it comes; whether Ctrl-C ended it."""
-    found: dict[str, Outcome] = {}
-    if not todo:
-        return found, False
-    outcomes = execute(todo, out, min(at_a_time, len(todo)), scheduler)
-    with tqdm(total=len(todo), unit="run", desc=title, disable=not progress) as bar:
-        try:
-            for job, outcome in outcomes:
-                found[job.key] = outcome
-                if outcome.status != "not run":
-                    save_outcome(out, outcome)
-                failed = sum(o.status == "failed" for o in found.values())
-                bar.set_postfix_str(f"{job.method.name} on {job.sequence.name}" + f", {failed} failed" * bool(failed))
-                bar.update()
-        except KeyboardInterrupt:
-            return found, True
-        finally:
-            outcomes.close()
-    return found, False
-
-
-def _in_order(asked: list[Job], outcomes: Mapping[str, Outcome]) -> tuple[tuple[Job, Outcome], ...]:
-    return tuple((job, outcomes.get(job.key) or _not_run(job)) for job in asked)
-
-
-def _not_run(job: Job) -> Outcome:
-    return Outcome(key=job.key, status="not run", reason=job.reason or "interrupted before it ran")
+def _not_run(plan: Plan, job: Job) -> Outcome:
+    reason = job.reason or f"not run yet: p2p benchmark {plan.name}"
+    return Outcome(key=job.key, status="not run", reason=reason)

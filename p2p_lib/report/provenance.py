@@ -18,12 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput
 from p2p_lib.data.provenance import provenance
 from p2p_lib.data.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.report import style, video
+from p2p_lib.report.typeset import Table
 
 _WHAT_RAN = (
     "sequence",
@@ -94,14 +96,27 @@ def save_video(
 def save_table(
     table: Any, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
 ) -> Saved:
-    """Write a pandas DataFrame as CSV and Markdown, with its note. What is missing is a dash in Markdown."""
+    """Write a pandas DataFrame as CSV and Markdown, with its note. What is missing is a dash in Markdown.
+
+    A :class:`~p2p_lib.report.typeset.Table` is written as LaTeX besides.
+    """
     target = _target(paths.table_dir(), name)
+    if isinstance(table, Table):
+        return _save_typeset(table, target, sources, parameters)
     target.with_name(f"{name}.csv").write_text(table.to_csv(index=False, lineterminator="\n"), encoding="utf-8")
     markdown = as_markdown(table)
     target.with_name(f"{name}.md").write_text(markdown, encoding="utf-8")
     _write_note(target, [".csv", ".md"], sources, parameters, ["pandas"])
     html = table.to_html(index=False, na_rep="-", border=0)
     return Saved(target.with_name(f"{name}.csv"), ({"text/html": html, "text/plain": markdown}, {}))
+
+
+def _save_typeset(table: Table, target: Path, sources: Iterable[Any], parameters: Mapping[str, Any] | None) -> Saved:
+    markdown = table.markdown()
+    for suffix, text in ((".csv", table.csv()), (".md", markdown), (".tex", table.latex())):
+        target.with_name(f"{target.name}{suffix}").write_text(text, encoding="utf-8")
+    _write_note(target, [".csv", ".md", ".tex"], sources, parameters, [])
+    return Saved(target.with_name(f"{target.name}.csv"), ({"text/markdown": markdown, "text/plain": markdown}, {}))
 
 
 def as_markdown(table: Any) -> str:
@@ -118,6 +133,9 @@ def describe(source: Any) -> dict[str, Any]:
         return {"run": _run_id(source), **_what_ran(source.info), "poses_sha256": _sha256(source.path / "poses.npz")}
     if isinstance(source, Evaluation):
         return {"evaluation": _what_ran(source.info), "align": source.align}
+    if isinstance(source, Benchmark):
+        keys = sorted({outcome.key for _, outcome in source.results if outcome.status == "done"})
+        return {"benchmark": source.plan.name, "profile": source.profile, "runs": keys}
     if isinstance(source, str | Path):
         return {"file": Path(source).name, "sha256": _sha256(Path(source))}
     if hasattr(source, "frame") and hasattr(source, "camera"):
@@ -126,7 +144,7 @@ def describe(source: Any) -> dict[str, Any]:
         first = source.frame(0)
         checksums["first frame"] = hashlib.sha256(first.rgb.tobytes() + first.depth_m.tobytes()).hexdigest()
         return {"sequence": source.name, "format": source.format, "frames": len(source), "sha256": checksums}
-    raise BadInput("figure source", type(source).__name__, "a Run, an Evaluation, a Sequence, or a file")
+    raise BadInput("figure source", type(source).__name__, "a Run, an Evaluation, a Benchmark, a Sequence, or a file")
 
 
 def _what_ran(info: Mapping[str, Any]) -> dict[str, Any]:
