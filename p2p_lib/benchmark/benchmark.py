@@ -13,12 +13,11 @@ Several plans may share a DIR: a run that two of them ask for happens once.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from p2p_lib.benchmark import rows
 from p2p_lib.benchmark.execution import execute
@@ -27,6 +26,7 @@ from p2p_lib.benchmark.outcome import Outcome, load_outcome, replace_text, run_p
 from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.benchmark.rows import Row
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.progress import progress_bar
 from p2p_lib.data.runs import Run, load_run
 from p2p_lib.data.sequence import Sequence
 
@@ -172,15 +172,20 @@ def _to_run(job: Job, outcome: Outcome, retry: bool) -> bool:
 def _run(outcomes: Iterator[tuple[Job, Outcome]], total: int, out: Path, progress: bool) -> dict[str, Outcome]:
     """Keep each outcome as it comes; Ctrl-C ends it with those that came."""
     found: dict[str, Outcome] = {}
-    with tqdm(total=total, unit="run", disable=not progress) as bar:
+    with progress_bar("benchmark", total, "run", shown=progress) as bar:
         try:
             for job, outcome in outcomes:
                 if outcome.status != "not run":
                     save_outcome(out, outcome)
                 found[job.key] = outcome
                 failed = sum(o.status == "failed" for o in found.values())
-                bar.set_postfix_str(f"{job.method.name} on {job.sequence.name}" + f", {failed} failed" * bool(failed))
+                said = f"{job.method.name} on {job.sequence.name}" + f", {failed} failed" * bool(failed)
+                bar.set_postfix_str(said, refresh=False)
                 bar.update()
+                if not bar.disable and not sys.stderr.isatty() and len(found) < total:
+                    # Into a file: such runs take hours, and somebody wants to know.
+                    left_s = bar.format_dict["elapsed"] / len(found) * (total - len(found))
+                    sys.stderr.write(f"{len(found)} of {total} runs, about {left_s / 60:.0f} min left: {said}\n")
         except KeyboardInterrupt:
             pass
         finally:

@@ -11,8 +11,9 @@ from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import MissingData
+from p2p_lib.data.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.data.models import MESHES, find_models
-from p2p_lib.data.runs import Run
+from p2p_lib.data.runs import ObjectRun, Run
 from p2p_lib.data.sequence import Sequence
 from p2p_lib.data.synthetic.shapes import load_mesh
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 _WIDTH_IN = 8.0
 #: Errors from a tenth of a millimetre to the ten centimetres at which a frame scores nothing.
 EDGES_MM = np.geomspace(0.1, 100, 31)
+#: Tracks so far off, or farther, have the brightest colour.
+FAR_PX = 4.0
 
 
 def scene_of(benchmark: Benchmark, method: str, sequence: str = "") -> tuple[Scene, Run, Sequence]:
@@ -60,6 +63,40 @@ def error_histograms(benchmark: Benchmark) -> Figure:
         axes[0].set_ylabel("frames [%]")
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower left", ncols=2, fontsize=8)
+    return figure
+
+
+def tracks_by_error(
+    benchmark: Benchmark, method: str, sequence: str = "", count: int = 3, width_px: int = 420
+) -> Figure:
+    """True boxes (white, dashed), estimated ones, and the 2D tracks of the keypoints coloured by their error.
+
+    The error is the distance in pixels from where the tracker saw a keypoint to the keypoint of the final map projected
+    with the true pose; points that the map has dropped since are not drawn.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    scene, run = scene_of(benchmark, method, sequence)[:2]
+    evaluation, keypoints, region_px = evaluate(run), load_keypoints(run.path), scene.region()
+    pictures = []
+    for row in _well_seen(run, count):
+        image = scene.draw(row, region_px, width_px, axes=False, trail=0)
+        for name, score in evaluation.objects.items():
+            uv_px, error_px = _track_errors(scene, run.objects[name], keypoints[name], score.T_obj_model, row)
+            scale = image.shape[1] / (region_px[2] - region_px[0])
+            at = (uv_px - region_px[:2] + 0.5) * scale - 0.5
+            image = overlay.draw_points(image, at, overlay.value_colours(error_px, 0, FAR_PX), 2.5)
+        pictures.append(image)
+    with style.applied():
+        high_in = _WIDTH_IN / count * pictures[0].shape[0] / pictures[0].shape[1]
+        figure, axes = panels(count, (_WIDTH_IN, high_in + 0.6), [1] * count, side_by_side=True)
+        for axis, picture in zip(axes, pictures, strict=True):
+            axis.imshow(picture)
+            axis.set_axis_off()
+        colours = ScalarMappable(Normalize(0, FAR_PX), "cividis")
+        bar = figure.colorbar(colours, ax=axes, location="bottom", aspect=60, pad=0.02, extend="max")
+        bar.set_label("2D track from its keypoint under the true pose [px]")
     return figure
 
 
@@ -124,8 +161,31 @@ def _portrait(run: Run, name: str, middle: np.ndarray, size_m: float, width_px: 
     obj = run.objects[name]
     T = obj.T_cam_model[np.flatnonzero(obj.has_truth)[0]].copy()
     T[:3, 3] = np.array([0, 0, 4 * size_m]) - T[:3, :3] @ middle
-    focal_px = 3.4 * width_px
+    focal_px = 3.1 * width_px
     return Camera(focal_px, focal_px, (width_px - 1) / 2, (width_px - 1) / 2, width_px, width_px), T
+
+
+def _well_seen(run: Run, count: int) -> list[int]:
+    """Rows spread over the frames in which every object has a pose; the first has no tracks yet."""
+    seen = np.flatnonzero(np.logical_and.reduce([obj.has_pose & obj.has_truth for obj in run.objects.values()]))
+    seen = seen[seen > 0]
+    if not len(seen):
+        raise MissingData(str(run.path), "no frame in which every object has a pose")
+    return seen[np.linspace(0, len(seen) - 1, count).round().astype(int)].tolist()
+
+
+def _track_errors(
+    scene: Scene, obj: ObjectRun, keypoints: ObjectKeypoints, T_obj_model: np.ndarray, row: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K, 2) tracks of one object in a frame and (K,) their errors, of the points that its final map still holds."""
+    now = keypoints.at(int(obj.frame_index[row]))
+    ids, uv_px = keypoints.track_id[now], keypoints.uv_px[now].astype(float)
+    place = {id: k for k, id in enumerate(keypoints.ids.tolist())}
+    kept = np.array([id in place for id in ids.tolist()], bool)
+    p_obj = keypoints.p_obj[[place[id] for id in ids[kept].tolist()]]
+    T_cam_obj = obj.T_cam_model[row] @ se3.inverse(T_obj_model)
+    true_px = scene.sequence.camera.project(se3.transform(T_cam_obj, p_obj.reshape(-1, 3)))
+    return uv_px[kept], np.linalg.norm(uv_px[kept] - true_px, axis=1)
 
 
 def _errors(benchmark: Benchmark, method: str, key: str) -> np.ndarray:
