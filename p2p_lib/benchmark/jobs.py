@@ -62,7 +62,7 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
     jobs = []
     for planned in scope.sequence:
         for sequence, missing in _present(planned):
-            for method in plan.methods(profile):
+            for method in (m for m in plan.methods(profile) if not m.only or planned.name in m.only):
                 for measure in measures:
                     for seed in scope.seeds:
                         job = Job(_with_detector(method), sequence, seed, measure, plan.chamfer)

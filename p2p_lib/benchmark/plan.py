@@ -41,6 +41,7 @@ class Method(_Strict):
     synthetic parameters of synthetic sequences; ``noise`` is one of exact, realsense, hard
     scale     of the pictures, 1 = as they are
     count     only so many of the objects, 0 = all
+    only      names of the sequences that it runs on, none for all
     """
 
     name: Text
@@ -53,6 +54,7 @@ class Method(_Strict):
     synthetic: dict[str, Any] = {}
     scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     count: Count = 0
+    only: list[Text] = []
 
 
 class PlannedSequence(_Strict):
