@@ -50,6 +50,14 @@ class Scene:
     def __len__(self) -> int:
         return len(next(iter(self.run.objects.values())))
 
+    def row(self, index: int) -> int:
+        """The row of the run that is of frame ``index`` of the sequence; :class:`BadInput` where there is none."""
+        frames = next(iter(self.run.objects.values())).frame_index
+        (rows,) = np.nonzero(frames == index)
+        if not len(rows):
+            raise BadInput("frame", index, f"one of the run, {frames[0]} to {frames[-1]}")
+        return int(rows[0])
+
     def draw(
         self,
         row: int,

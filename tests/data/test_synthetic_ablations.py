@@ -34,7 +34,7 @@ def in_view(scenario):
     return np.max([-uv, uv - [scenario.camera.width - 1, scenario.camera.height - 1]])
 
 
-@pytest.mark.parametrize("name", ["mug", "weak_texture", "long_turning"])
+@pytest.mark.parametrize("name", ["mug", "weak_texture", "fading_label", "long_turning"])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_object_stays_in_view_and_moves_like_a_hand(name, seed):
     scenario = SCENARIOS[name](seed)
@@ -119,6 +119,26 @@ def test_weak_texture_has_few_points_and_a_shape_that_tells_all(seed):
     assert np.mean(np.array(held) > 0.003) > 0.95, np.round(held, 4)
 
 
+@pytest.mark.parametrize("seed", SEEDS[:2])
+def test_fading_labels_differ_in_their_print_alone(seed):
+    full, faint, blank = (SCENARIOS["fading_label"](seed, contrast=c) for c in (1.0, 0.1, 0.0))
+    bodies = [s.bodies[0] for s in (full, faint, blank)]
+    for body in bodies[1:]:
+        np.testing.assert_array_equal(body.T_world_model, bodies[0].T_world_model)
+        np.testing.assert_array_equal(body.mesh.vertices, bodies[0].mesh.vertices)
+        np.testing.assert_array_equal(body.mesh.uv, bodies[0].mesh.uv)
+    shots = [photographs(s, seed, [7])[0] for s in (full, faint, blank)]
+    for rgb, depth_m, exact in shots[1:]:
+        np.testing.assert_array_equal(depth_m, shots[0][1])  # the noise, too
+        np.testing.assert_array_equal(exact.label, shots[0][2].label)
+        assert (rgb != shots[0][0]).any()
+    # What is printed fades in proportion, towards one ground per panel and lid: four panels around, two lids.
+    printed = [body.mesh.texture.astype(float) for body in bodies]
+    off = np.abs(printed[1] - printed[2] - 0.1 * (printed[0] - printed[2]))
+    assert np.mean(off > 2) < 1e-4  # rounding, and where smooth edges are drawn over each other
+    assert len(np.unique(bodies[2].mesh.texture.reshape(-1, 3), axis=0)) <= 6
+
+
 def test_the_block_is_closed_flat_and_unlike_itself():
     import trimesh
 
@@ -152,6 +172,7 @@ def test_long_turning_turns_several_times_and_comes_back(seed):
     [
         ("mug", {"reflectance": 1.5}, "reflectance 1.5"),
         ("weak_texture", {"contrast": -0.1}, "contrast -0.1"),
+        ("fading_label", {"contrast": 1.1}, "contrast 1.1"),
         ("long_turning", {"frames": 100}, "frames 100"),
     ],
 )

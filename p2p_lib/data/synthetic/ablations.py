@@ -1,4 +1,4 @@
-"""Scenarios that are hard without one component each: multiple hypotheses, the surface, the graph."""
+"""Scenarios that are hard without one thing each: multiple hypotheses, the surface, the graph, or texture."""
 
 from __future__ import annotations
 
@@ -53,6 +53,22 @@ def weak_texture(seed: int, frames: int = 240, contrast: float = 0.05) -> Scenar
     T = wander(rng, frames, 0.04, 15.0, 180) @ turn(np.array([0, 0, 1.0]), yaw)
     T[:, :3, 3] += _CENTRE
     return _on_the_table(rng, frames, Body("block", mesh, T), eye=np.array([0.0, -0.36, 0.42]))
+
+
+def fading_label(seed: int, frames: int = 180, contrast: float = 1.0) -> Scenario:
+    """A tin turned to and fro about its own axis, which only its print tells; ``contrast`` fades that print.
+
+    Sequences of one seed differ in nothing but the contrast: shape, path and the noise of the sensor are the same.
+    """
+    if frames < 2 or not 0 <= contrast <= 1:
+        got = f"frames {frames}, contrast {contrast}"
+        raise BadInput("fading_label", got, "at least 2 frames, contrast from 0 to 1")
+    rng = np.random.default_rng([seed, 1])
+    mesh = shapes.can(rng, 0.045 * rng.uniform(0.95, 1.05), 0.12 * rng.uniform(0.95, 1.05), contrast)
+    yaw = np.radians(65) * np.sin(2 * np.pi * np.arange(frames) / 180 + rng.uniform(0, 2 * np.pi))
+    T = wander(rng, frames, 0.03, 15.0, 150) @ turn(np.array([0, 0, 1.0]), yaw)
+    T[:, :3, 3] += _CENTRE
+    return _on_the_table(rng, frames, Body("tin", mesh, T), eye=np.array([0.0, -0.40, 0.34]))
 
 
 def long_turning(seed: int, frames: int = 660) -> Scenario:

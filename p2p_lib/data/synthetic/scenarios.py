@@ -16,6 +16,7 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
         crossing,
         ablations.mug,
         ablations.weak_texture,
+        ablations.fading_label,
         ablations.long_turning,
         absences.occlusion,
         absences.exit_reentry,
