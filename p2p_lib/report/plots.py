@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import WITH_POSE, Status
 from p2p_lib.data.runs import ObjectRun, Run
 from p2p_lib.evaluation import metrics
+from p2p_lib.evaluation.confidence import pose_error
 from p2p_lib.evaluation.protocol import Evaluation, ObjectScore
 from p2p_lib.report import style
 
@@ -39,15 +40,6 @@ def gaps(obj: ObjectRun, at_least: int = 5) -> list[tuple[int, int]]:
     return [(a, b) for kind, a, b in spans if kind == "none" and a > 0 and b - a >= at_least]
 
 
-def pose_error(obj: ObjectRun, score: ObjectScore) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation error (n,) in radians and translation error (n,) in metres of the model's frame; NaN without a pose."""
-    T_error = se3.inverse(obj.T_cam_model) @ (obj.T_cam_obj @ score.T_obj_model)
-    known = np.isfinite(T_error).all((1, 2))
-    angle_rad = np.full(len(known), np.nan)
-    angle_rad[known] = se3.angle_rad(T_error[known])
-    return angle_rad, np.linalg.norm(T_error[:, :3, 3], axis=1)
-
-
 def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
     """ADD, rotation and translation error of every object over time, above its statuses.
 
@@ -65,7 +57,7 @@ def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
             _logarithmic(axis)
         axes[0].legend(loc="upper left", ncols=len(names))
         axes[0].set_title(f"Error over time, {run.info['sequence']}, {_ALIGNED[evaluation.align]}")
-        _draw_strip(axes[3], run)
+        draw_strip(axes[3], run)
         figure.align_ylabels(axes[:3])
     return figure
 
@@ -74,7 +66,7 @@ def status_strip(run: Run) -> Figure:
     """One line per object: what its pose estimate was worth at every moment."""
     with style.applied():
         figure, (axis,) = panels(1, (_WIDTH_IN, 1.0 + 0.32 * len(run.objects)), [1])
-        _draw_strip(axis, run)
+        draw_strip(axis, run)
         axis.set_title(f"Status over time, {run.info['sequence']}")
     return figure
 
@@ -171,8 +163,8 @@ def _logarithmic(axis: Axes) -> None:
     axis.yaxis.set_minor_formatter("")
 
 
-def _draw_strip(axis: Axes, run: Run) -> None:
-    """Statuses as coloured, hatched bars, one line per object, with a legend of those that occur."""
+def draw_strip(axis: Axes, run: Run, named: Iterable[str] | None = None) -> None:
+    """Statuses as coloured, hatched bars, a line per object; a legend of those ``named``, else of those that occur."""
     from matplotlib.patches import Patch
 
     names = list(run.objects)
@@ -197,9 +189,10 @@ def _draw_strip(axis: Axes, run: Run) -> None:
     patches = [
         Patch(facecolor=fill, hatch=hatch, edgecolor="#333333", linewidth=0.3, label=str(status))
         for status, (fill, hatch) in style.STATUS.items()
-        if str(status) in occurring
+        if str(status) in (occurring if named is None else named)
     ]
-    axis.figure.legend(handles=patches, loc="outside lower right", ncols=len(patches), fontsize=8)
+    if patches:
+        axis.figure.legend(handles=patches, loc="outside lower right", ncols=len(patches), fontsize=8)
 
 
 def _span_s(obj: ObjectRun, start: int, stop: int) -> tuple[float, float]:

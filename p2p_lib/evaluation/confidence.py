@@ -1,0 +1,102 @@
+"""What a confidence is worth: does it say how often the pose is right, and does it tell right poses from wrong ones?
+
+A pose is right when it is within 2 cm and 5 degrees of the truth. The expected calibration error is that of
+Naeini et al. (AAAI 2015), with bins of equal width; AUROC is the chance that a right pose has the higher
+confidence of the two when one right and one wrong pose are drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.data.runs import ObjectRun, Run
+from p2p_lib.evaluation.protocol import Evaluation, ObjectScore
+
+MAX_M, MAX_DEG = 0.02, 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Poses of scored frames: confidence (m,) in [0, 1], and whether each is right (m,) bool."""
+
+    confidence: np.ndarray
+    right: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.right)
+
+    def joined(self, other: Judged) -> Judged:
+        """These poses, then the others."""
+        return Judged(np.r_[self.confidence, other.confidence], np.r_[self.right, other.right])
+
+    @property
+    def calibration_error(self) -> float:
+        """Expected calibration error: mean gap between confidence and share of right poses, by how many there are."""
+        bins = reliability(self)
+        return float(np.average(np.abs(bins.right - bins.confidence), weights=bins.count)) if len(self) else np.nan
+
+    @property
+    def auroc(self) -> float:
+        """Area under the ROC curve; ties count half; NaN where all are right or all are wrong."""
+        from scipy.stats import rankdata
+
+        n_right, n_wrong = int(self.right.sum()), int((~self.right).sum())
+        if not n_right or not n_wrong:
+            return float("nan")
+        ranks = rankdata(self.confidence)[self.right].sum()
+        return float((ranks - n_right * (n_right + 1) / 2) / (n_right * n_wrong))
+
+
+@dataclass(frozen=True, eq=False)
+class Bins:
+    """Poses by confidence, empty bins left out: mean confidence, share of right ones, count; (b,) each."""
+
+    confidence: np.ndarray
+    right: np.ndarray
+    count: np.ndarray
+
+
+def pose_error(obj: ObjectRun, score: ObjectScore) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation error (n,) in radians and translation error (n,) in metres of the model's frame; NaN without a pose."""
+    T_error = se3.inverse(obj.T_cam_model) @ (obj.T_cam_obj @ score.T_obj_model)
+    known = np.isfinite(T_error).all((1, 2))
+    angle_rad = np.full(len(known), np.nan)
+    angle_rad[known] = se3.angle_rad(T_error[known])
+    return angle_rad, np.linalg.norm(T_error[:, :3, 3], axis=1)
+
+
+def right_poses(obj: ObjectRun, score: ObjectScore, max_m: float = MAX_M, max_deg: float = MAX_DEG) -> np.ndarray:
+    """(n,) bool: frames with a pose within ``max_m`` and ``max_deg`` of the truth."""
+    angle_rad, apart_m = pose_error(obj, score)
+    return (np.degrees(angle_rad) <= max_deg) & (apart_m <= max_m)
+
+
+def judge(run: Run, evaluation: Evaluation) -> dict[str, Judged]:
+    """Every scored object's poses in the frames that are scored; frames without a pose claim nothing."""
+    judged = {}
+    for name, score in evaluation.objects.items():
+        obj = run.objects[name]
+        at = np.isin(obj.frame_index, score.frame_index) & obj.has_pose
+        judged[name] = Judged(obj.confidence[at], right_poses(obj, score)[at])
+    return judged
+
+
+def pooled(many: Iterable[Judged]) -> Judged:
+    """All of them together."""
+    total = Judged(np.zeros(0), np.zeros(0, bool))
+    for one in many:
+        total = total.joined(one)
+    return total
+
+
+def reliability(judged: Judged, bins: int = 10) -> Bins:
+    """Poses sorted into bins of equal width of their confidence."""
+    at = np.minimum((judged.confidence * bins).astype(int), bins - 1)
+    count = np.bincount(at, minlength=bins)
+    used = count > 0
+    confidence, right = (np.bincount(at, v, bins)[used] / count[used] for v in (judged.confidence, judged.right))
+    return Bins(confidence, right, count[used])
