@@ -24,6 +24,7 @@ from p2p_lib.stages.refinement import Keypoints, Refinement
 from p2p_lib.stages.registration import Hypothesis
 from p2p_lib.stages.sampling import Detector, choose, usable_region
 from p2p_lib.stages.tracking import PointTracker
+from p2p_lib.stages.views import Views, slide_covariance
 
 #: A tentative pose finds points, which make a better one, which finds more.
 _SEEKING_ROUNDS = 3
@@ -69,7 +70,7 @@ class TrackedObject:
         self.map = KeypointMap(config.keypoint_map)
         self.surface = make_volume(config.tsdf) if config.tsdf.enabled else None
         self.graph = ObjectGraph(config.factor_graph)
-        self.keyframes = np.zeros((0, 4, 4))  # their T_cam_obj, as registered
+        self.views = Views(config.keypoint_map.max_views)  # of the keyframes
         self._map_covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
         self._rng, self._stopwatch = rng, stopwatch
@@ -84,7 +85,7 @@ class TrackedObject:
 
     def awaited(self, mask: np.ndarray | None) -> bool:
         """Whether the object was hidden or lost until now and its mask says that it is back."""
-        away = len(self.keyframes) > 0 and self._status not in WITH_POSE
+        away = len(self.views) > 0 and self._status not in WITH_POSE
         return away and mask is not None and mask.sum() >= self.config.pipeline.min_mask_px
 
     def hint(self, frame: Frame, tracks: Tracks) -> Hint:
@@ -92,7 +93,7 @@ class TrackedObject:
 
         While it is away, points that agree on no pose are somewhere else: they are to be looked for anew.
         """
-        if not len(self.keyframes):
+        if not len(self.views):
             return Hint()
         view = self._observe(frame, None, tracks.select(self.map.ids))
         found = self._hypotheses(view)
@@ -112,7 +113,7 @@ class TrackedObject:
     def step(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> PoseEstimate:
         """This object's estimate at a frame, given its mask and everybody's tracks."""
         view = self._observe(frame, mask, tracks.select(self.map.ids))
-        if not len(self.keyframes):
+        if not len(self.views):
             return self._start(view)
         if mask is not None and mask.sum() < self.config.pipeline.min_mask_px:
             return self._without_pose(view, Status.OCCLUDED, f"{int(mask.sum())} mask pixels")
@@ -321,7 +322,8 @@ class TrackedObject:
         if keyframe:
             good = view.seen & (hypothesis.inliers | ~self.map.promoted)
             T_cam_obj = self._add_keyframe(view, T_cam_obj, self._sample(view), good, covariance)
-        covariance = covariance + self._map_covariance
+        way_rad, share = self.views.way_rad(T_cam_obj), self.config.factor_graph.slide_share
+        covariance = covariance + self._map_covariance + slide_covariance(refined.free_turns, way_rad, share)
         return self._with_pose(view, T_cam_obj, status, hypothesis.support, agreement, covariance, reason, keyframe)
 
     def _covariance(self, view: View, hypothesis: Hypothesis, refined: Refinement) -> np.ndarray:
@@ -342,17 +344,10 @@ class TrackedObject:
         """The appendix's "Sampling Criteria": a new view of the object, or too few points left."""
         cfg = self.config.keypoint_map
         self._since_keyframe += 1
-        turned = np.degrees(se3.angle_rad(se3.inverse(self.keyframes) @ T_cam_obj).min())
+        turned = np.degrees(self.views.turned_rad(T_cam_obj))
         visible = int((view.seen & (agrees | ~self.map.promoted)).sum())
         starved = visible < cfg.keyframe_min_points and self._since_keyframe > cfg.cooldown
         return view.mask is not None and not self._recovering and (turned > cfg.keyframe_angle_deg or starved)
-
-    def _views_with(self, T_cam_obj: np.ndarray) -> np.ndarray:
-        """The keyframes' poses and this one; beyond the cap it takes the place of the one turned most alike."""
-        kept = self.keyframes
-        if len(kept) >= self.config.keypoint_map.max_views:
-            kept = np.delete(kept, se3.angle_rad(se3.inverse(kept) @ T_cam_obj).argmin(), 0)
-        return np.concatenate([kept, T_cam_obj[None]])
 
     def _add_keyframe(
         self,
@@ -371,12 +366,12 @@ class TrackedObject:
         uv_px, p_cam = points
         new_ids = self.tracker.add(uv_px)
         ids, p_cam_all = np.concatenate([self.map.ids[good], new_ids]), np.concatenate([view.p_cam[good], p_cam])
-        self.map.add(new_ids, se3.transform(se3.inverse(T_cam_obj), p_cam), promoted=not len(self.keyframes))
-        key, views = None, self._views_with(T_cam_obj)
+        self.map.add(new_ids, se3.transform(se3.inverse(T_cam_obj), p_cam), promoted=not len(self.views))
+        key, registered = None, T_cam_obj
         if self.config.factor_graph.enabled:
             with self._stopwatch("graph"):
                 key, T_cam_obj = self._optimise(T_cam_obj, ids, p_cam_all, covariance)
-        self.keyframes = views
+        self.views.add(registered)
         self._since_keyframe = 0
         if self.surface is not None:
             with self._stopwatch("fusion"):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from p2p_lib import Point2Pose, open_sequence, preset
-from p2p_lib.core import se3
 from p2p_lib.core.types import WITH_POSE
 
 CAPS = {
@@ -63,15 +62,3 @@ def test_nothing_is_tracked_that_the_map_has_given_up(stream):
 
 def test_the_object_is_still_tracked_with_so_little(stream):
     assert stream["tracked pose"].mean() > 0.95
-
-
-def test_views_are_culled_by_likeness():
-    sequence = open_sequence("synthetic/crossing")
-    config = preset("default").with_values({"keypoint_map.max_views": 3})
-    method = Point2Pose(sequence.camera, config)
-    method.add_object("box")
-    box = method.objects["box"]
-    for degrees in (0, 40, 80, 42, 120, 1):
-        box.keyframes = box._views_with(se3.exp(np.array([0, np.radians(degrees), 0, 0, 0, 0.5])))
-    turned = np.degrees([se3.angle_rad(T) for T in box.keyframes])
-    np.testing.assert_allclose(turned, [42, 120, 1], atol=1e-6)

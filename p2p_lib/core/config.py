@@ -263,6 +263,9 @@ class FactorGraphConfig(_Checked):
     damping: float = _p(1e-4, "lambda_0 of Levenberg-Marquardt", low=0)
     iterations: int = _p(5, "Levenberg-Marquardt steps at most", low=1)
     relative_tolerance: float = _p(1e-3, "a smaller relative decrease of the loss ends the steps", low=0)
+    slide_share: float = _p(
+        0.03, "standard deviation of how far all points slide on a round body, as a share of its turn", low=0, high=1
+    )
     max_keyframes: int = _p(30, "keyframes kept, the most alike are merged; 0 = all", low=0)
     suspect_sigmas: float = _p(4.0, "median misfit in standard deviations of a keypoint to be retired", low=1)
 

@@ -10,7 +10,7 @@ can join (texture holds what shape leaves free), and the result says how well ea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import cv2
@@ -70,6 +70,7 @@ class Refinement:
     strengths    (6,): how firmly the shape holds each of :attr:`directions`, as the mean squared change of the
                  points' distance per squared displacement; a plane has three at 0, a can one
     directions   (6, 6) rows: unit tangents about the cloud's centre, rotation scaled by the cloud's radius
+    free_turns   (K, 6) right tangents of T_cam_obj, a radian each: how it may turn without leaving the surface
     reason       why the pose was left alone, or what was held; empty otherwise
     """
 
@@ -81,6 +82,7 @@ class Refinement:
     converged: bool = False
     strengths: np.ndarray | None = None
     directions: np.ndarray | None = None
+    free_turns: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     reason: str = ""
 
     @property
@@ -291,7 +293,7 @@ class _Problem:
         metres = np.repeat([1 / self.radius, 1.0], 3)
         to_origin = se3.adjoint(se3.from_rt(np.eye(3), self.centre)) * metres
         covariance = to_origin @ np.linalg.inv(H + np.diag(free)) @ to_origin.T
-        free_directions = int((at.strengths < self.config.min_strength).sum())
+        loose = at.directions[:, at.strengths < self.config.min_strength]
         return Refinement(
             at.T,
             (covariance + covariance.T) / 2,
@@ -301,8 +303,22 @@ class _Problem:
             converged,
             at.strengths,
             at.directions.T,
-            f"the shape leaves {free_directions} of 6 directions free" if free_directions else "",
+            _turns_of(loose).T @ to_origin.T * self.radius,
+            f"the shape leaves {loose.shape[1]} of 6 directions free" if loose.size else "",
         )
+
+
+#: A unit tangent about the cloud's centre turns, rather than shifts, if this much of it is rotation.
+_MOSTLY = 0.5
+
+
+def _turns_of(loose: np.ndarray) -> np.ndarray:
+    """(6, T) the turns among the span of orthonormal tangents (6, K), each with a unit of rotation."""
+    if not loose.size:
+        return np.zeros((6, 0))
+    _, size, mix = np.linalg.svd(loose[:3])
+    size, mix = size[size > _MOSTLY], mix[: len(size)][size > _MOSTLY]
+    return loose @ mix.T / size
 
 
 #: Huber threshold of keypoint residuals in standard deviations.

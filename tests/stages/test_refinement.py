@@ -223,6 +223,9 @@ def test_a_can_is_not_spun_by_its_surface_but_by_its_keypoints(noise_free):
     alone = refine(start, p_cam, volume, CONFIG)
     assert alone.refined and "1 of 6" in alone.reason
     assert alone.strengths[0] < CONFIG.min_strength < alone.strengths[1]
+    # A radian about the can's own axis, not about the cloud's centre.
+    assert alone.free_turns.shape == (1, 6)
+    np.testing.assert_allclose(np.abs(alone.free_turns[0]), [0, 0, 1, 0, 0, 0], atol=0.06)
     assert abs(spin_deg(alone.T_cam_obj, T) - 6) < 0.7
     assert np.degrees(np.sqrt(alone.covariance[2, 2])) > 3  # and it says that it does not know
 
@@ -255,6 +258,8 @@ def test_a_plane_fixes_three_directions_and_leaves_three():
     start = T @ se3.exp([0.03, -0.02, 0.05, 0.004, -0.003, 0.003])
     found = refine(start, p_cam, volume, CONFIG)
     assert "3 of 6" in found.reason
+    assert found.free_turns.shape == (1, 6)  # the two others are shifts
+    np.testing.assert_allclose(np.abs(found.free_turns[0, :3]), [0, 0, 1], atol=0.03)
     left = se3.log(se3.inverse(T) @ found.T_cam_obj)
     assert np.degrees(np.abs(left[:2])).max() < 0.7 and abs(left[5]) < 0.001  # tilt and height are mended
     assert abs(left[2] - 0.05) < 0.006  # the turn within the plane is not touched
