@@ -32,7 +32,7 @@ def stream():
             "pending": int((~box.map.promoted).sum()),
             "tracked": len(box.tracker._points),
             "mapped": len(box.map),
-            "views": len(box.keyframes),
+            "views": len(box.views),
             "pictures": len(box.surface.keys),
             "graph": len(box.graph.keys),
             "voxels": int(np.prod(box.surface.shape)),

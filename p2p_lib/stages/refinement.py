@@ -10,7 +10,7 @@ can join (texture holds what shape leaves free), and the result says how well ea
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import cv2
@@ -95,8 +95,9 @@ class Refinement:
 class _Linear:
     """The surface at one pose: distances, and normal equations per point about the cloud's centre.
 
-    distance_m is that of every point, infinite off the observed surface. H and g are means over the
-    points used; rotations are scaled by the cloud's radius, so that everything is in metres.
+    distance_m is that of every point, infinite off the observed surface. ``rows`` are the points used, J (n, 6) the
+    derivatives of their distances. H and g are means over them; rotations are scaled by the cloud's radius, so that
+    everything is in metres.
 
     strengths (6,) and directions (6, 6), columns, say how firmly the shape holds the pose: H per unit of
     squared gradient, without the noise of the gradients. A noisy plane's normals wobble, and H takes the
@@ -111,9 +112,15 @@ class _Linear:
     strengths: np.ndarray
     directions: np.ndarray
     cut_m: float
-    used: int
+    rows: np.ndarray
+    J: np.ndarray
     rms_m: float
     sigma_m: float
+
+    @property
+    def used(self) -> int:
+        """How many points count."""
+        return len(self.rows)
 
 
 def refine(
@@ -170,8 +177,9 @@ class _Problem:
         at = self.surface(T, self.volume.tau_m / 2)
         while tries < config.iterations and at is not None and not converged:
             tries += 1
-            T_new = self.moved(at.T, self.clipped(self.step(*self.joint(at), damping)))
-            new = self.surface(T_new, self.volume.tau_m / 2 ** (tries + 1))
+            step = self.clipped(self.step(*self.joint(at), damping))
+            nearby = at if np.linalg.norm(step) < self.volume.voxel_m else None
+            new = self.surface(self.moved(at.T, step), self.volume.tau_m / 2 ** (tries + 1), nearby)
             gain = self.cost(at, at) - self.cost(new, at) if new is not None else -np.inf
             converged = abs(gain) < config.tolerance
             if gain > 0:
@@ -180,14 +188,16 @@ class _Problem:
                 damping = max(damping, 1e-4) * _DAMPING_FACTOR**2
         if at is None:
             return Refinement(T, iterations=tries, reason="the cloud lies beyond the surface's truncation")
-        return self.result(at, tries, converged)
+        strengths, directions = self.shape(at.rows, at.J)
+        return self.result(replace(at, strengths=strengths, directions=directions), tries, converged)
 
     # -- the two kinds of residual -----------------------------------------------------------------
 
-    def surface(self, T: np.ndarray, widest_m: float = 0.0) -> _Linear | None:
+    def surface(self, T: np.ndarray, widest_m: float = 0.0, beside: _Linear | None = None) -> _Linear | None:
         """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points count.
 
-        Trims beyond so many MADs, but nothing within ``widest_m`` nor within Huber's threshold.
+        Trims beyond so many MADs, but nothing within ``widest_m`` nor within Huber's threshold. What the shape holds
+        is taken from ``beside``, a pose nearby, where there is one: it hardly changes.
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj, self.config.gradient_voxels)
@@ -205,7 +215,8 @@ class _Problem:
         J = surface_jacobian((p_obj[used] - self.centre) / self.radius, gradient[used])
         Jw = J * np.minimum(1.0, self.config.huber_m / np.maximum(np.abs(r), 1e-12))[:, None]
         n, rms = len(used), float(np.sqrt((r * r).mean()))
-        return _Linear(T, distance, Jw.T @ J / n, Jw.T @ r / n, *self.shape(used, J), cut, n, rms, sigma)
+        held = (beside.strengths, beside.directions) if beside else self.shape(used, J)
+        return _Linear(T, distance, Jw.T @ J / n, Jw.T @ r / n, *held, cut, used, J, rms, sigma)
 
     def shape(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Strengths (6,) ascending and directions (6, 6) columns, as :class:`_Linear` has them."""

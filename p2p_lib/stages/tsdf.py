@@ -454,8 +454,8 @@ class TsdfVolume:
         voxels around it have been observed, and its value is 0 where it is not. Positive is outside.
         """
         p_obj = np.asarray(p_obj, float)
-        value, valid = self._sample((p_obj.reshape(-1, 3) - self.origin_m) / self.voxel_m)
-        return value.reshape(p_obj.shape[:-1]), valid.reshape(p_obj.shape[:-1])
+        value, valid = self._sample(p_obj.reshape(-1, 3), np.zeros((1, 3)))
+        return np.where(valid, value[0], 0.0).reshape(p_obj.shape[:-1]), valid.reshape(p_obj.shape[:-1])
 
     def query_with_gradient(
         self, p_obj: np.ndarray, step_voxels: float = 0.5
@@ -465,27 +465,28 @@ class TsdfVolume:
         Points (N, 3) to (value_m (N,), gradient (N, 3), valid (N,)); valid where the value and all six
         neighbours are, and both are 0 where not.
         """
-        g = (np.asarray(p_obj, float).reshape(-1, 3) - self.origin_m) / self.voxel_m
         offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * step_voxels
-        value, ok = self._sample((offsets[:, None] + g).reshape(-1, 3))
-        value, valid = value.reshape(7, -1), ok.reshape(7, -1).all(0)
+        value, valid = self._sample(np.asarray(p_obj, float).reshape(-1, 3), offsets)
         gradient = (value[1:4] - value[4:7]).T / (2 * step_voxels * self.voxel_m)
         return np.where(valid, value[0], 0.0), np.where(valid[:, None], gradient, 0.0), valid
 
-    def _sample(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Metres and validity at fractional array indices (N, 3)."""
+    def _sample(self, p_obj: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Metres (K, N) at points (N, 3) moved by offsets (K, 3) in voxels, and whether all K are valid (N,)."""
         last = np.array(self.shape) - 1.0
-        if (last < 1).any() or not len(index):
-            return np.zeros(len(index)), np.zeros(len(index), bool)
+        if (last < 1).any() or not len(p_obj):
+            return np.zeros((len(offsets), len(p_obj))), np.zeros(len(p_obj), bool)
         from torch.nn.functional import grid_sample
 
         # grid_sample wants the last axis first and indices scaled to [-1, 1].
-        grid = (index[:, ::-1] * (2 / last[::-1]) - 1).astype(np.float32)
-        low, middle, high = (np.abs(grid) <= 1).T
+        scale = 2 / last[::-1]
+        middle = (p_obj - self.origin_m)[:, ::-1] * (scale / self.voxel_m) - 1
+        around = offsets[:, ::-1] * scale
+        grid = middle.astype(np.float32) + around.astype(np.float32)[:, None]
+        inside = (np.abs(middle) <= 1 - np.abs(around).max(0)).all(1)
         grid = self._tensor(grid).view(1, 1, 1, -1, 3)
-        value = grid_sample(self._value[None, None], grid, align_corners=True).view(-1).cpu().numpy().astype(float)
-        valid = low & middle & high & ~np.isnan(value)
-        return np.where(valid, value * self.tau_m, 0.0), valid
+        value = grid_sample(self._value[None, None], grid, align_corners=True).view(len(offsets), -1)
+        value = value.cpu().numpy().astype(float) * self.tau_m
+        return value, inside & ~np.isnan(value.sum(0))
 
     def mesh(self, min_weight: float = 1.0, min_component: float = 0.1) -> trimesh.Trimesh:
         """The zero level with vertex colours, see :func:`p2p_lib.stages.mesh.extract`."""
