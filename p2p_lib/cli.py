@@ -80,6 +80,14 @@ def _eval(a: argparse.Namespace) -> None:
     options = _pairs("--models", a.models, "NAME=PATH"), a.align, a.min_visible_px
     if (a.run is None) == (a.poses is None) or (a.poses is None) != (a.sequence is None):
         a.parser.error("needs either DIR, a run's folder, or --poses with --sequence")
+    if a.rows:
+        from p2p_lib.benchmark.rows import COLUMNS, as_csv
+        from p2p_lib.benchmark.scoring import run_rows
+
+        if a.run is None:
+            a.parser.error("--rows needs DIR, a run's folder")
+        print(as_csv(run_rows(a.run, options[0]), COLUMNS), end="")
+        return
     if a.poses is not None:
         evaluation = evaluate_poses(a.poses, a.sequence, *options, a.format, a.start, a.stop)
     else:
@@ -327,6 +335,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--start", type=int, default=0, metavar="I", help="first frame of --sequence to score")
     p.add_argument("--stop", type=int, metavar="J", help="one past the last frame to score")
     p.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    p.add_argument("--rows", action="store_true", help="every number as a CSV row: all forms, Chamfer, returns")
     p.add_argument("--models", nargs="+", action="extend", metavar="NAME=PATH", help="models for scoring")
     p.add_argument(
         "--align",

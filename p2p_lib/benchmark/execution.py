@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import platform
+import shutil
 import signal
 import threading
 from collections.abc import Iterable, Iterator, Sequence
@@ -40,6 +42,7 @@ def _on_this_machine(jobs: Iterable[Job], out: Path, at_a_time: int) -> Iterator
     """A process for each run, so many at a time. One that dies, of a lack of memory say, takes no other with it."""
     for library in ("OMP", "OPENBLAS", "MKL"):  # runs share the cores: more threads would wait for each other
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    _sweep(out)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
     running: set[BaseProcess] = set()
@@ -53,6 +56,13 @@ def _on_this_machine(jobs: Iterable[Job], out: Path, at_a_time: int) -> Iterator
         for process in tuple(running):
             process.kill()
         pool.shutdown(wait=True)
+
+
+def _sweep(out: Path) -> None:
+    """Remove what processes of this machine left unfinished that are no more."""
+    for folder in (out / "runs").glob(f".*.{platform.node()}.*"):
+        if not Path("/proc", folder.name.rpartition(".")[2]).exists():
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _in_a_process(context: BaseContext, job: Job, out: Path, running: set[BaseProcess]) -> Outcome:

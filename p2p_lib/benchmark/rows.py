@@ -124,6 +124,9 @@ def _over_sequences(plan: Plan, profile: str, group: Results) -> list[Row]:
             rows += [head | {"sequence": POOLED} | _plain(n) for n in numbers.areas(pool, align)]
         events = [f for o in objects for f in o.returns]
         rows += [head | {"sequence": POOLED} | _plain(n) for n in numbers.returns(events, WITHIN_FRAMES, "first")]
+        if failed:  # how many frames they had nobody knows
+            for row in rows:
+                row["reason"] = f"{failed} failed: not in the pool" if row["sequence"] == POOLED else ""
     return rows
 
 

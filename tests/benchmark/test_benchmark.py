@@ -3,6 +3,7 @@
 import csv
 import multiprocessing
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -18,7 +19,7 @@ from p2p_lib import cli
 from p2p_lib.benchmark import read_plan, run_benchmark
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import jobs_of
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.evaluation import metrics
 from p2p_lib.run import evaluate_run
 
@@ -199,3 +200,21 @@ def test_a_scheduler_that_does_not_answer_is_named(plan, tmp_path, monkeypatch):
     monkeypatch.setattr("p2p_lib.benchmark.execution._CONNECT_S", 1)
     with pytest.raises(BadInput, match=r"scheduler: got tcp://127\.0\.0\.1:9 .*expected a Dask scheduler that answers"):
         run_benchmark(plan, tmp_path, "quick", scheduler="tcp://127.0.0.1:9", progress=False)
+
+
+def test_without_distributed_it_says_what_to_install(plan, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(
+        MissingBackend, match=r"--scheduler: the package distributed is not installed\. Run: .*distributed"
+    ):
+        run_benchmark(plan, tmp_path, "quick", scheduler="tcp://127.0.0.1:9", progress=False)
+
+
+def test_what_dead_processes_left_is_swept(plan, tmp_path):
+    left = tmp_path / "runs" / f".abc.{platform.node()}.999999999"
+    running = tmp_path / "runs" / f".abc.{platform.node()}.{os.getpid()}"
+    elsewhere = tmp_path / "runs" / ".abc.another-machine.999999999"
+    for folder in (left, running, elsewhere):
+        folder.mkdir(parents=True)
+    run_benchmark(plan, tmp_path, "quick", progress=False)
+    assert not left.exists() and running.exists() and elsewhere.exists()

@@ -1,0 +1,94 @@
+"""Every number of one run, as a benchmark keeps them and ``p2p eval --rows`` prints them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.benchmark.jobs import Job
+from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome
+from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, Scope
+from p2p_lib.benchmark.rows import Row, result_rows
+from p2p_lib.core import se3
+from p2p_lib.core.errors import MissingData
+from p2p_lib.data.models import MESHES, find_models, given_models
+from p2p_lib.data.runs import Run, load_run
+from p2p_lib.data.sequence import Sequence, open_sequence
+from p2p_lib.evaluation import reconstruction
+from p2p_lib.evaluation.protocol import ObjectScore, evaluate
+from p2p_lib.evaluation.recovery import recovery_events
+
+#: What of ``run.json`` an outcome repeats.
+RAN = ("tracker", "detector", "masks", "preset", "frames", "commit", "modified", "versions")
+Models = Mapping[str, str | Path]
+
+
+def scored(done: Run, sequence: Sequence | None, models: Models, key: str = "") -> Outcome:
+    """A run's errors by both alignments, its returns, and with a sequence the Chamfer distance of its surfaces.
+
+    models  object to model file, over those that the run was made with
+    """
+    first, over_all = (evaluate(done, models, align) for align in ("first", "all"))
+    objects = {}
+    for name, score in first.objects.items():
+        events = recovery_events(done.objects[name], score)
+        objects[name] = ObjectOutcome(
+            lost=score.lost,
+            first=_errors(score),
+            all=_errors(over_all.objects[name]),
+            returns=[event.frames_to_recovery for event in events],
+            **(_chamfer(done, sequence, models, name, score) if sequence else {}),
+        )
+    ran = {key: done.info.get(key) for key in RAN}
+    return Outcome(key=key, status="done", ran=ran, objects=objects, left_out=first.left_out)
+
+
+def run_rows(folder: str | Path, models: Models | None = None) -> list[Row]:
+    """Every number of a run folder, each a row (see :mod:`p2p_lib.benchmark.rows`).
+
+    The Chamfer distance needs the sequence; where that has gone, a row says so.
+    """
+    done, models = load_run(folder), models or {}
+    try:
+        place = done.info.get("path") or done.info["sequence"]
+        outcome = scored(done, open_sequence(place, done.info["format"], seed=done.info["seed"]), models)
+    except MissingData as error:
+        outcome = scored(done, None, models)
+        objects = {n: o.model_copy(update={"no_chamfer": str(error)}) for n, o in outcome.objects.items()}
+        outcome = outcome.model_copy(update={"objects": objects})
+    method = Method(name=str(done.info["tracker"]))
+    scope = Scope(seeds=[done.info["seed"]], sequence=[PlannedSequence(name=done.info["sequence"])])
+    plan = Plan(name="run", title="one run", method=[method], quick=scope, full=scope)
+    job = Job(method, scope.sequence[0], done.info["seed"], "poses", True)
+    return result_rows(plan, "full", [(job, outcome)])
+
+
+def _made_with(done: Run) -> dict[str, Path]:
+    """The models that the run was scored with, where they are still there."""
+    folder = Path(done.info.get("path") or ".")
+    paths = {name: folder / where for name, where in (done.info.get("models") or {}).items()}
+    return {name: path for name, path in paths.items() if path.is_file()}
+
+
+def _errors(score: ObjectScore) -> dict[str, list[float]]:
+    return {"adds_m": score.adds_m.tolist(), "add_m": score.add_m.tolist()}
+
+
+def _chamfer(done: Run, sequence: Sequence, models: Models, name: str, score: ObjectScore) -> dict[str, Any]:
+    """The fields of an outcome on the reconstruction."""
+    import trimesh
+
+    mesh = done.path / "meshes" / f"{name}.ply"
+    if not mesh.is_file():
+        return {"no_chamfer": "no surface was reconstructed"}
+    if not np.isfinite(score.T_obj_model).all():
+        return {"no_chamfer": "no pose, so no model frame"}
+    known = find_models(sequence, MESHES) | _made_with(done) | given_models(models, sequence.objects, MESHES)
+    model = known[name] if name in known and known[name].suffix != ".xyz" else done.points[name]
+    truth, reference = reconstruction.seen_surface(sequence, name, model, score.frame_index)
+    surface = trimesh.load(mesh, process=False)
+    chamfer_cm = reconstruction.chamfer_cm(surface, se3.inverse(score.T_obj_model), truth)
+    return {"chamfer_cm": chamfer_cm, "reference": reference, "no_chamfer": "" if chamfer_cm else "nothing near it"}

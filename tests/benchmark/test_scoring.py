@@ -1,0 +1,61 @@
+"""Every number of one run: what ``p2p eval --rows`` prints is what a benchmark keeps."""
+
+import csv
+import io
+import shutil
+
+import pytest
+
+from p2p_lib import cli
+from p2p_lib.benchmark.rows import MEAN, POOLED
+from p2p_lib.run import evaluate_run
+
+
+@pytest.fixture
+def printed(capsys):
+    def rows(*arguments: str) -> list[dict[str, str]]:
+        assert cli.main(["eval", *arguments, "--rows"]) == 0
+        return list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+
+    return rows
+
+
+def test_the_rows_of_a_run_are_those_of_the_benchmark(whole, printed):
+    key = next(outcome.key for job, outcome in whole.results if job.method.name == "Ours")
+    mine = [row for row in printed(str(whole.out / "runs" / key)) if row["object"] == "object" and row["value"]]
+    theirs = [row for row in whole.rows if row["key"] == key and row["object"] == "object"]
+    same = ("metric", "form", "failures", "align", "unit", "frames", "lost", "tracker", "detector", "masks", "preset")
+    assert [[r[c] for c in same] for r in mine] == [[str(r[c]) for c in same] for r in theirs]
+    assert [float(r["value"]) for r in mine] == [r["value"] for r in theirs]
+    assert {(r["form"], r["failures"], r["align"]) for r in mine if r["metric"] == "ADD AUC"} == {
+        (form, failures, align)
+        for form in ("exact", "VOC")
+        for failures in ("zero", "left out")
+        for align in ("first", "all")
+    }
+
+
+def test_a_surface_is_scored_against_what_was_seen(slides, tmp_path, printed, capsys):
+    """The board is flat and its model 49 points on it: 2.5 cm apart, so that is what both forms mostly see."""
+    assert cli.main(["run", str(slides[0]), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    capsys.readouterr()
+    rows = printed(str(tmp_path / "run"))
+    found = {row["form"]: float(row["value"]) for row in rows if row["metric"] == "Chamfer distance" and row["object"]}
+    assert set(found) == {"BundleSDF", "release"} and all(0.2 < cm < 1.0 for cm in found.values())
+    assert {row["sequence"] for row in rows} == {slides[0].name, MEAN, POOLED}
+    exact = {**dict.fromkeys(("form", "failures", "align")), "form": "exact", "failures": "zero", "align": "all"}
+    (row,) = (r for r in rows if r["sequence"] == POOLED and r["metric"] == "ADD AUC" and exact.items() <= r.items())
+    assert float(row["value"]) == pytest.approx(
+        evaluate_run(tmp_path / "run", align="all").as_dict()["mean"]["add_auc"]
+    )
+
+
+def test_without_the_sequence_all_but_the_surface_is_scored(slides, tmp_path, printed, capsys):
+    moved = shutil.copytree(slides[0], tmp_path / "moved")
+    assert cli.main(["run", str(moved), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    capsys.readouterr()
+    shutil.rmtree(moved)
+    rows = printed(str(tmp_path / "run"))
+    (row,) = (row for row in rows if row["metric"] == "Chamfer distance")
+    assert row["value"] == "" and "no such folder" in row["reason"]
+    assert sum(row["metric"] == "ADD AUC" and row["object"] == "object" for row in rows) == 8
