@@ -39,7 +39,6 @@ class Points:
     p_body: np.ndarray  # (N, 3) place on it, metres
     map_cov: np.ndarray  # (N, 3, 3) its covariance
     tangent: np.ndarray  # (N, 3, 2) offset on the body per pixel of offset in the first appearance
-    cosine: np.ndarray  # (N,) of surface normal and view when the tangent was measured
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -70,7 +69,6 @@ class Points:
             p_body=np.zeros((n, 3)),
             map_cov=np.zeros((n, 3, 3)),
             tangent=np.zeros((n, 3, 2)),
-            cosine=np.zeros(n),
         )
 
     @property

@@ -15,86 +15,13 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.stages.registration import fit_rigid
+from p2p_lib.stages.tangent_planes import depth_noise_m, projection
 
-#: Half the window in which the surface around a pixel is taken for a plane, in steps.
-_PLANE = 3
 _EYE2, _EYE3 = np.eye(2), np.eye(3)
 #: How far a body is thought to turn and move between frames beyond what it did before: rad, m.
 _PRIOR = np.diag(1 / np.repeat([0.15, 0.02], 3) ** 2)
 # A squared residual of a robust fit counts half at this many variances.
 _SOFT = 5.0
-
-
-def usual_camera(width: int, height: int) -> Camera:
-    """A camera with the field of view that most depth cameras have about, for pictures of an unknown one."""
-    return Camera(0.95 * width, 0.95 * width, (width - 1) / 2, (height - 1) / 2, width, height)
-
-
-def depth_noise_m(z_m: np.ndarray) -> np.ndarray:
-    """Standard deviation of a depth sensor at this range."""
-    return 0.001 + 0.0025 * z_m**2
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Measured surface at N pixels, as planes.
-
-    p_cam    (N, 3) NaN where there is no trustworthy depth
-    per_px   (N, 3, 2) displacement on the plane per pixel
-    sigma_m  (N,) standard deviation along the optical axis
-    """
-
-    p_cam: np.ndarray
-    per_px: np.ndarray
-    sigma_m: np.ndarray
-
-    def select(self, rows: np.ndarray) -> Surface:
-        """The pixels at these rows or under this mask."""
-        return Surface(self.p_cam[rows], self.per_px[rows], self.sigma_m[rows])
-
-
-def surface_at(depth_m: np.ndarray, camera: Camera, uv_px: np.ndarray, step_px: int = 1) -> Surface:
-    """The surface behind pixels (N, 2): planes through the readings around each that hang together with it.
-
-    step_px  between the 7 x 7 readings
-    """
-    uv = np.asarray(uv_px, float)
-    px = np.rint(uv).astype(int)
-    dy, dx = (step_px * a.ravel() for a in np.mgrid[-_PLANE : _PLANE + 1, -_PLANE : _PLANE + 1])
-    h, w = depth_m.shape
-    x, y = px[:, :1] + dx, px[:, 1:] + dy
-    inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
-    z = np.where(inside, depth_m[np.clip(y, 0, h - 1), np.clip(x, 0, w - 1)], 0).astype(float)
-    z0 = z[:, len(dx) // 2]
-    # The plane at the pixel itself: moments about it.
-    basis = np.stack([np.ones_like(x, float), x - uv[:, :1], y - uv[:, 1:]], -1)
-    off, limit, plane = z - z0[:, None], 0.015 * step_px, np.zeros((len(uv), 3))
-    for _ in range(2):
-        use = (z > 0) & (np.abs(off) < limit)
-        weighted = basis * use[..., None]
-        normal = weighted.transpose(0, 2, 1) @ basis + np.diag([1e-3, 3.0, 3.0])
-        plane = np.linalg.solve(normal, (weighted * (z - z0[:, None])[..., None]).sum(1)[..., None])[..., 0]
-        off, limit = z - z0[:, None] - (basis * plane[:, None]).sum(-1), 0.006
-    count = use.sum(1)
-    known = (z0 > 0) & (count >= 8)
-    at_m = np.where(known, z0 + plane[:, 0], np.nan)
-    spread = np.sqrt((use * off**2).sum(1) / np.maximum(count, 1))
-    rays = np.column_stack([(uv[:, 0] - camera.cx) / camera.fx, (uv[:, 1] - camera.cy) / camera.fy, np.ones(len(uv))])
-    across = np.zeros((len(uv), 3, 2))
-    across[:, 0, 0], across[:, 1, 1] = 1 / camera.fx, 1 / camera.fy
-    per_px = across * at_m[:, None, None] + rays[:, :, None] * plane[:, None, 1:]
-    # Readings nearby share their noise; where the plane does not fit, it is not known where the point is.
-    return Surface(rays * at_m[:, None], per_px, np.hypot(0.7 * depth_noise_m(at_m), spread))
-
-
-def projection(camera: Camera, p_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) of points (N, 3) and their Jacobian (N, 2, 3)."""
-    z = np.maximum(p_cam[:, 2], 0.05)
-    uv = p_cam[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    J = np.zeros((len(z), 2, 3))
-    J[:, 0, 0], J[:, 1, 1] = camera.fx / z, camera.fy / z
-    J[:, 0, 2], J[:, 1, 2] = -(uv[:, 0] - camera.cx) / z, -(uv[:, 1] - camera.cy) / z
-    return uv, J
 
 
 def _turning(arm: np.ndarray) -> np.ndarray:
@@ -160,11 +87,19 @@ def fit_pose(
         H = _PRIOR + JW.T @ J.reshape(-1, 6) + (J_z * w_z[:, None]).T @ J_z
         g = JW.T @ r.ravel() + J_z.T @ (w_z * r_z) - _PRIOR @ turned
         delta = np.linalg.solve(H, g)
-        R, at = se3.exp(np.concatenate([delta[:3], np.zeros(3)]))[:3, :3] @ R, at + delta[3:]
+        R, at = _rotation(delta[:3]) @ R, at + delta[3:]
         arm, turned = (p_body - centre) @ R.T, np.concatenate([turned[:3] + delta[:3], at - start])
-        if step and np.abs(delta[:3]).max() < 3e-4 and np.abs(delta[3:]).max() < 1e-4 and soft == _SOFT:
+        if soft == _SOFT and np.abs(delta[:3]).max() < 1e-3 and np.abs(delta[3:]).max() < 2e-4:
             iterations = step + 1
     return Fit(se3.from_rt(R, at - R @ centre), np.linalg.inv(H), centre, (chi2 < 16) & (chi2_z < 25))
+
+
+def _rotation(w: np.ndarray) -> np.ndarray:
+    """(3, 3) of one rotation vector: as :func:`se3.exp`, without what batches cost."""
+    angle = np.sqrt(w @ w)
+    x, y, z = w / max(angle, 1e-12)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return _EYE3 + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
 
 
 def consensus(
@@ -211,6 +146,11 @@ class Prediction:
     z_m: np.ndarray
     cosine: np.ndarray
 
+    @property
+    def sigma_px(self) -> np.ndarray:
+        """(N,) standard deviation of uv_px."""
+        return np.sqrt(np.trace(self.cov_px2, axis1=1, axis2=2))
+
 
 def predict(
     T: np.ndarray,
@@ -234,16 +174,6 @@ def predict(
     return Prediction(uv, P @ across, cov, p_cam[:, 2], cosine)
 
 
-def tangent_steps(surface: Surface, camera: Camera, step_m: float) -> np.ndarray:
-    """(N, 2, 2) pixels per step of a square grid on each surface's tangent plane, step_m apart."""
-    u = surface.per_px[..., 0]
-    a = u / np.linalg.norm(u, axis=1, keepdims=True)
-    v = surface.per_px[..., 1]
-    b = v - (a * v).sum(1, keepdims=True) * a
-    b /= np.linalg.norm(b, axis=1, keepdims=True)
-    return step_m * (projection(camera, surface.p_cam)[1] @ np.stack([a, b], -1))
-
-
 def linked(p: np.ndarray, reach_m: float) -> np.ndarray:
     """(N,) label of each point's chain of points not farther than reach_m apart: the smallest row in it."""
     near = np.linalg.norm(p[:, None] - p[None], axis=-1) <= reach_m
@@ -253,3 +183,9 @@ def linked(p: np.ndarray, reach_m: float) -> np.ndarray:
         if (smaller == label).all():
             return label
         label = smaller
+
+
+def apart_m(T_a: np.ndarray, T_b: np.ndarray, centre: np.ndarray) -> float:
+    """How far two poses take a body's centre (3,) apart, and by turning what is 5 cm from it."""
+    moved = (T_a[:3, :3] - T_b[:3, :3]) @ centre + T_a[:3, 3] - T_b[:3, 3]
+    return float(np.linalg.norm(moved) + 0.05 * np.linalg.norm(T_a[:3, :3] - T_b[:3, :3]))

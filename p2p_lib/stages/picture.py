@@ -1,0 +1,80 @@
+"""What the embedded tracker needs of a frame, prepared once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.types import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One frame. Places uv_px (N, 2) may lie outside of it, or be NaN.
+
+    gray     (H, W) uint8; fine and coarse: the same and half as large, float32
+    chroma   (H/4, W/4, 2) float32, CIELAB a and b
+    depth_m  (H, W), 0 where not measured
+    """
+
+    gray: np.ndarray
+    fine: np.ndarray
+    coarse: np.ndarray
+    chroma: np.ndarray
+    depth_m: np.ndarray
+    camera: Camera
+
+    @classmethod
+    def of(cls, frame: Frame, camera: Camera) -> Picture:
+        """Of a frame taken by this camera."""
+        gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        quarter = cv2.resize(frame.rgb, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+        chroma = cv2.cvtColor(quarter, cv2.COLOR_RGB2LAB)[..., 1:].astype(np.float32)
+        fine, coarse = gray.astype(np.float32), cv2.pyrDown(gray).astype(np.float32)
+        return cls(gray, fine, coarse, chroma, frame.depth_m, camera)
+
+    def chroma_at(self, uv_px: np.ndarray) -> np.ndarray:
+        """(N, 2) around places."""
+        if not len(uv_px):
+            return np.zeros((0, 2), np.float32)
+        x, y = (np.ascontiguousarray((uv_px[:, i] + 0.5) / 4 - 0.5, np.float32)[:, None] for i in (0, 1))
+        return cv2.remap(self.chroma, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+
+    def depth_at(self, uv_px: np.ndarray) -> np.ndarray:
+        """(N,) metres at the nearest pixels, 0 where nothing was measured."""
+        u, v = self._nearest(uv_px)
+        return self.depth_m[v, u].astype(float)
+
+    def inside(self, uv_px: np.ndarray, region: np.ndarray | None = None) -> np.ndarray:
+        """(N,) bool: places in the picture, and in the region (H, W) if there is one."""
+        with np.errstate(invalid="ignore"):
+            inside = (uv_px >= 0).all(1) & (uv_px <= np.array(self.gray.shape[::-1]) - 1).all(1)
+        if region is not None:
+            u, v = self._nearest(uv_px)
+            inside &= region[v, u]
+        return inside
+
+    def _nearest(self, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        last = np.array(self.gray.shape[::-1]) - 1
+        return tuple(np.clip(np.rint(np.nan_to_num(uv_px)), 0, last).astype(int).T)
+
+
+def flow(before: Picture, after: Picture, uv_px: np.ndarray, window_px: int, levels: int) -> tuple[np.ndarray, ...]:
+    """Lucas-Kanade from places (N, 2) float32: where they went, and whether (N,) they were found.
+
+    Only the part of the pictures around the places is looked at.
+    """
+    h, w = before.gray.shape
+    reach = window_px << levels
+    x0, y0 = np.maximum(np.floor(uv_px.min(0)).astype(int) - reach, 0)
+    x1, y1 = np.minimum(np.ceil(uv_px.max(0)).astype(int) + reach, [w, h])
+    if min(x1 - x0, y1 - y0) < reach:
+        x0, y0, x1, y1 = 0, 0, w, h
+    part, corner = np.s_[y0:y1, x0:x1], np.float32([x0, y0])
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before.gray[part], after.gray[part], uv_px - corner, None, winSize=(window_px, window_px), maxLevel=levels
+    )
+    return there + corner, found[:, 0] > 0
