@@ -16,8 +16,6 @@ from p2p_lib.stages.tracked_points import Points
 
 #: How well a pose is known that matches have proposed: rad, m.
 _PROPOSED = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
-#: Samples of a search for a pose: among a body's own points, and among the matches of its landmarks.
-_OWN_SAMPLES, _MATCH_SAMPLES = 300, 1000
 _EYE2, _EYE3 = np.eye(2), np.eye(3)
 
 
@@ -105,8 +103,6 @@ class Bodies:
                 self._split(p, at[~fit.agrees], now)
             elif not lost_only:
                 body.hidden_for += 1
-                # Points that agree on no pose for long are not where they seem to be.
-                p.verified[at] &= body.hidden_for <= self.config.linger_frames
 
     def _fitted(self, body: Body, p: Points, at: np.ndarray, now: Picture) -> Fit | None:
         """The pose of a body by its points at these rows; None where they do not agree on one."""
@@ -119,9 +115,7 @@ class Bodies:
         if fit.agrees.sum() < max(cfg.body_points, 0.5 * len(at)):
             known = z > 0
             p_cam = now.camera.unproject(uv[known], z[known])
-            T, agrees = consensus(
-                p.p_body[at][known], p_cam, np.arange(len(p_cam)), self._rng, _OWN_SAMPLES, cfg.body_m
-            )
+            T, agrees = consensus(p.p_body[at][known], p_cam, np.arange(len(p_cam)), cfg.body_m)
             other = fit_pose(T, *seen) if agrees.sum() >= cfg.body_points else fit
             fit = max(fit, other, key=lambda one: one.agrees.sum())
         return fit if fit.agrees.sum() >= max(cfg.body_points, 0.3 * len(at)) else None
@@ -134,7 +128,7 @@ class Bodies:
         strays, p_cam = strays[known], now.camera.unproject(p.uv[strays[known]], z[known])
         if len(strays) < cfg.split_points:
             return
-        T, agrees = consensus(p.p_body[strays], p_cam, np.arange(len(strays)), self._rng, _OWN_SAMPLES, cfg.body_m)
+        T, agrees = consensus(p.p_body[strays], p_cam, np.arange(len(strays)), cfg.body_m)
         own = strays[agrees]
         if len(own) < cfg.split_points:
             return
@@ -178,7 +172,7 @@ class Bodies:
     def _propose(self, body: Body, p_body: np.ndarray, p_cam: np.ndarray, corner: np.ndarray) -> None:
         """Let a lost body's points be looked for at the pose that matches p_body, p_cam (M, 3) agree on."""
         cfg = self.config
-        T, agrees = consensus(p_body, p_cam, corner, self._rng, _MATCH_SAMPLES, cfg.body_m)
+        T, agrees = consensus(p_body, p_cam, corner, cfg.body_m)
         if len(np.unique(corner[agrees])) >= cfg.support:
             body.fit, body.hidden_for = Fit(T, _PROPOSED, body.fit.centre, np.ones(0, bool)), 1
 

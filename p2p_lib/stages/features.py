@@ -20,6 +20,8 @@ _AXIS = np.arange(_SAMPLES) - (_SAMPLES - 1) / 2
 _GRID = np.stack(np.meshgrid(_AXIS, _AXIS)).reshape(2, -1).astype(np.float32)
 _RADIUS = _AXIS[-1]
 _MARGIN = 14
+#: Half a picture of 640 x 480.
+_LARGE_PX = 150_000
 
 
 def _pooling() -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +40,7 @@ _POOL, _ROUND = _pooling()
 def detect(gray: np.ndarray, region: np.ndarray | None, limit: int) -> np.ndarray:
     """The strongest corners (M, 2) of a uint8 picture, at most ``limit``, inside ``region`` (H, W) bool if given.
 
-    On half its resolution: a fraction of the time, and what is smaller does not show again from afar.
+    In more than :data:`_LARGE_PX` pixels on half the resolution: a fraction of the time.
     """
     x0, y0, x1, y1 = 0, 0, gray.shape[1], gray.shape[0]
     if region is not None:
@@ -46,13 +48,14 @@ def detect(gray: np.ndarray, region: np.ndarray | None, limit: int) -> np.ndarra
         if not w:
             return np.zeros((0, 2), np.float32)
         x0, y0, x1, y1 = max(0, x - _MARGIN), max(0, y - _MARGIN), min(x1, x + w + _MARGIN), min(y1, y + h + _MARGIN)
-    half = cv2.pyrDown(gray[y0:y1, x0:x1])
-    inside = None if region is None else np.ascontiguousarray(region[y0:y1:2, x0:x1:2]).view(np.uint8)
-    corners = cv2.goodFeaturesToTrack(half, limit, 0.005, 3, mask=inside, blockSize=3)
+    part, step = gray[y0:y1, x0:x1], 1 + ((x1 - x0) * (y1 - y0) > _LARGE_PX)
+    # pyrDown keeps every other pixel where it is.
+    level = cv2.pyrDown(part) if step == 2 else part
+    inside = None if region is None else np.ascontiguousarray(region[y0:y1:step, x0:x1:step]).view(np.uint8)
+    corners = cv2.goodFeaturesToTrack(level, limit, 0.005, 4 - step + 1, mask=inside, blockSize=7 - 2 * step)
     if corners is None:
         return np.zeros((0, 2), np.float32)
-    # pyrDown keeps every other pixel where it is.
-    return 2 * corners.reshape(-1, 2) + np.float32([x0, y0])
+    return step * corners.reshape(-1, 2) + np.float32([x0, y0])
 
 
 def describe(gray: np.ndarray, uv_px: np.ndarray, step_px: np.ndarray) -> np.ndarray:

@@ -22,6 +22,8 @@ _EYE2, _EYE3 = np.eye(2), np.eye(3)
 _PRIOR = np.diag(1 / np.repeat([0.15, 0.02], 3) ** 2)
 # A squared residual of a robust fit counts half at this many variances.
 _SOFT = 5.0
+# Triples of matches that a search for a motion starts from.
+_TRIPLES = 100
 
 
 def _turning(arm: np.ndarray) -> np.ndarray:
@@ -103,32 +105,36 @@ def _rotation(w: np.ndarray) -> np.ndarray:
 
 
 def consensus(
-    p_body: np.ndarray, p_cam: np.ndarray, corner: np.ndarray, rng: np.random.Generator, samples: int, inlier_m: float
+    p_body: np.ndarray, p_cam: np.ndarray, corner: np.ndarray, inlier_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The rigid motion that most matches p_body, p_cam (M, 3) agree on: T_cam_body and who does (M,).
 
     corner  (M,) what each match is made of: several of one corner count once
+
+    Two matches go together if they are equally far apart on the body and in the picture. Triples are made
+    of the pairs that most others go together with, so that a few right matches among many wrong ones suffice.
     """
-    nobody = np.zeros(len(p_body), bool)
+    nobody = np.eye(4), np.zeros(len(p_body), bool)
     if len(p_body) < 3:
-        return np.eye(4), nobody
-    at = rng.integers(0, len(p_body), (samples, 3))
-    a, b = p_body[at], p_cam[at]
-    # Three points fit if the triangles are alike; most samples end here.
-    side_a, side_b = (np.linalg.norm(p - np.roll(p, 1, 1), axis=-1) for p in (a, b))
-    alike = (np.abs(side_a - side_b) < inlier_m).all(1) & (np.minimum(side_a, side_b) > 2 * inlier_m).all(1)
-    a, b = a[alike][:100], b[alike][:100]
-    if not len(a):
-        return np.eye(4), nobody
-    T = fit_rigid(a, b)
+        return nobody
+    apart_body, apart_cam = (np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (p_body, p_cam))
+    together = (np.abs(apart_body - apart_cam) < inlier_m) & (np.minimum(apart_body, apart_cam) > 2 * inlier_m)
+    C = together.astype(np.float32)
+    votes = C @ C * C
+    i, j = np.unravel_index(np.argsort(-np.triu(votes), axis=None, kind="stable")[:_TRIPLES], votes.shape)
+    k = np.where(together[i] & together[j], votes[i] + votes[j], -1).argmax(1)
+    some = votes[i, j] > 0
+    at = np.stack([i, j, k], 1)[some]
+    if not len(at):
+        return nobody
+    T = fit_rigid(p_body[at], p_cam[at])
     weight = 1 / np.bincount(corner, minlength=corner.max() + 1)[corner]
-    best = nobody
     for _ in range(2):
         off = np.linalg.norm(p_body @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3] - p_cam, axis=-1)
         inliers = off < inlier_m
         best = inliers[(inliers @ weight).argmax()]
         if best.sum() < 3:
-            return np.eye(4), nobody
+            return nobody
         T = fit_rigid(p_body[best], p_cam[best])[None]
     return T[0], best
 
