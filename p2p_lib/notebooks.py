@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import logging
 import math
 import os
 import re
@@ -141,7 +142,7 @@ def run_notebooks(
         for suffix in (".ipynb", ".html"):
             (home / "notebooks" / path.name).with_suffix(suffix).unlink(missing_ok=True)
 
-    say(f"{len(plans)} notebooks, profile {profile}, results in {_near(home)}")
+    say(f"{_counted(plans)}, profile {profile}, results in {_near(home)}")
     results: list[NotebookResult] = []
     kernels: list[Any] = []
     pool = ThreadPoolExecutor(jobs)
@@ -159,7 +160,7 @@ def run_notebooks(
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         index = write_gallery(home, profile)
-    say(f"Look at {_near(index)}: {len(results)} notebooks; pictures are in {_near(figures)}/")
+    say(f"Look at {_near(index)}: {_counted(results)}; pictures are in {_near(figures)}/")
     return results
 
 
@@ -249,6 +250,7 @@ def read_result(executed: Path) -> NotebookResult:
 
 def write_gallery(home: Path, profile: str) -> Path:
     """``index.html`` over all executed notebooks in ``home/notebooks``: title, first picture, seconds, checks."""
+    results = [read_result(path) for path in sorted((home / "notebooks").glob("*.ipynb"))]
     entries = [
         GalleryEntry(
             title=result.title,
@@ -258,10 +260,12 @@ def write_gallery(home: Path, profile: str) -> Path:
             table={name: _shown(value) for name, value in result.checks.items()},
             failure=result.error,
         )
-        for result in map(read_result, sorted((home / "notebooks").glob("*.ipynb")))
+        for result in results
     ]
+    seconds, numbers = sum(r.seconds for r in results), sum(len(r.checks) for r in results)
+    summary = f"{_counted(results)}, {seconds:.0f} s, {numbers} numbers checked"
     page = home / "index.html"
-    page.write_text(gallery_page(f"Point2Pose notebooks, profile {profile}", entries), encoding="utf-8")
+    page.write_text(gallery_page(f"Point2Pose notebooks, profile {profile}", entries, summary), encoding="utf-8")
     return page
 
 
@@ -272,6 +276,7 @@ def _run_one(
     import papermill
     from nbclient.exceptions import DeadKernelError
 
+    logging.getLogger("papermill").setLevel(logging.ERROR)  # it warns of widgets that a page does not have
     executed = home / "notebooks" / source.name
     say(f"{source.stem} ...")
     try:
@@ -382,6 +387,10 @@ def _message(error: Mapping[str, Any]) -> str:
 
 def _shown(value: Value) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _counted(notebooks: Sequence[Any]) -> str:
+    return f"{len(notebooks)} notebook{'s' * (len(notebooks) != 1)}"
 
 
 def _near(path: Path) -> Path:

@@ -1,6 +1,9 @@
 """Shared fixtures. The suite passes without any data beside the project; tests that want some say so."""
 
+import html
+import json
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -33,6 +36,17 @@ class Browser:
     def dom(self, page: Path, wait_ms: int = 5000) -> str:
         """What the page has become once its scripts have run."""
         return self._look("--dump-dom", page, wait_ms).stdout.decode()
+
+    def figures(self, page: Path, wait_ms: int = 10_000) -> list[dict]:
+        """Each picture, film and inner page as the browser has it: kind, width, height, shown_px (0: none)."""
+        text, probe = page.read_text(encoding="utf-8"), page.with_name(f"{page.stem}.probe.html")
+        end, script = text.rindex("</body>"), (PROJECT / "tests" / "figures_probe.js").read_text()
+        probe.write_text(f"{text[:end]}<script>{script}</script>{text[end:]}", encoding="utf-8")
+        try:
+            found = re.search(r'<pre id="probe">(.*?)</pre>', self.dom(probe, wait_ms), re.DOTALL)
+            return json.loads(html.unescape(found[1]))
+        finally:
+            probe.unlink()
 
     def screenshot(self, page: Path, to: Path, size: tuple[int, int] = (1000, 700), wait_ms: int = 5000) -> np.ndarray:
         """(H, W, 3) uint8 of its window; also written to ``to``."""

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import nbformat
@@ -62,6 +63,36 @@ def test_notebook_runs_in_the_quick_profile(path, suite_out):
     assert 0 < sum(result.cell_seconds) <= result.seconds
 
 
+def test_a_browser_shows_every_figure_of_the_gallery(suite_out, browser):
+    """All that the tests above have executed, as a visitor sees it: the gallery, and every page that it links to."""
+    pages = sorted((suite_out / "notebooks").glob("*.html"))
+    if not pages:
+        pytest.skip("no notebook was executed before this test")
+    thumbnails = browser.figures(suite_out / "index.html")
+    assert len(thumbnails) == len(pages), "a thumbnail per notebook"
+    links = set(re.findall(r'href="(notebooks/[^"]+)"', (suite_out / "index.html").read_text()))
+    assert links == {f"notebooks/{page.name}" for page in pages}
+    for page in pages:
+        code = [c for c in nbformat.read(page.with_suffix(".ipynb"), 4).cells if c.cell_type == "code"]
+        outputs = [output.get("data", {}) for c in code for output in c.outputs]
+        made = sum(
+            "image/png" in data or bool(re.search("<(video|iframe)", data.get("text/html", ""))) for data in outputs
+        )
+        figures = browser.figures(page)
+        assert len(figures) == made > 0, page.name
+        thumbnails += figures
+    assert [f for f in thumbnails if min(f["width"], f["height"], f["shown_px"]) < 20] == []
+
+
+def test_the_browser_sees_what_is_not_shown(tmp_path, browser):
+    page = tmp_path / "page.html"
+    gone, fine = '<img src="gone.png">', f'<img width="40" height="40" src="data:image/png;base64,{PNG}">'
+    page.write_text(f"<html><body>{gone}{fine}<video src='data:video/mp4;base64,AAAA'></video></body></html>")
+    seen = browser.figures(page)
+    assert [(f["kind"], f["width"]) for f in seen] == [("IMG", 0), ("IMG", 1), ("VIDEO", 0)]
+    assert seen[1]["shown_px"] == 1600
+
+
 # The runner
 
 
@@ -110,6 +141,7 @@ def test_notebooks_learn_their_folders(run):
 def test_gallery_shows_what_ran(run):
     page = (run[1] / "index.html").read_text()
     assert PNG in page and "ADD-S AUC fell to 12.34" in page and "<td>seed</td><td>3</td>" in page
+    assert re.search(r"3 notebooks, \d+ s, 6 numbers checked, <b class=\"failed\">1 failed</b>", page)
     assert 'href="notebooks/00_first.html"' in page and "://" not in page
     assert (run[1] / "notebooks" / "01_fails.html").exists(), "the failed notebook can be looked at too"
 

@@ -8,6 +8,7 @@ which are in millimetres otherwise.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -50,17 +51,23 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
 
 
 def write(
-    sequence: Sequence, out: str | Path, frames: Iterable[int] | None = None, masks: Iterable[int] | None = None
+    sequence: Sequence,
+    out: str | Path,
+    frames: Iterable[int] | None = None,
+    masks: Iterable[int] | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Some frames of any sequence as such a folder, as if one had recorded it: no truth, depth in millimetres.
 
     frames  which (default: all); they are numbered anew
     masks   of which of these, by their new numbers: all by default, ``()`` for none, ``(0,)`` for the first alone
 
-    Raises :class:`BadInput` where the folder is not empty.
+    Raises :class:`BadInput` where the folder is not empty, unless ``overwrite`` lets its pictures and masks go.
     """
     out = Path(out)
-    if out.is_dir() and any(out.iterdir()):
+    for old in ("rgb", "depth", "masks") if overwrite else ():
+        shutil.rmtree(out / old, ignore_errors=True)
+    if not overwrite and out.is_dir() and any(out.iterdir()):
         raise BadInput(str(out), "a folder that is not empty", "a new one for the pictures")
     frames = list(range(len(sequence)) if frames is None else frames)
     wanted = set(range(len(frames)) if masks is None else masks)

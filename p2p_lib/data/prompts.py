@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from p2p_lib.core.errors import BadInput, MissingData
@@ -69,6 +70,13 @@ def parse_prompts(content: object) -> tuple[Prompt, ...]:
     if twice := [name for name in names if names.count(name) > 1]:
         raise BadInput("prompts", f"{twice[0]!r} twice", "one entry per object, with all its points")
     return tuple(prompts)
+
+
+def prompts_in(masks: Mapping[str, np.ndarray], frame: int = 0) -> tuple[Prompt, ...]:
+    """One click in each mask (H, W) that is not empty, where it is farthest from the rim: where one would click."""
+    depths = {name: cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 5) for name, m in masks.items() if m.any()}
+    places = {name: np.unravel_index(int(depth.argmax()), depth.shape)[::-1] for name, depth in depths.items()}
+    return tuple(Prompt(name, frame, np.array([place], float)) for name, place in places.items())
 
 
 def save_prompts(path: str | Path, prompts: Iterable[Prompt]) -> Path:

@@ -18,13 +18,17 @@ def background_share(mask: np.ndarray, depth_m: np.ndarray) -> float:
 
     mask (H, W) bool, depth_m (H, W) metres, 0 = no measurement.
     """
+    on_rim, behind = rim(mask, depth_m)
+    return float(behind.sum() / on_rim.sum()) if on_rim.any() else float("nan")
+
+
+def rim(mask: np.ndarray, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) bool each: the measured pixels of a mask's rim, and those of them that lie on the background."""
     inner = cv2.erode(mask.astype(np.uint8), _disc(INSET_PX), borderValue=0)
-    rim = (inner > 0) & (cv2.erode(inner, np.ones((3, 3), np.uint8), borderValue=0) == 0) & (depth_m > 0)
-    if not rim.any():
-        return float("nan")
+    on_rim = (inner > 0) & (cv2.erode(inner, np.ones((3, 3), np.uint8), borderValue=0) == 0) & (depth_m > 0)
     own = np.where((inner > 0) & (depth_m > 0), depth_m, np.float32(1e3))
     behind_m = depth_m - cv2.erode(own, _disc(REACH_PX))
-    return float((rim & (behind_m > GAP_M + GAP_SHARE * depth_m)).sum() / rim.sum())
+    return on_rim, on_rim & (behind_m > GAP_M + GAP_SHARE * depth_m)
 
 
 def _disc(radius: int) -> np.ndarray:

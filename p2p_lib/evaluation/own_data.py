@@ -6,10 +6,13 @@ matrix of another resolution, times in milliseconds, masks that hold the table t
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +23,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.core.types import Frame
+from p2p_lib.data.faults import spoil
 from p2p_lib.data.prompts import Prompt
 from p2p_lib.data.sequence import Sequence, open_sequence
 from p2p_lib.evaluation.depth_colour import misfit
@@ -93,6 +97,8 @@ def check_folder(
     findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at")]
     findings += [_camera(sequence.camera), _times(sequence), _repeated(frames, sequence)]
     findings += [_depth(frames), _registered(frames)]
+    if any(finding.name == "depth" and finding.level is Level.WRONG for finding in findings):
+        return findings  # nothing that follows would mean anything
     if not firsts:
         fix = f"Make clicks with p2p click and give them with --prompts, or put masks into {sequence.path}/masks."
         return [*findings, Finding("masks", Level.LOOK, "none that show an object", fix)]
@@ -101,6 +107,13 @@ def check_folder(
         findings += [_range(name, frame, mask, config), _rim(name, [(frame, mask), *pairs], config)]
         findings += [_points(name, frame, mask, config)]
     return findings
+
+
+def check_spoilt(folder: str | Path, fault: str, **options: Any) -> list[Finding]:
+    """What :func:`check_folder` finds in a copy of a folder with one of :data:`p2p_lib.data.faults.FAULTS` put in."""
+    with tempfile.TemporaryDirectory() as home:
+        copy = shutil.copytree(folder, Path(home) / Path(folder).name)
+        return check_folder(spoil(copy, fault), **options)
 
 
 def as_lines(findings: Iterable[Finding]) -> str:
@@ -199,7 +212,7 @@ def _registered(frames: list[Frame]) -> Finding:
         return Finding(name, Level.OK, "too few edges in depth and colour to tell whether they agree")
     if found.gain <= GAIN:
         return Finding(name, Level.OK, "edges of depth lie on edges of colour")
-    where = f"shifted by ({found.du_px:+.0f}, {found.dv_px:+.0f}) px"
+    where = f"shifted by ({round(found.du_px):+d}, {round(found.dv_px):+d}) px"
     size = f"{found.scale:.2f} times as large and " if abs(found.scale - 1) > 0.03 else ""
     fix = "Register depth to colour when recording (`align` in the camera's software; p2p data convert-bag does)."
     text = f"depth lies beside colour: {size}{where}, its edges would fit {found.gain:.1f} times as well"
@@ -246,10 +259,10 @@ def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Findin
     u, v = np.rint(found.uv_px[taken]).astype(int).T
     contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]
     count, needed = int((contrast >= config.tracking.bare_contrast).sum()), config.pipeline.recover_min_inliers
-    text = f"{count} places to track in frame {frame.index}"
+    text = f"places to track in frame {frame.index}: {count}"
     if count < needed:
         fix = "Come nearer, light it better, or begin with a textured side: then its surface alone carries the pose."
-        return Finding(f"{name}: points", Level.WRONG, f"{text}, {needed} are needed to find it again", fix)
+        return Finding(f"{name}: points", Level.WRONG, f"{text}; {needed} are needed to find it again", fix)
     return Finding(f"{name}: points", Level.OK, text)
 
 

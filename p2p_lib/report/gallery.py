@@ -12,7 +12,7 @@ body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem aut
 section {{ display: flex; gap: 1.5rem; padding: 1.5rem 0; border-top: 1px solid #ddd; }}
 h2 {{ margin: 0; font-size: 1.2rem; }} a {{ color: #06c; text-decoration: none; }} .failed {{ color: #b00; }}
 img {{ width: 20rem; border: 1px solid #eee; }} td {{ padding-right: 1.5rem; }}
-</style></head><body><h1>{title}</h1>
+</style></head><body><h1>{title}</h1><p>{summary}</p>
 {entries}
 </body></html>
 """
@@ -30,14 +30,18 @@ class GalleryEntry:
     failure: str = ""
 
 
-def gallery_page(title: str, entries: Sequence[GalleryEntry]) -> str:
-    """The HTML of the page, pictures included."""
-    return _PAGE.format(title=html.escape(title), entries="\n".join(map(_section, entries)))
+def gallery_page(title: str, entries: Sequence[GalleryEntry], summary: str = "") -> str:
+    """The HTML of the page, pictures included; the summary is followed by how many of the results failed."""
+    failed = sum(bool(entry.failure) for entry in entries)
+    outcome = f'<b class="failed">{failed} failed</b>' if failed else "none failed"
+    line = f"{html.escape(summary)}, {outcome}" if summary else ""
+    return _PAGE.format(title=html.escape(title), summary=line, entries="\n".join(map(_section, entries)))
 
 
 def _section(entry: GalleryEntry) -> str:
     link = html.escape(entry.link, quote=True)
-    image = f'<a href="{link}"><img alt="" src="data:image/png;base64,{entry.picture_png}"></a>'
+    picture = f'<img alt="{html.escape(entry.title, quote=True)}" src="data:image/png;base64,{entry.picture_png}">'
+    image = f'<a href="{link}">{picture}</a>'
     rows = [f"<tr><td>{html.escape(key)}</td><td>{html.escape(value)}</td></tr>" for key, value in entry.table.items()]
     words = [
         f'<h2><a href="{link}">{html.escape(entry.title)}</a></h2><p>{html.escape(entry.line)}</p>',

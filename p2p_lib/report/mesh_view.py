@@ -26,7 +26,7 @@ def draw_mesh(mesh: trimesh.Trimesh | Mesh, camera: Camera, T_cam_obj: np.ndarra
 
     ``clay`` leaves the colours out: what remains is the shape.
     """
-    body = mesh if isinstance(mesh, Mesh) else _textured(mesh)
+    body = mesh if isinstance(mesh, Mesh) else as_body(mesh)
     if clay:
         body = replace(body, texture=np.full((2, 2, 3), _CLAY, np.uint8))
     lamp = Light(towards=tuple(T_cam_obj[:3, :3].T @ _LAMP), ambient=0.3) if clay else _AS_SEEN
@@ -35,8 +35,8 @@ def draw_mesh(mesh: trimesh.Trimesh | Mesh, camera: Camera, T_cam_obj: np.ndarra
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-def _textured(mesh: trimesh.Trimesh) -> Mesh:
-    """One texel per face, in the mean colour of its corners; shaded by vertex normals."""
+def as_body(mesh: trimesh.Trimesh) -> Mesh:
+    """A reconstructed surface for the renderer: a texel per face, the mean of its corners; shaded by their normals."""
     faces = np.asarray(mesh.faces)
     side = int(np.ceil(np.sqrt(len(faces))))
     texture = np.zeros((side, side, 3), np.uint8)

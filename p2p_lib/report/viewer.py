@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import html
-import io
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS)
     """The whole page as HTML: it works offline, from a file, and inside another page."""
     from viser import ViserServer
 
-    with contextlib.redirect_stdout(io.StringIO()):  # it greets, whatever it is told
+    with _silence():
         server = ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
             scene = _Scene(server, playback, points)
@@ -54,6 +54,19 @@ def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS)
             server.stop()
     end = page.rindex("</body>") if "</body>" in page else len(page)
     return page[:end] + _legend(playback) + page[end:]
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Viser greets and takes its leave, whatever it is told."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def write_page(run: str | Path, out: str | Path | None = None, sequence: Sequence | None = None) -> Path:

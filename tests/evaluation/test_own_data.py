@@ -17,7 +17,7 @@ from p2p_lib.data.prompts import load_prompts
 from p2p_lib.data.sequence import open_sequence
 from p2p_lib.evaluation.depth_colour import misfit
 from p2p_lib.evaluation.mask_rim import background_share
-from p2p_lib.evaluation.own_data import Level, as_lines, check_folder
+from p2p_lib.evaluation.own_data import Level, as_lines, check_folder, check_spoilt
 
 #: What must be found: the level, a part of what is said, and a part of the remedy.
 EXPECTED = {
@@ -32,7 +32,7 @@ EXPECTED = {
     "times jump back": ("files", Level.WRONG, r"times\.txt: got 0\.000000 s at frame 3", ""),
     "a gap": ("times", Level.LOOK, "but 3.* s between frames 2 and 3", "found again"),
     "pictures twice": ("motion", Level.LOOK, "pictures equal the next one", "each picture once"),
-    "no texture": ("box: points", Level.WRONG, r"^[0-7] places to track", "textured side"),
+    "no texture": ("box: points", Level.WRONG, r"frame 0: [0-7];", "textured side"),
     "wide masks": ("can: mask", Level.WRONG, r"\d\d+ % of its rim", "a little inside"),
     "no depth on the objects": ("box: depth", Level.WRONG, "only 0 % of its pixels", "shiny"),
 }
@@ -213,10 +213,24 @@ def test_a_folder_is_not_written_over(good):
         own.write(open_sequence(good), good)
 
 
+def test_a_folder_of_ours_may_be_written_anew(good, tmp_path):
+    source, out = open_sequence(good), tmp_path / "again"
+    own.write(source, out, range(6))
+    (out / "notes.txt").write_text("mine")
+    assert len(open_sequence(own.write(source, out, range(2), masks=(), overwrite=True))) == 2
+    assert not (out / "masks").exists() and (out / "notes.txt").read_text() == "mine"
+
+
 def test_a_folder_with_the_first_masks_alone(good, tmp_path):
     read = open_sequence(own.write(open_sequence(good), tmp_path / "first", range(6), masks=(0,)))
     assert read.masks(0).keys() == {"box", "can"} and read.masks(1) is None
     assert open_sequence(own.write(open_sequence(good), tmp_path / "none", range(6), masks=())).masks(0) is None
+
+
+def test_a_wrong_unit_is_told_once(good):
+    """Nothing can be said of objects that are a thousand times too far away, and nothing is."""
+    assert [f.name for f in alarms(check_spoilt(good, "depth unit"))] == ["depth"]
+    assert sorted(p.name for p in good.iterdir()) == ["cam_K.txt", "depth", "masks", "rgb", "times.txt"], "a copy was"
 
 
 def test_unknown_faults_are_refused(good):
