@@ -11,6 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import settings
+
+#: A test that is slow on a busy machine is not wrong.
+settings.register_profile("suite", deadline=None)
+settings.load_profile("suite")
 
 PROJECT = Path(__file__).resolve().parents[1]
 

@@ -56,6 +56,8 @@ class _Checked:
 
 @dataclass(frozen=True)
 class PipelineConfig(_Checked):
+    """Of a frame as a whole: what is used of it, and when a pose stands."""
+
     object_frame: str = _p(
         "centroid",
         "where the object frame starts: at the camera (paper, T_cam_obj = I) or at the first masked cloud's centroid",
@@ -144,6 +146,8 @@ class OracleConfig(_Checked):
 
 @dataclass(frozen=True)
 class SegmentationConfig(_Checked):
+    """Of the embedded segmenter, which starts from clicks."""
+
     side_px: int = _p(112, "longest side of the grid on which an object is cut out", "px", low=16, high=640)
     reach_m: float = _p(0.3, "no object is larger than this to any side of its clicks", "m", low=0.01)
     margin: float = _p(0.35, "room around the object, in its own size", low=0.05, high=2)
@@ -166,6 +170,8 @@ class SegmentationConfig(_Checked):
 
 @dataclass(frozen=True)
 class SamplingConfig(_Checked):
+    """Of the sampling objective J and its candidates (section "Sampling Strategy and Keypoints Map")."""
+
     candidates: int = _p(512, "N_k, candidates from the detector", "points", "release", low=1)
     points: int = _p(30, "K, points chosen at a keyframe", "points", "release", low=1)
     max_visible: int = _p(60, "points followed at a time; a keyframe adds no more than are missing", "points", low=3)
@@ -185,6 +191,8 @@ class SamplingConfig(_Checked):
 
 @dataclass(frozen=True)
 class KeypointMapConfig(_Checked):
+    """Of keyframes and point promotion (appendices "Sampling Criteria" and "Point Promotion Strategy")."""
+
     keyframe_angle_deg: float = _p(10.0, "turn since the nearest keyframe that asks for points", "deg", "paper", low=0)
     keyframe_min_points: int = _p(25, "fewer visible points ask for points", "points", "paper", low=0)
     cooldown: int = _p(5, "frames between keyframes asked for by too few points", "frames", low=0)
@@ -201,6 +209,8 @@ class KeypointMapConfig(_Checked):
 
 @dataclass(frozen=True)
 class RegistrationConfig(_Checked):
+    """Of hypotheses and their selection (section "Frame-to-Map Registration for Pose Estimation")."""
+
     multi_hypothesis: bool = _p(True, "sequential RANSAC; off: SVD, outlier removal, SVD (the ablation)", "", "paper")
     iterations: int = _p(400, "RANSAC samples per hypothesis at most", low=1)
     sample_size: int = _p(3, "points per RANSAC sample", "points", low=3)
@@ -224,6 +234,8 @@ class RegistrationConfig(_Checked):
 
 @dataclass(frozen=True)
 class TsdfConfig(_Checked):
+    """Of the reconstructed surface (section "3D Reconstruction")."""
+
     enabled: bool = _p(True, "build a surface per object", "", "paper")
     voxel_m: float = _p(0.003, "edge of a voxel", "m", low=2e-4)
     truncation_voxels: float = _p(5.0, "tau in voxels", "voxels", "release", low=1)
@@ -235,6 +247,8 @@ class TsdfConfig(_Checked):
 
 @dataclass(frozen=True)
 class RefinementConfig(_Checked):
+    """Of the pose's refinement on the surface (section "SDF Refinement")."""
+
     enabled: bool = _p(True, "refine the pose on the TSDF", "", "paper")
     iterations: int = _p(8, "L, Levenberg-Marquardt steps at most", "", "release", low=1)
     damping: float = _p(1e-4, "initial damping", "", "release", low=0)
@@ -252,6 +266,8 @@ class RefinementConfig(_Checked):
 
 @dataclass(frozen=True)
 class FactorGraphConfig(_Checked):
+    """Of the graph of keyframes and keypoints (section "Graph Optimization")."""
+
     enabled: bool = _p(True, "optimise keyframe poses and keypoints at each new keyframe", "", "paper")
     prior: bool = _p(True, "L_prior, anchors the first keyframe", "", "paper")
     between: bool = _p(True, "L_reg, relative poses from registration", "", "paper")

@@ -1,0 +1,1 @@
+"""Frames in, files out: loaders, synthetic sequences, manifests, runs on disk, cameras."""

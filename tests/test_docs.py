@@ -1,0 +1,106 @@
+"""What the documents say is so: files exist, commands are known, the example runs, the right people are cited."""
+
+import argparse
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from p2p_lib import Point2Pose, cli, preset
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.types import Frame, Status
+from p2p_lib.notebooks import list_notebooks
+
+PROJECT = Path(__file__).resolve().parents[1]
+DOCUMENTS = ("README.md", "CONTRIBUTING.md", "environment.md")
+#: Where a file named in passing may lie.
+PLACES = ("", "p2p_lib", "p2p_lib/core", "p2p_lib/data", "p2p_lib/stages", "p2p_lib/backends", "p2p_lib/evaluation")
+PLACES = (*PLACES, "p2p_lib/report", "notebooks")
+
+
+def read(name: str) -> str:
+    return (PROJECT / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["CONTRIBUTING.md"])
+def test_files_that_are_named_exist(name):
+    named = {word for word in re.findall(r"`([\w./]+\.py|[\w./]+/)`", read(name)) if "PATH" not in word}
+    named = {word for word in named if not word.startswith("out/") and word not in ("utils.py", "DIR/")}
+    assert len(named) > 15
+    missing = {word for word in named if not any((PROJECT / place / word).exists() for place in PLACES)}
+    assert not missing
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_links_lead_somewhere(name):
+    links = [link for link in re.findall(r"\]\(([^)#]+)[^)]*\)", read(name)) if "://" not in link]
+    assert not [link for link in links if not (PROJECT / link).exists()]
+
+
+def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    return dict(groups[0].choices) if groups else {}
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_commands_and_their_options_are_known(name):
+    known = commands(cli._parser())
+    for line in re.findall(r"\bp2p ([a-z][^`\n]*)", read(name)):
+        words = line.partition("#")[0].split()
+        if words[0] not in known:
+            assert not re.match(r"[a-z-]+$", words[0]) or words[0] in ("on", "does"), f"p2p {words[0]}"
+            continue
+        parser = known[words[0]]
+        if commands(parser) and len(words) > 1 and words[1] in commands(parser):
+            parser = commands(parser)[words[1]]
+        options = {option for action in parser._actions for option in action.option_strings}
+        for word in words[1:]:
+            if word.startswith("--"):
+                assert word.rstrip(".,;:)") in options, f"p2p {line}"
+
+
+def test_the_map_of_notebooks_is_whole():
+    assert re.findall(r"(?m)^\| `(\d\d_\w+)` \|", read("README.md")) == [path.stem for path in list_notebooks()]
+
+
+def test_the_example_tracker_tracks():
+    """The tracker of CONTRIBUTING.md, taken from there: a still scene is tracked, and stays where it was."""
+    source = re.search(r"```python\n(import numpy.*?)```", read("CONTRIBUTING.md"), re.DOTALL)[1]
+    names: dict = {}
+    exec(source, names)
+    camera = Camera(300, 300, 79.5, 59.5, 160, 120)
+    rgb = np.kron(np.random.default_rng(0).integers(0, 255, (15, 20, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+    config = preset("default").with_values({"tsdf.enabled": False, "factor_graph.enabled": False})
+    method, mask = Point2Pose(camera, config, tracker=names["StillTracker"]()), np.zeros((120, 160), bool)
+    mask[20:100, 30:130] = True
+    method.add_object("poster")
+    for k in range(4):
+        estimate = method.step(Frame(k, k / 30, rgb, np.full((120, 160), 0.8, np.float32)), {"poster": mask})["poster"]
+    assert estimate.status is Status.TRACKED and estimate.inliers >= 20
+    np.testing.assert_allclose(estimate.T_cam_obj[:3, :3], np.eye(3), atol=1e-6)
+
+
+def test_the_papers_authors_are_cited_for_the_method_and_ours_for_the_package():
+    cited = yaml.safe_load(read("CITATION.cff"))
+    names = [f"{author['given-names']} {author['family-names']}" for author in cited["preferred-citation"]["authors"]]
+    assert names == ["Tzu-Yuan Lin", "Ho Jae Lee", "Kevin Doherty", "Yonghyeon Lee", "Sangbae Kim"]
+    assert cited["authors"] == [{"name": "Point2Pose suite contributors"}]
+    project = tomllib.loads(read("pyproject.toml"))["project"]
+    assert project["authors"] == cited["authors"] and project["version"] == cited["version"]
+    assert project["license"] == cited["license"] == "BSD-3-Clause" and read("LICENSE").startswith("BSD 3-Clause")
+
+
+def test_the_linter_asks_for_docstrings_of_everything_public():
+    rules = tomllib.loads(read("pyproject.toml"))["tool"]["ruff"]["lint"]
+    assert "D" in rules["select"] and not {"D100", "D101", "D102", "D103", "D104"} & set(rules["ignore"])
+
+
+def test_no_document_names_a_file_that_git_does_not_know():
+    listed = subprocess.run(["git", "ls-files"], cwd=PROJECT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    assert set(DOCUMENTS) <= set(listed.stdout.split())
