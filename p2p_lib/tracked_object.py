@@ -16,6 +16,7 @@ from p2p_lib.core.config import Config, TsdfConfig
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.stages import refinement, registration
+from p2p_lib.stages.confidence import confidence
 from p2p_lib.stages.factor_graph import ObjectGraph
 from p2p_lib.stages.hints import Hint, surface_distance
 from p2p_lib.stages.keypoint_map import KeypointMap
@@ -322,9 +323,13 @@ class TrackedObject:
         if keyframe:
             good = view.seen & (hypothesis.inliers | ~self.map.promoted)
             T_cam_obj = self._add_keyframe(view, T_cam_obj, self._sample(view), good, covariance)
-        way_rad, share = self.views.way_rad(T_cam_obj), self.config.factor_graph.slide_share
-        covariance = covariance + self._map_covariance + slide_covariance(refined.free_turns, way_rad, share)
-        return self._with_pose(view, T_cam_obj, status, hypothesis.support, agreement, covariance, reason, keyframe)
+        way_rad, graph = self.views.way_rad(T_cam_obj), self.config.factor_graph
+        covariance = (
+            covariance + self._map_covariance + slide_covariance(refined.free_turns, way_rad, graph.slide_share)
+        )
+        covariance = graph.covariance_scale * covariance
+        sure = confidence(covariance, hypothesis.support, agreement, self.config.confidence)
+        return self._with_pose(view, T_cam_obj, status, hypothesis.support, sure, covariance, reason, keyframe)
 
     def _covariance(self, view: View, hypothesis: Hypothesis, refined: Refinement) -> np.ndarray:
         """(6, 6) of the pose relative to the map, right tangent of T_cam_obj."""
@@ -442,7 +447,7 @@ class TrackedObject:
         T_cam_obj: np.ndarray,
         status: Status,
         support: int,
-        confidence: float,
+        sure: float,
         covariance: np.ndarray,
         reason: str = "",
         keyframe: bool = False,
@@ -455,7 +460,7 @@ class TrackedObject:
             view.frame.time_s,
             status,
             T_cam_obj,
-            float(confidence),
+            sure,
             covariance,
             reason=reason,
             visible_points=int(view.seen.sum()),

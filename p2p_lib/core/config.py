@@ -282,11 +282,30 @@ class FactorGraphConfig(_Checked):
     damping: float = _p(1e-4, "lambda_0 of Levenberg-Marquardt", low=0)
     iterations: int = _p(5, "Levenberg-Marquardt steps at most", low=1)
     relative_tolerance: float = _p(1e-3, "a smaller relative decrease of the loss ends the steps", low=0)
+    covariance_scale: float = _p(
+        0.55,
+        "the noise of points is set for a poor sensor; what is left of the pose's covariance (seeds 310)",
+        low=0.01,
+    )
     slide_share: float = _p(
         0.03, "standard deviation of how far all points slide on a round body, as a share of its turn", low=0, high=1
     )
     max_keyframes: int = _p(30, "keyframes kept, the most alike are merged; 0 = all", low=0)
     suspect_sigmas: float = _p(4.0, "median misfit in standard deviations of a keypoint to be retired", low=1)
+
+
+@dataclass(frozen=True)
+class ConfidenceConfig(_Checked):
+    """Log odds that a pose is within 2 cm and 5 degrees of the truth.
+
+    Fitted on ``fading_label``, ``weak_texture`` and ``crossing``, degraded until a third of the poses were wrong,
+    seeds 310 to 314; ``benchmarks/bench_confidence.py`` says what they are worth on others.
+    """
+
+    offset: float = _p(-3.4, "log odds at a standard deviation of one degree, without any point", low=-50, high=50)
+    per_log_sigma: float = _p(-1.45, "of the largest standard deviation of rotation, by its logarithm", low=-20, high=0)
+    per_log_inliers: float = _p(1.28, "of the agreeing keypoints, by the logarithm of their number + 1", low=0, high=20)
+    per_agreement: float = _p(2.5, "of their share of the keypoints seen", low=0, high=50)
 
 
 @dataclass(frozen=True)
@@ -305,6 +324,7 @@ class Config:
     tsdf: TsdfConfig = TsdfConfig()
     refinement: RefinementConfig = RefinementConfig()
     factor_graph: FactorGraphConfig = FactorGraphConfig()
+    confidence: ConfidenceConfig = ConfidenceConfig()
 
     def with_values(self, values: dict[str, Any], source: str = "") -> Config:
         """A copy with ``{"stage.key": value}`` replaced. Strings are read as TOML values.
