@@ -77,6 +77,7 @@ class TrackedObject:
         self._rng, self._stopwatch = rng, stopwatch
         self._T_last: np.ndarray | None = None  # newest pose, of whatever frame
         self._last_seen_s = float("nan")
+        self._T_left: np.ndarray | None = None  # the newest before it went away
         self._T_before: np.ndarray | None = None  # pose of the frame before, None after a gap
         self._status = Status.INITIALISING
         self._since_keyframe = 0
@@ -304,8 +305,10 @@ class TrackedObject:
         """Judge the pose; if it stands, take the frame's observations into the map."""
         pipe, T_cam_obj = self.config.pipeline, refined.T_cam_obj
         returning = self._status not in WITH_POSE
-        if returning and hypothesis.support < pipe.recover_min_inliers:
-            return self._without_pose(view, Status.LOST, f"only {hypothesis.support} points agree on a return")
+        if (returning or self._recovering) and (doubt := self._doubt(hypothesis, refined)):
+            return self._without_pose(view, Status.LOST, doubt)
+        if returning:
+            self._T_left = self._T_last
         if not hypothesis.support and refined.inliers < pipe.carry_min_share:
             return self._without_pose(view, Status.LOST, "too few points, and the surface does not fit either")
         self._carried = 0 if hypothesis.support else self._carried + 1
@@ -330,6 +333,15 @@ class TrackedObject:
         covariance = graph.covariance_scale * covariance
         sure = confidence(covariance, hypothesis.support, agreement, self.config.confidence)
         return self._with_pose(view, T_cam_obj, status, hypothesis.support, sure, covariance, reason, keyframe)
+
+    def _doubt(self, hypothesis: Hypothesis, refined: Refinement) -> str:
+        """Why a return is not believed (any more): keypoints and surface have to agree until it is confirmed."""
+        pipe = self.config.pipeline
+        if hypothesis.support < pipe.recover_min_inliers:
+            return f"only {hypothesis.support} points agree on a return"
+        if refined.refined and refined.inliers < pipe.recover_min_share:
+            return f"{100 * refined.inliers:.0f} % of the depth lies on the surface: not a return"
+        return ""
 
     def _covariance(self, view: View, hypothesis: Hypothesis, refined: Refinement) -> np.ndarray:
         """(6, 6) of the pose relative to the map, right tangent of T_cam_obj."""
@@ -471,6 +483,8 @@ class TrackedObject:
         )
 
     def _without_pose(self, view: View, status: Status, reason: str) -> PoseEstimate:
+        if self._recovering:  # a return that was not confirmed is taken back
+            self._T_last, self._recovering = self._T_left, 0
         self._status = status
         return PoseEstimate(
             self.name,

@@ -251,6 +251,39 @@ def test_a_few_points_tell_where_the_others_are(seeking, left):
         assert back.T_cam_obj is None and back.inliers < 8
 
 
+def run_with(tracker, frames, config=None):
+    method = Point2Pose(CAMERA, config or preset(), tracker)
+    method.add_object("left")
+    return [method.step(f, {"left": m["left"]})["left"] for f, m in frames]
+
+
+def test_a_return_that_the_surface_contradicts_is_refused():
+    """The keypoints agree, but most of the mask is not where the object's surface would be."""
+    frames = list(film(board=True)[: HIDDEN.stop + 4])
+    back = range(HIDDEN.stop, HIDDEN.stop + 2)
+    for k in back:
+        frames[k] = (frames[k][0], {"left": np.ones_like(frames[k][1]["left"])})
+    told = run_with("embedded", frames)
+    assert all(told[k].status == Status.LOST and "lies on the surface" in told[k].reason for k in back)
+    assert told[-1].status == Status.RECOVERED and told[-1].T_cam_obj is not None
+    trusting = run_with("embedded", frames, preset().with_values({"pipeline.recover_min_share": 0.0}))
+    assert trusting[HIDDEN.stop].status == Status.RECOVERED
+
+
+def test_a_return_that_is_not_confirmed_is_taken_back():
+    """Two good frames, then too few points: no pose, and what it was before the hiding is the last that is known."""
+
+    class Fading(Shy):
+        def track(self, frame, search=None, urgent=False):
+            self.left = 99 if frame.index < HIDDEN.stop + 2 else 5
+            return super().track(frame, search, urgent)
+
+    told = run_with(Fading(99), film(board=True)[: HIDDEN.stop + 3], quick(**{"pipeline.seek_inliers": 0}))
+    before, taken = told[HIDDEN.start - 1], told[-1]
+    assert [e.status for e in told[-3:]] == [Status.RECOVERED, Status.RECOVERED, Status.LOST]
+    np.testing.assert_array_equal(taken.last_T_cam_obj, before.T_cam_obj)
+
+
 def test_one_hides_the_other_goes_on():
     frames = [(f, {"right": m["right"]} if k in HIDDEN else m) for k, (f, m) in enumerate(film())]
     estimates = track(frames)

@@ -76,6 +76,9 @@ class PipelineConfig(_Checked):
     seek_below: int = _p(25, "fewer seen keypoints are joined by those that a tentative pose shows", "points", low=0)
     seek_depth_m: float = _p(0.015, "a keypoint farther from the depth measured there is hidden", "m", low=1e-4)
     recover_min_inliers: int = _p(8, "agreeing points that a return after hiding or loss needs", "points", low=3)
+    recover_min_share: float = _p(
+        0.3, "share of the depth points that must lie on the surface for it (of new sides nothing does)", low=0, high=1
+    )
     max_jump_m: float = _p(0.08, "a larger move between frames needs as many points as a return", "m", "release", low=0)
     max_jump_deg: float = _p(25.0, "a larger turn between frames does too", "deg", "release", low=0)
     carry_frames: int = _p(60, "frames in a row that the surface may carry without registered points", "frames", low=0)
@@ -368,6 +371,7 @@ _PAPER: dict[str, Any] = {
     "keypoint_map.cooldown": 0,
     "pipeline.start_growth": 0.0,
     "pipeline.seek_inliers": 0,
+    "pipeline.recover_min_share": 0.0,
     "registration.iterations": 100,
     "registration.sample_size": 4,
     "registration.motion_priors": False,

@@ -63,6 +63,7 @@ PAPER_TEXT = {
     "pipeline.object_frame": "camera",
     "pipeline.start_growth": 0.0,
     "pipeline.seek_inliers": 0,
+    "pipeline.recover_min_share": 0.0,
     "keypoint_map.keyframe_angle_deg": 10.0,
     "keypoint_map.keyframe_min_points": 25,
     "keypoint_map.cooldown": 0,
