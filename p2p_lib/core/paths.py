@@ -46,6 +46,14 @@ def run_dir(name: str) -> Path:
     return (_given("P2P_RUNS") or _home() / "out" / "runs") / name
 
 
+def benchmark_dir(profile: str, given: str = "") -> Path:
+    """Where a notebook finds the results of ``p2p benchmark``: the folder given, as seen from the project.
+
+    Else ``out/benchmark/`` of the project; those of the quick profile are with the notebook's own runs.
+    """
+    return _home() / (given or "out/benchmark") if given or profile == "full" else run_dir("benchmark")
+
+
 def _given(variable: str) -> Path | None:
     return Path(os.environ[variable]).expanduser() if os.environ.get(variable) else None
 

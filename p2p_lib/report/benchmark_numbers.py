@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.plan import Method
 from p2p_lib.benchmark.rows import MEAN, Row, shown_name
@@ -48,11 +50,14 @@ class Numbers:
         return self.missing(method, sequence) if row is None else number(row["value"], row.get("std"))
 
     def mean(self, method: Method, metric: str) -> Cell:
-        """The mean over sequences; where nothing ran, the reason that the first of them gave."""
-        if self.row(method.name, metric, MEAN) is not None:
-            return self.cell(method.name, metric, MEAN)
-        jobs = [job for job, _ in self.benchmark.results if job.method.name == method.name]
-        return self.missing(method.name, shown_name(jobs[0]))
+        """The mean over sequences, and how many these are of; where nothing ran, the reason that the first gave."""
+        of = [(j, o) for j, o in self.benchmark.results if j.method.name == method.name and j.measure == "poses"]
+        planned = {shown_name(job) for job, _ in of}
+        ran = {shown_name(job) for job, outcome in of if outcome.status != "not run"}
+        if self.row(method.name, metric, MEAN) is None:
+            return self.missing(method.name, shown_name(of[0][0]))
+        cell = self.cell(method.name, metric, MEAN)
+        return replace(cell, note=f"{len(ran)} of {len(planned)} sequences" if len(ran) < len(planned) else "")
 
     def missing(self, method: str, sequence: str) -> Cell:
         """A dash, or ``fail``, with the reason that the run gave."""

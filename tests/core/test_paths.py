@@ -36,3 +36,11 @@ def test_asking_makes_no_folders(monkeypatch, tmp_path):
     monkeypatch.setenv("P2P_CACHE", str(tmp_path / "cache"))
     paths.cache_dir()
     assert not list(tmp_path.iterdir())
+
+
+def test_results_of_benchmarks_are_beside_the_project_unless_quick(monkeypatch, tmp_path):
+    monkeypatch.setenv("P2P_RUNS", str(tmp_path))
+    assert paths.benchmark_dir("quick") == tmp_path / "benchmark"
+    assert paths.benchmark_dir("full") == paths.PROJECT / "out" / "benchmark"
+    assert paths.benchmark_dir("quick", "out/mine") == paths.PROJECT / "out" / "mine", "wherever the notebook runs"
+    assert paths.benchmark_dir("full", str(tmp_path / "far")) == tmp_path / "far"

@@ -161,6 +161,13 @@ def test_methods_against_each_other(tmp_path):
     assert [c.bold for c in table.rows[0]][1::2] == [True, True, True] and not table.rows[1][1].bold
 
 
+def test_a_mean_over_some_of_the_sequences_says_so(tmp_path):
+    missing = Outcome(key="", status="not run", reason="not there")
+    runs = {("Proposed", "a"): [outcome(90)], ("Proposed", "b"): [missing]}
+    made = benchmark(tmp_path, runs, of="Proposed", paper="tab:ablation_mean_std", kind="methods")
+    assert paper_table(made).rows[0][1] == Cell("90.00", bold=False, note="1 of 2 sequences")
+
+
 def test_returns_are_summed_over_seeds(tmp_path):
     runs = {("Ours", "a"): [outcome(90), outcome(90)]}
     made = benchmark(tmp_path, runs, seeds=(0, 1), of="Point2Pose", kind="returns")
