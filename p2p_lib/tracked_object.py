@@ -117,11 +117,11 @@ class TrackedObject:
         view = self._observe(frame, mask, tracks.select(self.map.ids))
         if not len(self.views):
             return self._start(view)
-        if mask is not None and mask.sum() < self.config.pipeline.min_mask_px:
-            return self._without_pose(view, Status.OCCLUDED, f"{int(mask.sum())} mask pixels")
         if mask is not None and self._status not in WITH_POSE:
             # Found where the object is not, on its twin perhaps: let them be looked for elsewhere.
-            self.tracker.reject(self.map.ids[view.tracks.visible & ~view.seen])
+            self.tracker.reject(self.map.ids[view.tracks.visible & ~_inside(view.tracks.uv_px, mask)])
+        if mask is not None and mask.sum() < self.config.pipeline.min_mask_px:
+            return self._without_pose(view, Status.OCCLUDED, f"{int(mask.sum())} mask pixels")
         hypotheses, view = self._sought(view)
         hypothesis, refined, reason = self._choose(view, hypotheses)
         if hypothesis is None:
@@ -204,9 +204,8 @@ class TrackedObject:
         """(N, 3) of the visible points that lie in the mask; NaN for the others."""
         p_cam = np.full((len(tracks), 3), np.nan)
         rows = np.flatnonzero(tracks.visible)
-        if mask is not None and len(rows):
-            px = np.clip(np.rint(tracks.uv_px[rows]).astype(int), 0, np.array(mask.shape[::-1]) - 1)
-            rows = rows[mask[px[:, 1], px[:, 0]]]
+        if mask is not None:
+            rows = rows[_inside(tracks.uv_px[rows], mask)]
         p_cam[rows] = self._lift(frame, tracks.uv_px[rows])
         return p_cam
 
@@ -496,6 +495,13 @@ class TrackedObject:
             last_T_cam_obj=self._T_last,
             last_seen_s=self._last_seen_s,
         )
+
+
+def _inside(uv_px: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(N,) bool: pixels (N, 2) in a mask (H, W); those that are not finite are not."""
+    known = np.isfinite(uv_px).all(1)
+    px = np.clip(np.rint(np.where(known[:, None], uv_px, 0)).astype(int), 0, np.array(mask.shape[::-1]) - 1)
+    return known & mask[px[:, 1], px[:, 0]]
 
 
 def make_volume(config: TsdfConfig):

@@ -130,6 +130,7 @@ class TrackingConfig(_Checked):
     guess_px: float = _p(3.0, "standard deviation up to which a body alone shows a point", "px", low=0)
     min_cosine: float = _p(0.1, "of surface normal and view: surface turned away further is invisible", low=-1, high=1)
     repeats: float = _p(4.0, "frames in a row whose errors count as one observation of a place on a body", low=1)
+    shun_frames: int = _p(15, "frames for which a body is not looked for where it was found in error", "frames", low=0)
     survey_deg: float = _p(15.0, "turn that shows a new side of a body", "deg", low=1)
     max_landmarks: int = _p(2500, "corners remembered of a body", "points", low=100)
     landmarks: int = _p(400, "corners of a lost body looked for in a frame", "points", low=10)

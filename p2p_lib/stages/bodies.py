@@ -27,6 +27,8 @@ class Body:
     hidden_for   frames since the pose was known
     kept         whether enough of what it should show was there, when that was last looked at
     trail        the poses of the newest looks at whether it moves with another body
+    shunned      (M, 3) places in the camera's frame where it was found and is not: its double may be there
+    shunned_for  frames for which it is not looked for around them
     """
 
     fit: Fit
@@ -34,6 +36,8 @@ class Body:
     hidden_for: int = 0
     kept: bool = True
     trail: list[np.ndarray] = field(default_factory=list)
+    shunned: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    shunned_for: int = 0
     landmarks: Landmarks = field(default_factory=Landmarks)
 
     @property
@@ -87,13 +91,17 @@ class Bodies:
         for b, body in enumerate(self._bodies):
             own = p.verified & (p.body == b)
             if (own & wrong).sum() > 0.5 * own.sum():
-                body.hidden_for = self.config.linger_frames + 1
+                R, t = body.fit.T_cam_body[:3, :3], body.fit.T_cam_body[:3, 3]
+                body.shunned, body.shunned_for = p.p_body[own & wrong] @ R.T + t, self.config.shun_frames
+                body.hidden_for, body.trail = self.config.linger_frames + 1, []
 
     def fit(self, p: Points, now: Picture, lost_only: bool = False) -> None:
         """Fit bodies' poses to their points that were followed or found; who disagrees is not verified."""
         for b, body in enumerate(self._bodies):
             if lost_only and body.posed:
                 continue
+            if not lost_only:
+                body.shunned_for = max(body.shunned_for - 1, 0)
             at = np.flatnonzero(p.verified & (p.body == b))
             fit = self._fitted(body, p, at, now)
             if fit is not None:
@@ -156,9 +164,13 @@ class Bodies:
             return
         scales = range(len(STEPS_M)) if turn is None else (turn % len(STEPS_M),)
         found = corners(now, region, self.config.features, scales)
-        if len(found.uv_px) > self.config.candidates:
-            for body in lost:
-                self._propose(body, *body.landmarks.matches(found, self.config, self._rng))
+        for body in lost:
+            here = found
+            if body.shunned_for:
+                gap = np.linalg.norm(found.p_cam[:, None] - body.shunned[None], axis=-1).min(1)
+                here = found.select(gap > self.config.body_reach_m)
+            if len(here.uv_px) > self.config.candidates:
+                self._propose(body, *body.landmarks.matches(here, self.config, self._rng))
 
     def suggest(self, p: Points, rows: np.ndarray, uv_px: np.ndarray, now: Picture) -> None:
         """Propose poses for lost bodies by where somebody expects points of them, uv_px (M, 2)."""

@@ -29,6 +29,10 @@ class Corners:
     p_cam: np.ndarray
     descriptors: dict[int, np.ndarray]
 
+    def select(self, rows: np.ndarray) -> Corners:
+        """The corners at these rows or under this mask."""
+        return Corners(self.uv_px[rows], self.p_cam[rows], {k: d[rows] for k, d in self.descriptors.items()})
+
 
 def corners(now: Picture, region: np.ndarray | None, limit: int, scales: Iterable[int]) -> Corners:
     """The strongest corners, inside ``region`` (H, W) if given, described at these of :data:`STEPS_M`."""

@@ -89,6 +89,40 @@ def test_hidden_points_are_invisible():
     assert max(shown[1:]) < 0.1 and np.mean(shown[3:]) < 0.05
 
 
+@cache
+def film_with_its_double() -> list[Frame]:
+    """The card's double sways at the lower left all the time, and is there when the card is hidden."""
+    card, frames = printed(1, CARD), []
+    for t, frame in enumerate(film()):
+        M = np.array([[1.0, 0, 4 + 8 * np.sin(t / 6)], [0, 1, SHAPE[0] - CARD[0] - 2]])
+        here = cv2.warpAffine(np.ones(CARD, np.uint8), M, SHAPE[::-1]) > 0
+        here &= frame.depth_m > 0.8  # behind the card, before the wall
+        rgb, depth = frame.rgb.copy(), frame.depth_m.copy()
+        rgb[here] = cv2.warpAffine(card, M, SHAPE[::-1])[here]
+        depth[here] = 0.7
+        frames.append(Frame(t, t / 30, rgb, depth))
+    return frames
+
+
+def test_what_is_rejected_on_a_double_is_looked_for_elsewhere():
+    """The caller knows by its mask that the double is not the card; both are tracked."""
+    tracker, frames, shown = EmbeddedTracker(TrackingConfig()), film_with_its_double(), []
+    tracker.start(frames[0])
+    ids = tracker.add(truth(0))
+    double = tracker.add(on_card() + np.array([4, SHAPE[0] - CARD[0] - 2]))
+    for t, frame in enumerate(frames[1:], 1):
+        tracks = tracker.track(frame, urgent=t >= HIDDEN.stop)
+        mine = tracks.select(ids)
+        astray = mine.visible & ((error_px(mine, t) > 20) | (t in HIDDEN))
+        shown.append((astray.mean(), (mine.visible & ~astray).mean(), tracks.select(double).visible.mean()))
+        if t >= HIDDEN.start + 2:
+            tracker.reject(ids[astray])
+    astray, home, double_seen = np.array(shown).T
+    while_hidden = slice(HIDDEN.start + 2, HIDDEN.stop - 1)
+    assert (astray[while_hidden] > 0.1).mean() < 0.25, "after a rejection it is not found there at once again"
+    assert home[HIDDEN.stop + 2 :].min() > 0.7 and double_seen[5:].mean() > 0.6
+
+
 def test_points_come_back_elsewhere_turned_and_scaled():
     back = HIDDEN.stop + 5
     tracks = followed()[back - 1]
