@@ -153,7 +153,8 @@ def measure_table(measures: Mapping[str, Measure | str], head: str = LEGEND) -> 
         for label, m in measures.items()
     ]
     table = DataFrame(rows)
-    return table if table["why not"].any() else table.drop(columns="why not")
+    reasons = table.pop("why not")
+    return table.assign(**{"why not": reasons}) if reasons.any() else table
 
 
 def correlation_table(windows: Mapping[str, Sequence[Measure]], seed: int = 0) -> DataFrame:
