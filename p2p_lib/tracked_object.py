@@ -317,6 +317,8 @@ class TrackedObject:
             status, reason = Status.DEGRADED, f"only {hypothesis.support} points agree"
         used = view.seen & self.map.promoted
         agreement = (hypothesis.inliers & used).sum() / max(used.sum(), 1)
+        # Points that a wrong pose placed agree with it for ever after: each counts as much as that pose was trusted.
+        agreeing = self.map.trust[hypothesis.inliers].sum()
         covariance = self._covariance(view, hypothesis, refined)
         with self._stopwatch("map"):
             self._update_map(view, T_cam_obj, used, hypothesis.inliers)
@@ -324,14 +326,23 @@ class TrackedObject:
         self._settle_surface()
         if keyframe:
             good = view.seen & (hypothesis.inliers | ~self.map.promoted)
-            T_cam_obj = self._add_keyframe(view, T_cam_obj, self._sample(view), good, covariance)
-        way_rad, graph = self.views.way_rad(T_cam_obj), self.config.factor_graph
-        covariance = (
-            covariance + self._map_covariance + slide_covariance(refined.free_turns, way_rad, graph.slide_share)
-        )
-        covariance = graph.covariance_scale * covariance
-        sure = confidence(covariance, hypothesis.support, agreement, self.config.confidence)
-        return self._with_pose(view, T_cam_obj, status, hypothesis.support, sure, covariance, reason, keyframe)
+            _, sure = self._worth(T_cam_obj, refined, covariance, agreeing, agreement)
+            T_cam_obj = self._add_keyframe(view, T_cam_obj, self._sample(view), good, covariance, trust=sure)
+        of_all, sure = self._worth(T_cam_obj, refined, covariance, agreeing, agreement)
+        return self._with_pose(view, T_cam_obj, status, hypothesis.support, sure, of_all, reason, keyframe)
+
+    def _worth(
+        self, T_cam_obj: np.ndarray, refined: Refinement, covariance: np.ndarray, agreeing: float, agreement: float
+    ) -> tuple[np.ndarray, float]:
+        """(6, 6) covariance and confidence of a pose, with what the map itself may be wrong by.
+
+        covariance           (6, 6) of the pose relative to the map
+        agreeing, agreement  keypoints that agree with it, by their trust, and their share of those seen
+        """
+        graph = self.config.factor_graph
+        slid = slide_covariance(refined.free_turns, self.views.way_rad(T_cam_obj), graph.slide_share)
+        of_all = graph.covariance_scale * (covariance + self._map_covariance + slid)
+        return of_all, confidence(of_all, agreeing, agreement, self.config.confidence)
 
     def _doubt(self, hypothesis: Hypothesis, refined: Refinement) -> str:
         """Why a return is not believed (any more): keypoints and surface have to agree until it is confirmed."""
@@ -372,17 +383,19 @@ class TrackedObject:
         points: tuple[np.ndarray, np.ndarray],
         good: np.ndarray,
         covariance: np.ndarray | None = None,
+        trust: float = 1.0,
     ) -> np.ndarray:
         """New points, a vertex of the graph, a view of the surface. Returns the pose as the graph corrects it.
 
         points       uv_px (K, 2) and p_cam (K, 3) of the new points
         good         (N,) bool: points of the map whose observation the pose agrees with
         covariance   (6, 6) of the pose relative to the map; None at the first keyframe
+        trust        the pose's confidence
         """
         uv_px, p_cam = points
         new_ids = self.tracker.add(uv_px)
         ids, p_cam_all = np.concatenate([self.map.ids[good], new_ids]), np.concatenate([view.p_cam[good], p_cam])
-        self.map.add(new_ids, se3.transform(se3.inverse(T_cam_obj), p_cam), promoted=not len(self.views))
+        self.map.add(new_ids, se3.transform(se3.inverse(T_cam_obj), p_cam), not len(self.views), trust)
         key, registered = None, T_cam_obj
         if self.config.factor_graph.enabled:
             with self._stopwatch("graph"):

@@ -1,7 +1,9 @@
 """How likely a pose is right: within 2 cm and 5 degrees of the truth.
 
 A logistic regression on what is known without the truth: how well the pose is determined, how many keypoints agree on
-it, and which share of those seen that is. Its weights were fitted where poses go wrong (see :class:`ConfidenceConfig`).
+it, and which share of those seen that is. Points that a wrong pose placed agree with it for ever after, so each
+counts as much as the pose was trusted that placed it. Its weights were fitted where poses go wrong (see
+:class:`ConfidenceConfig`).
 """
 
 from __future__ import annotations
@@ -11,11 +13,11 @@ import numpy as np
 from p2p_lib.core.config import ConfidenceConfig
 
 
-def confidence(covariance: np.ndarray, inliers: int, agreement: float, config: ConfidenceConfig) -> float:
+def confidence(covariance: np.ndarray, inliers: float, agreement: float, config: ConfidenceConfig) -> float:
     """Between 0 and 1.
 
     covariance  (6, 6) of the pose, rotation (rad) first
-    inliers     keypoints that agree with the pose
+    inliers     keypoints that agree with the pose, each counted by the confidence of the pose that placed it
     agreement   their share of the keypoints seen, 0 to 1
     """
     sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))

@@ -22,6 +22,7 @@ class KeypointMap:
         self.ids = np.zeros(0, np.int64)
         self.p_obj = np.zeros((0, 3))
         self.promoted = np.zeros(0, bool)
+        self.trust = np.zeros(0)  # how likely the pose was right that placed each
         self._streak = np.zeros(0, np.int64)
         self._age = np.zeros(0, np.int64)
         self._agreed = np.zeros(0, np.int64)
@@ -32,8 +33,11 @@ class KeypointMap:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def add(self, ids: np.ndarray, p_obj: np.ndarray, promoted: bool = False) -> None:
-        """New points (N,) at p_obj (N, 3). The first frame's are promoted at once: they define the map."""
+    def add(self, ids: np.ndarray, p_obj: np.ndarray, promoted: bool = False, trust: float = 1.0) -> None:
+        """New points (N,) at p_obj (N, 3). The first frame's are promoted at once: they define the map.
+
+        ``trust`` is the confidence of the pose that places them.
+        """
         n = len(ids)
         zeros = np.zeros(n, np.int64)
         history = np.full((n, _HISTORY, 3), np.nan)
@@ -41,6 +45,7 @@ class KeypointMap:
         self.ids = np.concatenate([self.ids, np.asarray(ids, np.int64)])
         self.p_obj = np.concatenate([self.p_obj, p_obj])
         self.promoted = np.concatenate([self.promoted, np.full(n, promoted)])
+        self.trust = np.concatenate([self.trust, np.full(n, trust)])
         self._streak = np.concatenate([self._streak, zeros])
         self._age = np.concatenate([self._age, zeros])
         self._agreed = np.concatenate([self._agreed, zeros])

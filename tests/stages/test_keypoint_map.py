@@ -376,3 +376,14 @@ def test_rows_stay_together_when_points_go():
     for name, value in vars(together).items():
         if isinstance(value, np.ndarray):
             np.testing.assert_array_equal(value, np.concatenate([getattr(alone[i], name) for i in (1, 4)]), name)
+
+
+def test_every_point_keeps_the_trust_it_came_with():
+    points = KeypointMap(CFG)
+    points.add(np.array([7, 8]), np.zeros((2, 3)), promoted=True)
+    points.add(np.array([9]), np.ones((1, 3)), trust=0.25)
+    assert points.trust.tolist() == [1.0, 1.0, 0.25]
+    for _ in range(CFG.pending_ttl + 1):
+        points.observe(np.full((3, 3), np.nan), np.ones(3), stable=True)
+    assert points.retire().tolist() == [9]
+    assert points.trust.tolist() == [1.0, 1.0]
