@@ -186,7 +186,9 @@ class TrackedObject:
                 refined = {id(h): self._refine(view, h) for h in hypotheses}
         with self._stopwatch("selection"):
             T_cam_obj = [refined[id(h)].T_cam_obj if cfg.refine_all else h.T_cam_obj for h in hypotheses]
-            chosen, reason = registration.select(hypotheses, self._surface_distances(view, T_cam_obj), cfg)
+            distance_m = self._surface_distances(view, T_cam_obj)
+            odds = registration.motion_odds(T_cam_obj, list(self._priors().values()), cfg)
+            chosen, reason = registration.select(hypotheses, distance_m, cfg, odds)
         if chosen is None:
             return None, None, reason
         with self._stopwatch("refinement"):
@@ -247,18 +249,31 @@ class TrackedObject:
     def _hypotheses(self, view: View) -> list[Hypothesis]:
         """Candidate poses from the keypoints seen; rows as in the map."""
         cfg = self.config.registration
-        use = view.seen & (view.tracks.uncertainty <= cfg.max_uncertainty)
-        if (use & self.map.promoted).sum() >= cfg.min_promoted:
-            use &= self.map.promoted
-        p_cam = np.where(use[:, None], view.p_cam, np.nan)
+        certain = view.seen & (view.tracks.uncertainty <= cfg.max_uncertainty)
+        use = certain & self.map.promoted
+        if use.sum() < cfg.min_promoted:
+            use = certain
         priors = self._priors()
-        found = registration.generate(self.map.p_obj, p_cam, cfg, self._rng, priors=priors)
+        found = self._registered(view, use, priors)
+        most = max((h.support for h in found), default=0)
+        if cfg.multi_hypothesis and priors and most < cfg.contradicted * use.sum():
+            # Most points are wrong, whichever: pending ones may tell, and some may agree with where the surface leads.
+            found = self._registered(view, certain, priors)
+            carried = self._refine(view, None, list(priors.values())[-1])
+            if carried.refined:
+                p_cam = np.where(certain[:, None], view.p_cam, np.nan)
+                found += registration.refit(carried.T_cam_obj, "surface", self.map.p_obj, p_cam, cfg)
         found = self._without_jumps(found)
         if found or not cfg.motion_priors or self._carried >= self.config.pipeline.carry_frames:
             return found
         # Too few points to register: the surface may carry the pose on for a while, from where it should be.
         nobody, unknown = np.zeros(len(self.map), bool), np.full(len(self.map), np.inf)
         return [Hypothesis(T_cam_obj, nobody, unknown, name) for name, T_cam_obj in priors.items()]
+
+    def _registered(self, view: View, use: np.ndarray, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
+        """Hypotheses from the points ``use`` (N,) alone."""
+        p_cam = np.where(use[:, None], view.p_cam, np.nan)
+        return registration.generate(self.map.p_obj, p_cam, self.config.registration, self._rng, priors=priors)
 
     def _without_jumps(self, found: list[Hypothesis]) -> list[Hypothesis]:
         """Objects do not jump between frames: a hypothesis that does must have more support than any that does not.
@@ -279,13 +294,16 @@ class TrackedObject:
         """How far each dense point lies from the surface under each pose; None where there is nothing to compare."""
         if len(T_cam_obj) < 2 or self.surface is None or self.surface.empty or not len(view.cloud):
             return None
-        return refinement.surface_distances(self.surface, view.cloud, np.stack(T_cam_obj))
+        unseen = self.config.registration.unseen_share
+        return refinement.surface_distances(self.surface, view.cloud, np.stack(T_cam_obj), unseen)
 
-    def _refine(self, view: View, hypothesis: Hypothesis) -> Refinement:
+    def _refine(self, view: View, hypothesis: Hypothesis | None, T_cam_obj: np.ndarray | None = None) -> Refinement:
         """The pose refined on the surface, jointly with the keypoints where the configuration says so."""
-        cfg, T_cam_obj = self.config.refinement, hypothesis.T_cam_obj
+        cfg, T_cam_obj = self.config.refinement, hypothesis.T_cam_obj if hypothesis else T_cam_obj
         if not cfg.enabled or self.surface is None or self.surface.empty or not len(view.cloud):
             return Refinement(T_cam_obj, reason="no surface")
+        if hypothesis is None:
+            return refinement.refine(T_cam_obj, view.cloud, self.surface, cfg)
         at = hypothesis.inliers
         sigma_m = registration.noise_m(view.p_cam[at], self.config.registration)
         keypoints = Keypoints(self.map.p_obj[at], view.p_cam[at], sigma_m)

@@ -224,6 +224,9 @@ class RegistrationConfig(_Checked):
     max_uncertainty: float = _p(0.5, "tracks more uncertain than this are left out", low=0, high=1)
     min_promoted: int = _p(12, "with fewer visible keypoints, pending ones help out", "points", "release", low=3)
     motion_priors: bool = _p(True, "the last pose and constant velocity compete as hypotheses")
+    contradicted: float = _p(
+        0.7, "a smaller share of the keypoints that agree has pending points and surface asked", low=0
+    )
     noise_m: float = _p(0.001, "noise of a measured point at range 0", "m", low=1e-6)
     noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
     inlier_sigmas: float = _p(3.0, "inlier_m grows to this many sigmas of that noise; 0 = one constant", low=0)
@@ -232,6 +235,11 @@ class RegistrationConfig(_Checked):
         2.5, "standard errors by which the surface must prefer another than the best supported; 0 = least score", low=0
     )
     surface_margin_m: float = _p(2e-4, "and metres of mean distance", "m", low=0)
+    unseen_share: float = _p(0.4, "of the truncation that a point counts where nothing was seen", low=0, high=1)
+    odds_deg: float = _p(
+        5.0, "turn off the motion so far that halves the support of a hypothesis; 0 = none", "deg", low=0
+    )
+    odds_m: float = _p(0.02, "the same of its move", "m", low=0)
     min_support: int = _p(8, "inliers that let a hypothesis compete on the surface", "points", "release", low=0)
     min_support_share: float = _p(0.25, "or this share of the best supported", "", "release", low=0, high=1)
 
@@ -387,6 +395,9 @@ _PAPER: dict[str, Any] = {
     "registration.surface_sigmas": 0.0,
     "registration.refine_all": False,
     "registration.min_support": 0,
+    "registration.contradicted": 0.0,
+    "registration.unseen_share": 1.0,
+    "registration.odds_deg": 0.0,
     "factor_graph.bearing_sigma_rad": 0.01,
     "factor_graph.range_sigma_m": 0.01,
     "factor_graph.between_sigma_rad": 0.02,

@@ -97,6 +97,7 @@ class Bodies:
 
     def fit(self, p: Points, now: Picture, lost_only: bool = False) -> None:
         """Fit bodies' poses to their points that were followed or found; who disagrees is not verified."""
+        p.loose &= lost_only
         for b, body in enumerate(self._bodies):
             if lost_only and body.posed:
                 continue
@@ -129,7 +130,10 @@ class Bodies:
         return fit if fit.agrees.sum() >= max(cfg.body_points, 0.3 * len(at)) else None
 
     def _split(self, p: Points, strays: np.ndarray, now: Picture) -> None:
-        """Points that left their body together are another one."""
+        """Points that leave their body together go their own way, and are another one when they are far enough.
+
+        Until then the body may be the one that is wrong: its word does not count for them.
+        """
         cfg = self.config
         z = now.depth_at(p.uv[strays])
         known = (p.coasting[strays] == 0) & (z > 0)
@@ -140,11 +144,12 @@ class Bodies:
         own = strays[agrees]
         if len(own) < cfg.split_points:
             return
+        p.verified[own] = True
         centre, left = p.p_body[own].mean(0), self._bodies[p.body[own[0]]].fit.T_cam_body
-        if apart_m(left, T, centre) < cfg.split_m:
-            return
-        p.body[own], p.verified[own] = len(self._bodies), True
-        self._bodies.append(Body(Fit(T, _PROPOSED, centre, np.ones(len(own), bool)), T))
+        p.loose[own] = apart_m(left, T, centre) < cfg.split_m
+        if not p.loose[own[0]]:
+            p.body[own] = len(self._bodies)
+            self._bodies.append(Body(Fit(T, _PROPOSED, centre, np.ones(len(own), bool)), T))
 
     def keep(self, p: Points, tried: np.ndarray) -> None:
         """Give up poses that show points, ``tried`` (N,) and not found, that are not there."""

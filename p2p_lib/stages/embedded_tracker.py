@@ -151,7 +151,7 @@ class EmbeddedTracker:
         """Hold points against their bodies: what is turned away or hidden is invisible, what is vague follows."""
         p, cfg = self._points, self.config
         p.visible = p.verified.copy()
-        rows = np.flatnonzero(self._bodies.posed(p))
+        rows = np.flatnonzero(self._bodies.posed(p) & ~p.loose)
         if not len(rows):
             return
         told = self._bodies.predict(p, rows, self._now)

@@ -80,10 +80,7 @@ def generate(
     weights when ``config.inlier_sigmas`` is above 0. Rows that are not finite are ignored. Too few
     or collinear points: an empty list.
     """
-    p_obj, p_cam = np.asarray(p_obj, float).reshape(-1, 3), np.asarray(p_cam, float).reshape(-1, 3)
-    sigma_m = noise_m(p_cam, config) if sigma_m is None else np.asarray(sigma_m, float)
-    usable = np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1) & np.isfinite(sigma_m) & (sigma_m > 0)
-    matches = _Matches.of(p_obj[usable], p_cam[usable], sigma_m[usable], config)
+    matches, usable = _finite_matches(p_obj, p_cam, sigma_m, config)
     if len(matches.p_obj) < max(3, config.min_inliers):
         return []
     if config.multi_hypothesis:
@@ -93,6 +90,14 @@ def generate(
         found = _svd_twice(matches, config)
     distinct = _without_duplicates(found, matches, config)[: config.max_hypotheses]
     return [_spread(hypothesis, usable) for hypothesis in distinct]
+
+
+def refit(
+    T_cam_obj: np.ndarray, origin: str, p_obj: np.ndarray, p_cam: np.ndarray, config: RegistrationConfig
+) -> list[Hypothesis]:
+    """The hypothesis that grows from a given pose, refit on the correspondences that agree with it; or none."""
+    matches, usable = _finite_matches(p_obj, p_cam, None, config)
+    return [_spread(hypothesis, usable) for hypothesis in _from_priors(matches, {origin: T_cam_obj}, config)]
 
 
 def noise_m(p_cam: np.ndarray, config: RegistrationConfig) -> np.ndarray:
@@ -106,19 +111,37 @@ def competing(hypotheses: Sequence[Hypothesis], config: RegistrationConfig) -> l
     return [h for h in hypotheses if h.support >= min(config.min_support, config.min_support_share * most)]
 
 
+def motion_odds(
+    T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray], config: RegistrationConfig
+) -> np.ndarray | None:
+    """(H,) by how much the support of poses counts less for being off the nearest of the priors; None without any.
+
+    1 on a prior, 1/2 at ``odds_deg`` or ``odds_m`` from it: heavy tails, for objects may be pushed at any time.
+    """
+    if not len(priors) or not len(T_cam_obj) or not (config.odds_deg and config.odds_m):
+        return None
+    off = se3.inverse(np.stack(priors))[:, None] @ np.stack(T_cam_obj)[None]
+    turned = np.degrees(se3.angle_rad(off)) / config.odds_deg
+    moved = np.linalg.norm(np.stack(priors)[:, None, :3, 3] - np.stack(T_cam_obj)[None, :, :3, 3], axis=-1)
+    return 1 / (1 + (turned**2 + (moved / config.odds_m) ** 2).min(0))
+
+
 def select(
-    hypotheses: Sequence[Hypothesis], distance_m: np.ndarray | None, config: RegistrationConfig
+    hypotheses: Sequence[Hypothesis],
+    distance_m: np.ndarray | None,
+    config: RegistrationConfig,
+    odds: np.ndarray | None = None,
 ) -> tuple[Hypothesis | None, str]:
     """The hypothesis to go on with, and why.
 
     distance_m (H, N): how far each of the masked depth points lies from the surface under each pose (absolute
     TSDF value in metres); None while there is no surface. The paper takes the least mean. Ours
     (``surface_sigmas`` above 0): the best supported hypothesis stands unless another is nearer by more than chance
-    and ``surface_margin_m``; below that the surface cannot tell them apart.
+    and ``surface_margin_m``; below that the surface cannot tell them apart. ``odds`` (H,) weigh the support.
     """
     if not hypotheses:
         return None, "no hypothesis: too few correspondences agree"
-    support = np.array([h.support for h in hypotheses])
+    support = np.array([h.support for h in hypotheses]) * (1 if odds is None else odds)
     spread = np.array([h.residual_m[h.inliers].mean() if h.support else np.inf for h in hypotheses])
     champion = int(np.lexsort((spread, -support))[0])
     if len(hypotheses) == 1:
@@ -177,6 +200,16 @@ class _Matches:
         """(..., n) of poses (..., 4, 4)."""
         error = se3.transform(T_cam_obj, self.p_obj) - self.p_cam
         return np.sqrt(np.einsum("...i,...i->...", error, error))
+
+
+def _finite_matches(
+    p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray | None, config: RegistrationConfig
+) -> tuple[_Matches, np.ndarray]:
+    """The rows that are finite, and (N,) bool which those are."""
+    p_obj, p_cam = np.asarray(p_obj, float).reshape(-1, 3), np.asarray(p_cam, float).reshape(-1, 3)
+    sigma_m = noise_m(p_cam, config) if sigma_m is None else np.asarray(sigma_m, float)
+    usable = np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1) & np.isfinite(sigma_m) & (sigma_m > 0)
+    return _Matches.of(p_obj[usable], p_cam[usable], sigma_m[usable], config), usable
 
 
 def _fit(

@@ -36,6 +36,7 @@ class Points:
     coarse: Patches  # (N, K) at half resolution
     colour: np.ndarray  # (N, K, 2) chroma around the point
     body: np.ndarray  # (N,) which rigid body it belongs to, -1 for none
+    loose: np.ndarray  # (N,) bool: left its body together with others in the newest frame, not far yet
     p_body: np.ndarray  # (N, 3) place on it, metres
     map_cov: np.ndarray  # (N, 3, 3) its covariance
     tangent: np.ndarray  # (N, 3, 2) offset on the body per pixel of offset in the first appearance
@@ -66,6 +67,7 @@ class Points:
             coarse=Patches.empty((n, k)),
             colour=np.zeros((n, k, 2), np.float32),
             body=np.full(n, -1),
+            loose=np.zeros(n, bool),
             p_body=np.zeros((n, 3)),
             map_cov=np.zeros((n, 3, 3)),
             tangent=np.zeros((n, 3, 2)),

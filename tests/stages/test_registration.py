@@ -454,3 +454,32 @@ def test_covariance_says_which_direction_is_free() -> None:
     hypothesis = Hypothesis(T, np.ones(20, bool), np.zeros(20), "truth")
     sigma = np.sqrt(np.diag(registration.covariance(hypothesis, line, se3.transform(T, line), 0.002)))
     assert sigma[[0, 2]].max() < 0.02 and sigma[3:].max() < 0.001
+
+
+def test_support_counts_less_for_what_is_off_the_motion() -> None:
+    """1 on a prior, 1/2 at the configured turn or move from the nearest, and so a jump loses to a third as many."""
+    turn = [se3.exp(np.array([np.radians(deg), 0, 0, 0, 0, 0])) for deg in (0, DEFAULT.odds_deg, 20)]
+    move = se3.exp(np.array([0, 0, 0, DEFAULT.odds_m, 0, 0]))
+    T = random_pose(np.random.default_rng(3))
+    poses = [T @ turn[0], T @ turn[1], T @ turn[2], T @ move, T @ turn[2] @ turn[1]]
+    priors = [T, T @ turn[2]]
+    odds = registration.motion_odds(poses, priors, DEFAULT)
+    np.testing.assert_allclose(odds, [1, 0.5, 1, 0.5, 0.5], atol=1e-6)
+    assert registration.motion_odds(poses, [], DEFAULT) is None
+    assert registration.motion_odds(poses, priors, PAPER) is None
+    same = np.zeros((2, 50))
+    assert select([made(30), made(12)], same, DEFAULT)[0].origin == "30"
+    assert select([made(30), made(12)], same, DEFAULT, np.array([0.1, 1.0]))[0].origin == "12"
+
+
+def test_refit_grows_from_a_pose_what_agrees_with_it() -> None:
+    rng = np.random.default_rng(11)
+    p_obj, T, wrong = box_points(rng, 60), random_pose(rng), random_pose(rng)
+    p_cam = np.concatenate([se3.transform(wrong, p_obj[:45]), se3.transform(T, p_obj[45:])])
+    p_cam += 0.0005 * rng.normal(size=(60, 3))
+    p_cam[50] = np.nan
+    near = T @ se3.exp(np.array([0.01, 0, 0, 0, 0.001, 0]))
+    (found,) = registration.refit(near, "surface", p_obj, p_cam, DEFAULT)
+    assert found.origin == "surface" and found.support == 14 and not found.inliers[:45].any()
+    assert error_deg_m(found.T_cam_obj, T)[0] < 0.5
+    assert registration.refit(random_pose(rng), "surface", p_obj, p_cam, DEFAULT) == []
