@@ -72,18 +72,19 @@ def fading_label(seed: int, frames: int = 180, contrast: float = 1.0) -> Scenari
 
 
 def long_turning(seed: int, frames: int = 660) -> Scenario:
-    """A carton that turns three times around while it sways: its axis changes, and views come back again and again.
+    """A tin that turns three times around while it sways: its axis changes, and views come back again and again.
 
-    Errors add up from keyframe to keyframe unless the views that come back are tied to those before.
+    Only the print tells how far it has turned. Errors add up from keyframe to keyframe unless the views that come
+    back are tied to those before.
     """
     if frames < 300:
         raise BadInput("long_turning", f"frames {frames}", "at least 300: it turns by about two degrees a frame")
     rng = np.random.default_rng([seed, 1])
-    mesh = shapes.box(rng, tuple(np.array([0.085, 0.06, 0.12]) * rng.uniform(0.94, 1.06, 3)))
+    mesh = shapes.can(rng, 0.045 * rng.uniform(0.94, 1.06), 0.12 * rng.uniform(0.94, 1.06))
     yaw = np.radians(1.65) * np.arange(frames) * rng.choice([-1, 1]) + rng.uniform(0, 2 * np.pi)
     T = wander(rng, frames, 0.03, 28.0, 260) @ turn(np.array([0, 0, 1.0]), yaw)
     T[:, :3, 3] += _CENTRE
-    return _on_the_table(rng, frames, Body("carton", mesh, T), eye=np.array([0.0, -0.85, 0.50]))
+    return _on_the_table(rng, frames, Body("tin", mesh, T), eye=np.array([0.0, -0.85, 0.50]))
 
 
 def _on_the_table(
