@@ -159,7 +159,7 @@ def test_long_turning_turns_several_times_and_comes_back(seed):
     steps = se3.log(se3.inverse(T[:-1]) @ T[1:])[:, :3]
     assert np.degrees(np.linalg.norm(steps, axis=1)).sum() > 3 * 360
     spread = np.linalg.eigvalsh(np.cov((steps / np.linalg.norm(steps, axis=1, keepdims=True)).T))
-    assert spread[1] > 0.03  # about no one axis
+    assert spread[1] > 0.02  # about no one axis: it sways by 8 degrees and more
     between = turn_deg(R[:, None], R[None])
     before = np.tril(np.ones((len(R), len(R)), bool), -150)
     back = np.where(before, between, 180)[300:].min(1)
