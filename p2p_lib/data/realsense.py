@@ -23,6 +23,8 @@ from p2p_lib.core.types import Frame
 WAIT_MS = 200
 #: A camera that sends nothing for so long has gone.
 GONE_MS = 5000
+#: Pictures taken further apart are no pair.
+APART_MS = 25
 #: Pictures that a camera's exposure takes to settle, and what is asked of it: all RealSense depth cameras can.
 WARM_UP, WIDTH, HEIGHT, RATE_HZ = 30, 640, 480, 30
 # Distortion that moves no pixel further than this is left as it is: a D435's colour camera has none at all.
@@ -134,7 +136,7 @@ class RealSenseCamera:
                     return None
                 came, frames = self._pipeline.try_wait_for_frames(WAIT_MS)
             colour, depth = (frames.get_color_frame(), frames.get_depth_frame()) if came else (None, None)
-            if colour and depth and colour.get_frame_number() != self._last:
+            if colour and depth and colour.get_frame_number() != self._last and _together(colour, depth):
                 self._last = colour.get_frame_number()
                 registered = self._align.process(frames)
                 return registered.get_color_frame(), registered.get_depth_frame()
@@ -143,6 +145,12 @@ class RealSenseCamera:
             waited_ms = 0 if came else waited_ms + WAIT_MS
             if waited_ms >= GONE_MS:
                 raise MissingData(self.name, f"no picture for {GONE_MS / 1000:g} s", "Is the cable still in?")
+
+
+def _together(colour: Any, depth: Any) -> bool:
+    """Whether two pictures were taken at one moment: when we are late, the library may pair a colour with older depth."""
+    apart_ms = abs(colour.get_timestamp() - depth.get_timestamp())
+    return colour.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain() or apart_ms <= APART_MS
 
 
 def _library() -> Any:
@@ -167,7 +175,7 @@ def _pairs(rs: Any, bag: Path) -> Iterator[tuple[Any, Any]]:
                     return
                 continue
             colour, depth = frames.get_color_frame(), frames.get_depth_frame()
-            if not colour or not depth or colour.get_frame_number() == last:
+            if not colour or not depth or colour.get_frame_number() == last or not _together(colour, depth):
                 continue
             last = colour.get_frame_number()
             registered = align.process(frames)

@@ -142,7 +142,9 @@ def decide(moment: Moment, config: Config, seed: int = 0) -> Decisions:
     single = generate(moment.p_obj, moment.p_cam, replace(cfg, multi_hypothesis=False), rng)
     T_raw = np.stack([h.T_cam_obj for h in hypotheses])
     T_refined = np.stack([_refined(moment, h, config) for h in hypotheses])
-    raw_m, refined_m = (surface_distances(moment.surface, moment.cloud, T, cfg.unseen_share) for T in (T_raw, T_refined))
+    raw_m, refined_m = (
+        surface_distances(moment.surface, moment.cloud, T, cfg.unseen_share) for T in (T_raw, T_refined)
+    )
     chosen, reason = select(hypotheses, refined_m if cfg.refine_all else raw_m, cfg)
     at = next(i for i, h in enumerate(hypotheses) if h is chosen)
     poses = {
