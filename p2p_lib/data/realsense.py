@@ -148,7 +148,7 @@ class RealSenseCamera:
 
 
 def _together(colour: Any, depth: Any) -> bool:
-    """Whether two pictures were taken at one moment: when we are late, the library may pair a colour with older depth."""
+    """Whether two pictures are of one moment: when we are late, the library may pair colour with older depth."""
     apart_ms = abs(colour.get_timestamp() - depth.get_timestamp())
     return colour.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain() or apart_ms <= APART_MS
 
