@@ -314,10 +314,10 @@ class ConfidenceConfig(_Checked):
     seeds 310 to 314; ``benchmarks/bench_confidence.py`` says what they are worth on others.
     """
 
-    offset: float = _p(-3.4, "log odds at a standard deviation of one degree, without any point", low=-50, high=50)
-    per_log_sigma: float = _p(-1.45, "of the largest standard deviation of rotation, by its logarithm", low=-20, high=0)
-    per_log_inliers: float = _p(1.28, "of the agreeing keypoints, by the logarithm of their number + 1", low=0, high=20)
-    per_agreement: float = _p(2.5, "of their share of the keypoints seen", low=0, high=50)
+    offset: float = _p(-2.1, "log odds at a standard deviation of one degree, without any point", low=-50, high=50)
+    per_log_sigma: float = _p(-0.27, "of the largest standard deviation of rotation, by its logarithm", low=-20, high=0)
+    per_log_inliers: float = _p(1.35, "of the agreeing keypoints, by the logarithm of their number + 1", low=0, high=20)
+    per_agreement: float = _p(0.7, "of their share of the keypoints seen", low=0, high=50)
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ def test_thinning_leaves_the_mean_of_each_cell():
 def test_a_thicker_sphere_is_as_far_as_it_is_thicker(reference):
     exact, thick = chamfer_cm(sphere(0.05), se3.IDENTITY, reference), chamfer_cm(sphere(0.06), se3.IDENTITY, reference)
     assert all(0 < cm < 0.25 for cm in exact.values()), "what the 5 mm grid leaves"
+    assert exact["as aligned"] < 0.05, "nothing but the spacing of the samples"
     for form in exact:
         assert 1.0 <= thick[form] < 1.1, "centimetres"
 
@@ -42,7 +43,9 @@ def test_the_pose_of_the_frame_is_taken_out(reference):
     mesh.apply_transform(se3.inverse(T_model_obj) @ se3.from_rt(np.eye(3), np.array([0.006, -0.004, 0.003])))
     moved = chamfer_cm(mesh, T_model_obj, reference)
     still = chamfer_cm(sphere(0.05), se3.IDENTITY, reference)
-    # 0.8 cm without ICP; cells of the 5 mm grid fall elsewhere.
+    assert 0.25 < moved.pop("as aligned") < 0.78, "0.8 cm, of which a sphere hides what lies along it"
+    still.pop("as aligned")
+    # Cells of the 5 mm grid fall elsewhere.
     assert moved == pytest.approx(still, abs=0.04)
 
 
