@@ -1,8 +1,8 @@
 """Chamfer distance of a reconstructed mesh, in the two forms that the field's tables mix, and in a stricter one.
 
-Both of the field's place the mesh by the alignment of the poses, clean it, sample it, and let a short ICP take out what is left of the
-frame. They differ in the last step. ``BundleSDF``: half the sum of the two mean distances, over all samples of the
-mesh. ``release`` (the paper's): samples thinned to the same 5 mm grid as the reference, and one mean over both
+All place the mesh by the alignment of the poses, clean it and sample it; in the field's, a short ICP takes out what is
+left of the frame. They differ in the last step. ``BundleSDF``: half the sum of the two mean distances, over all samples
+of the mesh. ``release`` (the paper's): samples thinned to the same 5 mm grid as the reference, and one mean over both
 directions together, so that the larger cloud weighs more. ``as aligned`` is half the sum of the two mean distances as
 the poses place the mesh: no ICP, no grid.
 """

@@ -123,6 +123,30 @@ def test_what_is_rejected_on_a_double_is_looked_for_elsewhere():
     assert home[HIDDEN.stop + 2 :].min() > 0.7 and double_seen[5:].mean() > 0.6
 
 
+def test_a_part_that_slides_off_slowly_is_not_held_back():
+    """One card at first; then its right part goes its own way at a pixel a frame, on which the majority is silent."""
+    card, wall = printed(1, CARD), printed(2, SHAPE) // 2 + 60
+    cut, start, rng = 88, 10, np.random.default_rng(4)
+    right, frames = on_card()[:, 0] > cut, []
+    for t in range(45):
+        rgb, depth, off = wall.copy(), np.full(SHAPE, 0.9, np.float32), max(t - start, 0)
+        rgb[100:210, 100 : 100 + cut], depth[100:210, 100 : 100 + cut] = card[:, :cut], 0.5
+        moved = np.s_[100:210, 100 + cut + off : 240 + off]
+        rgb[moved], depth[moved] = card[:, cut:], 0.5
+        frames.append(Frame(t, t / 30, np.clip(rgb + rng.normal(0, 3, rgb.shape), 0, 255).astype(np.uint8), depth))
+    tracker = EmbeddedTracker(TrackingConfig())
+    tracker.start(frames[0])
+    ids, wrong = tracker.add(on_card() + 100), []
+    for t, frame in enumerate(frames[1:], 1):
+        told = tracker.track(frame).select(ids)
+        at = on_card() + 100 + np.outer(right, [max(t - start, 0), 0])
+        wrong.append((np.linalg.norm(told.uv_px - at, axis=1) > 1.5) | ~told.visible)
+    seam = np.abs(on_card()[:, 0] - cut) < 12  # its surroundings are of both parts
+    wrong, right, left = np.array(wrong), right & ~seam, ~right & ~seam
+    assert wrong[:, right].mean() < 0.1 and wrong[:, left].mean() < 0.05
+    assert wrong[start : start + 12, right].mean() < 0.15, "before they are far enough to be another body"
+
+
 def test_points_come_back_elsewhere_turned_and_scaled():
     back = HIDDEN.stop + 5
     tracks = followed()[back - 1]
