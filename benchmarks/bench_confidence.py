@@ -25,9 +25,10 @@ from p2p_lib.pipeline import Point2Pose
 BLURRED = {"axial_per_m": 0.02, "exposure": 0.2, "shutter_share": 0.8, "read_levels": 10.0}
 DEGRADED = [
     ("fading_label", {"contrast": 0.07}),
-    ("fading_label", {"contrast": 0.05}),
+    ("fading_label", {"contrast": 0.06}),
     ("weak_texture", {"contrast": 0.03, "axial_per_m": 0.02}),
     ("crossing", BLURRED),
+    ("occlusion", BLURRED),
 ]
 AS_THEY_ARE = ["crossing", "occlusion", "three_objects"]
 

@@ -310,14 +310,15 @@ class FactorGraphConfig(_Checked):
 class ConfidenceConfig(_Checked):
     """Log odds that a pose is within 2 cm and 5 degrees of the truth.
 
-    Fitted on ``fading_label``, ``weak_texture`` and ``crossing``, degraded until a third of the poses were wrong,
-    seeds 310 to 314; ``benchmarks/bench_confidence.py`` says what they are worth on others.
+    Fitted on ``fading_label``, ``weak_texture`` and ``crossing``, degraded until half of the poses were wrong, seeds
+    310 to 313, through the trust that passes from pose to point to pose; ``benchmarks/bench_confidence.py`` says what
+    they are worth on others.
     """
 
-    offset: float = _p(-2.1, "log odds at a standard deviation of one degree, without any point", low=-50, high=50)
-    per_log_sigma: float = _p(-0.27, "of the largest standard deviation of rotation, by its logarithm", low=-20, high=0)
-    per_log_inliers: float = _p(1.35, "of the agreeing keypoints, by the logarithm of their number + 1", low=0, high=20)
-    per_agreement: float = _p(0.7, "of their share of the keypoints seen", low=0, high=50)
+    offset: float = _p(-2.0, "log odds at a standard deviation of one degree, without any point", low=-50, high=50)
+    per_log_sigma: float = _p(-0.75, "of the largest standard deviation of rotation, by its logarithm", low=-20, high=0)
+    per_log_inliers: float = _p(1.1, "of the agreeing keypoints, by the logarithm of their number + 1", low=0, high=20)
+    per_agreement: float = _p(0.9, "of their share of the keypoints seen", low=0, high=50)
 
 
 @dataclass(frozen=True)

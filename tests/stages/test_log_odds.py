@@ -18,9 +18,9 @@ def covariance(largest_deg: float, metres: float = 0.001) -> np.ndarray:
 
 
 def test_sure_of_many_that_agree_and_not_of_few_that_do_not():
-    assert confidence(covariance(0.4), 35, 0.9, CONFIG) > 0.97
-    assert confidence(covariance(8.0), 6, 0.3, CONFIG) < 0.15
-    assert confidence(covariance(1.0), 0, 0.0, CONFIG) < 0.1
+    assert confidence(covariance(0.4), 35, 0.9, CONFIG) > 0.95
+    assert confidence(covariance(8.0), 6, 0.3, CONFIG) < 0.3
+    assert confidence(covariance(1.0), 0, 0.0, CONFIG) < 0.15
 
 
 @pytest.mark.parametrize("inliers", [0, 5, 40])
