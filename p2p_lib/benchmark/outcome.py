@@ -12,7 +12,12 @@ from pydantic import BaseModel, ConfigDict
 from p2p_lib.core.errors import BadInput
 
 
-class ObjectOutcome(BaseModel):
+class _Record(BaseModel):
+    # Of the nested ones too: each model writes its own numbers, and infinity would be written as null.
+    model_config = ConfigDict(ser_json_inf_nan="constants")
+
+
+class ObjectOutcome(_Record):
     """One object's errors over its scored frames.
 
     first, all  ``add_m`` and ``adds_m`` in metres by either alignment, infinite where there was no pose
@@ -33,7 +38,7 @@ class ObjectOutcome(BaseModel):
         return {name: np.array(values) for name, values in getattr(self, align).items()}
 
 
-class Outcome(BaseModel):
+class Outcome(_Record):
     """What became of a job.
 
     status    "not run" where data or a backend is missing: tried again the next time
@@ -42,8 +47,6 @@ class Outcome(BaseModel):
     tracks    scores of the 2D tracker by itself
     times     milliseconds and rates; they are the machine's, not the method's
     """
-
-    model_config = ConfigDict(ser_json_inf_nan="constants")
 
     key: str
     status: Literal["done", "failed", "not run"]

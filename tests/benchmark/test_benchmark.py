@@ -19,6 +19,7 @@ from p2p_lib import cli
 from p2p_lib.benchmark import read_plan, run_benchmark
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import jobs_of
+from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome, load_outcome, save_outcome
 from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.evaluation import metrics
 from p2p_lib.run import evaluate_run
@@ -218,3 +219,14 @@ def test_what_dead_processes_left_is_swept(plan, tmp_path):
         folder.mkdir(parents=True)
     run_benchmark(plan, tmp_path, "quick", progress=False)
     assert not left.exists() and running.exists() and elsewhere.exists()
+
+
+def test_a_record_with_lost_frames_is_read_back_as_it_was(tmp_path):
+    """Infinite errors, as JSON knows none."""
+    errors = {"add_m": [0.001, float("inf")], "adds_m": [0.0, float("inf")]}
+    box = ObjectOutcome(lost=1, first=errors, all=errors, returns=[3, None], chamfer_cm={"BundleSDF": 0.2})
+    made = Outcome(key="abc", status="done", objects={"box": box}, times={"hz": float("nan")})
+    save_outcome(tmp_path, made)
+    again = load_outcome(tmp_path, "abc")
+    assert again.objects == made.objects and np.isnan(again.times["hz"])
+    assert np.isinf(again.objects["box"].errors_m("first")["add_m"][1])
