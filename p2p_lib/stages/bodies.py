@@ -164,7 +164,8 @@ class Bodies:
 
     def search(self, now: Picture, region: np.ndarray | None, turn: int | None) -> None:
         """Propose poses for lost bodies by their landmarks; one scale in ``turn`` keeps the cost even, None: all."""
-        lost = [body for body in self._bodies if not body.posed and len(body.landmarks.p_body)]
+        # One that was given up is lost although the few points that it was taken for are followed on.
+        lost = [body for body in self._bodies if not (body.posed and body.kept) and len(body.landmarks.p_body)]
         if not lost:
             return
         scales = range(len(STEPS_M)) if turn is None else (turn % len(STEPS_M),)
