@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import sys
 import traceback
 from collections.abc import Sequence
 from dataclasses import asdict
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
@@ -40,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
 
 
-def _run(a: argparse.Namespace) -> None:
+def _run(a: argparse.Namespace) -> int:
     from p2p_lib.run import run
 
     result = run(
@@ -69,9 +71,12 @@ def _run(a: argparse.Namespace) -> None:
         print(result.evaluation.as_table())
         print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
     else:
-        print(f"Results in {a.out}. Not scored: {result.not_scored}")
+        print(f"Results in {a.out}; not scored, {result.not_scored}." + f" Next: p2p view {a.out}" * result.tracked)
     if result.interrupted:
         raise KeyboardInterrupt
+    if result.advice:
+        print(f"p2p run: {result.advice}", file=sys.stderr)
+    return 0 if result.tracked else P2PError.exit_code
 
 
 def _eval(a: argparse.Namespace) -> None:
@@ -130,10 +135,19 @@ def _click(a: argparse.Namespace) -> None:
     from p2p_lib.click import collect_clicks, wait_for_clicks
     from p2p_lib.data.sequence import open_sequence
 
+    _check_writable(a.out)
     sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed)
     page = collect_clicks(sequence, a.out, a.frame, a.port)
     prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)
     print(f"{len(prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --out DIR")
+
+
+def _check_writable(path: Path) -> None:
+    """Refuse a file that could not be written in the end, before anyone works for it."""
+    folder = next(p for p in path.absolute().parents if p.exists())
+    if path.is_dir() or not folder.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
+        what = "a folder" if path.is_dir() else "what cannot be written"
+        raise BadInput(f"--out {path}", what, "a file in a folder that can be written")
 
 
 def _live(a: argparse.Namespace) -> None:
@@ -190,29 +204,40 @@ def _view(a: argparse.Namespace) -> None:
 
 
 def _synth(a: argparse.Namespace) -> None:
+    from p2p_lib.data.sequence import SYNTHETIC, unknown_scenario
     from p2p_lib.data.synthetic import SCENARIOS, describe, write_sequence
 
     if a.list:
-        print("\n".join(f"{name:18}{describe(name)}" for name in SCENARIOS))
+        print("\n".join(f"{name:18}{re.sub('`+', '', describe(name))}" for name in SCENARIOS))
         return
     if a.scenario is None or a.out is None:
         raise BadInput("synth", "no scenario or no --out", "p2p synth SCENARIO --out DIR; p2p synth --list names them")
-    out = write_sequence(a.scenario, a.out, a.seed, a.noise, a.models or "", a.bop)
+    if unknown := unknown_scenario(a.scenario, SCENARIOS):
+        raise unknown
+    out = write_sequence(a.scenario.removeprefix(SYNTHETIC), a.out, a.seed, a.noise, a.models or "", a.bop)
     print(f"Written to {out}. Next: p2p run {out} --out RUN")
 
 
-def _benchmark(a: argparse.Namespace) -> None:
+def _benchmark(a: argparse.Namespace) -> int:
     from p2p_lib.benchmark import plan_names, read_plan, run_benchmarks
+    from p2p_lib.core.paths import data_dir
     from p2p_lib.report.paper_tables import write_table
 
     if a.list:
-        print("\n".join(f"{name:24}{read_plan(name).title}" for name in plan_names()))
-        return
+        for name in plan_names():
+            plan = read_plan(name)
+            print(f"{name:24}{plan.title}" + (f" (data: {', '.join(plan.data)})" if plan.data else ""))
+        print("(data: ...) is looked for below $P2P_DATA, see p2p data list; with --quick no plan needs any.")
+        return 0
     if not a.plan or a.out is None:
         raise BadInput(
             "benchmark", "no plan or no --out", "p2p benchmark PLAN --out DIR; p2p benchmark --list names them"
         )
     profile = "quick" if a.quick else "full"
+    lacking = [str(plan) for plan in a.plan if read_plan(plan).data] if data_dir() is None and not a.quick else []
+    if lacking:
+        what = f"{', '.join(lacking)}: $P2P_DATA is not set, so what needs data will not run"
+        print(f"p2p benchmark: {what}. Set it (see p2p data list), or add --quick.", file=sys.stderr)
     options = {"jobs": a.jobs, "scheduler": a.scheduler, "retry": a.retry, "progress": not a.quiet}
     benchmarks = run_benchmarks(a.plan, a.out, profile, **options)
     for benchmark in benchmarks:
@@ -220,6 +245,10 @@ def _benchmark(a: argparse.Namespace) -> None:
         print(f"{write_table(benchmark)}\n{counts}. Tables in {benchmark.folder}\n")
     if any(benchmark.interrupted for benchmark in benchmarks):
         raise KeyboardInterrupt
+    if any(benchmark.counts()["done"] for benchmark in benchmarks):
+        return 0
+    print("p2p benchmark: nothing ran; the tables say why", file=sys.stderr)
+    return P2PError.exit_code
 
 
 def _notebooks(a: argparse.Namespace) -> None:
@@ -291,11 +320,30 @@ def _pairs(option: str, given: list[str] | None, form: str) -> dict[str, str]:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with the words of a command in one line."""
+    """Says what is wrong with the words of a command in one line, and what was meant."""
+
+    def parse_known_args(self, args=None, namespace=None):
+        if args is not None and self._subparsers is None:  # before argparse misses --out where --ouput was given
+            known = list(self._option_string_actions)
+            for word in args[: args.index("--") if "--" in args else None]:
+                name = word.partition("=")[0]
+                if re.match("--[a-z]", name) and not any(option.startswith(name) for option in known):
+                    self.error(f"there is no option {name}{_meant(name, known)}")
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str):
-        print(f"{self.prog}: {message}. See {self.prog} --help", file=sys.stderr)
+        if choice := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
+            message += _meant(choice[1], re.findall(r"[\w-]+", choice[2]))
+        print(
+            f"{self.prog}: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See {self.prog} --help",
+            file=sys.stderr,
+        )
         raise SystemExit(2)
+
+
+def _meant(word: str, known: list[str]) -> str:
+    near = get_close_matches(word, known, n=1, cutoff=0.6)
+    return f". Did you mean {near[0]}?" if near else ""
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -43,6 +43,8 @@ class RunResult:
     evaluation   where the sequence has truth and models; else ``not_scored`` says why there is none
     summary      a line on the frames done, then one per object: frames with a pose, and what kept it from the others
     interrupted  whether Ctrl-C ended the run
+    advice       what to do about objects that never had a pose, a line; "" where all had one
+    tracked      whether any object ever had a pose
     """
 
     path: Path
@@ -50,6 +52,8 @@ class RunResult:
     not_scored: str
     summary: tuple[str, ...]
     interrupted: bool
+    advice: str = ""
+    tracked: bool = True
 
 
 def make_config(
@@ -99,6 +103,7 @@ def run(
     one-line message for anything that does not fit; Ctrl-C ends the run early and is reported in the result.
     """
     config = make_config(preset, config_file, settings, seed)
+    source = " ".join(map(str, (sequence, *(("--prompts", prompts) if isinstance(prompts, str | Path) else ()))))
     prompts = load_prompts(prompts) if isinstance(prompts, str | Path) else tuple(prompts or ())
     masks = _mask_source(masks, prompts)
     segmenter = masks if masks in SEGMENTERS else None
@@ -108,6 +113,10 @@ def run(
     frames = _frames(len(sequence), start, stop)
     chosen = _chosen([p.name for p in prompts] if segmenter else sequence.objects, objects)
     clicked = _by_frame([p for p in prompts if p.name in chosen], frames, sequence.camera)
+    if not segmenter and all(sequence.masks(i) is None for i in frames):
+        fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
+        expected = "masks of the first picture at least, or clicks"
+        raise BadInput("masks", f"none in frames {frames[0]} to {frames[-1]} of {sequence.name}", expected, fix)
     method = Point2Pose(
         sequence.camera,
         config,
@@ -157,7 +166,11 @@ def run(
         evaluation, not_scored = evaluate(done), ""
     except MissingData as error:
         evaluation, not_scored = None, str(error)
-    return RunResult(Path(out), evaluation, not_scored, _summary(done, len(frames)), interrupted)
+    if not any(obj.has_truth.any() for obj in done.objects.values()):
+        not_scored = "the sequence has no truth"
+    tracked = any(obj.has_pose.any() for obj in done.objects.values())
+    advice = "" if interrupted else _advice(done, source, bool(segmenter))
+    return RunResult(Path(out), evaluation, not_scored, _summary(done, len(frames)), interrupted, advice, tracked)
 
 
 def _estimates(
@@ -298,6 +311,29 @@ def _summary(run: Run, wanted: int) -> tuple[str, ...]:
         most = f"; without one mostly {without.most_common(1)[0][0]}" if without else ""
         lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{most}")
     return tuple(lines)
+
+
+def _advice(run: Run, source: str, clicks: bool) -> str:
+    """What to do about objects that never had a pose, by what kept it from them; "" where there are none.
+
+    source  the sequence, and the prompts, as they were given to the command line
+    """
+    reasons = {
+        name: Counter(obj.reason).most_common(1)[0][0] for name, obj in run.objects.items() if not obj.has_pose.any()
+    }
+    if not reasons:
+        return ""
+    who, why = f"{', '.join(reasons)} never had a pose", " ".join(reasons.values())
+    fix = "see what is wrong with the data"
+    if "not seen yet" in why:
+        fix = (
+            "click in the middle of it, elsewhere"
+            if clicks
+            else "its masks are empty or too small: draw it, or use p2p click"
+        )
+    if "pixels with depth" in why:
+        fix = "its depth is missing or out of range, or in another unit (--depth-scale)"
+    return f"{who} ({next(iter(reasons.values()))}); {fix}. Next: p2p check {source}"
 
 
 def _mask_source(masks: str | None, prompts: Sequence[Prompt]) -> str:

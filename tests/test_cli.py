@@ -174,6 +174,46 @@ def test_without_truth_there_is_no_score_and_no_fuss(sequence, tmp_path, capsys)
     assert out == "" and "nothing to score" in err
 
 
+def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys):
+    shutil.rmtree(sequence / "annotated_poses")
+    shutil.move(sequence / "gt_mask", sequence / "masks")
+    for path in (sequence / "depth").iterdir():
+        cv2.imwrite(str(path), np.full((H, W), 9000, np.uint16))
+    assert run(sequence, tmp_path / "out") == 2
+    out, err = capsys.readouterr()
+    assert "Next: p2p view" not in out and err.count("\n") == 1
+    assert "object never had a pose (only 0 mask pixels with depth)" in err and "--depth-scale" in err
+    assert err.endswith(f"Next: p2p check {sequence}\n")
+    for path in (sequence / "masks").iterdir():
+        cv2.imwrite(str(path), np.zeros((H, W), np.uint8))
+    assert run(sequence, tmp_path / "empty") == 2
+    assert "its masks are empty or too small" in capsys.readouterr().err
+    shutil.rmtree(sequence / "masks")
+    assert run(sequence, tmp_path / "none") == 2
+    assert "p2p click" in (line := one_line(capsys)) and "--prompts" in line
+
+
+def test_a_scenario_is_known_by_the_name_that_run_takes(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr("p2p_lib.data.synthetic.write_sequence", lambda name, out, *more: made.append(name) or out)
+    assert cli.main(["synth", "synthetic/crossing", "--out", str(tmp_path)]) == 0 and made == ["crossing"]
+
+
+def test_the_list_of_scenarios_has_no_markup(capsys):
+    assert cli.main(["synth", "--list"]) == 0
+    assert "`" not in capsys.readouterr().out
+
+
+def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("P2P_DATA", raising=False)
+    assert cli.main(["benchmark", "ycbineoat", "--out", str(tmp_path), "--quiet"]) == 2
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert "$P2P_DATA is not set" in first and "--quick" in first and "nothing ran" in last
+    assert cli.main(["benchmark", "--list"]) == 0
+    listed = capsys.readouterr().out
+    assert "YCBInEOAT (data: ycbineoat)" in listed and "Runtime\n" in listed
+
+
 # --- what does not: one line, exit code 2 ------------------------------------------------------
 
 
@@ -268,6 +308,10 @@ BAD_WORDS = {
     "no config": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/no.toml"], ["no.toml", "no such"]),
     "config is no TOML": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/cam_K.txt"], ["cam_K.txt", "TOML"]),
     "config is a folder": (["run", "{seq}", "--out", "{out}", "--config", "{seq}"], ["slide", "TOML"]),
+    "unknown stage": (["run", "{seq}", "--out", "{out}", "--set", "foo.bar=1"], ["'foo.bar'", "pipeline, tracking"]),
+    "unknown scenario": (["synth", "crosing", "--out", "{out}"], ["'crosing'", "Did you mean synthetic/crossing?"]),
+    "click into a file": (["click", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt/x", "can be written"]),
+    "click into a folder": (["click", "{seq}", "--out", "{seq}/rgb"], ["slide/rgb", "a folder"]),
     "negative seed": (["run", "{seq}", "--out", "{out}", "--seed", "-1"], ["seed", "-1"]),
     "depth scale": (["run", "{seq}", "--out", "{out}", "--depth-scale", "1000"], ["depth_scale", "1000"]),
     "start beyond the end": (["run", "{seq}", "--out", "{out}", "--start", "8"], ["start 8", "8 frames"]),
@@ -323,6 +367,9 @@ def test_a_damaged_run_is_named(case, done, tmp_path, capsys):
         (["run", "x", "--out", "y", "--start", "1.5"], "'1.5'"),
         (["run", "x", "--out", "y", "--turbo"], "--turbo"),
         (["eval"], "DIR"),
+        (["rum", "x"], "Did you mean run?"),
+        (["run", "x", "--ouput", "y"], "no option --ouput. Did you mean --out?"),
+        (["check", "x", "--jsn"], "no option --jsn. Did you mean --json? See p2p check --help"),
         (["eval", "x", "--align", "best"], "'best'"),
     ],
 )

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from p2p_lib.backends.registry import DEFAULT_DETECTOR
 from p2p_lib.backends.segmenters import SEGMENTERS
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.data.sequence import SYNTHETIC
 from p2p_lib.stages.tracking import DEFAULT_TRACKER
 
 PROFILES = ("quick", "full")
@@ -134,6 +135,14 @@ class Plan(_Strict):
             if unknown := set(scope.methods) - {method.name for method in self.method}:
                 raise ValueError(f"methods: no method is called {unknown.pop()!r}")
         return self
+
+    @property
+    def data(self) -> list[str]:
+        """What it needs in full below ``$P2P_DATA``: datasets, and models of rendered sequences."""
+        given = [s.name for s in self.full.sequence if not s.name.startswith((SYNTHETIC, "/"))]
+        names = [name.partition("/")[0] for name in given]
+        models = [s.synthetic.get("models") for s in (*self.full.sequence, *self.methods("full"))]
+        return list(dict.fromkeys([*names, *(str(m) for m in models if m)]))
 
     def scope(self, profile: str) -> Scope:
         """``quick`` or ``full``."""

@@ -20,12 +20,14 @@ from p2p_lib.evaluation.recovery import WITHIN_FRAMES
 
 #: What the ``sequence`` of a row says where it is about several.
 MEAN, POOLED = "mean over sequences", "pooled over frames"
+#: What MEAN is called where all of it is of one sequence (:func:`p2p_lib.benchmark.scoring.run_rows`).
+MEAN_OF_ONE = "mean over objects"
 NOT_RUN = "not run"
 
 #: The columns, in order. ``column`` is the paper's; ``key`` names the run's record; ``reason`` why there is no value.
 COLUMNS = (
     "plan profile method sequence object column seed metric form failures align value unit frames lost sequences "
-    "tracker detector masks preset commit modified library key reason"
+    "objects tracker detector masks preset commit modified library key reason"
 ).split()
 TIME_COLUMNS = (
     "plan profile method sequence seed metric value unit objects width_px tracker preset commit modified library key"
@@ -110,11 +112,14 @@ def _over_sequences(plan: Plan, profile: str, group: Results) -> list[Row]:
     """Mean over sequences (each object of each counts the same) and pool over frames of one method and seed."""
     done = [(job, outcome) for job, outcome in group if outcome.status == "done"]
     objects = [obj for _, outcome in done for obj in outcome.objects.values()]
-    failed = sum(_expected_objects(job) for job, outcome in group if outcome.status == "failed")
+    fallen = [job for job, outcome in group if outcome.status == "failed"]
+    failed = sum(_expected_objects(job) for job in fallen)
     if not objects and not failed:
         return []
     totals = {"frames": sum(len(o.first["add_m"]) for o in objects), "lost": sum(o.lost for o in objects)}
-    totals |= {"sequences": len(objects) + failed, "object": "", "column": "", "key": ""}
+    counted = [job for job, outcome in done if outcome.objects] + fallen
+    totals |= {"sequences": len(counted), "objects": len(objects) + failed}
+    totals |= {"object": "", "column": "", "key": ""}
     head = _head(plan, profile, *(done or group)[0]) | totals
     rows = [head | {"sequence": MEAN} | _plain(n) for n in numbers.mean([_numbers(o) for o in objects], failed)]
     if objects:

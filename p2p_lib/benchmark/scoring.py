@@ -11,7 +11,7 @@ import numpy as np
 from p2p_lib.benchmark.jobs import Job
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome
 from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, Scope
-from p2p_lib.benchmark.rows import Row, result_rows
+from p2p_lib.benchmark.rows import MEAN, MEAN_OF_ONE, Row, result_rows
 from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingData
 from p2p_lib.data.models import MESHES, find_models, given_models
@@ -63,7 +63,8 @@ def run_rows(folder: str | Path, models: Models | None = None) -> list[Row]:
     scope = Scope(seeds=[done.info["seed"]], sequence=[PlannedSequence(name=done.info["sequence"])])
     plan = Plan(name="run", title="one run", method=[method], quick=scope, full=scope)
     job = Job(method, scope.sequence[0], done.info["seed"], "poses", True)
-    return result_rows(plan, "full", [(job, outcome)])
+    rows = result_rows(plan, "full", [(job, outcome)])
+    return [row | {"sequence": MEAN_OF_ONE} if row["sequence"] == MEAN else row for row in rows]
 
 
 def _made_with(done: Run) -> dict[str, Path]:

@@ -449,7 +449,8 @@ def _unknown(what: str, key: str, known: Any) -> BadInput:
         expected = f"a key of [{stage}]: {', '.join(known)}"
     else:
         name = str(key)
-        expected = f"one of {', '.join(known)}" if len(known) < 8 else "a stage.key of the configuration"
+        stages = f"stage.key, where stage is one of {', '.join(_STAGES)}"
+        expected = f"one of {', '.join(known)}" if len(known) < 8 else stages
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     prefix = f"{stage}." if stage in _STAGES and name != str(key) else ""
     return BadInput(what, repr(key), expected, f"Did you mean {prefix + near[0]!r}?" if near else "")

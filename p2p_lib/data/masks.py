@@ -68,7 +68,13 @@ def find_masks(
 
     def images(where: Path) -> tuple[Path, ...]:
         files = list_files(where, LOSSLESS, "mask images")
-        return files if first_frame_alone and len(files) == 1 else check_paired(files, rgb_files)
+        if not first_frame_alone:
+            return check_paired(files, rgb_files)
+        try:
+            return files if len(files) == 1 else check_paired(files, rgb_files)
+        except BadInput as error:
+            alone = "One mask alone, of the first picture, is allowed too."
+            raise BadInput(error.name, error.got, error.expected, f"{error.fix} {alone}".strip()) from None
 
     if below:
         return MaskFiles({name: images(folder / name) for name in names}, dict.fromkeys(names), shape)

@@ -7,8 +7,9 @@ one line in :data:`FORMATS`.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol
@@ -124,14 +125,26 @@ def open_sequence(
         raise BadInput("format", repr(format), "one of " + ", ".join(FORMATS))
     name = str(path_or_name)
     if name.startswith(SYNTHETIC):
-        from p2p_lib.data.synthetic import scenario_dir
+        from p2p_lib.data.synthetic import SCENARIOS, scenario_dir
 
+        if near := unknown_scenario(name, SCENARIOS):
+            raise near
         folder, format = scenario_dir(name.removeprefix(SYNTHETIC), seed), format or "ycbmultitrack"
     else:
         folder, format = _find(path_or_name, format)
         name = os.path.basename(os.path.abspath(folder))
     loader = import_module(FORMATS[format or recognise(folder)])
     return loader.load(folder, name=name, depth_scale=depth_scale, masks=masks)
+
+
+def unknown_scenario(name: str, known: Iterable[str]) -> BadInput | None:
+    """What to say of a synthetic sequence that does not exist, naming the nearest that does; None where it does."""
+    known, scenario = sorted(known), name.removeprefix(SYNTHETIC)
+    if scenario in known:
+        return None
+    near = get_close_matches(scenario, known, n=1)
+    fix = f"Did you mean {SYNTHETIC}{near[0]}?" if near else ""
+    return BadInput("synthetic sequence", repr(scenario), "one of " + ", ".join(SYNTHETIC + k for k in known), fix)
 
 
 def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:
@@ -158,6 +171,9 @@ def recognise(folder: Path) -> str:
         if import_module(module).recognises(folder):
             return name
     holds = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())[:8]) or "nothing"
+    if not (folder / "rgb").is_dir() and ((folder / "depth").is_dir() or (folder / "cam_K.txt").is_file()):
+        fix = "rgb/ is missing: put the colour pictures there, one for each depth image."
+        raise BadInput(str(folder), f"a folder with {holds}", "rgb/, depth/ and cam_K.txt", fix)
     raise BadInput(
         str(folder),
         f"a folder with {holds}",

@@ -48,6 +48,10 @@ REPEATED_SHARE = 0.3
 RIM_SHARE = 0.5
 #: Shares of a mask, and of the picture, that should have a depth.
 MEASURED_SHARE = 0.5
+#: What an object seldom is: so much of the picture, so deep (of its distance). Objects looked at: at most 0.07, 0.23.
+LARGE_SHARE, DEEP_SHARE = 0.12, 0.25
+#: Share of depth at its largest value from which on it was cut off there.
+CLIPPED_SHARE = 0.1
 
 
 class Level(StrEnum):
@@ -100,12 +104,16 @@ def check_folder(
     if any(finding.name == "depth" and finding.level is Level.WRONG for finding in findings):
         return findings  # nothing that follows would mean anything
     if not firsts:
-        fix = f"Make clicks with p2p click and give them with --prompts, or put masks into {sequence.path}/masks."
-        return [*findings, Finding("masks", Level.LOOK, "none that show an object", fix)]
+        return [*findings, _no_masks(sequence, any(masks), config)]
+    if beyond := _all_beyond(firsts, config):
+        return [*findings, beyond]  # what follows would only be its consequences
     for name, (frame, mask) in firsts.items():
+        if mask.sum() < config.pipeline.min_mask_px:
+            findings.append(_nothing_there(name, frame, mask, config))
+            continue
         pairs = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
-        findings += [_range(name, frame, mask, config), _rim(name, [(frame, mask), *pairs], config)]
-        findings += [_points(name, frame, mask, config)]
+        findings.append(_range(name, frame, mask, config))
+        findings += [_rim(name, [(frame, mask), *pairs], config), _points(name, frame, mask, config)]
     return findings
 
 
@@ -124,8 +132,11 @@ def as_lines(findings: Iterable[Finding]) -> str:
     for finding in findings:
         lines.append(f"{finding.level:7}{finding.name:{width}}  {finding.text}")
         lines += [f"{'':7}{'':{width}}  -> {finding.fix}"] if finding.fix else []
-    wrong = [finding.name for finding in findings if finding.level is Level.WRONG]
-    lines.append(f"To mend first: {', '.join(wrong)}" if wrong else "Nothing is wrong with it as far as can be seen.")
+    wrong, look = ([f.name for f in findings if f.level is level] for level in (Level.WRONG, Level.LOOK))
+    last = (
+        f"To look at before tracking: {', '.join(look)}" if look else "Nothing is wrong with it as far as can be seen."
+    )
+    lines.append(f"To mend first: {', '.join(wrong)}" if wrong else last)
     return "\n".join(lines)
 
 
@@ -191,10 +202,16 @@ def _depth(frames: list[Frame]) -> Finding:
     share = float(np.mean([len(d) / f.depth_m.size for d, f in zip(known, frames)]))
     if not share:
         return Finding("depth", Level.WRONG, "no measurement anywhere", "Look at the files in depth/: all are 0.")
-    median_m = float(np.median(np.concatenate(known)))
+    every_m = np.concatenate(known)
+    median_m = float(np.median(every_m))
     text = f"{median_m:.3g} m in the middle, {100 * share:.0f} % of the pixels measured"
     if not NEAREST_M <= median_m <= FARTHEST_M:
-        factor = next((10.0**k for k in (-3, 3, -4, 4, -1, 1) if 0.15 <= median_m * 10.0**k <= 5), None)
+        clipped = float((every_m == every_m.max()).mean())
+        if median_m > FARTHEST_M and clipped > CLIPPED_SHARE:
+            text = f"{text}; {100 * clipped:.0f} % of them are cut off at {every_m.max():.3g} m, the most that fits"
+            fix = "No scale brings back what was cut off: export the depth again, as 16-bit millimetres."
+            return Finding("depth", Level.WRONG, text, fix)
+        factor = _factor(median_m)
         guess = f" A scale {factor:g} times the present one would make it {median_m * factor:.2g} m." if factor else ""
         fix = f"Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1).{guess}"
         return Finding("depth", Level.WRONG, f"{text}: the unit is another", fix)
@@ -202,6 +219,11 @@ def _depth(frames: list[Frame]) -> Finding:
         fix = "Keep the sensor's least distance, and out of the sun; glass, mirrors and black things have no depth."
         return Finding("depth", Level.LOOK, text, fix)
     return Finding("depth", Level.OK, text)
+
+
+def _factor(median_m: float) -> float | None:
+    """The power of ten that brings a depth to where things stand before a camera; None where none does."""
+    return next((10.0**k for k in (-3, 3, -4, 4, -1, 1) if 0.15 <= median_m * 10.0**k <= 5), None)
 
 
 def _registered(frames: list[Frame]) -> Finding:
@@ -219,6 +241,54 @@ def _registered(frames: list[Frame]) -> Finding:
     return Finding(name, Level.WRONG, text, fix)
 
 
+def _no_masks(sequence: Sequence, drawn: bool, config: Config) -> Finding:
+    """Nothing to begin with: no masks at all, or masks that hold no object."""
+    fix = f"Make clicks with p2p click and give them with --prompts, or put masks into {sequence.path}/masks."
+    if not drawn:
+        return Finding("masks", Level.LOOK, "none", fix)
+    text = f"none that shows an object: no object has {config.pipeline.min_mask_px} pixels in any picture"
+    return Finding("masks", Level.WRONG, text, fix)
+
+
+def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
+    """A click at which the segmenter found no object to speak of."""
+    count, needed = int(mask.sum()), config.pipeline.min_mask_px
+    what = f"only {count} pixels were segmented" if count else "nothing was segmented"
+    text = f"{what} at the clicks on it in frame {frame.index}; {needed} pixels are needed"
+    return Finding(f"{name}: mask", Level.WRONG, text, "Click elsewhere, in the middle of the object: p2p click.")
+
+
+def _distance_m(frame: Frame, mask: np.ndarray) -> float:
+    """Median depth of what is measured of a mask; NaN where nothing is, or too little of it."""
+    depth_m = frame.depth_m[mask]
+    measured = depth_m[depth_m > 0]
+    enough = len(measured) and len(measured) >= MEASURED_SHARE * len(depth_m)
+    return float(np.median(measured)) if enough else float("nan")
+
+
+def _all_beyond(firsts: dict[str, tuple[Frame, np.ndarray]], config: Config) -> Finding | None:
+    """The one finding of objects that are all too far away, or all too near: most likely depth is in another unit."""
+    pipe, away_m = config.pipeline, {name: _distance_m(*first) for name, first in firsts.items()}
+    distances = np.array(list(away_m.values()))
+    far = bool((distances > pipe.depth_max_m).all())
+    if not far and not (distances < pipe.depth_min_m).all():
+        return None
+    (first, (frame, mask)), *others = firsts.items()
+    text = f"{away_m[first]:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
+    text += f" ({', '.join(f'{name} {away_m[name]:.2f} m' for name, _ in others)})" if others else ""
+    return Finding(f"{first}: depth", Level.WRONG, *_beyond(text, distances, config))
+
+
+def _beyond(text: str, distances: np.ndarray, config: Config) -> tuple[str, str]:
+    """What is said of distances on one side of those that count, and what to do: the unit first, then the limit."""
+    pipe, far = config.pipeline, bool(distances.max() > config.pipeline.depth_max_m)
+    factor = _factor(float(np.median(distances)))
+    guess = f": {factor:g} times the present one would make it {distances[0] * factor:.2f} m" if factor else ""
+    wider = f"depth_max_m={2 * distances.max():.1f}" if far else f"depth_min_m={distances.min() / 2:.2g}"
+    fix = f"If it was not, the depth scale is wrong (--depth-scale{guess}); if it was, --set pipeline.{wider}."
+    return f"{text}, but {pipe.depth_min_m:g} to {pipe.depth_max_m:g} m count", fix
+
+
 def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """Whether an object is where depth counts, and measured."""
     pipe, depth_m = config.pipeline, frame.depth_m[mask]
@@ -230,14 +300,13 @@ def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding
     median_m = float(np.median(depth_m[depth_m > 0]))
     text = f"{median_m:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
     if not pipe.depth_min_m <= median_m <= pipe.depth_max_m:
-        fix = f"If it was not, the depth scale is wrong; if it was, --set pipeline.depth_max_m={2 * median_m:.1f}."
-        limits = f"{pipe.depth_min_m:g} to {pipe.depth_max_m:g} m count"
-        return Finding(f"{name}: depth", Level.WRONG, f"{text}, but {limits}", fix)
+        return Finding(f"{name}: depth", Level.WRONG, *_beyond(text, np.array([median_m]), config))
     return Finding(f"{name}: depth", Level.OK, text)
 
 
 def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Finding:
-    """Whether an object's masks hold background."""
+    """Whether an object's masks hold background; the first of them also whether it is background altogether."""
+    first = seen[0]
     seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.pipeline.min_mask_px]
     shares = np.array([background_share(mask, frame.depth_m) for frame, mask in seen])
     if np.isnan(shares).all():
@@ -248,7 +317,19 @@ def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Fin
         worst = seen[int(np.nanargmax(shares))][0].index
         fix = f"Draw it to the object's edge or a little inside; frame {worst} is the worst."
         return Finding(f"{name}: mask", Level.WRONG, text, fix)
+    large, deep_m, away_m = _extent(*first)
+    if large > LARGE_SHARE or deep_m > DEEP_SHARE * away_m:
+        text = f"it covers {100 * large:.0f} % of the picture, over {deep_m:.2f} m of depth; {text}"
+        fix = "Is it the object, or the table or wall? If it is not, click in its middle, or draw it tighter."
+        return Finding(f"{name}: mask", Level.LOOK, text, fix)
     return Finding(f"{name}: mask", Level.OK, text)
+
+
+def _extent(frame: Frame, mask: np.ndarray) -> tuple[float, float, float]:
+    """A mask's share of the picture, the depth that it reaches over without its outermost pixels, its distance (m)."""
+    depth_m = frame.depth_m[mask & (frame.depth_m > 0)]
+    near_m, away_m, far_m = np.percentile(depth_m, [2, 50, 98]) if len(depth_m) else (0.0, 0.0, 0.0)
+    return float(mask.mean()), float(far_m - near_m), float(away_m)
 
 
 def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:

@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from p2p_lib import cli
-from p2p_lib.benchmark.rows import MEAN, POOLED
+from p2p_lib.benchmark.rows import MEAN_OF_ONE, POOLED
 from p2p_lib.run import evaluate_run
 
 
@@ -42,7 +42,8 @@ def test_a_surface_is_scored_against_what_was_seen(slides, tmp_path, printed, ca
     rows = printed(str(tmp_path / "run"))
     found = {row["form"]: float(row["value"]) for row in rows if row["metric"] == "Chamfer distance" and row["object"]}
     assert set(found) == {"BundleSDF", "release", "as aligned"} and all(0.2 < cm < 1.0 for cm in found.values())
-    assert {row["sequence"] for row in rows} == {slides[0].name, MEAN, POOLED}
+    assert {row["sequence"] for row in rows} == {slides[0].name, MEAN_OF_ONE, POOLED}
+    assert {(row["sequences"], row["objects"]) for row in rows if row["sequence"] == MEAN_OF_ONE} == {("1", "1")}
     exact = {**dict.fromkeys(("form", "failures", "align")), "form": "exact", "failures": "zero", "align": "all"}
     (row,) = (r for r in rows if r["sequence"] == POOLED and r["metric"] == "ADD AUC" and exact.items() <= r.items())
     assert float(row["value"]) == pytest.approx(

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
 from p2p_lib.data import folder as own
 from p2p_lib.data.faults import FAULTS, spoil
-from p2p_lib.data.prompts import load_prompts
+from p2p_lib.data.prompts import Prompt, load_prompts
 from p2p_lib.data.sequence import open_sequence
 from p2p_lib.evaluation.depth_colour import misfit
 from p2p_lib.evaluation.mask_rim import background_share
@@ -185,6 +186,62 @@ def test_without_masks_it_asks_for_clicks(good, tmp_path):
     shutil.rmtree(folder / "masks")
     (asked,) = alarms(check_folder(folder))
     assert asked.name == "masks" and asked.level is Level.LOOK and "--prompts" in asked.fix
+    assert as_lines(check_folder(folder)).endswith("To look at before tracking: masks")
+
+
+def test_empty_masks_are_wrong(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "empty")
+    for path in (folder / "masks").rglob("*.png"):
+        cv2.imwrite(str(path), np.zeros((480, 640), np.uint8))
+    (wrong,) = alarms(check_folder(folder))
+    assert (wrong.name, wrong.level) == ("masks", Level.WRONG) and "p2p click" in wrong.fix
+
+
+def click(u, v):
+    return {"prompts": [Prompt("box", 0, np.array([[u, v]], float))]}
+
+
+def test_a_click_on_the_background_is_worth_a_look(good):
+    finding = found(good, "box: mask", **click(230, 240))
+    assert finding.level is Level.LOOK and re.match(r"it covers 2\d % of the picture, over 0\.4", finding.text)
+    assert "table or wall" in finding.fix
+
+
+def test_a_click_that_segments_nothing_is_said_once(good, recwarn):
+    (wrong,) = alarms(check_folder(good, **click(5, 5)))
+    assert (wrong.name, wrong.level) == ("box: mask", Level.WRONG) and wrong.text.startswith("nothing was segmented")
+    assert "Click elsewhere" in wrong.fix and not len(recwarn)
+
+
+def scaled_depth(folder, factor):
+    for path in (folder / "depth").iterdir():
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) * float(factor)
+        cv2.imwrite(str(path), np.clip(np.rint(depth), 0, 65535).astype(np.uint16))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("factor", "limit", "scale"), [(0.1, "depth_min_m=0.03", "10 times"), (10, "depth_max_m=1", "0.1 times")]
+)
+def test_objects_all_out_of_range_are_one_finding(good, tmp_path, factor, limit, scale):
+    (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)))
+    assert wrong.name == "box: depth" and "(can " in wrong.text
+    assert limit in wrong.fix and scale in wrong.fix
+
+
+def test_depth_that_was_cut_off_must_be_exported_again(good, tmp_path):
+    (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), 1000)))
+    assert wrong.name == "depth" and "cut off at 65.5 m" in wrong.text and "export the depth again" in wrong.fix
+
+
+def test_what_is_missing_is_named(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "less")
+    (folder / "masks/box/000000.png").unlink()
+    (wrong,) = check_folder(folder)
+    assert "000000.png is missing. One mask alone" in wrong.fix
+    shutil.rmtree(folder / "rgb")
+    (wrong,) = check_folder(folder)
+    assert wrong.fix.startswith("rgb/ is missing")
 
 
 def test_lines_align_and_remedies_follow_what_they_mend(good):
