@@ -6,7 +6,8 @@ hundreds of trials cost seconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -146,6 +147,27 @@ def optimise_online(turn: Turn, front_end: Solved, config: FactorGraphConfig) ->
         _add(graph, turn, front_end, m)
         known.append(_solved(turn, graph.optimise()))
     return known
+
+
+def outlier_trials(seeds: Iterable[int], config: FactorGraphConfig, outliers: float) -> list[dict[str, float]]:
+    """A row per turn: mean rotation error in degrees of each way, without outliers and with that share of them."""
+    rows = []
+    for seed in seeds:
+        clean, spoiled = (
+            simulate_turn(np.random.default_rng(seed), config=config, outliers=share) for share in (0.0, outliers)
+        )
+        start, spoiled_start = register(clean), register(spoiled)
+        ways = {
+            "registration alone, clean": start.errors(clean),
+            "registration alone, outliers": spoiled_start.errors(spoiled),
+            "graph, clean": optimise(clean, start, config).errors(clean),
+            "graph with Huber, outliers": optimise(spoiled, spoiled_start, config).errors(spoiled),
+            "graph with squares, outliers": optimise(spoiled, spoiled_start, replace(config, huber=1e6)).errors(
+                spoiled
+            ),
+        }
+        rows.append({"turn": seed, **{f"{way} [°]": float(np.nanmean(off[0])) for way, off in ways.items()}})
+    return rows
 
 
 def _add(graph: ObjectGraph, turn: Turn, front_end: Solved, m: int) -> None:

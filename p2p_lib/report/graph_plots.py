@@ -15,14 +15,17 @@ from p2p_lib.report.plots import panels
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Line of the k-th way in a comparison: told apart without colour too.
-_LINES = (
-    (style.NEUTRAL[0], "-"),
-    (style.OBJECTS[0], "-"),
-    (style.OBJECTS[1], "--"),
-    (style.OBJECTS[2], "-."),
-    (style.OBJECTS[4], ":"),
-)
+#: The line of each way, the same in every picture; told apart without colour too.
+_LINES = {
+    "registration alone": (style.NEUTRAL[0], "-"),
+    "factor graph": (style.METHODS[0], "-"),
+    "all three": (style.METHODS[0], "-"),
+    "all three, Huber": (style.METHODS[0], "-"),
+    "without prior": (style.METHODS[1], "--"),
+    "without obs": (style.METHODS[4], "-."),
+    "without reg": (style.METHODS[3], ":"),
+    "all three, squares": (style.METHODS[5], "--"),
+}
 
 
 def turn_from_above(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
@@ -34,7 +37,8 @@ def turn_from_above(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
     true_xz = 100 * se3.inverse(turn.T_cam_obj)[:, [0, 2], 3]
     with style.applied():
         figure, axes = panels(len(solved), (4.0 * len(solved), 4.4), [1] * len(solved), side_by_side=True)
-        for axis, (name, one), (colour, _) in zip(axes, solved.items(), _LINES, strict=False):
+        for axis, (name, one) in zip(axes, solved.items(), strict=True):
+            colour, _ = _LINES[name]
             xz = 100 * se3.inverse(one.T_cam_obj)[:, [0, 2], 3]
             axis.plot(*np.stack([true_xz, xz]).transpose(2, 0, 1), color=colour, linewidth=1)
             axis.plot(*true_xz.T, ".", color="#222222", markersize=4, label="true $X_m$")
@@ -50,20 +54,25 @@ def turn_from_above(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
 
 
 def errors_by_way(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
-    """Rotation and translation error of every keyframe, one line per way; gaps are keyframes that were left out."""
+    """Rotation and translation error of every keyframe, one line per way; gaps are keyframes that were left out.
+
+    Means are over the keyframes that every way has.
+    """
+    common = np.all([np.isfinite(one.errors(turn)[0]) for one in solved.values()], axis=0)
     with style.applied():
         figure, axes = panels(2, (8.0, 4.6), [1, 1])
         shaded = np.flatnonzero(turn.seen.sum(1) <= 2)
+        over = "mean" if common.all() else f"mean of the {common.sum()} that all have"
         for axis, which, unit in zip(axes, (0, 1), ("rotation [°]", "translation [mm]"), strict=True):
-            for (name, one), (colour, line) in zip(solved.items(), _LINES, strict=False):
-                errors = one.errors(turn)[which]
-                label = f"{name} ({np.nanmean(errors):.1f})"
+            for name, one in solved.items():
+                errors, (colour, line) = one.errors(turn)[which], _LINES[name]
+                label = f"{name} ({errors[common].mean():.1f})"
                 axis.plot(errors, line, color=colour, marker=".", markersize=4, label=label)
             if len(shaded):
                 axis.axvspan(shaded[0] - 0.5, shaded[-1] + 0.5, color="#D9D9D9", lw=0)
             axis.set_ylabel(unit)
             axis.set_ylim(bottom=0)
-            axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, title="mean", alignment="left")
+            axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, title=over, alignment="left")
         axes[1].set_xlabel("keyframe m (simulated)")
     return figure
 
@@ -98,14 +107,17 @@ def consistency_plot(nees: np.ndarray) -> Figure:
 
     at = np.linspace(0, 14, 200)
     bins = np.linspace(0, 14, 22)
+    last = (bins[-2] + bins[-1]) / 2
     with style.applied():
         figure, axes = panels(2, (8.0, 2.8), [1, 1], side_by_side=True)
         for axis, values, name in zip(axes, nees.T, ("rotation", "translation"), strict=True):
             weights = np.full(len(values), 1 / (len(values) * (bins[1] - bins[0])))
             axis.hist(np.minimum(values, 13.99), bins, weights=weights, color="#A9CCE8", edgecolor="white")
             axis.plot(at, chi2(3).pdf(at), color="#222222", label=r"$\chi^2$ of 3")
-            axis.axvline(values.mean(), color=style.OBJECTS[0], linestyle="--", label=f"mean {values.mean():.2f}")
+            axis.axvline(values.mean(), color=style.METHODS[0], linestyle="--", label=f"mean {values.mean():.2f}")
+            beyond = (values >= bins[-2]).sum()
+            axis.text(last, weights[0] * beyond, f"{beyond} beyond {bins[-2]:.0f}", ha="right", va="bottom", fontsize=8)
             axis.set_title(f"{name}, {len(values)} simulated turns")
-            axis.set(xlabel=r"$e^\top \Sigma^{-1} e$", yticks=[])
+            axis.set(xlabel=r"$e^\top \Sigma^{-1} e$", ylabel="density")
             axis.legend(loc="upper right")
     return figure

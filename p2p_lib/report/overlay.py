@@ -133,6 +133,13 @@ def draw_points(
     return image
 
 
+def draw_crosses(image: np.ndarray, uv_px: np.ndarray, colour: str, radius_px: float = 4) -> np.ndarray:
+    """Points (N, 2) as oblique crosses; NaN ones are left out."""
+    arms = radius_px * np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]]) / np.sqrt(2)
+    lines = np.asarray(uv_px, float).reshape(-1, 1, 1, 2) + arms
+    return _stroke(image, lines[np.isfinite(lines).all((1, 2, 3))].reshape(-1, 2, 2), colour, 2, rim=1.0)
+
+
 def value_colours(values: np.ndarray, low: float, high: float) -> np.ndarray:
     """(N, 3) uint8: dark blue at ``low`` or below to yellow at ``high`` or above (cividis); NaN is white."""
     values = np.asarray(values, float)
@@ -142,12 +149,24 @@ def value_colours(values: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.where(np.isnan(level)[:, None], np.uint8(255), colours)
 
 
+def depth_scale(depth_m: np.ndarray) -> str:
+    """What the colours of :func:`depth_picture` mean, in words for a caption."""
+    near, far = _depth_range(depth_m)
+    return f"yellow {near:.2f} m to dark blue {far:.2f} m"
+
+
+def _depth_range(depth_m: np.ndarray) -> tuple[float, float]:
+    """Metres from which on all is yellow, and up to which all is dark blue; NaN where nothing was measured."""
+    known = depth_m[depth_m > 0]
+    return tuple(np.quantile(known, [0.005, 0.995]).tolist()) if len(known) else (np.nan, np.nan)
+
+
 def depth_picture(depth_m: np.ndarray) -> np.ndarray:
     """Depth (H, W) as a picture: near is yellow, far is dark blue (cividis), no measurement is white."""
     known = depth_m > 0
     if not known.any():
         return np.full((*depth_m.shape, 3), 255, np.uint8)
-    near, far = np.quantile(depth_m[known], [0.005, 0.995])
+    near, far = _depth_range(depth_m)
     values = np.where(known, -depth_m, np.nan).ravel()
     return value_colours(values, -max(far, near + 1e-6), -near).reshape(*depth_m.shape, 3)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.evaluation.mug_moment import Decisions, Moment
+from p2p_lib.evaluation.point_tracks import Outcome
 from p2p_lib.report import overlay, style
 from p2p_lib.report.plots import panels
 
@@ -16,12 +17,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-#: Tracks that follow the object, tracks that do not, and the object's true outline.
-FOLLOWS, STRAYS, OUTLINE = "#56B4E9", "#E69F00", style.TRUTH
+#: Tracks that follow the object (dots), tracks that do not (crosses), and the object's true outline.
+FOLLOWS, STRAYS, OUTLINE = "#F2F2F2", style.OUTCOMES[Outcome.WRONG], style.TRUTH
+#: Hypotheses by their order; light enough to be seen on a dark object.
+HYPOTHESES = (style.METHODS[4], style.METHODS[2], style.METHODS[6], style.METHODS[5])
 
 
 def draw_tracks(moment: Moment, width_px: int = 420) -> np.ndarray:
-    """Where each point was sampled (ring) and where the tracker has it now (dot), by whether it follows the mug."""
+    """Where each point was sampled and where the tracker has it now: a line to a dot (follows the mug) or a cross."""
     image, camera, region = _cut(moment, width_px)
     image = _outline(image, camera, moment, moment.T_cam_obj)
     for rows, colour in ((~moment.right, STRAYS), (moment.right, FOLLOWS)):
@@ -29,7 +32,10 @@ def draw_tracks(moment: Moment, width_px: int = 420) -> np.ndarray:
         now, before = (_scaled(uv[rows], region, width_px) for uv in (moment.uv_px, moment.uv_before_px))
         for pair in np.stack([before, now], 1):
             image = overlay.draw_trail(image, pair, colour, 2)
-        image = overlay.draw_points(image, now, colour, 3)
+        if colour == STRAYS:
+            image = overlay.draw_crosses(image, now, colour, 4)
+        else:
+            image = overlay.draw_points(image, now, colour, 3)
     return overlay.draw_caption(image, f"synthetic: mug turned by {moment.turned_deg:.0f} degrees")
 
 
@@ -38,7 +44,7 @@ def draw_hypotheses(moment: Moment, decided: Decisions, width_px: int = 420) -> 
     pictures = []
     for k, (hypothesis, score) in enumerate(zip(decided.hypotheses, decided.scores_m, strict=True)):
         image, camera, region = _cut(moment, width_px)
-        colour = style.OBJECTS[k % len(style.OBJECTS)]
+        colour = HYPOTHESES[k % len(HYPOTHESES)]
         image = _outline(image, camera, moment, hypothesis.T_cam_obj, colour)
         at = _scaled(moment.uv_px[hypothesis.inliers], region, width_px)
         image = overlay.draw_points(image, at, colour, 3)
@@ -53,7 +59,7 @@ def support_and_score(moment: Moment, decided: Decisions) -> Figure:
     with style.applied():
         figure, axes = panels(2, (7.6, 1.2 + 0.5 * count), [1, 1.3], side_by_side=True)
         at = np.arange(count)
-        colours = [style.OBJECTS[k % len(style.OBJECTS)] for k in at]
+        colours = [HYPOTHESES[k % len(HYPOTHESES)] for k in at]
         errors = [moment.error(h.T_cam_obj)[0] for h in decided.hypotheses]
         bars = axes[0].barh(at, [h.support for h in decided.hypotheses], 0.62, color=colours)
         axes[0].bar_label(bars, fmt="%d", padding=2, fontsize=8)
@@ -82,15 +88,19 @@ def method_errors(table: DataFrame, bar_deg: float) -> Figure:
         for k, method in enumerate(methods):
             errors = table[method].to_numpy(float)
             spread = k + np.linspace(-0.18, 0.18, len(errors))
-            colour = style.OBJECTS[0] if k == len(methods) - 1 else style.NEUTRAL[0]
+            colour = style.METHODS[0] if k == len(methods) - 1 else style.NEUTRAL[0]
             axis.plot(errors, spread, "o", color=colour, markersize=4.5, alpha=0.85)
+            none = spread[np.isnan(errors)]
+            # x in shares of the axis, y in data.
+            edge = {"transform": axis.get_yaxis_transform(), "clip_on": False}
+            axis.plot(np.full(len(none), 1.0), none, "x", color=colour, markersize=5, **edge)
         axis.axvline(bar_deg, color=style.STATUS["lost"][0], linewidth=1, linestyle="--")
         axis.set_xscale("log")
         axis.xaxis.set_major_formatter("{x:g}")
         axis.xaxis.set_minor_formatter("")
         axis.set_yticks(range(len(methods)), [m.removesuffix(" [°]") for m in methods])
         axis.invert_yaxis()
-        axis.set(xlabel=f"rotation error [°], one dot per synthetic mug; dashed: {bar_deg:g}°")
+        axis.set(xlabel=f"rotation error [°], one dot per synthetic mug; dashed: {bar_deg:g}°; cross: no pose")
     return figure
 
 

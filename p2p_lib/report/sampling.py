@@ -164,8 +164,8 @@ def spacing_plot(
     table = choice_table(compare_choices(situations, ways, frames_on=frames_on))
     with style.applied():
         figure, axes = panels(2, (_WIDTH_IN, 2.5), [1, 1], side_by_side=True)
-        for axis, column, colour in zip(axes, ("covered [%]", "pose error [mm]"), style.METHODS, strict=False):
-            axis.plot(r_ideal_px, table[column], "o-", color=colour, markersize=4)
+        for axis, column in zip(axes, ("covered [%]", "pose error [mm]"), strict=True):
+            axis.plot(r_ideal_px, table[column], "o-", color=style.NEUTRAL[0], markersize=4)
             axis.axvline(situations[0].config.sampling.r_ideal_px, color=style.NEUTRAL[0], lw=0.8, ls=":")
             axis.set(xlabel=r"$r_{ideal}$ [px]", ylabel=column, xscale="log")
             axis.set_xticks(list(r_ideal_px), [f"{r:g}" for r in r_ideal_px])

@@ -26,12 +26,12 @@ STATUS: dict[Status, tuple[str, str]] = {
 #: What came of asking for a 2D point: right is the quiet one, wrong the colour of lost.
 OUTCOMES: dict[Outcome, str] = {
     Outcome.HIDDEN: "#FFFFFF",
-    Outcome.RIGHT: "#B3B3B3",
+    Outcome.RIGHT: "#CFCFCF",
     Outcome.MISSED: "#222222",
     Outcome.WRONG: "#D55E00",
 }
-#: Methods side by side, in the order in which they are compared.
-METHODS = ("#0072B2", "#E69F00", "#CC79A7", "#222222", "#56B4E9", "#882255", "#6B4E23")
+#: Methods, or anything else that is compared side by side, in that order: none is an object's or a status's colour.
+METHODS = ("#5511DD", "#557711", "#AA99CC", "#114411", "#BB8888", "#885566", "#44BB11")
 #: The truth, wherever it stands beside an estimate.
 TRUTH = "#FFFFFF"
 #: x, y and z of a drawn frame.

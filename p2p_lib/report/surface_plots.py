@@ -103,7 +103,9 @@ def basins(
             axis.set_xticks(range(len(millimetres)), millimetres)
             axis.set_yticks(range(len(degrees)), degrees)
             axis.set(xlabel="start off by [mm] (synthetic block)")
-            axis.set_title(f"{name}: back within {limit[0]:g}° and {limit[1]:g} mm [%]")
+            axis.set_title(
+                f"{name}: back within {limit[0]:g}° and {limit[1]:g} mm [%], n = {found.shape[2]}", fontsize=9
+            )
             axis.grid(visible=False)
         axes[0].set_ylabel("start off by [°]")
     return figure

@@ -47,7 +47,7 @@ class TrackScene:
         """Frame ``index``: dots in the object's colour are right, vermillion rings are wrong.
 
         Points that truth sees and the tracker does not are small dark dots at their true place. Lines are the
-        paths of the last ``trail`` frames.
+        paths of the last ``trail`` frames, as far as the tracker was right in them.
         """
         frame, camera, run = self.sequence.frame(index), self.sequence.camera, self.score.run
         region_px = region_px or (0, 0, camera.width, camera.height)
@@ -56,16 +56,18 @@ class TrackScene:
         shift = np.array([seen_by.cx, seen_by.cy]) - scale * [camera.cx, camera.cy]
         came, first = self.outcomes[index], max(index - trail, 0)
         for name, points in self._points.items():
-            uv = scale * np.where(run.visible[..., None], run.uv_px, np.nan)[first : index + 1, points] + shift
+            on_it = run.visible & (self.outcomes == Outcome.RIGHT)
+            path_px = scale * np.where(on_it[..., None], run.uv_px, np.nan)[first : index + 1, points] + shift
+            uv = scale * run.uv_px[index, points] + shift
             right = came[points] == Outcome.RIGHT
-            for path in uv[:, right].transpose(1, 0, 2):
+            for path in path_px[:, right].transpose(1, 0, 2):
                 image = overlay.draw_trail(image, path, self._colours[name], 1)
             missed = came[points] == Outcome.MISSED
             true_uv = scale * self.score.truth.uv_px[index, points[missed]] + shift
             image = overlay.draw_points(image, true_uv, style.OUTCOMES[Outcome.MISSED], 0.7)
-            image = overlay.draw_points(image, uv[-1, right], self._colours[name], 2.5)
+            image = overlay.draw_points(image, uv[right], self._colours[name], 2.5)
             wrong = came[points] == Outcome.WRONG
-            image = overlay.draw_points(image, uv[-1, wrong], style.OUTCOMES[Outcome.WRONG], 4, filled=False)
+            image = overlay.draw_points(image, uv[wrong], style.OUTCOMES[Outcome.WRONG], 4, filled=False)
         counts = ", ".join(
             f"{(came == k).sum()} {k.name.lower()}" for k in (Outcome.RIGHT, Outcome.WRONG, Outcome.MISSED)
         )
@@ -187,9 +189,11 @@ def reliability_plot(rows: Mapping[str, Reliability], uncertain_px: Mapping[str,
                 stated_px = half_px * row.uncertainty / (1 - row.uncertainty)
                 axis.plot(row.uncertainty, stated_px, "--", color=style.NEUTRAL[0], label="standard deviation stated")
             axis.set(xlabel=r"uncertainty $\sigma_t$", yscale="log")
-            axis.sharey(axes[0])
             axis.yaxis.set_major_formatter("{x:g}")
             axis.set_title(f"{label}: rank correlation {row.rank_correlation:.2f}")
+        edges = np.array([axis.get_ylim() for axis in axes])
+        for axis in axes:
+            axis.set_ylim(edges[:, 0].min(), edges[:, 1].max())
         axes[0].set_ylabel("error [px]")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower right", ncols=3, fontsize=8)
     return figure
