@@ -107,7 +107,6 @@ def consistency_plot(nees: np.ndarray) -> Figure:
 
     at = np.linspace(0, 14, 200)
     bins = np.linspace(0, 14, 22)
-    last = (bins[-2] + bins[-1]) / 2
     with style.applied():
         figure, axes = panels(2, (8.0, 2.8), [1, 1], side_by_side=True)
         for axis, values, name in zip(axes, nees.T, ("rotation", "translation"), strict=True):
@@ -116,7 +115,8 @@ def consistency_plot(nees: np.ndarray) -> Figure:
             axis.plot(at, chi2(3).pdf(at), color="#222222", label=r"$\chi^2$ of 3")
             axis.axvline(values.mean(), color=style.METHODS[0], linestyle="--", label=f"mean {values.mean():.2f}")
             beyond = (values >= bins[-2]).sum()
-            axis.text(last, weights[0] * beyond, f"{beyond} beyond {bins[-2]:.0f}", ha="right", va="bottom", fontsize=8)
+            where = {"transform": axis.transAxes, "ha": "right", "fontsize": 8}
+            axis.text(0.99, 0.35, f"last bar: all {beyond} beyond {bins[-2]:.0f}", **where)
             axis.set_title(f"{name}, {len(values)} simulated turns")
             axis.set(xlabel=r"$e^\top \Sigma^{-1} e$", ylabel="density")
             axis.legend(loc="upper right")

@@ -7,7 +7,14 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig
-from p2p_lib.evaluation.simulated_turn import consistency, optimise, optimise_online, register, simulate_turn
+from p2p_lib.evaluation.simulated_turn import (
+    consistency,
+    optimise,
+    optimise_online,
+    outlier_trials,
+    register,
+    simulate_turn,
+)
 
 CONFIG = FactorGraphConfig(max_keyframes=0)
 
@@ -46,3 +53,11 @@ def test_hidden_keyframes_need_relative_poses():
 def test_covariance_is_honest():
     nees = consistency(60, CONFIG, 9, keyframes=8, points=50)
     assert nees.shape == (60, 2) and (nees.mean(0) > 1.5).all() and (nees.mean(0) < 6).all()
+
+
+def test_outliers_cost_squares_more_than_huber():
+    rows = outlier_trials([0, 1], CONFIG, 0.08)
+    assert [row["turn"] for row in rows] == [0, 1]
+    for row in rows:
+        assert row["graph with squares, outliers [°]"] > 2 * row["graph with Huber, outliers [°]"]
+        assert row["graph, clean [°]"] < row["registration alone, clean [°]"]

@@ -102,6 +102,7 @@ def test_nothing_touches_the_picture_it_is_given():
         "mask": overlay.draw_mask(image, mask, "#0072B2", fill=0.3),
         "points": overlay.draw_points(image, uv, "#0072B2"),
         "rings": overlay.draw_points(image, uv, overlay.value_colours(uv[:, 0], 0, 300), filled=False),
+        "crosses": overlay.draw_crosses(image, uv, "#D55E00"),
         "trail": overlay.draw_trail(image, np.array([[0.0, 0], [5, 5], [np.nan, 0], [9, 9], [20, 9]]), "#0072B2"),
         "labels": overlay.draw_labels(image, [Label("box", "#0072B2", (100, 100, 200, 200))]),
         "caption": overlay.draw_caption(image, "synthetic"),
@@ -117,6 +118,7 @@ def test_nothing_to_draw_gives_a_copy():
     for result in (
         overlay.draw_points(image, np.zeros((0, 2)), "#FFFFFF"),
         overlay.draw_trail(image, np.zeros((1, 2)), "#FFFFFF"),
+        overlay.draw_crosses(image, np.full((2, 2), np.nan), "#FFFFFF"),
         overlay.draw_mask(image, np.zeros((480, 640), bool), "#FFFFFF"),
         overlay.draw_labels(image, []),
     ):

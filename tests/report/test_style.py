@@ -42,6 +42,14 @@ def test_objects_differ_for_everybody(seer):
 
 
 @pytest.mark.parametrize("seer", SEEN_BY)
+def test_methods_differ_for_everybody_and_are_no_object_and_no_status(seer):
+    assert min(apart(style.METHODS, seer).values()) > 10
+    others = [*style.OBJECTS, *(fill for fill, _ in style.STATUS.values())]
+    between = apart([*style.METHODS, *others], "normal")
+    assert min(d for (a, b), d in between.items() if a < len(style.METHODS) <= b) > 10
+
+
+@pytest.mark.parametrize("seer", SEEN_BY)
 def test_statuses_differ_by_colour_or_hatch(seer):
     statuses = list(style.STATUS.values())
     for (a, b), distance in apart([fill for fill, _ in statuses], seer).items():
