@@ -181,7 +181,9 @@ def reliability_plot(rows: Mapping[str, Reliability], uncertain_px: Mapping[str,
     """
     with style.applied():
         figure, axes = panels(len(rows), (_WIDTH_IN, 3.4), [1] * len(rows), side_by_side=True)
-        for axis, colour, (label, row) in zip(axes, style.METHODS, rows.items(), strict=False):
+        for axis, (label, row) in zip(axes, rows.items(), strict=True):
+            # The colour that it has beside all the others.
+            colour = style.METHODS[2 if label == "plain LK" else 0]
             axis.fill_between(row.uncertainty, row.median_px, row.p90_px, color=colour, alpha=0.2, lw=0)
             axis.plot(row.uncertainty, row.median_px, "o-", color=colour, markersize=4, label="half are nearer")
             axis.plot(row.uncertainty, row.p90_px, "^-", color=colour, markersize=4, lw=0.8, label="nine in ten are")
