@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.paths import PROJECT
+from p2p_lib.report import equations
 from p2p_lib.report.gallery import GalleryEntry, gallery_page
 
 if TYPE_CHECKING:
@@ -32,6 +33,20 @@ if TYPE_CHECKING:
 PROFILES = ("quick", "full")
 CHECKS_MIME = "application/vnd.p2p.checks+json"
 MAX_CELL_LINES = 15
+#: JupyterLab's page without the scripts that it would fetch; a table wider than the page is scrolled, not cut off.
+_PAGE = f"""{{% extends 'lab/index.html.j2' %}}
+{{% block html_head_js %}}{{% endblock %}}
+{{% block html_head_js_mathjax %}}{{% endblock %}}
+{{% block html_head_js_mermaidjs %}}{{% endblock %}}
+{{% block html_head_css %}}
+{equations.STYLE}
+<style>
+.jp-RenderedHTMLCommon {{ overflow-x: auto; }}
+.jp-RenderedHTMLCommon table {{ width: max-content; max-width: none; }}
+.jp-RenderedMarkdown td, .jp-RenderedMarkdown th {{ padding: 0.4em 0.5em; }}
+.jp-MarkdownCell table {{ width: auto; max-width: 100%; }}
+</style>
+{{% endblock %}}"""
 
 Value = bool | int | float | str
 
@@ -263,7 +278,7 @@ def write_gallery(home: Path, profile: str) -> Path:
         for result in results
     ]
     seconds, numbers = sum(r.seconds for r in results), sum(len(r.checks) for r in results)
-    summary = f"{_counted(results)}, {seconds:.0f} s, {numbers} numbers checked"
+    summary = f"{_counted(results)}, {seconds:.0f} s, {numbers} numbers recorded"
     page = home / "index.html"
     page.write_text(gallery_page(f"Point2Pose notebooks, profile {profile}", entries, summary), encoding="utf-8")
     return page
@@ -353,10 +368,23 @@ def _fitting_parameters(path: Path, given: Mapping[str, Any]) -> dict[str, Value
 
 
 def _write_page(executed: Path) -> None:
-    """The executed notebook as a page for the browser, beside it."""
+    """The executed notebook as a page for the browser, beside it; nothing in it is fetched from the network."""
     from nbconvert import HTMLExporter
+    from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
-    body, _ = HTMLExporter(embed_images=True).from_filename(str(executed))
+    class Renderer(IPythonRenderer):
+        def block_math(self, body: str) -> str:
+            return equations.mathml(body, display=True)
+
+        def inline_math(self, body: str) -> str:
+            return equations.mathml(body)
+
+    def as_html(source: str) -> str:
+        return MarkdownWithMath(renderer=Renderer(escape=False)).render(source)
+
+    exporter = HTMLExporter(embed_images=True, raw_template=_PAGE)
+    exporter.register_filter("markdown2html", as_html)
+    body, _ = exporter.from_filename(str(executed))
     executed.with_suffix(".html").write_text(body, encoding="utf-8")
 
 

@@ -141,7 +141,7 @@ def test_notebooks_learn_their_folders(run):
 def test_gallery_shows_what_ran(run):
     page = (run[1] / "index.html").read_text()
     assert PNG in page and "ADD-S AUC fell to 12.34" in page and "<td>seed</td><td>3</td>" in page
-    assert re.search(r"3 notebooks, \d+ s, 6 numbers checked, <b class=\"failed\">1 failed</b>", page)
+    assert re.search(r"3 notebooks, \d+ s, 6 numbers recorded, <b class=\"failed\">1 failed</b>", page)
     assert 'href="notebooks/00_first.html"' in page and "://" not in page
     assert (run[1] / "notebooks" / "01_fails.html").exists(), "the failed notebook can be looked at too"
 
