@@ -23,6 +23,8 @@ class Numbers:
         self.methods = benchmark.plan.methods(benchmark.profile)
         self.seeds = benchmark.plan.scope(benchmark.profile).seeds
         self.times = benchmark.times
+        #: A few dozen frames are too few to call a method the best or the fastest.
+        self.judges = benchmark.profile != "quick"
         self._rows = [
             row
             for row in benchmark.summary

@@ -23,7 +23,7 @@ def by_method(numbers: Numbers) -> Table:
     heads, groups = ["Method"], [("", 1), ("Ours", 4)]
     heads += [head for _, area in _AREAS.values() for head in (area, "std over sequences")]
     lines = [[Cell(_with_detector(numbers, method)), *_areas(numbers, method)] for method in numbers.methods]
-    bold = [1, 3]
+    bold = [1, 3] if numbers.judges else []
     if numbers.plan.tracks:
         names = ("AJ", "delta_avg", "OA", "found again")
         heads, groups = [*heads, *names], [*groups, ("2D tracks, shares", len(names))]
@@ -80,7 +80,7 @@ def by_rate(numbers: Numbers) -> Table:
 
 
 def by_run(numbers: Numbers) -> Table:
-    """A row per method and sequence, means over objects: both alignments, range over seeds, frames lost, rate."""
+    """A row per method and sequence, means over objects: both alignments, range over seeds, frames lost; the full form also the rate."""
     done: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for job, outcome in numbers.benchmark.results:
         found = done[job.method.name, shown_name(job)]
@@ -92,12 +92,14 @@ def by_run(numbers: Numbers) -> Table:
     for at, outcomes in done.items():
         words = [Cell(at[0]), Cell(at[1])]
         cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 5
-        lines.append([*words, *cells, number(_mean(hz.get(at)), digits=1)])
-    heads = ["Method", "Sequence", *["ADD-S (%)", "ADD (%)"] * 2, "frames lost", "rate (Hz)"]
-    groups = [("", 2), ("aligned at the first frame", 2), ("one constant over all", 2), ("", 2)]
+        rate = [number(_mean(hz.get(at)), digits=1)] if numbers.judges else []
+        lines.append([*words, *cells, *rate])
+    heads = ["Method", "Sequence", *["ADD-S (%)", "ADD (%)"] * 2, "frames lost", *["rate (Hz)"] * numbers.judges]
+    groups = [("", 2), ("aligned at the first frame", 2), ("one constant over all", 2), ("", 1 + numbers.judges)]
     said = f"Mean over objects and seeds {', '.join(map(str, numbers.seeds))}"
     said += ", in brackets the lowest and the highest" * (len(numbers.seeds) > 1)
-    how = "Exact area under the curve, frames without a pose count as 0; the rate is this machine's, under its load"
+    how = "Exact area under the curve, frames without a pose count as 0"
+    how += "; the rate is this machine's, under its load" * numbers.judges
     return Table(numbers.plan.title, heads, lines, groups, words=2, notes=[said, how, numbers.what_ran()])
 
 

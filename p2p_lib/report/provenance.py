@@ -116,7 +116,7 @@ def _save_typeset(table: Table, target: Path, sources: Iterable[Any], parameters
     for suffix, text in ((".csv", table.csv()), (".md", markdown), (".tex", table.latex())):
         target.with_name(f"{target.name}{suffix}").write_text(text, encoding="utf-8")
     _write_note(target, [".csv", ".md", ".tex"], sources, parameters, [])
-    return Saved(target.with_name(f"{target.name}.csv"), ({"text/markdown": markdown, "text/plain": markdown}, {}))
+    return Saved(target.with_name(f"{target.name}.csv"), ({"text/html": table.html(), "text/plain": markdown}, {}))
 
 
 def as_markdown(table: Any) -> str:

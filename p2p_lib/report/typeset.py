@@ -1,8 +1,9 @@
-"""Tables for papers: cells with a number, its spread, its weight, and what is to be said of it; set in three ways."""
+"""Tables for papers: cells with a number, its spread, its weight, and what is to be said of it; set in four ways."""
 
 from __future__ import annotations
 
 import csv
+import html
 import io
 import string
 from collections.abc import Sequence
@@ -83,8 +84,36 @@ class Table:
         lines = [heads, ["---"] * self.words + ["---:"] * (len(heads) - self.words)]
         lines += [[_markdown_cell(cell, letters) for cell in row] for row in self.rows]
         table = "".join("| " + " | ".join(line) + " |\n" for line in lines)
-        said = [*(f"({letter}) {note}." for note, letter in letters.items()), *(f"{note}." for note in self.notes)]
-        return f"**{self.title}**\n\n{table}\n" + "".join(f"{line}  \n" for line in said)
+        said = "".join(f"{line}  \n" for line in self._said(letters)).replace("$", r"\$")  # else it is an equation
+        return f"**{self.title}**\n\n{table}\n{said}"
+
+    def html(self) -> str:
+        """For notebooks: small, with the groups in a line of their own, so that all columns fit on a page."""
+        letters = self.letters()
+        sides = [_LEFT] * self.words + [_RIGHT] * (len(self.heads) - self.words)
+        above, heads, at = "", "", 0
+        for group, span in self.groups or [("", len(self.heads))]:
+            cells = "".join(
+                f'<th style="{side}"{"" if group else _BOTH * bool(self.groups)}>{_html(head)}</th>'
+                for head, side in zip(self.heads[at : at + span], sides[at:], strict=False)
+            )
+            above += f'<th colspan="{span}" style="{_MIDDLE}">{_html(group)}</th>' if group else cells
+            heads += cells if group else ""
+            at += span
+        lines = [above, heads] if heads else [above]
+        for at, row in enumerate(self.rows):
+            rule = "; border-top: 1px solid #999" if at in self.rules else ""
+            cells = [_html_cell(cell, letters) for cell in row]
+            pairs = zip(sides, cells, strict=True)
+            lines.append("".join(f'<td style="{side}{rule}">{text}</td>' for side, text in pairs))
+        table = "".join(f"<tr>{line}</tr>\n" for line in lines)
+        said = "<br>\n".join(map(_html, self._said(letters)))
+        title = f"<p><b>{_html(self.title)}</b></p>"
+        return f'{title}\n<table style="font-size: 11px">\n{table}</table>\n<p style="font-size: 11px">{said}</p>\n'
+
+    def _said(self, letters: dict[str, str]) -> list[str]:
+        """What stands below the table: its notes with their letters, then those of the whole."""
+        return [*(f"({letter}) {note}." for note, letter in letters.items()), *(f"{note}." for note in self.notes)]
 
     def latex(self) -> str:
         """For papers; needs the package booktabs."""
@@ -122,6 +151,22 @@ def _markdown_cell(cell: Cell, letters: dict[str, str]) -> str:
     text = cell.text.replace("|", "\\|")
     text = f"**{text}**" if cell.bold else text
     return f"{text} ({letters[cell.note]})" if cell.note else text
+
+
+_BOTH = ' rowspan="2"'
+_LEFT, _MIDDLE, _RIGHT = (
+    f"text-align: {side}; padding: 2px 5px; white-space: normal" for side in ("left", "center", "right")
+)
+
+
+def _html(text: str) -> str:
+    """Plain words; a dollar stands in an element of its own, else two of them are taken for an equation."""
+    return html.escape(text).replace("$", "<span>$</span>")
+
+
+def _html_cell(cell: Cell, letters: dict[str, str]) -> str:
+    text = f"<b>{_html(cell.text)}</b>" if cell.bold else _html(cell.text)
+    return f"{text}<sup>{letters[cell.note]}</sup>" if cell.note else text
 
 
 def _latex_cell(cell: Cell, letters: dict[str, str]) -> str:

@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -117,7 +118,8 @@ def test_what_did_not_run_says_why(tmp_path):
     assert cell(table, "bleach v1", *ours) == Cell(note="bleach: $P2P_DATA is not set")
     assert cell(table, "sugar v1", *ours).note == "no run of the plan is of this"
     markdown, latex = table.markdown(), table.latex()
-    assert "fail (" in markdown and ") bleach: $P2P_DATA is not set." in markdown
+    assert "fail (" in markdown and r") bleach: \$P2P_DATA is not set." in markdown, "or it is taken for an equation"
+    assert ") bleach: <span>$</span>P2P_DATA is not set." in table.html()
     assert r"\$P2P\_DATA is not set" in latex and "--\\textsuperscript{" in latex
     rows = list(csv.DictReader(io.StringIO(table.csv())))
     (row,) = (r for r in rows if r["Metric"] == "ADD-S (%)" and r["Method"] == "Ours")
@@ -208,3 +210,22 @@ def test_three_files_lie_beside_the_results(tmp_path):
 )
 def test_bold_is_the_best_of_those_that_tried(texts, bold):
     assert [c.bold for c in emboldened([Cell(text) for text in texts], True)] == bold
+
+
+def test_a_page_has_the_groups_above_their_heads():
+    rows = [[Cell("Ours"), Cell("1.00", bold=True), Cell(note="no <data>")]]
+    page = Table("A table", ["Method", "ADD", "rate"], rows, [("", 1), ("reported", 2)], notes=["All"]).html()
+    lines = page.splitlines()
+    assert [line.count("<th") for line in lines] == [0, 0, 2, 2, *[0] * (len(lines) - 4)]
+    assert 'rowspan="2">Method</th>' in lines[2] and 'colspan="2"' in lines[2]
+    assert "<b>1.00</b>" in page and "-<sup>a</sup>" in page and "(a) no &lt;data&gt;." in page
+
+
+def test_a_few_frames_crown_nobody(tmp_path):
+    runs = {("Ours", "x"): [outcome(90)], ("Ours, less", "x"): [outcome(80)]}
+    for kind in ("methods", "runs"):
+        made = benchmark(tmp_path, runs, kind=kind)
+        quick = paper_table(replace(made, profile="quick"))
+        assert not any(c.bold for row in quick.rows for c in row) and "rate (Hz)" not in quick.heads
+        full = paper_table(replace(made, profile="full"))
+        assert any(c.bold for row in full.rows for c in row) or "rate (Hz)" in full.heads
