@@ -80,7 +80,7 @@ def by_rate(numbers: Numbers) -> Table:
 
 
 def by_run(numbers: Numbers) -> Table:
-    """A row per method and sequence, means over objects: both alignments, range over seeds, frames lost; the full form also the rate."""
+    """A row per method and sequence, means over objects: both alignments, range over seeds, frames lost, rate."""
     done: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for job, outcome in numbers.benchmark.results:
         found = done[job.method.name, shown_name(job)]

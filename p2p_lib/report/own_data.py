@@ -11,7 +11,10 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame, Status
+from p2p_lib.data.models import MESHES, find_models
 from p2p_lib.data.prompts import Prompt
+from p2p_lib.data.sequence import Sequence as Recording
+from p2p_lib.data.synthetic.shapes import load_mesh
 from p2p_lib.evaluation.mask_rim import background_share, rim
 from p2p_lib.evaluation.own_data import Finding
 from p2p_lib.evaluation.self_check import SurfaceFit
@@ -53,19 +56,56 @@ def tight_box(mesh: trimesh.Trimesh) -> Box:
     return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
 
 
+def edges_mm(mesh: trimesh.Trimesh, beyond: float = 0.005, rounds: int = 2) -> np.ndarray:
+    """(3,) edges of the box around a surface, longest first, without its fringes.
+
+    Twice, the outermost share ``beyond`` of the vertices is cut off at each side, along the box's axes.
+    """
+    import trimesh
+
+    p_obj = np.asarray(mesh.vertices)
+    for _ in range(rounds):
+        T_box_obj, _ = trimesh.bounds.oriented_bounds(p_obj)
+        p_box = se3.transform(se3.orthonormalised(T_box_obj), p_obj)
+        low, high = np.quantile(p_box, [beyond, 1 - beyond], axis=0)
+        p_obj = p_obj[((p_box >= low) & (p_box <= high)).all(1)]
+    return np.sort(1e3 * trimesh.bounds.oriented_bounds(p_obj)[1])[::-1]
+
+
+def true_edges_mm(sequence: Recording) -> dict[str, np.ndarray]:
+    """Per object with a model, (3,) edges of the box around it, longest first."""
+    models = {name: load_mesh(file) for name, file in find_models(sequence, MESHES).items()}
+    return {name: np.sort(1e3 * tight_box(model).size_m)[::-1] for name, model in models.items()}
+
+
+def edges_table(edges: Mapping[str, np.ndarray], ruler: Mapping[str, np.ndarray]) -> DataFrame:
+    """A row per edge: the reconstructed surface's beside the ruler's."""
+    from pandas import DataFrame
+
+    rows = [
+        {"object": name, "edge": edge, "surface [mm]": round(float(found)), "ruler [mm]": round(float(true))}
+        for name in edges
+        for edge, found, true in zip(("longest", "middle", "shortest"), edges[name], ruler[name], strict=True)
+    ]
+    return DataFrame(rows)
+
+
 def clicked_picture(frame: Frame, prompts: Sequence[Prompt], colours: Mapping[str, str]) -> np.ndarray:
     """A picture with the clicks in it."""
     image = frame.rgb
     for prompt in prompts:
         image = overlay.draw_points(image, prompt.points_px, colours[prompt.name], radius_px=7)
+        for radius_px in (15, 16, 17):
+            image = overlay.draw_points(image, prompt.points_px, colours[prompt.name], radius_px, filled=False)
     return image
 
 
 def mesh_portrait(mesh: trimesh.Trimesh, width_px: int, height_px: int, turn_deg: float = 25.0) -> np.ndarray:
     """A surface from slightly above, filling the picture; ``turn_deg`` about the vertical, 0 as it was first seen."""
     box = Box.around(mesh.vertices)
-    away_m = 1.6 * float(np.linalg.norm(box.size_m))
-    focal_px = 1.35 * height_px
+    radius_m = float(np.linalg.norm(mesh.vertices - box.T_obj_box[:3, 3], axis=1).max())
+    away_m = 3.2 * radius_m
+    focal_px = 1.4 * min(height_px, width_px)
     camera = Camera(focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, width_px, height_px)
     turn = se3.exp(np.array([0, np.radians(turn_deg), 0, 0, 0, 0]))
     tilt = se3.exp(np.array([np.radians(25), 0, 0, 0, 0, 0]))
@@ -103,7 +143,11 @@ def widened(mask: np.ndarray, by_px: int) -> np.ndarray:
 
 def mesh_portraits(meshes: Mapping[str, trimesh.Trimesh], turns_deg: Sequence[float] = (-70, 0, 70, 180)) -> np.ndarray:
     """Every surface from several sides, a row each."""
-    sides = [mesh_portrait(mesh, 300, 260, turn) for mesh in meshes.values() for turn in turns_deg]
+    sides = [
+        overlay.draw_caption(mesh_portrait(mesh, 300, 260, turn), f"{name}, {turn:+g} deg")
+        for name, mesh in meshes.items()
+        for turn in turns_deg
+    ]
     return overlay.montage(sides, columns=len(turns_deg))
 
 
@@ -112,7 +156,13 @@ def findings_table(findings: Mapping[str, Sequence[Finding]]) -> DataFrame:
     from pandas import DataFrame
 
     rows = [
-        {"what was done to the folder": label, "where": f.name, "": str(f.level), "found": f.text, "what to do": f.fix}
+        {
+            "what was done to the folder": label,
+            "where": f.name,
+            "says": str(f.level),
+            "found": f.text.replace("`", ""),
+            "what to do": f.fix.replace("`", ""),
+        }
         for label, found in findings.items()
         for f in found
         if f.level != "ok"

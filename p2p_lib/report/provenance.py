@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import html
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -107,8 +108,7 @@ def save_table(
     markdown = as_markdown(table)
     target.with_name(f"{name}.md").write_text(markdown, encoding="utf-8")
     _write_note(target, [".csv", ".md"], sources, parameters, ["pandas"])
-    html = table.to_html(index=False, na_rep="-", border=0)
-    return Saved(target.with_name(f"{name}.csv"), ({"text/html": html, "text/plain": markdown}, {}))
+    return Saved(target.with_name(f"{name}.csv"), ({"text/html": as_html(table), "text/plain": markdown}, {}))
 
 
 def _save_typeset(table: Table, target: Path, sources: Iterable[Any], parameters: Mapping[str, Any] | None) -> Saved:
@@ -125,6 +125,21 @@ def as_markdown(table: Any) -> str:
     rows = [[_cell(value) for value in row] for row in table.itertuples(index=False)]
     lines = [[str(c) for c in table.columns], ["---:" if n else "---" for n in numeric], *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def as_html(table: Any) -> str:
+    """A DataFrame as HTML, numbers to the right, words to the left, its index left out."""
+    sides = ["right" if table[c].dtype.kind in "fiu" else "left" for c in table.columns]
+    rows = [("th", table.columns), *(("td", row) for row in table.itertuples(index=False))]
+    lines = [
+        "".join(f'<{tag} style="text-align: {side}">{_html_cell(v)}</{tag}>' for side, v in zip(sides, row))
+        for tag, row in rows
+    ]
+    return "<table>\n" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>\n"
+
+
+def _html_cell(value: Any) -> str:
+    return html.escape(_cell(value).replace("\\|", "|")).replace("$", "<span>$</span>")
 
 
 def describe(source: Any) -> dict[str, Any]:

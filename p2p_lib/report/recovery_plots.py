@@ -35,9 +35,12 @@ def moments(event: RecoveryEvent, after: Sequence[int] = (0, 1, 3, 10)) -> dict[
 
 
 def return_strip(
-    scenes: Mapping[str, Scene], name: str, event: RecoveryEvent, after: Sequence[int] = (0, 1, 3, 10)
+    scenes: Mapping[str, Scene], name: str, event: RecoveryEvent, after: Sequence[int] = (0, 1, 10)
 ) -> Figure:
-    """A row of pictures per method: the object before, while and after it is hidden; cut to where it truly is."""
+    """A row of pictures per method: the object before, while and after it is hidden; cut to where it truly is.
+
+    Its status is below each picture.
+    """
     from matplotlib.figure import Figure
 
     told = moments(event, after)
@@ -46,16 +49,19 @@ def return_strip(
     (left, top, right, bottom), *_ = regions
     with style.applied():
         high = _WIDTH_IN / len(told) * (bottom - top) / (right - left)
-        figure = Figure((_WIDTH_IN, high * len(scenes) + 0.5), layout="constrained")
+        figure = Figure((_WIDTH_IN, (0.96 * high + 0.1) * len(scenes) + 0.7), layout="constrained")
         axes = figure.subplots(len(scenes), len(told), squeeze=False)
         for row, (label, scene) in zip(axes, scenes.items()):
             for axis, index, region_px in zip(row, told.values(), regions):
-                axis.imshow(scene.draw(scene.row(index), region_px, 230, axes=False, trail=0))
+                at = scene.row(index)
+                axis.imshow(scene.draw(at, region_px, 300, axes=False, trail=0, words=False))
                 axis.set(xticks=[], yticks=[])
+                axis.set_xlabel(scene.run.objects[name].status[at], fontsize=10)
                 axis.spines[:].set_visible(False)
             row[0].set_ylabel(label, fontweight="bold")
         for axis, (what, index) in zip(axes[0], told.items()):
-            axis.set_title(f"{what}\n(frame {index})", fontsize=8.5)
+            axis.set_title(f"{what}\n(frame {index})", fontsize=9)
+        figure.suptitle(f"{first.sequence.name}: {name}", x=0.01, ha="left", fontsize=10)
     return figure
 
 

@@ -65,8 +65,9 @@ class Scene:
         width_px: int | None = None,
         axes: bool = True,
         trail: int = 30,
+        words: bool = True,
     ) -> np.ndarray:
-        """The run's ``row``-th frame, cut to a region and scaled to a width.
+        """The run's ``row``-th frame, cut to a region and scaled to a width; ``words`` are names, statuses, the time.
 
         Estimated boxes are in their object's colour, true ones white and dashed; an object that is hidden has only
         its true box. ``trail`` is the number of earlier frames whose path is drawn.
@@ -80,6 +81,8 @@ class Scene:
         for name, obj in self.run.objects.items():
             image = self._draw_object(image, camera, name, obj, row, axes, trail)
             labels.append(self._label(camera, name, obj, row))
+        if not words:
+            return image
         image = overlay.draw_labels(image, [label for label in labels if label is not None])
         return overlay.draw_caption(image, f"{self.sequence.name}  {frame.time_s:.2f} s")
 

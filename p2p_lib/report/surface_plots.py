@@ -186,8 +186,9 @@ def slices_beside_exact(volume: TsdfVolume, body: Body, heights_m: Sequence[floa
             axis.set_title(title)
         for axis in axes[-1]:
             axis.set_xlabel("x [mm]")
-        figure.colorbar(left, ax=axes[:, :2], label="signed distance [mm]", shrink=0.8)
-        figure.colorbar(right, ax=axes[:, 2], label="difference [mm]", shrink=0.8)
+        bars = (left, axes[:, :2], "signed\ndistance\n[mm]"), (right, axes[:, 2], "differ-\nence\n[mm]")
+        for shown, beside, words in bars:
+            figure.colorbar(shown, ax=beside, shrink=0.8).ax.set_title(words, fontsize=8, loc="left")
     return figure
 
 

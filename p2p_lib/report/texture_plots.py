@@ -195,7 +195,7 @@ def _against_texture(
 
 
 def _colours(count: int) -> np.ndarray:
-    """(count, 4) dark to bright."""
+    """(count, 4) dark to bright, but not so bright that a line is lost on white."""
     import matplotlib
 
-    return matplotlib.colormaps["cividis"](np.linspace(0, 1, max(count, 2)))[:count]
+    return matplotlib.colormaps["cividis"](np.linspace(0, 0.85, max(count, 2)))[:count]

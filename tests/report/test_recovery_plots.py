@@ -26,9 +26,9 @@ def test_a_row_is_found_by_its_frame(scenes):
 
 def test_the_strip_has_a_row_per_method_and_says_which_frames(scenes):
     figure = recovery_plots.return_strip(scenes, "can", EVENT)
-    titles = [axis.get_title(loc="left") for axis in figure.axes[:6]]
+    titles = [axis.get_title(loc="left") for axis in figure.axes[:5]]
     assert titles[0] == "last in sight\n(frame 14)" and titles[2:4] == ["return\n(frame 21)", "return + 1\n(frame 22)"]
-    assert len(figure.axes) == 12 and figure.axes[6].get_ylabel() == "forgets"
+    assert len(figure.axes) == 10 and figure.axes[5].get_ylabel() == "forgets"
 
 
 def test_pictures_are_cut_to_where_the_object_truly_is(scenes, made):
