@@ -74,8 +74,10 @@ def edges_mm(mesh: trimesh.Trimesh, beyond: float = 0.005, rounds: int = 2) -> n
 
 def true_edges_mm(sequence: Recording) -> dict[str, np.ndarray]:
     """Per object with a model, (3,) edges of the box around it, longest first."""
-    models = {name: load_mesh(file) for name, file in find_models(sequence, MESHES).items()}
-    return {name: np.sort(1e3 * tight_box(model).size_m)[::-1] for name, model in models.items()}
+    import trimesh
+
+    p_model = {name: load_mesh(file).vertices for name, file in find_models(sequence, MESHES).items()}
+    return {name: np.sort(1e3 * trimesh.bounds.oriented_bounds(p)[1])[::-1] for name, p in p_model.items()}
 
 
 def edges_table(edges: Mapping[str, np.ndarray], ruler: Mapping[str, np.ndarray]) -> DataFrame:

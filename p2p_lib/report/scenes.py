@@ -38,7 +38,8 @@ class Scene:
             raise BadInput("scene", f"a run of {run.info['sequence']!r}", f"one of {sequence.name!r}")
         _check_same_data(sequence, run)
         self.sequence, self.run = sequence, run
-        self.colours = style.object_colours(dict.fromkeys([*sequence.objects, *run.objects]))
+        known = set(run.objects) <= set(sequence.objects)  # a folder without masks knows no names
+        self.colours = style.object_colours(sequence.objects if known else run.objects)
         self._T_obj_model = {k: s.T_obj_model for k, s in evaluation.objects.items()} if evaluation else {}
         self._model_boxes = {name: Box.around(points) for name, points in run.points.items()} if truth else {}
         self._boxes = {
