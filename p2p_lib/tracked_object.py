@@ -183,7 +183,7 @@ class TrackedObject:
         refined: dict[int, Refinement] = {}
         with self._stopwatch("refinement"):
             if cfg.refine_all:
-                refined = {id(h): self._refine(view, h) for h in hypotheses}
+                refined = {id(h): self._refine(view, h.T_cam_obj, h.inliers) for h in hypotheses}
         with self._stopwatch("selection"):
             T_cam_obj = [refined[id(h)].T_cam_obj if cfg.refine_all else h.T_cam_obj for h in hypotheses]
             distance_m = self._surface_distances(view, T_cam_obj)
@@ -192,7 +192,7 @@ class TrackedObject:
         if chosen is None:
             return None, None, reason
         with self._stopwatch("refinement"):
-            return chosen, refined.get(id(chosen)) or self._refine(view, chosen), reason
+            return chosen, refined.get(id(chosen)) or self._refine(view, chosen.T_cam_obj, chosen.inliers), reason
 
     def _observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> View:
         """One frame's share of this object."""
@@ -259,7 +259,7 @@ class TrackedObject:
         if cfg.multi_hypothesis and priors and most < cfg.contradicted * use.sum():
             # Most points are wrong, whichever: pending ones may tell, and some may agree with where the surface leads.
             found = self._registered(view, certain, priors)
-            carried = self._refine(view, None, list(priors.values())[-1])
+            carried = self._refine(view, list(priors.values())[-1])
             if carried.refined:
                 p_cam = np.where(certain[:, None], view.p_cam, np.nan)
                 found += registration.refit(carried.T_cam_obj, "surface", self.map.p_obj, p_cam, cfg)
@@ -297,16 +297,15 @@ class TrackedObject:
         unseen = self.config.registration.unseen_share
         return refinement.surface_distances(self.surface, view.cloud, np.stack(T_cam_obj), unseen)
 
-    def _refine(self, view: View, hypothesis: Hypothesis | None, T_cam_obj: np.ndarray | None = None) -> Refinement:
-        """The pose refined on the surface, jointly with the keypoints where the configuration says so."""
-        cfg, T_cam_obj = self.config.refinement, hypothesis.T_cam_obj if hypothesis else T_cam_obj
+    def _refine(self, view: View, T_cam_obj: np.ndarray, agreeing: np.ndarray | None = None) -> Refinement:
+        """The pose refined on the surface, with the ``agreeing`` (N,) keypoints where the configuration says so."""
+        cfg = self.config.refinement
         if not cfg.enabled or self.surface is None or self.surface.empty or not len(view.cloud):
             return Refinement(T_cam_obj, reason="no surface")
-        if hypothesis is None:
-            return refinement.refine(T_cam_obj, view.cloud, self.surface, cfg)
-        at = hypothesis.inliers
-        sigma_m = registration.noise_m(view.p_cam[at], self.config.registration)
-        keypoints = Keypoints(self.map.p_obj[at], view.p_cam[at], sigma_m)
+        keypoints = None
+        if agreeing is not None:
+            sigma_m = registration.noise_m(view.p_cam[agreeing], self.config.registration)
+            keypoints = Keypoints(self.map.p_obj[agreeing], view.p_cam[agreeing], sigma_m)
         return refinement.refine(T_cam_obj, view.cloud, self.surface, cfg, keypoints=keypoints)
 
     def _priors(self) -> dict[str, np.ndarray]:
