@@ -20,7 +20,7 @@ import numpy as np
 
 from p2p_lib import Point2Pose, open_sequence, preset
 from p2p_lib.core.types import WITH_POSE, Frame
-from p2p_lib.data.sequence import Sequence
+from p2p_lib.datasets.sequence import Sequence
 
 EVERY, SETTLED = 500, 1000
 MOST_GROWTH_MB, MOST_SLOWER = 50.0, 0.20

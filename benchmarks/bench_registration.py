@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
-from p2p_lib.stages.registration import covariance, fit_rigid, generate
+from p2p_lib.method.registration import covariance, fit_rigid, generate
 
 SEEDS = 40
 

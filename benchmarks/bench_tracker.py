@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.config import preset
-from p2p_lib.data.sequence import open_sequence
+from p2p_lib.core.interfaces import PointTracker
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.true_tracks import Queries, TrueScene, draw_queries
-from p2p_lib.stages.embedded_tracker import EmbeddedTracker
-from p2p_lib.stages.lk_tracker import LkTracker
-from p2p_lib.stages.tracking import PointTracker
+from p2p_lib.trackers.builtin.tracker import BuiltinTracker
+from p2p_lib.trackers.lk import LkTracker
 
 
 def step_ms(tracker: PointTracker, frame, camera, queries: Queries) -> float:
@@ -40,7 +40,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     sequence = open_sequence(asked.sequence)
     queries = draw_queries(TrueScene.of(sequence), np.random.default_rng(0))
-    trackers = LkTracker(preset().tracking), EmbeddedTracker(preset().tracking)
+    trackers = LkTracker(preset().tracking), BuiltinTracker(preset().tracking)
     frames = range(asked.frames or len(sequence))
     cost = np.array([[step_ms(t, sequence.frame(i), sequence.camera, queries) for t in trackers] for i in frames])
     for tracker, ms in zip(trackers, cost.T, strict=True):

@@ -8,8 +8,8 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 _WHERE = {
-    "Point2Pose": "p2p_lib.pipeline",
-    "open_sequence": "p2p_lib.data.sequence",
+    "Point2Pose": "p2p_lib.method.pipeline",
+    "open_sequence": "p2p_lib.datasets.sequence",
     "Camera": "p2p_lib.core.camera",
     "Config": "p2p_lib.core.config",
     "preset": "p2p_lib.core.config",

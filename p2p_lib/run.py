@@ -10,30 +10,29 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.backends.registry import DEFAULT_DETECTOR, make_tracker
-from p2p_lib.backends.segmenters import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core import config as configuration
+from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, DEFAULT_TRACKER, SEGMENTERS, make_tracker
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.clicks import check_apart, check_clicks
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import Frame, PoseEstimate
-from p2p_lib.data import sequence as sequences
-from p2p_lib.data.export import export
-from p2p_lib.data.imported import as_run, read_poses
-from p2p_lib.data.keypoint_log import KeypointLog
-from p2p_lib.data.models import find_models, given_models
-from p2p_lib.data.prompts import Prompt, load_prompts
-from p2p_lib.data.runs import Run, RunWriter, load_run
+from p2p_lib.datasets import sequence as sequences
+from p2p_lib.datasets.export import export
+from p2p_lib.datasets.imported import as_run, read_poses
+from p2p_lib.datasets.keypoint_log import KeypointLog
+from p2p_lib.datasets.models import find_models, given_models
+from p2p_lib.datasets.prompts import Prompt, load_prompts
+from p2p_lib.datasets.runs import Run, RunWriter, load_run
 from p2p_lib.evaluation.mask_score import MaskEvaluation, evaluate_masks
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, score_tracker
 from p2p_lib.evaluation.true_tracks import TrueScene
-from p2p_lib.pipeline import Point2Pose
-from p2p_lib.stages.clicks import check_apart, check_clicks
-from p2p_lib.stages.mesh import save as save_mesh
-from p2p_lib.stages.tracking import DEFAULT_TRACKER, PointTracker
+from p2p_lib.method.mesh import save as save_mesh
+from p2p_lib.method.pipeline import Point2Pose
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ def run(
     progress: bool = True,
     say: Callable[[str], object] = lambda line: None,
 ) -> RunResult:
-    """Track the objects of a sequence and write a run folder (see :mod:`p2p_lib.data.runs`).
+    """Track the objects of a sequence and write a run folder (see :mod:`p2p_lib.datasets.runs`).
 
     ``masks`` says where masks come from: ``dataset``, ``dataset:FOLDER``, or a segmenter by name, which
     starts from ``prompts`` (a file, or values). The default is the dataset's, or with prompts the
@@ -214,7 +213,7 @@ def evaluate_poses(
     start: int = 0,
     stop: int | None = None,
 ) -> Evaluation:
-    """Score any method's poses (see :mod:`p2p_lib.data.imported`) by the rules of a run of ours over these frames."""
+    """Score any method's poses (:mod:`p2p_lib.datasets.imported`) by the rules of a run of ours over these frames."""
     if isinstance(sequence, str | Path):
         sequence = sequences.open_sequence(sequence, format)
     known = find_models(sequence) | given_models(models or {}, sequence.objects)

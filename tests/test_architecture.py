@@ -13,23 +13,21 @@ PACKAGE = PROJECT / "p2p_lib"
 #: Ground to roof; the parts of one floor do not know each other.
 FLOORS = [
     {"core"},
-    {"data", "stages"},
-    {"backends"},
-    {"tracked_object"},
-    {"pipeline"},
+    {"method", "datasets"},
+    {"synthetic"},
+    {"trackers", "detectors", "segmenters"},
     {"evaluation"},
     {"run"},
     {"benchmark"},
-    {"report"},
-    {"notebooks", "doctor", "click"},
-    {"live"},
-    {"cli"},
+    {"figures"},
+    {"studies"},
+    {"apps"},
 ]
 HOMES = {
-    "gtsam": ["stages/factor_graph.py"],
-    "matplotlib": ["report/*.py"],
+    "gtsam": ["method/factor_graph.py"],
+    "matplotlib": ["figures/*.py", "studies/*.py"],
     "open3d": ["core/native.py"],
-    "papermill": ["notebooks.py"],
+    "papermill": ["apps/notebooks.py"],
 }
 MACHINE = re.compile(r"(?<![\w./~-])/(work|tmp|root|farm|home/[a-z]\w*|opt|mnt|Users)/\w")
 REGISTRY = re.compile(r"https?://[^\s\"']*(/simple\b|/packages/[0-9a-f]{2}/|/whl/)|index-url[ =]+http|pypi\.org")
@@ -88,7 +86,7 @@ def test_heavy_library_has_one_home(library):
     assert users <= homes, f"{library} is used outside its home: {sorted(map(str, users - homes))}"
 
 
-HELP = "from p2p_lib.cli import main\ntry: main(['--help'])\nexcept SystemExit as end: assert not end.code"
+HELP = "from p2p_lib.apps.cli import main\ntry: main(['--help'])\nexcept SystemExit as end: assert not end.code"
 
 
 @pytest.mark.parametrize("code", ["import p2p_lib", HELP], ids=["import p2p_lib", "p2p --help"])
@@ -99,9 +97,13 @@ def test_loads_nothing_heavy(code):
 
 
 def test_every_module_imports_without_torch_open3d_and_plots():
-    """Importing any file of ours alone must not load them; report may plot."""
+    """Importing any file of ours alone must not load them; figures and studies may plot."""
     names = [".".join(path.relative_to(PROJECT).with_suffix("").parts) for path in sources()]
-    names = [name.removesuffix(".__init__") for name in names if part(name) not in ("report", "backends")]
+    names = [
+        name.removesuffix(".__init__")
+        for name in names
+        if part(name) not in ("figures", "studies", "trackers", "detectors", "segmenters")
+    ]
     code = f"import importlib, sys\nfor n in {names!r}: importlib.import_module(n)\n"
     code += "print('LOADED', *[m for m in ('torch', 'open3d', 'matplotlib', 'papermill') if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

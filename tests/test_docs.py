@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import yaml
 
-from p2p_lib import Point2Pose, cli, preset
+from p2p_lib import Point2Pose, preset
+from p2p_lib.apps import cli
+from p2p_lib.apps.notebooks import list_notebooks
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame, Status
-from p2p_lib.notebooks import list_notebooks
 
 PROJECT = Path(__file__).resolve().parents[1]
 DOCUMENTS = ("README.md", "CONTRIBUTING.md", "environment.md")

@@ -3,7 +3,7 @@
 ::
 
     DIR/records/KEY.json   one run's errors, times and provenance (see p2p_lib/benchmark/outcome.py)
-    DIR/runs/KEY/          the run itself: poses, meshes, timings (see p2p_lib/data/runs.py)
+    DIR/runs/KEY/          the run itself: poses, meshes, timings (see p2p_lib/datasets/runs.py)
     DIR/failures/KEY.txt   the traceback of a run that failed
     DIR/PLAN-PROFILE/      results.csv, summary.csv (over seeds), timings.csv
 
@@ -27,8 +27,8 @@ from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.benchmark.rows import Row
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.progress import progress_bar
-from p2p_lib.data.runs import Run, load_run
-from p2p_lib.data.sequence import Sequence
+from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.datasets.sequence import Sequence
 
 
 @dataclass(frozen=True, eq=False)

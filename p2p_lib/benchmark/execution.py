@@ -15,14 +15,14 @@ from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from p2p_lib.backends.packages import PIP, command
 from p2p_lib.benchmark.jobs import Job, library_version
 from p2p_lib.benchmark.outcome import Outcome
 from p2p_lib.benchmark.worker import perform
 from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.packages import PIP, command
 
 # Loaded once, in the process from which those of the runs are forked.
-_PRELOADED = ["p2p_lib.benchmark.worker", "p2p_lib.stages.factor_graph", "torch", "scipy.spatial", "scipy.optimize"]
+_PRELOADED = ["p2p_lib.benchmark.worker", "p2p_lib.method.factor_graph", "torch", "scipy.spatial", "scipy.optimize"]
 _PRELOADED += ["trimesh", "skimage.measure"]
 # How long a scheduler may take to answer.
 _CONNECT_S = 20

@@ -17,16 +17,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from p2p_lib.backends.registry import make_detector
 from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, uses_clicks
+from p2p_lib.core.backends import make_detector
 from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.paths import data_dir
-from p2p_lib.data import manifests
-from p2p_lib.data.models import find_models
-from p2p_lib.data.prompts import Prompt
-from p2p_lib.data.resized import Resized
-from p2p_lib.data.sequence import FORMATS, SYNTHETIC, Sequence, open_sequence
+from p2p_lib.datasets import manifests
+from p2p_lib.datasets.models import find_models
+from p2p_lib.datasets.prompts import Prompt
+from p2p_lib.datasets.resized import Resized
+from p2p_lib.datasets.sequence import FORMATS, SYNTHETIC, Sequence, open_sequence
 from p2p_lib.run import make_config
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -76,7 +76,7 @@ def open_planned(job: Job) -> Sequence:
     seed = job.seed if planned.seed is None else planned.seed
     folder = None if uses_clicks(method) else method.masks.partition(":")[2] or None
     if planned.name.startswith(SYNTHETIC):
-        from p2p_lib.data.synthetic import scenario_dir
+        from p2p_lib.synthetic import scenario_dir
 
         where = scenario_dir(planned.name.removeprefix(SYNTHETIC), seed, **_synthetic(planned, method)[0])
         sequence = _load(where, planned.name, folder)
@@ -182,7 +182,7 @@ def _with_detector(method: Method) -> Method:
 
 def _synthetic(planned: PlannedSequence, method: Method) -> tuple[dict[str, Any], dict[str, Any]]:
     """The parameters of a synthetic sequence, and the same with hashes of files in the place of their folder."""
-    from p2p_lib.data.synthetic.noise import NOISE
+    from p2p_lib.synthetic.noise import NOISE
 
     given = planned.synthetic | method.synthetic
     noise = given.pop("noise", "realsense")
@@ -202,7 +202,7 @@ def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
     """What stands for the sequence: a generator's parameters, else names and sizes of all files, truth and models."""
     planned, method = job.sequence, job.method
     if planned.name.startswith(SYNTHETIC):
-        from p2p_lib.data.synthetic.generate import generator_version
+        from p2p_lib.synthetic.generate import generator_version
 
         seed = job.seed if planned.seed is None else planned.seed
         return [planned.name, seed, generator_version(), _synthetic(planned, method)[1]]

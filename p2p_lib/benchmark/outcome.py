@@ -64,7 +64,7 @@ def record_path(out: Path, key: str) -> Path:
 
 
 def run_path(out: Path, key: str) -> Path:
-    """Where the run of a key lies (see :mod:`p2p_lib.data.runs`)."""
+    """Where the run of a key lies (see :mod:`p2p_lib.datasets.runs`)."""
     return out / "runs" / key
 
 

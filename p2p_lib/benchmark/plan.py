@@ -12,11 +12,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from p2p_lib.backends.registry import DEFAULT_DETECTOR
-from p2p_lib.backends.segmenters import SEGMENTERS
+from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_TRACKER, SEGMENTERS
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.data.sequence import SYNTHETIC
-from p2p_lib.stages.tracking import DEFAULT_TRACKER
+from p2p_lib.datasets.sequence import SYNTHETIC
 
 PROFILES = ("quick", "full")
 #: Where the plans of this package lie.
@@ -106,7 +104,7 @@ class Plan(_Strict):
 
     name     of its file
     paper    LaTeX label of the paper's table that it re-creates, "" for none
-    kind     how its table is arranged (see :mod:`p2p_lib.report.paper_tables`)
+    kind     how its table is arranged (see :mod:`p2p_lib.studies.paper_tables`)
     chamfer  whether reconstructions are scored as well
     tracks   whether the 2D trackers are scored by themselves as well
     """

@@ -14,9 +14,9 @@ from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, Scope
 from p2p_lib.benchmark.rows import MEAN, MEAN_OF_ONE, Row, result_rows
 from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingData
-from p2p_lib.data.models import MESHES, find_models, given_models
-from p2p_lib.data.runs import Run, load_run
-from p2p_lib.data.sequence import Sequence, open_sequence
+from p2p_lib.datasets.models import MESHES, find_models, given_models
+from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.evaluation import reconstruction
 from p2p_lib.evaluation.protocol import ObjectScore, evaluate
 from p2p_lib.evaluation.recovery import recovery_events

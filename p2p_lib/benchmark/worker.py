@@ -15,7 +15,7 @@ from p2p_lib.benchmark.jobs import Job, library_version, models_of, objects_of, 
 from p2p_lib.benchmark.outcome import Outcome, replace_text, run_path
 from p2p_lib.benchmark.scoring import scored
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
-from p2p_lib.data.runs import Run, load_run
+from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.protocol import rate
 from p2p_lib.run import evaluate_tracker, run
 

@@ -1,1 +1,5 @@
-"""Ground floor: values and maths. No disk, no plots, no third-party model."""
+"""Values and maths that every other package uses: frames, tracks, poses, camera, SE(3), configuration, errors.
+
+Look first at :mod:`p2p_lib.core.types` (what passes between the packages), :mod:`p2p_lib.core.interfaces` (what the
+method asks of trackers, detectors and segmenters) and :mod:`p2p_lib.core.config` (every parameter).
+"""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.data.runs import ObjectRun, Run
+from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation.protocol import Evaluation, ObjectScore
 
 MAX_M, MAX_DEG = 0.02, 5.0

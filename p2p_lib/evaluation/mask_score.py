@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from p2p_lib.core.errors import MissingData
-from p2p_lib.data.masks import read_labels
-from p2p_lib.data.runs import Run
-from p2p_lib.data.sequence import Sequence, open_sequence
+from p2p_lib.datasets.masks import read_labels
+from p2p_lib.datasets.runs import Run
+from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 
 

@@ -15,7 +15,7 @@ _NOISE, _DROPOUT, _OUTLIER, _PLACE = range(4)
 
 
 class OracleTracker:
-    """True tracks of a sequence's own frames. Implements :class:`p2p_lib.stages.tracking.PointTracker`.
+    """True tracks of a sequence's own frames. Implements :class:`p2p_lib.core.interfaces.PointTracker`.
 
     A query belongs to the object whose mask holds it, and lies on that object's true surface; one that lies on
     no object is never visible again. A visible point is reported with Gaussian noise; a chosen share is called

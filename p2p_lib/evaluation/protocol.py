@@ -21,8 +21,8 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.data.models import given_models, load_points
-from p2p_lib.data.runs import NO_MASKS, ObjectRun, Run
+from p2p_lib.datasets.models import given_models, load_points
+from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run
 from p2p_lib.evaluation import metrics
 
 ALIGNMENTS = ("first", "all")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from p2p_lib.data.runs import ObjectRun
+from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ObjectScore, scored_frames
 
 MIN_HIDDEN_FRAMES = 10

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.backends.registry import make_tracker
+from p2p_lib.core.backends import make_tracker
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import MissingBackend
-from p2p_lib.data.sequence import Sequence
+from p2p_lib.core.interfaces import PointTracker
+from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.point_tracks import (
     THRESHOLDS_PX,
@@ -24,7 +25,6 @@ from p2p_lib.evaluation.point_tracks import (
     tapvid,
 )
 from p2p_lib.evaluation.true_tracks import Queries, TrueScene, TrueTracks, draw_queries, true_tracks
-from p2p_lib.stages.tracking import PointTracker
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ def compare_trackers(
 ) -> dict[str, TrackerScore | str]:
     """The same queries to several trackers: a score by label, or the reason why there is none.
 
-    contestants  label to tracker and settings, e.g. ``"SH(10)": ("embedded", {"tracking.forget_after": 10})``
+    contestants  label to tracker and settings, e.g. ``"SH(10)": ("builtin", {"tracking.forget_after": 10})``
     left_out     labels that are not to run, with the reason
     """
     return {label: (left_out or {}).get(label) or _try(task, *one) for label, one in contestants.items()}

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.depth import lift
 from p2p_lib.core.errors import MissingData
 from p2p_lib.core.native import load_open3d
 from p2p_lib.core.types import Frame
-from p2p_lib.data.models import MESHES, find_models, given_models, load_mesh
-from p2p_lib.data.sequence import Sequence
-from p2p_lib.stages.lifting import lift
+from p2p_lib.datasets.models import MESHES, find_models, given_models, load_mesh
+from p2p_lib.datasets.sequence import Sequence
 
 #: Wide enough for a truth that jitters by degrees and for a sensor that is off by millimetres, thinner than a hand.
 DEPTH_TOLERANCE_M = 0.02

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from p2p_lib import cli
+from p2p_lib.apps import cli
 from p2p_lib.benchmark import read_plan, run_benchmark
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import jobs_of
@@ -55,7 +55,7 @@ def test_every_run_of_the_plan_is_there_and_scored_as_p2p_eval_does(whole):
 def test_a_row_says_all_that_one_needs_to_compare_it(whole):
     row = next(row for row in table(whole) if row["object"] == "object" and row["method"] == "No multi-hypothesis")
     assert (row["tracker"], row["detector"], row["masks"], row["preset"]) == (
-        "embedded",
+        "builtin",
         "corners",
         "dataset",
         "default",
@@ -130,7 +130,7 @@ def test_a_key_is_of_everything_that_decides_a_result(slides, plan, tmp_path, mo
 
 
 def test_a_killed_benchmark_resumes_to_the_identical_table(whole, plan, tmp_path):
-    command = [sys.executable, "-m", "p2p_lib.cli", "benchmark", str(plan), "--out", str(tmp_path), "--jobs", "1"]
+    command = [sys.executable, "-m", "p2p_lib.apps.cli", "benchmark", str(plan), "--out", str(tmp_path), "--jobs", "1"]
     killed = subprocess.Popen([*command, "--quiet"], stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
     while len(list((tmp_path / "records").glob("*.json"))) < 2 and time.monotonic() < deadline:

@@ -6,10 +6,10 @@ import pytest
 from p2p_lib.benchmark import load_benchmark, load_or_run_quick, read_plan, run_benchmarks
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.data.keypoint_log import load_keypoints
+from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.evaluation.protocol import evaluate
-from p2p_lib.report import benchmark_figures
-from p2p_lib.report.provenance import describe
+from p2p_lib.figures.provenance import describe
+from p2p_lib.studies import benchmark_figures
 
 
 def test_histograms_hold_every_scored_frame_once(whole):

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from p2p_lib.backends.registry import DETECTORS, TRACKERS
 from p2p_lib.benchmark import plan_names, read_plan
 from p2p_lib.benchmark.jobs import jobs_of
+from p2p_lib.core.backends import DETECTORS, TRACKERS
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.data.manifests import manifest
-from p2p_lib.data.paper_reported import paper_reported
-from p2p_lib.data.synthetic import SCENARIOS
+from p2p_lib.datasets.manifests import manifest
+from p2p_lib.datasets.paper_reported import paper_reported
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.run import make_config
+from p2p_lib.synthetic import SCENARIOS
 
 PLANS = plan_names()
 

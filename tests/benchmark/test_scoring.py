@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from p2p_lib import cli
+from p2p_lib.apps import cli
 from p2p_lib.benchmark.rows import MEAN_OF_ONE, POOLED
 from p2p_lib.run import evaluate_run
 

@@ -5,15 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from p2p_lib import cli
+from p2p_lib.apps import cli
 from p2p_lib.core import se3
 from p2p_lib.core.config import OracleConfig, preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import WITH_POSE
-from p2p_lib.data.sequence import open_sequence
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.true_tracks import TrueScene, draw_queries
-from p2p_lib.pipeline import Point2Pose
+from p2p_lib.method.pipeline import Point2Pose
 
 EXACT = OracleConfig(noise_px=0)
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from p2p_lib.core import se3
-from p2p_lib.data.sequence import open_sequence
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.reconstruction import GRID_M, chamfer_cm, seen_surface, thinned
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core import se3
-from p2p_lib.data.runs import ObjectRun, Run
+from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.evaluation.recovery import RecoveryEvent, recovered_within, recovery_events
 

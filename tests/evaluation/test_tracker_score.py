@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from p2p_lib import cli
-from p2p_lib.backends.registry import TRACKERS, make_tracker
+from p2p_lib.apps import cli
+from p2p_lib.core.backends import TRACKERS, make_tracker
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.types import Tracks
-from p2p_lib.data.models import MESHES, find_models
-from p2p_lib.data.sequence import open_sequence
+from p2p_lib.datasets.models import MESHES, find_models
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.tracker_score import run_tracker, score_tracker
 from p2p_lib.evaluation.true_tracks import TrueScene, draw_queries
 
@@ -122,5 +122,5 @@ def test_what_does_not_fit_is_said_in_one_line(capsys, words, complaint):
 
 
 def test_every_tracker_says_its_name():
-    for name in ("lk", "embedded"):
+    for name in ("lk", "builtin"):
         assert name in TRACKERS and make_tracker(name, TrackingConfig()).name == name

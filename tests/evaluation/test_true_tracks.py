@@ -7,8 +7,8 @@ import pytest
 
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame
-from p2p_lib.data.models import MESHES, find_models, load_mesh
-from p2p_lib.data.sequence import open_sequence
+from p2p_lib.datasets.models import MESHES, find_models, load_mesh
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.true_tracks import SurfacePoints, TrueScene, draw_queries, true_tracks
 
 EVERY = 15  # frames of crossing looked at
@@ -117,7 +117,7 @@ class Plate:
 
     def __init__(self, crossing, turns_deg, depth_m=None, mask=True, labelled=None):
         from p2p_lib.core import se3
-        from p2p_lib.data.sequence import ObjectTruth
+        from p2p_lib.datasets.sequence import ObjectTruth
 
         self.camera, self._depth, self._mask = crossing.camera, depth_m, mask
         T = se3.exp(np.array([[0, np.radians(d), 0, 0, 0, 0] for d in turns_deg]))

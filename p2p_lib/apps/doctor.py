@@ -1,0 +1,167 @@
+"""Checks every part of this installation and says how to mend what is missing (``p2p doctor``)."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from p2p_lib.core import native
+from p2p_lib.core.packages import INSTALL, PIP, command, cotracker_folder, install_command
+from p2p_lib.core.paths import PROJECT, cache_dir, data_dir
+
+#: Distributions whose module has another name.
+MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-image": "skimage"}
+#: Optional backend: module, what it serves, remedy.
+OPTIONAL = {
+    "transformers": ("transformers", "segmentation and features by neural networks", INSTALL["transformers"]),
+    "tapnet": ("tapnet", "2D trackers tapir and tapnextpp", INSTALL["tapnet"]),
+    "torchvision": ("torchvision", "2D tracker tapnextpp", INSTALL["torchvision"]),
+    "rerun": ("rerun", "recordings to look at frame by frame, p2p view --rerun", PIP + "rerun-sdk"),
+    "pyrealsense2": ("pyrealsense2", "RealSense cameras and recordings", PIP + "pyrealsense2"),
+    "dask": ("dask.distributed", "runs on a cluster", PIP + "'dask[distributed]'"),
+}
+FREE_GB = 5.0
+# How long a package may take to load before something is taken to be wrong with it.
+IMPORT_TIMEOUT_S = 180
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding: what was looked at, whether it is fine, whether one can do without, and what mends it."""
+
+    name: str
+    ok: bool
+    optional: bool
+    found: str
+    remedy: str = ""
+
+
+def run_doctor() -> list[Check]:
+    """Python, required packages (each really imported, in a process of its own), libraries, GPU, backends, data."""
+    packages = required_packages()
+    with ThreadPoolExecutor(2) as pool:  # torch and open3d take seconds each
+        imports = list(pool.map(_package, packages))
+    libraries = [_library(library, package) for library, package in native.SYSTEM_LIBRARIES.items()]
+    optional = [_optional(name, *about) for name, about in OPTIONAL.items()]
+    return [_python(), *imports, *libraries, _kernel(), _gpu(), *optional, _cotracker(), _data(), _cache(), _disk()]
+
+
+def format_checks(checks: list[Check]) -> str:
+    """The findings as lines for people, the remedies under what they mend."""
+    width = max(len(check.name) for check in checks)
+    lines = []
+    for check in checks:
+        mark = "ok" if check.ok else "-" if check.optional else "MISSING"
+        lines.append(f"{mark:8}{check.name:{width}}  {check.found}")
+        if not check.ok:
+            lines.append(f"{'':8}{'':{width}}  -> {check.remedy}")
+    wrong = [check.name for check in checks if not (check.ok or check.optional)]
+    lines.append(f"To mend: {', '.join(wrong)}" if wrong else "All that is required is there. A dash is optional.")
+    return "\n".join(lines)
+
+
+def required_packages() -> list[str]:
+    """The distributions that this package requires, as its own metadata says."""
+    needs = metadata.requires("p2p-lib") or []
+    return sorted(re.match(r"[A-Za-z0-9._-]+", need)[0] for need in needs if "extra ==" not in need)
+
+
+def _python() -> Check:
+    fine = (3, 11) <= sys.version_info[:2] <= (3, 13)
+    found = f"{platform.python_version()}, glibc {platform.libc_ver()[1] or 'none'}, {os.cpu_count()} cores"
+    return Check("Python", fine, False, found, "Set P2P_PYTHON to a Python 3.11 to 3.13 and run: make setup")
+
+
+def _package(name: str) -> Check:
+    module = MODULES.get(name, name.replace("-", "_"))
+    load = f"import {module}"
+    if name == "open3d":
+        load = "from p2p_lib.core.native import load_open3d; load_open3d()"
+    elif name == "libusb-package" and native.loads("libusb-1.0.so.0"):
+        return Check(name, True, True, "not needed: the system has libusb")
+    error = _fails(load)
+    return Check(name, not error, False, error or metadata.version(name), error.partition("Run: ")[2] or "make setup")
+
+
+def _fails(code: str) -> str:
+    """What ends a fresh Python that runs this code, in one line; empty where nothing does."""
+    try:
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=IMPORT_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return f"not loaded within {IMPORT_TIMEOUT_S} s"
+    if result.returncode < 0:
+        return f"ended by signal {-result.returncode} (a processor that its build does not know?)"
+    last = (result.stderr.strip().splitlines() or ["no message"])[-1]
+    return last if result.returncode else ""
+
+
+def _library(library: str, package: str) -> Check:
+    if native.loads(library):
+        return Check(library, True, False, "of the system")
+    if package == "libusb-1.0-0" and native.preload_libusb():
+        return Check(library, True, False, "of the package libusb-package")
+    return Check(library, False, False, "not found; Open3D needs it", native.install_command([library]))
+
+
+def _kernel() -> Check:
+    folder = Path(sys.prefix) / "share" / "jupyter" / "kernels" / "python3"
+    return Check("Jupyter kernel", folder.is_dir(), False, "python3" if folder.is_dir() else "none", "make setup")
+
+
+def _gpu() -> Check:
+    smi = shutil.which("nvidia-smi")
+    listed = subprocess.run([smi, "-L"], capture_output=True, text=True).stdout.strip().splitlines() if smi else []
+    if not listed:
+        return Check("GPU", False, True, "none; everything runs on the CPU", "nothing to do without an NVIDIA GPU")
+    name = re.sub(r" \(UUID.*", "", listed[0])
+    error = _fails("import torch, sys; sys.exit(None if torch.cuda.is_available() else f'torch {torch.__version__}')")
+    return Check("GPU", not error, True, f"{name}; {error or 'torch uses it'}", "P2P_TORCH=cuda make setup")
+
+
+def _optional(name: str, module: str, serves: str, remedy: str) -> Check:
+    try:
+        there = importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # its parent package is missing
+        there = False
+    return Check(name, there, True, serves + ("" if there else "; not installed"), command(remedy))
+
+
+def _cotracker() -> Check:
+    """CoTracker comes through torch.hub, which keeps it under its own cache folder."""
+    there, remedy = cotracker_folder() is not None, install_command("co-tracker")
+    serves = "2D tracker cotracker3, CC BY-NC: not for commercial use"
+    return Check("cotracker", there, True, serves + ("" if there else "; not there"), remedy)
+
+
+def _data() -> Check:
+    folder = data_dir()
+    if folder is None:
+        return Check("$P2P_DATA", False, True, "not set; embedded data only", "export P2P_DATA=FOLDER of your datasets")
+    remedy = "point P2P_DATA at an existing folder"
+    return Check("$P2P_DATA", folder.is_dir(), True, f"{folder}{'' if folder.is_dir() else ' does not exist'}", remedy)
+
+
+def _cache() -> Check:
+    folder = cache_dir()
+    nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    used_mb = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6 if folder.is_dir() else 0.0
+    found = f"{folder}, {used_mb:.0f} MB used"
+    return Check(
+        "cache folder", os.access(nearest, os.W_OK), False, found, "set P2P_CACHE to a folder you may write to"
+    )
+
+
+def _disk() -> Check:
+    free_gb = shutil.disk_usage(PROJECT).free / 1e9
+    return Check(
+        "disk", free_gb >= FREE_GB, False, f"{free_gb:.0f} GB free", f"free {FREE_GB:.0f} GB beside the project"
+    )

@@ -1,0 +1,426 @@
+"""The notebooks of the suite: list, check, run headless, and collect what their last cells recorded.
+
+A notebook has one cell tagged ``parameters`` (literals alone, ``PROFILE`` among them) and ends with a cell tagged
+``checks`` that asserts what the notebook claimed and calls :func:`record` with the numbers. Whatever a run leaves
+behind is read back from the executed notebook, so that the gallery, the tests and a later visitor see the same.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import logging
+import math
+import os
+import re
+import signal
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from p2p_lib.core.errors import BadInput, MissingData, P2PError
+from p2p_lib.core.paths import PROJECT
+from p2p_lib.figures import equations
+from p2p_lib.figures.gallery import GalleryEntry, gallery_page
+
+if TYPE_CHECKING:
+    from nbformat import NotebookNode
+
+#: ``quick``: embedded data, CPU, about a minute a notebook. ``full``: the data and backends that are present.
+PROFILES = ("quick", "full")
+CHECKS_MIME = "application/vnd.p2p.checks+json"
+MAX_CELL_LINES = 15
+#: JupyterLab's page without the scripts that it would fetch; a table wider than the page is scrolled, not cut off.
+_PAGE = f"""{{% extends 'lab/index.html.j2' %}}
+{{% block html_head_js %}}{{% endblock %}}
+{{% block html_head_js_mathjax %}}{{% endblock %}}
+{{% block html_head_js_mermaidjs %}}{{% endblock %}}
+{{% block html_head_css %}}
+{equations.STYLE}
+<style>
+.jp-RenderedHTMLCommon {{ overflow-x: auto; }}
+.jp-RenderedHTMLCommon table {{ width: max-content; max-width: none; }}
+.jp-RenderedMarkdown td, .jp-RenderedMarkdown th {{ padding: 0.4em 0.5em; }}
+.jp-MarkdownCell table {{ width: auto; max-width: 100%; }}
+</style>
+{{% endblock %}}"""
+
+Value = bool | int | float | str
+
+
+class NotebookFailed(P2PError):
+    """A cell of a notebook raised: names the notebook, the cell as ``[n]``, and its message."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class NotebookResult:
+    """What one executed notebook holds.
+
+    name          file name without suffix, e.g. ``00_quickstart``
+    title         its first heading
+    executed      the executed notebook; its page for the browser is beside it with the suffix ``.html``
+    seconds       wall-clock time of the whole run
+    cell_seconds  of each code cell, in order
+    checks        what the last cell recorded
+    picture_png   its first picture in base64, or empty
+    error         empty, or the cell and the message that ended the run
+    """
+
+    name: str
+    title: str
+    executed: Path
+    seconds: float
+    cell_seconds: tuple[float, ...]
+    checks: dict[str, Value]
+    picture_png: str
+    error: str
+
+
+def record(**numbers: Value) -> None:
+    """Show and keep the numbers that a notebook's ``checks`` cell has asserted. Finite numbers, bools and strings."""
+    for name, value in numbers.items():
+        value = numbers[name] = value.item() if hasattr(value, "item") else value
+        if not isinstance(value, Value) or (isinstance(value, float) and not math.isfinite(value)):
+            raise BadInput(f"record({name}=...)", repr(value), "a finite number, a bool or a string")
+    from IPython import get_ipython
+    from IPython.display import publish_display_data
+
+    if get_ipython() is not None:
+        width = max(map(len, numbers), default=0)
+        lines = "\n".join(f"{name:{width}}  {_shown(value)}" for name, value in numbers.items())
+        publish_display_data({CHECKS_MIME: numbers, "text/plain": lines})
+
+
+def list_notebooks(folder: Path | None = None, only: Sequence[str] = ()) -> list[Path]:
+    """The notebooks ``NN_*.ipynb`` of a folder in order; ``only`` picks by number (``"03"``) or by name."""
+    folder = folder or PROJECT / "notebooks"
+    found = sorted(folder.glob("[0-9][0-9]_*.ipynb"))
+    if not found:
+        raise MissingData(str(folder), "no notebooks NN_*.ipynb there", "Run from a clone of the repository.")
+    picked = {}
+    for wanted in map(str, only):
+        matches = [path for path in found if wanted.removesuffix(".ipynb") in (path.stem, path.stem[:2])]
+        if not matches:
+            raise BadInput("notebook", repr(wanted), "one of " + ", ".join(path.stem for path in found))
+        picked.update(dict.fromkeys(matches))
+    return sorted(picked) if only else found
+
+
+def run_notebooks(
+    profile: str = "quick",
+    only: Sequence[str] = (),
+    out: Path | None = None,
+    jobs: int = 1,
+    parameters: Mapping[str, Any] | None = None,
+    *,
+    folder: Path | None = None,
+    say: Callable[[str], None] = print,
+) -> list[NotebookResult]:
+    """Run the notebooks in order and write executed copies, pages, pictures, tables and a gallery.
+
+    Args:
+        profile: ``quick`` or ``full``, handed to each notebook as ``PROFILE``.
+        only: numbers or names of notebooks; all by default.
+        out: folder of the results, default ``out/<profile>``. Notebooks find the folders of their pictures, tables
+            and runs in ``$P2P_FIGURES``, ``$P2P_TABLES`` and ``$P2P_RUNS``. Pictures of the full profile go to
+            ``figures/`` of the project unless ``out`` is given.
+        jobs: how many run at a time.
+        parameters: further parameters; a string is read as the kind of value the notebook has. Unknown ones are
+            refused before anything runs.
+        folder: where the notebooks are, default ``notebooks/`` of the project.
+        say: gets a line of progress at a time.
+
+    Returns:
+        A result per notebook, in order.
+
+    Raises:
+        NotebookFailed: at the first notebook with a failing cell; what ran so far is on disk and in the gallery.
+    """
+    if profile not in PROFILES:
+        raise BadInput("profile", repr(profile), "one of " + ", ".join(PROFILES))
+    if jobs < 1:
+        raise BadInput("jobs", jobs, "at least 1")
+    paths = list_notebooks(folder, only)
+    given = {**(parameters or {}), "PROFILE": profile}
+    plans = [(path, _fitting_parameters(path, given)) for path in paths]
+    home = (out or PROJECT / "out" / profile).resolve()
+    figures = PROJECT / "figures" if profile == "full" and out is None else home / "figures"
+    places = {"P2P_FIGURES": figures, "P2P_TABLES": home / "tables", "P2P_RUNS": home / "runs"}
+    for place in (home / "notebooks", *places.values()):
+        place.mkdir(parents=True, exist_ok=True)
+    for path in paths:  # nothing of an earlier run passes for one of this
+        for suffix in (".ipynb", ".html"):
+            (home / "notebooks" / path.name).with_suffix(suffix).unlink(missing_ok=True)
+
+    say(f"{_counted(plans)}, profile {profile}, results in {_near(home)}")
+    results: list[NotebookResult] = []
+    kernels: list[Any] = []
+    pool = ThreadPoolExecutor(jobs)
+    runs = [pool.submit(_run_one, path, home, values, _kernel_manager(places, kernels), say) for path, values in plans]
+    try:
+        for future in runs:
+            results.append(future.result())
+            if results[-1].error:
+                page = _near(results[-1].executed.with_suffix(".html"))
+                raise NotebookFailed(f"notebook {results[-1].name}, {results[-1].error}. See {page}")
+    except KeyboardInterrupt:
+        for kernel in kernels:
+            kernel.kill()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        index = write_gallery(home, profile)
+    say(f"Look at {_near(index)}: {_counted(results)}; pictures are in {_near(figures)}/")
+    return results
+
+
+def check_notebook(path: Path) -> list[str]:
+    """What is wrong with a notebook's source as we keep it in git; empty when nothing is."""
+    code = [cell for cell in _read(path).cells if cell.cell_type == "code"]
+    problems = []
+    for number, cell in enumerate(code, 1):
+        found = ["has outputs (run nbstripout)"] if cell.outputs or cell.execution_count else []
+        problems += [f"code cell {number} {problem}" for problem in found + _source_problems(cell.source)]
+    if sum("parameters" in _tags(cell) for cell in code) != 1:
+        problems.append("needs exactly one cell tagged parameters")
+    else:
+        try:
+            problems += [] if "PROFILE" in notebook_parameters(path) else ["has no parameter PROFILE"]
+        except BadInput as error:
+            problems.append(str(error))
+    if not code or "checks" not in _tags(code[-1]):
+        problems.append("needs a last code cell tagged checks")
+    return problems
+
+
+def _source_problems(source: str) -> list[str]:
+    lines = len(source.splitlines())
+    problems = [f"has {lines} lines, more than {MAX_CELL_LINES}"] if lines > MAX_CELL_LINES else []
+    try:
+        nodes = list(ast.walk(ast.parse(source)))
+    except SyntaxError:
+        return [*problems, "is not plain Python (no shell, no magics)"]
+    if any(isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) for node in nodes):
+        problems.append("defines a function or class (it belongs in p2p_lib)")
+    modules = [name.name for node in nodes if isinstance(node, ast.Import) for name in node.names]
+    modules += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+    if {module.split(".")[0] for module in modules} & {"os", "subprocess"}:
+        problems.append("imports os or subprocess (the library has a function for it)")
+    texts = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    problems += [f"holds the absolute path {text!r}" for text in texts if re.match(r"(/|~/|[A-Za-z]:\\)\w", text)]
+    return problems
+
+
+def notebook_parameters(path: Path) -> dict[str, Value]:
+    """Names and values in the cell tagged ``parameters``, which holds assignments of literals and nothing else."""
+    source = "\n".join(cell.source for cell in _read(path).cells if "parameters" in _tags(cell))
+    values = {}
+    try:
+        for statement in ast.parse(source).body:
+            target = statement.target if isinstance(statement, ast.AnnAssign) else statement.targets[0]
+            values[target.id] = ast.literal_eval(statement.value)
+    except (SyntaxError, ValueError, AttributeError, TypeError):
+        raise BadInput(f"{path.name}: parameters", repr(source), "lines of the form NAME = literal") from None
+    return values
+
+
+def read_result(executed: Path) -> NotebookResult:
+    """What an executed notebook says of its run."""
+    notebook = _read(executed)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    outputs = [(cell, output) for cell in code for output in cell.outputs]
+    checks: dict[str, Value] = {}
+    for _, output in outputs:
+        checks |= output.get("data", {}).get(CHECKS_MIME, {})
+    pictures = [output.data["image/png"] for _, output in outputs if "image/png" in output.get("data", {})]
+    errors = [
+        f"cell [{cell.execution_count}] {_failing_line(cell.source, output)!r}: {_message(output)}"
+        for cell, output in outputs
+        if output.output_type == "error"
+    ]
+    errors += [
+        f"cell {cell.source.splitlines()[0]!r}: the kernel ended there (killed, or out of memory)"
+        for cell in code
+        if cell.source.strip() and "shell.execute_reply" not in cell.metadata.get("execution", {})
+    ]
+    run = notebook.metadata.get("papermill", {})
+    durations = [cell.metadata.get("papermill", {}).get("duration") for cell in code]
+    title = re.search(r"(?m)^# +(.+)$", "\n".join(c.source for c in notebook.cells if c.cell_type == "markdown"))
+    return NotebookResult(
+        name=executed.stem,
+        title=title[1].strip() if title else executed.stem,
+        executed=executed,
+        seconds=float(run.get("duration") or 0.0),
+        cell_seconds=tuple(float(duration or 0.0) for duration in durations),
+        checks=checks,
+        picture_png="".join(pictures[0].split()) if pictures else "",
+        error=errors[0] if errors else "",
+    )
+
+
+def write_gallery(home: Path, profile: str) -> Path:
+    """``index.html`` over all executed notebooks in ``home/notebooks``: title, first picture, seconds, checks."""
+    results = [read_result(path) for path in sorted((home / "notebooks").glob("*.ipynb"))]
+    entries = [
+        GalleryEntry(
+            title=result.title,
+            line=f"{result.name}, {result.seconds:.0f} s",
+            link=result.executed.with_suffix(".html").relative_to(home).as_posix(),
+            picture_png=result.picture_png,
+            table={name: _shown(value) for name, value in result.checks.items()},
+            failure=result.error,
+        )
+        for result in results
+    ]
+    seconds, numbers = sum(r.seconds for r in results), sum(len(r.checks) for r in results)
+    summary = f"{_counted(results)}, {seconds:.0f} s, {numbers} numbers recorded"
+    page = home / "index.html"
+    page.write_text(gallery_page(f"Point2Pose notebooks, profile {profile}", entries, summary), encoding="utf-8")
+    return page
+
+
+def _run_one(
+    source: Path, home: Path, values: dict[str, Value], kernel_manager: type, say: Callable[[str], None]
+) -> NotebookResult:
+    """Execute one notebook; a failing cell ends up in the result, not in an exception."""
+    import papermill
+    from nbclient.exceptions import DeadKernelError
+
+    logging.getLogger("papermill").setLevel(logging.ERROR)  # it warns of widgets that a page does not have
+    executed = home / "notebooks" / source.name
+    say(f"{source.stem} ...")
+    try:
+        papermill.execute_notebook(
+            source,
+            executed,
+            parameters=values,
+            cwd=source.parent,
+            kernel_name="python3",
+            kernel_manager_class=kernel_manager,
+            progress_bar=False,
+        )
+    except (papermill.PapermillExecutionError, DeadKernelError):
+        pass  # the executed notebook says so, and where
+    _write_page(executed)
+    result = read_result(executed)
+    outcome = "FAILED" if result.error else f"{len(result.checks)} numbers recorded"
+    say(f"{source.stem}: {result.seconds:.1f} s, {outcome}")
+    return result
+
+
+def _kernel_manager(places: Mapping[str, Path], kernels: list[Any]) -> type:
+    """A manager whose kernels talk over private sockets (over TCP they warn) and know the folders of this run.
+
+    Each joins ``kernels`` when started, so that all can be ended at once.
+    """
+    from jupyter_client.manager import AsyncKernelManager
+
+    environment = {
+        **{name: str(place) for name, place in places.items()},
+        "MPLBACKEND": "module://matplotlib_inline.backend_inline",
+        "OPEN3D_DISABLE_WEB_VISUALIZER": "true",
+        "PYTHONHASHSEED": "0",
+        "P2P_PROGRESS": "off",  # a bar of the notebook's own is blank in a page
+    }
+
+    class Manager(AsyncKernelManager):
+        def __init__(self, **options: Any) -> None:
+            super().__init__(**options)
+            self._folder = tempfile.TemporaryDirectory(prefix="p2p-")  # goes with the manager
+            self.transport, self.ip = "ipc", str(Path(self._folder.name) / "kernel")
+
+        async def start_kernel(self, **options: Any) -> None:
+            await super().start_kernel(**{**options, "env": {**os.environ, **environment}})
+            kernels.append(self)
+
+        def kill(self) -> None:
+            os.killpg(os.getpgid(self.provisioner.pid), signal.SIGKILL)
+
+    return Manager
+
+
+def _fitting_parameters(path: Path, given: Mapping[str, Any]) -> dict[str, Value]:
+    """The given values as this notebook's kinds of value; papermill would only warn of one that it does not have."""
+    known = notebook_parameters(path)
+    values = {}
+    for name, value in given.items():
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            fix = f"Did you mean {near[0]}?" if near else "Pick the notebooks that have it with --only."
+            raise BadInput(f"{path.stem} parameter", name, "one of " + ", ".join(known), fix)
+        kind = type(known[name])
+        if isinstance(value, str) and kind is not str:
+            try:
+                value = ast.literal_eval(value)
+            except (ValueError, SyntaxError):
+                pass  # refused just below
+        if kind is float and type(value) is int:
+            value = float(value)
+        if known[name] is not None and type(value) is not kind:
+            raise BadInput(f"{path.stem} parameter {name}", repr(value), f"{kind.__name__} like {known[name]!r}")
+        values[name] = value
+    return values
+
+
+def _write_page(executed: Path) -> None:
+    """The executed notebook as a page for the browser, beside it; nothing in it is fetched from the network."""
+    from nbconvert import HTMLExporter
+    from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
+
+    class Renderer(IPythonRenderer):
+        def block_math(self, body: str) -> str:
+            return equations.mathml(body, display=True)
+
+        def inline_math(self, body: str) -> str:
+            return equations.mathml(body)
+
+    def as_html(source: str) -> str:
+        return MarkdownWithMath(renderer=Renderer(escape=False)).render(source)
+
+    exporter = HTMLExporter(embed_images=True, raw_template=_PAGE)
+    exporter.register_filter("markdown2html", as_html)
+    body, _ = exporter.from_filename(str(executed))
+    executed.with_suffix(".html").write_text(body, encoding="utf-8")
+
+
+def _read(path: Path) -> NotebookNode:
+    import nbformat
+
+    try:
+        return nbformat.read(path, as_version=4)
+    except (nbformat.reader.NotJSONError, UnicodeDecodeError):
+        raise BadInput(path.name, "a file that is not JSON", "a Jupyter notebook (.ipynb)") from None
+
+
+def _tags(cell: NotebookNode) -> list[str]:
+    return cell.metadata.get("tags", [])
+
+
+def _failing_line(source: str, error: Mapping[str, Any]) -> str:
+    """The line of the cell that raised, else its first."""
+    lines = source.splitlines() or [""]
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(error["traceback"]))
+    at = re.search(r"(?m)^-+> +(\d+) ", plain)
+    return lines[min(int(at[1]), len(lines)) - 1 if at else 0].strip()
+
+
+def _message(error: Mapping[str, Any]) -> str:
+    return " ".join(f"{error['ename']}: {error['evalue']}".split()).removesuffix(":")
+
+
+def _shown(value: Value) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _counted(notebooks: Sequence[Any]) -> str:
+    return f"{len(notebooks)} notebook{'s' * (len(notebooks) != 1)}"
+
+
+def _near(path: Path) -> Path:
+    """The path as seen from the current folder where it lies below it."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

@@ -1,0 +1,82 @@
+"""Trackers, detectors and segmenters by name. Each is imported when it is asked for, and only then."""
+
+from __future__ import annotations
+
+import difflib
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import SamplingConfig, SegmentationConfig, TrackingConfig
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
+
+#: 2D trackers by the name that --tracker takes, as module:callable(config, rng).
+TRACKERS = {
+    "builtin": "p2p_lib.trackers.builtin.tracker:BuiltinTracker",
+    "lk": "p2p_lib.trackers.lk:LkTracker",
+    "tapir": "p2p_lib.trackers.tapir:load",
+    "tapnextpp": "p2p_lib.trackers.tapnextpp:load",
+    "cotracker3": "p2p_lib.trackers.cotracker:load",
+}
+#: Detectors by the name that --detector takes, as module:callable(config, rng).
+DETECTORS = {
+    "corners": "p2p_lib.detectors.classical:CornerDetector",
+    "uniform": "p2p_lib.detectors.classical:UniformDetector",
+    "farthest": "p2p_lib.detectors.classical:FarthestDetector",
+    "orb": "p2p_lib.detectors.classical:OrbDetector",
+    "superpoint": "p2p_lib.detectors.superpoint:load",
+}
+#: Segmenters by the name that --masks takes, as module:callable(camera, config, rng).
+SEGMENTERS = {
+    "builtin": "p2p_lib.segmenters.builtin.segmenter:BuiltinSegmenter",
+    "sam2": "p2p_lib.segmenters.sam2:load",
+}
+#: What runs when none is named.
+DEFAULT_TRACKER, DEFAULT_DETECTOR, DEFAULT_SEGMENTER = "builtin", "corners", "builtin"
+_SHORT_HORIZON = "p2p_lib.trackers.short_horizon:ShortHorizon"
+#: Names of earlier versions.
+ALIASES = {"embedded": "builtin"}
+
+
+def make_tracker(
+    tracker: str | PointTracker, config: TrackingConfig, rng: np.random.Generator | None = None
+) -> PointTracker:
+    """The tracker of this name, or the one given, with the memory that the configuration grants it.
+
+    :class:`BadInput` lists the known names where this one is unknown.
+    """
+    if isinstance(tracker, str):
+        tracker = _find("tracker", tracker, TRACKERS)(config, rng)
+    if not config.forget_after:
+        return tracker
+    return _load(_SHORT_HORIZON)(tracker, config.forget_after)
+
+
+def make_detector(detector: str | Detector, config: SamplingConfig, rng: np.random.Generator | None = None) -> Detector:
+    """The detector of this name, or the one given; :class:`BadInput` lists the known names."""
+    return _find("detector", detector, DETECTORS)(config, rng) if isinstance(detector, str) else detector
+
+
+def make_segmenter(
+    segmenter: str | Segmenter, camera: Camera, config: SegmentationConfig, rng: np.random.Generator
+) -> Segmenter:
+    """The segmenter of this name, or the one given; :class:`BadInput` lists the known names."""
+    if not isinstance(segmenter, str):
+        return segmenter
+    return _find("segmenter", segmenter, SEGMENTERS)(camera, config, rng)
+
+
+def _find(kind: str, name: str, known: dict[str, str]) -> Any:
+    name = ALIASES.get(name, name)
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        raise BadInput(kind, repr(name), "one of " + ", ".join(known), f"Did you mean {near[0]!r}?" if near else "")
+    return _load(known[name])
+
+
+def _load(where: str) -> Any:
+    module, _, attribute = where.partition(":")
+    return getattr(import_module(module), attribute)

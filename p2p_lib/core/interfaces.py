@@ -1,0 +1,117 @@
+"""What the method asks of the parts beside it: a 2D point tracker, a detector of candidates, a segmenter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.types import Frame, Tracks
+
+
+class PointTracker(Protocol):
+    """A streaming, causal 2D point tracker (paper: section "2D Point Tracker").
+
+    It follows query points q = (t_q, u_q) of all objects in one pass and gives each point's pixel u_t,
+    visibility delta_t and uncertainty sigma_t.
+    """
+
+    name: str
+    latency_frames: int  # how many frames late `track` answers; 0 = at once
+
+    def start(self, frame: Frame, camera: Camera | None = None) -> None:
+        """Begin a stream at this frame, forgetting any earlier one.
+
+        camera  that took the pictures, if somebody knows; a tracker may use it to reason in 3D
+        """
+
+    def add(self, uv_px: np.ndarray) -> np.ndarray:
+        """Add queries (N, 2) in the newest frame; returns their ids (N,) int64, increasing."""
+
+    def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
+        """Follow all live queries into the next frame; rows sorted by id.
+
+        search  (H, W) bool says where the objects are known to be, if somebody knows; a tracker may
+                use it to spare itself work elsewhere. None means the whole picture
+        urgent  the caller waits for invisible points to come back: worth more work in this frame
+        """
+
+    def drop(self, ids: np.ndarray) -> None:
+        """Forget these queries for good."""
+
+    def reject(self, ids: np.ndarray) -> None:
+        """The caller found these tracks wrong in the newest frame (they contradict the rigid motion).
+
+        A tracker may use it, e.g. to look for the points anew; ignoring it is allowed.
+        """
+
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
+        """The caller expects points ids (N,) of one rigid body at uv_px (N, 2) in the newest frame.
+
+        NaN where it expects none. A tracker may look there for those that it holds for invisible. Returns the newest
+        frame's tracks with what it found, or None where it has nothing to add: ignoring it is allowed.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Points a detector offers: uv_px (N, 2) and score (N,) in [0, 1] (paper: p_k, s_k)."""
+
+    uv_px: np.ndarray
+    score: np.ndarray
+
+    def select(self, keep: np.ndarray) -> Candidates:
+        """The candidates at these indices or under this mask."""
+        return Candidates(self.uv_px[keep], self.score[keep])
+
+
+class Detector(Protocol):
+    """Offers candidates inside a mask."""
+
+    name: str
+
+    def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
+        """Candidates in ``mask`` (H, W) bool, best first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hint:
+    """Where an object should be, in plain values; empty where nothing is known.
+
+    uv_px       (K, 2) its tracked points whose measured places agree with one rigid motion
+    distance_m  (H, W) float32: signed distance of each measured pixel to the object's reconstructed surface
+                at the pose those points give, positive in front of it; NaN where unknown. None without a surface
+    """
+
+    uv_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    distance_m: np.ndarray | None = None
+
+
+class Segmenter(Protocol):
+    """A streaming, causal segmenter of several objects."""
+
+    name: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The objects that it looks after, in the order in which they came."""
+
+    def segment(
+        self,
+        frame: Frame,
+        clicks: Mapping[str, np.ndarray] | None = None,
+        hints: Mapping[str, Hint] | None = None,
+    ) -> np.ndarray:
+        """(H, W) int32 label image of the next frame: 0 for no object, else 1 + the object's place in ``names``.
+
+        clicks  of objects that are new: (N, 2) pixels on them in this frame
+        hints   what others know of the objects that are not; a segmenter may use it
+
+        An object that is not to be seen has no pixels. Raises :class:`BadInput` for clicks where there is no depth.
+        """
+
+    def remove(self, name: str) -> None:
+        """Forget an object."""

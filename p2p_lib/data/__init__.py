@@ -1,1 +1,0 @@
-"""Frames in, files out: loaders, synthetic sequences, manifests, runs on disk, cameras."""

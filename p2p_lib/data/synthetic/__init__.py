@@ -1,9 +1,0 @@
-"""Embedded synthetic sequences: procedural packages on a table, an RGB-D camera, exact truth.
-
-``scenario_dir("crossing", seed=0)`` gives a folder in the YCBMultiTrack layout, rendered at the first call.
-"""
-
-from p2p_lib.data.synthetic.generate import scenario_dir, write_sequence
-from p2p_lib.data.synthetic.scenarios import SCENARIOS, describe
-
-__all__ = ["SCENARIOS", "describe", "scenario_dir", "write_sequence"]

@@ -1,0 +1,144 @@
+"""Cameras that run while others work: a RealSense, one of its recordings, or a folder played at some rate.
+
+A camera does not wait. :class:`Newest` reads it in a thread of its own and hands out the newest frame alone:
+whoever is slower than the camera misses frames instead of falling behind.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Condition, Event
+from time import monotonic
+from typing import Protocol
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.sequence import Sequence, open_sequence
+
+DEFAULT_RATE_HZ = 30.0
+_FORMS = "realsense, realsense:RECORDING or folder:PATH"
+
+
+class LiveCamera(Protocol):
+    """A stream of frames that nobody can hold up.
+
+    A frame's index counts the camera's own pictures from 0: what is missing between two of them was dropped.
+    """
+
+    name: str
+    camera: Camera
+
+    def read(self) -> Frame | None:
+        """The next frame, as soon as there is one; None after the last, or once closed."""
+
+    def close(self) -> None:
+        """Stop; a ``read`` that waits comes back."""
+
+
+class FolderCamera:
+    """A sequence on disk that plays like a camera: frame i is there i / rate_hz seconds after the first."""
+
+    def __init__(self, sequence: Sequence, rate_hz: float = DEFAULT_RATE_HZ):
+        if not 0 < rate_hz <= 1000:
+            raise BadInput("rate", rate_hz, "frames per second, above 0 and at most 1000")
+        self.name, self.camera = sequence.name, sequence.camera
+        self._sequence, self._rate_hz, self._closed = sequence, rate_hz, Event()
+        self._next, self._start_s = 0, 0.0
+
+    def read(self) -> Frame | None:
+        """The next frame at its time; at once where that is past."""
+        if self._next >= len(self._sequence):
+            return None
+        if self._next == 0:
+            self._start_s = monotonic()
+        due_s = self._start_s + self._next / self._rate_hz
+        if self._closed.wait(max(0.0, due_s - monotonic())):
+            return None
+        self._next += 1
+        return self._sequence.frame(self._next - 1)
+
+    def close(self) -> None:
+        """Play no further."""
+        self._closed.set()
+
+
+def open_camera(spec: str, rate_hz: float | None = None) -> LiveCamera:
+    """The camera that ``realsense``, ``realsense:RECORDING`` or ``folder:PATH`` names.
+
+    rate_hz  of a folder alone (default 30). PATH is whatever ``p2p run`` takes for a sequence
+    """
+    kind, _, what = spec.partition(":")
+    if kind == "folder" and what:
+        return FolderCamera(open_sequence(what), DEFAULT_RATE_HZ if rate_hz is None else rate_hz)
+    if kind != "realsense":
+        raise BadInput("camera", repr(spec), _FORMS)
+    if rate_hz is not None:
+        raise BadInput("rate", f"{rate_hz:g} with {spec}", "a rate for folder:PATH alone: other cameras have their own")
+    from p2p_lib.datasets.realsense import RealSenseCamera
+
+    return RealSenseCamera(Path(what) if what else None)
+
+
+class Newest:
+    """A camera's newest frame; older ones that nobody took in time are gone. A context manager.
+
+    keep  indices of frames that wait to be taken, such as those that were clicked in
+    """
+
+    def __init__(self, source: LiveCamera, keep: Collection[int] = ()):
+        self._source, self._keep = source, frozenset(keep)
+        self._waiting: deque[Frame] = deque()
+        self._changed, self._ended = Condition(), False
+        self._pool = ThreadPoolExecutor(1)
+        self._grabbing = self._pool.submit(self._grab)
+
+    def take(self) -> Frame | None:
+        """The newest frame, once each; waits for one. None at the end; raises what ended the camera, if anything."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._ended)
+            if self._waiting:
+                return self._waiting.popleft()
+        self._grabbing.result()
+        return None
+
+    def __enter__(self) -> Newest:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._source.close()
+        self._pool.shutdown(wait=True)
+
+    def _grab(self) -> None:
+        try:
+            while (frame := self._source.read()) is not None:
+                with self._changed:
+                    if self._waiting and self._waiting[-1].index not in self._keep:
+                        self._waiting.pop()
+                    self._waiting.append(frame)
+                    self._changed.notify()
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify()
+
+
+@dataclass(frozen=True, eq=False)
+class Still:
+    """One frame of a camera as a sequence, to be clicked on (:func:`p2p_lib.apps.click.collect_clicks`)."""
+
+    name: str
+    camera: Camera
+    picture: Frame
+    objects: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return 1
+
+    def frame(self, i: int) -> Frame:
+        """The picture, whatever its number."""
+        return self.picture

@@ -1,0 +1,69 @@
+"""Weights of third-party models: found below ``$P2P_DATA``, checked against their manifest, then loaded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from p2p_lib.core.paths import data_dir
+from p2p_lib.datasets.inventory import require
+from p2p_lib.datasets.manifests import manifest
+
+if TYPE_CHECKING:
+    import torch
+
+
+def checked_files(name: str) -> list[Path]:
+    """The files of the checkpoint ``name``, each with the sha256 that it must have.
+
+    Raises :class:`MissingBackend` with the commands that fetch it, :class:`BadInput` for a file that differs.
+    """
+    if data_dir() is None:
+        fix = f"Run: export P2P_DATA=DIR; p2p data fetch {name}"
+        raise MissingBackend(name, "its checkpoint is looked for below $P2P_DATA, which is not set", fix)
+    try:
+        return require(manifest(name))
+    except MissingData as error:
+        raise MissingBackend(name, f"its checkpoint is missing, {error.expected}", error.fix) from None
+
+
+def load_weights(name: str) -> dict[str, torch.Tensor]:
+    """The state dict of a PyTorch checkpoint of one file, on the CPU. Nothing but tensors is read."""
+    import pickle
+
+    import torch
+
+    (path,) = checked_files(name)
+    try:
+        read = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        reason = " ".join(str(error).split())[:120]
+        raise BadInput(str(path), f"more than tensors ({reason})", "a checkpoint of tensors", _fetch(name)) from None
+    except (RuntimeError, EOFError, ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise BadInput(str(path), f"an unreadable file ({reason})", "a PyTorch checkpoint", _fetch(name)) from None
+    weights = read.get("state_dict", read.get("model", read)) if isinstance(read, dict) else read
+    if not isinstance(weights, dict) or not all(isinstance(value, torch.Tensor) for value in weights.values()):
+        raise BadInput(str(path), f"a {type(weights).__name__} of other values", "a dictionary of tensors")
+    return weights
+
+
+def fill(model: torch.nn.Module, name: str, weights: dict[str, torch.Tensor]) -> None:
+    """Put weights into a model; :class:`BadInput` names the first that does not fit."""
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise BadInput(f"checkpoint {name}", reason, f"the weights of {type(model).__name__}", _fetch(name)) from None
+
+
+def device_of(device: str | None) -> str:
+    """The device asked for; by default CUDA where torch has it, else the CPU."""
+    import torch
+
+    return device or ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _fetch(name: str) -> str:
+    return f"Run: p2p data fetch {name}"

@@ -1,0 +1,197 @@
+"""Poses of any method, read so that they are scored by the same rules as a run of ours.
+
+What may be given (see :mod:`p2p_lib.datasets.export`, which writes all of them):
+
+- a BOP challenge CSV: the best-scored estimate of an object in a picture counts;
+- TUM trajectories: ``<object>.txt`` in a folder, or one file; times are matched to the sequence's;
+- 4x4 matrices, one file a frame: ``ob_in_cam/*.txt`` of BundleSDF, ``annotated_poses/``, or a folder of such, with
+  one folder per object where there are several. Files are named as the pictures, or by frame number from 0.
+
+A frame for which there is nothing, or a matrix of zeros or NaN, is lost, and lost it is scored.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.types import Status
+from p2p_lib.datasets import images
+from p2p_lib.datasets.export import BOP_HEADER, image_ids, obj_ids, scene_id
+from p2p_lib.datasets.models import load_points
+from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run
+from p2p_lib.datasets.sequence import Sequence
+
+MATRIX_FOLDERS = ("ob_in_cam", "annotated_poses")
+
+
+def read_poses(path: str | Path, sequence: Sequence) -> dict[str, np.ndarray]:
+    """Object to T_cam_obj (N, 4, 4) over the sequence's frames, NaN where lost; only objects that were found.
+
+    Raises :class:`MissingData` where nothing is there, :class:`BadInput` where it fits no form or no frame.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        return _read_bop(path, sequence)
+    if path.is_file():
+        return {_only_object(path, sequence): _read_tum(path, sequence)}
+    if not path.is_dir():
+        raise MissingData(str(path), "no such file or folder, expected poses (BOP .csv, TUM .txt, or 4x4 matrices)")
+    found = sorted(path.glob("*.csv"))
+    if found:
+        if len(found) > 1:
+            raise BadInput(str(path), f"{len(found)} .csv files", "one", "Name the one that is meant.")
+        return _read_bop(found[0], sequence)
+    folder = next((path / name for name in MATRIX_FOLDERS if (path / name).is_dir()), path)
+    named = {name: folder / name for name in sequence.objects if (folder / name).is_dir()}
+    if named:
+        return {name: _read_matrices(where, sequence) for name, where in named.items()}
+    trajectories = {name: folder / f"{name}.txt" for name in sequence.objects if (folder / f"{name}.txt").is_file()}
+    if trajectories:
+        return {name: _read_tum(where, sequence) for name, where in trajectories.items()}
+    return {_only_object(folder, sequence): _read_matrices(folder, sequence)}
+
+
+def as_run(
+    poses: Mapping[str, np.ndarray],
+    sequence: Sequence,
+    models: Mapping[str, Path],
+    method: str = "imported",
+    path: Path | None = None,
+    frames: range | None = None,
+) -> Run:
+    """A :class:`~p2p_lib.datasets.runs.Run` of such poses over a sequence, or ``frames`` of it, ready to be evaluated.
+
+    models  object to model file; every object of the sequence is in the run: one without poses is lost throughout
+    """
+    at = np.arange(len(sequence)) if frames is None else np.array(frames)
+    n, nothing = len(at), np.full((len(sequence), 4, 4), np.nan)
+    visible = [sequence.visible_px(int(i)) for i in at]
+    objects = {}
+    for name in sequence.objects:
+        T, truth = poses.get(name, nothing)[at], sequence.truth.get(name)
+        seen = np.isfinite(T).all((1, 2))
+        columns = {
+            "frame_index": at,
+            "time_s": np.asarray(sequence.times_s, float)[at],
+            "status": np.where(seen, str(Status.TRACKED), str(Status.LOST)),
+            "T_cam_obj": T,
+            "confidence": seen.astype(float),
+            "covariance": np.full((n, 6, 6), np.nan),
+            "visible_points": np.zeros(n, int),
+            "inliers": np.zeros(n, int),
+            "keyframe": np.zeros(n, bool),
+            "T_cam_model": truth.T_cam_model[at] if truth else nothing[at],
+            "labelled": truth.labelled[at] if truth else np.zeros(n, bool),
+            "visible_px": np.array([NO_MASKS if v is None else v.get(name, 0) for v in visible]),
+            "reason": np.where(seen, "", "no pose given"),
+        }
+        objects[name] = ObjectRun(**{f.name: columns[f.name] for f in fields(ObjectRun)})
+    info = {"sequence": sequence.name, "objects": list(sequence.objects), "tracker": method, "masks": None}
+    points = {name: load_points(file) for name, file in models.items()}
+    return Run(path or Path(method), info, objects, points, {})
+
+
+def _only_object(path: Path, sequence: Sequence) -> str:
+    if len(sequence.objects) != 1:
+        wanted = ", ".join(sequence.objects)
+        raise BadInput(str(path), "poses of one object", f"a folder or file for each of {wanted}", "Name them so.")
+    return sequence.objects[0]
+
+
+def _read_matrices(folder: Path, sequence: Sequence) -> np.ndarray:
+    files = images.list_files(folder, (".txt",), "4x4 matrices, one file a frame")
+    frames = _frames(folder, [path.stem for path in files], sequence)
+    poses = np.full((len(sequence), 4, 4), np.nan)
+    for path, frame in zip(files, frames):
+        T = images.read_numbers(path, "a 4x4 transformation in metres")
+        if T.shape == (4, 4) and (np.isnan(T).any() or not T[:3].any()):
+            continue
+        poses[frame] = se3.orthonormalised(se3.check(str(path), T, images.NOT_RIGID))
+    return poses
+
+
+def _frames(folder: Path, stems: list[str], sequence: Sequence) -> list[int]:
+    """The frame of each file: by the picture's name, else by number."""
+    of_name = {name: i for i, name in enumerate(sequence.frame_names)}
+    if set(stems) <= set(of_name):
+        return [of_name[stem] for stem in stems]
+    if all(stem.isdigit() and int(stem) < len(sequence) for stem in stems):
+        return [int(stem) for stem in stems]
+    odd = next(stem for stem in stems if stem not in of_name)
+    want = f"the name of a picture such as {sequence.frame_names[0]}, or a frame number below {len(sequence)}"
+    raise BadInput(str(folder / f"{odd}.txt"), f"the name {odd}", want)
+
+
+def _read_tum(path: Path, sequence: Sequence) -> np.ndarray:
+    poses = np.full((len(sequence), 4, 4), np.nan)
+    rows = [line for line in path.read_text(errors="replace").splitlines() if line.strip() and line.lstrip()[0] != "#"]
+    for number, line in enumerate(rows, 1):
+        try:
+            values = np.array(line.split(), float)
+        except ValueError:
+            values = np.empty(0)
+        if values.shape != (8,) or not np.isfinite(values).all() or not 0.9 < np.linalg.norm(values[4:]) < 1.1:
+            raise BadInput(f"{path}: line {number}", repr(line[:60]), "time_s tx ty tz qx qy qz qw, a unit quaternion")
+        poses[_frame_at(path, values[0], sequence.times_s)] = se3.from_rt(_rotation(values[4:]), values[1:4])
+    return poses
+
+
+def _frame_at(path: Path, time_s: float, times_s: np.ndarray) -> int:
+    nearest = int(np.argmin(np.abs(times_s - time_s)))
+    # Half the time between frames: further off it belongs to none of them.
+    if abs(times_s[nearest] - time_s) > 0.5 * (np.median(np.diff(times_s)) if len(times_s) > 1 else 1.0):
+        want = f"times of the sequence's frames, {times_s[0]:.6f} to {times_s[-1]:.6f} s"
+        raise BadInput(str(path), f"the time {time_s:.6f} s", want)
+    return nearest
+
+
+def _rotation(xyzw: np.ndarray) -> np.ndarray:
+    x, y, z, w = xyzw / np.linalg.norm(xyzw)
+    angle = 2 * np.arctan2(np.linalg.norm([x, y, z]), w)
+    axis = np.array([x, y, z]) / max(np.linalg.norm([x, y, z]), 1e-300)
+    return se3.exp(np.r_[axis * angle, 0, 0, 0])[:3, :3]
+
+
+def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
+    """Best-scored estimates. Of several instances of a kind only the first is filled: BOP does not tell them apart."""
+    frame_of = {int(k): i for i, k in enumerate(image_ids(sequence, np.arange(len(sequence))))}
+    name_of = {number: name for name, number in reversed(obj_ids(sequence.objects).items())}
+    poses: dict[str, np.ndarray] = {}
+    best: dict[tuple[str, int], float] = {}
+    for number, row in enumerate(_bop_rows(path), 2):
+        try:
+            scene, image, obj = (int(row[key]) for key in ("scene_id", "im_id", "obj_id"))
+            score = float(row["score"])
+            R, t_mm = np.array(row["R"].split(), float).reshape(3, 3), np.array(row["t"].split(), float)
+            T = se3.from_rt(R, t_mm * 0.001)
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            raise BadInput(f"{path}: line {number}", f"unreadable ({error})", BOP_HEADER) from None
+        if scene != scene_id(sequence) or obj not in name_of:
+            continue  # another scene's, or an object that this one does not have
+        if image not in frame_of:
+            raise BadInput(f"{path}: line {number}", f"im_id {image}", "the number of a picture of the sequence")
+        name, frame = name_of[obj], frame_of[image]
+        if score > best.get((name, frame), -np.inf) and np.isfinite(T).all():
+            best[name, frame] = score
+            poses.setdefault(name, np.full((len(sequence), 4, 4), np.nan))
+            poses[name][frame] = se3.orthonormalised(se3.check(f"{path}: line {number}", T, images.NOT_RIGID))
+    if not poses:
+        raise BadInput(str(path), f"nothing of scene {scene_id(sequence)}", f"poses of {', '.join(sequence.objects)}")
+    return poses
+
+
+def _bop_rows(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        raise MissingData(str(path), "no such file, expected a BOP results CSV")
+    with path.open(newline="", errors="replace") as file:
+        rows = csv.DictReader(file)
+        if list(rows.fieldnames or []) != BOP_HEADER.split(","):
+            raise BadInput(str(path), f"the header {','.join(rows.fieldnames or [])[:80]!r}", BOP_HEADER)
+        return list(rows)

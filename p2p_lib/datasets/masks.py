@@ -1,0 +1,125 @@
+"""Masks out of files: one folder per object, or one label image per frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_files, read_image
+
+
+@dataclass(eq=False)
+class MaskFiles:
+    """Masks on disk: for each object its files, and the label that means it (None: anything but 0).
+
+    An object has one file a frame (None: it is not in this picture), or a single one for the first frame alone.
+    """
+
+    files: dict[str, tuple[Path | None, ...]]
+    labels: dict[str, int | None]
+    shape: tuple[int, int]
+    _counts: dict[int, dict[str, int]] = field(default_factory=dict)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names, in the order of their labels or folders."""
+        return tuple(self.files)
+
+    def read(self, i: int) -> dict[str, np.ndarray] | None:
+        """Object to (H, W) bool at frame i; None where no object has a mask for it."""
+        at_i = {name: files[i] for name, files in self.files.items() if i < len(files)}
+        pictures = {path: read_labels(path, self.shape) for path in set(at_i.values()) if path}
+        pictures[None] = np.zeros(self.shape, np.uint8)
+        masks = {}
+        for name, path in at_i.items():
+            label = self.labels[name]
+            masks[name] = pictures[path] > 0 if label is None else pictures[path] == label
+        self._counts[i] = {name: int(np.count_nonzero(mask)) for name, mask in masks.items()}
+        return masks or None
+
+    def count(self, i: int) -> dict[str, int] | None:
+        """Object to pixels at frame i; costs nothing after :meth:`read`."""
+        if i not in self._counts:
+            self.read(i)
+        return self._counts[i] or None
+
+
+def find_masks(
+    folder: Path,
+    rgb_files: tuple[Path, ...],
+    shape: tuple[int, int],
+    objects: tuple[str, ...] | None = None,
+    first_frame_alone: bool = False,
+) -> MaskFiles:
+    """The masks below a folder: one folder per object, or one label image per frame.
+
+    ``objects`` are the names to find; None takes what is there: the folders' names, or ``object_k`` for
+    label k (``object`` where there is a single one). With known names, label k is the k-th of them, and
+    a single object is everything that is not 0.
+    """
+    if not folder.is_dir():
+        raise MissingData(str(folder), "no such folder of masks", "Name a folder inside the sequence, or a path.")
+    below = tuple(sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")))
+    names = below if objects is None else objects
+
+    def images(where: Path) -> tuple[Path, ...]:
+        files = list_files(where, LOSSLESS, "mask images")
+        if not first_frame_alone:
+            return check_paired(files, rgb_files)
+        try:
+            return files if len(files) == 1 else check_paired(files, rgb_files)
+        except BadInput as error:
+            alone = "One mask alone, of the first picture, is allowed too."
+            raise BadInput(error.name, error.got, error.expected, f"{error.fix} {alone}".strip()) from None
+
+    if below:
+        return MaskFiles({name: images(folder / name) for name in names}, dict.fromkeys(names), shape)
+    files = images(folder)
+    labels: dict[str, int | None]
+    if objects is None:
+        found = _labels_in(files, shape)
+        labels = {f"object_{k}": k for k in found} if len(found) > 1 else {"object": None}
+    else:
+        labels = {name: k + 1 for k, name in enumerate(names)} if len(names) > 1 else {names[0]: None}
+    return MaskFiles(dict.fromkeys(labels, files), labels, shape)
+
+
+def _labels_in(files: tuple[Path, ...], shape: tuple[int, int]) -> list[int]:
+    """All labels above 0 of a set of label images: an object may enter late, so every image is looked at."""
+    present = np.zeros(65536, bool)
+    for path in files:
+        present |= np.bincount(read_labels(path, shape).ravel(), minlength=65536) > 0
+    return [int(k) for k in np.flatnonzero(present) if k > 0]
+
+
+def masks_folder(folder: Path, masks: str | Path) -> Path:
+    """The folder of masks that was asked for: a name inside the sequence, else a path."""
+    inside = folder / masks
+    return inside if inside.is_dir() else Path(masks).expanduser()
+
+
+def read_labels(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """(H, W) integer labels of a mask image; 0 is background. Palette images give their indices."""
+    labels = read_image(path, cv2.IMREAD_UNCHANGED, "a mask image")
+    if labels.ndim == 3:
+        colours = labels[..., :3]  # a fourth channel is opacity
+        labels = colours[..., 0]
+        if (colours != labels[..., None]).any():
+            labels = _palette_indices(path)
+    check_size(path, labels, shape)
+    return labels
+
+
+def _palette_indices(path: Path) -> np.ndarray:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        if image.mode != "P":
+            raise BadInput(
+                str(path), f"a colour picture ({image.mode})", "one label per pixel", "Save it with one channel."
+            )
+        return np.asarray(image)

@@ -1,0 +1,71 @@
+"""A sequence at another resolution: what a smaller camera at the same place would have delivered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.sequence import Sequence
+
+
+@dataclass(frozen=True, eq=False)
+class Resized:
+    """A :class:`~p2p_lib.datasets.sequence.Sequence` scaled by a factor up to 1.
+
+    Colour is averaged over areas; depth and masks are taken from the nearest pixel, since averages across an edge
+    are neither of its sides. ``visible_px`` stays the original's, so that the same frames are scored.
+    """
+
+    original: Sequence
+    scale: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale <= 1:
+            raise BadInput("scale", self.scale, "above 0 and at most 1")
+
+    @property
+    def camera(self) -> Camera:
+        """The original's camera with its pixels merged; integer pixels are pixel centres."""
+        camera = self.original.camera
+        width, height = round(camera.width * self.scale), round(camera.height * self.scale)
+        sx, sy = width / camera.width, height / camera.height
+        return replace(
+            camera,
+            fx=camera.fx * sx,
+            fy=camera.fy * sy,
+            cx=(camera.cx + 0.5) * sx - 0.5,
+            cy=(camera.cy + 0.5) * sy - 0.5,
+            width=width,
+            height=height,
+        )
+
+    def frame(self, i: int) -> Frame:
+        """The i-th picture, smaller."""
+        frame, size = self.original.frame(i), (self.camera.width, self.camera.height)
+        depth_m = cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        return replace(frame, rgb=cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), depth_m=depth_m)
+
+    def masks(self, i: int) -> dict[str, np.ndarray] | None:
+        """The masks at frame i, smaller."""
+        masks, size = self.original.masks(i), (self.camera.width, self.camera.height)
+        if masks is None:
+            return None
+        nearest = cv2.INTER_NEAREST_EXACT
+        return {k: cv2.resize(m.astype(np.uint8), size, interpolation=nearest) > 0 for k, m in masks.items()}
+
+    def visible_px(self, i: int) -> dict[str, int] | None:
+        """Sizes of the original's masks."""
+        return self.original.visible_px(i)
+
+    def __len__(self) -> int:
+        return len(self.original)
+
+    def __getattr__(self, name: str) -> Any:
+        """Names, times, truth, models: the original's."""
+        return getattr(self.original, name)

@@ -1,0 +1,183 @@
+"""RGB-D sequences: the protocol that every layout fulfils, and the one door, :func:`open_sequence`.
+
+A layout is one module with ``recognises(folder)`` and ``load(folder, name, depth_scale, masks)``, and
+one line in :data:`FORMATS`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.paths import data_dir
+from p2p_lib.core.types import Frame
+
+#: Layouts by name, in the order in which they are tried on a folder.
+FORMATS: dict[str, str] = {
+    "ho3d": "p2p_lib.datasets.ho3d",
+    "bop": "p2p_lib.datasets.bop",
+    "ycbmultitrack": "p2p_lib.datasets.ycbmultitrack",
+    "ycbineoat": "p2p_lib.datasets.ycbineoat",
+    "folder": "p2p_lib.datasets.folder",
+}
+
+#: Sequences that are generated rather than read are called ``synthetic/NAME``.
+SYNTHETIC = "synthetic/"
+#: Renders those; imported when one is asked for.
+_GENERATOR = "p2p_lib.synthetic"
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTruth:
+    """One object's truth over the whole sequence.
+
+    T_cam_model  (N, 4, 4) metres, OpenCV axes; NaN where there is none
+    labelled     (N,) bool: the dataset's own visibility labels hold (all True where it has none)
+    """
+
+    T_cam_model: np.ndarray
+    labelled: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.labelled)
+        if self.T_cam_model.shape != (n, 4, 4) or self.labelled.shape != (n,) or self.labelled.dtype != bool:
+            got = f"T_cam_model {self.T_cam_model.shape}, labelled {self.labelled.shape} {self.labelled.dtype}"
+            raise BadInput("truth", got, "(N, 4, 4) and (N,) bool")
+
+
+class Sequence(Protocol):
+    """RGB-D frames of one video, with masks and truth where the dataset has them.
+
+    name     what results call it
+    path     its folder, None where it has none
+    objects  names of the objects it knows; a single unnamed one is called ``object``
+    truth    per object, empty where there is none; read when first asked for
+    times_s  (N,) seconds, increasing; frame_names what each frame's picture is called
+    model_places  object to the files and folders where its model may lie, best first
+    """
+
+    name: str
+    format: str
+    path: Path | None
+    camera: Camera
+    objects: tuple[str, ...]
+    times_s: np.ndarray
+    model_places: Mapping[str, tuple[Path, ...]]
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """What each frame's picture is called, without its ending."""
+        ...
+
+    @property
+    def truth(self) -> dict[str, ObjectTruth]:
+        """Object to its truth; empty where there is none."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def frame(self, i: int) -> Frame:
+        """The i-th picture, read now; what is wrong with its files is said in one line that names the file."""
+        ...
+
+    def masks(self, i: int) -> dict[str, np.ndarray] | None:
+        """Object to (H, W) bool at frame i; None where the sequence has no masks (or none for this frame)."""
+        ...
+
+    def visible_px(self, i: int) -> dict[str, int] | None:
+        """Object to the size of its visible mask at frame i, by the dataset's OWN masks whatever ``masks`` gives.
+
+        The scoring rule uses this, so that the same frames count for every source of masks.
+        """
+        ...
+
+
+def open_sequence(
+    path_or_name: str | Path,
+    format: str | None = None,
+    depth_scale: float | None = None,
+    seed: int = 0,
+    masks: str | Path | None = None,
+) -> Sequence:
+    """A sequence from a folder, the embedded ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
+
+    Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one; any
+    other folder by its path below ``$P2P_DATA``.
+
+    format       one of :data:`FORMATS`; by default the layout is recognised
+    depth_scale  metres per raw unit of the depth images (default 0.001: millimetres)
+    seed         of the generator, for ``synthetic/NAME``
+    masks        another folder of masks (a name inside the sequence, or a path); by default the dataset's own
+
+    Raises :class:`MissingData` where files are not there and :class:`BadInput` where they do not fit.
+    """
+    if depth_scale is not None and not 0 < depth_scale <= 1:
+        fix = "Millimetres are 0.001, metres are 1."
+        raise BadInput("depth_scale", depth_scale, "metres per raw unit, above 0 and at most 1", fix)
+    if format is not None and format not in FORMATS:
+        raise BadInput("format", repr(format), "one of " + ", ".join(FORMATS))
+    name = str(path_or_name)
+    if name.startswith(SYNTHETIC):
+        synthetic = import_module(_GENERATOR)
+        if near := unknown_scenario(name, synthetic.SCENARIOS):
+            raise near
+        folder, format = synthetic.scenario_dir(name.removeprefix(SYNTHETIC), seed), format or "ycbmultitrack"
+    else:
+        folder, format = _find(path_or_name, format)
+        name = os.path.basename(os.path.abspath(folder))
+    loader = import_module(FORMATS[format or recognise(folder)])
+    return loader.load(folder, name=name, depth_scale=depth_scale, masks=masks)
+
+
+def unknown_scenario(name: str, known: Iterable[str]) -> BadInput | None:
+    """What to say of a synthetic sequence that does not exist, naming the nearest that does; None where it does."""
+    known, scenario = sorted(known), name.removeprefix(SYNTHETIC)
+    if scenario in known:
+        return None
+    near = get_close_matches(scenario, known, n=1)
+    fix = f"Did you mean {SYNTHETIC}{near[0]}?" if near else ""
+    return BadInput("synthetic sequence", repr(scenario), "one of " + ", ".join(SYNTHETIC + k for k in known), fix)
+
+
+def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:
+    """An existing folder, and the layout where its dataset's manifest says it."""
+    folder = Path(path_or_name).expanduser()
+    if folder.is_dir():
+        return folder, format
+    from p2p_lib.datasets.manifests import find_sequence
+
+    found = find_sequence(str(path_or_name))
+    below = None if data_dir() is None else data_dir() / folder
+    if found is None and below is not None and below.is_dir():
+        return below, format
+    if found is None:
+        fix = f"Give a folder, an embedded sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
+        where = "$P2P_DATA is not set" if data_dir() is None else f"no sequence of this name below {data_dir()}"
+        raise MissingData(str(path_or_name), f"no such folder, and {where}", fix)
+    return found[0], format or found[1].format
+
+
+def recognise(folder: Path) -> str:
+    """The name of a folder's layout; :class:`BadInput` where no layout fits."""
+    for name, module in FORMATS.items():
+        if import_module(module).recognises(folder):
+            return name
+    holds = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())[:8]) or "nothing"
+    if not (folder / "rgb").is_dir() and ((folder / "depth").is_dir() or (folder / "cam_K.txt").is_file()):
+        fix = "rgb/ is missing: put the colour pictures there, one for each depth image."
+        raise BadInput(str(folder), f"a folder with {holds}", "rgb/, depth/ and cam_K.txt", fix)
+    raise BadInput(
+        str(folder),
+        f"a folder with {holds}",
+        "rgb/, depth/ and cam_K.txt (and masks/, annotated_poses/ where there are any)",
+        f"Name the layout with --format ({', '.join(FORMATS)}).",
+    )

@@ -1,0 +1,66 @@
+"""SuperPoint (DeTone et al., 2018), the paper's detector, through the maintained class of ``transformers``.
+
+The weights are Magic Leap's: for academic and other non-commercial use only.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import packages
+from p2p_lib.core.config import SamplingConfig
+from p2p_lib.core.interfaces import Candidates
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets import checkpoints
+
+if TYPE_CHECKING:
+    import torch
+
+# The network works in cells of this size; a crop that starts between them would see other features.
+_CELL_PX = 8
+# Around the mask: what a keypoint depends on, 45 px in the network and some more for its suppressed neighbours.
+_MARGIN_PX = 64
+
+
+def load(
+    config: SamplingConfig, rng: np.random.Generator | None = None, device: str | None = None
+) -> SuperPointDetector:
+    """The detector with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
+    folder = checkpoints.checked_files("superpoint")[0].parent
+    module = packages.load("transformers", "superpoint", "transformers")
+    # safetensors hold tensors and nothing else; local_files_only: nothing is downloaded here.
+    model = module.SuperPointForKeypointDetection.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+    return SuperPointDetector(model, config, checkpoints.device_of(device))
+
+
+class SuperPointDetector:
+    """Keypoints in the mask with the network's confidence as score. Implements ``Detector``."""
+
+    name = "superpoint"
+
+    def __init__(self, model: torch.nn.Module, config: SamplingConfig, device: str = "cpu"):
+        self._model, self._device, self._limit = model.to(device).eval(), device, config.candidates
+
+    def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
+        """Keypoints in the mask, best first, looked for around it alone."""
+        import torch
+
+        x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
+        if not w:
+            return Candidates(np.zeros((0, 2)), np.zeros(0))
+        x0, y0 = (max(0, (at - _MARGIN_PX) // _CELL_PX * _CELL_PX) for at in (x, y))
+        crop = frame.rgb[y0 : y + h + _MARGIN_PX, x0 : x + w + _MARGIN_PX]
+        gray = torch.from_numpy(cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)).to(self._device).float() / 255
+        with torch.inference_mode():
+            found = self._model(pixel_values=gray.expand(1, 3, *gray.shape))
+        kept = found.mask[0].bool()
+        # The class gives indices of pixels over the size of the picture.
+        uv_px = found.keypoints[0][kept].double().cpu().numpy() * gray.shape[::-1] + [x0, y0]
+        score = found.scores[0][kept].double().cpu().numpy()
+        px = np.rint(uv_px).astype(int)
+        inside = np.flatnonzero(mask[px[:, 1], px[:, 0]])
+        best = inside[np.argsort(-score[inside], kind="stable")][: self._limit]
+        return Candidates(uv_px[best], np.clip(score[best], 0, 1))

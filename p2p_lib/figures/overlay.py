@@ -1,0 +1,300 @@
+"""Drawing on pictures: boxes, axes, masks, points, labels.
+
+Every function takes an RGB picture (H, W, 3) uint8 and returns a new one. Colours are ``#RRGGBB``; lines are
+antialiased, placed to a sixteenth of a pixel, and carry a dark rim so that they show on any background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.figures import style
+
+_SHIFT = 4  # OpenCV's fixed-point coordinates: sixteenths of a pixel
+_NEAR_M = 0.02  # lines are cut off here, in front of the camera
+_FONT, _RIM = cv2.FONT_HERSHEY_SIMPLEX, "#101010"
+
+_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+#: The 12 edges of a box as pairs of rows of :func:`box_corners`: those that differ in one coordinate.
+EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (_SIGNS[a] != _SIGNS[b]).sum() == 1])
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A box around an object: its centre and axes in the object's frame, and its edge lengths.
+
+    T_obj_box  (4, 4); size_m (3,)
+    """
+
+    T_obj_box: np.ndarray
+    size_m: np.ndarray
+
+    def __post_init__(self) -> None:
+        se3.check("box", self.T_obj_box)
+        if np.shape(self.size_m) != (3,) or not (np.asarray(self.size_m) >= 0).all():
+            raise BadInput("box size_m", self.size_m, "three lengths in metres")
+
+    @classmethod
+    def around(cls, points: np.ndarray, T_obj_points: np.ndarray = se3.IDENTITY, keep: float = 1.0) -> Box:
+        """The box of points (N, 3) along the axes of their own frame; ``keep`` < 1 leaves out the farthest of them."""
+        points = np.asarray(points, float)
+        points = points[np.isfinite(points).all(1)]
+        if not len(points):
+            raise BadInput("box", "no finite points", "at least one")
+        low, high = np.quantile(points, [(1 - keep) / 2, (1 + keep) / 2], axis=0)
+        return cls(T_obj_points @ se3.from_rt(np.eye(3), (low + high) / 2), high - low)
+
+    def moved(self, T_new_obj: np.ndarray) -> Box:
+        """The same box in another frame."""
+        return Box(T_new_obj @ self.T_obj_box, self.size_m)
+
+
+def box_corners(size_m: np.ndarray) -> np.ndarray:
+    """(8, 3) corners of a box about the origin."""
+    return _SIGNS * np.asarray(size_m, float) / 2
+
+
+def draw_box(
+    image: np.ndarray,
+    camera: Camera,
+    T_cam_box: np.ndarray,
+    size_m: np.ndarray,
+    colour: str,
+    width_px: int = 2,
+    dashed: bool = False,
+) -> np.ndarray:
+    """A box's edges; those behind it are thin."""
+    p_cam = se3.transform(T_cam_box, box_corners(size_m))
+    front = _front_edges(T_cam_box, np.asarray(size_m, float))
+    behind, before = _segments(camera, p_cam[EDGES[~front]]), _segments(camera, p_cam[EDGES[front]])
+    image = _stroke(image, behind, colour, 1, rim=0, strength=0.5)
+    if dashed:
+        image, before = _stroke(image, before, _RIM, width_px, rim=0, strength=0.5), _dashes(before)
+    return _stroke(image, before, colour, width_px, rim=0 if dashed else 0.6)
+
+
+def draw_axes(
+    image: np.ndarray, camera: Camera, T_cam_obj: np.ndarray, length_m: float, width_px: int = 2
+) -> np.ndarray:
+    """A frame's x, y and z axes, the farthest first, in the colours of :data:`style.AXES`."""
+    tips = se3.transform(T_cam_obj, np.eye(3) * length_m)
+    for k in np.argsort(-tips[:, 2]):
+        line = np.stack([T_cam_obj[:3, 3], tips[k]])[None]
+        image = _stroke(image, _segments(camera, line), style.AXES[k], width_px)
+    return image
+
+
+def draw_mask(image: np.ndarray, mask: np.ndarray, colour: str, width_px: int = 2, fill: float = 0.0) -> np.ndarray:
+    """A mask's (H, W) outline, and its inside tinted by a share ``fill``."""
+    image, mask = image.copy(), np.asarray(mask, bool)
+    if mask.shape != image.shape[:2]:
+        raise BadInput("mask", mask.shape, f"{image.shape[:2]} as the picture")
+    if fill > 0:
+        image[mask] = np.rint((1 - fill) * image[mask] + fill * np.array(style.rgb(colour))).astype(np.uint8)
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    for paint, thickness, share in ((_RIM, width_px + 2, 0.6), (colour, width_px, 1.0)):
+        drawn = cv2.drawContours(image.copy(), outlines, -1, style.rgb(paint), thickness, cv2.LINE_AA)
+        image = cv2.addWeighted(drawn, share, image, 1 - share, 0)
+    return image
+
+
+def draw_masks(
+    image: np.ndarray, masks: Mapping[str, np.ndarray], colours: Mapping[str, str], fill: float = 0.35
+) -> np.ndarray:
+    """Several objects' masks, each in its colour."""
+    for name, mask in masks.items():
+        image = draw_mask(image, mask, colours[name], fill=fill)
+    return image
+
+
+def draw_points(
+    image: np.ndarray, uv_px: np.ndarray, colours: str | np.ndarray, radius_px: float = 3, filled: bool = True
+) -> np.ndarray:
+    """Points (N, 2) as dots or rings; NaN ones are left out. One colour, or (N, 3) uint8 as :func:`value_colours`."""
+    image, uv_px = image.copy(), np.asarray(uv_px, float).reshape(-1, 2)
+    if isinstance(colours, str):
+        colours = np.tile(np.array(style.rgb(colours), np.uint8), (len(uv_px), 1))
+    shown = np.flatnonzero(np.isfinite(uv_px).all(1) & (np.abs(uv_px) < 1e5).all(1))
+    one, radius = 1 << _SHIFT, round(radius_px * (1 << _SHIFT))
+    for (u, v), colour in zip(np.rint(uv_px[shown] * one).astype(int).tolist(), colours[shown].tolist()):
+        if filled:
+            cv2.circle(image, (u, v), radius + one, style.rgb(_RIM), -1, cv2.LINE_AA, _SHIFT)
+            cv2.circle(image, (u, v), radius, colour, -1, cv2.LINE_AA, _SHIFT)
+        else:
+            cv2.circle(image, (u, v), radius, style.rgb(_RIM), 3, cv2.LINE_AA, _SHIFT)
+            cv2.circle(image, (u, v), radius, colour, 1, cv2.LINE_AA, _SHIFT)
+    return image
+
+
+def draw_crosses(image: np.ndarray, uv_px: np.ndarray, colour: str, radius_px: float = 4) -> np.ndarray:
+    """Points (N, 2) as oblique crosses; NaN ones are left out."""
+    arms = radius_px * np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]]) / np.sqrt(2)
+    lines = np.asarray(uv_px, float).reshape(-1, 1, 1, 2) + arms
+    return _stroke(image, lines[np.isfinite(lines).all((1, 2, 3))].reshape(-1, 2, 2), colour, 2, rim=1.0)
+
+
+def value_colours(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """(N, 3) uint8: dark blue at ``low`` or below to yellow at ``high`` or above (cividis); NaN is white."""
+    values = np.asarray(values, float)
+    level = np.clip((values - low) / (high - low), 0, 1)
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
+    colours = table[np.rint(np.nan_to_num(level) * 255).astype(int)]
+    return np.where(np.isnan(level)[:, None], np.uint8(255), colours)
+
+
+def depth_scale(depth_m: np.ndarray) -> str:
+    """What the colours of :func:`depth_picture` mean, in words for a caption."""
+    near, far = _depth_range(depth_m)
+    return f"yellow {near:.2f} m to dark blue {far:.2f} m"
+
+
+def _depth_range(depth_m: np.ndarray) -> tuple[float, float]:
+    """Metres from which on all is yellow, and up to which all is dark blue; NaN where nothing was measured."""
+    known = depth_m[depth_m > 0]
+    return tuple(np.quantile(known, [0.005, 0.995]).tolist()) if len(known) else (np.nan, np.nan)
+
+
+def depth_picture(depth_m: np.ndarray) -> np.ndarray:
+    """Depth (H, W) as a picture: near is yellow, far is dark blue (cividis), no measurement is white."""
+    known = depth_m > 0
+    if not known.any():
+        return np.full((*depth_m.shape, 3), 255, np.uint8)
+    near, far = _depth_range(depth_m)
+    values = np.where(known, -depth_m, np.nan).ravel()
+    return value_colours(values, -max(far, near + 1e-6), -near).reshape(*depth_m.shape, 3)
+
+
+def draw_trail(image: np.ndarray, uv_px: np.ndarray, colour: str, width_px: int = 2) -> np.ndarray:
+    """A path (N, 2) through the picture; NaN interrupts it."""
+    pairs = np.stack([uv_px[:-1], uv_px[1:]], 1) if len(uv_px) > 1 else np.zeros((0, 2, 2))
+    return _stroke(image, pairs[np.isfinite(pairs).all((1, 2))], colour, width_px, rim=0)
+
+
+@dataclass(frozen=True)
+class Label:
+    """A word at an object: what it says, its colour, and the rectangle (left, top, right, bottom) it belongs to."""
+
+    text: str
+    colour: str
+    around_px: tuple[float, float, float, float]
+
+
+def draw_labels(image: np.ndarray, labels: Iterable[Label], scale: float = 0.45) -> np.ndarray:
+    """Labels beside their rectangles, so that none covers another: above, else below, right or left."""
+    image, taken = image.copy(), []
+    for label in labels:
+        (w, h), base = cv2.getTextSize(label.text, _FONT, scale, 1)
+        w, h = w + 10, h + base + 4
+        left, top = _free_place((w, h), label.around_px, taken, image.shape)
+        taken.append((left, top, left + w, top + h))
+        cv2.rectangle(image, (left, top), (left + w - 1, top + h - 1), style.rgb(label.colour), -1)
+        at, colour = (left + 5, top + h - base - 1), style.rgb(style.ink(label.colour))
+        cv2.putText(image, label.text, at, _FONT, scale, colour, 1, cv2.LINE_AA)
+    return image
+
+
+def draw_caption(image: np.ndarray, text: str, scale: float = 0.45) -> np.ndarray:
+    """White words on a dark ground in the upper left corner."""
+    image = image.copy()
+    (w, h), base = cv2.getTextSize(text, _FONT, scale, 1)
+    ground = image[: h + base + 6, : w + 12]
+    ground[:] = (ground * 0.35).astype(np.uint8)
+    cv2.putText(image, text, (6, h + 4), _FONT, scale, (255, 255, 255), 1, cv2.LINE_AA)
+    return image
+
+
+def zoomed(
+    image: np.ndarray, camera: Camera, region_px: tuple[int, int, int, int], width_px: int
+) -> tuple[np.ndarray, Camera]:
+    """A region (left, top, right, bottom; the latter exclusive) at another width, and the camera that sees it so."""
+    left, top, right, bottom = region_px
+    if not (0 <= left < right <= image.shape[1] and 0 <= top < bottom <= image.shape[0]):
+        raise BadInput("region_px", region_px, f"a rectangle within {image.shape[1]}x{image.shape[0]}")
+    s = width_px / (right - left)
+    height_px = round(s * (bottom - top))
+    s_v = height_px / (bottom - top)
+    how = cv2.INTER_AREA if s < 1 else cv2.INTER_CUBIC
+    part = cv2.resize(image[top:bottom, left:right], (width_px, height_px), interpolation=how)
+    # Integer pixels are pixel centres: the region's own edge lies half a pixel before its first one.
+    cx, cy = (camera.cx - left + 0.5) * s - 0.5, (camera.cy - top + 0.5) * s_v - 0.5
+    return part, replace(camera, fx=camera.fx * s, fy=camera.fy * s_v, cx=cx, cy=cy, width=width_px, height=height_px)
+
+
+def montage(images: Sequence[np.ndarray], columns: int, gap_px: int = 4) -> np.ndarray:
+    """Pictures of one size, row by row, with white between them."""
+    if not len(images) or len({image.shape for image in images}) != 1:
+        raise BadInput("montage", sorted({image.shape for image in images}), "pictures of one size")
+    h, w, _ = images[0].shape
+    rows = -(-len(images) // columns)
+    sheet = np.full((rows * (h + gap_px) - gap_px, columns * (w + gap_px) - gap_px, 3), 255, np.uint8)
+    for k, image in enumerate(images):
+        top, left = k // columns * (h + gap_px), k % columns * (w + gap_px)
+        sheet[top : top + h, left : left + w] = image
+    return sheet
+
+
+def _front_edges(T_cam_box: np.ndarray, size_m: np.ndarray) -> np.ndarray:
+    """(12,) bool: edges of at least one face that looks at the camera."""
+    outward = np.concatenate([np.eye(3), -np.eye(3)])
+    centres = se3.transform(T_cam_box, outward * size_m / 2)
+    faces = np.einsum("fi,fi->f", outward @ T_cam_box[:3, :3].T, centres) < 0
+    in_face = np.concatenate([_SIGNS > 0, _SIGNS < 0], 1)
+    return (in_face[EDGES[:, 0]] & in_face[EDGES[:, 1]] & faces).any(1)
+
+
+def _segments(camera: Camera, p_cam: np.ndarray) -> np.ndarray:
+    """Lines (M, 2, 3) in pixels (K, 2, 2), cut off at the near plane; those behind it are gone."""
+    p_cam = p_cam[(p_cam[..., 2] > _NEAR_M).any(1)]
+    z = p_cam[..., 2]
+    behind = z <= _NEAR_M
+    step = z[:, ::-1] - z
+    share = np.where(behind, (_NEAR_M - z) / np.where(behind, step, 1), 0)
+    return camera.project(p_cam + share[..., None] * (p_cam[:, ::-1] - p_cam))
+
+
+def _stroke(
+    image: np.ndarray, segments: np.ndarray, colour: str, width_px: int, rim: float = 0.6, strength: float = 1.0
+) -> np.ndarray:
+    """Segments (M, 2, 2) in pixels; ``rim`` is how dark the rim is, ``strength`` how opaque the line."""
+    lines = list(np.rint(segments * (1 << _SHIFT)).astype(np.int32)[:, :, None])
+    image = image.copy()
+    for paint, thickness, share in ((_RIM, width_px + 2, rim), (colour, width_px, strength)):
+        if lines and share:
+            drawn = cv2.polylines(image.copy(), lines, False, style.rgb(paint), thickness, cv2.LINE_AA, _SHIFT)
+            image = cv2.addWeighted(drawn, share, image, 1 - share, 0)
+    return image
+
+
+def _dashes(segments: np.ndarray, period_px: float = 10.0) -> np.ndarray:
+    """Segments (M, 2, 2) cut into dashes of half a period, beginning and ending with one."""
+    pieces = [np.zeros((0, 2, 2))]
+    for a, b in segments:
+        n = 2 * min(round(float(np.linalg.norm(b - a)) / period_px), 500) + 1
+        s = np.linspace(0, 1, n + 1)[:, None]
+        at = a + s * (b - a)
+        pieces.append(np.stack([at[:-1:2], at[1::2]], 1))
+    return np.concatenate(pieces)
+
+
+def _free_place(
+    size: tuple[int, int], around: tuple[float, ...], taken: list[tuple[int, ...]], shape: tuple[int, ...]
+) -> tuple[int, int]:
+    """Upper left corner for a label: the first place beside its rectangle that is inside and free."""
+    w, h = size
+    left, top, right, bottom = around
+    middle, centre = (left + right - w) / 2, (top + bottom - h) / 2
+    wanted = [(middle, top - h - 4), (middle, bottom + 4), (right + 4, centre), (left - w - 4, centre)]
+    wanted += [(middle, top - k * (h + 2) - 4) for k in (2, 3, 4)]
+    places = []
+    for u, v in wanted:
+        u, v = round(min(max(u, 0), shape[1] - w)), round(min(max(v, 0), shape[0] - h))
+        if not any(u < x1 and x0 < u + w and v < y1 and y0 < v + h for x0, y0, x1, y1 in taken):
+            places.append((u, v))
+    return places[0] if places else (round(middle), round(top))

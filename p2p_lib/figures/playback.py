@@ -1,0 +1,133 @@
+"""A run as a viewer wants it: everything on disk, put together frame by frame, with the sequence where it is there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.errors import P2PError
+from p2p_lib.core.types import WITH_POSE, Frame
+from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
+from p2p_lib.datasets.masks import read_labels
+from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.datasets.sequence import Sequence, open_sequence
+from p2p_lib.evaluation.protocol import Evaluation, evaluate
+from p2p_lib.figures import style
+
+if TYPE_CHECKING:
+    import trimesh
+
+#: Farther points are walls, which nobody needs to see.
+CLOUD_MAX_M = 2.5
+
+
+@dataclass(frozen=True, eq=False)
+class Playback:
+    """One run over its frames; rows i are those of the run, whatever frame of the sequence they are.
+
+    sequence  None where its folder is gone: then there are no pictures, points and masks
+    """
+
+    run: Run
+    sequence: Sequence | None
+    keypoints: dict[str, ObjectKeypoints]
+
+    @classmethod
+    def of(cls, run: Run | str | Path, sequence: Sequence | None = None) -> Playback:
+        """Of a run's folder; the sequence is opened as the run says unless it is given."""
+        run = run if isinstance(run, Run) else load_run(run)
+        return cls(run, sequence or _reopened(run), load_keypoints(run.path))
+
+    def __len__(self) -> int:
+        return len(self.frame_index)
+
+    @cached_property
+    def frame_index(self) -> np.ndarray:
+        """(n,) frames of the sequence."""
+        return next(iter(self.run.objects.values())).frame_index
+
+    @cached_property
+    def times_s(self) -> np.ndarray:
+        """(n,) seconds since the first of them."""
+        times_s = next(iter(self.run.objects.values())).time_s
+        return times_s - times_s[0]
+
+    @cached_property
+    def colours(self) -> dict[str, str]:
+        """Object to ``#RRGGBB``."""
+        return style.object_colours(self.run.objects)
+
+    @cached_property
+    def meshes(self) -> dict[str, trimesh.Trimesh]:
+        """Object to its reconstructed surface, in its frame; those that have one."""
+        import trimesh
+
+        files = {name: self.run.path / "meshes" / f"{name}.ply" for name in self.run.objects}
+        return {name: trimesh.load_mesh(path, process=False) for name, path in files.items() if path.is_file()}
+
+    @cached_property
+    def evaluation(self) -> Evaluation | None:
+        """Its score, where there is truth to score it by."""
+        try:
+            return evaluate(self.run)
+        except P2PError:
+            return None
+
+    def has_pose(self, name: str) -> np.ndarray:
+        """(n,) bool: rows with a pose of that very frame."""
+        return np.isin(self.run.objects[name].status, [str(s) for s in WITH_POSE])
+
+    def keyframes(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (K,) that added a keyframe, and its T_obj_cam (K, 4, 4) as estimated then."""
+        obj = self.run.objects[name]
+        rows = np.flatnonzero(obj.keyframe & self.has_pose(name))
+        return rows, se3.inverse(obj.T_cam_obj[rows])
+
+    def frame(self, i: int) -> Frame | None:
+        """The picture of row i, where it can still be had."""
+        return None if self.sequence is None else self.sequence.frame(int(self.frame_index[i]))
+
+    def cloud(self, frame: Frame, points: int) -> tuple[np.ndarray, np.ndarray]:
+        """About so many of a frame's points (M, 3) in camera coordinates, on a grid, and their colours (M, 3) uint8."""
+        h, w = frame.shape
+        step = max(1, round(np.sqrt(h * w / points)))
+        v, u = (a.ravel() for a in np.mgrid[step // 2 : h : step, step // 2 : w : step])
+        near = (frame.depth_m[v, u] > 0) & (frame.depth_m[v, u] < CLOUD_MAX_M)
+        u, v = u[near], v[near]
+        return self.sequence.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u]), frame.rgb[v, u]
+
+    def masks(self, i: int) -> dict[str, np.ndarray]:
+        """The masks (H, W) bool of row i: those that the run kept, else the dataset's where it used them."""
+        frame = int(self.frame_index[i])
+        kept = {name: self.run.path / "masks" / name / f"{frame:06d}.png" for name in self.run.objects}
+        if self.sequence is None:
+            return {}
+        if any(path.is_file() for path in kept.values()):
+            shape = self.sequence.camera.height, self.sequence.camera.width
+            return {name: read_labels(path, shape) > 0 for name, path in kept.items() if path.is_file()}
+        if self.run.info["masks"] != "dataset":
+            return {}
+        masks = self.sequence.masks(frame) or {}
+        return {name: masks[name] for name in self.run.objects if name in masks}
+
+    def add_m(self, name: str) -> np.ndarray:
+        """(n,) ADD in metres, NaN where there is no pose or no truth."""
+        errors = np.full(len(self), np.nan)
+        if self.evaluation is not None and name in self.evaluation.objects:
+            score = self.evaluation.objects[name]
+            found = np.isfinite(score.add_m)
+            errors[np.searchsorted(self.frame_index, score.frame_index[found])] = score.add_m[found]
+        return errors
+
+
+def _reopened(run: Run) -> Sequence | None:
+    info = run.info
+    try:
+        return open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
+    except P2PError:
+        return None

@@ -1,0 +1,240 @@
+"""The only way out for a picture, a film or a table: each with a note of what it was made from.
+
+Pictures and films go to ``$P2P_FIGURES`` (else ``figures/`` of the project), tables to ``$P2P_TABLES`` (else
+``out/tables/``). Beside ``NAME.png`` lies ``NAME.json``: parameters, what was read, versions, commit. Neither holds a
+time or a folder of this machine, so that the same work gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.core import paths
+from p2p_lib.core.errors import BadInput
+from p2p_lib.datasets.provenance import provenance
+from p2p_lib.datasets.runs import Run
+from p2p_lib.evaluation.protocol import Evaluation
+from p2p_lib.figures import film as video
+from p2p_lib.figures import style
+from p2p_lib.figures.typeset import Table
+
+_WHAT_RAN = (
+    "sequence",
+    "objects",
+    "start",
+    "stop",
+    "frames",
+    "tracker",
+    "masks",
+    "preset",
+    "seed",
+    "commit",
+    "modified",
+)
+_SHOWN_PX = 900  # a notebook shows pictures at most this wide
+
+
+@dataclass(frozen=True, eq=False)
+class Saved:
+    """What was written, and how a notebook shows it. The last expression of a cell is displayed."""
+
+    path: Path
+    shown: tuple[dict[str, Any], dict[str, Any]]
+
+    def _repr_mimebundle_(self, include=None, exclude=None):
+        return self.shown
+
+
+def save_figure(
+    figure: Any, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
+) -> Saved:
+    """Write a Matplotlib figure as PNG and PDF, or a picture (H, W, 3) uint8 as PNG, with its note.
+
+    sources     what it was drawn from: runs, evaluations, sequences, files
+    parameters  what decided how it was made: profile, seed, ...
+    """
+    target = _target(paths.figure_dir(), name)
+    if isinstance(figure, np.ndarray):
+        width_px = _write_picture(figure, target)
+        suffixes, drawn_with = [".png"], []
+    else:
+        width_px = _write_plot(figure, target)
+        suffixes, drawn_with = [".png", ".pdf"], ["matplotlib"]
+    _write_note(target, suffixes, sources, parameters, drawn_with)
+    png = target.with_name(f"{name}.png")
+    shown = {"image/png": base64.b64encode(png.read_bytes()).decode(), "text/plain": f"<{name}.png>"}
+    return Saved(png, (shown, {"image/png": {"width": min(width_px, _SHOWN_PX)}}))
+
+
+def save_video(
+    images: Iterable[np.ndarray],
+    name: str,
+    *,
+    fps: float = 30.0,
+    sources: Iterable[Any] = (),
+    parameters: Mapping[str, Any] | None = None,
+) -> Saved:
+    """Write pictures as a film (see :func:`~p2p_lib.figures.film.write_video`) with its note; shown embedded."""
+    target = _target(paths.figure_dir(), name)
+    path = video.write_video(images, target.with_name(f"{name}.mp4"), fps)
+    _write_note(target, [path.suffix], sources, {**(parameters or {}), "fps": fps}, ["av"])
+    film = video.show_video(path)
+    data = film._repr_mimebundle_() if path.suffix == ".gif" else {"text/html": film._repr_html_()}
+    bundle = data if isinstance(data, tuple) else (data, {})
+    return Saved(path, ({**bundle[0], "text/plain": f"<{path.name}>"}, bundle[1]))
+
+
+def save_table(
+    table: Any, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
+) -> Saved:
+    """Write a pandas DataFrame as CSV and Markdown, with its note. What is missing is a dash in Markdown.
+
+    A :class:`~p2p_lib.figures.typeset.Table` is written as LaTeX besides.
+    """
+    target = _target(paths.table_dir(), name)
+    if isinstance(table, Table):
+        return _save_typeset(table, target, sources, parameters)
+    target.with_name(f"{name}.csv").write_text(table.to_csv(index=False, lineterminator="\n"), encoding="utf-8")
+    markdown = as_markdown(table)
+    target.with_name(f"{name}.md").write_text(markdown, encoding="utf-8")
+    _write_note(target, [".csv", ".md"], sources, parameters, ["pandas"])
+    return Saved(target.with_name(f"{name}.csv"), ({"text/html": as_html(table), "text/plain": markdown}, {}))
+
+
+def _save_typeset(table: Table, target: Path, sources: Iterable[Any], parameters: Mapping[str, Any] | None) -> Saved:
+    markdown = table.markdown()
+    for suffix, text in ((".csv", table.csv()), (".md", markdown), (".tex", table.latex())):
+        target.with_name(f"{target.name}{suffix}").write_text(text, encoding="utf-8")
+    _write_note(target, [".csv", ".md", ".tex"], sources, parameters, [])
+    return Saved(target.with_name(f"{target.name}.csv"), ({"text/html": table.html(), "text/plain": markdown}, {}))
+
+
+def as_markdown(table: Any) -> str:
+    """A DataFrame as a Markdown table, numbers to the right, its index left out."""
+    numeric = [kind in "fiu" for kind in (table[c].dtype.kind for c in table.columns)]
+    rows = [[_cell(value) for value in row] for row in table.itertuples(index=False)]
+    lines = [[str(c) for c in table.columns], ["---:" if n else "---" for n in numeric], *rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def as_html(table: Any) -> str:
+    """A DataFrame as HTML, numbers to the right, words to the left, its index left out."""
+    sides = ["right" if table[c].dtype.kind in "fiu" else "left" for c in table.columns]
+    rows = [("th", table.columns), *(("td", row) for row in table.itertuples(index=False))]
+    lines = [
+        "".join(f'<{tag} style="text-align: {side}">{_html_cell(v)}</{tag}>' for side, v in zip(sides, row))
+        for tag, row in rows
+    ]
+    return "<table>\n" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>\n"
+
+
+def _html_cell(value: Any) -> str:
+    return html.escape(_cell(value).replace("\\|", "|")).replace("$", "<span>$</span>")
+
+
+def describe(source: Any) -> dict[str, Any]:
+    """What a note says of a source: its kind, what ran, and checksums where they are cheap."""
+    if isinstance(source, Run):
+        return {"run": _run_id(source), **_what_ran(source.info), "poses_sha256": _sha256(source.path / "poses.npz")}
+    if isinstance(source, Evaluation):
+        return {"evaluation": _what_ran(source.info), "align": source.align}
+    if isinstance(source, Benchmark):
+        keys = sorted({outcome.key for _, outcome in source.results if outcome.status == "done"})
+        return {"benchmark": source.plan.name, "profile": source.profile, "runs": keys}
+    if isinstance(source, str | Path):
+        return {"file": Path(source).name, "sha256": _sha256(Path(source))}
+    if hasattr(source, "frame") and hasattr(source, "camera"):
+        files = [source.path / name for name in ("cam_K.txt", "scenario.json")] if source.path else []
+        checksums = {file.name: _sha256(file) for file in files if file.is_file()}
+        first = source.frame(0)
+        checksums["first frame"] = hashlib.sha256(first.rgb.tobytes() + first.depth_m.tobytes()).hexdigest()
+        return {"sequence": source.name, "format": source.format, "frames": len(source), "sha256": checksums}
+    raise BadInput("figure source", type(source).__name__, "a Run, an Evaluation, a Benchmark, a Sequence, or a file")
+
+
+def _what_ran(info: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: info.get(key) for key in _WHAT_RAN}
+
+
+def _run_id(run: Run) -> str:
+    """Twelve digits that stand for everything that decides a run's poses: its parameters and what ran on what."""
+    config = run.path / "config.toml"
+    text = json.dumps(_what_ran(run.info), sort_keys=True) + (config.read_text() if config.is_file() else "")
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _sha256(path: Path) -> str | None:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+
+
+def _target(folder: Path, name: str) -> Path:
+    """Where NAME goes, without a suffix."""
+    if not re.fullmatch(r"\w[\w-]*", name):
+        raise BadInput("figure name", repr(name), "letters, digits, '_' and '-': it names files")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder / name
+
+
+def _write_plot(figure: Any, target: Path) -> int:
+    """PNG and PDF of a Matplotlib figure; the width in pixels at which it reads well on a screen."""
+    with style.applied():
+        figure.savefig(target.with_name(f"{target.name}.png"), metadata={"Software": None})
+        figure.savefig(target.with_name(f"{target.name}.pdf"), metadata={"CreationDate": None})
+        return round(figure.get_figwidth() * figure.dpi)
+
+
+def _write_picture(image: np.ndarray, target: Path) -> int:
+    from PIL import Image
+
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise BadInput(f"figure {target.name}", f"{image.shape} {image.dtype}", "(H, W, 3) uint8, red first")
+    Image.fromarray(image).save(target.with_name(f"{target.name}.png"), optimize=True)
+    return image.shape[1]
+
+
+def _write_note(
+    target: Path,
+    suffixes: list[str],
+    sources: Iterable[Any],
+    parameters: Mapping[str, Any] | None,
+    drawn_with: list[str],
+) -> None:
+    from importlib.metadata import version
+
+    made = provenance()
+    made["versions"] |= {name: version(name) for name in drawn_with}
+    files = {f"{target.name}{suffix}": _sha256(target.with_name(f"{target.name}{suffix}")) for suffix in suffixes}
+    note = {
+        "parameters": {key: _plain(value) for key, value in (parameters or {}).items()},
+        "sources": [describe(source) for source in sources],
+        **made,
+        "sha256": files,
+    }
+    path = target.with_name(f"{target.name}.json")
+    path.write_text(json.dumps(note, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """As JSON holds it; a path is named by its last part alone."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    if isinstance(value, Path):
+        return value.name
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def _cell(value: Any) -> str:
+    if value is None or value != value:  # NaN
+        return "-"
+    return f"{value:g}" if isinstance(value, float) else str(value).replace("|", "\\|")

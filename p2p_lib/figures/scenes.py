@@ -1,0 +1,208 @@
+"""What a run shows at a frame: boxes, axes, paths and statuses on its video; single pictures, stories, films."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame, PoseEstimate
+from p2p_lib.datasets.runs import ObjectRun, Run
+from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.evaluation.protocol import Evaluation
+from p2p_lib.figures import overlay, style
+from p2p_lib.figures.overlay import Box, Label
+from p2p_lib.figures.plots import gaps
+from p2p_lib.method.pipeline import Point2Pose
+
+
+class Scene:
+    """A run on its video, ready to be drawn.
+
+    evaluation  brings the model's frame into the object's, and with it true boxes beside the estimated ones
+    boxes       object to its box in the object's frame, where there is no model or another is wanted
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        run: Run,
+        evaluation: Evaluation | None = None,
+        boxes: Mapping[str, Box] | None = None,
+        truth: bool = True,
+    ):
+        if sequence.name != run.info["sequence"]:
+            raise BadInput("scene", f"a run of {run.info['sequence']!r}", f"one of {sequence.name!r}")
+        _check_same_data(sequence, run)
+        self.sequence, self.run = sequence, run
+        known = set(run.objects) <= set(sequence.objects)  # a folder without masks knows no names
+        self.colours = style.object_colours(sequence.objects if known else run.objects)
+        self._T_obj_model = {k: s.T_obj_model for k, s in evaluation.objects.items()} if evaluation else {}
+        self._model_boxes = {name: Box.around(points) for name, points in run.points.items()} if truth else {}
+        self._boxes = {
+            name: Box.around(run.points[name], T)
+            for name, T in self._T_obj_model.items()
+            if name in run.points and np.isfinite(T).all()
+        } | dict(boxes or {})
+
+    def __len__(self) -> int:
+        return len(next(iter(self.run.objects.values())))
+
+    def row(self, index: int) -> int:
+        """The row of the run that is of frame ``index`` of the sequence; :class:`BadInput` where there is none."""
+        frames = next(iter(self.run.objects.values())).frame_index
+        (rows,) = np.nonzero(frames == index)
+        if not len(rows):
+            raise BadInput("frame", index, f"one of the run, {frames[0]} to {frames[-1]}")
+        return int(rows[0])
+
+    def draw(
+        self,
+        row: int,
+        region_px: tuple[int, int, int, int] | None = None,
+        width_px: int | None = None,
+        axes: bool = True,
+        trail: int = 30,
+        words: bool = True,
+    ) -> np.ndarray:
+        """The run's ``row``-th frame, cut to a region and scaled to a width; ``words`` are names, statuses, the time.
+
+        Estimated boxes are in their object's colour, true ones white and dashed; an object that is hidden has only
+        its true box. ``trail`` is the number of earlier frames whose path is drawn.
+        """
+        first = next(iter(self.run.objects.values()))
+        frame = self.sequence.frame(int(first.frame_index[row]))
+        camera, image = self.sequence.camera, frame.rgb
+        region_px = region_px or (0, 0, camera.width, camera.height)
+        image, camera = overlay.zoomed(image, camera, region_px, width_px or region_px[2] - region_px[0])
+        labels = []
+        for name, obj in self.run.objects.items():
+            image = self._draw_object(image, camera, name, obj, row, axes, trail)
+            labels.append(self._label(camera, name, obj, row))
+        if not words:
+            return image
+        image = overlay.draw_labels(image, [label for label in labels if label is not None])
+        return overlay.draw_caption(image, f"{self.sequence.name}  {frame.time_s:.2f} s")
+
+    def film(self, rows: Iterable[int] | None = None, **drawing) -> Iterator[np.ndarray]:
+        """The pictures of these rows (default: all) one after the other; ``drawing`` as of :meth:`draw`."""
+        return (self.draw(row, **drawing) for row in (range(len(self)) if rows is None else rows))
+
+    def story(self, count: int = 6, columns: int = 3, width_px: int = 360) -> np.ndarray:
+        """One sheet of ``count`` frames that tell what happened, cut to where the objects are."""
+        region_px = self.region()
+        return overlay.montage([self.draw(row, region_px, width_px, trail=0) for row in self.moments(count)], columns)
+
+    def moments(self, count: int) -> list[int]:
+        """Rows that tell the story: the first, each gap's middle and the return from it, then what lies between."""
+        n, wanted = len(self), [0]
+        for obj in self.run.objects.values():
+            for start, stop in gaps(obj):
+                wanted += [(start + stop) // 2, min(stop + 2, n - 1)]
+        rows = sorted(set(wanted))[:count]
+        while len(rows) < min(count, n):
+            ends = [*rows, n - 1 + (rows[-1] != n - 1)]
+            widest = max(range(len(ends) - 1), key=lambda k: ends[k + 1] - ends[k])
+            rows = sorted({*rows, (ends[widest] + ends[widest + 1]) // 2})
+        return rows
+
+    def region(self, margin: float = 0.08) -> tuple[int, int, int, int]:
+        """Where in the picture the objects are over the whole run, with a margin (a share of the picture's width)."""
+        camera = self.sequence.camera
+        uv = [
+            camera.project(se3.transform(T, overlay.box_corners(box.size_m)))
+            for name, obj in self.run.objects.items()
+            for T, box in self._placed(name, obj)
+        ]
+        uv = np.concatenate([x.reshape(-1, 2) for x in uv]) if uv else np.zeros((0, 2))
+        uv = uv[camera.inside(uv)]
+        if not len(uv):
+            return 0, 0, camera.width, camera.height
+        low, high = uv.min(0) - margin * camera.width, uv.max(0) + margin * camera.width
+        left, top = np.maximum(np.floor(low), 0).astype(int)
+        right, bottom = np.minimum(np.ceil(high), [camera.width, camera.height]).astype(int)
+        return int(left), int(top), int(right), int(bottom)
+
+    def _placed(self, name: str, obj: ObjectRun) -> Iterator[tuple[np.ndarray, Box]]:
+        """T_cam_box (k, 4, 4) of all estimated, then of all true boxes of an object."""
+        if box := self._boxes.get(name):
+            yield obj.T_cam_obj[obj.has_pose] @ box.T_obj_box, box
+        if box := self._model_boxes.get(name):
+            yield obj.T_cam_model[obj.has_truth] @ box.T_obj_box, box
+
+    def _draw_object(
+        self, image: np.ndarray, camera: Camera, name: str, obj: ObjectRun, row: int, axes: bool, trail: int
+    ) -> np.ndarray:
+        colour, box, true_box = self.colours[name], self._boxes.get(name), self._model_boxes.get(name)
+        T_obj_centre = box.T_obj_box if box else se3.IDENTITY
+        if true_box and obj.has_truth[row]:
+            image = overlay.draw_box(
+                image, camera, obj.T_cam_model[row] @ true_box.T_obj_box, true_box.size_m, style.TRUTH, 1, dashed=True
+            )
+        if not obj.has_pose[row]:
+            return image
+        path = camera.project((obj.T_cam_obj[max(row - trail, 0) : row + 1] @ T_obj_centre)[:, :3, 3])
+        image = overlay.draw_trail(image, path, colour)
+        T_cam_box = obj.T_cam_obj[row] @ T_obj_centre
+        if box:
+            image = overlay.draw_box(image, camera, T_cam_box, box.size_m, colour)
+        length_m = 0.45 * float(np.max(box.size_m)) if box else 0.05
+        return overlay.draw_axes(image, camera, T_cam_box, length_m) if axes else image
+
+    def _label(self, camera: Camera, name: str, obj: ObjectRun, row: int) -> Label | None:
+        """The object's name and status, at its estimated box, else its true one, else where it was last seen."""
+        box, true_box = self._boxes.get(name), self._model_boxes.get(name)
+        T_cam_box, size_m = None, np.zeros(3)
+        before = np.flatnonzero(obj.has_pose[: row + 1])
+        if not obj.has_pose[row] and true_box and obj.has_truth[row]:
+            T_cam_box, size_m = obj.T_cam_model[row] @ true_box.T_obj_box, true_box.size_m
+        elif len(before):
+            T_cam_box = obj.T_cam_obj[before[-1]] @ (box.T_obj_box if box else se3.IDENTITY)
+            size_m = box.size_m if box else size_m
+        if T_cam_box is None:
+            return None
+        uv = camera.project(se3.transform(T_cam_box, overlay.box_corners(size_m)))
+        if not np.isfinite(uv).all():
+            return None
+        return Label(f"{name}: {obj.status[row]}", self.colours[name], (*uv.min(0), *uv.max(0)))
+
+
+def draw_live(
+    method: Point2Pose,
+    frame: Frame,
+    estimates: Mapping[str, PoseEstimate],
+    masks: Mapping[str, np.ndarray] | None = None,
+    title: str = "",
+) -> np.ndarray:
+    """The tracker's own view of a frame: each object's mask, keypoints (pending ones as rings), axes and status.
+
+    The keypoints are those of the map, projected with the estimate: they sit where the map says, not where a
+    2D track is.
+    """
+    image, labels = frame.rgb, []
+    colours = style.object_colours(method.objects)
+    image = overlay.draw_masks(image, masks or {}, colours, fill=0.15)
+    for name, estimate in estimates.items():
+        T_cam_obj, keypoints = estimate.T_cam_obj, method.objects[name].map
+        if T_cam_obj is None or not len(keypoints):
+            continue
+        uv_px = method.camera.project(se3.transform(T_cam_obj, keypoints.p_obj))
+        image = overlay.draw_points(image, uv_px[~keypoints.promoted], colours[name], 3, filled=False)
+        image = overlay.draw_points(image, uv_px[keypoints.promoted], colours[name], 2.5)
+        image = overlay.draw_axes(image, method.camera, T_cam_obj, 0.06)
+        low, high = np.nanmin(uv_px, 0), np.nanmax(uv_px, 0)
+        labels.append(Label(f"{name}: {estimate.status}", colours[name], (*low, *high)))
+    return overlay.draw_caption(overlay.draw_labels(image, labels), f"{title}  {frame.time_s:.2f} s".strip())
+
+
+def _check_same_data(sequence: Sequence, run: Run) -> None:
+    """The run's truth must be the sequence's: a synthetic one may have been generated anew since."""
+    for name, obj in run.objects.items():
+        truth = sequence.truth.get(name)
+        if truth is None or not len(obj):
+            continue
+        if not np.allclose(truth.T_cam_model[obj.frame_index], obj.T_cam_model, atol=1e-6, equal_nan=True):
+            raise BadInput("scene", f"a run on another {sequence.name!r}", "the data it ran on", "Run it again.")

@@ -1,0 +1,232 @@
+"""A run in 3D with a time slider, as one page that needs nothing else: what ``p2p view`` opens.
+
+In camera coordinates: what the camera saw as points, its picture, and each object where it was estimated to be: axes,
+reconstructed surface, keypoints (those seen at the moment are bright), the keyframes as the small cameras they were
+taken from. An object without a pose is not drawn; its path stays, coloured by status. The page is made with viser.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import html
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.types import Status
+from p2p_lib.datasets.runs import quaternion_xyzw
+from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.figures import style
+from p2p_lib.figures.playback import Playback
+
+#: Moments at which points and picture are renewed, points each time, and the picture's width: about 2 MB with all that
+#: draws them.
+MOMENTS, POINTS, PICTURE_PX = 30, 5000, 240
+#: Sizes in metres of what is drawn at the object, its keyframes and its points.
+_AXES_M, _KEYFRAME_M, _POINT_M = 0.06, 0.012, 0.003
+_CLOUD_POINT_M, _CAMERA_M = 0.006, 0.08
+#: Faces of a surface; finer ones are thinned out.
+_FACES = 20_000
+_LEGEND = """<div style="position:fixed;right:12px;top:12px;z-index:9;font:13px/1.5 system-ui,sans-serif;
+background:#fffc;padding:6px 10px;border-radius:4px;pointer-events:none">{title}<br>{objects}<br>{statuses}</div>"""
+
+
+def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS) -> str:
+    """The whole page as HTML: it works offline, from a file, and inside another page."""
+    from viser import ViserServer
+
+    with _silence():
+        server = ViserServer(host="127.0.0.1", port=0, verbose=False)
+        try:
+            scene = _Scene(server, playback, points)
+            recording = server.get_scene_serializer()
+            shown = set(np.linspace(0, len(playback) - 1, moments).astype(int).tolist())
+            for i in range(len(playback)):
+                scene.show(i, i in shown)
+                after = playback.times_s[i + 1] if i + 1 < len(playback) else playback.times_s[i] + 1 / 30
+                recording.insert_sleep(float(after - playback.times_s[i]))
+            page = recording.as_html()
+        finally:
+            server.stop()
+    end = page.rindex("</body>") if "</body>" in page else len(page)
+    return page[:end] + _legend(playback) + page[end:]
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Viser greets and takes its leave, whatever it is told."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+def write_page(run: str | Path, out: str | Path | None = None, sequence: Sequence | None = None) -> Path:
+    """Write the page of a run's folder (default: ``view.html`` in it); the path written."""
+    playback = Playback.of(run, sequence)
+    out = Path(out) if out is not None else playback.run.path / "view.html"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(scene_page(playback), encoding="utf-8")
+    return out
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A page inside a notebook, and inside the pages that notebooks are exported to."""
+
+    path: Path
+    height_px: int
+
+    def _repr_mimebundle_(self, include=None, exclude=None):
+        inside = html.escape(self.path.read_text(encoding="utf-8"), quote=True)
+        frame = f'<iframe srcdoc="{inside}" width="100%" height="{self.height_px}" style="border:0"></iframe>'
+        return {"text/html": frame, "text/plain": f"<{self.path.name}>"}
+
+
+def show_run(run: str | Path, sequence: Sequence | None = None, height_px: int = 560) -> Shown:
+    """The page of a run's folder, written there as ``view.html`` and shown by the cell that ends with it."""
+    return Shown(write_page(run, sequence=sequence), height_px)
+
+
+class _Scene:
+    """What stands in the scene, and how it changes with time."""
+
+    def __init__(self, server: Any, playback: Playback, points: int):
+        self._playback, self._points, self._scene = playback, points, server.scene
+        server.scene.set_up_direction("-y")
+        middle = _middle(playback)
+        server.initial_camera.position = tuple(middle + middle[2] * np.array([0.35, -0.5, -1.0]))
+        server.initial_camera.look_at = tuple(middle)
+        self._camera = None
+        if playback.sequence is not None:
+            camera = playback.sequence.camera
+            self._camera = server.scene.add_camera_frustum(
+                "/camera",
+                fov=float(2 * np.arctan(camera.height / 2 / camera.fy)),
+                aspect=camera.width / camera.height,
+                scale=_CAMERA_M,
+                thickness=_CAMERA_M / 40,
+                color=style.rgb(style.NEUTRAL[0]),
+            )
+        self._objects = {name: self._add_object(name) for name in playback.run.objects}
+
+    def _add_object(self, name: str) -> dict[str, Any]:
+        """The nodes of one object; those below its frame follow it."""
+        scene, playback, colour = self._scene, self._playback, style.rgb(self._playback.colours[name])
+        at = f"/objects/{name}"
+        nodes = {"frame": scene.add_frame(at, axes_length=_AXES_M, axes_radius=_AXES_M / 25, visible=False)}
+        nodes["label"] = scene.add_label(f"/labels/{name}", name, visible=False, anchor="bottom-center")
+        if name in playback.meshes:
+            scene.add_mesh_trimesh(f"{at}/surface", _thinned(playback.meshes[name]))
+        if name in playback.keypoints and len(playback.keypoints[name].ids):
+            p_obj = playback.keypoints[name].p_obj
+            faint = np.tile(np.array(style.rgb(style.NEUTRAL[1]), np.uint8), (len(p_obj), 1))
+            nodes["keypoints"] = scene.add_point_cloud(
+                f"{at}/keypoints", p_obj, faint, point_size=1.4 * _POINT_M, point_shape="circle", precision="float32"
+            )
+        rows, T_obj_cam = playback.keyframes(name)
+        wxyz, aspect = quaternion_xyzw(T_obj_cam)[:, [3, 0, 1, 2]], 4 / 3
+        nodes["keyframes"] = [
+            scene.add_camera_frustum(
+                f"{at}/keyframes/{playback.frame_index[row]}",
+                fov=0.8,
+                aspect=aspect,
+                scale=_KEYFRAME_M,
+                thickness=_KEYFRAME_M / 12,
+                color=colour,
+                wxyz=q,
+                position=T[:3, 3],
+                visible=False,
+            )
+            for row, q, T in zip(rows, wxyz, T_obj_cam, strict=True)
+        ]
+        nodes["keyframe_rows"] = rows
+        self._add_path(name)
+        return nodes
+
+    def _add_path(self, name: str) -> None:
+        """Where the object was at every frame, in the colour of its status then."""
+        obj, has = self._playback.run.objects[name], self._playback.has_pose(name)
+        if has.any():
+            fill = np.array([style.rgb(style.STATUS[Status(s)][0]) for s in obj.status[has]], np.uint8)
+            self._scene.add_point_cloud(
+                f"/paths/{name}", obj.T_cam_obj[has, :3, 3], fill, point_size=_POINT_M, precision="float32"
+            )
+
+    def show(self, i: int, renew: bool) -> None:
+        """Change the scene to row i; ``renew``: its points, picture and bright keypoints too."""
+        for name, nodes in self._objects.items():
+            self._show_object(name, nodes, i, renew)
+        frame = self._playback.frame(i) if renew else None
+        if frame is not None:
+            p_cam, colours = self._playback.cloud(frame, self._points)
+            self._scene.add_point_cloud("/points", p_cam, colours, point_size=_CLOUD_POINT_M)
+            size = (PICTURE_PX, round(PICTURE_PX * frame.shape[0] / frame.shape[1]))
+            self._camera.image = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+
+    def _show_object(self, name: str, nodes: dict[str, Any], i: int, renew: bool) -> None:
+        obj, has = self._playback.run.objects[name], bool(self._playback.has_pose(name)[i])
+        before = bool(self._playback.has_pose(name)[i - 1]) if i else None
+        if has != before:
+            nodes["frame"].visible = has
+        if i == 0 or obj.status[i] != obj.status[i - 1]:
+            nodes["label"].text = f"{name}: {obj.status[i]}"
+        if has:
+            T = obj.T_cam_obj[i]
+            x, y, z, w = quaternion_xyzw(T)
+            nodes["frame"].wxyz, nodes["frame"].position = (w, x, y, z), T[:3, 3]
+            nodes["label"].position = T[:3, 3] - [0, 1.5 * _AXES_M, 0]
+            if before is None or not nodes["label"].visible:
+                nodes["label"].visible = True
+        for k in np.flatnonzero(nodes["keyframe_rows"] == i):
+            nodes["keyframes"][k].visible = True
+        if renew and "keypoints" in nodes:
+            points = self._playback.keypoints[name]
+            seen = np.isin(points.ids, points.track_id[points.at(int(self._playback.frame_index[i]))])
+            shades = np.array([style.rgb(style.NEUTRAL[1]), style.rgb(self._playback.colours[name])], np.uint8)
+            nodes["keypoints"].colors = shades[seen.astype(int)]
+
+
+def _middle(playback: Playback) -> np.ndarray:
+    """(3,) about where the objects are, in camera coordinates."""
+    poses = np.concatenate([obj.T_cam_obj[obj.has_pose, :3, 3] for obj in playback.run.objects.values()])
+    return np.median(poses, 0) if len(poses) else np.array([0.0, 0.0, 0.7])
+
+
+def _thinned(mesh: Any) -> Any:
+    """A surface of at most so many faces, by merging the corners within a cell that grows until that is reached."""
+    import trimesh
+
+    cell_m, whole = 0.003, mesh
+    while len(mesh.faces) > _FACES:
+        keys = np.floor(np.asarray(whole.vertices) / cell_m).astype(np.int64)
+        _, first, to = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        faces = to.ravel()[np.asarray(whole.faces)]
+        distinct = (faces != np.roll(faces, 1, 1)).all(1)
+        colours = np.asarray(whole.visual.vertex_colors)[first]
+        mesh = trimesh.Trimesh(whole.vertices[first], faces[distinct], vertex_colors=colours, process=False)
+        cell_m *= 1.4
+    return mesh
+
+
+def _legend(playback: Playback) -> str:
+    info, run = playback.run.info, playback.run
+    occurring = [s for s in style.STATUS if any((obj.status == str(s)).any() for obj in run.objects.values())]
+    title = f"{info['sequence']}, tracker {info['tracker']}, {len(playback)} frames"
+    return _LEGEND.format(
+        title=html.escape(title),
+        objects=", ".join(f'<b style="color:{c}">{html.escape(name)}</b>' for name, c in playback.colours.items()),
+        statuses=" ".join(_swatch(style.STATUS[s][0], str(s)) for s in occurring),
+    )
+
+
+def _swatch(colour: str, text: str) -> str:
+    return f'<span style="background:{colour};border:1px solid #888;padding:0 6px"></span> {html.escape(text)} &nbsp;'

@@ -1,0 +1,349 @@
+"""The keyframe graph of one object (paper: section "Graph Optimization" and its appendix).
+
+Variables are the inverse keyframe poses X_m = T_obj_cam and the keypoints p_n in the object frame:
+the object stands still and a virtual camera moves around it. Three losses tie them: a prior that
+anchors the first keyframe, relative poses from registration, and bearing and range of each keypoint
+seen. GTSAM's own factors and its Levenberg-Marquardt solve it; this is the one file that knows GTSAM.
+
+State is kept as plain arrays, so that a solve that fails leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.config import FactorGraphConfig
+from p2p_lib.core.errors import BadInput
+from p2p_lib.method.keyframes import Keyframe, Link, condense, misfit
+
+# gtsam's keys: a letter in the highest byte.
+_X, _P = ord("x") << 56, ord("p") << 56
+# Points that a keyframe must share with the others where no relative pose holds it.
+_ANCHORING_POINTS = 3
+# A variance above this means that nothing determines the direction: a turn, or ten metres.
+_UNDETERMINED = np.repeat([(2 * np.pi) ** 2, 10.0**2], 3)
+
+
+@dataclass(frozen=True, eq=False)
+class GraphResult:
+    """What the graph knows after a solve; after a failed one, what it knew before.
+
+    ok, reason             whether the newest keyframe was solved for; else why it was left out
+    keys (M,)              as returned by ``add_keyframe``; keyframes merged into others are no longer listed
+    T_cam_obj (M, 4, 4)    poses of those keyframes
+    point_ids (N,), p_obj (N, 3)  keypoints, sorted by id
+    residual_sigmas (N,)   median over a point's observations of the misfit, in standard deviations
+    suspects (K,)          ids of points seen at least twice that disagree in most of their observations
+    covariance             (6, 6) of the newest keyframe, right tangent of T_cam_obj in the object
+                           frame, rotation first; None where the graph does not determine it
+    error_before, error_after  value of the loss
+    """
+
+    ok: bool
+    reason: str
+    keys: np.ndarray
+    T_cam_obj: np.ndarray
+    point_ids: np.ndarray
+    p_obj: np.ndarray
+    residual_sigmas: np.ndarray
+    suspects: np.ndarray
+    covariance: np.ndarray | None
+    error_before: float
+    error_after: float
+
+
+@dataclass(eq=False)
+class _Solution:
+    T_obj_cam: dict[int, np.ndarray]
+    points: dict[int, np.ndarray]
+    covariance: np.ndarray | None
+    error_before: float
+    error_after: float
+    note: str = field(default="")
+
+
+class ObjectGraph:
+    """Keyframes and keypoints of one object; ``add_keyframe``, then ``optimise``."""
+
+    def __init__(self, config: FactorGraphConfig):
+        self.config = config
+        self._keyframes: dict[int, Keyframe] = {}
+        self._points: dict[int, np.ndarray] = {}
+        self._new: list[int] = []  # added since the last solve that went well
+        self._next_key = 0
+        self._last: _Solution | None = None
+        self._anchor = se3.IDENTITY
+        if config.enabled:  # its import takes a second that no frame should wait for
+            importlib.import_module("gtsam")
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """The keyframes that are held, oldest first: those that were merged into others are not."""
+        return tuple(sorted(self._keyframes))
+
+    def add_keyframe(
+        self,
+        T_cam_obj: np.ndarray,
+        point_ids: np.ndarray,
+        p_cam: np.ndarray,
+        *,
+        p_obj_init: np.ndarray,
+        covariance: np.ndarray | None = None,
+        sigma_rad: np.ndarray | float | None = None,
+        sigma_m: np.ndarray | float | None = None,
+    ) -> int:
+        """A new keyframe, to be solved for by the next ``optimise``; returns its key.
+
+        T_cam_obj     (4, 4) from registration. The first keyframe's is where the prior anchors the graph
+        point_ids     (N,) distinct; p_cam (N, 3) their observations. Rows that are not finite are left out
+        p_obj_init    (N, 3) where points that the graph does not know yet start from
+        covariance    (6, 6) of the pose relative to the keyframe before, right tangent of T_cam_obj, as far
+                      as it comes from elsewhere than these observations (the surface): what is counted
+                      twice makes the result too sure. None: the configured noise, at the object
+        sigma_rad, sigma_m  noise of bearings and ranges, (N,) or one for all; configured values where None
+        """
+        T_obj_cam = se3.inverse(se3.check("keyframe T_cam_obj", T_cam_obj))
+        ids = np.asarray(point_ids, np.int64).reshape(-1)
+        p_cam, start = np.asarray(p_cam, float).reshape(-1, 3), np.asarray(p_obj_init, float).reshape(-1, 3)
+        if not len(ids) == len(p_cam) == len(start) == len(np.unique(ids)):
+            got = f"{len(np.unique(ids))} distinct of {len(ids)} ids, {len(p_cam)} p_cam, {len(start)} p_obj_init"
+            raise BadInput("keyframe points", got, "distinct ids and a row for each")
+        sigma = np.stack([np.broadcast_to(s, ids.shape) for s in self._noise(sigma_rad, sigma_m)], -1)
+        usable = np.isfinite(p_cam).all(1) & np.isfinite(start).all(1) & (np.linalg.norm(p_cam, axis=1) > 1e-6)
+        usable &= (np.isfinite(sigma) & (sigma > 0)).all(1)
+        key, link = self._next_key, None
+        if self._keyframes:
+            link = self._link(T_obj_cam, start[usable], covariance)
+        else:
+            self._anchor = T_obj_cam
+        self._keyframes[key] = Keyframe(T_obj_cam, ids[usable], p_cam[usable], sigma[usable], link)
+        for i, p in zip(ids[usable].tolist(), start[usable], strict=True):
+            self._points.setdefault(i, p)
+        self._new.append(key)
+        self._next_key += 1
+        return key
+
+    def forget(self, point_ids: np.ndarray) -> None:
+        """Takes points and all their observations out of the graph (a keypoint that the map retired)."""
+        gone = np.asarray(point_ids, np.int64)
+        for keyframe in self._keyframes.values():
+            stays = ~np.isin(keyframe.ids, gone)
+            if not stays.all():
+                keyframe.replace_observations(keyframe.ids[stays], keyframe.p_cam[stays], keyframe.sigma[stays])
+        for i in gone.tolist():
+            self._points.pop(i, None)
+
+    def optimise(self) -> GraphResult:
+        """Solves for all keyframes and keypoints. Never raises for what the data cannot determine: see ``ok``."""
+        reason = self._why_not()
+        solution = None
+        if not reason:
+            try:
+                solution = _solve(self._keyframes, self._points, self._anchor, self.config)
+            except (RuntimeError, ValueError) as error:  # gtsam's, for an indeterminate system or impossible noise
+                reason = "gtsam: " + str(error).strip().splitlines()[0]
+            else:
+                reason = _implausible(solution)
+        if reason:
+            left_out = ", ".join(map(str, self._new))
+            for key in self._new:
+                del self._keyframes[key]
+            self._new = []
+            self._drop_unseen()
+            return self._result(False, f"keyframe {left_out} left out: {reason}" if left_out else reason)
+        for key, T_obj_cam in solution.T_obj_cam.items():
+            self._keyframes[key].T_obj_cam = T_obj_cam
+        self._points |= solution.points
+        self._new, self._last = [], solution
+        result = self._result(True, solution.note)
+        condense(self._keyframes, self._points, self.config.max_keyframes, self.config.suspect_sigmas)
+        self._drop_unseen()
+        return result
+
+    def _noise(self, sigma_rad: np.ndarray | float | None, sigma_m: np.ndarray | float | None) -> tuple[Any, Any]:
+        cfg = self.config
+        return (
+            cfg.bearing_sigma_rad if sigma_rad is None else sigma_rad,
+            cfg.range_sigma_m if sigma_m is None else sigma_m,
+        )
+
+    def _link(self, T_obj_cam: np.ndarray, p_obj: np.ndarray, covariance: np.ndarray | None) -> Link:
+        """The relative pose to the newest keyframe; its noise moved from the object to X's right tangent."""
+        if not _is_covariance(covariance):
+            about = se3.from_rt(np.eye(3), p_obj.mean(0) if len(p_obj) else np.zeros(3))
+            sigmas = np.repeat([self.config.between_sigma_rad, self.config.between_sigma_m], 3)
+            A = se3.adjoint(about)
+            covariance = A @ np.diag(sigmas**2) @ A.T
+        previous = max(self._keyframes)
+        relative = se3.inverse(self._keyframes[previous].T_obj_cam) @ T_obj_cam
+        A = se3.adjoint(se3.inverse(T_obj_cam))
+        return Link(previous, relative, A @ covariance @ A.T)
+
+    def _why_not(self) -> str:
+        """What keeps the graph from being solved, as far as its structure tells; empty if nothing does."""
+        if not self._keyframes:
+            return "no keyframes"
+        first = min(self._keyframes)
+        for key in self._new:
+            keyframe = self._keyframes[key]
+            if key == first or (self.config.between and keyframe.link):
+                continue
+            earlier = np.concatenate([k.ids for other, k in self._keyframes.items() if other < key])
+            shared = int(np.isin(keyframe.ids, earlier).sum()) if self.config.observations else 0
+            if shared < _ANCHORING_POINTS:
+                return f"{shared} points shared with earlier keyframes and no relative pose"
+        return ""
+
+    def _drop_unseen(self) -> None:
+        seen = {i for keyframe in self._keyframes.values() for i in keyframe.ids.tolist()}
+        self._points = {i: p for i, p in self._points.items() if i in seen}
+
+    def _result(self, ok: bool, reason: str) -> GraphResult:
+        keys = np.array(sorted(self._keyframes), np.int64)
+        ids = np.array(sorted(self._points), np.int64)
+        poses = [self._keyframes[k].T_obj_cam for k in keys.tolist()]
+        p_obj = np.array([self._points[i] for i in ids.tolist()]).reshape(-1, 3)
+        residual, suspects = self._misfits(ids, p_obj)
+        last = self._last
+        return GraphResult(
+            ok,
+            reason,
+            keys,
+            se3.inverse(np.array(poses).reshape(-1, 4, 4)),
+            ids,
+            p_obj,
+            residual,
+            suspects,
+            last.covariance if last else None,
+            last.error_before if last else 0.0,
+            last.error_after if last else 0.0,
+        )
+
+    def _misfits(self, ids: np.ndarray, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Median misfit of each point in standard deviations, and which points disagree mostly."""
+        if not len(ids):
+            return np.zeros(0), np.zeros(0, np.int64)
+        keyframes = self._keyframes.values()
+        rows = np.searchsorted(ids, np.concatenate([k.ids for k in keyframes]))
+        expected = [se3.transform(se3.inverse(k.T_obj_cam), p_obj[np.searchsorted(ids, k.ids)]) for k in keyframes]
+        expected, seen = np.concatenate(expected), np.concatenate([k.p_cam for k in keyframes])
+        sigma = np.concatenate([k.sigma for k in keyframes])
+        off = misfit(expected, seen, sigma)
+        order = np.lexsort((off, rows))
+        count = np.bincount(rows, minlength=len(ids))
+        middle = (np.cumsum(count) - count) + count // 2
+        median = off[order][np.minimum(middle, len(order) - 1)]
+        return median, ids[(count >= 2) & (median > self.config.suspect_sigmas)]
+
+
+def _is_covariance(covariance: np.ndarray | None) -> bool:
+    return covariance is not None and np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance).min() > 0
+
+
+def _implausible(solution: _Solution) -> str:
+    values = [*solution.T_obj_cam.values(), *solution.points.values()]
+    if not all(np.isfinite(v).all() for v in values) or not np.isfinite(solution.error_after):
+        return "the solution is not finite"
+    if solution.error_after > solution.error_before * (1 + 1e-6) + 1e-9:
+        return f"the loss grew from {solution.error_before:.3g} to {solution.error_after:.3g}"
+    return ""
+
+
+def _solve(
+    keyframes: dict[int, Keyframe], points: dict[int, np.ndarray], anchor: np.ndarray, config: FactorGraphConfig
+) -> _Solution:
+    """Levenberg-Marquardt over all variables (paper: "Solving the Optimization"), and the newest covariance."""
+    import gtsam
+
+    first, newest = min(keyframes), max(keyframes)
+    graph, values, ordering = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Ordering()
+    if config.prior:
+        sigmas = np.repeat([config.prior_sigma_rad, config.prior_sigma_m], 3)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        graph.add(gtsam.PriorFactorPose3(_x(first), gtsam.Pose3(anchor), noise))
+    # Keypoints first: each is eliminated on its own, which leaves a small system of poses.
+    for i in sorted(points) if config.observations else ():
+        values.insert(_p(i), points[i])
+        ordering.push_back(_p(i))
+    for key in sorted(keyframes):
+        keyframe = keyframes[key]
+        values.insert(_x(key), gtsam.Pose3(keyframe.T_obj_cam))
+        ordering.push_back(_x(key))
+        if config.between and keyframe.link:
+            graph.add(_between(key, keyframe.link, config))
+        if config.observations:
+            if keyframe.factors is None:
+                keyframe.factors = _observations(key, keyframe, config)
+            graph.push_back(keyframe.factors)
+    params = gtsam.LevenbergMarquardtParams()
+    params.setlambdaInitial(config.damping)
+    params.setMaxIterations(config.iterations)
+    params.setRelativeErrorTol(config.relative_tolerance)
+    params.setOrdering(ordering)
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+    error_before, solved = optimiser.error(), optimiser.optimize()
+    covariance, note = _covariance(graph, solved, ordering, newest)
+    return _Solution(
+        {key: solved.atPose3(_x(key)).matrix() for key in keyframes},
+        {i: solved.atPoint3(_p(i)) for i in points} if config.observations else {},
+        covariance,
+        error_before,
+        optimiser.error(),
+        note,
+    )
+
+
+def _x(key: int) -> int:
+    return _X + key
+
+
+def _p(point_id: int) -> int:
+    return _P + point_id
+
+
+def _robust(gaussian: Any, config: FactorGraphConfig) -> Any:
+    import gtsam
+
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(config.huber), gaussian)
+
+
+def _between(key: int, link: Link, config: FactorGraphConfig) -> Any:
+    """L_reg of one keyframe."""
+    import gtsam
+
+    noise = _robust(gtsam.noiseModel.Gaussian.Covariance(link.covariance), config)
+    return gtsam.BetweenFactorPose3(_x(link.previous), _x(key), gtsam.Pose3(link.T_previous_this), noise)
+
+
+def _observations(key: int, keyframe: Keyframe, config: FactorGraphConfig) -> Any:
+    """L_obs of one keyframe: bearing (2) and range (1) of each point, in this order."""
+    import gtsam
+
+    graph = gtsam.NonlinearFactorGraph()
+    range_m = np.linalg.norm(keyframe.p_cam, axis=1)
+    rows = zip(keyframe.ids.tolist(), keyframe.p_cam, range_m.tolist(), keyframe.sigma.tolist(), strict=True)
+    for i, p_cam, distance, (sigma_rad, sigma_m) in rows:
+        noise = _robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_rad, sigma_rad, sigma_m])), config)
+        graph.add(gtsam.BearingRangeFactor3D(_x(key), _p(i), gtsam.Unit3(p_cam), distance, noise))
+    return graph
+
+
+def _covariance(graph: Any, solved: Any, ordering: Any, newest: int) -> tuple[np.ndarray | None, str]:
+    """The newest keyframe's marginal covariance, from X's right tangent to that of T_cam_obj.
+
+    T_cam_obj exp(eta) is the inverse of X exp(xi) for eta = -Ad_X xi.
+    """
+    try:
+        marginal = graph.linearize(solved).eliminateMultifrontal(ordering).marginalCovariance(_x(newest))
+    except (RuntimeError, ValueError):
+        return None, "no covariance: nothing anchors the graph"
+    A = se3.adjoint(solved.atPose3(_x(newest)).matrix())
+    covariance = A @ marginal @ A.T
+    if not np.isfinite(covariance).all() or (np.diag(covariance) > _UNDETERMINED).any():
+        return None, "no covariance: nothing anchors the graph"
+    return (covariance + covariance.T) / 2, ""

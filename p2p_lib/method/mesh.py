@@ -1,0 +1,105 @@
+"""Meshes from the fused volume: marching cubes, vertex colours, components, PLY and GLB."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from p2p_lib.core.errors import BadInput
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from p2p_lib.method.tsdf import TsdfVolume
+
+
+def extract(volume: TsdfVolume, min_weight: float = 1.0, min_component: float = 0.1) -> trimesh.Trimesh:
+    """The zero-crossing surface of a volume (paper: marching cubes on V(v) = 0), in the object frame.
+
+    Only cells whose eight voxels were observed with at least ``min_weight`` are meshed. Connected
+    components with less than ``min_component`` of the largest one's area are removed: depth noise.
+    Faces wind so that normals point outwards. An empty volume gives an empty mesh.
+    """
+    import trimesh
+
+    vertices, faces = _marching_cubes(volume, min_weight)
+    if len(faces) == 0:
+        return trimesh.Trimesh()
+    faces = faces[_large_components(vertices, faces, min_component)]
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used], faces.reshape(-1, 3)
+    return trimesh.Trimesh(
+        volume.origin_m + volume.voxel_m * vertices,
+        faces,
+        vertex_colors=_colours(volume, vertices),
+        process=False,
+    )
+
+
+def save(mesh: trimesh.Trimesh, path: str | Path) -> Path:
+    """Write a mesh as ``.ply`` or ``.glb`` (by the name's ending), making its folder.
+
+    Raises :class:`BadInput` for any other ending or a mesh without faces.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".ply", ".glb"):
+        raise BadInput("mesh file", path.name, "a name that ends in .ply or .glb")
+    if len(mesh.faces) == 0:
+        raise BadInput("mesh", "no faces", "a mesh of an observed surface", "Integrate at least one keyframe first.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mesh.export(path)
+    return path
+
+
+def _marching_cubes(volume: TsdfVolume, min_weight: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices in array indices (N, 3) and faces (M, 3), over fully observed cells."""
+    from skimage.measure import marching_cubes
+
+    value, observed = volume.values(), volume.weights() >= min_weight
+    cells = _cells(observed)
+    known = value[observed & np.isfinite(value)]
+    if not cells.any() or known.min() >= 0 or known.max() <= 0:
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    # scikit-image looks at the mask of a cell's last corner only.
+    mask = np.zeros(value.shape, bool)
+    mask[1:, 1:, 1:] = cells
+    vertices, faces, _, _ = marching_cubes(
+        np.where(observed, value, 1.0), 0.0, mask=mask, gradient_direction="descent", allow_degenerate=False
+    )
+    return vertices.astype(float), faces.astype(int)
+
+
+def _cells(observed: np.ndarray) -> np.ndarray:
+    """(nx-1, ny-1, nz-1): cells whose eight corners are all observed."""
+    for axis in range(3):
+        a = [slice(None)] * 3
+        b = [slice(None)] * 3
+        a[axis], b[axis] = slice(None, -1), slice(1, None)
+        observed = observed[tuple(a)] & observed[tuple(b)]
+    return observed
+
+
+def _large_components(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> np.ndarray:
+    """Which faces belong to components with at least ``min_share`` of the largest one's area."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(vertices)
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(n, n))
+    label = connected_components(graph, directed=False)[1][faces[:, 0]]
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    area = np.bincount(label, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    return (area >= min_share * area.max())[label]
+
+
+def _colours(volume: TsdfVolume, vertices: np.ndarray) -> np.ndarray:
+    """(N, 3) uint8 at array indices (N, 3): between the two voxels of each vertex's edge, by weight."""
+    low, high = np.floor(vertices).astype(int), np.ceil(vertices).astype(int)
+    share = (vertices - low).max(1)[:, None]
+    sums = volume.colours()
+    mixed = sums[tuple(low.T)] * (1 - share) + sums[tuple(high.T)] * share
+    rgb = mixed[:, :3] / np.maximum(mixed[:, 3:], 1e-6)
+    return np.clip(np.round(rgb), 0, 255).astype(np.uint8)

@@ -1,0 +1,466 @@
+"""SDF refinement: Levenberg-Marquardt of a pose on the fused surface (paper: SDF Refinement).
+
+Minimises, over D in SE(3), the Huber loss of the surface's signed distance at the measured points,
+``sum rho_H(Phi(T^-1 D^-1 p)^2)``, with ``T <- D T``. The increment is parameterised on the right,
+``D = T exp(xi) T^-1``, which makes ``D T = T exp(xi)``: the same pose, in the house's tangent.
+
+Ours beyond the paper: directions that the shape leaves free are not moved by it, keypoint residuals
+can join (texture holds what shape leaves free), and the result says how well each direction is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import RefinementConfig
+
+#: Fewer points on the observed surface than this determine nothing.
+MIN_POINTS = 10
+#: Damping is raised or lowered by this factor as steps fail or succeed.
+_DAMPING_FACTOR = 5.0
+#: No map is exact to less than this share of its voxels, however little the points scatter.
+_SIGMA_FLOOR_VOXELS = 0.25
+_MAD_TO_SIGMA = 1.4826
+#: The map's noise is independent this many voxels apart.
+_PAIR_VOXELS = 3.0
+#: A strength must exceed this many standard deviations of what noise alone makes of it.
+_CLEAR_OF_NOISE = 3.0
+
+
+class Surface(Protocol):
+    """What refinement asks of a volume; :class:`p2p_lib.method.tsdf.TsdfVolume` is one."""
+
+    tau_m: float
+    voxel_m: float
+
+    def query(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distance in metres and validity at points of the object frame."""
+        ...
+
+    def query_with_gradient(self, p_obj: np.ndarray, step_voxels: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same with the gradient in between."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Map points met again: p_obj (M, 3) in the map, p_cam (M, 3) as measured, sigma_m (M,) of each coordinate."""
+
+    p_obj: np.ndarray
+    p_cam: np.ndarray
+    sigma_m: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """A refined pose and what is known about it.
+
+    T_cam_obj    (4, 4); the input's where nothing could be refined
+    covariance   (6, 6) right tangent of T_cam_obj, [rotation rad, translation m], or None where not refined
+    rms_m        root mean square distance of the used points to the surface; NaN where none
+    inliers      share of the given points that lie on observed surface and were not trimmed
+    iterations   Levenberg-Marquardt steps tried
+    converged    whether it stopped because the step had become small
+    strengths    (6,): how firmly the shape holds each of :attr:`directions`, as the mean squared change of the
+                 points' distance per squared displacement; a plane has three at 0, a can one
+    directions   (6, 6) rows: unit tangents about the cloud's centre, rotation scaled by the cloud's radius
+    free_turns   (K, 6) right tangents of T_cam_obj, a radian each: how it may turn without leaving the surface
+    reason       why the pose was left alone, or what was held; empty otherwise
+    """
+
+    T_cam_obj: np.ndarray
+    covariance: np.ndarray | None = None
+    rms_m: float = float("nan")
+    inliers: float = 0.0
+    iterations: int = 0
+    converged: bool = False
+    strengths: np.ndarray | None = None
+    directions: np.ndarray | None = None
+    free_turns: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    reason: str = ""
+
+    @property
+    def refined(self) -> bool:
+        """Whether the surface took part at all."""
+        return self.covariance is not None
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """The surface at one pose: distances, and normal equations per point about the cloud's centre.
+
+    distance_m is that of every point, infinite off the observed surface. ``rows`` are the points used, J (n, 6) the
+    derivatives of their distances. H and g are means over them; rotations are scaled by the cloud's radius, so that
+    everything is in metres.
+
+    strengths (6,) and directions (6, 6), columns, say how firmly the shape holds the pose: H per unit of
+    squared gradient, without the noise of the gradients. A noisy plane's normals wobble, and H takes the
+    wobble for shape; the products of two neighbours' Jacobians, whose noise is independent, do not. What
+    is left may still be chance: a strength that does not stand clear of it is 0.
+    """
+
+    T: np.ndarray
+    distance_m: np.ndarray
+    H: np.ndarray
+    g: np.ndarray
+    strengths: np.ndarray
+    directions: np.ndarray
+    cut_m: float
+    rows: np.ndarray
+    J: np.ndarray
+    rms_m: float
+    sigma_m: float
+
+    @property
+    def used(self) -> int:
+        """How many points count."""
+        return len(self.rows)
+
+
+def refine(
+    T_cam_obj: np.ndarray,
+    p_cam: np.ndarray,
+    volume: Surface,
+    config: RefinementConfig,
+    *,
+    keypoints: Keypoints | None = None,
+) -> Refinement:
+    """Refine T_cam_obj so that the measured points p_cam (N, 3) lie on the volume's surface.
+
+    Points that are not finite or fall where nothing was observed take no part. Never raises for bad
+    numbers: with fewer than ten usable points the input pose comes back with the reason.
+    """
+    T_cam_obj = np.asarray(T_cam_obj, float)
+    if not np.isfinite(T_cam_obj).all():
+        return Refinement(T_cam_obj, reason="the pose to refine is not finite")
+    p_cam = _usable(p_cam, config.max_points)
+    keypoints = _usable_keypoints(keypoints, config.keypoint_weight)
+    if len(p_cam) < MIN_POINTS:
+        return Refinement(T_cam_obj, reason=f"{len(p_cam)} depth points, {MIN_POINTS} are needed")
+    problem = _Problem.about(T_cam_obj, p_cam, volume, config, keypoints)
+    if problem is None:
+        return Refinement(T_cam_obj, reason=f"fewer than {MIN_POINTS} depth points lie on observed surface")
+    return problem.solve(T_cam_obj)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    p_cam: np.ndarray
+    volume: Surface
+    config: RefinementConfig
+    keypoints: Keypoints | None
+    centre: np.ndarray  # of the cloud, object frame
+    radius: float  # of the cloud: turns a rotation into the displacement it causes
+    pairs: np.ndarray  # (P, 2) rows of p_cam: neighbours far enough apart for their noise to be independent
+
+    @classmethod
+    def about(cls, T_cam_obj, p_cam, volume, config, keypoints) -> _Problem | None:
+        p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
+        _, valid = volume.query(p_obj)
+        if valid.sum() < MIN_POINTS:
+            return None
+        centre = p_obj[valid].mean(0)
+        radius = float(np.sqrt(((p_obj[valid] - centre) ** 2).sum(-1).mean()))
+        pairs = _neighbours(p_cam, _PAIR_VOXELS * volume.voxel_m)
+        return cls(p_cam, volume, config, keypoints, centre, max(radius, 1e-4), pairs)
+
+    def solve(self, T: np.ndarray) -> Refinement:
+        config = self.config
+        damping, converged, tries = config.damping, False, 0
+        # Wide at first: far from the solution, the few points that hold a direction look like outliers.
+        at = self.surface(T, self.volume.tau_m / 2)
+        while tries < config.iterations and at is not None and not converged:
+            tries += 1
+            step = self.clipped(self.step(*self.joint(at), damping))
+            nearby = at if np.linalg.norm(step) < self.volume.voxel_m else None
+            new = self.surface(self.moved(at.T, step), self.volume.tau_m / 2 ** (tries + 1), nearby)
+            gain = self.cost(at, at) - self.cost(new, at) if new is not None else -np.inf
+            converged = abs(gain) < config.tolerance
+            if gain > 0:
+                at, damping = new, damping / _DAMPING_FACTOR
+            else:
+                damping = max(damping, 1e-4) * _DAMPING_FACTOR**2
+        if at is None:
+            return Refinement(T, iterations=tries, reason="the cloud lies beyond the surface's truncation")
+        strengths, directions = self.shape(at.rows, at.J)
+        return self.result(replace(at, strengths=strengths, directions=directions), tries, converged)
+
+    # -- the two kinds of residual -----------------------------------------------------------------
+
+    def surface(self, T: np.ndarray, widest_m: float = 0.0, beside: _Linear | None = None) -> _Linear | None:
+        """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points count.
+
+        Trims beyond so many MADs, but nothing within ``widest_m`` nor within Huber's threshold. What the shape holds
+        is taken from ``beside``, a pose nearby, where there is one: it hardly changes.
+        """
+        p_obj = se3.transform(se3.inverse(T), self.p_cam)
+        value, gradient, valid = self.volume.query_with_gradient(p_obj, self.config.gradient_voxels)
+        distance = np.where(valid, value, np.inf)
+        # Beyond the truncation the distance is not known and its gradient is 0.
+        near = np.flatnonzero(np.abs(distance) < 0.98 * self.volume.tau_m)
+        if len(near) < MIN_POINTS:
+            return None
+        middle = _median(value[near])
+        scatter = _MAD_TO_SIGMA * _median(np.abs(value[near] - middle))
+        sigma = max(scatter, _SIGMA_FLOOR_VOXELS * self.volume.voxel_m)
+        cut = max(abs(middle) + self.config.mad_trim * sigma, self.config.huber_m, widest_m)
+        used = near[np.abs(value[near]) <= cut]
+        r = value[used]
+        J = surface_jacobian((p_obj[used] - self.centre) / self.radius, gradient[used])
+        Jw = J * np.minimum(1.0, self.config.huber_m / np.maximum(np.abs(r), 1e-12))[:, None]
+        n, rms = len(used), float(np.sqrt((r * r).mean()))
+        held = (beside.strengths, beside.directions) if beside else self.shape(used, J)
+        return _Linear(T, distance, Jw.T @ J / n, Jw.T @ r / n, *held, cut, used, J, rms, sigma)
+
+    def shape(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Strengths (6,) ascending and directions (6, 6) columns, as :class:`_Linear` has them."""
+        H = J.T @ J / len(J)
+        row = np.full(len(self.p_cam), -1)
+        row[used] = np.arange(len(used))
+        a, b = row[self.pairs].T
+        both = (a >= 0) & (b >= 0)
+        count = int(both.sum())
+        steepness = max(np.trace(H[3:, 3:]), 1e-12)
+        if count < max(MIN_POINTS, len(used) // 4):
+            strength, direction = np.linalg.eigh(H)  # the points lie too far apart for pairs
+            return strength / steepness, direction
+        S = J[a[both]].T @ J[b[both]] / count
+        strength, direction = np.linalg.eigh((S + S.T) / 2)
+        wobble = np.einsum("ik,ij,jk->k", direction, H, direction) - strength
+        clear = strength > _CLEAR_OF_NOISE * np.abs(wobble) / np.sqrt(count)
+        return np.where(clear, np.maximum(strength, 0.0), 0.0) / steepness, direction
+
+    def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations of T^-1 p_cam - p_obj in standard deviations, same variables."""
+        k = self.keypoints
+        q = se3.transform(se3.inverse(T), k.p_cam)
+        J = np.concatenate([se3.hat(q - self.centre) / self.radius, np.broadcast_to(-np.eye(3), (len(q), 3, 3))], -1)
+        r = q - k.p_obj
+        scale = self.config.keypoint_weight * _huber_weight(np.linalg.norm(r, axis=-1) / k.sigma_m) / k.sigma_m**2
+        return np.einsum("mia,m,mib->ab", J, scale, J), np.einsum("mia,m,mi->a", J, scale, r)
+
+    # -- solving -------------------------------------------------------------------------------
+
+    def joint(self, at: _Linear) -> tuple[np.ndarray, np.ndarray]:
+        """Information and gradient: the surface's in the directions it determines, the keypoints' in all."""
+        P, worth = self.determined(at), self.worth(at)
+        H, g = worth * P @ at.H @ P, worth * P @ at.g
+        if self.keypoints is not None:
+            H_k, g_k = self.keypoint_system(at.T)
+            H, g = H + H_k, g + g_k
+        return H, g
+
+    def worth(self, at: _Linear) -> float:
+        """Independent observations per squared metre: depth errors of neighbours are correlated."""
+        return min(at.used, self.config.independent_points) / at.sigma_m**2
+
+    def determined(self, at: _Linear) -> np.ndarray:
+        """Projection onto the directions that the shape holds."""
+        held = at.directions[:, at.strengths >= self.config.min_strength]
+        return held @ held.T
+
+    def step(self, H: np.ndarray, g: np.ndarray, damping: float) -> np.ndarray:
+        """Damped Gauss-Newton step in the subspace that holds any information."""
+        value, vector = np.linalg.eigh(H)
+        known = value > 1e-9 * max(value[-1], 1e-300)
+        inverse = np.where(known, 1 / np.where(known, value + damping * value[-1], 1.0), 0.0)
+        return -vector @ (inverse * (vector.T @ g))
+
+    def clipped(self, step: np.ndarray) -> np.ndarray:
+        turn, shift = np.linalg.norm(step[:3]) / self.radius, np.linalg.norm(step[3:])
+        largest = max(turn / self.config.max_step_rad, shift / self.config.max_step_m, 1.0)
+        return step / largest
+
+    def moved(self, T: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """T exp(xi) with xi about the cloud's centre."""
+        C = se3.from_rt(np.eye(3), self.centre)
+        D = C @ se3.exp(np.concatenate([step[:3] / self.radius, step[3:]])) @ se3.inverse(C)
+        return se3.orthonormalised(T @ D)
+
+    def cost(self, new: _Linear, at: _Linear) -> float:
+        """The objective at ``new`` in squared standard deviations, with the trimming and scale of ``at``.
+
+        Trimmed points and those off the observed surface cost what the trimming distance does.
+        """
+        r, d = np.minimum(np.abs(new.distance_m), at.cut_m), self.config.huber_m
+        total = self.worth(at) / at.used * np.where(r < d, r * r, 2 * d * r - d * d).sum()
+        if self.keypoints is not None:
+            k = self.keypoints
+            e = np.linalg.norm(se3.transform(se3.inverse(new.T), k.p_cam) - k.p_obj, axis=-1) / k.sigma_m
+            total += self.config.keypoint_weight * np.where(e < _HUBER, e * e, 2 * _HUBER * e - _HUBER**2).sum()
+        return float(total)
+
+    def result(self, at: _Linear, tries: int, converged: bool) -> Refinement:
+        """The pose reached, its covariance moved from the cloud's centre to the object's origin."""
+        H, _ = self.joint(at)
+        # What nothing determines is known to within the largest step.
+        free = np.repeat([self.config.max_step_rad * self.radius, self.config.max_step_m], 3) ** -2.0
+        metres = np.repeat([1 / self.radius, 1.0], 3)
+        to_origin = se3.adjoint(se3.from_rt(np.eye(3), self.centre)) * metres
+        covariance = to_origin @ np.linalg.inv(H + np.diag(free)) @ to_origin.T
+        loose = at.directions[:, at.strengths < self.config.min_strength]
+        return Refinement(
+            at.T,
+            (covariance + covariance.T) / 2,
+            at.rms_m,
+            at.used / len(self.p_cam),
+            tries,
+            converged,
+            at.strengths,
+            at.directions.T,
+            _turns_of(loose).T @ to_origin.T * self.radius,
+            f"the shape leaves {loose.shape[1]} of 6 directions free" if loose.size else "",
+        )
+
+
+#: A unit tangent about the cloud's centre turns, rather than shifts, if this much of it is rotation.
+_MOSTLY = 0.5
+
+
+def _turns_of(loose: np.ndarray) -> np.ndarray:
+    """(6, T) the turns among the span of orthonormal tangents (6, K), each with a unit of rotation."""
+    if not loose.size:
+        return np.zeros((6, 0))
+    _, size, mix = np.linalg.svd(loose[:3])
+    size, mix = size[size > _MOSTLY], mix[: len(size)][size > _MOSTLY]
+    return loose @ mix.T / size
+
+
+#: Huber threshold of keypoint residuals in standard deviations.
+_HUBER = 1.345
+
+
+def _huber_weight(e: np.ndarray) -> np.ndarray:
+    return np.minimum(1.0, _HUBER / np.maximum(e, 1e-12))
+
+
+def _neighbours(p_cam: np.ndarray, distance_m: float) -> np.ndarray:
+    """(P, 2) rows of points about ``distance_m`` apart, each point with one to its right and one below it."""
+    pairs = []
+    for along, across in ((0, 1), (1, 0)):
+        strip = np.floor(p_cam[:, across] / (distance_m / 2))
+        # Within a strip the keys run along it; strips lie farther apart than any pair.
+        key = strip * (np.ptp(p_cam[:, along]) + 4 * distance_m) + p_cam[:, along]
+        order = np.argsort(key)
+        nearest = np.searchsorted(key[order], key + distance_m)
+        first = np.flatnonzero(nearest < len(key))
+        pairs.append(np.stack([first, order[nearest[first]]], -1))
+    first, second = np.concatenate(pairs).T
+    apart = np.linalg.norm(p_cam[first] - p_cam[second], axis=-1)
+    near = (apart > distance_m / 2) & (apart < 2 * distance_m)
+    return np.stack([first[near], second[near]], -1)
+
+
+def _median(x: np.ndarray) -> float:
+    """The upper median: exact enough for a noise level, several times faster than NumPy's on small arrays."""
+    return float(np.partition(x, len(x) // 2)[len(x) // 2])
+
+
+def surface_jacobian(q: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """(N, 6) derivative of Phi at points q (N, 3) when the pose turns right by xi: q -> exp(-xi) q.
+
+    ``gradient`` (N, 3) is that of Phi at q. Rotation first, about q's origin.
+    """
+    (x, y, z), (a, b, c) = q.T, gradient.T
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x, -a, -b, -c], -1)
+
+
+def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
+    """(H, N) absolute TSDF value in metres of the points p_cam (N, 3) under poses (H, 4, 4).
+
+    Its mean over the points is the paper's measure for choosing a hypothesis. A point that falls where nothing was
+    observed counts ``unseen`` times the truncation distance, so that no pose wins by turning away from the surface.
+    Points that are not finite are left out.
+    """
+    T_cam_obj = np.asarray(T_cam_obj, float).reshape(-1, 4, 4)
+    value, valid = volume.query(se3.transform(se3.inverse(T_cam_obj), _usable(p_cam, len(p_cam))))
+    return np.where(valid, np.abs(value), unseen * volume.tau_m)
+
+
+def surface_score(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
+    """(H,) mean of :func:`surface_distances`; infinite without any finite point."""
+    distance_m = surface_distances(volume, p_cam, T_cam_obj, unseen)
+    return distance_m.mean(1) if distance_m.size else np.full(len(distance_m), np.inf)
+
+
+def sample_cloud(
+    depth_m: np.ndarray,
+    mask: np.ndarray,
+    camera: Camera,
+    max_points: int,
+    *,
+    margin_px: int = 2,
+    depth_edge_m: float = 0.02,
+) -> np.ndarray:
+    """(N, 3) measured points of a masked depth picture in the camera frame, N <= max_points.
+
+    Leaves out a border of ``margin_px`` inside the mask, and pixels whose 3x3 neighbourhood holds an
+    invalid depth or a step beyond ``depth_edge_m``: both mix two surfaces. Deterministic, spread over
+    the whole mask. Empty where nothing is left.
+    """
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if len(rows) == 0 or max_points < 1:
+        return np.zeros((0, 3))
+    top, left = max(rows[0] - 1, 0), max(cols[0] - 1, 0)
+    cut = np.s_[top : rows[-1] + 2, left : cols[-1] + 2]
+    inside, depth = np.ascontiguousarray(mask[cut]).astype(np.uint8), np.ascontiguousarray(depth_m[cut], np.float32)
+    kernel = np.ones((2 * margin_px + 1,) * 2, np.uint8)
+    inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    around = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(depth, around), cv2.dilate(depth, around)
+    v, u = np.nonzero((inside > 0) & (low > 0) & (high - low <= depth_edge_m))
+    # A lattice of pixels, then an even thinning of what is left over.
+    stride = max(1, int(np.sqrt(len(u) / max_points)))
+    on = np.flatnonzero((u % stride == 0) & (v % stride == 0))
+    on = on[np.linspace(0, len(on) - 1, min(len(on), max_points)).astype(int)]
+    return camera.unproject(np.stack([u[on] + left, v[on] + top], -1), depth[v[on], u[on]].astype(float))
+
+
+def _usable(p_cam: np.ndarray, max_points: int) -> np.ndarray:
+    p_cam = np.asarray(p_cam, float).reshape(-1, 3)
+    p_cam = p_cam[np.isfinite(p_cam).all(-1)]
+    if len(p_cam) <= max_points:
+        return p_cam
+    return p_cam[np.linspace(0, len(p_cam) - 1, max_points).astype(int)]
+
+
+def _usable_keypoints(keypoints: Keypoints | None, weight: float) -> Keypoints | None:
+    if keypoints is None or weight == 0:
+        return None
+    finite = np.isfinite(keypoints.p_obj).all(-1) & np.isfinite(keypoints.p_cam).all(-1)
+    ok = finite & (keypoints.sigma_m > 0) & np.isfinite(keypoints.sigma_m)
+    return Keypoints(keypoints.p_obj[ok], keypoints.p_cam[ok], keypoints.sigma_m[ok]) if ok.sum() >= 3 else None
+
+
+#: Every how many pixels an image's depth is held against the surface.
+_STRIDE = 2
+
+
+def surface_distance(
+    surface: Surface, corners_obj: np.ndarray, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray
+) -> np.ndarray:
+    """(H, W) float32 of :class:`Hint`, from every second pixel where the surface can be seen.
+
+    corners_obj (8, 3) bound the surface in the object frame.
+    """
+    distance = np.full(depth_m.shape, np.nan, np.float32)
+    uv = camera.project(se3.transform(T_cam_obj, corners_obj))
+    if not np.isfinite(uv).all():
+        return distance
+    size = np.array(depth_m.shape[::-1])
+    (left, top), (right, bottom) = np.clip([uv.min(0), uv.max(0) + 1], 0, size).astype(int)
+    v, u = np.mgrid[top:bottom:_STRIDE, left:right:_STRIDE]
+    z = depth_m[v, u]
+    p_obj = se3.transform(se3.inverse(T_cam_obj), camera.unproject(np.stack([u, v], -1), z).reshape(-1, 3))
+    value, known = surface.query(p_obj)
+    found = np.where(known & (z.ravel() > 0), value, np.nan).reshape(z.shape)
+    coarse = np.repeat(np.repeat(found, _STRIDE, 0), _STRIDE, 1)
+    distance[top:bottom, left:right] = coarse[: bottom - top, : right - left]
+    return distance

@@ -1,0 +1,88 @@
+"""Where to put new points (paper: section "Sampling Strategy and Keypoints Map").
+
+Candidates come from a detector with a score in [0, 1]; the greedy objective
+J_k = lambda s_k + (1 - lambda) min(d_k / r_ideal, 1) - beta rho(d_k) picks among them, where d_k is
+the distance to all points chosen so far and to those stored and visible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.config import SamplingConfig
+from p2p_lib.core.interfaces import Candidates
+from p2p_lib.core.types import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """The three terms of J as they enter it, each of the shape that was asked for; their sum is J.
+
+    trackability  lambda s, 0 or more
+    spread        (1 - lambda) min(d / r_ideal, 1), 0 or more
+    crowding      -beta rho(d), 0 or less
+    """
+
+    trackability: np.ndarray
+    spread: np.ndarray
+    crowding: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """J."""
+        return self.trackability + self.spread + self.crowding
+
+
+def terms(score: np.ndarray, d_px: np.ndarray, config: SamplingConfig) -> Terms:
+    """The terms of J for scores at distances d_px from everything chosen or stored."""
+    lam = config.score_weight
+    spread = np.minimum(d_px / config.r_ideal_px, 1)
+    crowding = np.maximum(0, (config.r_min_px - d_px) / config.r_min_px) if config.r_min_px > 0 else 0.0 * spread
+    return Terms(lam * score, (1 - lam) * spread, -config.cluster_weight * crowding)
+
+
+def objective(score: np.ndarray, d_px: np.ndarray, config: SamplingConfig) -> np.ndarray:
+    """J of candidates with score (N,) at distance d_px (N,) from everything chosen or stored."""
+    return terms(score, d_px, config).total
+
+
+def choose(candidates: Candidates, stored_px: np.ndarray, count: int, config: SamplingConfig) -> np.ndarray:
+    """Indices of up to ``count`` candidates in the order taken, greedily maximising :func:`objective`.
+
+    ``stored_px`` (M, 2) are the map's points visible in this frame.
+    """
+    n = len(candidates.score)
+    if not n:
+        return np.zeros(0, int)
+    d = distance_px(candidates.uv_px, stored_px)
+    chosen: list[int] = []
+    free = np.ones(n, bool)
+    for _ in range(min(count, n)):
+        J = np.where(free, objective(candidates.score, d, config), -np.inf)
+        best = int(J.argmax())
+        # The paper says K <= N_k, not when to stop short of K: here once crowding costs more than the best is worth.
+        if J[best] <= 0:
+            break
+        chosen.append(best)
+        free[best] = False
+        d = np.minimum(d, np.linalg.norm(candidates.uv_px - candidates.uv_px[best], axis=1))
+    return np.array(chosen, int)
+
+
+def distance_px(uv_px: np.ndarray, others_px: np.ndarray) -> np.ndarray:
+    """d_k of the objective: distance (N,) from pixels (N, 2) to the nearest of others (M, 2); infinite without any."""
+    if not len(others_px):
+        return np.full(len(uv_px), np.inf)
+    return np.linalg.norm(uv_px[:, None] - others_px[None], axis=-1).min(1)
+
+
+def usable_region(frame: Frame, mask: np.ndarray, config: SamplingConfig) -> np.ndarray:
+    """Where a point can be lifted: in the mask, off its border, with depth, off depth edges. (H, W) bool."""
+    size = 2 * config.edge_margin_px + 1
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0)
+    ones = np.ones((3, 3), np.uint8)
+    step_m = cv2.dilate(frame.depth_m, ones) - cv2.erode(frame.depth_m, ones)
+    return (inner > 0) & (frame.depth_m > 0) & (step_m <= config.depth_edge_m)

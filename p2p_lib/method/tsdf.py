@@ -1,0 +1,495 @@
+"""3D reconstruction: one truncated signed distance volume per object (paper: 3D Reconstruction, appendix).
+
+A dense grid in the object frame, held as torch tensors, so that the same code runs on CPU and CUDA.
+The grid grows in blocks with the object and never beyond ``max_voxels``, whatever a wild depth pixel
+asks for. Every sum of the weighted mean is kept apart from its weight, so an observation can be taken
+out again and put back where the factor graph has moved its keyframe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import TsdfConfig
+from p2p_lib.core.errors import BadInput
+
+if TYPE_CHECKING:
+    import torch
+    import trimesh
+
+#: The grid's sides are multiples of this many voxels, so that it grows seldom.
+BLOCK = 8
+#: Voxels handled at once while fusing. On a CPU few enough for the temporaries to stay in its cache, and for
+#: torch not to share them among threads: on two busy cores, its threads wait for each other far longer than they work.
+_SLAB = {"cpu": 1 << 15, "cuda": 1 << 22}
+#: Depth pixels looked at to decide where the object is.
+_REGION_POINTS = 4000
+#: A jump in sorted depth that separates the object from whatever else the mask caught.
+_DEPTH_GAP_M = 0.05
+#: Annotated poses of real datasets are rounded; fusing needs an affine map only, so they are taken as they come.
+_POSE_TOLERANCE = 5e-3
+#: Background nearer than this to the mask does not carve: mask and pose are good to a pixel or two.
+_CARVE_MARGIN_PX = 1
+#: A weight below this is what rounding leaves of observations that were all taken out again.
+_NO_WEIGHT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One masked RGB-D observation, cut to its pixels, and the box of voxels it was fused into.
+
+    depth_m   (h+2, w+2) float32 with a border; -inf where nothing is to be fused
+    inside    (h+2, w+2) bool: measured and inside the mask; depth elsewhere only carves
+    rgbw      (4, h+2, w+2) uint8: colour and 1
+    corner    column and row of the cut's first inner pixel
+    lo, hi    voxel box [lo, hi) in lattice indices; fixed when first fused, so that taking out mirrors putting in
+    """
+
+    depth_m: np.ndarray
+    inside: np.ndarray
+    rgbw: np.ndarray
+    corner: tuple[int, int]
+    camera: Camera
+    T_cam_obj: np.ndarray
+    weight: float
+    lo: np.ndarray
+    hi: np.ndarray
+
+    @cached_property
+    def centre_cam(self) -> np.ndarray:
+        """(3,) middle of the cut's pixels at the median depth."""
+        (h, w), (left, top) = self.inside.shape, self.corner
+        return self.camera.unproject(np.array([left + w / 2, top + h / 2]), np.median(self.depth_m[self.inside]))
+
+
+def _slabs(lo: np.ndarray, hi: np.ndarray, voxels: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Box [lo, hi) cut across x, and across y where a sheet is too large, into boxes of about so many voxels."""
+    nx, ny, nz = (hi - lo).tolist()
+    rows = min(ny, max(1, voxels // nz))
+    sheets = max(1, voxels // (rows * nz)) if rows == ny else 1
+    for x in range(0, nx, sheets):
+        for y in range(0, ny, rows):
+            start = np.array([x, y, 0])
+            yield lo + start, np.minimum(lo + start + np.array([sheets, rows, nz]), hi)
+
+
+def _clear_of(mask: np.ndarray) -> np.ndarray:
+    """Pixels beyond :data:`_CARVE_MARGIN_PX` of the mask."""
+    kernel = np.ones((2 * _CARVE_MARGIN_PX + 1,) * 2, np.uint8)
+    return cv2.dilate(mask.astype(np.uint8), kernel) == 0
+
+
+class TsdfVolume:
+    """The fused surface of one object (paper: V(v), W(v) and their colours).
+
+    Voxel (i, j, k) of the lattice is centred on ``anchor_m + voxel_m * (i, j, k)`` in the object frame;
+    the arrays hold lattice indices ``lo`` to ``lo + shape``. With ``origin_m`` and ``shape`` the grid is
+    fixed there and does not grow.
+
+    Raises :class:`BadInput` for a fixed grid beyond ``config.max_voxels``.
+    """
+
+    def __init__(
+        self,
+        config: TsdfConfig,
+        *,
+        origin_m: np.ndarray | None = None,
+        shape: tuple[int, int, int] | None = None,
+        device: str = "cpu",
+    ):
+        import torch
+
+        self.config, self.device = config, torch.device(device)
+        self.voxel_m, self.tau_m = config.voxel_m, config.voxel_m * config.truncation_voxels
+        self.grows = shape is None
+        self.anchor_m = np.zeros(3) if origin_m is None else np.asarray(origin_m, float)
+        if shape is not None and np.prod(shape) > config.max_voxels:
+            raise BadInput("tsdf shape", "x".join(map(str, shape)), f"at most {config.max_voxels} voxels")
+        self._views: dict[int, _View] = {}
+        self._total = 0.0  # of all weights
+        self.lo = np.zeros(3, int)
+        self._allocate(self.lo, np.zeros(3, int) if shape is None else np.asarray(shape, int))
+
+    # -- state ---------------------------------------------------------------------------------
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels per axis; (0, 0, 0) before the first observation."""
+        return tuple(self._weight.shape)
+
+    @property
+    def empty(self) -> bool:
+        """Whether no voxel has been observed."""
+        return self._total < _NO_WEIGHT
+
+    @property
+    def origin_m(self) -> np.ndarray:
+        """(3,) centre of the first voxel in the object frame."""
+        return self.anchor_m + self.voxel_m * self.lo
+
+    def corners_m(self) -> np.ndarray:
+        """(8, 3) corners of the grid in the object frame."""
+        corners = np.array(np.meshgrid(*zip(self.lo, self.lo + self.shape, strict=True), indexing="ij"))
+        return self.anchor_m + self.voxel_m * corners.reshape(3, -1).T
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """The keyframes whose observations are kept for re-integration, oldest first."""
+        return tuple(self._views)
+
+    def values(self) -> np.ndarray:
+        """(nx, ny, nz) float32: V(v) = the mean of min(1, d / tau), normalised to [-1, 1]; NaN where unobserved."""
+        return self._value.cpu().numpy().copy()
+
+    def weights(self) -> np.ndarray:
+        """(nx, ny, nz) float32: W(v), the sum of observation weights."""
+        return self._weight.cpu().numpy().copy()
+
+    def colours(self) -> np.ndarray:
+        """(nx, ny, nz, 4) float32: sums of weighted red, green and blue (0 to 255) and of their weights.
+
+        Averaged over the observations that met the voxel inside the truncation band; those that looked
+        past it saw the colour of something else.
+        """
+        return np.moveaxis(self._colour.cpu().numpy(), 0, -1).copy()
+
+    def _allocate(self, lo: np.ndarray, shape: np.ndarray) -> None:
+        """Fresh arrays over lattice box [lo, lo + shape), with what the old ones held copied in."""
+        import torch
+
+        old = (self._sum, self._weight, self._colour, self._value) if hasattr(self, "_sum") else ()
+        start = self.lo - lo
+        self.lo = np.array(lo, int)
+        size = tuple(int(n) for n in shape)
+        self._sum = torch.zeros(size, device=self.device)
+        self._weight = torch.zeros(size, device=self.device)
+        self._colour = torch.zeros((4, *size), device=self.device)
+        # What queries read: kept up to date voxel by voxel while fusing.
+        self._value = torch.full(size, float("nan"), device=self.device)
+        for new, was in zip((self._sum, self._weight, self._colour, self._value), old, strict=False):
+            box = (slice(int(a), int(a) + n) for a, n in zip(start, was.shape[-3:], strict=True))
+            new[..., *box] = was
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        import torch
+
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+
+    # -- fusing --------------------------------------------------------------------------------
+
+    def integrate(
+        self,
+        depth_m: np.ndarray,
+        rgb: np.ndarray,
+        mask: np.ndarray,
+        camera: Camera,
+        T_cam_obj: np.ndarray,
+        weight: float = 1.0,
+        key: int | None = None,
+    ) -> int:
+        """Fuse one masked RGB-D picture; returns how many voxels it touched.
+
+        Projective update of the appendix: d(v) = D(pi(v)) - z(v) with depth sampled at the nearest
+        pixel; a voxel outside the picture or mask, at an invalid depth, or with d < -tau is left alone;
+        the others take min(1, d / tau) into their weighted mean.
+
+        depth_m (H, W) metres, 0 or not finite = invalid; rgb (H, W, 3) uint8; mask (H, W) bool.
+        ``weight=-1`` takes an equal picture at an equal pose out again, exactly up to rounding as long as
+        the grid has not grown since. With ``key`` the observation is kept and can be moved
+        (:meth:`move`) or taken out (:meth:`remove`), whether or not the grid has grown.
+        An empty mask or one without any valid depth touches nothing.
+
+        Raises :class:`BadInput` for arrays of other shapes or a pose that is not rigid.
+        """
+        T_cam_obj = se3.check("tsdf T_cam_obj", T_cam_obj, _POSE_TOLERANCE)
+        view = self._view(depth_m, rgb, mask, camera, T_cam_obj, weight)
+        if view is None:
+            return 0
+        if key is not None:
+            self.remove(key)
+            self._views[key] = view
+        return self._fuse(view, view.weight)
+
+    def remove(self, key: int) -> bool:
+        """Take a kept keyframe's observation out of the volume; False if there is none."""
+        view = self._views.pop(key, None)
+        if view is not None:
+            self._fuse(view, -view.weight)
+        return view is not None
+
+    def keep_only(self, keys: Iterable[int]) -> None:
+        """Let go of the kept observations of all other keyframes: they stay fused, and cannot be moved any more."""
+        kept = set(map(int, keys))
+        self._views = {key: view for key, view in self._views.items() if key in kept}
+
+    def move(self, poses: Mapping[int, np.ndarray], limit: int | None = None) -> list[int]:
+        """Re-integrate the kept observations of keyframes that the graph has moved (T_cam_obj by key).
+
+        Those whose cloud moved by more than half a voxel or 0.5 degrees, the farthest first and at most
+        ``limit`` of them (None: all); the rest stay where they are for a later
+        call. Poses that are not finite are passed over. Returns the keys moved.
+        """
+        known = [key for key in poses if key in self._views]
+        if not known:
+            return []
+        T_new = np.stack([np.asarray(poses[key], float) for key in known])
+        T_old = np.stack([self._views[key].T_cam_obj for key in known])
+        centre = np.stack([self._views[key].centre_cam for key in known])[:, None]
+        shift = se3.transform(se3.inverse(T_new), centre) - se3.transform(se3.inverse(T_old), centre)
+        excess = np.maximum(
+            np.linalg.norm(shift[:, 0], axis=-1) / (0.5 * self.voxel_m),
+            se3.angle_rad(se3.inverse(T_old) @ T_new) / np.deg2rad(0.5),
+        )
+        order = [i for i in np.argsort(-excess, kind="stable") if excess[i] > 1 and np.isfinite(T_new[i]).all()]
+        for i in order[:limit]:
+            self._move_one(known[i], T_new[i])
+        return [known[i] for i in order[:limit]]
+
+    def _move_one(self, key: int, T_cam_obj: np.ndarray) -> None:
+        view = self._views[key]
+        self._fuse(view, -view.weight)
+        moved = replace(view, T_cam_obj=T_cam_obj)
+        self._grow(moved)
+        lo, hi = self._frustum_box(moved)
+        self._views[key] = moved = replace(moved, lo=lo, hi=hi)
+        self._fuse(moved, moved.weight)
+
+    def _view(self, depth_m, rgb, mask, camera: Camera, T_cam_obj, weight: float) -> _View | None:
+        depth_m, mask = np.asarray(depth_m), np.asarray(mask, bool)
+        want = (camera.height, camera.width)
+        if depth_m.shape != want or mask.shape != want or np.shape(rgb) != (*want, 3):
+            raise BadInput(
+                "tsdf picture",
+                f"depth {depth_m.shape}, mask {mask.shape}, rgb {np.shape(rgb)}",
+                f"{want} as the camera",
+            )
+        rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        if len(rows) == 0:
+            return None
+        picture = (depth_m, rgb, mask, camera, T_cam_obj, weight)
+        view = self._cut(cols[0], rows[0], cols[-1] + 1, rows[-1] + 1, *picture)
+        if not view.inside.any():
+            return None
+        self._grow(view)
+        if self.config.carve:
+            view = self._cut(*self._window(view), *picture)
+        lo, hi = self._frustum_box(view)
+        return replace(view, lo=lo, hi=hi)
+
+    def _cut(self, left, top, right, bottom, depth_m, rgb, mask, camera, T_cam_obj, weight: float) -> _View:
+        """The view of these columns and rows of a picture."""
+        cut = np.s_[top:bottom, left:right]
+        depth, mask = np.asarray(depth_m[cut], np.float32), mask[cut]
+        measured = (depth > 0) & (depth < np.inf)
+        inside = np.pad(mask & measured, 1)
+        used = inside[1:-1, 1:-1] | (measured & _clear_of(mask) if self.config.carve else False)
+        depth = np.pad(np.where(used, depth, -np.inf), 1, constant_values=-np.inf)
+        rgbw = np.ones((4, *inside.shape), np.uint8)
+        rgbw[:3, 1:-1, 1:-1] = np.moveaxis(np.asarray(rgb)[cut], -1, 0)
+        return _View(depth, inside, rgbw, (left, top), camera, T_cam_obj, float(weight), self.lo, self.lo)
+
+    def _window(self, view: _View) -> tuple[int, int, int, int]:
+        """Columns and rows [left, top, right, bottom) that the grid projects to, all where it reaches the camera."""
+        p_cam = se3.transform(view.T_cam_obj, self.corners_m())
+        width, height = view.camera.width, view.camera.height
+        if p_cam[:, 2].min() <= 0.01:
+            return 0, 0, width, height
+        uv = view.camera.project(p_cam)
+        left, top = np.clip(np.floor(uv.min(0)), 0, (width - 1, height - 1)).astype(int)
+        right, bottom = np.clip(np.ceil(uv.max(0)) + 1, (left + 1, top + 1), (width, height)).astype(int)
+        return int(left), int(top), int(right), int(bottom)
+
+    def _region(self, view: _View) -> np.ndarray:
+        """(2, 3) robust bounds of the masked cloud in the object frame, unpadded.
+
+        The largest run of depths without a gap, and of it all but the outermost half percent on each
+        side: a mask that bleeds onto the background or a wild pixel does not move them.
+        """
+        v, u = np.nonzero(view.inside)
+        keep = np.linspace(0, len(u) - 1, min(len(u), _REGION_POINTS)).astype(int)
+        v, u = v[keep], u[keep]
+        z = view.depth_m[v, u].astype(float)
+        ranked = np.sort(z)
+        run = max(np.split(ranked, np.flatnonzero(np.diff(ranked) > _DEPTH_GAP_M) + 1), key=len)
+        own = (z >= run[0]) & (z <= run[-1])
+        uv_px = np.stack([u[own] - 1 + view.corner[0], v[own] - 1 + view.corner[1]], -1)
+        p_obj = se3.transform(se3.inverse(view.T_cam_obj), view.camera.unproject(uv_px, z[own]))
+        return np.percentile(p_obj, [0.5, 99.5], axis=0)
+
+    def _grow(self, view: _View) -> None:
+        """Make room for the view's cloud."""
+        if not self.grows:
+            return
+        region = self._region(view)
+        pad = max(self.config.padding_m, self.tau_m)
+        want_lo = np.floor((region[0] - pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
+        want_hi = np.ceil((region[1] + pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
+        old_lo, old_hi = self.lo, self.lo + self.shape
+        if self._weight.numel() == 0:
+            old_lo = (want_lo + want_hi) // 2 // BLOCK * BLOCK
+            old_hi = old_lo + BLOCK
+        lo, hi = self._capped(old_lo, old_hi, np.minimum(want_lo, old_lo), np.maximum(want_hi, old_hi))
+        if (lo != self.lo).any() or (hi - lo != self.shape).any():
+            self._allocate(lo, hi - lo)
+
+    def _capped(self, old_lo, old_hi, want_lo, want_hi) -> tuple[np.ndarray, np.ndarray]:
+        """The largest share of the wanted growth, equal on all sides, that stays within ``max_voxels``."""
+        if np.prod((want_hi - want_lo).astype(float)) <= self.config.max_voxels:
+            return want_lo, want_hi
+        lo, hi = old_lo, old_hi
+        low, high = 0.0, 1.0
+        for _ in range(24):
+            share = (low + high) / 2
+            a = old_lo + np.ceil((want_lo - old_lo) * share / BLOCK).astype(int) * BLOCK
+            b = old_hi + np.floor((want_hi - old_hi) * share / BLOCK).astype(int) * BLOCK
+            if np.prod((b - a).astype(float)) <= self.config.max_voxels:
+                low, lo, hi = share, a, b
+            else:
+                high = share
+        return lo, hi
+
+    def _frustum_box(self, view: _View) -> tuple[np.ndarray, np.ndarray]:
+        """Lattice box [lo, hi) of the grid's voxels that may lie behind the view's pixels, before depth + tau."""
+        lo, hi = self.lo, self.lo + self.shape
+        corners = np.array(np.meshgrid(*zip(lo, hi - 1, strict=True), indexing="ij")).reshape(3, -1).T
+        z = se3.transform(view.T_cam_obj, self.anchor_m + self.voxel_m * corners)[:, 2]
+        far = min(float(view.depth_m.max()) + self.tau_m, z.max())
+        near = max(z.min(), 0.0)
+        if far <= near:
+            return lo, lo
+        h, w = view.depth_m.shape
+        u, v = (view.corner[0] + np.array([-1.5, w - 1.5]), view.corner[1] + np.array([-1.5, h - 1.5]))
+        uvz = np.array(np.meshgrid(u, v, [near, far], indexing="ij")).reshape(3, -1).T
+        p_obj = se3.transform(se3.inverse(view.T_cam_obj), view.camera.unproject(uvz[:, :2], uvz[:, 2]))
+        index = (p_obj - self.anchor_m) / self.voxel_m
+        box_lo = np.clip(np.floor(index.min(0)).astype(int), lo, hi)
+        return box_lo, np.clip(np.ceil(index.max(0)).astype(int) + 1, box_lo, hi)
+
+    def _fuse(self, view: _View, weight: float) -> int:
+        size = view.hi - view.lo
+        if (size <= 0).any():
+            return 0
+        depth = self._tensor(view.depth_m).view(-1)
+        gate = self._tensor(np.where(view.inside, -self.tau_m, self.tau_m).astype(np.float32)).view(-1)
+        rgbw = self._tensor(view.rgbw.astype(np.float32)).view(4, -1)
+        touched = 0
+        for lo, hi in _slabs(view.lo, view.hi, _SLAB[self.device.type]):
+            pixel, z = self._project(view, lo, hi)
+            d = depth.index_select(0, pixel).sub_(z)
+            least = gate.index_select(0, pixel) if self.config.carve else -self.tau_m
+            hit = (d >= least).nonzero().view(-1)
+            phi = d.index_select(0, hit).div_(self.tau_m).clamp_(max=1.0)
+            at = self._flat_index(lo, hi).index_select(0, hit)
+            self._accumulate(at, phi, weight)
+            near = (phi < 1).nonzero().view(-1)
+            at, pixel = at.index_select(0, near), pixel.index_select(0, hit.index_select(0, near))
+            for total, seen in zip(self._colour.view(4, -1), rgbw, strict=True):
+                total.index_add_(0, at, seen.index_select(0, pixel), alpha=weight)
+            touched += len(hit)
+        self._total += weight * touched
+        return touched
+
+    def _project(self, view: _View, lo: np.ndarray, hi: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        """Index into the view's cut picture and depth z in metres of every voxel in [lo, hi), flat.
+
+        Pixel coordinates times depth are affine in the voxel's indices, so each is a sum of three rows.
+        Whatever falls outside the cut picture lands on its border, which holds no depth.
+        """
+        cam, (h, w) = view.camera, view.depth_m.shape
+        K = np.array([[cam.fx, 0, cam.cx - view.corner[0] + 1], [0, cam.fy, cam.cy - view.corner[1] + 1], [0, 0, 1.0]])
+        A = K @ view.T_cam_obj[:3, :3] * self.voxel_m
+        b = K @ se3.transform(view.T_cam_obj, self.anchor_m[None])[0]
+
+        def affine(row: int) -> torch.Tensor:
+            x, y, z = (
+                self._tensor((A[row, axis] * np.arange(lo[axis], hi[axis])).astype(np.float32)) for axis in range(3)
+            )
+            return (x.add_(b[row])[:, None] + y)[:, :, None] + z
+
+        u, v, z = affine(0), affine(1), affine(2)
+        behind = z <= 1e-6
+        # Half a pixel more, cut off, is the nearest pixel; torch's own rounding is shared among threads.
+        u = u.div_(z).clamp_(0, w - 1).add_(0.5).int()
+        v = v.div_(z).clamp_(0, h - 1).add_(0.5).int()
+        pixel = v.mul_(w).add_(u)
+        # A voxel behind the camera goes to the border as well.
+        return (pixel.masked_fill_(behind, 0) if bool(behind.any()) else pixel).view(-1), z.view(-1)
+
+    def _flat_index(self, lo: np.ndarray, hi: np.ndarray) -> torch.Tensor:
+        """Position in the flattened arrays of every voxel in lattice box [lo, hi)."""
+        import torch
+
+        _, ny, nz = self.shape
+        first, last = (lo - self.lo).tolist(), (hi - self.lo).tolist()
+        i, j, k = (torch.arange(a, b, device=self.device) for a, b in zip(first, last, strict=True))
+        return ((i[:, None] * ny + j)[:, :, None] * nz + k).view(-1)
+
+    def _accumulate(self, at: torch.Tensor, phi: torch.Tensor, weight: float) -> None:
+        total, count = self._sum.view(-1), self._weight.view(-1)
+        new_sum = total.index_select(0, at).add_(phi, alpha=weight)
+        new_weight = count.index_select(0, at).add_(weight)
+        if weight < 0:
+            gone = new_weight < _NO_WEIGHT
+            new_sum.masked_fill_(gone, 0.0)
+            new_weight.masked_fill_(gone, 0.0)
+        total.index_copy_(0, at, new_sum)
+        count.index_copy_(0, at, new_weight)
+        # 0 / 0 is NaN, which is what an unobserved voxel holds.
+        self._value.view(-1).index_copy_(0, at, new_sum.div_(new_weight))
+
+    # -- asking --------------------------------------------------------------------------------
+
+    def query(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distance in metres (tau times the normalised V) at points (..., 3) of the object frame.
+
+        Trilinear. Returns (value_m (...,) float64, valid (...,) bool); a point is valid where all eight
+        voxels around it have been observed, and its value is 0 where it is not. Positive is outside.
+        """
+        p_obj = np.asarray(p_obj, float)
+        value, valid = self._sample(p_obj.reshape(-1, 3), np.zeros((1, 3)))
+        return np.where(valid, value[0], 0.0).reshape(p_obj.shape[:-1]), valid.reshape(p_obj.shape[:-1])
+
+    def query_with_gradient(
+        self, p_obj: np.ndarray, step_voxels: float = 0.5
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Value in metres and its numeric gradient (no unit) by central differences over +- ``step_voxels``.
+
+        Points (N, 3) to (value_m (N,), gradient (N, 3), valid (N,)); valid where the value and all six
+        neighbours are, and both are 0 where not.
+        """
+        offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * step_voxels
+        value, valid = self._sample(np.asarray(p_obj, float).reshape(-1, 3), offsets)
+        gradient = (value[1:4] - value[4:7]).T / (2 * step_voxels * self.voxel_m)
+        return np.where(valid, value[0], 0.0), np.where(valid[:, None], gradient, 0.0), valid
+
+    def _sample(self, p_obj: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Metres (K, N) at points (N, 3) moved by offsets (K, 3) in voxels, and whether all K are valid (N,)."""
+        last = np.array(self.shape) - 1.0
+        if (last < 1).any() or not len(p_obj):
+            return np.zeros((len(offsets), len(p_obj))), np.zeros(len(p_obj), bool)
+        from torch.nn.functional import grid_sample
+
+        # grid_sample wants the last axis first and indices scaled to [-1, 1].
+        scale = 2 / last[::-1]
+        middle = (p_obj - self.origin_m)[:, ::-1] * (scale / self.voxel_m) - 1
+        around = offsets[:, ::-1] * scale
+        grid = middle.astype(np.float32) + around.astype(np.float32)[:, None]
+        inside = (np.abs(middle) <= 1 - np.abs(around).max(0)).all(1)
+        grid = self._tensor(grid).view(1, 1, 1, -1, 3)
+        value = grid_sample(self._value[None, None], grid, align_corners=True).view(len(offsets), -1)
+        value = value.cpu().numpy().astype(float) * self.tau_m
+        return value, inside & ~np.isnan(value.sum(0))
+
+    def mesh(self, min_weight: float = 1.0, min_component: float = 0.1) -> trimesh.Trimesh:
+        """The zero level with vertex colours, see :func:`p2p_lib.method.mesh.extract`."""
+        from p2p_lib.method.mesh import extract
+
+        return extract(self, min_weight, min_component)

@@ -1,0 +1,96 @@
+"""Evidence for and against a pixel's being of an object, and the cut that it leads to; on a patch's grid.
+
+All evidence is log odds, positive for the object, and adds up.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.config import SegmentationConfig
+from p2p_lib.core.interfaces import Hint
+from p2p_lib.segmenters.builtin import random_walk
+from p2p_lib.segmenters.builtin.colours import evidence, histogram
+from p2p_lib.segmenters.builtin.patch import Patch, connected, grown, plane_heights
+
+#: Less of a body than this on the patch's border is an accident.
+_AT_THE_BORDER = 0.02
+#: Height in standard deviations of depth at which something stands out of its support.
+_STANDS_OUT = 2.0
+#: A strip of this height above the plane, besides noise, belongs to the plane: its fit is no better.
+_PLANE_SLACK_M = 0.003
+
+
+def by_geometry(
+    patch: Patch, seeds: np.ndarray, plane: np.ndarray | None, config: SegmentationConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """An object hangs together in depth and is not what it stands on.
+
+    seeds (h, w) bool lie on the object, ``plane`` is what may support it. Returns the evidence (h, w) and the
+    body (h, w) bool: what hangs together with the seeds, where that looks like one object; else nothing.
+    """
+    log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
+    measured = patch.depth_m > 0
+    at = seeds & measured
+    if not at.any():
+        return log_odds, nothing
+    log_odds[measured & (np.abs(patch.depth_m - np.median(patch.depth_m[at])) > config.reach_m)] -= config.contradiction
+    free = patch.smooth
+    if plane is not None:
+        height, sigma_m = plane_heights(patch, plane), float(np.median(patch.sigma_m[at]))
+        above_m = float(np.median(height[at]))
+        if abs(above_m) < _STANDS_OUT * sigma_m:
+            return log_odds, nothing  # flat: depth does not tell it from what it lies on
+        if above_m > 0:
+            low = height < min(above_m / 2, (_STANDS_OUT + 0.5) * sigma_m + _PLANE_SLACK_M)
+            log_odds[measured & low] -= config.geometry_weight
+            free = free & ~low
+    body = connected(free, seeds)
+    log_odds[measured & ~grown(body, 1)] -= config.geometry_weight
+    if body[patch.border()].mean() > _AT_THE_BORDER:
+        return log_odds, nothing  # it goes on beyond the patch: more than one object hangs together
+    log_odds[body] += config.geometry_weight
+    return log_odds, body
+
+
+def by_colour(patch: Patch, own: np.ndarray, outside: np.ndarray, config: SegmentationConfig) -> np.ndarray:
+    """Each pixel's colour is likelier among the object's ``own`` (4096,) shares, or ``outside`` (h, w) bool."""
+    return config.colour_weight * evidence(own, histogram(patch.codes[outside]))[patch.codes]
+
+
+def by_surface(patch: Patch, hint: Hint, config: SegmentationConfig) -> np.ndarray:
+    """The object's reconstructed surface passes here, or its outside does."""
+    if hint.distance_m is None:
+        return np.zeros(patch.shape, np.float32)
+    distance_m = patch.nearest(hint.distance_m)
+    on, before = np.abs(distance_m) < config.surface_m, distance_m > 2 * config.surface_m
+    return config.surface_weight * (on.astype(np.float32) - before)
+
+
+def cut(
+    patch: Patch,
+    log_odds: np.ndarray,
+    config: SegmentationConfig,
+    *,
+    start: np.ndarray | None = None,
+    sure: np.ndarray | None = None,
+    barred: np.ndarray | None = None,
+) -> np.ndarray:
+    """(h, w) probability of the object, by a random walk; ``sure`` and ``barred`` (h, w) bool are given."""
+    target = (log_odds > 0).astype(np.float32)
+    strength = (config.evidence_strength * np.tanh(np.abs(log_odds) / 2)).astype(np.float32)
+    for given, value in ((sure, 1), (barred, 0)):
+        if given is not None:
+            target[given], strength[given] = value, 1
+    start = 0.25 + 0.5 * target if start is None else start
+    return random_walk.walk(target, strength, patch.ties, start, config.iterations)
+
+
+def carried(was: np.ndarray, before: Patch, patch: Patch) -> tuple[np.ndarray, np.ndarray]:
+    """A share (h, w) of the patch before and its depth, carried along by the optical flow to this patch."""
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(patch.gray, before.gray, None)
+    v, u = np.mgrid[: patch.shape[0], : patch.shape[1]]
+    at = flow + np.stack([u, v], -1).astype(np.float32)
+    share = cv2.remap(was.astype(np.float32), at, None, cv2.INTER_LINEAR, borderValue=0)
+    return share, cv2.remap(before.depth_m, at, None, cv2.INTER_NEAREST, borderValue=0)

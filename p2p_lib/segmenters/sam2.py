@@ -1,0 +1,152 @@
+"""SAM 2.1 (Ravi et al., ICLR 2025) as a segmenter, through the maintained classes of ``transformers``.
+
+Causal, frame by frame: a memory of the object's last frames and of the one with the clicks conditions the mask in
+the next. Code and weights: Apache-2.0. Each object has an inference session of its own, so that it can come late and
+go; the picture's features, which are most of the work, are computed once for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from p2p_lib.core import packages
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.clicks import check_clicks, check_depth
+from p2p_lib.core.config import SegmentationConfig
+from p2p_lib.core.interfaces import Hint
+from p2p_lib.core.raster import to_raster
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets import checkpoints
+
+if TYPE_CHECKING:
+    import torch
+
+#: What the publisher's picture processor, which needs torchvision, scales colours by: ImageNet's mean and deviation.
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+_OBJECT = 1  # the id of a session's only object
+_ABSENT = -1024.0  # the logit of pixels of an object that is not to be seen, as the network itself has it
+#: What a session keeps of a frame but reads no more once its memory is encoded.
+_READ_ONCE = ("pred_masks", "high_res_masks")
+_SPATIAL = ("maskmem_features", "maskmem_pos_enc")
+
+
+def load(
+    camera: Camera, config: SegmentationConfig, rng: np.random.Generator | None = None, device: str | None = None
+) -> Sam2Segmenter:
+    """The segmenter with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
+    transformers = packages.load("transformers", "sam2", "transformers")
+    folder = checkpoints.checked_files("sam2")[0].parent
+    # Nothing but tensors is in a file of this kind, and nothing is fetched from elsewhere.
+    model = transformers.Sam2VideoModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+    return Sam2Segmenter(model, camera, checkpoints.device_of(device))
+
+
+class Sam2Segmenter:
+    """Streams pictures through a ``Sam2VideoModel``. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
+
+    It looks at colour alone: hints are not used, and unmeasured pixels are labelled too.
+    """
+
+    name = "sam2"
+
+    def __init__(self, model: torch.nn.Module, camera: Camera, device: str = "cpu"):
+        self._model, self._device, self._camera = model.to(device).eval(), device, camera
+        self._size = int(model.config.image_size)
+        self._sessions: dict[str, Any] = {}
+        self._at = 0  # number of the frame to come
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The objects that it looks after, in the order in which they came."""
+        return tuple(self._sessions)
+
+    def remove(self, name: str) -> None:
+        """Forget an object."""
+        del self._sessions[name]
+
+    def segment(
+        self,
+        frame: Frame,
+        clicks: Mapping[str, ArrayLike] | None = None,
+        hints: Mapping[str, Hint] | None = None,
+    ) -> np.ndarray:
+        """One frame in, one label image out; where two objects claim a pixel the likelier one has it."""
+        import torch
+
+        new = {name: check_clicks(name, at, self._camera) for name, at in (clicks or {}).items()}
+        for name, at in new.items():
+            check_depth(name, at, frame)
+        for name, at in new.items():
+            self._sessions[name] = self._session(at)
+        with torch.inference_mode():
+            labels = self._labels(frame) if self._sessions else np.zeros(frame.shape, np.int32)
+        self._at += 1
+        return labels
+
+    def _session(self, clicks: np.ndarray) -> Any:
+        """A session whose object has clicks in the frame to come."""
+        import torch
+        from transformers import Sam2VideoInferenceSession
+
+        session = Sam2VideoInferenceSession(
+            video_height=self._camera.height,
+            video_width=self._camera.width,
+            inference_device=torch.device(self._device),
+            inference_state_device=torch.device(self._device),
+            video_storage_device=torch.device(self._device),
+            dtype=torch.float32,
+        )
+        shape = self._camera.height, self._camera.width
+        # The network adds the half by which a pixel's centre is off its edge.
+        points = torch.from_numpy(to_raster(clicks, shape, self._size) - 0.5).float()[None, None]
+        labels = torch.ones(points.shape[:-1], dtype=torch.int32)  # all on the object
+        at = session.obj_id_to_idx(_OBJECT)
+        session.add_point_inputs(at, self._at, {"point_coords": points, "point_labels": labels})
+        session.obj_with_new_inputs = [_OBJECT]
+        return session
+
+    def _labels(self, frame: Frame) -> np.ndarray:
+        import torch
+
+        pixels = self._pixels(frame.rgb)
+        found = self._model.get_image_features(pixels, return_dict=True)
+        features = {"vision_feats": found.fpn_hidden_states, "vision_pos_embeds": found.fpn_position_encoding}
+        logits = []
+        for session in self._sessions.values():
+            session.cache.cache_vision_features(self._at, features)
+            told = self._model(inference_session=session, frame=pixels, frame_idx=self._at)
+            logits.append(torch.where(told.object_score_logits.view(-1, 1, 1, 1) > 0, told.pred_masks, _ABSENT))
+            self._trim(session)
+        masks = torch.nn.functional.interpolate(torch.cat(logits), frame.shape, mode="bilinear", align_corners=False)
+        best, which = masks[:, 0].max(0)
+        return torch.where(best > 0, which + 1, 0).cpu().numpy().astype(np.int32)
+
+    def _pixels(self, rgb: np.ndarray) -> torch.Tensor:
+        """(1, 3, S, S) as the network wants it."""
+        import torch
+
+        picture = torch.from_numpy(rgb).to(self._device).permute(2, 0, 1)[None].float() / 255
+        picture = torch.nn.functional.interpolate(
+            picture, (self._size, self._size), mode="bilinear", align_corners=False, antialias=True
+        )
+        mean, deviation = (torch.tensor(v, device=self._device).view(1, 3, 1, 1) for v in (MEAN, DEVIATION))
+        return (picture - mean) / deviation
+
+    def _trim(self, session: Any) -> None:
+        """Let go of what is not read any more: by itself a session grows by megabytes a frame."""
+        config = self._model.config
+        session.processed_frames = {}
+        at = session.obj_id_to_idx(_OBJECT)
+        session.frames_tracked_per_obj[at] = {self._at: {"reverse": False}}
+        kept = session.output_dict_per_obj[at]
+        recent = kept["non_cond_frame_outputs"]
+        for old in [i for i in recent if i <= self._at - config.max_object_pointers_in_encoder]:
+            del recent[old]
+        for i, output in [*recent.items(), *kept["cond_frame_outputs"].items()]:
+            spent = _SPATIAL if i in recent and i <= self._at - config.num_maskmem else ()
+            for key in (*_READ_ONCE, *spent):
+                output.pop(key, None)

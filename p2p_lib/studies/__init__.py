@@ -1,0 +1,1 @@
+"""One study per notebook: its experiment and its plots."""

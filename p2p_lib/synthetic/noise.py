@@ -1,0 +1,167 @@
+"""What a real RGB-D camera does to a perfect picture (active stereo, as a RealSense D435)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.synthetic.render import Picture
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Sensor model; 0 switches an effect off. The defaults are about those of a RealSense D435 at 640x480.
+
+    axial_per_m       standard deviation of the depth noise at 1 m, in m; grows with the range squared
+    correlation_px    the noise is even over about this radius (stereo matches windows, not pixels)
+    disparity_step_px stereo quantises disparity to this; the depth step grows with the range squared
+    baseline_m        distance of the two imagers: what only one of them sees has no depth
+    lateral_px        standard deviation of the raggedness of depth edges
+    edge_m            a depth step larger than this is an edge; pixels beside it lose depth with edge_loss
+    edge_loss         probability
+    grazing_deg       incidence at which half of the depth is lost
+    psf_px            blur of lens and demosaicing (standard deviation)
+    read_levels       colour noise in the dark, standard deviation in grey levels
+    shot_levels       colour noise at full brightness, added in variance
+    exposure          largest relative change of brightness over time (slow)
+    shutter_share     share of the frame time that the shutter is open: motion blur
+    blur_samples      pictures averaged for it
+    mask_px           standard deviation of the displacement of the masks' outlines, which wobble smoothly
+    mask_loss         probability that an object's mask is missing in a frame
+    drop              probability that a frame is missing (never the first)
+    """
+
+    axial_per_m: float = 0.004
+    correlation_px: float = 1.5
+    disparity_step_px: float = 1 / 32
+    baseline_m: float = 0.05
+    lateral_px: float = 0.6
+    edge_m: float = 0.02
+    edge_loss: float = 0.5
+    grazing_deg: float = 80.0
+    psf_px: float = 0.6
+    read_levels: float = 1.5
+    shot_levels: float = 2.5
+    exposure: float = 0.04
+    shutter_share: float = 0.0
+    blur_samples: int = 6
+    mask_px: float = 0.0
+    mask_loss: float = 0.0
+    drop: float = 0.0
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            shares = dict.fromkeys(("edge_loss", "shutter_share", "mask_loss", "drop"), 1)
+            high = (shares | {"exposure": 0.9, "grazing_deg": 90}).get(f.name, np.inf)
+            if not np.isfinite(value) or not 0 <= value <= high:
+                raise BadInput(f"sensor {f.name}", value, f"a number from 0 to {high}")
+        if self.blur_samples < 1:
+            raise BadInput("sensor blur_samples", self.blur_samples, "at least 1")
+
+
+#: Exact depth and clean colour.
+PERFECT = Sensor(**{f.name: 1 if f.name == "blur_samples" else 0 for f in fields(Sensor)})
+
+#: What ``p2p synth --noise`` takes.
+NOISE = {
+    "exact": PERFECT,
+    "realsense": Sensor(),
+    "hard": Sensor(
+        axial_per_m=0.006, exposure=0.15, shutter_share=0.4, mask_px=1.5, mask_loss=0.01, drop=0.02, edge_loss=0.8
+    ),
+}
+
+
+def measured_depth(picture: Picture, camera: Camera, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """Depth (H, W) float64 in metres as the sensor reports it; 0 = no measurement."""
+    exact = picture.depth_m
+    H, W = exact.shape
+    hole = exact <= 0
+    if sensor.baseline_m:
+        hole |= _second_imager_blind(exact, camera.fx * sensor.baseline_m)
+    if sensor.edge_loss:
+        hole |= _edges(exact, sensor.edge_m) & (rng.random((H, W), np.float32) < sensor.edge_loss)
+    if sensor.grazing_deg:
+        incidence = np.degrees(np.arccos(np.clip(picture.cos_incidence, 0, 1)))
+        lost = np.clip((incidence - sensor.grazing_deg) / 10 + 0.5, 0, 1)
+        hole |= rng.random((H, W), np.float32) < lost
+    depth = _ragged(exact, sensor, rng) if sensor.lateral_px else exact
+    if sensor.axial_per_m:
+        depth = depth + sensor.axial_per_m * depth**2 * _correlated(H, W, sensor.correlation_px, rng)
+    if sensor.disparity_step_px and sensor.baseline_m:
+        unit = camera.fx * sensor.baseline_m / sensor.disparity_step_px
+        steps = np.round(np.divide(unit, depth, out=np.zeros((H, W)), where=depth > 0))
+        depth = np.divide(unit, steps, out=np.zeros((H, W)), where=steps > 0)
+    return np.where(hole, 0.0, depth)
+
+
+def measured_colour(rgb: np.ndarray, sensor: Sensor, gain: float, rng: np.random.Generator) -> np.ndarray:
+    """Colour (H, W, 3) uint8 of a rendered (H, W, 3) float32 picture at a relative exposure ``gain``."""
+    rgb = rgb * np.float32(gain)
+    if sensor.psf_px:
+        rgb = cv2.GaussianBlur(rgb, (0, 0), sensor.psf_px)
+    if sensor.read_levels or sensor.shot_levels:
+        variance = sensor.read_levels**2 + sensor.shot_levels**2 * np.clip(rgb, 0, 255) / 255
+        rgb = rgb + np.sqrt(variance, dtype=np.float32) * rng.standard_normal(rgb.shape, np.float32)
+    return np.clip(np.round(rgb), 0, 255).astype(np.uint8)
+
+
+def measured_mask(mask: np.ndarray, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """A segmenter's mask (H, W) bool of an exact one: its outline wobbles; now and then it is missing."""
+    if sensor.mask_loss and rng.random() < sensor.mask_loss:
+        return np.zeros_like(mask)
+    if not sensor.mask_px or not mask.any():
+        return mask
+    H, W = mask.shape
+    wobble = [sensor.mask_px * _correlated(H, W, 6.0, rng) for _ in range(2)]
+    v, u = np.mgrid[:H, :W].astype(np.float32)
+    at = u + wobble[0], v + wobble[1]
+    moved = cv2.remap(mask.astype(np.uint8), *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    return moved > 0
+
+
+def kept_frames(frames: int, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """The frames that arrive; the first always does."""
+    kept = rng.random(frames) >= sensor.drop
+    kept[0] = True
+    return np.flatnonzero(kept)
+
+
+def _second_imager_blind(depth_m: np.ndarray, f_times_b: float) -> np.ndarray:
+    """Pixels hidden from the second imager, which sits a baseline to the right: nearer surface covers them there."""
+    z = np.where(depth_m > 0, depth_m, np.inf)
+    column = np.arange(depth_m.shape[1]) - f_times_b / z
+    nearest = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
+    return column > nearest
+
+
+def _edges(depth_m: np.ndarray, step_m: float) -> np.ndarray:
+    """Pixels within one pixel of a depth step."""
+    z = depth_m.astype(np.float32)
+    square = np.ones((3, 3), np.uint8)
+    return cv2.dilate(z, square) - cv2.erode(z, square) > step_m
+
+
+def _ragged(depth_m: np.ndarray, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """Depth looked up at randomly displaced pixels beside edges; even surface stays as it is."""
+    H, W = depth_m.shape
+    v, u = np.nonzero(_edges(depth_m, sensor.edge_m))
+    shift = np.round(sensor.lateral_px * rng.standard_normal((2, len(v)))).astype(int)
+    ragged = depth_m.copy()
+    ragged[v, u] = depth_m[np.clip(v + shift[0], 0, H - 1), np.clip(u + shift[1], 0, W - 1)]
+    return ragged
+
+
+def _correlated(height: int, width: int, radius_px: float, rng: np.random.Generator) -> np.ndarray:
+    """(height, width) float32 Gaussian noise of unit standard deviation, blurred by ``radius_px``."""
+    noise = rng.standard_normal((height, width), np.float32)
+    if radius_px <= 0:
+        return noise
+    half = int(np.ceil(3 * radius_px))
+    kernel = cv2.getGaussianKernel(2 * half + 1, radius_px, cv2.CV_32F)
+    return cv2.sepFilter2D(noise, -1, kernel, kernel) / np.float32((kernel**2).sum())

@@ -1,0 +1,104 @@
+"""A re-creation of the paper's synthetic subset: five sequences, 2,705 frames, circular and linear motion.
+
+Not the paper's files: the same objects, camera and kinds of motion, drawn anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.synthetic import shapes
+from p2p_lib.synthetic.motion import look_at, turn, wander
+from p2p_lib.synthetic.scene import Body, Scenario, room
+from p2p_lib.synthetic.shapes import Mesh
+
+FRAMES = 541  # five times this is 2,705
+CAMERA = Camera(380.0, 380.0, 320.0, 240.0, 640, 480)
+
+#: Where no YCB model is given: a printed solid of about its size.
+STAND_INS: dict[str, Callable[[np.random.Generator], Mesh]] = {
+    "002_master_chef_can": partial(shapes.can, radius_m=0.051, height_m=0.139),
+    "004_sugar_box": partial(shapes.box, size_m=(0.089, 0.038, 0.175)),
+    "005_tomato_soup_can": partial(shapes.can, radius_m=0.034, height_m=0.101),
+    "010_potted_meat_can": partial(shapes.box, size_m=(0.097, 0.050, 0.082)),
+    "019_pitcher_base": partial(shapes.can, radius_m=0.062, height_m=0.240),
+    "037_scissors": partial(shapes.box, size_m=(0.088, 0.016, 0.200)),
+    "072-a_toy_airplane": partial(shapes.block, radius_m=0.07, height_m=0.14),
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """One object of a sequence and how it moves: ``circular`` (around the middle) or ``linear`` (to and fro)."""
+
+    model: str
+    motion: str
+
+
+SEQUENCES = {
+    "ycb_sugar_box": (Part("004_sugar_box", "linear"),),
+    "ycb_pitcher": (Part("019_pitcher_base", "circular"),),
+    "ycb_meat_sugar": (Part("010_potted_meat_can", "circular"), Part("004_sugar_box", "linear")),
+    "ycb_scissors_can": (Part("037_scissors", "circular"), Part("002_master_chef_can", "linear")),
+    "ycb_airplane_can": (Part("072-a_toy_airplane", "circular"), Part("005_tomato_soup_can", "linear")),
+}
+
+
+def paper_sequence(seed: int, frames: int = FRAMES, models: str = "", *, parts: tuple[Part, ...]) -> Scenario:
+    """One of :data:`SEQUENCES`. The circling object passes before and behind the other one.
+
+    ``models`` is a folder of YCB models (``<name>/textured.obj``, metres); without it printed stand-ins are used, and
+    the scenario's ``objects`` say so.
+    """
+    if frames < 2:
+        raise BadInput("frames", frames, "at least 2")
+    rng = np.random.default_rng([seed, 1])
+    # Two objects keep clear of each other: one stays within 4 cm of the middle, the other goes around it.
+    reach = {"circular": 0.21, "linear": 0.04} if len(parts) > 1 else {"circular": 0.10, "linear": 0.08}
+    bodies = []
+    for part in parts:
+        mesh = _mesh(rng, part.model, models)
+        T = {"circular": _circular, "linear": _linear}[part.motion](rng, frames, reach[part.motion])
+        middle = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
+        bodies.append(Body(part.model, mesh, T @ se3.from_rt(np.eye(3), -middle)))
+    eye = np.array([0.0, -0.52, 0.34])
+    T_world_cam = np.broadcast_to(look_at(eye, np.array([0.0, 0.02, 0.14])), (frames, 4, 4))
+    kind = "YCB models" if models else "procedural stand-ins of about the YCB models' sizes"
+    return Scenario(CAMERA, T_world_cam, tuple(bodies), room(rng), objects=kind)
+
+
+def _mesh(rng: np.random.Generator, model: str, models: str) -> Mesh:
+    if not models:
+        return STAND_INS[model](rng)
+    path = Path(models).expanduser() / model / "textured.obj"
+    if not path.is_file():
+        fix = "Give the folder that holds the YCB models, one folder each; without --models stand-ins are used."
+        raise MissingData(f"model {path}", "no such file", fix)
+    return shapes.load_mesh(path)
+
+
+def _circular(rng: np.random.Generator, frames: int, radius_m: float) -> np.ndarray:
+    """Twice around a circle that lies flat, turning by a full turn on the way."""
+    share = np.arange(frames)[:, None] / (frames - 1)
+    angle = 2 * np.pi * (2 * share + rng.uniform()) * rng.choice([-1, 1])
+    T = wander(rng, frames, 0.01, 8.0, 200) @ turn(np.array([0, 0, 1.0]), 2 * np.pi * (share[:, 0] + rng.uniform()))
+    T[:, :3, 3] += np.concatenate([radius_m * np.cos(angle), radius_m * np.sin(angle), 0.16 + 0 * angle], 1)
+    return T
+
+
+def _linear(rng: np.random.Generator, frames: int, reach_m: float) -> np.ndarray:
+    """To and fro along a line, turning by 200 degrees on the way."""
+    share = np.arange(frames) / (frames - 1)
+    yaw = np.radians(200) * share * rng.choice([-1, 1]) + rng.uniform(0, 2 * np.pi)
+    T = wander(rng, frames, 0.01, 8.0, 200) @ turn(np.array([0, 0, 1.0]), yaw)
+    T[:, 0, 3] += reach_m * np.sin(2 * np.pi * (2 * share + rng.uniform()))
+    T[:, 1:3, 3] += [0.02, 0.14]
+    return T

@@ -1,0 +1,37 @@
+"""Every scenario by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from p2p_lib.synthetic import ablations, absences, paper_subset
+from p2p_lib.synthetic.crossing import crossing
+from p2p_lib.synthetic.scene import Scenario
+
+#: Each takes the seed first and its own keyword parameters.
+SCENARIOS: dict[str, Callable[..., Scenario]] = {
+    make.__name__: make
+    for make in (
+        crossing,
+        ablations.mug,
+        ablations.weak_texture,
+        ablations.fading_label,
+        ablations.long_turning,
+        absences.occlusion,
+        absences.exit_reentry,
+        absences.look_alikes,
+        absences.late_object,
+        absences.three_objects,
+        absences.moving_camera,
+    )
+}
+SCENARIOS |= {name: partial(paper_subset.paper_sequence, parts=parts) for name, parts in paper_subset.SEQUENCES.items()}
+
+
+def describe(name: str) -> str:
+    """What happens in a scenario, in one line."""
+    if name in paper_subset.SEQUENCES:
+        parts = " and ".join(f"{part.model} ({part.motion})" for part in paper_subset.SEQUENCES[name])
+        return f"as in the paper's synthetic subset: {parts}, {paper_subset.FRAMES} frames."
+    return SCENARIOS[name].__doc__.splitlines()[0]

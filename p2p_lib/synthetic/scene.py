@@ -1,0 +1,54 @@
+"""What a scene is made of: bodies that move, a room that stands still, light, a camera on its path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.synthetic import labels, shapes
+from p2p_lib.synthetic.render import Light
+from p2p_lib.synthetic.shapes import Mesh
+
+FPS = 30.0
+#: About a RealSense D435's colour camera.
+VGA = Camera(615.0, 615.0, 319.5, 239.5, 640, 480)
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A moving mesh. ``T_world_model`` (T, 4, 4), one per frame. Only labelled bodies have masks, poses and tracks."""
+
+    name: str
+    mesh: Mesh
+    T_world_model: np.ndarray
+    labelled: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A scene in time. World: z up, the table top is z = 0. ``T_world_cam`` (T, 4, 4); ``objects``: what they are."""
+
+    camera: Camera
+    T_world_cam: np.ndarray
+    bodies: tuple[Body, ...]
+    room: tuple[Mesh, ...]
+    light: Light = field(default_factory=Light)
+    objects: str = "procedural"
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.T_world_cam)
+
+
+def room(rng: np.random.Generator) -> tuple[Mesh, ...]:
+    """A table top and the wall behind it."""
+    table = shapes.plane(
+        labels.wood(rng, 1536, 1024), [[-0.9, -0.6, 0], [0.9, -0.6, 0], [0.9, 0.45, 0], [-0.9, 0.45, 0]]
+    )
+    wall = shapes.plane(
+        labels.plaster(rng, 1024, 512), [[-1.6, 0.9, -0.6], [1.6, 0.9, -0.6], [1.6, 0.9, 1.2], [-1.6, 0.9, 1.2]]
+    )
+    return table, wall

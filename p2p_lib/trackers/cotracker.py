@@ -1,0 +1,119 @@
+"""CoTracker3 online (Karaev et al., ICCV 2025), through torch.hub. Code and weights: CC BY-NC, not for commercial use.
+
+The model looks at windows of 16 pictures, 8 of them new, so an answer comes up to 7 frames late. A rollout
+begins with 8 copies of its first picture, so that the first window is full after 8 real ones.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from p2p_lib.core import packages
+from p2p_lib.core.config import TrackingConfig
+from p2p_lib.datasets import checkpoints
+from p2p_lib.trackers.rollouts import RolloutTracker
+
+if TYPE_CHECKING:
+    import torch
+
+# The predictor's own: steps of refinement, and the product of visibility and confidence that counts as visible.
+_ITERATIONS, _VISIBLE = 6, 0.6
+
+
+def load(config: TrackingConfig, rng: np.random.Generator | None = None, device: str | None = None) -> RolloutTracker:
+    """The tracker with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
+    weights = checkpoints.load_weights("cotracker3")
+    predictor = new_predictor()
+    checkpoints.fill(predictor.model, "cotracker3", weights)
+    return RolloutTracker(CoTrackerModel(predictor, checkpoints.device_of(device)))
+
+
+def new_predictor() -> torch.nn.Module:
+    """The official predictor with random weights, from torch.hub's folder or an installed package; never downloads."""
+    import torch
+
+    folder = packages.cotracker_folder()
+    if folder is not None:
+        return torch.hub.load(str(folder), "cotracker3_online", source="local", pretrained=False)
+    module = packages.load("cotracker.predictor", "cotracker3", "co-tracker")
+    return module.CoTrackerOnlinePredictor(checkpoint=None, window_len=16)
+
+
+class CoTrackerModel:
+    """Makes rollouts of a CoTracker3 (see :class:`p2p_lib.trackers.rollouts.RolloutModel`)."""
+
+    name = "cotracker3"
+
+    def __init__(self, predictor: torch.nn.Module, device: str = "cpu"):
+        self.model, self.device = predictor.model.to(device).eval(), device
+        self.size = tuple(predictor.interp_shape)  # height, width
+        self.window, self.fresh = self.model.window_len, predictor.step
+        self.latency_frames = self.fresh - 1
+
+    def begin(self, pictures: list[np.ndarray], uv_px: np.ndarray) -> CoTrackerRollout:
+        """A rollout with queries in the first picture."""
+        return CoTrackerRollout(self, pictures, uv_px)
+
+    def resized(self, rgb: np.ndarray) -> torch.Tensor:
+        """(3, h, w) float32 in [0, 255]; the corners' pixel centres stay in the corners."""
+        import torch
+
+        picture = torch.from_numpy(rgb).to(self.device).permute(2, 0, 1)[None].float()
+        return torch.nn.functional.interpolate(picture, self.size, mode="bilinear", align_corners=True)[0]
+
+    def scale(self, shape: tuple[int, int]) -> np.ndarray:
+        """(2,) x, y: the model's pixels per pixel of a picture of shape (H, W)."""
+        h, w = self.size
+        return np.array([(w - 1) / (shape[1] - 1), (h - 1) / (shape[0] - 1)])
+
+
+class CoTrackerRollout:
+    """The model's sliding window with a fixed set of queries. It keeps its state in the model: swapped in and out."""
+
+    def __init__(self, of: CoTrackerModel, pictures: list[np.ndarray], uv_px: np.ndarray):
+        import torch
+
+        self._of, self._scale = of, of.scale(pictures[0].shape[:2])
+        queries = np.concatenate([np.zeros((len(uv_px), 1)), uv_px * self._scale], 1).astype(np.float32)
+        self._queries = torch.from_numpy(queries).to(of.device)[None]
+        still = of.resized(pictures[0])
+        self._pictures = deque([still] * of.fresh, maxlen=of.window)
+        self._taken = 0  # real pictures so far
+        self._state: dict | None = None
+        self._told: tuple[np.ndarray, ...] = ()  # of the frames since the still, as far as the windows reach
+        for rgb in pictures:
+            self._take(rgb)
+
+    def step(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions (Q, 2) in pixels, visible (Q,), uncertainty (Q,) of the frame ``latency_frames`` ago."""
+        self._take(rgb)
+        answered = self._taken - 1 - self._of.latency_frames
+        if answered < 0:
+            q = self._queries.shape[1]
+            return np.full((q, 2), np.nan), np.zeros(q, bool), np.ones(q)
+        xy, visible, sure = (told[answered - self._first] for told in self._told)
+        return xy / self._scale, visible * sure > _VISIBLE, 1 - sure
+
+    def _take(self, rgb: np.ndarray) -> None:
+        self._pictures.append(self._of.resized(rgb))
+        self._taken += 1
+        if self._taken % self._of.fresh == 0:
+            self._run_window()
+
+    def _run_window(self) -> None:
+        """One window over the newest pictures; of what the model predicts the window's part is kept."""
+        import torch
+
+        model, window = self._of.model, self._of.window
+        with torch.inference_mode():
+            model.init_video_online_processing()
+            if self._state is not None:
+                vars(model).update(self._state)
+            video = torch.stack(list(self._pictures))[None]
+            told = model(video=video, queries=self._queries, iters=_ITERATIONS, is_online=True)[:3]
+        self._state = {key: value for key, value in vars(model).items() if key.startswith("online_")}
+        self._told = tuple(part[0, -window:].double().cpu().numpy() for part in told)
+        self._first = self._taken - window  # the frame, counted from the queries', that its first row is of

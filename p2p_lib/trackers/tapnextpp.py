@@ -1,0 +1,88 @@
+"""TAPNext++ (arXiv:2604.10582): a recurrent tracker of points as tokens, through the official package ``tapnet``.
+
+Causal, frame by frame; its state takes no further queries. Code and weights: Apache-2.0.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from p2p_lib.core import packages
+from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.raster import from_raster, square, to_raster
+from p2p_lib.datasets import checkpoints
+from p2p_lib.trackers.rollouts import RolloutTracker
+
+if TYPE_CHECKING:
+    import torch
+
+#: Side of the square that pictures are scaled to; coordinates have one bin per pixel of it.
+SIZE_PX = 256
+# The uncertainty is the probability that the model puts farther off than this, in pixels of its raster.
+_NEAR_PX = 8
+
+
+def load(config: TrackingConfig, rng: np.random.Generator | None = None, device: str | None = None) -> RolloutTracker:
+    """The tracker with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
+    weights = checkpoints.load_weights("tapnextpp")
+    model = new_model()
+    # The trainer's prefix, where the checkpoint still has it.
+    checkpoints.fill(model, "tapnextpp", {key.removeprefix("tapnext."): value for key, value in weights.items()})
+    return RolloutTracker(TapNextModel(model, checkpoints.device_of(device)))
+
+
+def new_model() -> torch.nn.Module:
+    """The official class for 256 x 256 pixels, with random weights."""
+    packages.load("torchvision", "tapnextpp", "torchvision")
+    module = packages.load("tapnet.tapnext.tapnext_torch", "tapnextpp", "tapnet")
+    return module.TAPNext(image_size=(SIZE_PX, SIZE_PX))
+
+
+class TapNextModel:
+    """Makes rollouts of a TAPNext model (see :class:`p2p_lib.trackers.rollouts.RolloutModel`)."""
+
+    name = "tapnextpp"
+    latency_frames = 0
+
+    def __init__(self, model: torch.nn.Module, device: str = "cpu"):
+        self.model, self.device = model.to(device).eval(), device
+
+    def begin(self, pictures: list[np.ndarray], uv_px: np.ndarray) -> TapNextRollout:
+        """A rollout with queries in the newest picture."""
+        return TapNextRollout(self, pictures[0], uv_px)
+
+
+class TapNextRollout:
+    """The model's recurrent state with a fixed set of queries."""
+
+    def __init__(self, of: TapNextModel, rgb: np.ndarray, uv_px: np.ndarray):
+        import torch
+
+        self._of = of
+        xy = to_raster(uv_px, rgb.shape[:2], SIZE_PX)
+        tyx = np.concatenate([np.zeros((len(xy), 1)), xy[:, ::-1]], 1).astype(np.float32)
+        self._state = self._forward(rgb, query_points=torch.from_numpy(tyx).to(of.device)[None])[-1]
+
+    def step(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions (Q, 2) in pixels, visible (Q,), uncertainty (Q,) in the next picture."""
+        yx, logits, visible, self._state = self._forward(rgb, state=self._state)
+        yx, logits = yx[0, 0].double(), logits[0, 0].double()
+        sure = _mass_near(yx[:, 0], logits[:, :SIZE_PX]) * _mass_near(yx[:, 1], logits[:, SIZE_PX:])
+        uv = from_raster(yx.flip(-1).cpu().numpy(), rgb.shape[:2], SIZE_PX)
+        return uv, (visible[0, 0, :, 0] > 0).cpu().numpy(), 1 - sure.cpu().numpy()
+
+    def _forward(self, rgb: np.ndarray, **given: Any) -> tuple:
+        import torch
+
+        with torch.inference_mode():
+            return self._of.model(video=square(rgb, SIZE_PX, self._of.device), **given)
+
+
+def _mass_near(at: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
+    """Probability (Q,) of the bins (Q, B) whose centre is near a coordinate (Q,)."""
+    import torch
+
+    centre = torch.arange(logits.shape[1], device=logits.device) + 0.5
+    return (torch.softmax(logits, 1) * ((centre - at[:, None]).abs() <= _NEAR_PX)).sum(1)

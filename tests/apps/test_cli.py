@@ -1,0 +1,615 @@
+"""The command line: what a user types, what comes back, and one line for everything that can go wrong."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import p2p_lib
+from p2p_lib.apps import cli
+from p2p_lib.core.errors import MissingData, P2PError
+from p2p_lib.datasets.runs import load_run
+from p2p_lib.method.pipeline import Point2Pose
+
+FRAMES, W, H = 8, 160, 120
+K = np.array([[200.0, 0, 79.5], [0, 200, 59.5], [0, 0, 1]])
+DEPTH_M = 0.5
+#: Points alone: the rest of the method is tested elsewhere, and torch takes seconds to import.
+POINTS_ALONE = ["--set", "tsdf.enabled=false", "--set", "factor_graph.enabled=false", "--quiet"]
+
+
+def write_sequence(folder: Path, frames: int = FRAMES) -> Path:
+    """A printed board that slides by 2 px right and 1 px down a frame before a wall, in the YCBInEOAT layout."""
+    rng = np.random.default_rng(0)
+    print_ = [cv2.resize(rng.integers(0, 256, (s, s, 3)).astype(np.float32), (60, 60)) for s in (6, 15, 30)]
+    board = np.clip(np.mean(print_, 0) * 1.6 - 70, 0, 255).astype(np.uint8)
+    for name in ("rgb", "depth", "gt_mask", "annotated_poses", "models/object"):
+        (folder / name).mkdir(parents=True)
+    np.savetxt(folder / "cam_K.txt", K)
+    corners = np.array([[x, y, 0] for x in np.linspace(-0.075, 0.075, 7) for y in np.linspace(-0.075, 0.075, 7)])
+    np.savetxt(folder / "models/object/points.xyz", corners)
+    for k in range(frames):
+        x, y = 30 + 2 * (k % 20), 20 + k % 20
+        rgb, depth = np.full((H, W, 3), 90, np.uint8), np.full((H, W), 900, np.uint16)
+        rgb[y : y + 60, x : x + 60], depth[y : y + 60, x : x + 60] = board, 1000 * DEPTH_M
+        mask = np.zeros((H, W), np.uint8)
+        mask[y : y + 60, x : x + 60] = 255
+        for name, image in (("rgb", rgb), ("depth", depth), ("gt_mask", mask)):
+            cv2.imwrite(str(folder / name / f"{k:04d}.png"), image)
+        T = np.eye(4)
+        T[:3, 3] = (x + 29.5 - K[0, 2]) / 200 * DEPTH_M, (y + 29.5 - K[1, 2]) / 200 * DEPTH_M, DEPTH_M
+        np.savetxt(folder / "annotated_poses" / f"{k:04d}.txt", T)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory) -> Path:
+    return write_sequence(tmp_path_factory.mktemp("cli") / "slide")
+
+
+@pytest.fixture
+def sequence(pristine, tmp_path) -> Path:
+    """A copy to spoil."""
+    return Path(shutil.copytree(pristine, tmp_path / "slide"))
+
+
+@pytest.fixture(scope="module")
+def done(pristine, tmp_path_factory) -> Path:
+    """A finished run, of seed 7; nobody writes to it."""
+    out = tmp_path_factory.mktemp("done") / "run"
+    assert cli.main(["run", str(pristine), "--out", str(out), "--seed", "7", *POINTS_ALONE]) == 0
+    return out
+
+
+def run(sequence: Path, out: Path, *more: str) -> int:
+    return cli.main(["run", str(sequence), "--out", str(out), *POINTS_ALONE, *more])
+
+
+# --- what works --------------------------------------------------------------------------------
+
+
+def test_a_run_leaves_what_was_promised(done):
+    assert {p.name for p in done.iterdir()} >= {"config.toml", "run.json", "poses", "poses.npz", "timings.csv"}
+    rows = np.loadtxt(done / "poses" / "object.txt")
+    assert rows.shape == (FRAMES, 8)
+    np.testing.assert_allclose(rows[:, 0], np.arange(FRAMES) / 30, atol=1e-6)
+    moved = rows[:, 1:4] - rows[0, 1:4]
+    np.testing.assert_allclose(moved, np.arange(FRAMES)[:, None] * [2 / 200 * DEPTH_M, 1 / 200 * DEPTH_M, 0], atol=5e-4)
+
+
+def test_a_run_says_its_score_and_what_to_do_next(sequence, tmp_path, capsys):
+    assert run(sequence, tmp_path / "out") == 0
+    out, err = capsys.readouterr()
+    assert "ADD-S" in out and "object" in out
+    assert out.splitlines()[-1] == f"Results in {tmp_path / 'out'}. Next: p2p eval {tmp_path / 'out'} --json"
+    assert err == ""
+
+
+SCORES = {"add_auc", "adds_auc", "add_auc_voc", "adds_auc_voc"}
+
+
+def test_eval_prints_exactly_one_json_object(done, capsys):
+    assert cli.main(["eval", str(done), "--json"]) == 0
+    out, err = capsys.readouterr()
+    got = json.loads(out)  # anything beside one object would be "Extra data"
+    assert err == "" and "NaN" not in out and "Infinity" not in out
+    assert set(got) == {"objects", "mean", "hz", "p95_ms", "tracker", "masks", "preset", "seed", "align"}
+    assert set(got["objects"]) == {"object"}
+    assert set(got["objects"]["object"]) == SCORES | {"frames", "lost"}
+    assert set(got["mean"]) == SCORES
+    assert got["objects"]["object"]["frames"] == FRAMES and got["objects"]["object"]["lost"] == 0
+    assert 98 < got["mean"]["add_auc"] <= got["mean"]["adds_auc"] <= 100
+    assert got["hz"] > 0 and got["p95_ms"] > 0
+    assert (got["masks"], got["preset"], got["seed"], got["align"]) == ("dataset", "default", 7, "first")
+    assert isinstance(got["tracker"], str) and got["tracker"]
+
+
+def test_eval_options_reach_the_evaluation(done, pristine, capsys):
+    models = f"object={pristine / 'models/object/points.xyz'}"
+    assert cli.main(["eval", str(done), "--json", "--align", "all", "--models", models]) == 0
+    assert json.loads(capsys.readouterr().out)["align"] == "all"
+    assert cli.main(["eval", str(done), "--min-visible-px", "3601"]) == 2
+    assert "3601 visible pixels" in capsys.readouterr().err
+
+
+def test_eval_prints_a_table_for_people(done, capsys):
+    assert cli.main(["eval", str(done)]) == 0
+    out = capsys.readouterr().out
+    assert not out.startswith("{") and "ADD-S" in out and "Hz" in out and "seed 7" in out
+
+
+def test_options_reach_the_run(sequence, tmp_path, capsys):
+    shutil.copytree(sequence / "gt_mask", sequence / "drawn")
+    (tmp_path / "mine.toml").write_text("[sampling]\npoints = 17\n[keypoint_map]\nstreak = 2\n")
+    code = run(
+        *(sequence, tmp_path / "out", "--preset", "paper", "--config", str(tmp_path / "mine.toml")),
+        *("--set", "sampling.points=18", "--seed", "3", "--start", "2", "--stop", "6"),
+        *("--masks", "dataset:drawn", "--objects", "object", "--format", "ycbineoat", "--depth-scale", "0.001"),
+    )
+    assert code == 0
+    loaded = load_run(tmp_path / "out")
+    assert loaded.objects["object"].frame_index.tolist() == [2, 3, 4, 5]
+    assert (loaded.info["preset"], loaded.info["seed"], loaded.info["masks"]) == ("paper", 3, "dataset:drawn")
+    written = (tmp_path / "out" / "config.toml").read_text()
+    assert "points = 18\n" in written and "streak = 2\n" in written and 'preset = "paper"' in written
+    # What was written reproduces the configuration.
+    again = run(sequence, tmp_path / "again", "--config", str(tmp_path / "out" / "config.toml"), "--stop", "2")
+    assert again == 0 and (tmp_path / "again" / "config.toml").read_text() == written
+
+
+def test_progress_goes_where_it_does_not_disturb(sequence, tmp_path, capsys):
+    loud = [word for word in POINTS_ALONE if word != "--quiet"]
+    assert cli.main(["run", str(sequence), "--out", str(tmp_path / "out"), *loud]) == 0
+    out, err = capsys.readouterr()
+    assert f"{FRAMES}/{FRAMES}" in err and "Hz" in err and "object tracked" in err
+    assert "frame/s" not in out and "\r" not in out
+    assert err.count("\n") == 1 and "\r" not in err, "a terminal's bar would fill a log file"
+
+
+def test_replacing_a_run_is_said(sequence, tmp_path, capsys):
+    assert run(sequence, tmp_path / "out", "--seed", "4") == 0
+    assert "replaces" not in capsys.readouterr().err
+    assert run(sequence, tmp_path / "out", "--stop", "3") == 0
+    err = capsys.readouterr().err
+    assert re.search(rf"out held a run of slide \({FRAMES} frames, tracker \S+, seed 4\), which this one replaces", err)
+    assert len(load_run(tmp_path / "out").objects["object"]) == 3
+
+
+def test_without_truth_there_is_no_score_and_no_fuss(sequence, tmp_path, capsys):
+    shutil.rmtree(sequence / "annotated_poses")
+    assert run(sequence, tmp_path / "out") == 0
+    out, err = capsys.readouterr()
+    assert "ADD" not in out and err == ""
+    assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and "nothing to score" in err
+
+
+def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys):
+    shutil.rmtree(sequence / "annotated_poses")
+    shutil.move(sequence / "gt_mask", sequence / "masks")
+    for path in (sequence / "depth").iterdir():
+        cv2.imwrite(str(path), np.full((H, W), 9000, np.uint16))
+    assert run(sequence, tmp_path / "out") == 2
+    out, err = capsys.readouterr()
+    assert "Next: p2p view" not in out and err.count("\n") == 1
+    assert "object never had a pose (only 0 mask pixels with depth)" in err and "--depth-scale" in err
+    assert err.endswith(f"Next: p2p check {sequence}\n")
+    for path in (sequence / "masks").iterdir():
+        cv2.imwrite(str(path), np.zeros((H, W), np.uint8))
+    assert run(sequence, tmp_path / "empty") == 2
+    assert "its masks are empty or too small" in capsys.readouterr().err
+    shutil.rmtree(sequence / "masks")
+    assert run(sequence, tmp_path / "none") == 2
+    assert "p2p click" in (line := one_line(capsys)) and "--prompts" in line
+
+
+def test_a_scenario_is_known_by_the_name_that_run_takes(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr("p2p_lib.synthetic.write_sequence", lambda name, out, *more: made.append(name) or out)
+    assert cli.main(["synth", "synthetic/crossing", "--out", str(tmp_path)]) == 0 and made == ["crossing"]
+
+
+def test_the_list_of_scenarios_has_no_markup(capsys):
+    assert cli.main(["synth", "--list"]) == 0
+    assert "`" not in capsys.readouterr().out
+
+
+def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("P2P_DATA", raising=False)
+    assert cli.main(["benchmark", "ycbineoat", "--out", str(tmp_path), "--quiet"]) == 2
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert "$P2P_DATA is not set" in first and "--quick" in first and "nothing ran" in last
+    assert cli.main(["benchmark", "--list"]) == 0
+    listed = capsys.readouterr().out
+    assert "YCBInEOAT (data: ycbineoat)" in listed and "Runtime\n" in listed
+
+
+# --- what does not: one line, exit code 2 ------------------------------------------------------
+
+
+def one_line(capsys, command: str = "run") -> str:
+    """The only line of stderr; nothing on stdout, no traceback."""
+    out, err = capsys.readouterr()
+    assert out == "" and err.endswith("\n") and err.count("\n") == 1, err
+    assert err.startswith(f"p2p {command}: ") and "Traceback" not in err
+    return err
+
+
+def spoil(path: Path, content: bytes | None) -> None:
+    path.unlink() if content is None else path.write_bytes(content)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:100])
+
+
+def image(path: Path, array: np.ndarray) -> None:
+    cv2.imwrite(str(path), array)
+
+
+def no_pictures(s: Path) -> None:
+    for path in [*(s / "rgb").iterdir(), *(s / "depth").iterdir()]:
+        path.unlink()
+
+
+BAD_FILES = {
+    "missing picture": (
+        lambda s: spoil(s / "rgb/0003.png", None),
+        ["depth: got 8 files, expected 7", "slide/rgb", "0003.png"],
+    ),
+    "missing depth": (lambda s: spoil(s / "depth/0003.png", None), ["depth", "7 files", "0003.png is missing"]),
+    "cut picture": (lambda s: cut(s / "rgb/0003.png"), ["rgb/0003.png", "unreadable"]),
+    "empty picture": (lambda s: spoil(s / "rgb/0000.png", b""), ["rgb/0000.png", "unreadable file of 0 bytes"]),
+    "cut depth": (lambda s: cut(s / "depth/0004.png"), ["depth/0004.png", "unreadable"]),
+    "small depth": (
+        lambda s: image(s / "depth/0002.png", np.ones((60, 80), np.uint16)),
+        ["depth/0002.png", "80x60", "160x120"],
+    ),
+    "8-bit depth": (lambda s: image(s / "depth/0001.png", np.ones((H, W), np.uint8)), ["depth/0001.png", "uint8"]),
+    "small mask": (lambda s: image(s / "gt_mask/0002.png", np.ones((6, 8), np.uint8)), ["gt_mask/0002.png", "8x6"]),
+    "empty sequence": (no_pictures, ["rgb", "no files"]),
+    "no depth folder": (lambda s: shutil.rmtree(s / "depth"), ["depth"]),
+    "K of two rows": (lambda s: spoil(s / "cam_K.txt", b"600 0 320\n0 600 240\n"), ["cam_K.txt", "(2, 3)", "3x3"]),
+    "K of words": (lambda s: spoil(s / "cam_K.txt", b"fx fy cx\n"), ["cam_K.txt", "fx fy cx", "3x3"]),
+    "K transposed": (lambda s: np.savetxt(s / "cam_K.txt", K.T), ["cam_K.txt", "fx 0 cx 0 fy cy 0 0 1"]),
+    "no K": (lambda s: spoil(s / "cam_K.txt", None), ["cam_K.txt"]),
+    "NaN pose": (
+        lambda s: np.savetxt(s / "annotated_poses/0005.txt", np.full((4, 4), np.nan)),
+        ["annotated_poses/0005.txt", "NaN", "4x4"],
+    ),
+    "pose of three rows": (
+        lambda s: np.savetxt(s / "annotated_poses/0005.txt", np.eye(4)[:3]),
+        ["annotated_poses/0005.txt", "(3, 4)"],
+    ),
+    "model of words": (lambda s: spoil(s / "models/object/points.xyz", b"a b c\n"), ["points.xyz", "unreadable"]),
+    "times of words": (lambda s: spoil(s / "times.txt", b"now\nthen\n"), ["times.txt", "'now'"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_files_are_named_in_one_line(case, sequence, tmp_path, capsys):
+    ruin, words = BAD_FILES[case]
+    ruin(sequence)
+    assert run(sequence, tmp_path / "out") == 2
+    line = one_line(capsys)
+    assert all(word in line for word in words), line
+
+
+BAD_WORDS = {
+    "no such folder": (["run", "{seq}x", "--out", "{out}"], ["slidex", "no such folder", "synthetic/crossing"]),
+    "a file for a folder": (["run", "{seq}/cam_K.txt", "--out", "{out}"], ["cam_K.txt", "no such folder"]),
+    "nothing known": (["run", "{seq}/rgb", "--out", "{out}"], ["slide/rgb", "0000.png", "--format"]),
+    "unknown synthetic": (["run", "synthetic/corssing", "--out", "{out}"], ["corssing", "crossing"]),
+    "unknown object": (["run", "{seq}", "--out", "{out}", "--objects", "mug"], ["objects: got 'mug'", "object"]),
+    "object twice": (["run", "{seq}", "--out", "{out}", "--objects", "object,object"], ["'object'"]),
+    "unknown tracker": (["run", "{seq}", "--out", "{out}", "--tracker", "nope"], ["tracker: got 'nope'", "one of"]),
+    "unknown preset": (["run", "{seq}", "--out", "{out}", "--preset", "papr"], ["preset: got 'papr'", "'paper'"]),
+    "unknown format": (["run", "{seq}", "--out", "{out}", "--format", "bop5"], ["format: got 'bop5'", "ycbineoat"]),
+    "unknown masks": (["run", "{seq}", "--out", "{out}", "--masks", "sam9"], ["masks: got 'sam9'", "dataset:FOLDER"]),
+    "no mask folder": (["run", "{seq}", "--out", "{out}", "--masks", "dataset:"], ["masks: got 'dataset:'"]),
+    "mask folder missing": (["run", "{seq}", "--out", "{out}", "--masks", "dataset:nowhere"], ["nowhere"]),
+    "unknown key": (
+        ["run", "{seq}", "--out", "{out}", "--set", "sampling.pionts=3"],
+        ["'sampling.pionts'", "Did you mean 'sampling.points'"],
+    ),
+    "bad value": (["run", "{seq}", "--out", "{out}", "--set", "sampling.points=few"], ["sampling.points", "'few'"]),
+    "value out of bounds": (["run", "{seq}", "--out", "{out}", "--set", "sampling.points=0"], ["sampling.points", "0"]),
+    "no value": (["run", "{seq}", "--out", "{out}", "--set", "sampling.points"], ["--set", "stage.key=value"]),
+    "no config": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/no.toml"], ["no.toml", "no such"]),
+    "config is no TOML": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/cam_K.txt"], ["cam_K.txt", "TOML"]),
+    "config is a folder": (["run", "{seq}", "--out", "{out}", "--config", "{seq}"], ["slide", "TOML"]),
+    "unknown stage": (["run", "{seq}", "--out", "{out}", "--set", "foo.bar=1"], ["'foo.bar'", "pipeline, tracking"]),
+    "unknown scenario": (["synth", "crosing", "--out", "{out}"], ["'crosing'", "Did you mean synthetic/crossing?"]),
+    "click into a file": (["click", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt/x", "can be written"]),
+    "click into a folder": (["click", "{seq}", "--out", "{seq}/rgb"], ["slide/rgb", "a folder"]),
+    "negative seed": (["run", "{seq}", "--out", "{out}", "--seed", "-1"], ["seed", "-1"]),
+    "depth scale": (["run", "{seq}", "--out", "{out}", "--depth-scale", "1000"], ["depth_scale", "1000"]),
+    "start beyond the end": (["run", "{seq}", "--out", "{out}", "--start", "8"], ["start 8", "8 frames"]),
+    "stop before start": (["run", "{seq}", "--out", "{out}", "--start", "4", "--stop", "4"], ["start 4", "stop 4"]),
+    "negative start": (["run", "{seq}", "--out", "{out}", "--start", "-1"], ["start -1"]),
+    "model without path": (["run", "{seq}", "--out", "{out}", "--models", "object"], ["--models", "NAME=PATH"]),
+    "model not there": (["run", "{seq}", "--out", "{out}", "--models", "object=/no.obj"], ["/no.obj", "no such model"]),
+    "model of nobody": (["run", "{seq}", "--out", "{out}", "--models", "mug={seq}"], ["'mug'", "object"]),
+    "out is a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt"], ["cam_K.txt", "a folder for the results"]),
+    "out within a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt"]),
+    "no run": (["eval", "{seq}"], ["slide", "no run there", "p2p run SEQ --out"]),
+    "eval nowhere": (["eval", "{seq}/none", "--json"], ["none", "no run there"]),
+    "eval unknown model": (["eval", "{done}", "--models", "mug={seq}"], ["'mug'", "object"]),
+    "eval model not there": (["eval", "{done}", "--models", "object=/no.obj"], ["/no.obj"]),
+    "eval scores nothing": (["eval", "{done}", "--min-visible-px", "99999"], ["nothing to score", "99999"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_WORDS)
+def test_bad_words_are_answered_in_one_line(case, sequence, done, tmp_path, capsys):
+    words, expected = BAD_WORDS[case]
+    words = [word.format(seq=sequence, out=tmp_path / "out", done=done) for word in words]
+    more = POINTS_ALONE if words[0] == "run" else []
+    assert cli.main([*words[:2], *more, *words[2:]]) == 2
+    line = one_line(capsys, words[0])
+    assert all(word in line for word in expected), line
+
+
+DAMAGE = {
+    "run.json cut": (lambda out: cut(out / "run.json"), ["run.json", "unreadable"]),
+    "poses.npz cut": (lambda out: cut(out / "poses.npz"), ["poses.npz", "unreadable"]),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_run_is_named(case, done, tmp_path, capsys):
+    out = Path(shutil.copytree(done, tmp_path / "copy"))
+    ruin, words = DAMAGE[case]
+    ruin(out)
+    assert cli.main(["eval", str(out), "--json"]) == 2
+    line = one_line(capsys, "eval")
+    assert all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ([], "COMMAND"),
+        (["fly"], "'fly'"),
+        (["run"], "SEQ"),
+        (["run", "x"], "--out"),
+        (["run", "x", "--out", "y", "--seed", "one"], "'one'"),
+        (["run", "x", "--out", "y", "--start", "1.5"], "'1.5'"),
+        (["run", "x", "--out", "y", "--turbo"], "--turbo"),
+        (["eval"], "DIR"),
+        (["rum", "x"], "Did you mean run?"),
+        (["run", "x", "--ouput", "y"], "no option --ouput. Did you mean --out?"),
+        (["check", "x", "--jsn"], "no option --jsn. Did you mean --json? See p2p check --help"),
+        (["eval", "x", "--align", "best"], "'best'"),
+    ],
+)
+def test_words_that_are_no_command_point_to_the_help(words, says, capsys):
+    with pytest.raises(SystemExit) as left:
+        cli.main(words)
+    assert left.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and says in err
+    assert "See p2p" in err and err.rstrip().endswith("--help")
+
+
+def test_debug_shows_where_it_went_wrong(sequence, tmp_path, capsys):
+    words = ["run", str(sequence), "--out", str(tmp_path / "out"), "--tracker", "nope"]
+    assert cli.main([*words, "--debug"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("Traceback") and "make_tracker" in err and "tracker: got 'nope'" in err
+
+
+# --- clicks ------------------------------------------------------------------------------------
+
+
+def clicks(folder: Path, *objects: tuple) -> list[str]:
+    """--prompts with a file of these (name, frame, points)."""
+    content = {"objects": [{"name": n, "frame": k, "points": points} for n, k, points in objects]}
+    (folder / "prompts.json").write_text(json.dumps(content))
+    return ["--prompts", str(folder / "prompts.json")]
+
+
+ON_BOARD = [[45, 40], [60, 50], [70, 70]]  # at frame 0; it moves by (2, 1) a frame
+
+
+def test_clicks_replace_masks(sequence, tmp_path, capsys):
+    shutil.rmtree(sequence / "gt_mask")
+    out = tmp_path / "out"
+    assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--save-masks") == 0
+    done = load_run(out)
+    assert done.info["masks"] == "builtin" and done.info["prompts"][0]["points"] == ON_BOARD
+    assert done.objects["object"].has_pose.all()
+    for k in range(FRAMES):
+        mask = cv2.imread(str(out / "masks" / "object" / f"{k:06d}.png"), cv2.IMREAD_UNCHANGED)
+        truth = np.zeros((H, W), bool)
+        truth[20 + k : 80 + k, 30 + 2 * k : 90 + 2 * k] = True
+        assert mask.shape == (H, W) and set(np.unique(mask)) == {0, 255}
+        assert ((mask > 0) & truth).sum() / ((mask > 0) | truth).sum() > 0.9
+    # The kept masks are a source of masks like any other, and a new run clears them away.
+    again = tmp_path / "again"
+    assert run(sequence, again, "--masks", f"dataset:{out / 'masks'}") == 0
+    assert load_run(again).objects["object"].has_pose.all() and not (again / "masks").exists()
+    assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--stop", "2") == 0
+    assert not list((out / "masks").rglob("*.png"))
+
+
+def test_what_counts_is_the_datasets_own_visibility(sequence, tmp_path, capsys):
+    """An object whose clicks come late was visible before all the same: those frames are failures."""
+    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("object", 4, [[60, 50], [70, 60]]))) == 0
+    capsys.readouterr()
+    assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 0
+    got = json.loads(capsys.readouterr().out)
+    assert got["objects"]["object"]["frames"] == FRAMES and got["objects"]["object"]["lost"] == 4
+    assert got["masks"] == "builtin"
+
+
+def test_masks_are_scored(sequence, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--save-masks") == 0
+    capsys.readouterr()
+    assert cli.main(["eval-masks", str(out), "--json"]) == 0
+    got = json.loads(capsys.readouterr().out)
+    assert got["mean_iou"] > 0.9 and got["objects"]["object"]["visible_frames"] == FRAMES and got["masks"] == "builtin"
+    assert cli.main(["eval-masks", str(out)]) == 0
+    assert "mean IoU" in capsys.readouterr().out
+
+
+def test_an_object_of_ones_own_is_tracked_without_score(sequence, tmp_path, capsys):
+    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("my board", 0, ON_BOARD))) == 0
+    assert "my board: a pose in 8 of 8 frames" in capsys.readouterr().out
+
+
+BAD_CLICKS = {
+    "no file": (["--prompts", "{seq}/none.json"], ["none.json", "p2p click SEQ --out"]),
+    "no JSON": (["--prompts", "{seq}/cam_K.txt"], ["cam_K.txt", "unreadable JSON"]),
+    "no prompts": (["--masks", "builtin"], ["masks: got 'builtin' without prompts", "p2p click", "--prompts"]),
+    "both": ([("object", 0, ON_BOARD), "--masks", "dataset"], ["masks: got 'dataset' and prompts", "builtin"]),
+    "outside": ([("object", 0, [[W, 10]])], ["clicks on 'object'", "(160, 10)", "160x120"]),
+    "late and outside": ([("object", 5, [[3, -9]])], ["clicks on 'object'", "(3, -9)"]),
+    "same click": ([("a", 0, ON_BOARD), ("b", 0, ON_BOARD[:1])], ["clicks on 'b'", "also one of 'a'"]),
+    "same name": ([("a", 0, ON_BOARD), ("a", 1, ON_BOARD)], ["'a' twice"]),
+    "frame not run": ([("object", 5, ON_BOARD), "--stop", "4"], ["prompt of 'object'", "frame 5", "0 to 3"]),
+    "unknown object": ([("object", 0, ON_BOARD), "--objects", "mug"], ["objects: got 'mug'", "object"]),
+    "no name of a file": ([("a/b", 0, ON_BOARD)], ["object name", "'a/b'"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CLICKS)
+def test_bad_clicks_are_answered_in_one_line(case, sequence, tmp_path, capsys):
+    given, expected = BAD_CLICKS[case]
+    prompts = [x for x in given if isinstance(x, tuple)]
+    words = [x.format(seq=sequence) for x in given if isinstance(x, str)]
+    assert run(sequence, tmp_path / "out", *(clicks(tmp_path, *prompts) if prompts else []), *words) == 2
+    line = one_line(capsys)
+    assert all(word in line for word in expected), line
+
+
+def test_clicks_without_depth_are_answered_in_one_line(sequence, tmp_path, capsys):
+    path = sequence / "depth" / "0000.png"
+    cv2.imwrite(str(path), np.zeros((H, W), np.uint16))
+    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("object", 0, ON_BOARD))) == 2
+    assert "clicks on 'object': got (45, 40) has no depth in frame 0" in one_line(capsys)
+
+
+def test_masks_that_were_not_kept_cannot_be_scored(done, capsys):
+    assert cli.main(["eval-masks", str(done)]) == 2
+    assert "--save-masks" in one_line(capsys, "eval-masks")
+
+
+# --- interruption ------------------------------------------------------------------------------
+
+
+def test_an_interruption_leaves_what_was_there(sequence, tmp_path, capsys, monkeypatch):
+    step = Point2Pose.step
+
+    def interrupted(self, frame, masks=None):
+        if frame.index == 5:
+            raise KeyboardInterrupt
+        return step(self, frame, masks)
+
+    monkeypatch.setattr(Point2Pose, "step", interrupted)
+    assert run(sequence, tmp_path / "out") == 130
+    out, err = capsys.readouterr()
+    assert err == "p2p run: interrupted\n" and "p2p eval" in out
+    loaded = load_run(tmp_path / "out")
+    assert loaded.objects["object"].frame_index.tolist() == list(range(5))
+    assert len(loaded.timings["total_ms"]) == 5
+    assert loaded.info["finished"] is False and loaded.info["stopped_by"] == "KeyboardInterrupt"
+    assert len(np.loadtxt(tmp_path / "out" / "poses" / "object.txt")) == 5
+    assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["objects"]["object"]["frames"] == 5
+
+
+def test_an_interruption_before_the_first_frame(sequence, tmp_path, capsys, monkeypatch):
+    def interrupted(self, frame, masks=None):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Point2Pose, "step", interrupted)
+    assert run(sequence, tmp_path / "out") == 130
+    assert capsys.readouterr().err == "p2p run: interrupted\n"
+    with pytest.raises(MissingData, match="a run without frames"):
+        load_run(tmp_path / "out")
+    assert cli.main(["eval", str(tmp_path / "out")]) == 2
+    assert "a run without frames" in one_line(capsys, "eval")
+
+
+def test_a_fault_on_the_way_leaves_what_was_there(sequence, tmp_path, capsys):
+    cut(sequence / "rgb/0006.png")
+    assert run(sequence, tmp_path / "out") == 2
+    assert "rgb/0006.png" in one_line(capsys)
+    loaded = load_run(tmp_path / "out")
+    assert loaded.objects["object"].frame_index.tolist() == list(range(6))
+    assert loaded.info["finished"] is False and loaded.info["stopped_by"] == "BadInput"
+
+
+def p2p(*words: str, **more) -> subprocess.Popen:
+    command = [sys.executable, "-m", "p2p_lib.apps.cli", *words]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **more)
+
+
+def test_ctrl_c(tmp_path):
+    """The real thing: a process, a signal, what is on disk."""
+    sequence, out = write_sequence(tmp_path / "long", frames=600), tmp_path / "out"
+    # A shell that runs its jobs in the background has them ignore the signal, and they hand that on.
+    heed = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    process = p2p("run", str(sequence), "--out", str(out), *POINTS_ALONE, **heed)
+    deadline = time.monotonic() + 60
+    timings = out / "timings.csv"
+    while not (timings.is_file() and timings.read_text().count("\n") > 10):
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and err == "p2p run: interrupted\n"
+    loaded = load_run(out)
+    frames = len(loaded.objects["object"])
+    assert 10 <= frames < 600 and loaded.info["finished"] is False
+    assert len(loaded.timings["total_ms"]) == frames
+
+
+def test_as_a_process(tmp_path):
+    process = p2p("run", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (2, "") and err.count("\n") == 1
+    assert "nowhere: no such folder" in err and not (tmp_path / "out").exists()
+
+
+# --- help --------------------------------------------------------------------------------------
+
+
+def said(words: list[str], capsys) -> str:
+    with pytest.raises(SystemExit) as left:
+        cli.main(words)
+    assert left.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_help_tells_what_there_is_and_how_to_start(capsys):
+    text = said(["--help"], capsys)
+    for command in ("run", "eval", "notebooks", "doctor"):
+        assert f"\n    {command}" in text
+    assert "p2p run synthetic/crossing --out" in text
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        (
+            "run",
+            "SEQ --out --format --objects --preset --config --set --tracker --masks --seed --start --stop --models "
+            "--depth-scale --debug",
+        ),
+        ("eval", "DIR --json --models --align --min-visible-px --debug"),
+        ("notebooks", "--profile --only --debug"),
+        ("doctor", "--debug"),
+    ],
+)
+def test_help_of_each_command_names_its_options(command, options, capsys):
+    text = said([command, "--help"], capsys)
+    assert all(option in text for option in options.split())
+
+
+def test_version(capsys):
+    assert said(["--version"], capsys).strip() == p2p_lib.__version__
+
+
+def test_the_installed_command_is_this_one():
+    script = Path(sys.executable).with_name("p2p")
+    if not script.is_file():
+        pytest.skip("p2p is not installed beside this Python")
+    result = subprocess.run([script, "--version"], capture_output=True, text=True, timeout=60, env=os.environ)
+    assert (result.returncode, result.stdout.strip()) == (0, p2p_lib.__version__)
+
+
+def test_errors_that_can_be_mended_have_their_exit_code():
+    assert P2PError.exit_code == MissingData("x", "y").exit_code == 2

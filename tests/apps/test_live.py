@@ -1,0 +1,262 @@
+"""Live: the newest frame wins, what is dropped is counted, and a line of JSON says what was seen."""
+
+import json
+import queue
+import re
+import shutil
+import threading
+import time
+from urllib.request import Request, urlopen
+
+import cv2
+import numpy as np
+import pytest
+from test_cli import POINTS_ALONE, H, K, W, write_sequence
+
+from p2p_lib.apps import cli
+from p2p_lib.apps.live import json_line, track_live
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.types import Frame, Status
+from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
+from p2p_lib.datasets.prompts import Prompt, save_prompts
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.run import make_config, run
+
+FRAMES = 20  # then the board jumps back
+SETTINGS = {"tsdf.enabled": "false", "factor_graph.enabled": "false"}
+PROMPTS = (Prompt("board", 0, [[60, 50]]),)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_sequence(tmp_path_factory.mktemp("live") / "slide", FRAMES)
+
+
+class Scripted:
+    """A camera that gives what is put into its hand."""
+
+    def __init__(self, camera: Camera):
+        self.name, self.camera, self.hand, self.closed = "scripted", camera, queue.Queue(), False
+
+    def read(self):
+        given = None if self.closed else self.hand.get(timeout=10)
+        if isinstance(given, Exception):
+            raise given
+        return given
+
+    def close(self):
+        self.closed = True
+        self.hand.put(None)
+
+
+def picture(index: int) -> Frame:
+    return Frame(index, index / 30, np.zeros((H, W, 3), np.uint8), np.ones((H, W), np.float32))
+
+
+@pytest.fixture
+def scripted():
+    return Scripted(Camera.from_K(K, W, H))
+
+
+def taken_by_thread(camera: Scripted) -> None:
+    """Until the reading thread holds all that was given."""
+    while camera.hand.qsize():
+        time.sleep(0.001)
+    time.sleep(0.02)
+
+
+def test_the_newest_frame_wins(scripted):
+    with Newest(scripted) as newest:
+        scripted.hand.put(picture(0))
+        assert newest.take().index == 0
+        for k in range(1, 6):
+            scripted.hand.put(picture(k))
+        taken_by_thread(scripted)
+        assert newest.take().index == 5, "1 to 4 came while nobody looked"
+        scripted.hand.put(picture(6))
+        assert newest.take().index == 6, "it waits for what is to come"
+        scripted.hand.put(None)
+        assert newest.take() is None and newest.take() is None
+
+
+def test_frames_that_must_not_be_dropped_wait(scripted):
+    with Newest(scripted, keep={1, 3}) as newest:
+        for k in range(6):
+            scripted.hand.put(picture(k))
+        scripted.hand.put(None)
+        taken_by_thread(scripted)
+        assert [f.index for f in iter(newest.take, None)] == [1, 3, 5]
+
+
+def test_what_ends_the_camera_reaches_the_one_who_waits(scripted):
+    with Newest(scripted) as newest:
+        scripted.hand.put(MissingData("camera", "unplugged"))
+        with pytest.raises(MissingData, match="unplugged"):
+            newest.take()
+
+
+def test_leaving_ends_the_thread(scripted):
+    before = threading.active_count()
+    with Newest(scripted):
+        assert threading.active_count() == before + 1
+    assert scripted.closed and threading.active_count() == before
+
+
+def test_a_folder_plays_at_its_rate(folder):
+    camera = FolderCamera(open_sequence(folder), 50)
+    start = time.monotonic()
+    indices = [frame.index for frame in iter(camera.read, None)]
+    assert indices == list(range(FRAMES)) and time.monotonic() - start >= (FRAMES - 1) / 50
+
+
+def test_a_folder_that_is_closed_stops_waiting(folder):
+    camera = FolderCamera(open_sequence(folder), 0.01)
+    camera.read()
+    threading.Timer(0.05, camera.close).start()
+    start = time.monotonic()
+    assert camera.read() is None and time.monotonic() - start < 10
+
+
+def test_slow_processing_drops_frames_and_counts_them(folder):
+    got = []
+
+    def slow(estimate):
+        got.append(estimate)
+        time.sleep(0.05)
+
+    count = track_live(FolderCamera(open_sequence(folder), 100), PROMPTS, slow, config=make_config(settings=SETTINGS))
+    assert count.frames == len(got) and count.dropped > 0 and count.frames + count.dropped <= FRAMES
+    assert [e.frame_index for e in got] == sorted({e.frame_index for e in got}) and got[0].frame_index == 0
+    assert count.dropped == got[-1].frame_index + 1 - len(got), "what lies between two that were tracked"
+    assert f"{count.frames} frames in " in str(count) and f"{count.dropped} dropped" in str(count)
+
+
+def test_live_estimates_are_those_of_a_run(folder, tmp_path):
+    """A camera that waits for the tracker gives what p2p run gives: there is one algorithm."""
+    sequence = open_sequence(folder)
+    camera, got = Scripted(sequence.camera), []
+
+    def next_please(estimate):
+        got.append(estimate)
+        camera.hand.put(sequence.frame(estimate.frame_index + 1) if estimate.frame_index + 1 < FRAMES else None)
+
+    camera.hand.put(sequence.frame(0))
+    count = track_live(camera, PROMPTS, next_please, config=make_config(settings=SETTINGS))
+    assert (count.frames, count.dropped) == (FRAMES, 0)
+    run(sequence, tmp_path / "run", settings=SETTINGS, prompts=PROMPTS, progress=False)
+    wanted = np.load(tmp_path / "run" / "poses.npz")
+    np.testing.assert_allclose([e.T_cam_obj for e in got], wanted["board/T_cam_obj"], atol=1e-12)
+    assert [str(e.status) for e in got] == wanted["board/status"].tolist()
+
+
+def test_a_prompt_starts_its_object_in_its_frame(folder):
+    sequence, got = open_sequence(folder), []
+    count = track_live(
+        FolderCamera(sequence, 200),
+        [Prompt("late", 9, [[60 + 18, 50 + 9]])],
+        lambda e: (got.append(e), time.sleep(0.03)),
+        config=make_config(settings=SETTINGS),
+    )
+    assert got[0].frame_index == 9 and got[0].status is Status.TRACKED and count.frames < FRAMES
+
+
+def test_a_prompt_of_a_frame_that_never_comes_is_refused(folder):
+    camera = FolderCamera(open_sequence(folder), 500)
+    with pytest.raises(BadInput, match="prompt of 'mug': got frame 99, which never came"):
+        track_live(camera, [Prompt("mug", 99, [[1, 1]])], print, config=make_config(settings=SETTINGS))
+
+
+# --- the command -------------------------------------------------------------------------------
+
+
+WORDS = [word for word in POINTS_ALONE if word != "--quiet"]
+
+
+def test_live_prints_a_line_per_object_and_frame(folder, tmp_path, capsys):
+    prompts = save_prompts(tmp_path / "p.json", PROMPTS)
+    code = cli.main(["live", "--camera", f"folder:{folder}", "--rate", "40", "--prompts", str(prompts), *WORDS])
+    out, err = capsys.readouterr()
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert code == 0
+    frames, dropped = map(int, re.fullmatch(r"(\d+) frames in .* s \(.* Hz\), (\d+) dropped\n", err).groups())
+    assert len(lines) == frames and frames + dropped <= FRAMES
+    keys = {"time_s", "frame", "object", "status", "confidence", "T_cam_obj", "covariance", "reason"}
+    assert all(set(line) == keys and line["object"] == "board" for line in lines)
+    last = lines[-1]
+    assert last["time_s"] == pytest.approx(last["frame"] / 30, abs=1e-6) and last["status"] == "tracked"
+    moved = np.array(last["T_cam_obj"])[:3, 3] - np.array(lines[0]["T_cam_obj"])[:3, 3]
+    np.testing.assert_allclose(moved, last["frame"] * np.array([2, 1, 0]) / 200 * 0.5, atol=1e-3)
+    assert np.shape(last["covariance"]) == (6, 6)
+
+
+def test_no_pose_is_null_and_the_line_is_strict_json():
+    from p2p_lib.core.types import PoseEstimate
+
+    line = json_line(PoseEstimate("mug", 3, 0.1, Status.LOST, reason='says "no"'))
+    assert json.loads(line) | {"reason": ""} == {
+        "time_s": 0.1,
+        "frame": 3,
+        "object": "mug",
+        "status": "lost",
+        "confidence": 0.0,
+        "T_cam_obj": None,
+        "covariance": None,
+        "reason": "",
+    }
+    assert "\n" not in line and "NaN" not in line
+
+
+def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeypatch):
+    from p2p_lib.apps import click
+
+    def press(url: str) -> None:
+        content = {"objects": [{"name": "board", "frame": 0, "points": [[60, 50]]}]}
+        urlopen(Request(f"{url}prompts", json.dumps(content).encode(), {"Content-Type": "application/json"})).close()
+
+    wait = click.Clicker.wait
+    monkeypatch.setattr(click.Clicker, "wait", lambda self: (press(self.url), wait(self, 10)))
+    assert cli.main(["live", "--camera", f"folder:{folder}", "--rate", "40", "--no-browser", *WORDS]) == 0
+    out, err = capsys.readouterr()
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert lines[0]["frame"] == 0 and {line["object"] for line in lines} == {"board"}
+    assert err.startswith("Click in your browser at http://127.0.0.1:") and "dropped" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--camera", "webcam"], "camera: got 'webcam', expected realsense, realsense:RECORDING or folder:PATH"),
+        (["--camera", "folder:"], "camera: got 'folder:'"),
+        (["--camera", "folder:{folder}", "--rate", "0"], "rate: got 0.0, expected frames per second, above 0"),
+        (["--camera", "folder:{folder}x"], "slidex: no such folder"),
+        (["--camera", "realsense:{folder}/no.bag"], "no.bag: no such recording"),
+        (["--camera", "realsense", "--rate", "15"], "rate: got 15 with realsense"),
+        (["--camera", "folder:{folder}", "--prompts", "{folder}/none.json"], "none.json: no such file of prompts"),
+        (["--camera", "folder:{folder}", "--prompts", "{prompts}", "--masks", "sam9"], "sam9"),
+    ],
+)
+def test_refusals_are_one_line(words, message, folder, tmp_path, capsys):
+    prompts = save_prompts(tmp_path / "p.json", PROMPTS)
+    assert cli.main(["live", *(word.format(folder=folder, prompts=prompts) for word in words)]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and message in err and err.startswith("p2p live: ") and err.count("\n") == 1
+
+
+def test_a_spoilt_picture_ends_it_with_its_name(folder, tmp_path, capsys):
+    spoilt = shutil.copytree(folder, tmp_path / "spoilt")
+    cv2.imwrite(str(spoilt / "depth" / "0019.png"), np.ones((H, W), np.uint8))
+    prompts = save_prompts(tmp_path / "p.json", PROMPTS)
+    assert cli.main(["live", "--camera", f"folder:{spoilt}", "--rate", "100", "--prompts", str(prompts), *WORDS]) == 2
+    assert "0019.png" in capsys.readouterr().err
+
+
+def test_realsense_is_named_by_open_camera(monkeypatch):
+    """Where the library is missing, the one line says how to get it."""
+    import sys
+
+    from p2p_lib.core.errors import MissingBackend
+
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    with pytest.raises(MissingBackend, match=r"pyrealsense2: .*uv pip install"):
+        open_camera("realsense")

@@ -1,0 +1,281 @@
+"""Every notebook of the suite is clean and runs in the quick profile; the runner refuses and reports as it should."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
+
+from p2p_lib.apps.notebooks import (
+    NotebookFailed,
+    check_notebook,
+    list_notebooks,
+    notebook_parameters,
+    read_result,
+    record,
+    run_notebooks,
+)
+from p2p_lib.core.errors import BadInput, MissingData
+
+SUITE = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
+PARAMETERS = "PROFILE = 'quick'\nSEED: int = 0\nSCALE = 1.0\nNAME = 'a'"
+RECORD = "from p2p_lib.apps.notebooks import record\nrecord(seed=SEED, scale=SCALE, profile=PROFILE)"
+
+
+def cell(source: str, tag: str = ""):
+    return new_code_cell(source, metadata={"tags": [tag]} if tag else {})
+
+
+def write(path: Path, *middle: str, parameters: str = PARAMETERS, checks: str = RECORD) -> Path:
+    cells = [new_markdown_cell("# A story\n\nWhy."), cell(parameters, "parameters"), *map(cell, middle)]
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    nbformat.write(new_notebook(cells=[*cells, cell(checks, "checks")], metadata={"kernelspec": kernel}), path)
+    return path
+
+
+# The suite
+
+
+@pytest.fixture(scope="session")
+def suite_out(tmp_path_factory) -> Path:
+    """One folder for all notebooks of the session, as `make reproduce` has one."""
+    return tmp_path_factory.mktemp("suite")
+
+
+def test_the_suite_is_there():
+    assert [path.name for path in SUITE] == [path.name for path in list_notebooks()]
+
+
+@pytest.mark.parametrize("path", SUITE, ids=lambda path: path.stem)
+def test_notebook_is_clean(path):
+    assert check_notebook(path) == []
+
+
+@pytest.mark.parametrize("path", SUITE, ids=lambda path: path.stem)
+def test_notebook_runs_in_the_quick_profile(path, suite_out):
+    lines = []
+    (result,) = run_notebooks("quick", [path.stem], suite_out, say=lines.append)
+    assert result.error == "" and result.checks, "the checks cell records the numbers that it asserted"
+    assert result.executed.with_suffix(".html").stat().st_size > 10_000
+    assert 0 < sum(result.cell_seconds) <= result.seconds
+
+
+def test_a_browser_shows_every_figure_of_the_gallery(suite_out, browser):
+    """All that the tests above have executed, as a visitor sees it: the gallery, and every page that it links to."""
+    pages = sorted((suite_out / "notebooks").glob("*.html"))
+    if not pages:
+        pytest.skip("no notebook was executed before this test")
+    thumbnails = browser.figures(suite_out / "index.html")
+    assert len(thumbnails) == len(pages), "a thumbnail per notebook"
+    links = set(re.findall(r'href="(notebooks/[^"]+)"', (suite_out / "index.html").read_text()))
+    assert links == {f"notebooks/{page.name}" for page in pages}
+    for page in pages:
+        code = [c for c in nbformat.read(page.with_suffix(".ipynb"), 4).cells if c.cell_type == "code"]
+        outputs = [output.get("data", {}) for c in code for output in c.outputs]
+        made = sum(
+            "image/png" in data or bool(re.search("<(video|iframe)", data.get("text/html", ""))) for data in outputs
+        )
+        figures = browser.figures(page)
+        assert len(figures) == made > 0, page.name
+        thumbnails += figures
+    assert [f for f in thumbnails if min(f["width"], f["height"], f["shown_px"]) < 20] == []
+
+
+def test_the_browser_sees_what_is_not_shown(tmp_path, browser):
+    page = tmp_path / "page.html"
+    gone, fine = '<img src="gone.png">', f'<img width="40" height="40" src="data:image/png;base64,{PNG}">'
+    page.write_text(f"<html><body>{gone}{fine}<video src='data:video/mp4;base64,AAAA'></video></body></html>")
+    seen = browser.figures(page)
+    assert [(f["kind"], f["width"]) for f in seen] == [("IMG", 0), ("IMG", 1), ("VIDEO", 0)]
+    assert seen[1]["shown_px"] == 1600
+
+
+# The runner
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Three small notebooks, the second of which fails, run two at a time."""
+    folder, out = tmp_path_factory.mktemp("notebooks"), tmp_path_factory.mktemp("out")
+    picture = "import base64\nfrom IPython.display import Image, display\n"
+    picture += f"display(Image(base64.b64decode({PNG!r})))"
+    where = "import os\nprint(os.environ['P2P_FIGURES'], os.environ['P2P_TABLES'], os.getcwd())"
+    write(folder / "00_first.ipynb", picture, where)
+    write(folder / "01_fails.ipynb", checks="auc = 12.34\nassert auc > 95, f'ADD-S AUC fell to {auc}\\nof 95'")
+    write(folder / "02_last.ipynb")
+    lines = []
+    with pytest.raises(NotebookFailed) as failed:
+        run_notebooks("quick", out=out, folder=folder, jobs=2, parameters={"SEED": "3", "SCALE": 2}, say=lines.append)
+    return folder, out, failed.value, lines
+
+
+PNG = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+
+
+def test_failing_check_names_notebook_cell_and_message(run):
+    message = str(run[2])
+    assert message.startswith("notebook 01_fails, cell [3] \"assert auc > 95, f'ADD-S")
+    assert "AssertionError: ADD-S AUC fell to 12.34 of 95. See " in message and "\n" not in message
+    assert run[2].exit_code == 1
+
+
+def test_what_a_notebook_recorded_is_read_back(run):
+    result = read_result(run[1] / "notebooks" / "00_first.ipynb")
+    assert result.checks == {"seed": 3, "scale": 2.0, "profile": "quick"}
+    assert isinstance(result.checks["scale"], float)
+    assert result.title == "A story" and result.picture_png == PNG and result.error == ""
+    assert len(result.cell_seconds) == 5 and 0 < sum(result.cell_seconds) <= result.seconds
+
+
+def test_notebooks_learn_their_folders(run):
+    folder, out, *_ = run
+    notebook = nbformat.read(out / "notebooks" / "00_first.ipynb", 4)
+    printed = [o.text for c in notebook.cells for o in c.get("outputs", ()) if o.output_type == "stream"]
+    assert printed == [f"{out / 'figures'} {out / 'tables'} {folder}\n"], "and nothing else is printed"
+    assert (out / "figures").is_dir() and (out / "tables").is_dir()
+
+
+def test_gallery_shows_what_ran(run):
+    page = (run[1] / "index.html").read_text()
+    assert PNG in page and "ADD-S AUC fell to 12.34" in page and "<td>seed</td><td>3</td>" in page
+    assert re.search(r"3 notebooks, \d+ s, 6 numbers recorded, <b class=\"failed\">1 failed</b>", page)
+    assert 'href="notebooks/00_first.html"' in page and "://" not in page
+    assert (run[1] / "notebooks" / "01_fails.html").exists(), "the failed notebook can be looked at too"
+
+
+def test_progress_is_told(run):
+    lines = run[3]
+    assert lines[0].startswith("3 notebooks, profile quick, results in ")
+    assert any(line.startswith("00_first: ") and line.endswith(" s, 3 numbers recorded") for line in lines)
+    assert any(line.startswith("01_fails: ") and line.endswith("FAILED") for line in lines)
+
+
+def test_a_kernel_that_dies_is_a_failure(tmp_path):
+    write(tmp_path / "00_dies.ipynb", "import signal\nsignal.raise_signal(signal.SIGKILL)")
+    with pytest.raises(NotebookFailed, match=r"00_dies, cell 'import signal': the kernel ended there"):
+        run_notebooks("quick", out=tmp_path / "out", folder=tmp_path, say=lambda line: None)
+
+
+# Refusals, all before anything runs
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"parameters": {"SED": 1}},
+            "00_a parameter: got SED, expected one of PROFILE, SEED, SCALE, NAME. Did you mean",
+        ),
+        ({"parameters": {"SEED": "many"}}, "00_a parameter SEED: got 'many', expected int like 0"),
+        ({"parameters": {"SEED": True}}, "00_a parameter SEED: got True, expected int like 0"),
+        ({"parameters": {"NAME": 3}}, "00_a parameter NAME: got 3, expected str like 'a'"),
+        ({"profile": "fast"}, "profile: got 'fast', expected one of quick, full"),
+        ({"only": ["07"]}, "notebook: got '07', expected one of 00_a, 01_b"),
+        ({"jobs": 0}, "jobs: got 0, expected at least 1"),
+    ],
+)
+def test_refusals(tmp_path, arguments, message):
+    write(tmp_path / "00_a.ipynb")
+    write(tmp_path / "01_b.ipynb", parameters="PROFILE = 'quick'")
+    with pytest.raises(BadInput) as refused:
+        run_notebooks(**{"only": ["00"], **arguments}, out=tmp_path / "out", folder=tmp_path, say=lambda line: None)
+    assert str(refused.value).startswith(message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_parameter_must_be_known_to_all_notebooks_that_run(tmp_path):
+    write(tmp_path / "00_a.ipynb")
+    write(tmp_path / "01_b.ipynb", parameters="PROFILE = 'quick'")
+    with pytest.raises(BadInput, match=r"01_b parameter: got SEED, expected one of PROFILE\. Pick the"):
+        run_notebooks(out=tmp_path / "out", folder=tmp_path, parameters={"SEED": 1}, say=lambda line: None)
+
+
+def test_picking_keeps_the_order(tmp_path):
+    for name in ("00_a", "01_b", "02_c", "draft"):
+        write(tmp_path / f"{name}.ipynb")
+    assert [path.stem for path in list_notebooks(tmp_path)] == ["00_a", "01_b", "02_c"]
+    assert [path.stem for path in list_notebooks(tmp_path, ["02_c.ipynb", "00", "00_a"])] == ["00_a", "02_c"]
+    with pytest.raises(MissingData, match="no notebooks"):
+        list_notebooks(tmp_path / "nowhere")
+
+
+# The rules for sources
+
+
+@pytest.mark.parametrize(
+    ("source", "problem"),
+    [
+        ("def f():\n    pass", "code cell 2 defines a function or class"),
+        ("class A: pass", "code cell 2 defines a function or class"),
+        ("!ls", "code cell 2 is not plain Python"),
+        ("%matplotlib inline", "code cell 2 is not plain Python"),
+        ("import subprocess", "code cell 2 imports os or subprocess"),
+        ("from os import system", "code cell 2 imports os or subprocess"),
+        ("open('/data/a.txt')", "code cell 2 holds the absolute path '/data/a.txt'"),
+        ("open('~/a.txt')", "code cell 2 holds the absolute path '~/a.txt'"),
+        ("\n".join(f"x{k} = {k}" for k in range(16)), "code cell 2 has 16 lines, more than 15"),
+    ],
+)
+def test_rules_for_cells(tmp_path, source, problem):
+    (found,) = check_notebook(write(tmp_path / "00_a.ipynb", source))
+    assert found.startswith(problem)
+
+
+def test_harmless_cells_pass(tmp_path):
+    fine = ["speed = '3 m/s'\nshare = f'{100 * 0.5:.0f} % of n=%d' % 3", "y = [lambda x: x != 2]\nz = 7 % 4"]
+    assert check_notebook(write(tmp_path / "00_a.ipynb", *fine)) == []
+
+
+def test_outputs_do_not_belong_into_git(tmp_path):
+    path = write(tmp_path / "00_a.ipynb", "1")
+    notebook = nbformat.read(path, 4)
+    notebook.cells[2].outputs = [new_output("stream", text="1")]
+    nbformat.write(notebook, path)
+    assert check_notebook(path) == ["code cell 2 has outputs (run nbstripout)"]
+
+
+def test_special_cells_are_needed(tmp_path):
+    nbformat.write(new_notebook(cells=[cell("x = 1")]), tmp_path / "00_a.ipynb")
+    wanted = ["needs exactly one cell tagged parameters", "needs a last code cell tagged checks"]
+    assert check_notebook(tmp_path / "00_a.ipynb") == wanted
+    assert check_notebook(write(tmp_path / "01_b.ipynb", parameters="SEED = 1")) == ["has no parameter PROFILE"]
+
+
+@pytest.mark.parametrize(
+    "source", ["PROFILE = 'a' + 'b'", "import os", "PROFILE = f()", "PROFILE: str", "a, b = 1, 2", "x ="]
+)
+def test_parameters_are_literals(tmp_path, source):
+    path = write(tmp_path / "00_a.ipynb", parameters=source)
+    with pytest.raises(BadInput, match="expected lines of the form NAME = literal"):
+        notebook_parameters(path)
+
+
+def test_a_file_that_is_no_notebook_is_named(tmp_path):
+    (tmp_path / "00_a.ipynb").write_text("PROFILE = 1")
+    with pytest.raises(BadInput, match=r"00_a\.ipynb: got a file that is not JSON"):
+        check_notebook(tmp_path / "00_a.ipynb")
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, [1, 2], None])
+def test_only_plain_finite_values_are_recorded(value):
+    with pytest.raises(BadInput, match=r"record\(auc=\.\.\.\)"):
+        record(auc=value)
+
+
+def test_recorded_numpy_scalars_are_plain_numbers():
+    numpy = pytest.importorskip("numpy")
+    published = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("IPython.get_ipython", lambda: object())
+        patch.setattr("IPython.display.publish_display_data", published.append)
+        record(auc=numpy.float32(0.5), frames=numpy.int64(7), fine=numpy.bool_(True), what="x")
+    (data,) = published
+    assert json.loads(json.dumps(data["application/vnd.p2p.checks+json"])) == {
+        "auc": 0.5,
+        "frames": 7,
+        "fine": True,
+        "what": "x",
+    }

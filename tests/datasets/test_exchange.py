@@ -1,0 +1,270 @@
+"""Poses out and in again: every form keeps every pose, and a lost frame stays lost; faults name the line."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from p2p_lib.apps.cli import main
+from p2p_lib.core import se3
+from p2p_lib.core.config import preset
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.types import PoseEstimate, Status
+from p2p_lib.datasets.bop_writer import write_models, write_scene
+from p2p_lib.datasets.export import FORMATS, export
+from p2p_lib.datasets.imported import read_poses
+from p2p_lib.datasets.runs import RunWriter, load_run
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.run import evaluate_poses, evaluate_run, export_run
+
+W, H, N = 40, 30, 12
+STEMS = [str(1581120424100262102 + i * 33_000_000) for i in range(N)]  # nanoseconds, as YCBInEOAT names pictures
+LOST = {"can": {0, 5, 6}, "box": {11}}
+K = "50 0 20\n0 50 15\n0 0 1\n"
+
+
+def truth_of(k):
+    rng = np.random.default_rng(k)
+    start = se3.from_rt(se3.exp(np.r_[rng.normal(size=3), 0, 0, 0])[:3, :3], [0, 0, 0.7])
+    return start @ se3.exp(np.arange(N)[:, None] * rng.normal(0, 0.03, 6))
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """A YCBMultiTrack sequence of two objects with models, whose pictures are named by their time."""
+    folder = tmp_path_factory.mktemp("exchange") / "table"
+    for sub in ("rgb", "depth"):
+        (folder / sub).mkdir(parents=True)
+    (folder / "cam_K.txt").write_text(K)
+    for k, obj in enumerate(("box", "can")):
+        for sub in ("masks", "annotated_poses", "models"):
+            (folder / sub / obj).mkdir(parents=True)
+        np.savetxt(folder / f"models/{obj}/points.xyz", np.random.default_rng(9 + k).normal(0, 0.03, (60, 3)))
+        for stem, T in zip(STEMS, truth_of(k)):
+            np.savetxt(folder / f"annotated_poses/{obj}/{stem}.txt", T)
+            cv2.imwrite(str(folder / f"masks/{obj}/{stem}.png"), np.full((H, W), 255, np.uint8))
+    for stem in STEMS:
+        cv2.imwrite(str(folder / f"rgb/{stem}.png"), np.zeros((H, W, 3), np.uint8))
+        cv2.imwrite(str(folder / f"depth/{stem}.png"), np.full((H, W), 700, np.uint16))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(table, tmp_path_factory):
+    """The same as a BOP scene, with its models and pictures numbered with gaps."""
+    root = tmp_path_factory.mktemp("bop") / "set"
+    numbers = write_scene(root / "test" / "000007", open_sequence(table))
+    write_models(root / "models", {n: table / f"models/{name}/points.xyz" for name, n in numbers.items()})
+    return root / "test" / "000007"
+
+
+def run_on(folder, out):
+    """A run with noise of 2 mm and 0.6 degrees in an object frame of its own, and lost frames."""
+    sequence = open_sequence(folder)
+    names = dict(zip(sequence.objects, ("box", "can")))
+    models = {obj: places[-1] for obj, places in sequence.model_places.items()}
+    models = {obj: next(p for p in (place, place / "points.xyz") if p.is_file()) for obj, place in find(sequence)}
+    rng = np.random.default_rng(1)
+    with RunWriter(out, sequence, preset("default"), "lk", "dataset", models=models) as writer:
+        for i in range(N):
+            estimates = {}
+            for obj, truth in sequence.truth.items():
+                T = truth.T_cam_model[i] @ se3.exp(np.r_[rng.normal(0, 0.01, 3), rng.normal(0, 0.002, 3)])
+                T = T @ se3.exp(np.array([0.3, -1.2, 0.5, 0.1, 0.2, -0.05]))
+                if i in LOST[names[obj]]:
+                    estimates[obj] = PoseEstimate(obj, i, sequence.times_s[i], Status.LOST, reason="test")
+                else:
+                    estimates[obj] = PoseEstimate(obj, i, sequence.times_s[i], Status.TRACKED, T, 0.8)
+            writer.add(sequence.frame(i), estimates, 20.0 + i)
+    return load_run(out)
+
+
+def find(sequence):
+    for obj, places in sequence.model_places.items():
+        yield obj, next(p for p in places if p.is_file() or (p / "points.xyz").is_file())
+
+
+@pytest.mark.parametrize("layout", ["ycbmultitrack", "bop"])
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("frame", ["object", "model"])
+def test_every_form_keeps_every_pose_and_every_loss(table, scene, tmp_path, layout, format, frame):
+    folder = table if layout == "ycbmultitrack" else scene
+    run = run_on(folder, tmp_path / "run")
+    export_run(tmp_path / "run", format, tmp_path / "out", frame)
+    read = read_poses(tmp_path / "out", open_sequence(folder))
+    assert read.keys() == run.objects.keys()
+    for name, obj in run.objects.items():
+        lost = np.isnan(read[name]).all((1, 2))
+        np.testing.assert_array_equal(lost, ~obj.has_pose)
+        first = np.flatnonzero(obj.has_pose)[0]
+        T_obj_frame = np.eye(4) if frame == "object" else se3.inverse(obj.T_cam_obj[first]) @ obj.T_cam_model[first]
+        np.testing.assert_allclose(read[name][~lost], (obj.T_cam_obj @ T_obj_frame)[~lost], atol=3e-8)
+    # The same poses get the same scores, whichever way they come.
+    ours = evaluate_run(tmp_path / "run").as_dict()
+    theirs = evaluate_poses(tmp_path / "out", folder).as_dict()
+    assert 60 < ours["mean"]["add_auc"] < 99 and ours["objects"].keys() == theirs["objects"].keys()
+    for name, score in ours["objects"].items():
+        assert theirs["objects"][name] == pytest.approx(score, abs=1e-4) and score["lost"] > 0
+
+
+def test_tum_as_scipy_reads_it(table, tmp_path):
+    run = run_on(table, tmp_path / "run")
+    export(run, tmp_path / "out", "tum")
+    rows = np.loadtxt(tmp_path / "out" / "can.txt")
+    seen = np.flatnonzero(run.objects["can"].has_pose)
+    np.testing.assert_allclose(rows[:, 0], open_sequence(table).times_s[seen], atol=1e-6)
+    R = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    np.testing.assert_allclose(se3.from_rt(R, rows[:, 1:4]), run.objects["can"].T_cam_obj[seen], atol=1e-8)
+
+
+def test_bop_csv_as_its_page_says(scene, tmp_path):
+    run = run_on(scene, tmp_path / "run")
+    [path] = export_run(tmp_path / "run", "bop", tmp_path / "out")
+    assert path.name == "p2p_000007-test.csv"
+    lines = path.read_text().splitlines()
+    assert lines[0] == "scene_id,im_id,obj_id,score,R,t,time" and len(lines) == 1 + 2 * N - 4
+    obj = run.objects["obj_000001"]
+    scene_id, im_id, obj_id, score, R, t, time_s = lines[1].split(",")
+    assert (scene_id, im_id, obj_id, float(score)) == ("7", "0", "1", 0.8) and float(time_s) == 0.02
+    first = obj.T_cam_model[0]  # aligned there, so exact
+    np.testing.assert_allclose(np.array(R.split(), float), first[:3, :3].ravel(), atol=1e-9)
+    np.testing.assert_allclose(np.array(t.split(), float), first[:3, 3] * 1000, atol=1e-6)
+    times = {line.split(",")[1]: set() for line in lines[1:]}
+    for line in lines[1:]:
+        times[line.split(",")[1]].add(line.split(",")[6])
+    assert all(len(found) == 1 for found in times.values())  # one time for all estimates of a picture
+
+
+def test_bop_csv_takes_the_best_score_and_skips_other_scenes(scene, tmp_path):
+    header = "scene_id,im_id,obj_id,score,R,t,time\n"
+    one = "1 0 0 0 1 0 0 0 1"
+    rows = [f"7,3,1,0.5,{one},0 0 500,-1", f"7,3,1,0.9,{one},0 0 900,-1", f"7,3,1,0.2,{one},0 0 200,-1"]
+    rows += [f"8,3,1,1.0,{one},0 0 100,-1", f"7,3,55,1.0,{one},0 0 100,-1"]
+    (tmp_path / "a.csv").write_text(header + "\n".join(rows))
+    read = read_poses(tmp_path / "a.csv", open_sequence(scene))
+    assert list(read) == ["obj_000001"] and np.isfinite(read["obj_000001"]).all((1, 2)).tolist() == [
+        i == 3 for i in range(N)
+    ]
+    assert read["obj_000001"][3, 2, 3] == pytest.approx(0.9)
+
+
+@pytest.fixture
+def bottle(table, tmp_path):
+    """One unnamed object, in the YCBInEOAT layout."""
+    folder = tmp_path / "mustard"
+    folder.mkdir()
+    for sub in ("rgb", "depth"):
+        (folder / sub).symlink_to(table / sub)
+    (folder / "annotated_poses").symlink_to(table / "annotated_poses" / "can")
+    (folder / "cam_K.txt").write_text(K)
+    return folder
+
+
+@pytest.mark.parametrize("names", [STEMS, [f"{i:04d}" for i in range(N)]], ids=["pictures", "numbers"])
+@pytest.mark.parametrize("sub", ["", "ob_in_cam", "annotated_poses"])
+def test_matrices_as_bundlesdf_writes_them(bottle, tmp_path, names, sub):
+    poses = truth_of(1)
+    (tmp_path / "theirs" / sub).mkdir(parents=True)
+    for name, T in zip(names, poses):
+        np.savetxt(tmp_path / "theirs" / sub / f"{name}.txt", T)
+    (tmp_path / "theirs" / sub / f"{names[4]}.txt").unlink()
+    np.savetxt(tmp_path / "theirs" / sub / f"{names[5]}.txt", np.zeros((4, 4)))
+    np.savetxt(tmp_path / "theirs" / sub / f"{names[6]}.txt", np.full((4, 4), np.nan))
+    [T] = read_poses(tmp_path / "theirs", open_sequence(bottle)).values()
+    kept = np.setdiff1d(np.arange(N), [4, 5, 6])
+    np.testing.assert_allclose(T[kept], poses[kept], atol=1e-9)
+    assert np.isnan(T[[4, 5, 6]]).all()
+    model = {"object": str(bottle.resolve().parent / "points.xyz")}
+    np.savetxt(model["object"], np.random.default_rng(0).normal(0, 0.03, (50, 3)))
+    [score] = evaluate_poses(tmp_path / "theirs", bottle, model).as_dict()["objects"].values()
+    assert (score["frames"], score["lost"]) == (N, 3)
+    assert score["add_auc"] == pytest.approx(100 * (N - 3) / N)
+
+
+def test_an_object_without_poses_is_lost_not_left_out(table, tmp_path):
+    (tmp_path / "theirs" / "can").mkdir(parents=True)
+    for stem, T in zip(STEMS, truth_of(1)):
+        np.savetxt(tmp_path / "theirs" / "can" / f"{stem}.txt", T)
+    scores = evaluate_poses(tmp_path / "theirs", table).as_dict()
+    assert scores["objects"]["box"]["lost"] == N and scores["objects"]["box"]["add_auc"] == 0
+    assert scores["mean"]["add_auc"] == pytest.approx(50)
+
+
+def test_only_some_frames(table, tmp_path):
+    """A run over part of a sequence, and another method's poses over the same part, get the same scores."""
+    run_on(table, tmp_path / "run")
+    export_run(tmp_path / "run", "poses", tmp_path / "out")
+    whole = evaluate_poses(tmp_path / "out", table)
+    part = evaluate_poses(tmp_path / "out", table, start=3, stop=9)
+    assert part.objects["can"].frame_index.tolist() == list(range(3, 9)) and part.objects["can"].lost == 2
+    assert whole.objects["can"].lost == 3
+    with pytest.raises(BadInput, match="0 <= start < stop within 12 frames"):
+        evaluate_poses(tmp_path / "out", table, start=9, stop=9)
+
+
+IDENTITY = "1 0 0 0\n0 1 0 0\n0 0 1 0.5\n0 0 0 1\n"
+FAULTS = {
+    "no such folder": ({}, r"theirs: no such file or folder, expected poses"),
+    "two tables": ({"a.csv": "", "b.csv": ""}, r"theirs: got 2 \.csv files"),
+    "another header": ({"a.csv": "a,b\n1,2\n"}, r"a\.csv: got the header 'a,b', expected scene_id"),
+    "nothing of it": ({"a.csv": "scene_id,im_id,obj_id,score,R,t,time\n"}, r"a\.csv: got nothing of scene 1"),
+    "a short rotation": (
+        {"a.csv": "scene_id,im_id,obj_id,score,R,t,time\n1,0,1,1,1 0 0,0 0 1,1\n"},
+        r"a\.csv: line 2: got unreadable",
+    ),
+    "no such picture": (
+        {"a.csv": "scene_id,im_id,obj_id,score,R,t,time\n1,99,1,1,1 0 0 0 1 0 0 0 1,0 0 1,1\n"},
+        r"a\.csv: line 2: got im_id 99",
+    ),
+    "a quaternion too long": (
+        {"can.txt": f"{STEMS[0][:10]}.1002 0 0 1 0 0 0 2\n"},
+        r"line 1: got .*quaternion",
+    ),
+    "a word": ({"can.txt": "0 0 0 zero 0 0 0 1\n"}, r"can\.txt: line 1: got '0 0 0 zero"),
+    "another time": ({"can.txt": "0.5 0 0 1 0 0 0 1\n"}, r"can\.txt: got the time 0\.500000 s, expected times"),
+    "not rigid": ({"can/0000.txt": "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"}, r"0000\.txt: got a matrix that is not"),
+    "another name": ({"can/frame.txt": IDENTITY}, r"frame\.txt: got the name frame, expected the name of a picture"),
+    "a number too high": ({"can/0012.txt": IDENTITY}, r"0012\.txt: got the name 0012, .*frame number below 12"),
+    "three rows": ({"can/0000.txt": "1 0 0 0\n0 1 0 0\n0 0 1 0\n"}, r"0000\.txt: got shape \(3, 4\)"),
+    "whose are they": ({"0000.txt": IDENTITY}, r"theirs: got poses of one object, expected .* box, can"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_named(table, tmp_path, fault):
+    files, expected = FAULTS[fault]
+    for name, text in files.items():
+        (tmp_path / "theirs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "theirs" / name).write_text(text)
+    with pytest.raises((BadInput, MissingData), match=expected):
+        read_poses(tmp_path / "theirs", open_sequence(table))
+
+
+def test_the_commands(table, tmp_path, capsys):
+    run_on(table, tmp_path / "run")
+    assert main(["export", str(tmp_path / "run"), "--format", "poses", "--out", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(tmp_path / "out/annotated_poses" / n) for n in ("box", "can")]
+    assert len(list((tmp_path / "out/annotated_poses/can").iterdir())) == N - 3
+    words = ["eval", "--poses", str(tmp_path / "out"), "--sequence", str(table)]
+    assert main(words) == 0
+    assert "imported" in capsys.readouterr().out
+    for wrong in (["eval"], words[:3], ["eval", str(tmp_path / "run"), *words[1:]]):
+        with pytest.raises(SystemExit):
+            main(wrong)
+        assert "either DIR, a run's folder, or --poses with --sequence. See p2p eval --help" in capsys.readouterr().err
+
+
+def test_without_truth_there_is_no_model_frame(table, tmp_path, capsys):
+    folder = tmp_path / "plain"
+    folder.mkdir()
+    for sub in ("rgb", "depth", "masks"):
+        (folder / sub).symlink_to(table / sub)
+    (folder / "cam_K.txt").write_text(K)
+    sequence = open_sequence(folder)
+    with RunWriter(tmp_path / "run", sequence, preset("default"), "lk", "dataset") as writer:
+        for i in range(N):
+            pose = PoseEstimate("can", i, sequence.times_s[i], Status.TRACKED, np.eye(4), 1.0)
+            writer.add(sequence.frame(i), {"can": pose}, 1.0)
+    with pytest.raises(MissingData, match="no scored frame with truth and a pose, so no model frame"):
+        export_run(tmp_path / "run", "bop", tmp_path / "out")
+    assert export_run(tmp_path / "run", "bop", tmp_path / "out", "object")

@@ -1,0 +1,231 @@
+"""Bad input: every fault of a sequence on disk is one line that names the file, what was found, what was expected."""
+
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.core import se3
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.datasets.sequence import open_sequence
+
+W, H, N = 40, 30, 3
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    """A YCBMultiTrack folder of two objects that opens and reads without complaint."""
+    folder = tmp_path / "table"
+    for sub in ("rgb", "depth"):
+        (folder / sub).mkdir(parents=True)
+    for i in range(N):
+        cv2.imwrite(str(folder / "rgb" / f"{i:04d}.png"), np.full((H, W, 3), 50 + i, np.uint8))
+        cv2.imwrite(str(folder / "depth" / f"{i:04d}.png"), np.full((H, W), 700, np.uint16))
+        for obj in ("box", "can"):
+            for sub in ("masks", "annotated_poses"):
+                (folder / sub / obj).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / "masks" / obj / f"{i:04d}.png"), np.full((H, W), 255, np.uint8))
+            np.savetxt(folder / "annotated_poses" / obj / f"{i:04d}.txt", se3.exp(np.full(6, 0.1 * i)))
+    (folder / "is_mask_visible" / "can").mkdir(parents=True)
+    np.save(folder / "is_mask_visible" / "can" / "is_mask_visible.npy", np.ones(N, bool))
+    np.savetxt(folder / "cam_K.txt", [[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
+    read_all(folder)
+    return folder
+
+
+def read_all(folder, **options):
+    s = open_sequence(folder, **options)
+    for i in range(len(s)):
+        s.frame(i), s.masks(i), s.visible_px(i)
+    return s, s.truth
+
+
+def png(path, image):
+    assert cv2.imwrite(str(path), image)
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+CASES = {
+    "colour unreadable": (
+        lambda f: (f / "rgb/0001.png").write_bytes(b"not a picture"),
+        r"rgb/0001\.png: got an unreadable file of 13 bytes, expected a colour picture",
+    ),
+    "colour cut off": (lambda f: cut(f / "rgb/0002.png"), r"rgb/0002\.png: got an unreadable file of \d+ bytes"),
+    "colour empty": (
+        lambda f: (f / "rgb/0000.png").write_bytes(b""),
+        r"rgb/0000\.png: got an unreadable file of 0 bytes",
+    ),
+    "colour missing": (
+        lambda f: (f / "rgb/0001.png").unlink(),
+        r"depth: got 3 files, expected 2, one for each in .*rgb\. 0001\.png is too many",
+    ),
+    "depth missing": (
+        lambda f: (f / "depth/0001.png").unlink(),
+        r"depth: got 2 files, expected 3, one for each in .*rgb\. 0001\.png is missing",
+    ),
+    "colour of another size": (
+        lambda f: png(f / "rgb/0002.png", np.zeros((H, W + 2, 3), np.uint8)),
+        r"rgb/0002\.png: got 42x30 pixels, expected 40x30 as the first picture",
+    ),
+    "depth of another size": (
+        lambda f: png(f / "depth/0001.png", np.zeros((H // 2, W // 2), np.uint16)),
+        r"depth/0001\.png: got 20x15 pixels, expected 40x30 as the colour picture\. Register",
+    ),
+    "depth of eight bits": (
+        lambda f: png(f / "depth/0001.png", np.zeros((H, W), np.uint8)),
+        r"depth/0001\.png: got 30x40 uint8, expected one channel, uint16",
+    ),
+    "depth in colour": (
+        lambda f: png(f / "depth/0001.png", np.zeros((H, W, 3), np.uint16)),
+        r"depth/0001\.png: got 30x40x3 uint16, expected one channel",
+    ),
+    "no pictures": (
+        lambda f: [p.unlink() for p in (f / "rgb").iterdir()],
+        r"rgb: got no files, expected colour pictures \(\.png",
+    ),
+    "no depth folder": (lambda f: shutil.rmtree(f / "depth"), r"depth: no such folder, expected depth images"),
+    "no camera": (lambda f: (f / "cam_K.txt").unlink(), r"cam_K\.txt: no such file, expected a 3x3 camera matrix"),
+    "camera of two rows": (
+        lambda f: (f / "cam_K.txt").write_text("50 0 20\n0 50 15\n"),
+        r"cam_K\.txt: got shape \(2, 3\), expected a 3x3 camera matrix",
+    ),
+    "camera of one row": (
+        lambda f: (f / "cam_K.txt").write_text("50 0 20 0 50 15 0 0 1"),
+        r"cam_K\.txt: got shape \(1, 9\), expected a 3x3 camera matrix",
+    ),
+    "camera empty": (lambda f: (f / "cam_K.txt").write_text(""), r"cam_K\.txt: got shape \(0,\), expected a 3x3"),
+    "camera in words": (
+        lambda f: (f / "cam_K.txt").write_text("fx 50\nfy 50\n"),
+        r"cam_K\.txt: got 'fx 50', expected a 3x3 camera matrix",
+    ),
+    "camera ragged": (
+        lambda f: (f / "cam_K.txt").write_text("50 0 20\n0 50\n0 0 1\n"),
+        r"cam_K\.txt: got rows of unequal length, expected a 3x3",
+    ),
+    "camera NaN": (
+        lambda f: (f / "cam_K.txt").write_text("nan 0 20\n0 50 15\n0 0 1\n"),
+        r"cam_K\.txt: got nan 0 20.*, expected fx 0 cx",
+    ),
+    "pose NaN": (
+        lambda f: np.savetxt(f / "annotated_poses/can/0001.txt", np.full((4, 4), np.nan)),
+        r"annotated_poses/can/0001\.txt: got NaN or infinite entries, expected a finite 4x4",
+    ),
+    "pose not rigid": (
+        lambda f: np.savetxt(f / "annotated_poses/can/0001.txt", np.diag([1, 1, 1.1, 1])),
+        r"annotated_poses/can/0001\.txt: got a matrix that is not a rotation",
+    ),
+    "pose of three rows": (
+        lambda f: np.savetxt(f / "annotated_poses/can/0001.txt", np.eye(4)[:3]),
+        r"annotated_poses/can/0001\.txt: got shape \(3, 4\), expected a 4x4",
+    ),
+    "pose missing": (
+        lambda f: (f / "annotated_poses/box/0002.txt").unlink(),
+        r"annotated_poses/box: got 2 files, expected 3, one for each in .*rgb\. 0002\.txt is missing",
+    ),
+    "mask missing": (
+        lambda f: (f / "masks/box/0000.png").unlink(),
+        r"masks/box: got 2 files, expected 3.*0000\.png is missing",
+    ),
+    "masks of an object missing": (
+        lambda f: shutil.rmtree(f / "masks/box"),
+        r"masks/box: no such folder, expected mask",
+    ),
+    "mask unreadable": (
+        lambda f: (f / "masks/can/0001.png").write_bytes(b"x"),
+        r"masks/can/0001\.png: got an unreadable file of 1 bytes, expected a mask image",
+    ),
+    "mask of another size": (
+        lambda f: png(f / "masks/can/0001.png", np.zeros((8, 9), np.uint8)),
+        r"masks/can/0001\.png: got 9x8 pixels, expected 40x30",
+    ),
+    "labels too short": (
+        lambda f: np.save(f / "is_mask_visible/can/is_mask_visible.npy", np.ones(N - 1, bool)),
+        r"is_mask_visible/can/is_mask_visible\.npy: got shape \(2,\) bool, expected 3 labels",
+    ),
+    "labels pickled": (
+        lambda f: np.save(f / "is_mask_visible/can/is_mask_visible.npy", np.array([{}] * N), allow_pickle=True),
+        r"is_mask_visible/can/is_mask_visible\.npy: got an unreadable array",
+    ),
+    "labels damaged": (
+        lambda f: (f / "is_mask_visible/can/is_mask_visible.npy").write_bytes(b"\x93NUMPY"),
+        r"is_mask_visible/can/is_mask_visible\.npy: got an unreadable array",
+    ),
+    "times too few": (
+        lambda f: (f / "times.txt").write_text("0\n0.1\n"),
+        r"times\.txt: got 2 times, expected 3, one for each in .*rgb",
+    ),
+    "times standing still": (
+        lambda f: (f / "times.txt").write_text("0\n0.1\n0.1\n"),
+        r"times\.txt: got 0\.100000 s at frame 2, expected times in seconds that increase",
+    ),
+    "times NaN": (
+        lambda f: (f / "times.txt").write_text("0\n0.1\nnan\n"),
+        r"times\.txt: got nan s at frame 2, expected times in seconds that increase",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_fault_names_the_file(sequence, case):
+    spoil, expected = CASES[case]
+    spoil(sequence)
+    with pytest.raises((BadInput, MissingData)) as error:
+        read_all(sequence)
+    message = str(error.value)
+    assert re.search(expected, message), message
+    assert "\n" not in message and str(sequence) in message
+
+
+def test_a_picture_that_vanishes_after_opening_is_named(sequence):
+    s = open_sequence(sequence)
+    (sequence / "rgb/0002.png").unlink()
+    with pytest.raises(MissingData, match=r"rgb/0002\.png: no such file, expected a colour picture"):
+        s.frame(2)
+
+
+def test_faults_wait_for_their_frame(sequence):
+    (sequence / "depth/0002.png").write_bytes(b"x")
+    s = open_sequence(sequence)
+    assert s.frame(1).index == 1
+    with pytest.raises(BadInput, match=r"depth/0002\.png"):
+        s.frame(2)
+
+
+@pytest.mark.parametrize("i", [-1, N])
+def test_frames_that_are_not_there(sequence, i):
+    s = open_sequence(sequence)
+    for read in (s.frame, s.masks, s.visible_px):
+        with pytest.raises(BadInput, match=rf"table: frame: got {i}, expected a number from 0 to 2"):
+            read(i)
+
+
+def test_masks_that_are_not_there(sequence):
+    with pytest.raises(MissingData, match=r"masks_sam: no such folder of masks\. Name a folder inside the sequence"):
+        open_sequence(sequence, masks="masks_sam")
+
+
+def test_lossy_masks_are_refused(sequence):
+    for path in (sequence / "masks/can").iterdir():
+        path.rename(path.with_suffix(".jpg"))
+    with pytest.raises(BadInput, match=r"masks/can: got no files, expected mask images \(\.png"):
+        open_sequence(sequence)
+
+
+def test_colour_masks_without_labels_are_refused(sequence):
+    rainbow = np.random.default_rng(0).integers(0, 255, (H, W, 3), np.uint8)
+    png(sequence / "masks/can/0001.png", rainbow)
+    with pytest.raises(BadInput, match=r"masks/can/0001\.png: got a colour picture \(RGB\), expected one label"):
+        open_sequence(sequence).masks(1)
+
+
+def test_a_sequence_of_another_layout_says_what_it_lacks(sequence):
+    (sequence / "cam_K.txt").unlink()
+    shutil.rmtree(sequence / "annotated_poses")
+    with pytest.raises(BadInput, match=r"annotated_poses: got no folders, expected one folder of poses"):
+        np.savetxt(sequence / "cam_K.txt", [[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
+        open_sequence(sequence, format="ycbmultitrack")

@@ -1,0 +1,147 @@
+"""The same work gives the same bytes, and a note that says what it was, without telling of the machine."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from p2p_lib.core.errors import BadInput
+from p2p_lib.figures import plots, provenance, tables
+from p2p_lib.figures.provenance import save_figure, save_table, save_video
+
+
+@pytest.fixture
+def folders(tmp_path, monkeypatch):
+    """Changes where everything goes; returns the function that does."""
+
+    def use(name):
+        monkeypatch.setenv("P2P_FIGURES", str(tmp_path / name / "figures"))
+        monkeypatch.setenv("P2P_TABLES", str(tmp_path / name / "tables"))
+        return tmp_path / name
+
+    return use
+
+
+def image():
+    return np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
+
+
+def save_all(made):
+    sources = [made.run, made.evaluation, made.sequence]
+    parameters = {"PROFILE": "quick", "SEED": np.int64(3), "values": np.arange(3)}
+    save_figure(plots.error_over_time(made.run, made.evaluation), "plot", sources=sources, parameters=parameters)
+    save_figure(image(), "picture", sources=sources, parameters=parameters)
+    save_video([image()] * 4, "film", fps=10, sources=sources)
+    save_table(tables.score_table(made.evaluation), "scores", sources=sources, parameters=parameters)
+
+
+@pytest.mark.filterwarnings("error::UserWarning")  # a layout that does not fit
+def test_saved_again_is_the_same_to_the_byte(made, folders):
+    contents = []
+    for name in ("first", "second"):
+        folder = folders(name)
+        save_all(made)
+        contents.append({p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()})
+    assert contents[0] == contents[1]
+    assert {str(p) for p in contents[0]} == {
+        *(f"figures/{name}" for name in ("plot.png", "plot.pdf", "plot.json", "picture.png", "picture.json")),
+        *("figures/film.mp4", "figures/film.json", "tables/scores.csv", "tables/scores.md", "tables/scores.json"),
+    }
+
+
+def test_note_says_what_was_made_from_what(made, folders):
+    folder = folders("out")
+    save_all(made)
+    note = json.loads((folder / "figures" / "plot.json").read_text())
+    assert note["parameters"] == {"PROFILE": "quick", "SEED": 3, "values": [0, 1, 2]}
+    run, evaluation, sequence = note["sources"]
+    assert (run["sequence"], run["tracker"], run["seed"]) == (made.sequence.name, "lk", 0)
+    assert re.fullmatch("[0-9a-f]{12}", run["run"]) and re.fullmatch("[0-9a-f]{64}", run["poses_sha256"])
+    assert evaluation["align"] == "first" and sequence["frames"] == len(made.sequence)
+    assert set(sequence["sha256"]) == {"cam_K.txt", "scenario.json", "first frame"}
+    assert {"p2p_lib", "python", "numpy", "matplotlib"} <= set(note["versions"]) and "commit" in note
+    import hashlib
+
+    assert note["sha256"]["plot.png"] == hashlib.sha256((folder / "figures" / "plot.png").read_bytes()).hexdigest()
+
+
+def test_nothing_tells_of_the_machine_or_the_hour(made, folders):
+    folder = folders("out")
+    save_all(made)
+    for path in folder.rglob("*"):
+        if path.is_file():
+            content = path.read_bytes()
+            assert str(folder.parent).encode() not in content and str(made.run.path).encode() not in content
+            assert b"CreationDate" not in content and b"ModDate" not in content, path
+    png = (folder / "figures" / "plot.png").read_bytes()
+    assert b"Software" not in png and b"tIME" not in png
+
+
+def test_another_configuration_is_another_run(made, tmp_path):
+    import shutil
+    from dataclasses import replace
+
+    changed = shutil.copytree(made.run.path, tmp_path / "run")
+    assert provenance.describe(replace(made.run, path=changed)) == provenance.describe(made.run)
+    (changed / "config.toml").write_text("preset = 'paper'\n")
+    assert provenance.describe(replace(made.run, path=changed))["run"] != provenance.describe(made.run)["run"]
+
+
+def test_picture_is_written_as_it_is_and_shown_as_written(folders):
+    from base64 import b64decode
+
+    from PIL import Image
+
+    folder = folders("out")
+    saved = save_figure(image(), "picture")
+    assert saved.path == folder / "figures" / "picture.png"
+    with Image.open(saved.path) as read:
+        assert (np.asarray(read) == image()).all()
+    data, metadata = saved._repr_mimebundle_()
+    assert b64decode(data["image/png"]) == saved.path.read_bytes() and metadata["image/png"]["width"] == 60
+
+
+def test_film_is_shown_embedded(folders):
+    folders("out")
+    saved = save_video([image()] * 3, "film", fps=5)
+    assert "base64" in saved._repr_mimebundle_()[0]["text/html"]
+
+
+def test_saving_leaves_matplotlib_as_it_was(made, folders):
+    import matplotlib
+
+    folders("out")
+    before = dict(matplotlib.rcParams)
+    save_figure(plots.status_strip(made.run), "strip")
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_table_reads_back(folders):
+    import pandas
+
+    folders("out")
+    table = pandas.DataFrame({"object": ["a|b", "c"], "ADD [%]": [91.25, None], "frames": [3, 4]})
+    saved = save_table(table, "scores")
+    assert pandas.read_csv(saved.path).equals(table)
+    lines = saved.path.with_suffix(".md").read_text().splitlines()
+    assert lines == ["| object | ADD [%] | frames |", "| --- | ---: | ---: |", "| a\\|b | 91.25 | 3 |", "| c | - | 4 |"]
+    assert "<table" in saved._repr_mimebundle_()[0]["text/html"]
+
+
+def test_a_file_as_source_is_named_without_its_folder(tmp_path):
+    path = tmp_path / "numbers.csv"
+    path.write_text("1,2\n")
+    told = provenance.describe(path)
+    assert told["file"] == "numbers.csv" and len(told["sha256"]) == 64
+
+
+def test_bad_input(folders):
+    folders("out")
+    for name in ("../escape", "a b", ""):
+        with pytest.raises(BadInput, match="figure name"):
+            save_figure(image(), name)
+    with pytest.raises(BadInput, match=r"\(H, W, 3\) uint8"):
+        save_figure(image().astype(float), "picture")
+    with pytest.raises(BadInput, match="figure source"):
+        save_figure(image(), "picture", sources=[3])

@@ -1,0 +1,121 @@
+"""A run drawn on its video: what is estimated is in colour, what is hidden is not made up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from p2p_lib.core import se3
+from p2p_lib.core.errors import BadInput
+from p2p_lib.figures import overlay, style
+from p2p_lib.figures.overlay import Box
+from p2p_lib.figures.plots import gaps
+from p2p_lib.figures.scenes import Scene, draw_live
+from p2p_lib.method.pipeline import Point2Pose
+
+
+@pytest.fixture(scope="module")
+def scene(made):
+    return Scene(made.sequence, made.run, made.evaluation)
+
+
+def in_colour(image, colour, uv_px):
+    """Share of pixels (at most one beside uv_px) that have a colour, lines being antialiased."""
+    at = np.rint(uv_px).astype(int)[:, None] + np.array([[u, v] for u in (-1, 0, 1) for v in (-1, 0, 1)])
+    off = np.abs(image[at[..., 1], at[..., 0]].astype(int) - style.rgb(colour)).max(2).min(1)
+    return (off < 40).mean()
+
+
+def box_edges(made, name, row):
+    """Pixels along the front edges of the model's box at the truth."""
+    obj, box = made.run.objects[name], Box.around(made.run.points[name])
+    T = obj.T_cam_model[row] @ box.T_obj_box
+    ends = overlay.box_corners(box.size_m)[overlay.EDGES[overlay._front_edges(T, box.size_m)]]
+    along = ends[:, 0, None] + np.linspace(0.1, 0.9, 9)[:, None] * (ends[:, 1] - ends[:, 0])[:, None]
+    return made.sequence.camera.project(se3.transform(T, along.reshape(-1, 3)))
+
+
+def test_boxes_lie_on_the_objects(made, scene):
+    for row in (0, len(scene) - 1):
+        image = scene.draw(row, axes=False, trail=0)
+        for name, colour in scene.colours.items():
+            assert in_colour(image, colour, box_edges(made, name, row)) > 0.8, (name, row)
+            assert in_colour(made.sequence.frame(row).rgb, colour, box_edges(made, name, row)) < 0.3
+
+
+def test_a_hidden_object_has_only_its_true_box(made, scene):
+    for name, obj in made.run.objects.items():
+        start, stop = gaps(obj)[0]
+        row = (start + stop) // 2
+        uv = box_edges(made, name, row)
+        image = scene.draw(row, axes=False, trail=0)
+        assert in_colour(image, scene.colours[name], uv) < 0.1
+        assert 0.3 < in_colour(image, style.TRUTH, uv) <= 1  # dashes
+        plain = Scene(made.sequence, made.run, made.evaluation, truth=False).draw(row, axes=False, trail=0)
+        assert in_colour(plain, style.TRUTH, uv) < 0.1
+
+
+def test_a_wrong_pose_is_drawn_where_it_is(made, scene):
+    """The truth in white beside the estimate: 2 cm are about 20 pixels here."""
+    image = scene.draw(6, axes=False, trail=0)
+    uv = box_edges(made, "box", 6)
+    assert in_colour(image, style.TRUTH, uv) > 0.3
+    assert in_colour(image, scene.colours["box"], uv) < 0.5
+
+
+def test_without_evaluation_there_are_axes_and_the_boxes_given(made):
+    bare = Scene(made.sequence, made.run, truth=False)
+    uv = box_edges(made, "can", 0)
+    assert in_colour(bare.draw(0), bare.colours["can"], uv) < 0.2
+    assert (bare.draw(0) != made.sequence.frame(0).rgb).any()
+    given = Box.around(made.run.points["can"], made.evaluation.objects["can"].T_obj_model)
+    boxed = Scene(made.sequence, made.run, truth=False, boxes={"can": given})
+    assert in_colour(boxed.draw(0, axes=False), boxed.colours["can"], uv) > 0.8
+
+
+def test_moments_tell_of_every_gap(made, scene):
+    rows = scene.moments(6)
+    assert len(rows) == 6 and rows[0] == 0 and rows == sorted(set(rows)) and rows[-1] < len(scene)
+    for obj in made.run.objects.values():
+        for start, stop in gaps(obj):
+            assert any(start <= row < stop for row in rows) and any(stop <= row <= stop + 2 for row in rows)
+    assert scene.moments(10_000) == list(range(len(scene)))
+
+
+def test_region_holds_the_objects(made, scene):
+    left, top, right, bottom = scene.region(margin=0.0)
+    assert 0 <= left < right <= 640 and 0 <= top < bottom <= 480 and (right - left) * (bottom - top) < 640 * 480
+    for i in range(0, len(scene), 5):
+        for mask in made.sequence.masks(i).values():
+            v, u = np.nonzero(mask)
+            assert not len(u) or (left <= u.min() + 1 and u.max() <= right and top <= v.min() + 1 and v.max() <= bottom)
+
+
+def test_story_and_film_have_their_sizes(scene):
+    left, top, right, bottom = scene.region()
+    height = round(240 * (bottom - top) / (right - left))
+    assert scene.story(count=4, columns=2, width_px=240).shape == (2 * height + 4, 2 * 240 + 4, 3)
+    assert [image.shape for image in scene.film(range(0, 6, 2), width_px=320)] == [(240, 320, 3)] * 3
+
+
+def test_a_run_on_other_data_is_refused(made):
+    obj = made.run.objects["can"]
+    moved = replace(obj, T_cam_model=obj.T_cam_model + [[0, 0, 0, 0.01]] * 4)
+    with pytest.raises(BadInput, match="Run it again"):
+        Scene(made.sequence, replace(made.run, objects={**made.run.objects, "can": moved}))
+    with pytest.raises(BadInput, match="mustard0"):
+        Scene(made.sequence, replace(made.run, info={**made.run.info, "sequence": "mustard0"}))
+
+
+def test_live_view_shows_the_keypoints(made):
+    method = Point2Pose(made.sequence.camera)
+    frame, masks = made.sequence.frame(0), made.sequence.masks(0)
+    for name in made.sequence.objects:
+        method.add_object(name, masks[name])
+    estimates = method.step(frame)
+    image = draw_live(method, frame, estimates, masks, title=made.sequence.name)
+    colours = style.object_colours(made.sequence.objects)
+    for name, obj in method.objects.items():
+        uv = method.camera.project(se3.transform(estimates[name].T_cam_obj, obj.map.p_obj))
+        assert in_colour(image, colours[name], uv) > 0.8
+    assert (frame.rgb == made.sequence.frame(0).rgb).all()

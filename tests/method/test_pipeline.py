@@ -1,0 +1,620 @@
+"""The whole loop on a small rendered scene whose poses are known exactly: cartons before a printed wall."""
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import Config, preset
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
+from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.synthetic import shapes
+from p2p_lib.synthetic.noise import Sensor, measured_colour, measured_depth
+from p2p_lib.synthetic.render import render
+from p2p_lib.trackers.builtin.tracker import BuiltinTracker
+
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
+CAMERA = Camera(440.0, 442.0, 201.3, 148.6, 400, 300)
+# A carton's front looks along -y and its top along +z; in the camera that is towards us and up.
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+LENGTH = 28
+Masks = dict[str, np.ndarray]
+
+
+def path(start_m, step_m, turn_deg: float) -> np.ndarray:
+    """T_cam_model (LENGTH, 4, 4): even motion while turning about the vertical, with a slight nod."""
+    k = np.arange(LENGTH)
+    vertical = Rotation.from_rotvec(np.radians(turn_deg) * (k / LENGTH)[:, None] * [0.1, 1, 0]).as_matrix()
+    return se3.from_rt(vertical @ UPRIGHT, np.asarray(start_m) + k[:, None] * np.asarray(step_m))
+
+
+TRUTH = {
+    "left": path([-0.11, 0.01, 0.55], [0.0012, -0.0005, 0.0006], 32),
+    "right": path([0.10, 0.0, 0.6], [-0.0008, 0.0008, -0.0008], -28),
+}
+HIDDEN = range(9, 14)  # frames in which a board stands before everything, in the film that has one
+
+
+@cache
+def film(board: bool = False) -> list[tuple[Frame, Masks]]:
+    """LENGTH frames with their masks, as a depth camera sees them."""
+    rng = np.random.default_rng(5)
+    meshes = {"left": shapes.box(rng, (0.10, 0.05, 0.14)), "right": shapes.box(rng, (0.08, 0.07, 0.11))}
+    corners = np.array([[-0.7, 0.5, 1.0], [0.7, 0.5, 1.0], [0.7, -0.5, 1.0], [-0.7, -0.5, 1.0]])
+    wall = render([(shapes.plane(rng.integers(60, 200, (40, 60, 3), np.uint8), corners), np.eye(4))], CAMERA, np.eye(4))
+    cover = shapes.slab(rng, (0.6, 0.01, 0.5))
+    frames = []
+    for k in range(LENGTH):
+        bodies = [(meshes[name], TRUTH[name][k]) for name in TRUTH]
+        if board and k in HIDDEN:
+            bodies.append((cover, se3.from_rt(UPRIGHT, np.array([0, 0, 0.3]))))
+        picture = render(bodies, CAMERA, np.eye(4), background=wall)
+        noise = np.random.default_rng([9, k])
+        sensor = Sensor(axial_per_m=0.002)
+        depth = measured_depth(picture, CAMERA, sensor, noise)
+        frame = Frame(k, k / 30, measured_colour(picture.rgb, sensor, 1.0, noise), depth.astype(np.float32))
+        frames.append((frame, {name: picture.label == i for i, name in enumerate(TRUTH, 1)}))
+    return frames
+
+
+def quick(name: str = "default", seed: int = 0, **values) -> Config:
+    """Points alone, without surface and graph: for what does not depend on them."""
+    off = {"tsdf.enabled": False, "refinement.enabled": False, "factor_graph.enabled": False}
+    return preset(name, seed).with_values(off | values)
+
+
+def track(frames, names=("left", "right"), config: Config | None = None) -> list[dict[str, PoseEstimate]]:
+    method = Point2Pose(CAMERA, config or quick())
+    for name in names:
+        method.add_object(name)
+    return [method.step(frame, {n: masks[n] for n in names if n in masks}) for frame, masks in frames]
+
+
+def errors(estimates: list[dict[str, PoseEstimate]], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (deg) and translation (mm) errors where there is a pose; object frames fixed at the first of them."""
+    with_pose = [e[name] for e in estimates if name in e and e[name].T_cam_obj is not None]
+    T_cam_obj = np.stack([e.T_cam_obj for e in with_pose])
+    T_cam_model = TRUTH[name][[e.frame_index for e in with_pose]]
+    T_obj_model = se3.inverse(T_cam_obj[0]) @ T_cam_model[0]
+    off = se3.inverse(T_cam_model) @ T_cam_obj @ T_obj_model
+    return np.degrees(se3.angle_rad(off)), 1e3 * np.linalg.norm(off[:, :3, 3], axis=1)
+
+
+def iou(one: np.ndarray, other: np.ndarray) -> float:
+    return (one & other).sum() / max((one | other).sum(), 1)
+
+
+def statuses(estimates: list[dict[str, PoseEstimate]], name: str) -> list[str]:
+    return [str(e[name].status) for e in estimates]
+
+
+def assert_same(one: list[dict[str, PoseEstimate]], other: list[dict[str, PoseEstimate]]) -> None:
+    """Bit for bit."""
+    assert len(one) == len(other)
+    for a, b in zip(one, other):
+        assert a.keys() == b.keys()
+        for name in a:
+            left, right = vars(a[name]), vars(b[name])
+            assert left.keys() == right.keys()
+            for key in left:
+                np.testing.assert_array_equal(left[key], right[key], f"{name} {key}")
+
+
+def assert_honest(estimates: list[dict[str, PoseEstimate]]) -> None:
+    """What every stream of estimates keeps to."""
+    newest: dict[str, PoseEstimate] = {}
+    for step in estimates:
+        for name, e in step.items():
+            assert e.object == name
+            if e.T_cam_obj is not None:
+                newest[name] = e
+            else:
+                assert e.reason and e.confidence == 0 and not e.keyframe and e.inliers == 0
+            if name in newest:
+                np.testing.assert_array_equal(e.last_T_cam_obj, newest[name].T_cam_obj)
+                assert e.last_seen_s == newest[name].time_s
+            else:
+                assert e.last_T_cam_obj is None and np.isnan(e.last_seen_s)
+            assert e.status != Status.INITIALISING or name not in newest
+
+
+# --- poses follow truth ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_poses_follow_the_truth(name):
+    """Two objects at once, everything on: surface, refinement, graph."""
+    estimates = track(film(), config=preset(name))
+    assert_honest(estimates)
+    for k, (frame, _) in enumerate(film()):
+        for e in estimates[k].values():
+            assert (e.frame_index, e.time_s) == (frame.index, frame.time_s)
+    for obj in TRUTH:
+        assert set(statuses(estimates, obj)) == {"tracked"}
+        angle_deg, shift_mm = errors(estimates, obj)
+        assert len(angle_deg) == LENGTH
+        assert np.median(angle_deg) < 1.5 and angle_deg.max() < 4
+        assert np.median(shift_mm) < 2.5 and shift_mm.max() < 6
+        assert sum(e[obj].keyframe for e in estimates) >= 2
+
+
+def test_poses_follow_the_truth_by_points_alone():
+    estimates = track(film(), config=quick())
+    for obj in TRUTH:
+        angle_deg, shift_mm = errors(estimates, obj)
+        assert len(angle_deg) == LENGTH
+        assert np.median(angle_deg) < 1.5 and np.median(shift_mm) < 2.5
+
+
+def test_where_the_object_frame_starts():
+    frame, masks = film()[0]
+    paper, default = (track(film()[:1], config=quick(name))[0] for name in ("paper", "default"))
+    for obj in TRUTH:
+        np.testing.assert_array_equal(paper[obj].T_cam_obj, np.eye(4))
+        T = default[obj].T_cam_obj
+        np.testing.assert_array_equal(T[:3, :3], np.eye(3))
+        v, u = np.nonzero(masks[obj] & (frame.depth_m > 0))
+        cloud = CAMERA.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
+        np.testing.assert_allclose(T[:3, 3], np.median(cloud, 0), atol=1e-6)
+
+
+def test_nobody_knows_the_masks():
+    """The first mask alone; from then on every object goes by its points."""
+    method = Point2Pose(CAMERA, quick())
+    for name in TRUTH:
+        method.add_object(name, mask=film()[0][1][name])
+    estimates = [method.step(frame) for frame, _ in film()]
+    assert_honest(estimates)
+    for obj in TRUTH:
+        angle_deg, shift_mm = errors(estimates, obj)
+        assert len(angle_deg) >= LENGTH - 2
+        assert np.median(angle_deg) < 2 and np.median(shift_mm) < 3
+
+
+# --- hiding and coming back --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def hidden_run() -> list[dict[str, PoseEstimate]]:
+    return track(film(board=True), config=preset())
+
+
+@pytest.mark.parametrize("obj", TRUTH)
+def test_a_hidden_object_has_no_pose_and_says_so(hidden_run, obj):
+    assert_honest(hidden_run)
+    for k in HIDDEN:
+        e = hidden_run[k][obj]
+        assert e.status == Status.OCCLUDED and e.T_cam_obj is None and e.visible_points == 0
+        assert e.last_seen_s == film()[HIDDEN.start - 1][0].time_s
+    assert all(hidden_run[k][obj].status == Status.TRACKED for k in range(HIDDEN.start))
+
+
+@pytest.mark.parametrize("obj", TRUTH)
+def test_its_return_is_marked_and_true(hidden_run, obj):
+    after = statuses(hidden_run, obj)[HIDDEN.stop :]
+    marked = preset().pipeline.recovered_frames
+    found = after.index("recovered")
+    assert found <= preset().tracking.redetect_every
+    assert after[:found] == ["lost"] * found
+    assert after[found : found + marked] == ["recovered"] * marked
+    assert set(after[found + marked :]) == {"tracked"}
+    angle_deg, shift_mm = errors(hidden_run, obj)
+    assert np.median(angle_deg[-6:]) < 3 and np.median(shift_mm[-6:]) < 5
+
+
+def test_no_keyframe_while_hidden_or_just_back(hidden_run):
+    for k, step in enumerate(hidden_run):
+        for e in step.values():
+            assert not (e.keyframe and (k in HIDDEN or e.status == Status.RECOVERED))
+
+
+class Shy(BuiltinTracker):
+    """After the hiding it finds but ``left`` points by itself; the others when it is told where to look."""
+
+    def __init__(self, left: int):
+        super().__init__(preset().tracking)
+        self.left, self.expected = left, []
+
+    def track(self, frame, search=None, urgent=False):
+        tracks = super().track(frame, search, urgent)
+        if frame.index < HIDDEN.stop:
+            return tracks
+        few = tracks.visible & (np.cumsum(tracks.visible) <= self.left)
+        return replace(tracks, visible=few, uncertainty=np.where(few, tracks.uncertainty, 1.0))
+
+    def suggest(self, ids, uv_px):
+        self.expected.append(int(np.isfinite(uv_px[:, 0]).sum()))
+        return super().suggest(ids, uv_px)
+
+
+@pytest.mark.parametrize(("seeking", "left"), [(3, 4), (3, 2), (0, 4)])
+def test_a_few_points_tell_where_the_others_are(seeking, left):
+    """A rigid triple gives a pose, the pose places, and the tracker points there: back at once, with many."""
+    tracker, frames = Shy(left), [(f, {"left": m["left"]}) for f, m in film(board=True)]
+    method = Point2Pose(CAMERA, quick(**{"pipeline.seek_inliers": seeking}), tracker)
+    method.add_object("left")
+    estimates = [method.step(f, m) for f, m in frames[: HIDDEN.stop + 1]]
+    back = estimates[-1]["left"]
+    assert (back.status == Status.RECOVERED) == (seeking > 0 and left >= 3)
+    if back.status == Status.RECOVERED:
+        assert back.inliers >= 15 and max(tracker.expected) >= 15
+        angle_deg, shift_mm = errors(estimates, "left")
+        assert angle_deg[-1] < 3 and shift_mm[-1] < 5
+    else:
+        assert back.T_cam_obj is None and back.inliers < 8
+
+
+def run_with(tracker, frames, config=None):
+    method = Point2Pose(CAMERA, config or preset(), tracker)
+    method.add_object("left")
+    return [method.step(f, {"left": m["left"]})["left"] for f, m in frames]
+
+
+def test_a_return_that_the_surface_contradicts_is_refused():
+    """The keypoints agree, but most of the mask is not where the object's surface would be."""
+    frames = list(film(board=True)[: HIDDEN.stop + 4])
+    back = range(HIDDEN.stop, HIDDEN.stop + 2)
+    for k in back:
+        frames[k] = (frames[k][0], {"left": np.ones_like(frames[k][1]["left"])})
+    told = run_with("builtin", frames)
+    assert all(told[k].status == Status.LOST and "lies on the surface" in told[k].reason for k in back)
+    assert told[-1].status == Status.RECOVERED and told[-1].T_cam_obj is not None
+    trusting = run_with("builtin", frames, preset().with_values({"pipeline.recover_min_share": 0.0}))
+    assert trusting[HIDDEN.stop].status == Status.RECOVERED
+
+
+def test_a_return_that_is_not_confirmed_is_taken_back():
+    """Two good frames, then too few points: no pose, and what it was before the hiding is the last that is known."""
+
+    class Fading(Shy):
+        def track(self, frame, search=None, urgent=False):
+            self.left = 99 if frame.index < HIDDEN.stop + 2 else 5
+            return super().track(frame, search, urgent)
+
+    told = run_with(Fading(99), film(board=True)[: HIDDEN.stop + 3], quick(**{"pipeline.seek_inliers": 0}))
+    before, taken = told[HIDDEN.start - 1], told[-1]
+    assert [e.status for e in told[-3:]] == [Status.RECOVERED, Status.RECOVERED, Status.LOST]
+    np.testing.assert_array_equal(taken.last_T_cam_obj, before.T_cam_obj)
+
+
+def test_one_hides_the_other_goes_on():
+    frames = [(f, {"right": m["right"]} if k in HIDDEN else m) for k, (f, m) in enumerate(film())]
+    estimates = track(frames)
+    assert [k for k in range(LENGTH) if statuses(estimates, "left")[k] == "occluded"] == list(HIDDEN)
+    assert set(statuses(estimates, "right")) == {"tracked"}
+
+
+@pytest.mark.parametrize("pixels", [0, 1, 99])
+def test_a_few_pixels_are_as_good_as_hidden(pixels):
+    sliver = np.zeros((300, 400), bool)
+    sliver.ravel()[:pixels] = True
+    frames = [*film()[:5], (film()[5][0], {"left": sliver, "right": film()[5][1]["right"]})]
+    e = track(frames)[5]["left"]
+    assert e.status == Status.OCCLUDED and f"{pixels} mask pixels" in e.reason
+
+
+# --- objects come and go -----------------------------------------------------------------------
+
+
+def test_a_late_object_starts_when_it_is_added():
+    method, estimates = Point2Pose(CAMERA, quick()), []
+    method.add_object("left")
+    for k, (frame, masks) in enumerate(film()):
+        if k == 12:
+            method.add_object("right", mask=masks["right"])
+        estimates.append(method.step(frame, {n: masks[n] for n in method.objects}))
+    assert all("right" not in e for e in estimates[:12])
+    assert estimates[12]["right"].status == Status.TRACKED and estimates[12]["right"].keyframe
+    for obj in TRUTH:
+        angle_deg, shift_mm = errors(estimates, obj)
+        assert np.median(angle_deg) < 1.5 and np.median(shift_mm) < 2.5
+    assert len(errors(estimates, "right")[0]) == LENGTH - 12
+
+
+def test_an_object_waits_until_its_mask_has_come_and_stopped_growing():
+    """Frames 8 and 9 show a part of it only; only in 11 is it known that no more is to come."""
+    frames = [(f, {"left": m["left"]} if k < 8 else dict(m)) for k, (f, m) in enumerate(film()[:16])]
+    for k, share in ((8, 0.2), (9, 0.6)):
+        columns = np.flatnonzero(frames[k][1]["right"].any(0))
+        frames[k][1]["right"] = frames[k][1]["right"] & (np.arange(CAMERA.width) < np.quantile(columns, share))
+    estimates = track(frames)
+    assert statuses(estimates, "right") == ["initialising"] * 11 + ["tracked"] * 5
+    assert "coming into view" in estimates[9]["right"].reason
+    assert_honest(estimates)
+    at_once = track(frames, config=quick().with_values({"pipeline.start_growth": 0.0}))
+    assert statuses(at_once, "right").index("tracked") < 11
+
+
+def test_the_first_mask_serves_the_next_frame_only():
+    method = Point2Pose(CAMERA, quick())
+    method.add_object("left", mask=film()[0][1]["left"])
+    assert method.step(film()[0][0], {})["left"].status == Status.TRACKED
+    assert method.step(film()[1][0], {})["left"].status == Status.OCCLUDED
+
+
+def test_a_removed_object_is_gone_and_its_points_with_it():
+    method = Point2Pose(CAMERA, quick())
+    for name in TRUTH:
+        method.add_object(name)
+    for frame, masks in film()[:6]:
+        method.step(frame, masks)
+    kept = set(method.objects["right"].map.ids.tolist())
+    method.remove_object("left")
+    step = method.step(film()[6][0], {"right": film()[6][1]["right"]})
+    assert set(step) == {"right"} and step["right"].status == Status.TRACKED
+    alive = method.tracker.track(film()[7][0])
+    assert set(alive.ids.tolist()) >= kept
+    assert set(alive.ids.tolist()) <= set(method.objects["right"].map.ids.tolist())
+    # The name is free again, for an object that starts anew.
+    method.add_object("left", mask=film()[8][1]["left"])
+    assert method.step(film()[8][0], film()[8][1])["left"].keyframe
+
+
+def test_objects_that_are_removed_before_they_start_leave_nothing():
+    method = Point2Pose(CAMERA, quick())
+    method.add_object("left", mask=film()[0][1]["left"])
+    method.remove_object("left")
+    assert method.step(film()[0][0], {}) == {}
+    method.add_object("left")
+    assert method.step(film()[1][0], {})["left"].status == Status.INITIALISING
+
+
+def test_without_objects_nothing_happens():
+    method = Point2Pose(CAMERA, quick())
+    assert [method.step(frame) for frame, _ in film()[:3]] == [{}, {}, {}]
+
+
+# --- the same every time, and never from the future --------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_the_same_seed_gives_the_same_result(name):
+    assert_same(*(track(film()[:8], config=preset(name, seed=3)) for _ in range(2)))
+
+
+@pytest.mark.parametrize("stop", [1, HIDDEN.start + 2, HIDDEN.stop + 3])
+def test_the_future_changes_nothing(hidden_run, stop):
+    assert_same(hidden_run[:stop], track(film(board=True)[:stop], config=preset()))
+
+
+def test_input_is_left_as_it_was():
+    before = [(f.rgb.copy(), f.depth_m.copy(), {n: m.copy() for n, m in masks.items()}) for f, masks in film()[:8]]
+    track(film()[:8], config=preset())
+    for (frame, masks), (rgb, depth, masks_before) in zip(film(), before):
+        np.testing.assert_array_equal(frame.rgb, rgb)
+        np.testing.assert_array_equal(frame.depth_m, depth)
+        for name in masks_before:
+            np.testing.assert_array_equal(masks[name], masks_before[name])
+
+
+# --- what an RGB-D camera may bring ------------------------------------------------------------
+
+
+def without_depth(frame: Frame, where: np.ndarray, value: float = 0.0) -> Frame:
+    depth = frame.depth_m.copy()
+    depth[where] = value
+    return Frame(frame.index, frame.time_s, frame.rgb, depth)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf, 9.0])
+def test_without_depth_an_object_goes_on_initialising(value):
+    frames = [(without_depth(f, m["left"], value) if k < 6 else f, m) for k, (f, m) in enumerate(film()[:9])]
+    estimates = track(frames)
+    assert statuses(estimates, "left") == ["initialising"] * 6 + ["tracked"] * 3
+    assert set(statuses(estimates, "right")) == {"tracked"}
+    assert_honest(estimates)
+
+
+def test_depth_may_fail_for_a_while():
+    frames = [(without_depth(f, m["left"]) if 8 <= k < 12 else f, m) for k, (f, m) in enumerate(film()[:20])]
+    estimates = track(frames)
+    assert_honest(estimates)
+    assert not {estimates[k]["left"].status for k in range(8, 12)} & {*WITH_POSE, Status.OCCLUDED}
+    assert set(statuses(estimates, "left")[13:]) <= {"recovered", "tracked"}
+    assert set(statuses(estimates, "right")) == {"tracked"}
+
+
+def test_nan_depth_is_no_depth():
+    rng = np.random.default_rng(0)
+    holes = rng.random((300, 400)) < 0.2
+    runs = [track([(without_depth(f, holes, v), m) for f, m in film()[:10]]) for v in (0.0, np.nan, -1.0)]
+    assert_same(runs[0], runs[1])
+    assert_same(runs[0], runs[2])
+    assert np.median(errors(runs[0], "left")[1]) < 3
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_a_plain_object_is_no_trouble(name):
+    """Without any texture there may be no pose, but there is an answer at every frame."""
+    frames = []
+    for frame, masks in film()[:8]:
+        rgb = frame.rgb.copy()
+        rgb[masks["left"]] = (120, 130, 140)
+        frames.append((Frame(frame.index, frame.time_s, rgb, frame.depth_m), masks))
+    estimates = track(frames, config=preset(name))
+    assert_honest(estimates)
+    assert set(statuses(estimates, "right")) == {"tracked"}
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_a_black_blind_camera_is_no_trouble(name):
+    nothing = [
+        (Frame(k, k / 30, np.zeros((300, 400, 3), np.uint8), np.zeros((300, 400), np.float32)), masks)
+        for k, (_, masks) in enumerate(film()[:6])
+    ]
+    assert set(statuses(track(nothing, config=preset(name)), "left")) == {"initialising"}
+    suddenly = [*film()[:4], *nothing]
+    estimates = track(suddenly, config=preset(name))
+    assert set(statuses(estimates, "left")[4:]) == {"lost"}
+
+
+def test_masks_may_touch_the_border_and_be_everything():
+    everything = np.ones((300, 400), bool)
+    estimates = track([(f, {"left": everything}) for f, _ in film()[:4]], names=("left",), config=preset())
+    assert statuses(estimates, "left")[0] == "tracked"
+
+
+# --- refusals ----------------------------------------------------------------------------------
+
+
+def test_refusals_name_what_came_and_what_is_known():
+    method = Point2Pose(CAMERA, quick())
+    frame, masks = film()[0]
+    with pytest.raises(BadInput, match="masks: got unknown object 'left', expected objects added before: none yet"):
+        method.step(frame, masks)
+    method.add_object("left")
+    with pytest.raises(BadInput, match="masks: got unknown object 'right', expected objects added before: left"):
+        method.step(frame, masks)
+    with pytest.raises(BadInput, match=r"mask of 'left': got 300x400, expected 400x300 as the camera"):
+        method.step(frame, {"left": masks["left"].T})
+    with pytest.raises(BadInput, match=r"mask of 'left': got 3x400x300, expected 400x300"):
+        method.step(frame, {"left": np.zeros((300, 400, 3), bool)})
+    with pytest.raises(BadInput, match=r"mask of 'right': got 10x10, expected 400x300"):
+        method.add_object("right", mask=np.ones((10, 10), bool))
+    small = Frame(3, 0.0, frame.rgb[:200, :300], frame.depth_m[:200, :300])
+    with pytest.raises(BadInput, match="frame 3: got 300x200, expected 400x300 as the camera"):
+        method.step(small, {})
+    with pytest.raises(BadInput, match=r"add_object: got 'left', expected a name not in use. In use: left"):
+        method.add_object("left")
+    with pytest.raises(BadInput, match="remove_object: got 'cup', expected one of left"):
+        method.remove_object("cup")
+    assert list(method.objects) == ["left"]
+
+
+@pytest.mark.parametrize("what", ["tracker", "detector", "segmenter"])
+def test_unknown_backends_are_refused(what):
+    with pytest.raises(BadInput, match=f"{what}: got 'nope', expected one of "):
+        Point2Pose(CAMERA, quick(), **{what: "nope"})
+
+
+def test_a_refused_frame_changes_nothing():
+    method = Point2Pose(CAMERA, quick())
+    for name in TRUTH:
+        method.add_object(name, mask=film()[0][1][name])
+    estimates = []
+    for frame, masks in film()[:10]:
+        with pytest.raises(BadInput):
+            method.step(frame, masks | {"left": np.ones((2, 2), bool)})
+        with pytest.raises(BadInput):
+            method.step(frame, masks | {"cup": masks["left"]})
+        estimates.append(method.step(frame, masks))
+    assert_same(estimates, track(film()[:10]))
+
+
+def test_masks_of_numbers_count_where_they_are_above_zero():
+    frames = [(f, {n: (200 * m[n]).astype(np.uint8) for n in m}) for f, m in film()[:8]]
+    assert_same(track(frames), track(film()[:8]))
+
+
+def test_time_is_told_stage_by_stage():
+    method = Point2Pose(CAMERA, preset())
+    method.add_object("left")
+    for frame, masks in film()[:4]:
+        method.step(frame, {"left": masks["left"]})
+    ms = method.stopwatch.last_ms
+    assert {"tracking", "registration", "refinement", "map", "total"} <= set(ms)
+    assert ms["total"] >= max(v for k, v in ms.items() if k != "total") > 0
+
+
+# --- clicks ------------------------------------------------------------------------------------
+
+
+def clicks_on(mask: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Three pixels (x, y) well inside a mask."""
+    v, u = np.nonzero(cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)))
+    at = np.random.default_rng(seed).choice(len(v), 3, replace=False)
+    return np.stack([u[at], v[at]], 1)
+
+
+def test_three_clicks_serve_as_well_as_masks():
+    method = Point2Pose(CAMERA, preset())
+    for name, mask in film()[0][1].items():
+        method.add_object(name, clicks=clicks_on(mask))
+    estimates = []
+    for frame, masks in film():
+        estimates.append(method.step(frame))
+        for name, mask in masks.items():
+            assert iou(method.masks[name], mask & (frame.depth_m > 0)) > 0.85  # measured pixels alone are labelled
+        assert not (method.masks["left"] & method.masks["right"]).any()
+    assert_honest(estimates)
+    for name in TRUTH:
+        angle_deg, shift_mm = errors(estimates, name)
+        assert len(angle_deg) == LENGTH and angle_deg.max() < 4 and shift_mm.max() < 6
+
+
+def test_what_a_board_hides_is_absent_and_comes_back():
+    method = Point2Pose(CAMERA, preset())
+    frames = film(board=True)
+    for name, mask in frames[0][1].items():
+        method.add_object(name, clicks=clicks_on(mask))
+    estimates = []
+    for frame, _ in frames:
+        estimates.append(method.step(frame))
+        if frame.index in HIDDEN:
+            assert not any(mask.any() for mask in method.masks.values())
+    for name in TRUTH:
+        got = statuses(estimates, name)
+        assert {got[k] for k in HIDDEN} == {"occluded"}
+        assert got[-1] == "tracked" and "recovered" in got
+        assert iou(method.masks[name], frames[-1][1][name]) > 0.85
+
+
+def test_a_late_object_is_clicked_while_another_has_masks():
+    method = Point2Pose(CAMERA, quick())
+    method.add_object("left")
+    for frame, masks in film()[:12]:
+        if frame.index == 5:
+            method.add_object("right", clicks=clicks_on(masks["right"]))
+        estimates = method.step(frame, {"left": masks["left"]})
+        np.testing.assert_array_equal(method.masks["left"], masks["left"])
+    assert {str(e.status) for e in estimates.values()} == {"tracked"}
+    assert iou(method.masks["right"], masks["right"]) > 0.85
+    with pytest.raises(BadInput, match="mask of 'right': got a mask of an object with clicks"):
+        method.step(film()[12][0], film()[12][1])
+    method.remove_object("right")
+    assert set(method.step(film()[12][0], {"left": film()[12][1]["left"]})) == {"left"} == set(method.masks)
+
+
+def test_clicks_that_do_not_fit_are_refused_and_leave_no_object_behind():
+    method, masks = Point2Pose(CAMERA, quick()), film()[0][1]
+    good = clicks_on(masks["left"])
+    for clicks, what in {
+        ((400, 10),): r"\(400, 10\), expected pixels within 400x300",
+        ((-1, 10),): r"\(-1, 10\)",
+        ((np.nan, 10),): r"\(nan, 10\)",
+        ((1, 2, 3),): "at least one",
+        (): "at least one",
+        "left": "at least one",
+    }.items():
+        with pytest.raises(BadInput, match=f"clicks on 'cup'.*{what}"):
+            method.add_object("cup", clicks=clicks)
+    with pytest.raises(BadInput, match="object 'cup': got a mask and clicks"):
+        method.add_object("cup", mask=masks["left"], clicks=good)
+    with pytest.raises(BadInput, match="mask of 'cup': got an empty mask"):
+        method.add_object("cup", mask=np.zeros((300, 400), bool))
+    method.add_object("left", clicks=good)
+    with pytest.raises(BadInput, match="clicks on 'cup': got a click that is also one of 'left'"):
+        method.add_object("cup", clicks=[good[1] + 0.2, [10, 10]])
+    assert list(method.objects) == ["left"]
+
+
+def test_clicks_without_depth_are_refused_before_anything_is_done():
+    method, (frame, masks) = Point2Pose(CAMERA, quick()), film()[0]
+    clicks = clicks_on(masks["left"])
+    x, y = clicks[1]
+    hole = frame.depth_m.copy()
+    hole[y - 4 : y + 5, x - 4 : x + 5] = 0
+    method.add_object("left", clicks=clicks)
+    with pytest.raises(BadInput, match=rf"clicks on 'left': got \({x}, {y}\) has no depth in frame 0"):
+        method.step(Frame(0, 0.0, frame.rgb, hole))
+    other = Point2Pose(CAMERA, quick())
+    other.add_object("left", clicks=clicks)
+    # A frame with depth is taken as if nothing had been.
+    assert_same([method.step(f) for f, _ in film()[:4]], [other.step(f) for f, _ in film()[:4]])

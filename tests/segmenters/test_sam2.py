@@ -1,0 +1,243 @@
+"""The SAM 2 adapter against the official classes with random weights; skipped where ``transformers`` is not there.
+
+What the weights would say is not looked at: coordinates, memory and absence are, and they do not depend on it.
+"""
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+from p2p_lib.core import packages
+from p2p_lib.core.backends import make_segmenter
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import preset
+from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.manifests import manifest
+from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.segmenters import sam2
+
+CAMERA = Camera(150.0, 150.0, 80, 60, 160, 120)
+SIDE = 128
+CLICKS = np.array([[80.0, 60], [70, 50]])
+
+needs_transformers = pytest.mark.skipif(
+    importlib.util.find_spec("transformers") is None,
+    reason=f"transformers is not installed: {packages.install_command('transformers')}",
+)
+
+
+def film(count: int) -> list[Frame]:
+    rng = np.random.default_rng(0)
+    depth = np.full((120, 160), 0.7, np.float32)
+    return [Frame(k, k / 30, rng.integers(0, 256, (120, 160, 3), np.uint8), depth) for k in range(count)]
+
+
+@pytest.fixture(scope="module")
+def model():
+    """The official class, small, with random weights."""
+    import torch
+    from transformers import Sam2VideoConfig, Sam2VideoModel
+
+    hiera = {
+        "model_type": "sam2_hiera_det_model",
+        "hidden_size": 12,
+        "num_attention_heads": 1,
+        "image_size": [SIDE, SIDE],
+        "blocks_per_stage": [1, 1, 2, 1],
+        "embed_dim_per_stage": [12, 24, 48, 96],
+        "num_attention_heads_per_stage": [1, 1, 2, 2],
+        "window_size_per_stage": [8, 4, 4, 4],
+        "global_attention_blocks": [3],
+        "window_positional_embedding_background_size": [7, 7],
+    }
+    vision = {
+        "model_type": "sam2_vision_model",
+        "backbone_config": hiera,
+        "backbone_channel_list": [96, 48, 24, 12],
+        "backbone_feature_sizes": [[32, 32], [16, 16], [8, 8]],
+        "fpn_hidden_size": 128,
+    }
+    small = {"mlp_dim": 32, "num_attention_heads": 2, "iou_head_hidden_dim": 32}
+    torch.manual_seed(0)
+    config = Sam2VideoConfig(
+        vision_config=vision,
+        prompt_encoder_config={"hidden_size": 128, "image_size": SIDE},
+        mask_decoder_config={"hidden_size": 128, **small},
+        image_size=SIDE,
+        memory_attention_hidden_size=128,
+        memory_attention_num_layers=1,
+        memory_attention_feed_forward_hidden_size=32,
+        memory_attention_rope_feat_sizes=[8, 8],
+        memory_encoder_hidden_size=128,
+        memory_encoder_output_channels=64,
+        mask_downsampler_embed_dim=128,
+        memory_fuser_embed_dim=128,
+        memory_fuser_intermediate_dim=32,
+        memory_fuser_num_layers=1,
+        # Few enough for a short film to outlast them.
+        num_maskmem=3,
+        max_object_pointers_in_encoder=4,
+    )
+    return Sam2VideoModel(config).eval()
+
+
+class Watched(sam2.Sam2Segmenter):
+    """Keeps the logits that the model gave."""
+
+    def __init__(self, model):
+        super().__init__(model, CAMERA)
+        self.logits = []
+        model.register_forward_hook(self._note)
+
+    def _note(self, _module, _inputs, output):
+        if hasattr(output, "object_score_logits") and hasattr(output, "frame_idx"):
+            self.logits.append((output.pred_masks.numpy().copy(), float(output.object_score_logits)))
+
+
+@needs_transformers
+def test_trimmed_memory_changes_nothing(model):
+    """Frame by frame the same as an official session that keeps everything."""
+    import torch
+    from transformers import Sam2VideoInferenceSession
+
+    ours, frames = Watched(model), film(10)
+    for k, frame in enumerate(frames):
+        ours.segment(frame, None if k else {"cup": CLICKS})
+    told, ours.logits = ours.logits, []
+    session = Sam2VideoInferenceSession(video_height=120, video_width=160, dtype=torch.float32)
+    at = session.obj_id_to_idx(1)
+    points = torch.tensor((CLICKS + 0.5) * SIDE / [160, 120] - 0.5).float()[None, None]
+    labels = torch.ones(1, 1, 2, dtype=torch.int32)
+    session.add_point_inputs(at, 0, {"point_coords": points, "point_labels": labels})
+    session.obj_with_new_inputs = [1]
+    for k, frame in enumerate(frames):
+        output = model(inference_session=session, frame=ours._pixels(frame.rgb))
+        np.testing.assert_allclose(told[k][0], output.pred_masks.numpy(), atol=1e-5)
+    assert len(session.processed_frames) == 10  # what it would keep by itself
+    (kept,) = ours._sessions.values()
+    assert not kept.processed_frames
+    assert len(kept.output_dict_per_obj[0]["non_cond_frame_outputs"]) <= 4
+
+
+@needs_transformers
+def test_memory_stays_bounded(model):
+    def megabytes(segmenter) -> float:
+        (session,) = segmenter._sessions.values()
+        outputs = session.output_dict_per_obj[0]
+        tensors = [t for kind in outputs.values() for o in kind.values() for t in o.values() if hasattr(t, "nbytes")]
+        return sum(t.nbytes for t in tensors) / 1e6
+
+    ours, sizes = sam2.Sam2Segmenter(model, CAMERA), []
+    for k, frame in enumerate(film(14)):
+        ours.segment(frame, None if k else {"cup": CLICKS})
+        sizes.append(megabytes(ours))
+    assert sizes[13] == sizes[9] > 0
+
+
+@needs_transformers
+def test_points_and_pictures_are_the_official_processors(model):
+    """Points to half a pixel of the network, whose processor takes a pixel's corner for its centre."""
+    import torch
+    from transformers import Sam2VideoProcessor
+
+    official = Sam2VideoProcessor._normalize_coordinates(None, SIDE, torch.tensor(CLICKS), (120, 160)).numpy()
+    session = sam2.Sam2Segmenter(model, CAMERA)._session(CLICKS)
+    ours = session.point_inputs_per_obj[0][0]["point_coords"].numpy()[0, 0]
+    assert np.abs(ours - official).max() <= 0.5
+    grey = np.full((120, 160, 3), 128, np.uint8)
+    pixels = sam2.Sam2Segmenter(model, CAMERA)._pixels(grey).numpy()
+    assert pixels.shape == (1, 3, SIDE, SIDE)
+    expected = (128 / 255 - np.array(sam2.MEAN)) / np.array(sam2.DEVIATION)
+    np.testing.assert_allclose(pixels[0].mean((1, 2)), expected, atol=1e-5)
+
+
+class Says:
+    """Stands in for the model: masks and scores as told, on the network's quarter grid."""
+
+    class config:
+        image_size, num_maskmem, max_object_pointers_in_encoder = SIDE, 3, 4
+
+    def __init__(self, answers):
+        self.answers = list(answers)
+
+    def to(self, _device):
+        return self
+
+    def eval(self):
+        return self
+
+    def get_image_features(self, pixels, return_dict):
+        from types import SimpleNamespace
+
+        return SimpleNamespace(fpn_hidden_states=[pixels], fpn_position_encoding=[pixels])
+
+    def __call__(self, inference_session, frame, frame_idx):
+        from types import SimpleNamespace
+
+        import torch
+
+        logits, score = self.answers.pop(0)
+        masks, scores = torch.tensor(logits)[None, None].float(), torch.tensor([[score]]).float()
+        return SimpleNamespace(pred_masks=masks, object_score_logits=scores)
+
+
+def half(left: bool) -> np.ndarray:
+    logits = np.full((32, 32), -5.0)
+    logits[:, :16] = 5.0
+    return logits if left else logits[:, ::-1].copy()
+
+
+@needs_transformers
+def test_labels_are_the_likelier_objects_and_absent_ones_have_none():
+    answers = [(half(True), 3.0), (half(False), 3.0), (half(True), -1.0), (half(False) + 9, 2.0), (half(True) * 2, 2.0)]
+    ours, frames = sam2.Sam2Segmenter(Says(answers), CAMERA), film(3)
+    both = ours.segment(frames[0], {"a": CLICKS, "b": CLICKS + 10})
+    assert both.shape == (120, 160) and both.dtype == np.int32 and ours.names == ("a", "b")
+    assert (both[:, :78] == 1).all() and (both[:, 82:] == 2).all()
+    # "a" is absent now, and "b" everywhere.
+    assert (ours.segment(frames[1]) == 2).all()
+    ours.remove("a")
+    assert ours.names == ("b",)
+    assert set(np.unique(ours.segment(frames[2])[:, :78])) == {1}
+
+
+@needs_transformers
+def test_the_pipeline_takes_it(model):
+    method = Point2Pose(CAMERA, preset(), segmenter=sam2.Sam2Segmenter(model, CAMERA))
+    frames = film(4)
+    method.add_object("cup", clicks=CLICKS)
+    for k, frame in enumerate(frames):
+        if k == 2:
+            method.add_object("late", clicks=CLICKS - 5)
+        assert set(method.step(frame)) == ({"cup"} if k < 2 else {"cup", "late"})
+    method.remove_object("cup")
+    assert set(method.step(frames[3])) == {"late"}
+
+
+@needs_transformers
+def test_clicks_without_depth_are_refused(model):
+    frame = film(1)[0]
+    hole = Frame(0, 0.0, frame.rgb, np.zeros_like(frame.depth_m))
+    with pytest.raises(BadInput, match=r"\(80, 60\) has no depth"):
+        sam2.Sam2Segmenter(model, CAMERA).segment(hole, {"cup": CLICKS})
+
+
+# --- without the package or the weights --------------------------------------------------------
+
+
+def test_it_says_what_to_install_or_fetch(monkeypatch):
+    monkeypatch.delenv("P2P_DATA", raising=False)
+    with pytest.raises(MissingBackend) as error:
+        make_segmenter("sam2", CAMERA, preset().segmentation, np.random.default_rng(0))
+    if importlib.util.find_spec("transformers") is None:
+        assert "pip install" in str(error.value) and "transformers" in str(error.value)
+    else:
+        assert "p2p data fetch sam2" in str(error.value)
+
+
+def test_the_manifest_names_its_licence_and_option():
+    of = manifest("sam2")
+    assert "Apache" in of.licence and of.used_by == "--masks sam2"
+    assert {f.path for f in of.files} == {"model.safetensors", "config.json"}

@@ -1,0 +1,321 @@
+"""The embedded segmenter on an analytic scene and on the embedded sequence: outlines, absence, causality."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.clicks import depths_at
+from p2p_lib.core.config import preset
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.interfaces import Hint
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.method.refinement import surface_distance
+from p2p_lib.segmenters.builtin.colours import colour_codes, evidence, histogram
+from p2p_lib.segmenters.builtin.patch import Patch, around, connected, plane_heights, support_plane
+from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
+
+CAMERA = Camera(300.0, 310.0, 158.3, 121.7, 320, 240)
+CONFIG = preset().segmentation
+WALL_M, CARD_M, BOARD_M = 1.0, 0.7, 0.5
+
+
+def card(at: tuple[int, int], size: tuple[int, int] = (60, 50)) -> np.ndarray:
+    """(H, W) bool of a card whose upper left corner is at a pixel (x, y)."""
+    mask = np.zeros((240, 320), bool)
+    x, y = at
+    mask[max(y, 0) : max(y + size[1], 0), max(x, 0) : max(x + size[0], 0)] = True
+    return mask
+
+
+@cache
+def _print(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return cv2.resize(rng.integers(30, 226, (24, 32, 3), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+
+
+def picture(k: int, cards: list[tuple[tuple[int, int], int]], board: np.ndarray | None = None) -> Frame:
+    """A frame of a printed wall, cards at pixels, each with its own print and depth, and perhaps a board before all."""
+    rng = np.random.default_rng(k)
+    rgb, depth = (_print(99) // 2 + 60).copy(), np.full((240, 320), WALL_M)
+    for at, seed in cards:
+        mask, moved = card(at), np.roll(_print(seed), at[::-1], (0, 1))
+        rgb[mask], depth[mask] = moved[mask], CARD_M + 0.05 * (seed % 2)
+    if board is not None:
+        rgb[board], depth[board] = (150, 110, 70), BOARD_M
+    rgb = np.clip(rgb + rng.normal(0, 2, rgb.shape), 0, 255).astype(np.uint8)
+    return Frame(k, k / 30, rgb, (depth + rng.normal(0, 0.001, depth.shape)).astype(np.float32))
+
+
+def on(**at) -> dict[str, np.ndarray]:
+    """Three clicks on each card, whose upper left corners are given."""
+    return {name: np.add(corner, [[12, 12], [40, 20], [25, 38]]) for name, corner in at.items()}
+
+
+def segmenter() -> BuiltinSegmenter:
+    return BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0))
+
+
+def iou(one: np.ndarray, other: np.ndarray) -> float:
+    return (one & other).sum() / max((one | other).sum(), 1)
+
+
+# --- the first frame ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at", [(100, 80), (2, 3), (255, 185)])
+def test_an_object_is_found_from_clicks(at):
+    found = segmenter().segment(picture(0, [(at, 1)]), on(card=at))
+    assert found.dtype == np.int32 and iou(found == 1, card(at)) > 0.93
+
+
+def test_objects_that_touch_in_the_picture_are_told_apart():
+    left, right = (90, 80), (150, 90)
+    found = segmenter().segment(picture(0, [(left, 2), (right, 3)]), on(one=left, two=right))
+    assert iou(found == 1, card(left)) > 0.9 and iou(found == 2, card(right)) > 0.9
+
+
+def test_a_flat_print_is_found_by_its_colours():
+    """A sticker on the wall: depth knows nothing of it."""
+    frame = picture(0, [])
+    rgb = frame.rgb.copy()
+    rgb[card((120, 90))] = (220, 60, 40)
+    found = segmenter().segment(Frame(0, 0.0, rgb, frame.depth_m), on(sticker=(120, 90)))
+    assert iou(found == 1, card((120, 90))) > 0.9
+
+
+def test_a_box_on_a_table_ends_at_the_table():
+    """Colour and depth are continuous where it stands; the plane tells."""
+    v, u = np.mgrid[:240, :320]
+    rays_y = (v - CAMERA.cy) / CAMERA.fy
+    # A table that falls away from the camera: y = 0.15 + 0 z, seen below the horizon.
+    table_m = np.where(rays_y > 0.02, 0.15 / np.maximum(rays_y, 0.02), 3.0)
+    foot = 150
+    box = (u > 130) & (u < 190) & (v > 90) & (v <= foot)
+    depth = np.where(box, table_m[foot, 0], np.minimum(table_m, 2.0))
+    rgb = (_print(7) // 8 + 100).astype(np.uint8)
+    rgb[box] = rgb[box] // 2 + 40
+    frame = Frame(0, 0.0, rgb, depth.astype(np.float32))
+    found = segmenter().segment(frame, {"box": [[150, 110], [170, 120], [160, 130]]})
+    assert iou(found == 1, box) > 0.85
+
+
+def test_unmeasured_pixels_are_nobodys():
+    at = (100, 80)
+    frame = picture(0, [(at, 1)])
+    depth = frame.depth_m.copy()
+    depth[95:105, 120:135] = 0
+    found = segmenter().segment(Frame(0, 0.0, frame.rgb, depth), on(card=at)) == 1
+    assert not found[depth == 0].any() and iou(found, card(at) & (depth > 0)) > 0.93
+
+
+# --- from frame to frame -----------------------------------------------------------------------
+
+
+def path(k: int) -> tuple[int, int]:
+    return 60 + 4 * k, 80 + k
+
+
+def test_a_moving_object_is_followed():
+    follow = segmenter()
+    for k in range(30):
+        found = follow.segment(picture(k, [(path(k), 1)]), None if k else on(card=path(0))) == 1
+        assert iou(found, card(path(k))) > 0.9, k
+
+
+def test_two_objects_pass_and_keep_their_names():
+    """The nearer one covers the other for a while, but never all of it."""
+    one, two = lambda k: (60 + 4 * k, 90), lambda k: (180 - 4 * k, 120)
+    follow = segmenter()
+    for k in range(30):
+        clicks = None if k else on(far=one(0), near=two(0))
+        found = follow.segment(picture(k, [(one(k), 3), (two(k), 2)]), clicks)
+        near = card(two(k))
+        far = card(one(k)) & ~near
+        assert iou(found == 2, near) > 0.85 and iou(found == 1, far) > 0.75, k
+
+
+def test_what_is_covered_is_absent_whatever_covers_it():
+    """A board slides over the resting card: nothing of the board is taken for it; points bring it back."""
+    at = (120, 80)
+    follow = segmenter()
+    for k in range(26):
+        board = np.zeros((240, 320), bool)
+        board[40:200, max(0, 8 * k - 60) : 8 * k] = True
+        found = follow.segment(picture(k, [(at, 1)], board), None if k else on(card=at)) == 1
+        assert not (found & board).any()
+        if not (card(at) & ~board).any():
+            assert not found.any()
+    # Gone since it was covered, until somebody knows points of it.
+    assert not found.any()
+    frame = picture(40, [((30, 150), 1)])
+    assert not (follow.segment(frame) == 1).any()
+    points = np.array([[38.0, 158], [50, 165], [60, 170], [70, 160], [80, 190], [45, 185], [60, 190], [75, 175]])
+    found = follow.segment(frame, hints={"card": Hint(points)}) == 1
+    assert iou(found, card((30, 150))) > 0.9
+
+
+def test_points_on_something_else_do_not_bring_it_back():
+    at = (120, 80)
+    follow = segmenter()
+    follow.segment(picture(0, [(at, 1)]), on(card=at))
+    gone = picture(1, [], board=card(at, (160, 120)))
+    assert not (follow.segment(gone) == 1).any()
+    wrong = np.stack(np.meshgrid([140.0, 180, 220], [100.0, 130, 160]), -1).reshape(-1, 2)
+    assert not (follow.segment(gone, hints={"card": Hint(wrong)}) == 1).any()
+
+
+def test_an_object_leaves_the_picture():
+    follow = segmenter()
+    for k in range(24):
+        found = follow.segment(picture(k, [((30 - 5 * k, 80), 1)]), None if k else on(card=(30, 80))) == 1
+        truth = card((30 - 5 * k, 80))
+        assert iou(found, truth) > 0.7 or truth.sum() < 400
+    assert not found.any()
+
+
+def test_strictly_causal():
+    """Every label image is the same, bit for bit, whatever comes after."""
+    short, long = segmenter(), segmenter()
+    ends = [short.segment(picture(k, [(path(k), 1)]), None if k else on(card=path(0))) for k in range(8)]
+    for k in range(20):
+        found = long.segment(picture(k, [(path(k), 1)]), None if k else on(card=path(0)))
+        if k < 8:
+            np.testing.assert_array_equal(found, ends[k])
+
+
+def test_late_objects_and_removed_ones():
+    follow, cards = segmenter(), [((60, 80), 1), ((200, 80), 2)]
+    assert set(np.unique(follow.segment(picture(0, cards), on(one=(60, 80))))) == {0, 1}
+    found = follow.segment(picture(1, cards), on(two=(200, 80)))
+    assert follow.names == ("one", "two") and iou(found == 2, card((200, 80))) > 0.9
+    follow.remove("one")
+    found = follow.segment(picture(2, cards))
+    assert follow.names == ("two",) and iou(found == 1, card((200, 80))) > 0.9
+
+
+def test_clicks_without_depth_name_the_click():
+    frame = picture(0, [((100, 80), 1)])
+    with pytest.raises(BadInput, match=r"clicks on 'card': got \(112, 92\) has no depth in frame 0"):
+        segmenter().segment(Frame(0, 0.0, frame.rgb, np.zeros_like(frame.depth_m)), on(card=(100, 80)))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_embedded_sequence(seed):
+    """The first pass of synthetic/crossing: new sides come into view, and one covers part of the other."""
+    sequence = open_sequence("synthetic/crossing", seed=seed)
+    new = BuiltinSegmenter(sequence.camera, CONFIG, np.random.default_rng(0))
+    rng, first, clicks = np.random.default_rng(seed), sequence.frame(0), {}
+    for name, mask in sequence.masks(0).items():
+        v, u = np.nonzero((cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0) & (first.depth_m > 0))
+        clicks[name] = np.stack([u, v], -1)[rng.choice(len(v), 3, replace=False)]
+    scores = {name: [] for name in clicks}
+    for i in range(60):
+        labels, truth = new.segment(sequence.frame(i), None if i else clicks), sequence.masks(i)
+        for k, name in enumerate(new.names, 1):
+            if truth[name].sum() >= 300:
+                scores[name].append(iou(labels == k, truth[name]))
+    assert min(np.mean(s) for s in scores.values()) > 0.85
+
+
+# --- the parts ---------------------------------------------------------------------------------
+
+
+def test_colours_speak_for_the_side_they_are_seen_on():
+    rng = np.random.default_rng(0)
+    red, blue = rng.integers(0, 60, (500, 3), np.uint8), rng.integers(0, 60, (500, 3), np.uint8)
+    red[:, 0] += 180
+    blue[:, 2] += 180
+    shares = histogram(colour_codes(red)), histogram(colour_codes(blue))
+    assert all(abs(s.sum() - 1) < 1e-9 for s in shares)
+    says = evidence(*shares)
+    assert (says[colour_codes(red)] > 1).all() and (says[colour_codes(blue)] < -1).all()
+    unseen = colour_codes(np.array([[10, 250, 10]], np.uint8))
+    np.testing.assert_allclose(says[unseen], 0, atol=1e-6)
+    np.testing.assert_allclose(evidence(*shares[::-1]), -says, atol=1e-12)
+    assert not histogram(np.zeros(0, int)).any()
+
+
+def test_the_support_plane_is_found_among_other_things():
+    """n . p = d with n towards the camera, through noise and a third of outliers."""
+    normal, d = np.array([0.1, -0.8, -0.59]), -0.5
+    normal /= np.linalg.norm(normal)
+    depth = np.clip(d / (CAMERA.rays @ normal), 0, 3).astype(np.float32)
+    depth[:, 100:200] = 0.45
+    depth += np.random.default_rng(0).normal(0, 0.002, depth.shape).astype(np.float32) * (depth > 0)
+    frame = Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), np.maximum(depth, 0))
+    patch = Patch.of(frame, around(np.array([160, 180.0]), np.array([150, 60.0]), frame.shape), CAMERA, CONFIG)
+    plane = support_plane(patch, patch.depth_m > 0, np.random.default_rng(0))
+    assert plane[:3] @ normal > np.cos(np.radians(2)) and abs(plane[3] - d) < 0.01
+    on_it = (patch.grid(np.array([[20.0, 200], [290, 200]]))).T
+    assert np.abs(plane_heights(patch, plane)[on_it[1], on_it[0]]).max() < 0.02
+
+
+def test_no_plane_where_there_is_none():
+    depth = np.random.default_rng(0).uniform(0.4, 2, (240, 320)).astype(np.float32)
+    frame = Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), depth)
+    patch = Patch.of(frame, around(np.array([160, 120.0]), np.array([100, 100.0]), frame.shape), CAMERA, CONFIG)
+    assert support_plane(patch, patch.depth_m > 0, np.random.default_rng(0)) is None
+    assert support_plane(patch, np.zeros(patch.shape, bool), np.random.default_rng(0)) is None
+
+
+def test_patches_keep_places():
+    """A pixel of the picture is found at its place on the grid, and goes back to it."""
+    frame = picture(0, [((100, 80), 1)])
+    patch = Patch.of(frame, around(np.array([130, 105.0]), np.array([90, 90.0]), frame.shape), CAMERA, CONFIG)
+    assert max(patch.shape) <= CONFIG.side_px < max(patch.box.shape)
+    mask = np.zeros(frame.shape, np.float32)
+    mask[card((100, 80))] = 1
+    back = patch.up(patch.down(mask)) > 0.5
+    assert iou(back, card((100, 80))[patch.box.slices]) > 0.97
+    dots = patch.dots(np.array([[100.0, 80], [-50, 80]]), 0)
+    assert dots.sum() == 1
+    assert (patch.down(mask)[dots] > 0).all()  # the corner lies on the card
+    x, y = patch.rays()
+    at = np.argwhere(dots)[0]
+    np.testing.assert_allclose([x[at[1]], y[at[0]]], CAMERA.rays[80, 100, :2], atol=2 / 300)
+
+
+def test_connected_parts_are_those_with_seeds():
+    region = np.zeros((10, 20), bool)
+    region[2:5, 2:6] = region[2:5, 10:14] = True
+    seeds = np.zeros_like(region)
+    seeds[3, 3] = seeds[8, 8] = True
+    found = connected(region, seeds)
+    assert found[2:5, 2:6].all() and found.sum() == 12
+
+
+def test_depth_at_clicks_bridges_small_holes_only():
+    frame = picture(0, [])
+    depth = frame.depth_m.copy()
+    depth[50:52, 50:52] = 0
+    depth[100:120, 100:120] = 0
+    at = np.array([[50.0, 50], [110, 110], [0, 0]])
+    z = depths_at(at, Frame(0, 0.0, frame.rgb, depth))
+    assert abs(z[0] - WALL_M) < 0.01 and np.isnan(z[1]) and abs(z[2] - WALL_M) < 0.01
+
+
+def test_distances_to_a_known_surface():
+    """A sphere stands for the reconstructed surface."""
+
+    class Sphere:
+        tau_m, voxel_m = 1.0, 0.003
+
+        def query(self, p):
+            return np.linalg.norm(p, axis=-1) - 0.1, np.linalg.norm(p, axis=-1) < 0.15
+
+    T_cam_obj = np.eye(4)
+    T_cam_obj[:3, 3] = 0.05, -0.02, 0.6
+    frame = picture(0, [])
+    depth = np.full(frame.shape, 0.52, np.float32)
+    depth[:, :20] = 0
+    corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+    distance = surface_distance(Sphere(), corners, depth, CAMERA, T_cam_obj)
+    u, v = np.rint(CAMERA.project(T_cam_obj[:3, 3])).astype(int)
+    assert distance[v, u] == pytest.approx(0.08 - 0.1, abs=1e-3)
+    assert np.isnan(distance[:, :20]).all() and np.isnan(distance[0, 0])
+    p_obj = CAMERA.unproject(np.array([u + 20.0, v + 10]), 0.52) - T_cam_obj[:3, 3]
+    assert distance[v + 10, u + 20] == pytest.approx(np.linalg.norm(p_obj) - 0.1, abs=3e-3)

@@ -1,0 +1,112 @@
+"""The scenarios of absence: from the exact truth, each object goes away, moves meanwhile, and comes back known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.synthetic import SCENARIOS, generate
+
+SMALL = Camera(615 / 4, 615 / 4, 79.5, 59.5, 160, 120)
+STEP = 2  # every second frame is looked at
+#: Objects that go away in each scenario.
+AWAY = {
+    "occlusion": ["box"],
+    "exit_reentry": ["box"],
+    "look_alikes": ["left", "right"],
+    "late_object": ["can"],
+    "three_objects": ["box", "can", "block"],
+    "moving_camera": ["box"],
+}
+
+
+def turn_deg(R_a, R_b):
+    return np.degrees(np.arccos(np.clip((np.einsum("...ij,...ij->...", R_a, R_b) - 1) / 2, -1, 1)))
+
+
+def watch(scenario, seed):
+    """Per object: poses (T, 4, 4) in the camera, visible pixels (T,), visible surface points (T, 256)."""
+    truth = [generate._Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
+    blank = generate.render([], SMALL, scenario.T_world_cam[0])
+    frames = range(0, scenario.frames, STEP)
+    px, seen = np.zeros((len(truth), len(frames)), int), np.zeros((len(truth), len(frames), 256), bool)
+    for i, t in enumerate(frames):
+        exact = generate._exact(scenario, float(t), blank)
+        for k, one in enumerate(truth):
+            px[k, i] = np.count_nonzero(exact.label == one.label)
+            seen[k, i] = one.tracks(scenario, t, exact)[1]
+    T_cam_world = se3.inverse(scenario.T_world_cam)
+    return {
+        one.body.name: ((T_cam_world @ one.body.T_world_model)[::STEP], px[k], seen[k]) for k, one in enumerate(truth)
+    }
+
+
+def absences(px):
+    """(first hidden, first back) of each stretch without a pixel between two with some."""
+    hidden = np.r_[False, px == 0, False].astype(int)
+    spans = zip(np.flatnonzero(np.diff(hidden) == 1), np.flatnonzero(np.diff(hidden) == -1), strict=True)
+    return [(a, b) for a, b in spans if 0 < a and b < len(px)]
+
+
+def check_return(name, T, px, seen):
+    """One absence of at least 11 frames, moved by 10 cm and 30 degrees, back with what was seen before."""
+    spans = [(a, b) for a, b in absences(px) if (b - a) * STEP > 10]
+    assert len(spans) == 1, (name, spans)
+    a, b = spans[0]
+    assert np.linalg.norm(T[b, :3, 3] - T[a - 1, :3, 3]) > 0.10, name
+    assert turn_deg(T[a - 1, :3, :3], T[b, :3, :3]) > 30, name
+    shows = seen[b + 4]
+    assert shows.sum() > 20, name
+    assert (seen[:a].any(0) & shows).sum() >= 0.4 * shows.sum(), name
+    assert px[b + 8] > 0.8 * px[b + 8 : b + 20].max(), name
+    return np.arange(a, b)
+
+
+@pytest.mark.parametrize("name", AWAY)
+def test_objects_go_away_and_come_back_known(name, seed=1):
+    scenario = replace(SCENARIOS[name](seed), camera=SMALL)
+    seen = watch(scenario, seed)
+    gone = {o: check_return(o, *seen[o]) for o in AWAY[name]}
+    for o, (T, px, _) in seen.items():
+        assert turn_deg(T[1:, :3, :3], T[:-1, :3, :3]).max() < 4 * STEP, o
+        if o not in AWAY[name]:
+            assert px.min() > 0.5 * np.median(px), o  # the others stay in view
+    frames = np.concatenate(list(gone.values()))
+    assert len(set(frames)) == len(frames)  # never two at once
+
+
+def test_look_alikes_differ_in_one_mark_only():
+    left, right, hand = SCENARIOS["look_alikes"](3).bodies
+    np.testing.assert_array_equal(left.mesh.vertices, right.mesh.vertices)
+    differ = (left.mesh.texture != right.mesh.texture).any(-1)
+    v, u = np.nonzero(differ)
+    assert 0 < differ.mean() < 0.03
+    assert np.ptp(u) < 170 and np.ptp(v) < 170  # texels: one mark of 4 to 5 cm
+    assert hand.name == "hand" and not hand.labelled
+
+
+def test_the_mark_shows_when_a_look_alike_is_back():
+    # Where the mark is on the front, by the texture coordinates; the front is what faces the camera.
+    for body in SCENARIOS["look_alikes"](2).bodies[:2]:
+        T = se3.inverse(SCENARIOS["look_alikes"](2).T_world_cam) @ body.T_world_model
+        front_cam = -T[:, :3, 1]  # the front faces -y of the model
+        towards = -T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
+        assert np.einsum("tc,tc->t", front_cam, towards).min() > 0.4
+
+
+def test_the_late_object_is_out_of_the_picture_at_first():
+    scenario = replace(SCENARIOS["late_object"](1), camera=SMALL)
+    T = se3.inverse(scenario.T_world_cam) @ scenario.bodies[1].T_world_model
+    uv = SMALL.project(se3.transform(T, scenario.bodies[1].mesh.vertices))
+    inside = SMALL.inside(uv).any(1)
+    assert not inside[:60].any() and inside[100:].all()
+
+
+def test_the_camera_does_move():
+    T = SCENARIOS["moving_camera"](1).T_world_cam
+    assert np.ptp(T[:, :3, 3], axis=0).max() > 0.15
+    assert turn_deg(T[:1, :3, :3], T[:, :3, :3]).max() > 10
+    step = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    assert step.max() < 0.01

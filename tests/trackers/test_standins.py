@@ -1,0 +1,284 @@
+"""What the adapters do themselves, with tiny models of the documented call signatures in place of the real ones.
+
+Coordinates, memory of points that come and go, and lateness; the real classes are in test_official.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.raster import from_raster, in_picture, to_raster
+from p2p_lib.core.types import Frame
+from p2p_lib.trackers import rollouts
+from p2p_lib.trackers.cotracker import CoTrackerModel
+from p2p_lib.trackers.rollouts import RolloutTracker
+from p2p_lib.trackers.tapir import TapirTracker
+
+torch = pytest.importorskip("torch")
+SHAPE = (96, 128)
+
+
+def ramps(t=0, dx=0, dy=0) -> Frame:
+    """Red grows with x, green with y: a colour is a place. The whole slides by dx, dy pixels."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    rgb = np.stack([30 + 1.5 * (u - dx), 30 + 2 * (v - dy), np.full(SHAPE, 90.0)], -1)
+    return Frame(t, t / 30, np.clip(rgb.round(), 0, 255).astype(np.uint8), np.ones(SHAPE, np.float32))
+
+
+# --- rasters -------------------------------------------------------------------------------------
+
+
+@given(st.floats(-0.5, 639.5), st.floats(-0.5, 479.5), st.sampled_from([256, 480]))
+def test_rasters_keep_edges_and_come_back(u, v, size):
+    uv = np.array([[u, v]])
+    assert from_raster(to_raster(uv, (480, 640), size), (480, 640), size) == pytest.approx(uv, abs=1e-9)
+    corners = np.array([[-0.5, -0.5], [639.5, 479.5], [319.5, 239.5]])
+    np.testing.assert_allclose(to_raster(corners, (480, 640), size), [[0, 0], [size, size], [size / 2, size / 2]])
+
+
+def test_the_picture_ends_half_a_pixel_beyond_its_centres():
+    uv = np.array([[-0.5, 0], [-0.6, 0], [639.5, 479.5], [639.6, 0], [0, 479.6], [np.nan, 0]])
+    assert in_picture(uv, (480, 640)).tolist() == [True, False, True, False, False, False]
+
+
+# --- TAPIR ---------------------------------------------------------------------------------------
+
+
+class Features(NamedTuple):
+    lowres: tuple
+    hires: tuple
+    resolutions: tuple
+
+
+class ColourTapir(torch.nn.Module):
+    """Finds a query's colour anew in every picture. Its memory counts the pictures a query has seen."""
+
+    num_pips_iter = 4
+
+    def get_feature_grids(self, video, is_training):
+        assert video.shape[:2] == (1, 1) and video.shape[2] == video.shape[3] and video.min() >= -1 and video.max() <= 1
+        return Features((video,) * 3, (video,) * 3, (video.shape[2:4],) * 3)
+
+    def get_query_features(self, video, is_training, query_points, feature_grids):
+        t, y, x = query_points[0].T
+        assert (t == 0).all()
+        colour = video[0, 0, y.long(), x.long()][None]  # the raster's pixel that holds the point
+        return Features((colour,) * 3, (colour.clone(),) * 3, feature_grids.resolutions)
+
+    def construct_initial_causal_state(self, num_points, num_resolutions):
+        assert num_resolutions == 2
+        return [{"seen": torch.zeros(1, num_points, 2)}] * num_resolutions * 4
+
+    def estimate_trajectories(
+        self, video_size, is_training, feature_grids, query_features, query_points_in_video,
+        query_chunk_size, causal_context, get_causal_context,
+    ):  # fmt: skip
+        assert query_points_in_video is None and get_causal_context
+        picture = feature_grids.lowres[0][0, 0]
+        assert tuple(picture.shape[:2]) == tuple(video_size)
+        away = torch.cdist(query_features.lowres[-1][0], picture.reshape(-1, 3))
+        best = away.argmin(1)
+        xy = torch.stack([best % picture.shape[1] + 0.5, best // picture.shape[1] + 0.5], -1)[None, :, None].float()
+        seen = causal_context[-1]["seen"][..., 0] + 1
+        assert len(causal_context) == 8 and (query_features.hires[-1] == query_features.lowres[-1]).all()
+        lost = (away.min(1).values > 0.05)[None].float() * 20 - 10
+        # Only the last iteration at each resolution counts: entries 4 and 8.
+        wrong, far = torch.full_like(xy, -1e6), -2.0 - seen[..., None]
+        return {
+            "tracks": [xy if k in (4, 8) else wrong for k in range(9)],
+            "occlusion": [lost[..., None]] * 9,
+            "expected_dist": [far] * 9,
+            "causal_context": [{"seen": seen[..., None].repeat(1, 1, 2)}] * 8,
+        }
+
+
+UV = np.array([[20.0, 70], [100, 15], [64.5, 48.25]])
+
+
+def seen_count(tracks):
+    """How many pictures each point's memory has seen, read from the uncertainty."""
+    return np.round(-2 - np.log(tracks.uncertainty / (1 - tracks.uncertainty))).tolist()
+
+
+def test_tapir_places():
+    tracker = TapirTracker(ColourTapir(), size_px=480)
+    tracker.start(ramps())
+    ids = tracker.add(UV)
+    for dx, dy in ((0, 0), (5, 3), (-12, 8)):
+        tracks = tracker.track(ramps(1, dx, dy))
+        assert tracks.ids.tolist() == ids.tolist() and tracks.visible.all()
+        off_px = tracks.uv_px - UV - np.array([dx, dy])
+        assert np.abs(off_px).max() < 0.7 and abs(off_px.mean()) < 0.4  # no half pixel lost
+    gone = tracker.track(ramps(1, 100, 0))
+    assert not gone.visible[1]  # its colour left the picture
+
+
+def test_tapir_memory_follows_its_point():
+    tracker = TapirTracker(ColourTapir(), size_px=96)
+    tracker.start(ramps())
+    tracker.add(UV)
+    tracker.track(ramps(1)), tracker.track(ramps(2))
+    assert tracker.add(UV[:1]).tolist() == [3]
+    assert seen_count(tracker.track(ramps(3))) == [3, 3, 3, 1]
+    tracker.drop(np.array([0, 2]))
+    tracks = tracker.track(ramps(4))
+    assert tracks.ids.tolist() == [1, 3] and seen_count(tracks) == [4, 2]
+    np.testing.assert_allclose(tracks.uv_px, UV[[1, 0]], atol=1)
+    tracker.drop(np.array([1, 3]))
+    assert len(tracker.track(ramps(5))) == 0
+    assert tracker.add(UV[:2]).tolist() == [4, 5] and seen_count(tracker.track(ramps(6))) == [1, 1]
+    tracker.start(ramps(0))
+    assert tracker.add(UV[:1]).tolist() == [0]
+
+
+# --- rollouts ------------------------------------------------------------------------------------
+
+
+class Echo:
+    """A rollout that answers where its queries were, moved by the newest picture's value."""
+
+    def __init__(self, log, pictures, uv_px):
+        self.uv, self.log = uv_px, log
+        log.append(("begin", [int(p[0, 0, 0]) for p in pictures], len(uv_px)))
+
+    def step(self, rgb):
+        return self.uv + float(rgb[0, 0, 0]), np.ones(len(self.uv), bool), np.full(len(self.uv), 0.25)
+
+
+class EchoModel:
+    name = "echo"
+
+    def __init__(self, late=0):
+        self.latency_frames, self.log = late, []
+
+    def begin(self, pictures, uv_px):
+        return Echo(self.log, pictures, uv_px)
+
+
+def value(t):
+    return Frame(t, t / 30, np.full((*SHAPE, 3), t, np.uint8), np.ones(SHAPE, np.float32))
+
+
+def test_points_of_one_frame_share_a_rollout():
+    model = EchoModel()
+    tracker = RolloutTracker(model)
+    with pytest.raises(BadInput, match="start"):
+        tracker.add(UV)
+    tracker.start(value(0))
+    tracker.add(UV[:2]), tracker.add(UV[2:])
+    tracker.track(value(1))
+    tracker.add(np.zeros((0, 2)))
+    tracker.track(value(2))
+    tracker.add(UV[:1])
+    tracks = tracker.track(value(3))
+    assert model.log == [("begin", [0], 3), ("begin", [2], 1)]
+    assert tracks.ids.tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(tracks.uv_px, UV[[0, 1, 2, 0]] + 3)
+
+
+def test_a_late_model_gets_the_pictures_since_the_queries():
+    model = EchoModel(late=3)
+    tracker = RolloutTracker(model)
+    tracker.start(value(0))
+    for t in range(1, 6):
+        tracker.track(value(t))
+    tracker.add(UV)
+    tracker.track(value(6))
+    assert model.log == [("begin", [2, 3, 4, 5], 3)]
+
+
+def test_dropped_points_are_gone_and_empty_rollouts_with_them():
+    tracker = RolloutTracker(EchoModel())
+    tracker.start(value(0))
+    tracker.add(UV)
+    tracker.drop(np.array([1]))  # before its rollout has seen a picture
+    tracker.track(value(1))
+    tracker.add(UV[:2])
+    tracker.drop(np.array([0, 4]))
+    tracks = tracker.track(value(2))
+    assert tracks.ids.tolist() == [2, 3] and len(tracker._rollouts) == 2
+    np.testing.assert_allclose(tracks.uv_px, UV[[2, 0]] + 2)
+    tracker.drop(np.array([2]))
+    assert len(tracker._rollouts) == 1
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_any_coming_and_going_keeps_rows_and_points_together(seed):
+    rng = np.random.default_rng(seed)
+    tracker, here = RolloutTracker(EchoModel()), {}
+    tracker.start(value(0))
+    for t in range(1, 12):
+        for _ in range(rng.integers(0, 3)):
+            uv = rng.uniform(0, 50, (rng.integers(0, 4), 2))
+            here |= dict(zip(tracker.add(uv).tolist(), uv, strict=True))
+        gone = [k for k in here if rng.random() < 0.2]
+        tracker.drop(np.array(gone, int))
+        here = {k: uv for k, uv in here.items() if k not in gone}
+        tracks = tracker.track(value(t))
+        assert tracks.ids.tolist() == sorted(here)
+        if here:
+            np.testing.assert_allclose(tracks.uv_px, np.array([here[k] for k in sorted(here)]) + t)
+
+
+def test_rollouts_are_bounded(monkeypatch):
+    monkeypatch.setattr(rollouts, "MAX_ROLLOUTS", 3)
+    tracker = RolloutTracker(EchoModel())
+    tracker.start(value(0))
+    for t in range(1, 6):
+        # The second comes with a single point, the others with two.
+        tracker.add(UV[:1] if t == 2 else UV[:2])
+        tracks = tracker.track(value(t))
+    assert len(tracker._rollouts) == 3
+    assert len(tracks) == 9 and not tracks.visible[2] and tracks.visible.sum() == 6
+
+
+# --- CoTracker3 ----------------------------------------------------------------------------------
+
+
+class ValueCoTracker(torch.nn.Module):
+    """Says of each frame the value that its picture had, so that an answer tells of which frame it is."""
+
+    window_len = 16
+
+    def init_video_online_processing(self):
+        self.online_ind, self.online_seen = 0, torch.zeros(0)
+
+    def forward(self, video, queries, iters, is_online):
+        assert video.shape[1] == 16 and is_online and iters == 6 and (queries[..., 0] == 0).all()
+        values = video[0, :, 0, 0, 0]
+        self.online_seen = torch.cat([self.online_seen, values if not len(self.online_seen) else values[8:]])
+        self.online_ind += 8
+        tracks = queries[:, None, :, 1:].repeat(1, len(self.online_seen), 1, 1) + self.online_seen[None, :, None, None]
+        sure = torch.ones(tracks.shape[:3])
+        return tracks, sure * 0.9, sure * 0.7, None
+
+
+class Predictor(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.model, self.interp_shape, self.step = ValueCoTracker(), (48, 64), 8
+
+
+def test_cotracker_answers_for_the_frame_seven_ago_and_keeps_rollouts_apart():
+    tracker = RolloutTracker(CoTrackerModel(Predictor()))
+    tracker.start(value(0))
+    tracker.add(UV)
+    scale = np.array([127 / 63, 95 / 47])  # what is 1 px for the model, in the picture's
+    for t in range(1, 40):
+        tracks = tracker.track(value(t))
+        if t == 12:
+            late = tracker.add(UV[:1] + 1)  # in frame 5
+        if t < 7:
+            assert not tracks.visible.any() and np.isnan(tracks.uv_px).all()
+            continue
+        np.testing.assert_allclose(tracks.uv_px[:3], UV + (t - 7) * scale, atol=1e-4)
+        np.testing.assert_allclose(tracks.uncertainty, 0.3, atol=1e-6)
+        if t > 12:
+            np.testing.assert_allclose(tracks.select(late).uv_px, UV[:1] + 1 + (t - 7) * scale, atol=1e-4)
+    # 0.9 x 0.7 counts as visible, wherever the point is still in the picture.
+    np.testing.assert_array_equal(tracks.visible, in_picture(tracks.uv_px, SHAPE))
