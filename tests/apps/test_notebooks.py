@@ -20,7 +20,7 @@ from p2p_lib.apps.notebooks import (
 )
 from p2p_lib.core.errors import BadInput, MissingData
 
-SUITE = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
+SUITE = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 PARAMETERS = "PROFILE = 'quick'\nSEED: int = 0\nSCALE = 1.0\nNAME = 'a'"
 RECORD = "from p2p_lib.apps.notebooks import record\nrecord(seed=SEED, scale=SCALE, profile=PROFILE)"
 
