@@ -323,7 +323,7 @@ def _view(a: argparse.Namespace) -> None:
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.apps.notebooks import run_notebooks
 
-    parameters = pairs("--parameter", "NAME=VALUE")(a.parameter)
+    parameters = pairs("--parameter", "NAME=VALUE")(a.parameter or ())
     run_notebooks(a.profile, only=names(a.only) or (), jobs=a.jobs, parameters=parameters)
 
 

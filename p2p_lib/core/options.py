@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from p2p_lib.core import config as configuration
-from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_TRACKER, DETECTORS, SEGMENTERS, TRACKERS
+from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, DEFAULT_TRACKER, DETECTORS, SEGMENTERS, TRACKERS
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker
 
 
-def pairs(option: str, form: str) -> Callable[[Iterable[str] | None], dict[str, str]]:
+def pairs(option: str, form: str) -> Callable[[Iterable[str]], dict[str, str]]:
     """A reader of ``["a=1", ...]``, as an option collects them, to ``{"a": "1", ...}``."""
 
-    def read(given: Iterable[str] | None) -> dict[str, str]:
+    def read(given: Iterable[str]) -> dict[str, str]:
         found = {}
-        for item in given or ():
+        for item in given:
             name, equals, value = item.partition("=")
             if not (name and equals and value):
                 raise BadInput(option, repr(item), form)
@@ -36,63 +36,68 @@ def names(given: str | None) -> tuple[str, ...] | None:
     return tuple(part for part in (given or "").split(",") if part) or None
 
 
-def _option(default: Any, help: str, *, flag: str = "", read: Callable[[Any], Any] | None = None, **argument: Any):
-    """A field. ``read`` makes its value of what ``argparse.add_argument(flag, **argument)`` collects."""
-    return field(default=default, metadata={"flag": flag, "read": read, "argument": {"help": help, **argument}})
+def _typed(help: str, *, flag: str = "", read: Callable[[Any], Any] | None = None, **how: Any) -> dict[str, Any]:
+    """How a field is typed: ``read`` makes its value of what ``argparse.add_argument(flag, **how)`` collects."""
+    return {"flag": flag, "read": read, "how": {"help": help, **how}}
+
+
+_PRESET = _typed("paper or default: parameters only, never backends")
+_CONFIG = _typed("TOML file with [stage] key = value", flag="--config", type=Path, metavar="FILE")
+_SET = _typed(
+    "change one parameter; repeatable",
+    flag="--set",
+    read=pairs("--set", "stage.key=value"),
+    action="append",
+    metavar="STAGE.KEY=VALUE",
+)
+_SEED = _typed("of every random choice (default 0)", type=int, metavar="N")
+_DEVICE = _typed("where surfaces are fused and refined: cpu (default), cuda or cuda:N")
+_TRACKER = _typed(f"2D point tracker: {', '.join(TRACKERS)} (default {DEFAULT_TRACKER})", metavar="NAME")
+_DETECTOR = _typed(f"source of new points: {', '.join(DETECTORS)} (default {DEFAULT_DETECTOR})", metavar="NAME")
+_MASKS = _typed(
+    f"dataset, dataset:FOLDER, {', '.join(SEGMENTERS)} (default: dataset; with --prompts {DEFAULT_SEGMENTER})",
+    metavar="SOURCE",
+)
+_PROMPTS = _typed("clicks on the objects (see p2p click)", type=Path, metavar="FILE")
+_SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")
+_FORMAT = _typed("layout: ho3d, bop, ycbmultitrack, ycbineoat, folder (default: recognised)")
+_DEPTH_SCALE = _typed("metres per raw depth unit (default 0.001)", type=float, metavar="M")
+_OBJECTS = _typed("track only these objects", read=names, metavar="A,B")
+_START = _typed("first frame", type=int, metavar="I")
+_STOP = _typed("one past the last frame", type=int, metavar="J")
+_MODELS = _typed(
+    "models for scoring",
+    read=pairs("--models", "NAME=PATH"),
+    nargs="+",
+    action="extend",
+    metavar="NAME=PATH",
+)
 
 
 @dataclass(frozen=True)
 class RunOptions:
     """What one may ask of a run, beside the sequence and the folder of its results.
 
-    ``tracker`` may be a tracker itself, ``prompts`` a file or values, ``objects`` any names, ``settings``
-    ``{"stage.key": value}`` and ``models`` object to file. None leaves the choice to the configuration or the sequence.
+    ``tracker`` may be a tracker itself, ``prompts`` a file or values, ``settings`` is ``{"stage.key": value}``,
+    ``models`` object to file. None leaves the choice to the configuration or to the sequence.
     """
 
-    preset: str | None = _option(None, "paper or default: parameters only, never backends")
-    config_file: str | Path | None = _option(
-        None, "TOML file with [stage] key = value", flag="--config", type=Path, metavar="FILE"
-    )
-    settings: Mapping[str, Any] | None = _option(
-        None,
-        "change one parameter; repeatable",
-        flag="--set",
-        read=pairs("--set", "stage.key=value"),
-        action="append",
-        metavar="STAGE.KEY=VALUE",
-    )
-    seed: int | None = _option(None, "of every random choice (default 0)", type=int, metavar="N")
-    device: str | None = _option(None, "where surfaces are fused and refined: cpu (default), cuda or cuda:N")
-    tracker: str | PointTracker = _option(
-        DEFAULT_TRACKER, f"2D point tracker: {', '.join(TRACKERS)} (default {DEFAULT_TRACKER})", metavar="NAME"
-    )
-    detector: str = _option(
-        DEFAULT_DETECTOR, f"source of new points: {', '.join(DETECTORS)} (default {DEFAULT_DETECTOR})", metavar="NAME"
-    )
-    masks: str | None = _option(
-        None,
-        f"dataset, dataset:FOLDER, {', '.join(SEGMENTERS)} (default: dataset; with --prompts builtin)",
-        metavar="SOURCE",
-    )
-    prompts: str | Path | Iterable[Any] | None = _option(
-        None, "clicks on the objects (see p2p click)", type=Path, metavar="FILE"
-    )
-    save_masks: bool = _option(False, "keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")
-    format: str | None = _option(
-        None, "layout: ho3d, bop, ycbmultitrack, ycbineoat, folder (default: recognised)", metavar="FORMAT"
-    )
-    depth_scale: float | None = _option(None, "metres per raw depth unit (default 0.001)", type=float, metavar="M")
-    objects: Sequence[str] | None = _option(None, "track only these objects", read=names, metavar="A,B")
-    start: int = _option(0, "first frame", type=int, metavar="I")
-    stop: int | None = _option(None, "one past the last frame", type=int, metavar="J")
-    models: Mapping[str, str | Path] | None = _option(
-        None,
-        "models for scoring",
-        read=pairs("--models", "NAME=PATH"),
-        nargs="+",
-        action="extend",
-        metavar="NAME=PATH",
-    )
+    preset: str | None = field(default=None, metadata=_PRESET)
+    config_file: str | Path | None = field(default=None, metadata=_CONFIG)
+    settings: Mapping[str, Any] | None = field(default=None, metadata=_SET)
+    seed: int | None = field(default=None, metadata=_SEED)
+    device: str | None = field(default=None, metadata=_DEVICE)
+    tracker: str | PointTracker = field(default=DEFAULT_TRACKER, metadata=_TRACKER)
+    detector: str = field(default=DEFAULT_DETECTOR, metadata=_DETECTOR)
+    masks: str | None = field(default=None, metadata=_MASKS)
+    prompts: str | Path | Iterable[Any] | None = field(default=None, metadata=_PROMPTS)
+    save_masks: bool = field(default=False, metadata=_SAVE_MASKS)
+    format: str | None = field(default=None, metadata=_FORMAT)
+    depth_scale: float | None = field(default=None, metadata=_DEPTH_SCALE)
+    objects: Sequence[str] | None = field(default=None, metadata=_OBJECTS)
+    start: int = field(default=0, metadata=_START)
+    stop: int | None = field(default=None, metadata=_STOP)
+    models: Mapping[str, str | Path] | None = field(default=None, metadata=_MODELS)
 
     @classmethod
     def of_arguments(cls, arguments: argparse.Namespace) -> RunOptions:
@@ -101,7 +106,7 @@ class RunOptions:
         for option in fields(cls):
             if hasattr(arguments, option.name):
                 value, read = getattr(arguments, option.name), option.metadata["read"]
-                given[option.name] = read(value) if read else value
+                given[option.name] = read(value) if read and value is not None else value
         return cls(**given)
 
     def config(self) -> Config:
@@ -129,7 +134,7 @@ def add_options(parser: argparse.ArgumentParser, *wanted: str, **helps: str) -> 
     for option in fields(RunOptions):
         if not wanted or option.name in wanted:
             flag = option.metadata["flag"] or "--" + option.name.replace("_", "-")
-            argument = {**option.metadata["argument"], "dest": option.name, "default": option.default}
+            argument = {**option.metadata["how"], "dest": option.name, "default": option.default}
             if option.name in helps:
                 argument["help"] = helps[option.name]
             parser.add_argument(flag, **argument)
