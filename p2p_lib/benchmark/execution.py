@@ -20,9 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.benchmark.jobs import Job, library_version, open_planned
-from p2p_lib.benchmark.outcome import Outcome, replace_text, run_path
+from p2p_lib.benchmark.outcome import Outcome, run_path
 from p2p_lib.benchmark.scoring import scored
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from p2p_lib.core.files import replace_text
 from p2p_lib.core.packages import PIP, command
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.protocol import rate

@@ -224,7 +224,7 @@ FAULTS = {
     "a word": ({"can.txt": "0 0 0 zero 0 0 0 1\n"}, r"can\.txt: line 1: got '0 0 0 zero"),
     "another time": ({"can.txt": "0.5 0 0 1 0 0 0 1\n"}, r"can\.txt: got the time 0\.500000 s, expected times"),
     "not rigid": ({"can/0000.txt": "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"}, r"0000\.txt: got a matrix that is not"),
-    "another name": ({"can/frame.txt": IDENTITY}, r"frame\.txt: got the name frame, expected the name of a picture"),
+    "another name": ({"can/frame.txt": IDENTITY}, r"frame\.txt: got the name frame, expected the name of an image"),
     "a number too high": ({"can/0012.txt": IDENTITY}, r"0012\.txt: got the name 0012, .*frame number below 12"),
     "three rows": ({"can/0000.txt": "1 0 0 0\n0 1 0 0\n0 0 1 0\n"}, r"0000\.txt: got shape \(3, 4\)"),
     "whose are they": ({"0000.txt": IDENTITY}, r"theirs: got poses of one object, expected .* box, can"),
