@@ -9,19 +9,11 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.datasets.runs import Run
-from p2p_lib.evaluation.protocol import SCORES, Evaluation
+from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import recovery_events
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-#: Scores by the words of a table's head; the areas are over 0 to 0.1 m.
-HEADS = {
-    "adds_auc": "ADD-S AUC [%]",
-    "add_auc": "ADD AUC [%]",
-    "adds_auc_voc": "ADD-S AUC, VOC [%]",
-    "add_auc_voc": "ADD AUC, VOC [%]",
-}
 
 
 def of_rows(rows: Iterable[Mapping[str, Any]]) -> DataFrame:
@@ -33,15 +25,7 @@ def of_rows(rows: Iterable[Mapping[str, Any]]) -> DataFrame:
 
 def score_table(evaluation: Evaluation) -> DataFrame:
     """A row per object and their mean: areas under the curve in percent, frames scored, frames lost among them."""
-    from pandas import DataFrame
-
-    plain = evaluation.as_dict()
-    rows = [
-        {"object": name, **_areas(scores), "frames": scores["frames"], "lost": scores["lost"]}
-        for name, scores in plain["objects"].items()
-    ]
-    total = {key: sum(row[key] for row in rows) for key in ("frames", "lost")}
-    return DataFrame([*rows, {"object": "mean", **_areas(plain["mean"]), **total}] if len(rows) > 1 else rows)
+    return evaluation.as_frame()
 
 
 def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
@@ -74,7 +58,3 @@ def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
 def _moved(T_cam_before: np.ndarray, T_cam_after: np.ndarray) -> tuple[float, float]:
     moved_m = np.linalg.norm(T_cam_after[:3, 3] - T_cam_before[:3, 3])
     return float(moved_m), float(se3.angle_rad(se3.inverse(T_cam_before) @ T_cam_after))
-
-
-def _areas(scores: dict[str, float]) -> dict[str, float]:
-    return {HEADS[key]: round(scores[key], 2) for key in HEADS if key in SCORES}
