@@ -18,6 +18,8 @@ settings.register_profile("suite", deadline=None)
 settings.load_profile("suite")
 
 PROJECT = Path(__file__).resolve().parents[1]
+#: Fixtures of several packages.
+pytest_plugins = ["tests.fixtures.made_run", "tests.fixtures.moving_frames"]
 
 
 @pytest.fixture(scope="session")

@@ -19,8 +19,7 @@ from p2p_lib.core.types import Frame, Status
 PROJECT = Path(__file__).resolve().parents[1]
 DOCUMENTS = ("README.md", "CONTRIBUTING.md", "environment.md")
 #: Where a file named in passing may lie.
-PLACES = ("", "p2p_lib", "p2p_lib/core", "p2p_lib/data", "p2p_lib/stages", "p2p_lib/backends", "p2p_lib/evaluation")
-PLACES = (*PLACES, "p2p_lib/report", "notebooks")
+PLACES = ("", "p2p_lib", *(str(p.relative_to(PROJECT)) for p in sorted((PROJECT / "p2p_lib").glob("*/"))), "notebooks")
 
 
 def read(name: str) -> str:
