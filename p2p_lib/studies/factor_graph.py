@@ -14,10 +14,11 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.figures import style
 from p2p_lib.figures.plots import panels
 from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
-from p2p_lib.method.registration import covariance, noise_m
+from p2p_lib.method.registration import covariance
 from p2p_lib.method.registration import generate as register
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def simulate_turn(
     seen[slice(*hidden)] &= np.cumsum(seen[slice(*hidden)], 1) <= 2
     bearing = exact / range_m + config.factor_graph.bearing_sigma_rad * rng.normal(size=exact.shape)
     bearing /= np.linalg.norm(bearing, axis=-1, keepdims=True)
-    sigma_m = noise_m(exact.reshape(-1, 3), config.registration).reshape(range_m.shape)
+    sigma_m = depth_noise_m(exact[..., 2:], config.depth)
     p_cam = bearing * (range_m + sigma_m * rng.normal(size=range_m.shape))
     wrong = rng.random(seen.shape) < outliers
     away = rng.normal(size=exact.shape)
@@ -113,10 +114,11 @@ def register_turn(turn: Turn, config: Config, seed: int = 0) -> Solved:
     rng = np.random.default_rng(seed)
     T, p_obj, covariances = [turn.T_cam_obj[0]], np.full_like(turn.p_obj, np.nan), [None]
     for m, p_cam in enumerate(turn.p_cam):
-        found = register(p_obj, p_cam, config.registration, rng)
+        sigma_m = depth_noise_m(p_cam[:, 2], config.depth)
+        found = register(p_obj, p_cam, config.registration, rng, sigma_m=sigma_m)
         if found:
             T.append(found[0].T_cam_obj)
-            covariances.append(covariance(found[0], p_obj, p_cam, noise_m(p_cam, config.registration)))
+            covariances.append(covariance(found[0], p_obj, p_cam, sigma_m))
         elif m:
             T.append(T[-1] @ se3.inverse(T[-2:][0]) @ T[-1])
             covariances.append(np.diag(np.repeat([np.radians(3), 0.01], 3) ** 2))
@@ -146,7 +148,7 @@ def _growing_graph(turn: Turn, registered: Solved, config: Config) -> Iterator[O
             turn.p_cam[m, ids],
             p_obj_init=registered.p_obj[ids],
             covariance=registered.covariance[m],
-            sigma_m=noise_m(turn.p_cam[m, ids], config.registration),
+            sigma_m=depth_noise_m(turn.p_cam[m, ids, 2], config.depth),
         )
         yield graph
 

@@ -5,7 +5,7 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
-from p2p_lib.method.registration import noise_m
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.studies.factor_graph import (
     consistency,
     optimise,
@@ -28,7 +28,7 @@ def test_observations_have_the_noise_of_the_pipeline(turn):
     exact = se3.transform(turn.T_cam_obj, turn.p_obj)[turn.seen]
     seen = turn.p_cam[turn.seen]
     range_m, bearing = np.linalg.norm(exact, axis=1), exact / np.linalg.norm(exact, axis=1)[:, None]
-    off_sigmas = (np.linalg.norm(seen, axis=1) - range_m) / noise_m(exact, CONFIG.registration)
+    off_sigmas = (np.linalg.norm(seen, axis=1) - range_m) / depth_noise_m(exact[:, 2], CONFIG.depth)
     assert np.std(off_sigmas) == pytest.approx(1, rel=0.1)
     across = np.linalg.norm(np.cross(seen / np.linalg.norm(seen, axis=1)[:, None], bearing), axis=1)
     assert np.sqrt((across**2).mean() / 2) == pytest.approx(CONFIG.factor_graph.bearing_sigma_rad, rel=0.1)
