@@ -216,7 +216,7 @@ def test_a_page_has_the_groups_above_their_heads():
     rows = [[Cell("Ours"), Cell("1.00", bold=True), Cell(note="no <data>")]]
     page = Table("A table", ["Method", "ADD", "rate"], rows, [("", 1), ("reported", 2)], notes=["All"]).html()
     assert [head.count("<th") for head in page.partition("</thead>")[0].split("<tr>")[1:]] == [2, 3]
-    assert 'colspan="2" >reported</th>' in page
+    assert 'colspan="2">reported</th>' in page
     assert "<b>1.00</b>" in page and "-<sup>a</sup>" in page and "(a) no &lt;data&gt;." in page
 
 
