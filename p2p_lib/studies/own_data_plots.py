@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from p2p_lib.apps.check import Finding
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame, Status
+from p2p_lib.datasets.alignment import background_share, rim
 from p2p_lib.datasets.models import MESHES, find_models
 from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.datasets.sequence import Sequence as Recording
@@ -20,8 +22,6 @@ from p2p_lib.figures.overlay import Box
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import panels
 from p2p_lib.figures.scenes import Scene
-from p2p_lib.studies.mask_rim import background_share, rim
-from p2p_lib.studies.own_data import Finding
 from p2p_lib.studies.self_check import SurfaceFit
 from p2p_lib.synthetic.shapes import load_mesh
 

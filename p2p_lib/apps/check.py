@@ -1,14 +1,14 @@
-"""Looks at a sequence of one's own before anything is tracked and names what is wrong: what ``p2p check`` prints.
+"""What ``p2p check`` prints: what is wrong with a sequence of one's own, before anything is tracked.
 
-What goes wrong with own data is known: depth in another unit, depth that was not registered to colour, the camera
-matrix of another resolution, times in milliseconds, masks that hold the table too, objects without anything to track.
+Known faults: depth in another unit or not registered to colour, the camera matrix of another resolution, times in
+milliseconds, masks that hold the table too, objects without anything to track.
 """
 
 from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -22,35 +22,36 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.core.types import Frame
+from p2p_lib.datasets.alignment import background_share, misfit
 from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.method.sampling import choose, usable_region
-from p2p_lib.studies.depth_colour import misfit
-from p2p_lib.studies.mask_rim import background_share
 from p2p_lib.synthetic.faults import spoil
 
 #: Frames that are looked at, evenly spread.
 FRAMES = 12
-#: Of the picture's width: an offset between depth and colour that does not matter, and a principal point off centre.
+#: Of the image's width: an offset between depth and colour that does not matter, and a principal point off centre.
 OFFSET_SHARE, CENTRE_SHARE = 0.01, 0.1
-#: How much better depth must fit elsewhere to be called not registered: 1.05 at most on good sequences looked at.
+#: How much better depth must fit elsewhere to be called not registered: 1.05 at most on good sequences.
 GAIN = 1.2
-#: Whatever is recorded in front of a depth camera is this far away, in metres.
+#: Ranges in metres of whatever is recorded in front of a depth camera.
 NEAREST_M, FARTHEST_M = 0.05, 20.0
-#: Horizontal and vertical angles of view of any RGB-D camera, in degrees.
+#: Horizontal and vertical angles of view of any RGB-D camera.
 VIEW_DEG = (20.0, 130.0)
 #: Frames per second that cameras have, and a gap as a multiple of the usual interval.
 RATES_HZ, GAP = (0.5, 500.0), 10.0
-#: Share of pictures that may equal the next one.
+#: Fraction of images that may equal the next one.
 REPEATED_SHARE = 0.3
-#: Share of a mask's rim that may lie on the background: 0.4 at most on good sequences looked at.
+#: Fraction of a mask's rim that may lie on the background: 0.4 at most on good sequences.
 RIM_SHARE = 0.5
-#: Shares of a mask, and of the picture, that should have a depth.
+#: Fraction of a mask that should have a depth; half of it of the whole image.
 MEASURED_SHARE = 0.5
-#: What an object seldom is: so much of the picture, so deep (of its distance). Objects looked at: at most 0.07, 0.23.
+#: What an object seldom is: so much of the image, so deep (of its distance). Good sequences: at most 0.07, 0.23.
 LARGE_SHARE, DEEP_SHARE = 0.12, 0.25
-#: Share of depth at its largest value from which on it was cut off there.
+#: Fraction of depth at its largest value from which on it was cut off there.
 CLIPPED_SHARE = 0.1
+
+FirstMasks = dict[str, tuple[Frame, np.ndarray]]
 
 
 class Level(StrEnum):
@@ -81,10 +82,10 @@ def check_folder(
 ) -> list[Finding]:
     """What is right and wrong with a sequence, in the order in which it should be mended.
 
-    prompts  clicks, for a sequence without masks: the embedded segmenter makes its first ones
+    prompts  clicks, for a sequence without masks: the built-in segmenter makes its first ones
     config   whose limits count (default: the preset ``default``)
 
-    Files that cannot be read are findings too; nothing is raised for the data's sake.
+    Files that cannot be read are findings too.
     """
     config = config or preset()
     try:
@@ -93,14 +94,14 @@ def check_folder(
         chosen = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist()
         frames = [sequence.frame(i) for i in chosen]
         masks = [sequence.masks(i) or {} for i in chosen]
-        firsts = dict(_clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config))
+        firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
     except P2PError as error:
         return [_unreadable(error)]
-    size = f"{len(sequence)} pictures of {sequence.camera.width}x{sequence.camera.height}"
-    findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at")]
-    findings += [_camera(sequence.camera), _times(sequence), _repeated(frames, sequence)]
-    findings += [_depth(frames), _registered(frames)]
-    if any(finding.name == "depth" and finding.level is Level.WRONG for finding in findings):
+    size = f"{len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
+    depth = _depth(frames)
+    findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
+    findings += [_times(sequence), _repeated(frames, sequence), depth, _registered(frames)]
+    if depth.level is Level.WRONG:
         return findings  # nothing that follows would mean anything
     if not firsts:
         return [*findings, _no_masks(sequence, any(masks), config)]
@@ -110,9 +111,9 @@ def check_folder(
         if mask.sum() < config.pipeline.min_mask_px:
             findings.append(_nothing_there(name, frame, mask, config))
             continue
-        pairs = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
+        others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         findings.append(_range(name, frame, mask, config))
-        findings += [_rim(name, [(frame, mask), *pairs], config), _points(name, frame, mask, config)]
+        findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
     return findings
 
 
@@ -130,13 +131,12 @@ def as_lines(findings: Iterable[Finding]) -> str:
     lines = []
     for finding in findings:
         lines.append(f"{finding.level:7}{finding.name:{width}}  {finding.text}")
-        lines += [f"{'':7}{'':{width}}  -> {finding.fix}"] if finding.fix else []
-    wrong, look = ([f.name for f in findings if f.level is level] for level in (Level.WRONG, Level.LOOK))
-    last = (
-        f"To look at before tracking: {', '.join(look)}" if look else "Nothing is wrong with it as far as can be seen."
-    )
-    lines.append(f"To mend first: {', '.join(wrong)}" if wrong else last)
-    return "\n".join(lines)
+        lines += [f"{'':7}{'':{width}}  -> {finding.fix}"] * bool(finding.fix)
+    wrong, look = (", ".join(f.name for f in findings if f.level is level) for level in (Level.WRONG, Level.LOOK))
+    if wrong:
+        return "\n".join([*lines, f"To mend first: {wrong}"])
+    nothing = "Nothing is wrong with it as far as can be seen."
+    return "\n".join([*lines, f"To look at before tracking: {look}" if look else nothing])
 
 
 def _unreadable(error: P2PError) -> Finding:
@@ -146,20 +146,20 @@ def _unreadable(error: P2PError) -> Finding:
 
 
 def _camera(camera: Camera) -> Finding:
-    """Whether K belongs to pictures of this size: its principal point is their middle, nearly."""
+    """Whether K belongs to images of this size: its principal point is about their middle."""
     size, centre = np.array([camera.width, camera.height]), np.array([camera.cx, camera.cy]) + 0.5
     view_deg = np.degrees(2 * np.arctan(size / 2 / [camera.fx, camera.fy]))
     text = f"sees {view_deg[0]:.0f} x {view_deg[1]:.0f} degrees, centre at ({camera.cx:.0f}, {camera.cy:.0f})"
     if (np.abs(centre / size - 0.5) > CENTRE_SHARE).any():
         of = "x".join(f"{round(2 * c, -1):.0f}" for c in centre)
-        text = f"K has its centre at ({camera.cx:.0f}, {camera.cy:.0f}): that of pictures of about {of}"
+        text = f"K has its centre at ({camera.cx:.0f}, {camera.cy:.0f}): that of images of about {of}"
         factors = size / (2 * centre)
         fix = f"Take K at {camera.width}x{camera.height}"
         if abs(factors[0] / factors[1] - 1) < 0.1:
-            fix += f": for pictures scaled as a whole, its first two rows times {factors.mean():.3g}"
+            fix += f": for images scaled as a whole, its first two rows times {factors.mean():.3g}"
         return Finding("camera", Level.WRONG, text, f"{fix}.")
     if (view_deg < VIEW_DEG[0]).any() or (view_deg > VIEW_DEG[1]).any():
-        fix = "fx and fy are in pixels, at the size that the pictures have here."
+        fix = "fx and fy are in pixels, at the size that the images have here."
         return Finding("camera", Level.WRONG, f"{text}: no RGB-D camera does", fix)
     return Finding("camera", Level.OK, text)
 
@@ -168,31 +168,31 @@ def _times(sequence: Sequence) -> Finding:
     """Whether the times are seconds, and without holes."""
     steps_s = np.diff(sequence.times_s)
     if not len(steps_s):
-        return Finding("times", Level.LOOK, "a single picture", "Tracking needs a video.")
+        return Finding("times", Level.LOOK, "a single image", "Tracking needs a video.")
     usual_s, widest = float(np.median(steps_s)), int(steps_s.argmax())
-    text = f"{1 / usual_s:.3g} pictures per second, {sequence.times_s[-1] - sequence.times_s[0]:.1f} s"
+    text = f"{1 / usual_s:.3g} images per second, {sequence.times_s[-1] - sequence.times_s[0]:.1f} s"
     if not RATES_HZ[0] <= 1 / usual_s <= RATES_HZ[1]:
         unit = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
         guess = next((f" These look like {n}." for k, n in unit.items() if 1 <= k / usual_s <= RATES_HZ[1]), "")
-        text = f"{usual_s:.3g} s between pictures: {1 / usual_s:.3g} per second"
+        text = f"{usual_s:.3g} s between images: {1 / usual_s:.3g} per second"
         return Finding("times", Level.WRONG, text, f"times.txt holds seconds, one a line.{guess}")
     if steps_s[widest] > GAP * usual_s:
         text += f", but {steps_s[widest]:.2g} s between frames {widest} and {widest + 1}"
-        fix = "Pictures are missing there: what moved meanwhile has to be found again."
+        fix = "Images are missing there: what moved meanwhile has to be found again."
         return Finding("times", Level.LOOK, text, fix)
     return Finding("times", Level.OK, text)
 
 
 def _repeated(frames: list[Frame], sequence: Sequence) -> Finding:
-    """Whether pictures are copies of the one before: a recorder that was faster than its camera."""
+    """Whether images are copies of the one before: a recorder that was faster than its camera."""
     pairs = [(f, sequence.frame(f.index + 1)) for f in frames if f.index + 1 < len(sequence)]
     copies = [a.index for a, b in pairs if np.array_equal(a.rgb, b.rgb)]
     frozen = [a.index for a, b in pairs if a.depth_m.any() and np.array_equal(a.depth_m, b.depth_m)]
     if max(len(copies), len(frozen)) > REPEATED_SHARE * len(pairs):
         what, of = ("colour", copies) if len(copies) >= len(frozen) else ("depth", frozen)
-        text = f"{len(of)} of {len(pairs)} {what} pictures equal the next one, that of frame {of[0]} for one"
-        return Finding("motion", Level.LOOK, text, "Record each picture once, with the time at which it was taken.")
-    return Finding("motion", Level.OK, "every picture looked at differs from the next")
+        text = f"{len(of)} of {len(pairs)} {what} images equal the next one, that of frame {of[0]} for one"
+        return Finding("motion", Level.LOOK, text, "Record each image once, with the time at which it was taken.")
+    return Finding("motion", Level.OK, "every image looked at differs from the next")
 
 
 def _depth(frames: list[Frame]) -> Finding:
@@ -245,7 +245,7 @@ def _no_masks(sequence: Sequence, drawn: bool, config: Config) -> Finding:
     fix = f"Make clicks with p2p click and give them with --prompts, or put masks into {sequence.path}/masks."
     if not drawn:
         return Finding("masks", Level.LOOK, "none", fix)
-    text = f"none that shows an object: no object has {config.pipeline.min_mask_px} pixels in any picture"
+    text = f"none that shows an object: no object has {config.pipeline.min_mask_px} pixels in any image"
     return Finding("masks", Level.WRONG, text, fix)
 
 
@@ -265,7 +265,7 @@ def _distance_m(frame: Frame, mask: np.ndarray) -> float:
     return float(np.median(measured)) if enough else float("nan")
 
 
-def _all_beyond(firsts: dict[str, tuple[Frame, np.ndarray]], config: Config) -> Finding | None:
+def _all_beyond(firsts: FirstMasks, config: Config) -> Finding | None:
     """The one finding of objects that are all too far away, or all too near: most likely depth is in another unit."""
     pipe, away_m = config.pipeline, {name: _distance_m(*first) for name, first in firsts.items()}
     distances = np.array(list(away_m.values()))
@@ -318,14 +318,14 @@ def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Fin
         return Finding(f"{name}: mask", Level.WRONG, text, fix)
     large, deep_m, away_m = _extent(*first)
     if large > LARGE_SHARE or deep_m > DEEP_SHARE * away_m:
-        text = f"it covers {100 * large:.0f} % of the picture, over {deep_m:.2f} m of depth; {text}"
+        text = f"it covers {100 * large:.0f} % of the image, over {deep_m:.2f} m of depth; {text}"
         fix = "Is it the object, or the table or wall? If it is not, click in its middle, or draw it tighter."
         return Finding(f"{name}: mask", Level.LOOK, text, fix)
     return Finding(f"{name}: mask", Level.OK, text)
 
 
 def _extent(frame: Frame, mask: np.ndarray) -> tuple[float, float, float]:
-    """A mask's share of the picture, the depth that it reaches over without its outermost pixels, its distance (m)."""
+    """A mask's fraction of the image, the depth that it reaches over without its outermost pixels, its distance (m)."""
     depth_m = frame.depth_m[mask & (frame.depth_m > 0)]
     near_m, away_m, far_m = np.percentile(depth_m, [2, 50, 98]) if len(depth_m) else (0.0, 0.0, 0.0)
     return float(mask.mean()), float(far_m - near_m), float(away_m)
@@ -353,26 +353,26 @@ def _contrast(rgb: np.ndarray, side_px: int) -> np.ndarray:
     return np.sqrt(np.maximum(square - mean * mean, 0))
 
 
-def _first_masks(sequence: Sequence, config: Config) -> Iterator[tuple[str, tuple[Frame, np.ndarray]]]:
+def _first_masks(sequence: Sequence, config: Config) -> FirstMasks:
     """Each object's first mask that is large enough to start from, with its frame."""
-    waiting = set(sequence.objects)
+    firsts: FirstMasks = {}
     for i in range(len(sequence)):
         masks = sequence.masks(i)
-        if masks is None or not waiting:
-            return
-        for name in sorted(waiting & masks.keys()):
+        if masks is None or firsts.keys() >= set(sequence.objects):
+            break
+        for name in sorted(masks.keys() & set(sequence.objects) - firsts.keys()):
             if masks[name].sum() >= config.pipeline.min_mask_px:
-                waiting.discard(name)
-                yield name, (sequence.frame(i), masks[name])
+                firsts[name] = sequence.frame(i), masks[name]
+    return firsts
 
 
-def _clicked(
-    sequence: Sequence, prompts: Iterable[Prompt], config: Config
-) -> Iterator[tuple[str, tuple[Frame, np.ndarray]]]:
-    """Each clicked object's first mask, as the embedded segmenter cuts it out."""
+def _clicked(sequence: Sequence, prompts: Iterable[Prompt], config: Config) -> FirstMasks:
+    """Each clicked object's first mask, as the built-in segmenter cuts it out."""
+    firsts: FirstMasks = {}
     for prompt in prompts:
         if prompt.frame >= len(sequence):
             raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", f"below {len(sequence)}")
         rng, frame = np.random.default_rng(config.seed), sequence.frame(prompt.frame)
         segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
-        yield prompt.name, (frame, segmenter.segment(frame, {prompt.name: prompt.points_px}) > 0)
+        firsts[prompt.name] = frame, segmenter.segment(frame, {prompt.name: prompt.points_px}) > 0
+    return firsts

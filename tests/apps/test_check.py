@@ -8,16 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from p2p_lib.apps import cli
+from p2p_lib.apps import check, cli
+from p2p_lib.apps.check import Level, as_lines, check_folder, check_spoilt
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
+from p2p_lib.datasets.alignment import background_share, misfit
 from p2p_lib.datasets.prompts import Prompt, load_prompts
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.studies.depth_colour import misfit
-from p2p_lib.studies.mask_rim import background_share
-from p2p_lib.studies.own_data import Level, as_lines, check_folder, check_spoilt
 from p2p_lib.synthetic.faults import FAULTS, spoil
 
 #: What must be found: the level, a part of what is said, and a part of the remedy.
@@ -27,12 +26,12 @@ EXPECTED = {
     "ten times as far": ("box: depth", Level.WRONG, r"6\.\d+ m away.*0\.1 to 2\.5 m count", "the depth scale is wrong"),
     "depth not registered": ("registration", Level.WRONG, r"0\.7\d times as large", "Register depth to colour"),
     "depth shifted": ("registration", Level.WRONG, r"shifted by \(\+1[6-9]|\(\+20, [+-]0\) px", "Register depth"),
-    "K of another resolution": ("camera", Level.WRONG, r"pictures of about 128\dx96\d", r"first two rows times 0\.5\."),
-    "K of another aspect": ("camera", Level.WRONG, "pictures of about 1280x720", r"Take K at 640x480\.$"),
-    "times in milliseconds": ("times", Level.WRONG, "s between pictures", "These look like milliseconds"),
+    "K of another resolution": ("camera", Level.WRONG, r"images of about 128\dx96\d", r"first two rows times 0\.5\."),
+    "K of another aspect": ("camera", Level.WRONG, "images of about 1280x720", r"Take K at 640x480\.$"),
+    "times in milliseconds": ("times", Level.WRONG, "s between images", "These look like milliseconds"),
     "times jump back": ("files", Level.WRONG, r"times\.txt: got 0\.000000 s at frame 3", ""),
     "a gap": ("times", Level.LOOK, "but 3.* s between frames 2 and 3", "found again"),
-    "pictures twice": ("motion", Level.LOOK, "pictures equal the next one", "each picture once"),
+    "pictures twice": ("motion", Level.LOOK, "images equal", "each image once"),
     "no texture": ("box: points", Level.WRONG, r"frame 0: [0-7];", "textured side"),
     "wide masks": ("can: mask", Level.WRONG, r"\d\d+ % of its rim", "a little inside"),
     "no depth on the objects": ("box: depth", Level.WRONG, "only 0 % of its pixels", "shiny"),
@@ -203,7 +202,7 @@ def click(u, v):
 
 def test_a_click_on_the_background_is_worth_a_look(good):
     finding = found(good, "box: mask", **click(230, 240))
-    assert finding.level is Level.LOOK and re.match(r"it covers 2\d % of the picture, over 0\.4", finding.text)
+    assert finding.level is Level.LOOK and re.match(r"it covers 2\d % of the image, over 0\.4", finding.text)
     assert "table or wall" in finding.fix
 
 
@@ -296,7 +295,5 @@ def test_unknown_faults_are_refused(good):
 
 
 def test_camera_of_a_telescope_is_no_camera():
-    from p2p_lib.studies.own_data import _camera
-
-    assert _camera(Camera(600, 600, 320, 240, 640, 480)).level is Level.OK
-    assert _camera(Camera(6000, 6000, 320, 240, 640, 480)).level is Level.WRONG
+    assert check._camera(Camera(600, 600, 320, 240, 640, 480)).level is Level.OK
+    assert check._camera(Camera(6000, 6000, 320, 240, 640, 480)).level is Level.WRONG
