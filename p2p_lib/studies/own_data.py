@@ -1,0 +1,220 @@
+"""Notebook 10: what went in and what came out, what good masks are, how to tell without any truth that it works.
+
+A reconstructed surface is drawn at the estimated pose. Where the camera measured something behind it, the object cannot
+be: a wrong pose, or a surface that bulges. What lies in front of it hides it and says nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import trimesh
+from pandas import DataFrame, Series
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.types import Frame, Status
+from p2p_lib.datasets.alignment import background_share, rim
+from p2p_lib.datasets.models import MESHES, find_models
+from p2p_lib.datasets.prompts import Prompt
+from p2p_lib.datasets.runs import Run
+from p2p_lib.datasets.sequence import Sequence as Recording
+from p2p_lib.figures import overlay, style
+from p2p_lib.figures.mesh_view import draw_mesh
+from p2p_lib.figures.overlay import Box
+from p2p_lib.figures.playback import Playback
+from p2p_lib.figures.plots import panels
+from p2p_lib.figures.scenes import Scene
+from p2p_lib.synthetic.render import render
+from p2p_lib.synthetic.shapes import Mesh, load_mesh
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: As near to the surface is on it; so much before it is something else that hides it.
+ON_M, BEFORE_M = 0.005, 0.01
+
+
+def surface_fit(
+    sequence: Recording,
+    run: Run,
+    meshes: Mapping[str, Mesh],
+    rows: Iterable[int],
+    T_obj_wrong: np.ndarray = se3.IDENTITY,
+) -> dict[str, Series]:
+    """Per object, at these rows with a pose: the fraction of its unhidden surface on which depth was measured.
+
+    meshes       object to its reconstructed surface (:func:`p2p_lib.figures.mesh_view.as_body`)
+    T_obj_wrong  (4, 4) by which all poses are put off on purpose, to see what a wrong pose would look like
+    """
+    found: dict[str, dict[int, float]] = {name: {} for name in meshes}
+    for row in rows:
+        frame = sequence.frame(int(next(iter(run.objects.values())).frame_index[row]))
+        for name, body in meshes.items():
+            obj = run.objects[name]
+            if obj.has_pose[row]:
+                T_obj_cam = se3.inverse(obj.T_cam_obj[row] @ T_obj_wrong)
+                drawn_m = render([(body, se3.IDENTITY)], sequence.camera, T_obj_cam).depth_m
+                behind_m = (frame.depth_m - drawn_m)[(drawn_m > 0) & (frame.depth_m > 0)]
+                unhidden_m = behind_m[behind_m > -BEFORE_M]
+                found[name][row] = (np.abs(unhidden_m) < ON_M).mean() if len(unhidden_m) else np.nan
+    return {name: Series(fits, dtype=float) for name, fits in found.items()}
+
+
+def errors_against(source: Recording, frames: Iterable[int], run: Run) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Object to its rotation (n,) in degrees and translation (n,) in mm off a truth that the run did not know.
+
+    frames  those of ``source`` that the run's were. The object frame is aligned at the first row with a pose; NaN where
+    there is no pose.
+    """
+    errors, frames = {}, np.array(list(frames))
+    for name, obj in run.objects.items():
+        T_cam_model = source.truth[name].T_cam_model[frames[obj.frame_index]]
+        first = int(np.argmax(obj.has_pose))
+        T_obj_model = se3.inverse(obj.T_cam_obj[first]) @ T_cam_model[first]
+        errors[name] = se3.error_deg_mm(obj.T_cam_obj @ T_obj_model, T_cam_model)
+    return errors
+
+
+def tight_box(mesh: trimesh.Trimesh) -> Box:
+    """The smallest box around a surface, along its own axes."""
+    T_box_obj, size_m = trimesh.bounds.oriented_bounds(mesh)
+    return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
+
+
+def edges_mm(mesh: trimesh.Trimesh, beyond: float = 0.005, rounds: int = 2) -> np.ndarray:
+    """(3,) edges of the box around a surface, longest first, without its fringes.
+
+    Twice, the outermost fraction ``beyond`` of the vertices is cut off at each side, along the box's axes.
+    """
+    p_obj = np.asarray(mesh.vertices)
+    for _ in range(rounds):
+        T_box_obj, _ = trimesh.bounds.oriented_bounds(p_obj)
+        p_box = se3.transform(se3.orthonormalised(T_box_obj), p_obj)
+        low, high = np.quantile(p_box, [beyond, 1 - beyond], axis=0)
+        p_obj = p_obj[((p_box >= low) & (p_box <= high)).all(1)]
+    return np.sort(1e3 * trimesh.bounds.oriented_bounds(p_obj)[1])[::-1]
+
+
+def true_edges_mm(sequence: Recording) -> dict[str, np.ndarray]:
+    """Per object with a model, (3,) edges of the box around it, longest first."""
+    meshes = {name: load_mesh(file) for name, file in find_models(sequence, MESHES).items()}
+    return {k: np.sort(1e3 * trimesh.bounds.oriented_bounds(m.vertices)[1])[::-1] for k, m in meshes.items()}
+
+
+def edges_table(edges: Mapping[str, np.ndarray], ruler: Mapping[str, np.ndarray]) -> DataFrame:
+    """A row per edge: the reconstructed surface's beside the ruler's."""
+    return DataFrame(
+        {"object": name, "edge": edge, "surface [mm]": round(float(found)), "ruler [mm]": round(float(true))}
+        for name in edges
+        for edge, found, true in zip(("longest", "middle", "shortest"), edges[name], ruler[name], strict=True)
+    )
+
+
+def findings_table(findings: Mapping[str, Sequence[Any]]) -> DataFrame:
+    """What ``p2p check`` says about folders: a row per finding (:mod:`p2p_lib.apps.check`) that is not fine."""
+    return DataFrame(
+        {
+            "what was done to the folder": label,
+            "where": f.name,
+            "says": str(f.level),
+            "found": f.text.replace("`", ""),
+            "what to do": f.fix.replace("`", ""),
+        }
+        for label, found in findings.items()
+        for f in found
+        if f.level != "ok"
+    )
+
+
+def story(playback: Playback, prompts: Sequence[Prompt], rows: Sequence[int], width_px: int = 430) -> np.ndarray:
+    """Clicks, poses and surfaces on one sheet: the clicked image, the run at some rows, each object reconstructed."""
+    boxes = {name: tight_box(mesh) for name, mesh in playback.meshes.items()}
+    scene = Scene(playback.sequence, playback.run, boxes=boxes, truth=False)
+    region_px = scene.region()
+    clicked = clicked_image(playback.sequence.frame(prompts[0].frame), prompts, playback.colours)
+    clicked, camera = overlay.zoomed(clicked, playback.sequence.camera, region_px, width_px)
+    images = [overlay.draw_caption(clicked, "clicks")]
+    images += [scene.draw(row, region_px, width_px, trail=60) for row in rows]
+    for name, mesh in playback.meshes.items():
+        images.append(overlay.draw_caption(mesh_portrait(mesh, camera.width, camera.height), f"{name}: surface"))
+    return overlay.montage(images, columns=3)
+
+
+def clicked_image(frame: Frame, prompts: Sequence[Prompt], colours: Mapping[str, str]) -> np.ndarray:
+    """An image with the clicks in it."""
+    image = frame.rgb
+    for prompt in prompts:
+        image = overlay.draw_points(image, prompt.points_px, colours[prompt.name], radius_px=7)
+        for radius_px in (15, 16, 17):
+            image = overlay.draw_points(image, prompt.points_px, colours[prompt.name], radius_px, filled=False)
+    return image
+
+
+def mesh_portrait(mesh: trimesh.Trimesh, width_px: int, height_px: int, turn_deg: float = 25.0) -> np.ndarray:
+    """A surface from slightly above, filling the image; ``turn_deg`` about the vertical, 0 as it was first seen."""
+    centre = Box.around(mesh.vertices).T_obj_box[:3, 3]
+    radius_m = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+    focal_px = 1.4 * min(height_px, width_px)
+    camera = Camera(focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, width_px, height_px)
+    tilt, turn = se3.exp(np.radians([[25, 0, 0, 0, 0, 0], [0, turn_deg, 0, 0, 0, 0]]))
+    away, centred = se3.from_rt(np.eye(3), [0, 0, 3.2 * radius_m]), se3.from_rt(np.eye(3), -centre)
+    return draw_mesh(mesh, camera, away @ tilt @ turn @ centred)
+
+
+def mesh_portraits(meshes: Mapping[str, trimesh.Trimesh], turns_deg: Sequence[float] = (-70, 0, 70, 180)) -> np.ndarray:
+    """Every surface from several sides, a row each."""
+    sides = [
+        overlay.draw_caption(mesh_portrait(mesh, 300, 260, turn), f"{name}, {turn:+g} deg")
+        for name, mesh in meshes.items()
+        for turn in turns_deg
+    ]
+    return overlay.montage(sides, columns=len(turns_deg))
+
+
+def mask_image(frame: Frame, mask: np.ndarray, title: str, width_px: int = 430) -> np.ndarray:
+    """A mask around its object: its rim on the object is blue, on the background vermillion."""
+    on_rim, behind = rim(mask, frame.depth_m)
+    image = overlay.draw_mask(frame.rgb, mask, style.NEUTRAL[1], width_px=1, fill=0.15)
+    for pixels, colour in ((on_rim & ~behind, style.OBJECTS[0]), (on_rim & behind, style.STATUS[Status.LOST][0])):
+        image[cv2.dilate(pixels.astype(np.uint8), np.ones((2, 2))) > 0] = style.rgb(colour)
+    camera = Camera(1, 1, 0, 0, mask.shape[1], mask.shape[0])
+    image, _ = overlay.zoomed(image, camera, overlay.region_around(mask, camera, (30, 30)), width_px)
+    share = background_share(mask, frame.depth_m)
+    return overlay.draw_caption(image, f"{title}: {100 * share:.0f} % of the rim on the background")
+
+
+def masks_image(frame: Frame, masks: Mapping[str, np.ndarray], width_px: int = 420) -> np.ndarray:
+    """Several masks of one object side by side, by their titles (see :func:`mask_image`)."""
+    images = [mask_image(frame, mask, title, width_px) for title, mask in masks.items()]
+    height_px = min(image.shape[0] for image in images)
+    return overlay.montage([image[:height_px] for image in images], columns=len(images))
+
+
+def widened(mask: np.ndarray, by_px: int) -> np.ndarray:
+    """A mask (H, W) bool drawn too wide."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by_px + 1,) * 2, np.uint8)) > 0
+
+
+@style.styled
+def fit_plot(playback: Playback, fits: Mapping[str, Mapping[str, Series]]) -> Figure:
+    """The fraction of each surface on which depth was measured, over time; the confidence below.
+
+    fits  label to the objects' fits (:func:`surface_fit`); the first is drawn full, the others dashed
+    """
+    figure, axes = panels(2, (8.0, 4.2), [2, 1])
+    for k, (label, objects) in enumerate(fits.items()):
+        line = {"linestyle": (0, (3 + k, 2)) if k else "-", "marker": "."}
+        for name, fit in objects.items():
+            times_s, colour = playback.times_s[fit.index], playback.colours[name]
+            axes[0].plot(times_s, 100 * fit, color=colour, label=f"{name}, {label}", **line)
+    for name, obj in playback.run.objects.items():
+        axes[1].plot(playback.times_s, np.where(obj.has_pose, obj.confidence, np.nan), color=playback.colours[name])
+    axes[0].set(ylabel="depth on the surface [%]", ylim=(0, 102))
+    axes[0].legend(loc="lower left", ncols=len(fits))
+    axes[0].set_title(f"Does the surface lie where depth was measured? {playback.run.info['sequence']}")
+    axes[1].set(ylabel="confidence", ylim=(0, 1.05), xlabel="time [s]")
+    return figure

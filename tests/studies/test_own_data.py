@@ -1,0 +1,127 @@
+"""Clicks where they are, rims in the right colour, meshes that fill their image; the surface against measured depth."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+
+from p2p_lib.apps.check import Finding, Level
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.types import Frame, Status
+from p2p_lib.datasets.prompts import Prompt, prompts_in
+from p2p_lib.figures import style
+from p2p_lib.studies import own_data
+from p2p_lib.studies.own_data import errors_against, surface_fit
+from p2p_lib.studies.turntable import carton
+from p2p_lib.synthetic.render import render
+
+V, U = np.mgrid[:120, :160]
+DISC = np.hypot(U - 80, V - 60) <= 30
+FRAME = Frame(0, 0.0, np.full((120, 160, 3), 128, np.uint8), np.where(DISC, 0.6, 1.0).astype(np.float32))
+
+
+def has(image, colour, at_least=1):
+    return (image == style.rgb(colour)).all(-1).sum() >= at_least
+
+
+def test_clicks_are_drawn_where_they_are():
+    image = own_data.clicked_image(FRAME, [Prompt("mug", 0, [[40, 50]])], {"mug": style.OBJECTS[0]})
+    v, u = np.nonzero((image == style.rgb(style.OBJECTS[0])).all(-1))
+    assert abs(u.mean() - 40) < 0.5 and abs(v.mean() - 50) < 0.5
+
+
+def test_a_rim_on_the_background_is_vermillion():
+    lost = style.STATUS[Status.LOST][0]
+    good, bad = (
+        own_data.mask_image(FRAME, DISC, "good"),
+        own_data.mask_image(FRAME, own_data.widened(DISC, 8), "bad"),
+    )
+    near = [np.abs(image.astype(int) - style.rgb(lost)).sum(-1).min() for image in (good, bad)]
+    assert near[0] > 60 > near[1]
+    sheet = own_data.masks_image(FRAME, {"a": DISC, "b": own_data.widened(DISC, 8)}, width_px=200)
+    assert sheet.shape[1] == 404
+
+
+def test_a_click_is_where_one_would_click():
+    (prompt,) = prompts_in({"disc": DISC, "hidden": np.zeros_like(DISC)}, frame=3)
+    assert prompt.name == "disc" and prompt.frame == 3
+    assert np.hypot(*(prompt.points_px[0] - [80, 60])) < 2
+
+
+def test_portraits_show_the_surface_from_its_sides():
+    body = trimesh.creation.box((0.05, 0.2, 0.1))
+    front = np.array([200, 30, 30, 255], np.uint8)
+    body.visual.vertex_colors = np.tile(front, (len(body.vertices), 1))
+    portrait = own_data.mesh_portrait(body, 200, 150)
+    covered = (portrait < 250).any(-1)
+    assert 0.05 < covered.mean() < 0.7 and not covered[[0, -1]].any() and not covered[:, [0, -1]].any()
+    assert own_data.mesh_portraits({"a": body, "b": body}, (0, 90)).shape[:2] == (524, 604)
+    np.testing.assert_allclose(np.sort(own_data.tight_box(body).size_m), [0.05, 0.1, 0.2], atol=1e-6)
+
+
+def test_the_table_of_findings_holds_what_is_not_fine():
+    findings = [Finding("files", Level.OK, "all"), Finding("camera", Level.WRONG, "K is off", "Take another.")]
+    table = own_data.findings_table({"K of another": findings, "fine": findings[:1]})
+    assert table.to_numpy().tolist() == [["K of another", "camera", "WRONG", "K is off", "Take another."]]
+
+
+CAMERA = Camera(300, 300, 159.5, 119.5, 320, 240)
+N = 4
+
+
+class Estimates(SimpleNamespace):
+    def __len__(self):
+        return N
+
+
+@pytest.fixture(scope="module")
+def made():
+    """A carton that moves before a wall; in the last frame a board hides its left half, in the second it is lost."""
+    body = carton(0).mesh
+    T = se3.exp(np.c_[np.linspace(0, 0.4, N), np.zeros(N), np.full(N, 0.5), np.zeros((N, 3))])
+    T[:, :3, 3] = np.c_[np.linspace(-0.05, 0.05, N), np.zeros(N), np.full(N, 0.6)]
+    frames = []
+    for k in range(N):
+        depth = render([(body, se3.IDENTITY)], CAMERA, se3.inverse(T[k])).depth_m
+        depth = np.where(depth > 0, depth, 1.5).astype(np.float32)
+        if k == N - 1:
+            depth[:, : int(CAMERA.project(T[k, :3, 3])[0])] = 0.3
+        frames.append(Frame(k, k / 30, np.zeros((240, 320, 3), np.uint8), depth))
+    T_cam_obj = T.copy()
+    T_cam_obj[1] = np.nan
+    has = np.arange(N) != 1
+    obj = Estimates(T_cam_obj=T_cam_obj, has_pose=has, frame_index=np.arange(N))
+    sequence = SimpleNamespace(camera=CAMERA, frame=frames.__getitem__, truth={"box": SimpleNamespace(T_cam_model=T)})
+    return sequence, SimpleNamespace(objects={"box": obj}), {"box": body}
+
+
+def test_at_the_true_pose_all_of_it_is_on_the_surface(made):
+    sequence, run, bodies = made
+    fit = surface_fit(sequence, run, bodies, range(N))["box"]
+    assert fit.index.tolist() == [0, 2, 3], "no pose, no say"
+    assert (fit > 0.99).all(), "what hides it says nothing"
+
+
+def test_a_wrong_pose_shows_and_the_more_the_farther(made):
+    sequence, run, bodies = made
+    shares = [
+        surface_fit(sequence, run, bodies, [0], se3.exp(np.radians([0, deg, 0, 0, 0, 0])))["box"][0]
+        for deg in (0, 5, 10, 20)
+    ]
+    assert (np.diff(shares) < -0.05).all()
+
+
+def test_errors_against_a_truth_that_was_not_known(made):
+    sequence, run, _ = made
+    T_obj_model, T = se3.exp(np.array([0.1, 0.2, 0, 0.01, 0, 0])), run.objects["box"].T_cam_obj
+    drift = np.repeat(np.eye(4)[None], N, 0)
+    drift[3] = se3.exp(np.radians([0, 4.0, 0, 0, 0, 0]))
+    drift[2, 0, 3] = 0.007
+    off = Estimates(has_pose=run.objects["box"].has_pose, frame_index=np.arange(N))
+    off.T_cam_obj = T @ drift @ se3.inverse(T_obj_model)
+    deg, mm = errors_against(sequence, range(N), SimpleNamespace(objects={"box": off}))["box"]
+    np.testing.assert_allclose(deg[[0, 2, 3]], [0, 0, 4], atol=1e-6)
+    np.testing.assert_allclose(mm[[0, 2, 3]], [0, 7, 0], atol=1e-6)
+    assert np.isnan(deg[1]) and np.isnan(mm[1])
