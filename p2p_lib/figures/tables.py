@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import html
-import string
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.core.tables import as_html, as_markdown
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import recovery_events
