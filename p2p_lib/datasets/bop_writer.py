@@ -6,11 +6,11 @@ import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
+from p2p_lib.datasets.images import save_png
 from p2p_lib.datasets.models import load_mesh, load_points
 from p2p_lib.datasets.sequence import Sequence
 
@@ -31,28 +31,27 @@ def write_scene(
     outlines        whole outlines, for ``mask/`` and the counts over them; without it those are left out
     depth_scale_mm  millimetres per unit of the depth written
 
-    An object is listed in the pictures in which it has truth. Returns the numbers used.
+    An object is listed in the images in which it has truth. Returns the numbers used.
     """
     folder = Path(folder)
     obj_ids = dict(obj_ids or {name: k for k, name in enumerate(sequence.objects, 1)})
-    for sub in ("rgb", "depth", "mask_visib", *(["mask"] if outlines else [])):
-        (folder / sub).mkdir(parents=True, exist_ok=True)
+    (folder / "mask_visib").mkdir(parents=True, exist_ok=True)
     camera = {"cam_K": sequence.camera.K.ravel().tolist(), "depth_scale": depth_scale_mm}
     truth = {name: sequence.truth[name].T_cam_model for name in obj_ids if name in sequence.truth}
     gt, info = {}, {}
     for i in range(len(sequence)):
         frame, masks = sequence.frame(i), sequence.masks(i) or {}
         listed = [name for name in truth if np.isfinite(truth[name][i]).all()]
-        _write_pictures(folder, i, frame, depth_scale_mm)
+        _write_images(folder, i, frame, depth_scale_mm)
         gt[str(i)] = [_pose(obj_ids[name], truth[name][i]) for name in listed]
         whole = outlines(i) if outlines else {}
         info[str(i)] = []
         for index, name in enumerate(listed):
             file = f"{i:06d}_{index:06d}.png"
             visible = masks.get(name, np.zeros(frame.shape, bool))
-            _save(folder / "mask_visib" / file, visible.astype(np.uint8) * 255)
+            save_png(folder / "mask_visib" / file, visible.astype(np.uint8) * 255)
             if outlines:
-                _save(folder / "mask" / file, whole[name].astype(np.uint8) * 255)
+                save_png(folder / "mask" / file, whole[name].astype(np.uint8) * 255)
             info[str(i)].append(_info(visible, whole.get(name), frame.depth_m > 0))
     cameras = {str(i): camera for i in range(len(sequence))}
     for name, scene in (("scene_camera", cameras), ("scene_gt", gt), ("scene_gt_info", info)):
@@ -89,15 +88,15 @@ def write_models(folder: str | Path, models: Mapping[int, str | Path]) -> None:
     (folder / "models_info.json").write_text(json.dumps(info, indent=1) + "\n")
 
 
-def _write_pictures(folder: Path, i: int, frame: Frame, depth_scale_mm: float) -> None:
+def _write_images(folder: Path, i: int, frame: Frame, depth_scale_mm: float) -> None:
     raw = np.rint(frame.depth_m.astype(float) * 1000 / depth_scale_mm)
     if raw.max(initial=0) > 65535:
         got = f"{frame.depth_m.max():.2f} m"
         raise BadInput(
             f"frame {i} depth", got, f"at most {65.535 * depth_scale_mm:.2f} m", "Take a larger depth_scale_mm."
         )
-    _save(folder / "rgb" / f"{i:06d}.png", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
-    _save(folder / "depth" / f"{i:06d}.png", raw.astype(np.uint16))
+    save_png(folder / "rgb" / f"{i:06d}.png", frame.rgb)
+    save_png(folder / "depth" / f"{i:06d}.png", raw.astype(np.uint16))
 
 
 def _pose(obj_id: int, T_cam_model: np.ndarray) -> dict:
@@ -118,8 +117,3 @@ def _box(mask: np.ndarray) -> list[int]:
     """x, y, width, height around a mask; -1 where it is empty, as BOP writes it."""
     v, u = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     return [int(u[0]), int(v[0]), int(u[-1] - u[0] + 1), int(v[-1] - v[0] + 1)] if len(v) else [-1, -1, -1, -1]
-
-
-def _save(path: Path, picture: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), picture):
-        raise OSError(f"{path} could not be written")

@@ -134,7 +134,7 @@ def _write_record(folder: Path, of: Manifest, record: dict) -> None:
 def verify(of: Manifest, every_frame: bool = False) -> Iterator[Check]:
     """Look at what is on disk: files against checksums, unpacked files, every sequence opened and its truth read.
 
-    every_frame  read all pictures of every sequence, else the first and the last
+    every_frame  read all images of every sequence, else the first and the last
     """
     folder = folder_of(of)
     if not folder.is_dir():

@@ -1,7 +1,7 @@
 """RealSense cameras, and their recordings (.bag; .db3 of newer software), through pyrealsense2.
 
 Depth is registered to the colour camera by the library itself. A recording becomes a folder of one's own, every pair
-of pictures kept however long it takes; a camera, or a recording in its stead, is read at its own pace.
+of images kept however long it takes; a camera, or a recording in its stead, is read at its own pace.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from p2p_lib.core.types import Frame
 WAIT_MS = 200
 #: A camera that sends nothing for so long has gone.
 GONE_MS = 5000
-#: Pictures taken further apart are no pair.
+#: Images taken further apart are no pair.
 APART_MS = 25
-#: Pictures that a camera's exposure takes to settle, and what is asked of it: all RealSense depth cameras can.
+#: Images that a camera's exposure takes to settle, and what is asked of it: all RealSense depth cameras can.
 WARM_UP, WIDTH, HEIGHT, RATE_HZ = 30, 640, 480, 30
 # Distortion that moves no pixel further than this is left as it is: a D435's colour camera has none at all.
 MOST_DISTORTION_PX = 0.5
@@ -41,7 +41,7 @@ TO_BGR = {
 def convert_bag(bag: str | Path, out: str | Path, progress: bool = True) -> int:
     """Write ``rgb/``, ``depth/``, ``cam_K.txt``, ``depth_scale.txt`` and ``times.txt``; returns the number of frames.
 
-    Times are the colour pictures', in seconds from the first. ``masks/`` are for the user to add.
+    Times are the colour images', in seconds from the first. ``masks/`` are for the user to add.
 
     Raises :class:`MissingBackend` without pyrealsense2, :class:`MissingData` and :class:`BadInput` where the recording
     is none, has no depth or no colour, or a lens distortion that cannot be ignored.
@@ -51,7 +51,7 @@ def convert_bag(bag: str | Path, out: str | Path, progress: bool = True) -> int:
         raise MissingData(str(bag), "no such recording", "Give a .bag of the RealSense Viewer or of rs-record.")
     rs = _library()
     if out.is_dir() and any(out.iterdir()):
-        raise BadInput(str(out), "a folder that is not empty", "a new one for the pictures")
+        raise BadInput(str(out), "a folder that is not empty", "a new one for the images")
     times_s: list[float] = []
     with progress_bar(bag.name, shown=progress) as bar:
         for colour, depth in _pairs(rs, bag):
@@ -64,7 +64,7 @@ def convert_bag(bag: str | Path, out: str | Path, progress: bool = True) -> int:
             times_s.append(colour.get_timestamp() / 1000)
             bar.update()
     if not times_s:
-        raise BadInput(str(bag), "no pair of a colour and a depth picture", "a recording of both cameras")
+        raise BadInput(str(bag), "no pair of a colour and a depth image", "a recording of both cameras")
     (out / "times.txt").write_text("".join(f"{t - times_s[0]:.6f}\n" for t in times_s))
     return len(times_s)
 
@@ -88,7 +88,7 @@ class RealSenseCamera:
             self._pair()
         self._first = self._pair()
         if self._first is None:
-            raise BadInput(self.name, "no pair of a colour and a depth picture", "both cameras")
+            raise BadInput(self.name, "no pair of a colour and a depth image", "both cameras")
         colour = self._first[0]
         self._number, self._start_ms = colour.get_frame_number(), colour.get_timestamp()
         lens = _pinhole(self._rs, self.name, colour)
@@ -96,7 +96,7 @@ class RealSenseCamera:
         self.camera = Camera.from_K(K, lens.width, lens.height, name=self.name)
 
     def read(self) -> Frame | None:
-        """The next pair of pictures, depth registered to colour."""
+        """The next pair of images, depth registered to colour."""
         pair, self._first = self._first or self._pair(), None
         if pair is None:
             return None
@@ -128,7 +128,7 @@ class RealSenseCamera:
             raise MissingData(self.name, f"no camera of colour and depth answers ({said})", fix) from None
 
     def _pair(self) -> tuple[Any, Any] | None:
-        """The next colour picture with its depth; None at a recording's end, or once closed."""
+        """The next colour image with its depth; None at a recording's end, or once closed."""
         waited_ms = 0
         while True:
             with self._waiting:
@@ -144,11 +144,11 @@ class RealSenseCamera:
                 return None
             waited_ms = 0 if came else waited_ms + WAIT_MS
             if waited_ms >= GONE_MS:
-                raise MissingData(self.name, f"no picture for {GONE_MS / 1000:g} s", "Is the cable still in?")
+                raise MissingData(self.name, f"no image for {GONE_MS / 1000:g} s", "Is the cable still in?")
 
 
 def _together(colour: Any, depth: Any) -> bool:
-    """Whether two pictures are of one moment: when we are late, the library may pair colour with older depth."""
+    """Whether two images are of one moment: when we are late, the library may pair colour with older depth."""
     apart_ms = abs(colour.get_timestamp() - depth.get_timestamp())
     return colour.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain() or apart_ms <= APART_MS
 
@@ -163,7 +163,7 @@ def _library() -> Any:
 
 
 def _pairs(rs: Any, bag: Path) -> Iterator[tuple[Any, Any]]:
-    """Colour and depth registered to it; each colour picture once."""
+    """Colour and depth registered to it; each colour image once."""
     pipeline = rs.pipeline()
     recording = _start(rs, pipeline, bag)
     align, last = rs.align(rs.stream.color), None
@@ -185,7 +185,7 @@ def _pairs(rs: Any, bag: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _start(rs: Any, pipeline: Any, bag: Path) -> Any:
-    """Play a recording from its first picture on, waiting for us; the playback."""
+    """Play a recording from its first image on, waiting for us; the playback."""
     config = rs.config()
     try:
         config.enable_device_from_file(str(bag), repeat_playback=False)
@@ -193,7 +193,7 @@ def _start(rs: Any, pipeline: Any, bag: Path) -> Any:
     except RuntimeError as error:
         raise BadInput(str(bag), f"an unreadable recording ({' '.join(str(error).split())[:120]})", "a .bag") from None
     recording = profile.get_device().as_playback()
-    # It can be told to wait only once it runs, and has dropped pictures by then: so back to the start.
+    # It can be told to wait only once it runs, and has dropped images by then: so back to the start.
     recording.pause()
     recording.set_real_time(False)
     while pipeline.try_wait_for_frames(WAIT_MS)[0]:
@@ -214,7 +214,7 @@ def _pinhole(rs: Any, name: str, colour: Any) -> Any:
     moved = max(_distortion_px(rs, lens, u, v) for u in (0, lens.width - 1) for v in (0, lens.height - 1))
     if moved > MOST_DISTORTION_PX:
         got = f"a colour camera whose lens moves the corners by {moved:.1f} px"
-        raise BadInput(name, got, f"at most {MOST_DISTORTION_PX} px", "Undistort the pictures first.")
+        raise BadInput(name, got, f"at most {MOST_DISTORTION_PX} px", "Undistort the images first.")
     return lens
 
 
@@ -243,6 +243,6 @@ def _bgr(name: str, colour: Any) -> np.ndarray:
     return cv2.cvtColor(image, TO_BGR[kind])
 
 
-def _save(path: Path, picture: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), picture):
+def _save(path: Path, image: np.ndarray) -> None:
+    if not cv2.imwrite(str(path), image):
         raise OSError(f"{path} could not be written")

@@ -104,13 +104,13 @@ def test_without_truth_and_masks(scene):
     [
         ("scene_camera", "{", r"scene_camera\.json: got unreadable"),
         ("scene_camera", "[1]", r"scene_camera\.json: got unreadable"),
-        ("scene_camera", '{"1": {"cam_K": [1], "depth_scale": 1}}', r"scene_camera\.json: got no 36 for a picture"),
-        ("scene_gt", '{"1": [{"cam_R_m2c": [1]}]}', r"scene_gt\.json: got picture 1: no obj_id at 0"),
-        ("scene_gt", '{"1": [{"obj_id": 1}]}', r"scene_gt\.json: picture 1, obj_000001: got unreadable"),
+        ("scene_camera", '{"1": {"cam_K": [1], "depth_scale": 1}}', r"scene_camera\.json: got no 36 for an image"),
+        ("scene_gt", '{"1": [{"cam_R_m2c": [1]}]}', r"scene_gt\.json: got image 1: no obj_id at 0"),
+        ("scene_gt", '{"1": [{"obj_id": 1}]}', r"scene_gt\.json: image 1, obj_000001: got unreadable"),
         (
             "scene_gt",
             json.dumps({"1": [{"obj_id": 1, "cam_R_m2c": [2] * 9, "cam_t_m2c": [0, 0, 1]}]}),
-            r"picture 1, obj_000001: got a matrix that is not a rotation",
+            r"image 1, obj_000001: got a matrix that is not a rotation",
         ),
     ],
 )
