@@ -300,6 +300,13 @@ def _data_convert_bag(a: argparse.Namespace) -> None:
     print(f"{count} frames in {a.out}. Next: put the masks into {a.out}/masks, then p2p run {a.out} --out DIR")
 
 
+def _data_record_truth(a: argparse.Namespace) -> None:
+    from p2p_lib.datasets.recording import record_truth
+
+    found = record_truth(a.folder, a.object, a.camera, a.mocap, a.model)
+    print(f"clocks {found.offset_s:.4f} s apart, known to {found.std_s * 1000:.1f} ms. Truth in {a.folder}")
+
+
 def _doctor(a: argparse.Namespace) -> int:
     from p2p_lib.apps.doctor import format_checks, run_doctor
 
@@ -494,6 +501,13 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("recording", type=Path, metavar="FILE", help="a .bag (or .db3)")
     p.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
     p.add_argument("--quiet", action="store_true", help="no progress bar")
+    p = _command(data, "record-truth", _data_record_truth, "add truth by motion capture to a folder of one's own")
+    p.add_argument("folder", type=Path, metavar="FOLDER", help="rgb/ depth/ cam_K.txt times.txt, and masks/ if any")
+    p.add_argument("--object", required=True, metavar="NAME", help="the object's name, as of its masks")
+    log = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
+    p.add_argument("--mocap", type=Path, required=True, metavar="LOG", help=f"its marker body in the world: {log}")
+    p.add_argument("--camera", type=Path, required=True, metavar="LOG", help="the model in the camera, at image times")
+    p.add_argument("--model", type=Path, metavar="FILE", help="its model, which says when it is in the image")
     p = _command(data, "where", _data_where, "print the folder of a dataset, checkpoint or sequence")
     p.add_argument("dataset", metavar="NAME")
 

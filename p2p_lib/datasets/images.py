@@ -82,10 +82,10 @@ def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
 
 
 def read_numbers(path: Path, expected: str) -> np.ndarray:
-    """(rows, columns) float64 of a text file of numbers; ``expected`` says what the file should hold."""
+    """(rows, columns) float64 of a text file of numbers between spaces or commas; ``expected`` says what they are."""
     text = _read(path, expected).decode("utf-8", "replace")
     try:
-        return np.loadtxt(StringIO(text), ndmin=2) if text.strip() else np.empty(0)
+        return np.loadtxt(StringIO(text.replace(",", " ")), ndmin=2) if text.strip() else np.empty(0)
     except ValueError as error:
         reason = str(error).partition(";")[0].removesuffix(".")
         raise BadInput(str(path), f"unreadable numbers ({reason})", expected) from None
