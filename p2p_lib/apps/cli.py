@@ -84,6 +84,7 @@ def _command(name: str, help: str, *arguments: Argument) -> Callable:
 _SEQUENCE = _arg("sequence", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA")
 _RUN = _arg("run", type=Path, metavar="DIR", help="folder written by p2p run")
 _DATASET = _arg("dataset", metavar="NAME")
+_POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
 _JSON = _arg("--json", action="store_true", help="JSON instead of a table")
 _QUIET = _arg("--quiet", action="store_true", help="no progress bar")
 _NO_BROWSER = _arg("--no-browser", action="store_true", help="only say where the page is")
@@ -359,8 +360,8 @@ def _click(a: argparse.Namespace) -> None:
     _JSON,
 )
 def _check(a: argparse.Namespace) -> int:
+    from p2p_lib.apps.check import Level, as_lines, check_folder
     from p2p_lib.datasets.prompts import load_prompts
-    from p2p_lib.studies.own_data import Level, as_lines, check_folder
 
     prompts = load_prompts(a.prompts) if a.prompts else ()
     findings = check_folder(a.sequence, prompts=prompts, format=a.format, depth_scale=a.depth_scale)
@@ -450,6 +451,22 @@ def _data_convert_bag(a: argparse.Namespace) -> None:
 
     count = convert_bag(a.recording, a.out, not a.quiet)
     print(f"{count} frames in {a.out}. Next: put the masks into {a.out}/masks, then p2p run {a.out} --out DIR")
+
+
+@_command(
+    "data record-truth",
+    "add truth by motion capture to a folder of one's own",
+    _arg("folder", type=Path, metavar="FOLDER", help="rgb/ depth/ cam_K.txt times.txt, and masks/ if any"),
+    _arg("--object", required=True, metavar="NAME", help="the object's name, as of its masks"),
+    _arg("--mocap", type=Path, required=True, metavar="LOG", help=f"its marker body in the world: {_POSE_LOG}"),
+    _arg("--camera", type=Path, required=True, metavar="LOG", help="the model in the camera, at image times"),
+    _arg("--model", type=Path, metavar="FILE", help="its model, which says when it is in the image"),
+)
+def _data_record_truth(a: argparse.Namespace) -> None:
+    from p2p_lib.datasets.recording import record_truth
+
+    found = record_truth(a.folder, a.object, a.camera, a.mocap, a.model)
+    print(f"clocks {found.offset_s:.4f} s apart, known to {found.std_s * 1000:.1f} ms. Truth in {a.folder}")
 
 
 @_command("data where", "print the folder of a dataset, checkpoint or sequence", _DATASET)
