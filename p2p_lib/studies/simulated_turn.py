@@ -13,8 +13,8 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig
+from p2p_lib.core.robust import fit_rigid
 from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
-from p2p_lib.method.registration import fit_rigid
 
 _FEWEST = 4  # points that the front end registers with; with fewer it keeps the last motion
 
