@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.raster import in_picture
+from p2p_lib.core.image import in_image
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.trackers.ids import PointIds
 
@@ -76,7 +76,7 @@ class RolloutTracker:
             live = np.isin(ids, tracks.ids)
             rows = np.searchsorted(tracks.ids, ids[live])
             tracks.uv_px[rows], tracks.uncertainty[rows] = uv[live], np.clip(uncertainty[live], 0, 1)
-            tracks.visible[rows] = visible[live] & in_picture(uv[live], frame.shape)
+            tracks.visible[rows] = visible[live] & in_image(uv[live], frame.shape, -0.5)
         self._visible = tracks.visible.copy()
         return tracks
 
