@@ -10,7 +10,8 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import DepthConfig
-from p2p_lib.core.depth import lift
+from p2p_lib.core.depth import depth_noise_m, in_range, lift, off_edges
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame, Tracks
 
 #: Depth this near the mask's border mixes the object with what is behind it.
@@ -75,12 +76,15 @@ class Observer:
 
     def lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
         """(N, 3) points behind pixels (N, 2); NaN where there is no trustworthy depth."""
-        return lift(frame, uv_px, self.camera, (self.config.min_m, self.config.max_m), self.config.edge_m)
+        return lift(frame, uv_px, self.camera, self.config)
+
+    def noise_m(self, p_cam: np.ndarray) -> np.ndarray:
+        """(N,) standard deviation of measured points (N, 3)."""
+        return depth_noise_m(p_cam[:, 2], self.config)
 
     def measured(self, observation: Observation) -> np.ndarray:
         """(H, W) bool: pixels of the mask with a depth within range."""
-        depth_m = observation.frame.depth_m
-        return observation.mask & (depth_m >= self.config.min_m) & (depth_m <= self.config.max_m)
+        return observation.mask & in_range(observation.frame.depth_m, self.config)
 
     def expected_px(
         self, observation: Observation, T_cam_obj: np.ndarray, p_obj: np.ndarray, off_m: float
@@ -115,18 +119,9 @@ def sample_cloud(depth_m: np.ndarray, mask: np.ndarray, camera: Camera, max_poin
     kernel = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
     inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-    around = np.ones((3, 3), np.uint8)
-    low, high = cv2.erode(depth, around), cv2.dilate(depth, around)
-    v, u = np.nonzero((inside > 0) & (low > 0) & (high - low <= _CLOUD_EDGE_M))
+    v, u = np.nonzero((inside > 0) & off_edges(depth, _CLOUD_EDGE_M))
     # A lattice of pixels, then an even thinning of what is left over.
     stride = max(1, int(np.sqrt(len(u) / max_points)))
     on = np.flatnonzero((u % stride == 0) & (v % stride == 0))
     on = on[np.linspace(0, len(on) - 1, min(len(on), max_points)).astype(int)]
     return camera.unproject(np.stack([u[on] + left, v[on] + top], -1), depth[v[on], u[on]].astype(float))
-
-
-def in_mask(uv_px: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(N,) bool: pixels (N, 2) in a mask (H, W); those that are not finite are not."""
-    known = np.isfinite(uv_px).all(1)
-    px = np.clip(np.rint(np.where(known[:, None], uv_px, 0)).astype(int), 0, np.array(mask.shape[::-1]) - 1)
-    return known & mask[px[:, 1], px[:, 0]]

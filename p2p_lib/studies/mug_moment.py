@@ -17,10 +17,11 @@ from p2p_lib.core import se3
 from p2p_lib.core.backends import make_detector, make_tracker
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config
-from p2p_lib.core.depth import lift
+from p2p_lib.core.depth import depth_noise_m, lift
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame
 from p2p_lib.method.refinement import Keypoints, refine, sample_cloud, surface_distances
-from p2p_lib.method.registration import Hypothesis, competing, generate, noise_m, select
+from p2p_lib.method.registration import Hypothesis, competing, generate, select
 from p2p_lib.method.sampling import choose, usable_region
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.synthetic.ablations import mug
@@ -93,18 +94,17 @@ def mug_moment(
         frame, mask = shots[t]
         surface.integrate(frame.depth_m, frame.rgb, mask, scenario.camera, poses[t])
     first, first_mask = shots[sampled]
-    region = usable_region(first, first_mask, config.sampling)
+    region = usable_region(first, first_mask, config.sampling, config.depth.edge_m)
     found = make_detector("corners", config.sampling, rng).detect(first, region)
     uv_before = found.uv_px[choose(found, np.zeros((0, 2)), points, config.sampling)]
     uv = _tracked([shots[t][0] for t in range(sampled, now + 1)], uv_before, config, rng)
     frame, mask = shots[now]
-    uv[~_inside(uv, mask)] = np.nan
-    range_m = config.pipeline.depth_min_m, config.pipeline.depth_max_m
-    p_first = lift(first, uv_before, scenario.camera, range_m, config.sampling.depth_edge_m)
-    p_cam = lift(frame, uv, scenario.camera, range_m, config.sampling.depth_edge_m)
+    uv[~in_mask(uv, mask)] = np.nan
+    p_first = lift(first, uv_before, scenario.camera, config.depth)
+    p_cam = lift(frame, uv, scenario.camera, config.depth)
     p_obj = se3.transform(se3.inverse(poses[sampled]), p_first)
     off_m = np.linalg.norm(se3.transform(poses[now], p_obj) - p_cam, axis=1)
-    right = off_m < 3 * noise_m(p_cam, config.registration)
+    right = off_m < 3 * depth_noise_m(p_cam[:, 2], config.depth)
     cloud = sample_cloud(frame.depth_m, mask, scenario.camera, config.refinement.max_points)
     mesh = scenario.bodies[0].mesh
     truth = poses[now], poses[sampled], mesh.vertices, mesh.faces
@@ -160,7 +160,7 @@ def decide(moment: Moment, config: Config, seed: int = 0) -> Decisions:
 def _refined(moment: Moment, hypothesis: Hypothesis, config: Config) -> np.ndarray:
     """The hypothesis after SDF refinement with its own inliers."""
     at = hypothesis.inliers
-    keypoints = Keypoints(moment.p_obj[at], moment.p_cam[at], noise_m(moment.p_cam[at], config.registration))
+    keypoints = Keypoints(moment.p_obj[at], moment.p_cam[at], depth_noise_m(moment.p_cam[at, 2], config.depth))
     found = refine(hypothesis.T_cam_obj, moment.cloud, moment.surface, config.refinement, keypoints=keypoints)
     return found.T_cam_obj
 
@@ -211,10 +211,3 @@ def _tracked(frames: list[Frame], uv_px: np.ndarray, config: Config, rng: np.ran
         tracks = tracker.track(frame)
     tracks = tracks.select(ids)
     return np.where(tracks.visible[:, None], tracks.uv_px, np.nan)
-
-
-def _inside(uv_px: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(N,) bool: on the mask."""
-    known = np.isfinite(uv_px).all(1)
-    u, v = np.clip(np.rint(np.where(known[:, None], uv_px, 0)), 0, np.array(mask.shape[::-1]) - 1).astype(int).T
-    return known & mask[v, u]

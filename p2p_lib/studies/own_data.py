@@ -267,10 +267,10 @@ def _distance_m(frame: Frame, mask: np.ndarray) -> float:
 
 def _all_beyond(firsts: dict[str, tuple[Frame, np.ndarray]], config: Config) -> Finding | None:
     """The one finding of objects that are all too far away, or all too near: most likely depth is in another unit."""
-    pipe, away_m = config.pipeline, {name: _distance_m(*first) for name, first in firsts.items()}
+    limits, away_m = config.depth, {name: _distance_m(*first) for name, first in firsts.items()}
     distances = np.array(list(away_m.values()))
-    far = bool((distances > pipe.depth_max_m).all())
-    if not far and not (distances < pipe.depth_min_m).all():
+    far = bool((distances > limits.max_m).all())
+    if not far and not (distances < limits.min_m).all():
         return None
     (first, (frame, mask)), *others = firsts.items()
     text = f"{away_m[first]:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
@@ -280,17 +280,17 @@ def _all_beyond(firsts: dict[str, tuple[Frame, np.ndarray]], config: Config) -> 
 
 def _beyond(text: str, distances: np.ndarray, config: Config) -> tuple[str, str]:
     """What is said of distances on one side of those that count, and what to do: the unit first, then the limit."""
-    pipe, far = config.pipeline, bool(distances.max() > config.pipeline.depth_max_m)
+    limits, far = config.depth, bool(distances.max() > config.depth.max_m)
     factor = _factor(float(np.median(distances)))
     guess = f": {factor:g} times the present one would make it {distances[0] * factor:.2f} m" if factor else ""
-    wider = f"depth_max_m={2 * distances.max():.1f}" if far else f"depth_min_m={distances.min() / 2:.2g}"
-    fix = f"If it was not, the depth scale is wrong (--depth-scale{guess}); if it was, --set pipeline.{wider}."
-    return f"{text}, but {pipe.depth_min_m:g} to {pipe.depth_max_m:g} m count", fix
+    wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
+    fix = f"If it was not, the depth scale is wrong (--depth-scale{guess}); if it was, --set depth.{wider}."
+    return f"{text}, but {limits.min_m:g} to {limits.max_m:g} m count", fix
 
 
 def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """Whether an object is where depth counts, and measured."""
-    pipe, depth_m = config.pipeline, frame.depth_m[mask]
+    limits, depth_m = config.depth, frame.depth_m[mask]
     share = float((depth_m > 0).mean())
     if share < MEASURED_SHARE:
         fix = "Dark, shiny and transparent things have none; change the light or the distance, or spray it matt."
@@ -298,7 +298,7 @@ def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding
         return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
     median_m = float(np.median(depth_m[depth_m > 0]))
     text = f"{median_m:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
-    if not pipe.depth_min_m <= median_m <= pipe.depth_max_m:
+    if not limits.min_m <= median_m <= limits.max_m:
         return Finding(f"{name}: depth", Level.WRONG, *_beyond(text, np.array([median_m]), config))
     return Finding(f"{name}: depth", Level.OK, text)
 
@@ -334,7 +334,7 @@ def _extent(frame: Frame, mask: np.ndarray) -> tuple[float, float, float]:
 def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """Whether an object has anything to track: points that can be lifted, with a contrast of their own."""
     detector = make_detector(DEFAULT_DETECTOR, config.sampling, np.random.default_rng(config.seed))
-    found = detector.detect(frame, usable_region(frame, mask, config.sampling))
+    found = detector.detect(frame, usable_region(frame, mask, config.sampling, config.depth.edge_m))
     taken = choose(found, np.zeros((0, 2)), config.sampling.max_visible, config.sampling)
     u, v = np.rint(found.uv_px[taken]).astype(int).T
     contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]
