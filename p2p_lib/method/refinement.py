@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import RefinementConfig
 from p2p_lib.method import observability
 
@@ -364,3 +365,30 @@ def _usable_keypoints(keypoints: Keypoints | None, config: RefinementConfig) -> 
     finite = np.isfinite(keypoints.p_obj).all(-1) & np.isfinite(keypoints.p_cam).all(-1)
     ok = finite & (keypoints.sigma_m > 0) & np.isfinite(keypoints.sigma_m)
     return Keypoints(keypoints.p_obj[ok], keypoints.p_cam[ok], keypoints.sigma_m[ok]) if ok.sum() >= 3 else None
+
+
+#: Every how many pixels an image's depth is held against the surface.
+_STRIDE = 2
+
+
+def surface_distance(
+    surface: Surface, corners_obj: np.ndarray, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray
+) -> np.ndarray:
+    """(H, W) float32 of :class:`Hint`, from every second pixel where the surface can be seen.
+
+    corners_obj (8, 3) bound the surface in the object frame.
+    """
+    distance = np.full(depth_m.shape, np.nan, np.float32)
+    uv = camera.project(se3.transform(T_cam_obj, corners_obj))
+    if not np.isfinite(uv).all():
+        return distance
+    size = np.array(depth_m.shape[::-1])
+    (left, top), (right, bottom) = np.clip([uv.min(0), uv.max(0) + 1], 0, size).astype(int)
+    v, u = np.mgrid[top:bottom:_STRIDE, left:right:_STRIDE]
+    z = depth_m[v, u]
+    p_obj = se3.transform(se3.inverse(T_cam_obj), camera.unproject(np.stack([u, v], -1), z).reshape(-1, 3))
+    value, known = surface.query(p_obj)
+    found = np.where(known & (z.ravel() > 0), value, np.nan).reshape(z.shape)
+    coarse = np.repeat(np.repeat(found, _STRIDE, 0), _STRIDE, 1)
+    distance[top:bottom, left:right] = coarse[: bottom - top, : right - left]
+    return distance

@@ -24,6 +24,8 @@ _PRIOR_INERTIA_M2 = 1e-6
 # What is known of a pose before any point is seen: keeps covariances finite.
 _UNKNOWN_RAD, _UNKNOWN_M = np.pi, 1.0
 _REFITS = 5
+#: Fewest inliers of a pose by which to look for more.
+MINIMAL = 3
 #: An inlier's residual is at most this many standard deviations of the point's noise, where that is known.
 _INLIER_SIGMAS = 3.0
 # RANSAC draws this many samples at once, and stops when the chance that no sample so far was free of
