@@ -66,7 +66,7 @@ def track_live(
     prompts, count = sorted(prompts, key=lambda p: p.frame), count or LiveCount()
     config = config or preset()
     method = Point2Pose(camera.camera, config, tracker, detector, segmenter)
-    if config.tsdf.enabled:
+    if config.method.surface:
         make_volume(config.tsdf)  # what it loads takes seconds, in which the camera need not run
     start_s = monotonic()
     with Newest(camera, keep={p.frame for p in prompts}) as newest:
