@@ -331,6 +331,7 @@ class FactorGraphConfig(_Checked):
     observations: bool = _p(True, "L_obs ties keypoints by bearing and range.", "", "paper")
     bearing_sigma_rad: float = _p(0.0015, "This is the noise of a bearing.", "rad", low=1e-6)
     range_sigma_m: float = _p(0.01, "This is the noise of a range where it is constant.", "m", "release", low=1e-6)
+    huber: float = _p(1.345, "This is the Huber threshold in standard deviations.", "", "release", low=0.1)
     between_sigma_rad: float = _p(
         0.02, "This is the noise of a relative rotation where it is constant.", "rad", low=1e-6
     )
@@ -380,7 +381,11 @@ class Config:
         """
         stages: dict[str, dict[str, Any]] = {}
         top: dict[str, Any] = {}
-        known = {**{f"{s}.{f.name}": f for s in _STAGES for f in fields(getattr(self, s))}, "seed": None, "device": None}
+        known = {
+            **{f"{s}.{f.name}": f for s in _STAGES for f in fields(getattr(self, s))},
+            "seed": None,
+            "device": None,
+        }
         for key, value in values.items():
             if key not in known:
                 raise _unknown(f"{source}: configuration key" if source else "configuration key", key, known)

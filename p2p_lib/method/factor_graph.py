@@ -27,8 +27,6 @@ _X, _P = ord("x") << 56, ord("p") << 56
 _ANCHORING_POINTS = 3
 # Noise of the prior on the first pose (rad, m): it defines the object frame, so there is next to none.
 _PRIOR_SIGMA = 1e-4
-# Huber threshold in standard deviations (the release's).
-_HUBER = 1.345
 # A smaller relative decrease of the loss ends Levenberg-Marquardt.
 _RELATIVE_TOLERANCE = 1e-3
 # A variance above this means that nothing determines the direction: a turn, or ten metres.
@@ -256,10 +254,10 @@ def _solve(
         values.insert(_x(key), gtsam.Pose3(keyframe.T_obj_cam))
         ordering.push_back(_x(key))
         if config.between and keyframe.link:
-            graph.add(_between(key, keyframe.link))
+            graph.add(_between(key, keyframe.link, config))
         if config.observations:
             if keyframe.factors is None:
-                keyframe.factors = _observations(key, keyframe)
+                keyframe.factors = _observations(key, keyframe, config)
             graph.push_back(keyframe.factors)
     params = gtsam.LevenbergMarquardtParams()
     params.setlambdaInitial(config.damping)
@@ -287,21 +285,21 @@ def _p(point_id: int) -> int:
     return _P + point_id
 
 
-def _robust(gaussian: Any) -> Any:
+def _robust(gaussian: Any, config: FactorGraphConfig) -> Any:
     import gtsam
 
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(_HUBER), gaussian)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(config.huber), gaussian)
 
 
-def _between(key: int, link: Link) -> Any:
+def _between(key: int, link: Link, config: FactorGraphConfig) -> Any:
     """L_reg of one keyframe."""
     import gtsam
 
-    noise = _robust(gtsam.noiseModel.Gaussian.Covariance(link.covariance))
+    noise = _robust(gtsam.noiseModel.Gaussian.Covariance(link.covariance), config)
     return gtsam.BetweenFactorPose3(_x(link.previous), _x(key), gtsam.Pose3(link.T_previous_this), noise)
 
 
-def _observations(key: int, keyframe: Keyframe) -> Any:
+def _observations(key: int, keyframe: Keyframe, config: FactorGraphConfig) -> Any:
     """L_obs of one keyframe: bearing (2) and range (1) of each point, in this order."""
     import gtsam
 
@@ -309,7 +307,7 @@ def _observations(key: int, keyframe: Keyframe) -> Any:
     range_m = np.linalg.norm(keyframe.p_cam, axis=1)
     rows = zip(keyframe.ids.tolist(), keyframe.p_cam, range_m.tolist(), keyframe.sigma.tolist(), strict=True)
     for i, p_cam, distance, (sigma_rad, sigma_m) in rows:
-        noise = _robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_rad, sigma_rad, sigma_m])))
+        noise = _robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_rad, sigma_rad, sigma_m])), config)
         graph.add(gtsam.BearingRangeFactor3D(_x(key), _p(i), gtsam.Unit3(p_cam), distance, noise))
     return graph
 
