@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.image import in_image
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,4 @@ class Camera:
 
     def inside(self, uv_px: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
         """Which pixels (..., 2) lie in the picture; NaN does not."""
-        u, v = uv_px[..., 0], uv_px[..., 1]
-        in_u = (u >= margin_px) & (u <= self.width - 1 - margin_px)
-        return in_u & (v >= margin_px) & (v <= self.height - 1 - margin_px)
+        return in_image(uv_px, (self.height, self.width), margin_px)

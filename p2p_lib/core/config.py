@@ -64,8 +64,6 @@ class PipelineConfig(_Checked):
         choices=("camera", "centroid"),
     )
     min_mask_px: int = _p(100, "smaller masks count as hidden", "px", "release", low=1)
-    depth_min_m: float = _p(0.1, "nearer depth is invalid", "m", "release", low=0)
-    depth_max_m: float = _p(2.5, "farther depth is invalid", "m", low=0.1)
     recovered_frames: int = _p(5, "frames after a return that are marked recovered", "frames", low=0)
     start_growth: float = _p(
         1.1, "an object whose mask grows by more than this factor a frame is not started yet; 0 = at once", low=0
@@ -84,6 +82,17 @@ class PipelineConfig(_Checked):
     carry_frames: int = _p(60, "frames in a row that the surface may carry without registered points", "frames", low=0)
     carry_min_share: float = _p(0.6, "share of the depth points on the surface that it needs for that", low=0, high=1)
     degraded_inliers: int = _p(8, "a pose from fewer agreeing points is degraded", "points", low=3)
+
+
+@dataclass(frozen=True)
+class DepthConfig(_Checked):
+    """Of measured depth: which of it is used, and how noisy it is."""
+
+    min_m: float = _p(0.1, "nearer depth is invalid", "m", "release", low=0)
+    max_m: float = _p(2.5, "farther depth is invalid", "m", low=0.1)
+    edge_m: float = _p(0.01, "a larger depth step in the 3x3 neighbourhood is an edge", "m", "release", low=0)
+    noise_m: float = _p(0.001, "standard deviation of depth at range 0", "m", low=1e-6)
+    noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
 
 
 @dataclass(frozen=True)
@@ -168,8 +177,6 @@ class SegmentationConfig(_Checked):
     find_points: int = _p(8, "agreeing tracked points that say where an absent object is back", "points", low=3)
     min_share: float = _p(0.03, "of the area it showed lately; an object that shows less is absent", low=0, high=1)
     min_px: int = _p(40, "fewer pixels are absent", "px", low=1)
-    noise_m: float = _p(0.0015, "noise of depth at range 0", "m", low=1e-6)
-    noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
 
 
 @dataclass(frozen=True)
@@ -190,7 +197,6 @@ class SamplingConfig(_Checked):
     )
     r_min_px: float = _p(5.0, "r_min of the objective", "px", "release", low=0)
     edge_margin_px: int = _p(2, "distance to the mask's border", "px", "release", low=0)
-    depth_edge_m: float = _p(0.01, "a larger depth step in the 3x3 neighbourhood is an edge", "m", "release", low=0)
 
 
 @dataclass(frozen=True)
@@ -227,9 +233,7 @@ class RegistrationConfig(_Checked):
     contradicted: float = _p(
         0.7, "a smaller share of the keypoints that agree has pending points and surface asked", low=0
     )
-    noise_m: float = _p(0.001, "noise of a measured point at range 0", "m", low=1e-6)
-    noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
-    inlier_sigmas: float = _p(3.0, "inlier_m grows to this many sigmas of that noise; 0 = one constant", low=0)
+    inlier_sigmas: float = _p(3.0, "inlier_m grows to this many sigmas of the depth noise; 0 = one constant", low=0)
     refine_all: bool = _p(True, "refine every hypothesis on the surface before it judges them; off: the chosen one")
     surface_sigmas: float = _p(
         2.5, "standard errors by which the surface must prefer another than the best supported; 0 = least score", low=0
@@ -328,6 +332,7 @@ class Config:
     preset: str = "default"
     seed: int = 0
     pipeline: PipelineConfig = PipelineConfig()
+    depth: DepthConfig = DepthConfig()
     tracking: TrackingConfig = TrackingConfig()
     oracle: OracleConfig = OracleConfig()
     segmentation: SegmentationConfig = SegmentationConfig()

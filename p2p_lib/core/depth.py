@@ -1,10 +1,12 @@
-"""From pixels to 3D: lift tracked points with the depth picture (paper: section "Sampling Strategy")."""
+"""Measured depth: its noise, its edges, and points lifted with it (paper: section "Sampling Strategy")."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.types import Frame
 
 #: The 3x3 neighbourhood, its middle first: (9, 2) pixels.
@@ -13,15 +15,34 @@ _OFFSETS = np.array([(0, 0), (-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1
 _MOMENTS = np.stack([np.ones(9), *_OFFSETS.T, *_OFFSETS.T**2, _OFFSETS.prod(1)], -1)
 # Holds the slope back where few or collinear readings would let noise choose it; nine readings outweigh it twelvefold.
 _RIDGE = 0.5
+#: What depth cameras have about: the built-in tracker and segmenter assume it of any.
+USUAL = DepthConfig()
 
 
-def lift(frame: Frame, uv_px: np.ndarray, camera: Camera, range_m: tuple[float, float], edge_m: float) -> np.ndarray:
+def depth_noise_m(z_m: np.ndarray, config: DepthConfig = USUAL) -> np.ndarray:
+    """Standard deviation of depth measured at z_m: that of a depth sensor, growing with the range squared."""
+    return config.noise_m + config.noise_per_m2 * z_m**2
+
+
+def in_range(depth_m: np.ndarray, config: DepthConfig) -> np.ndarray:
+    """(H, W) bool: measured, and neither too near nor too far."""
+    return (depth_m >= config.min_m) & (depth_m <= config.max_m)
+
+
+def off_edges(depth_m: np.ndarray, edge_m: float) -> np.ndarray:
+    """(H, W) bool: the whole 3x3 neighbourhood is measured and holds no step larger than ``edge_m``."""
+    around = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(depth_m, around), cv2.dilate(depth_m, around)
+    return (low > 0) & (high - low <= edge_m)
+
+
+def lift(frame: Frame, uv_px: np.ndarray, camera: Camera, config: DepthConfig) -> np.ndarray:
     """Points p_cam (N, 3) behind pixels uv_px (N, 2); NaN rows where there is no trustworthy depth.
 
     Depth is that of a plane, least squares through the readings in the 3x3 neighbourhood that lie within
-    ``edge_m`` of the nearest pixel's: it averages sensor noise without mixing two surfaces, and gives a
-    slanted surface its depth at the pixel's fraction too. Depth outside ``range_m`` = (nearest, farthest)
-    is invalid.
+    ``config.edge_m`` of the nearest pixel's: it averages sensor noise without mixing two surfaces, and gives a
+    slanted surface its depth at the pixel's fraction too. Depth outside ``config.min_m`` to ``config.max_m`` is
+    invalid.
     """
     p_cam = np.full((len(uv_px), 3), np.nan)
     rows = np.flatnonzero(camera.inside(uv_px))
@@ -30,7 +51,7 @@ def lift(frame: Frame, uv_px: np.ndarray, camera: Camera, range_m: tuple[float, 
     at = px[:, None] + _OFFSETS
     x, y = np.moveaxis(np.clip(at, 0, last), -1, 0)
     z = frame.depth_m[y, x].astype(float)
-    same_surface = (z >= range_m[0]) & (z <= range_m[1]) & (np.abs(z - z[:, :1]) <= edge_m)
+    same_surface = in_range(z, config) & (np.abs(z - z[:, :1]) <= config.edge_m)
     same_surface &= ((at >= 0) & (at <= last)).all(-1)
     ok = same_surface[:, 0]
     rows, uv = rows[ok], uv_px[rows[ok]]

@@ -20,11 +20,6 @@ def from_raster(xy: np.ndarray, shape: tuple[int, int], size: int) -> np.ndarray
     return np.asarray(xy, float) * (np.array(shape[::-1], float) / size) - 0.5
 
 
-def in_picture(uv_px: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(N,) bool: pixels whose centre a picture of shape (H, W) holds."""
-    return ((uv_px >= -0.5) & (uv_px <= np.array(shape[::-1]) - 0.5)).all(1)
-
-
 def square(rgb: np.ndarray, size: int, device: str) -> torch.Tensor:
     """(1, 1, size, size, 3) float32 in [-1, 1]: the picture scaled to a square raster, as the models were trained."""
     import torch

@@ -12,6 +12,7 @@ import numpy as np
 
 from p2p_lib.core import packages
 from p2p_lib.core.config import SamplingConfig
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import checkpoints
@@ -60,7 +61,6 @@ class SuperPointDetector:
         # The class gives indices of pixels over the size of the picture.
         uv_px = found.keypoints[0][kept].double().cpu().numpy() * gray.shape[::-1] + [x0, y0]
         score = found.scores[0][kept].double().cpu().numpy()
-        px = np.rint(uv_px).astype(int)
-        inside = np.flatnonzero(mask[px[:, 1], px[:, 0]])
+        inside = np.flatnonzero(in_mask(uv_px, mask))
         best = inside[np.argsort(-score[inside], kind="stable")][: self._limit]
         return Candidates(uv_px[best], np.clip(score[best], 0, 1))

@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import lift
 from p2p_lib.core.errors import MissingData
+from p2p_lib.core.image import in_mask, nearest_px
 from p2p_lib.core.native import load_open3d
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.models import MESHES, find_models, given_models, load_mesh
@@ -29,7 +31,7 @@ MIN_COSINE = 0.1
 # A mesh in front of a point by more than this hides it.
 _SELF_OCCLUSION_M = 0.002
 # Where there is no mesh: readings that count, and half the base of the normal.
-_RANGE_M, _EDGE_M, _BASE_PX = (0.1, 5.0), 0.02, 2
+_DEPTH, _BASE_PX = DepthConfig(min_m=0.1, max_m=5.0, edge_m=0.02), 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +104,11 @@ class TrueScene:
 
     def owners(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
         """(N,) index of the object whose mask holds each pixel; -1 where none does."""
-        u, v = _pixels(frame, uv_px)
         masks = self._masks(frame.index)
         owner = np.full(len(uv_px), -1)
         for k, name in enumerate(self.objects):
             if name in masks:
-                owner[masks[name][v, u] & self.sequence.camera.inside(uv_px)] = k
+                owner[in_mask(uv_px, masks[name]) & self.sequence.camera.inside(uv_px)] = k
         return owner
 
     def lift(self, frame: Frame, object: np.ndarray, uv_px: np.ndarray) -> SurfacePoints:
@@ -156,7 +157,7 @@ class TrueScene:
         view = away / distance_m[:, None]
         p_cam = se3.transform(T_cam_model, points.p_model)
         uv = self.sequence.camera.project(p_cam)
-        u, v = _pixels(frame, uv)
+        u, v = nearest_px(uv, frame.shape)
         measured_m = frame.depth_m[v, u]
         agrees = np.abs(measured_m - p_cam[:, 2]) <= DEPTH_TOLERANCE_M
         cosine = np.einsum("nc,nc->n", points.normal, view)
@@ -170,7 +171,7 @@ class TrueScene:
     def _lift_by_depth(self, frame: Frame, uv_px: np.ndarray, T_cam_model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         steps = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]) * _BASE_PX
         around = (uv_px[None] + steps[:, None]).reshape(-1, 2)
-        p_cam = lift(frame, around, self.sequence.camera, _RANGE_M, _EDGE_M).reshape(5, -1, 3)
+        p_cam = lift(frame, around, self.sequence.camera, _DEPTH).reshape(5, -1, 3)
         normal = np.cross(p_cam[4] - p_cam[3], p_cam[2] - p_cam[1])  # y down times x right: towards the camera
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         return se3.transform(se3.inverse(T_cam_model), p_cam[0]), normal @ T_cam_model[:3, :3]
@@ -244,12 +245,6 @@ def _draw(scene: TrueScene, frame: Frame, wanted: int, rng: np.random.Generator)
     points, uv = points.select(met), uv[met]
     seen = np.flatnonzero(scene.see(frame, points).visible)[:wanted]
     return Queries(np.full(len(seen), frame.index), uv[seen], points.select(seen))
-
-
-def _pixels(frame: Frame, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest pixels u, v (N,) each, moved into the picture."""
-    h, w = frame.shape
-    return tuple(np.clip(np.rint(np.nan_to_num(uv_px, nan=0)).astype(int), 0, [w - 1, h - 1]).T)
 
 
 def _ray_scene(vertices: np.ndarray, faces: np.ndarray):

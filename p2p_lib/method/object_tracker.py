@@ -13,7 +13,8 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, TsdfConfig
-from p2p_lib.core.depth import lift
+from p2p_lib.core.depth import depth_noise_m, in_range, lift
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Detector, Hint, PointTracker
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status, Tracks
@@ -118,7 +119,7 @@ class TrackedObject:
             return self._start(view)
         if mask is not None and self._status not in WITH_POSE:
             # Found where the object is not, on its twin perhaps: let them be looked for elsewhere.
-            self.tracker.reject(self.map.ids[view.tracks.visible & ~_inside(view.tracks.uv_px, mask)])
+            self.tracker.reject(self.map.ids[view.tracks.visible & ~in_mask(view.tracks.uv_px, mask)])
         if mask is not None and mask.sum() < self.config.pipeline.min_mask_px:
             return self._without_pose(view, Status.OCCLUDED, f"{int(mask.sum())} mask pixels")
         hypotheses, view = self._sought(view)
@@ -160,7 +161,8 @@ class TrackedObject:
             return None
         if returning and not hypotheses:
             fewer = replace(self.config.registration, min_inliers=pipe.seek_inliers)
-            hypotheses = registration.generate(self.map.p_obj, view.p_cam, fewer, self._rng)
+            sigma_m = self._noise_m(view.p_cam)
+            hypotheses = registration.generate(self.map.p_obj, view.p_cam, fewer, self._rng, sigma_m=sigma_m)
         return max(hypotheses, key=lambda h: h.support, default=None)
 
     def _expected_px(self, view: View, T_cam_obj: np.ndarray) -> np.ndarray:
@@ -206,13 +208,16 @@ class TrackedObject:
         p_cam = np.full((len(tracks), 3), np.nan)
         rows = np.flatnonzero(tracks.visible)
         if mask is not None:
-            rows = rows[_inside(tracks.uv_px[rows], mask)]
+            rows = rows[in_mask(tracks.uv_px[rows], mask)]
         p_cam[rows] = self._lift(frame, tracks.uv_px[rows])
         return p_cam
 
     def _lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
-        pipe = self.config.pipeline
-        return lift(frame, uv_px, self.camera, (pipe.depth_min_m, pipe.depth_max_m), self.config.sampling.depth_edge_m)
+        return lift(frame, uv_px, self.camera, self.config.depth)
+
+    def _noise_m(self, p_cam: np.ndarray) -> np.ndarray:
+        """Standard deviation (N,) of measured points (N, 3)."""
+        return depth_noise_m(p_cam[:, 2], self.config.depth)
 
     def _start(self, view: View) -> PoseEstimate:
         """The first frame: fix the object frame and found the map on the first points."""
@@ -261,7 +266,9 @@ class TrackedObject:
             carried = self._refine(view, list(priors.values())[-1])
             if carried.refined:
                 p_cam = np.where(certain[:, None], view.p_cam, np.nan)
-                found += registration.refit(carried.T_cam_obj, "surface", self.map.p_obj, p_cam, cfg)
+                found += registration.refit(
+                    carried.T_cam_obj, "surface", self.map.p_obj, p_cam, cfg, self._noise_m(p_cam)
+                )
         found = self._without_jumps(found)
         if found or not cfg.motion_priors or self._carried >= self.config.pipeline.carry_frames:
             return found
@@ -272,7 +279,8 @@ class TrackedObject:
     def _registered(self, view: View, use: np.ndarray, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
         """Hypotheses from the points ``use`` (N,) alone."""
         p_cam = np.where(use[:, None], view.p_cam, np.nan)
-        return registration.generate(self.map.p_obj, p_cam, self.config.registration, self._rng, priors=priors)
+        cfg, sigma_m = self.config.registration, self._noise_m(p_cam)
+        return registration.generate(self.map.p_obj, p_cam, cfg, self._rng, sigma_m=sigma_m, priors=priors)
 
     def _without_jumps(self, found: list[Hypothesis]) -> list[Hypothesis]:
         """Objects do not jump between frames: a hypothesis that does must have more support than any that does not.
@@ -303,8 +311,8 @@ class TrackedObject:
             return Refinement(T_cam_obj, reason="no surface")
         keypoints = None
         if agreeing is not None:
-            sigma_m = registration.noise_m(view.p_cam[agreeing], self.config.registration)
-            keypoints = Keypoints(self.map.p_obj[agreeing], view.p_cam[agreeing], sigma_m)
+            p_cam = view.p_cam[agreeing]
+            keypoints = Keypoints(self.map.p_obj[agreeing], p_cam, self._noise_m(p_cam))
         return refinement.refine(T_cam_obj, view.cloud, self.surface, cfg, keypoints=keypoints)
 
     def _priors(self) -> dict[str, np.ndarray]:
@@ -373,8 +381,7 @@ class TrackedObject:
         """(6, 6) of the pose relative to the map, right tangent of T_cam_obj."""
         if refined.covariance is not None:
             return refined.covariance
-        sigma_m = registration.noise_m(view.p_cam, self.config.registration)
-        return registration.covariance(hypothesis, self.map.p_obj, view.p_cam, sigma_m)
+        return registration.covariance(hypothesis, self.map.p_obj, view.p_cam, self._noise_m(view.p_cam))
 
     def _update_map(self, view: View, T_cam_obj: np.ndarray, used: np.ndarray, agrees: np.ndarray) -> None:
         """Verify pending points, count which keypoints agreed, have the others looked for anew."""
@@ -435,7 +442,7 @@ class TrackedObject:
         Only what the graph still holds can be moved later: pictures of keyframes that it has merged are let go.
         """
         p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
-        sigma_m = registration.noise_m(p_cam, self.config.registration)
+        sigma_m = self._noise_m(p_cam)
         key = self.graph.add_keyframe(T_cam_obj, ids, p_cam, p_obj_init=p_obj, covariance=covariance, sigma_m=sigma_m)
         result = self.graph.optimise()
         if self.surface is not None:
@@ -457,8 +464,7 @@ class TrackedObject:
 
     def _measured(self, view: View) -> np.ndarray:
         """(H, W) bool: pixels of the mask with a depth within range."""
-        pipe, depth_m = self.config.pipeline, view.frame.depth_m
-        return view.mask & (depth_m >= pipe.depth_min_m) & (depth_m <= pipe.depth_max_m)
+        return view.mask & in_range(view.frame.depth_m, self.config.depth)
 
     def _moved_little(self, T_cam_obj: np.ndarray) -> bool:
         """The appendix's "Pose Stability" check against the frame before."""
@@ -473,7 +479,9 @@ class TrackedObject:
         """New points where the objective wants them: uv_px (K, 2) and p_cam (K, 3)."""
         with self._stopwatch("sampling"):
             cfg = self.config.sampling
-            candidates = self.detector.detect(view.frame, usable_region(view.frame, view.mask, cfg))
+            candidates = self.detector.detect(
+                view.frame, usable_region(view.frame, view.mask, cfg, self.config.depth.edge_m)
+            )
             p_cam = self._lift(view.frame, candidates.uv_px)
             liftable = np.isfinite(p_cam[:, 0])
             candidates, p_cam = candidates.select(liftable), p_cam[liftable]
@@ -524,13 +532,6 @@ class TrackedObject:
             last_T_cam_obj=self._T_last,
             last_seen_s=self._last_seen_s,
         )
-
-
-def _inside(uv_px: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(N,) bool: pixels (N, 2) in a mask (H, W); those that are not finite are not."""
-    known = np.isfinite(uv_px).all(1)
-    px = np.clip(np.rint(np.where(known[:, None], uv_px, 0)).astype(int), 0, np.array(mask.shape[::-1]) - 1)
-    return known & mask[px[:, 1], px[:, 0]]
 
 
 def make_volume(config: TsdfConfig):

@@ -19,6 +19,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import RefinementConfig
+from p2p_lib.core.depth import off_edges
 
 #: Fewer points on the observed surface than this determine nothing.
 MIN_POINTS = 10
@@ -413,9 +414,7 @@ def sample_cloud(
     kernel = np.ones((2 * margin_px + 1,) * 2, np.uint8)
     inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-    around = np.ones((3, 3), np.uint8)
-    low, high = cv2.erode(depth, around), cv2.dilate(depth, around)
-    v, u = np.nonzero((inside > 0) & (low > 0) & (high - low <= depth_edge_m))
+    v, u = np.nonzero((inside > 0) & off_edges(depth, depth_edge_m))
     # A lattice of pixels, then an even thinning of what is left over.
     stride = max(1, int(np.sqrt(len(u) / max_points)))
     on = np.flatnonzero((u % stride == 0) & (v % stride == 0))

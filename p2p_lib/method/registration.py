@@ -14,6 +14,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import RegistrationConfig
+from p2p_lib.core.depth import depth_noise_m
 
 # A set of points determines the turn about its long axis when noise of a third of the inlier
 # threshold turns it by less than this; below, the set counts as collinear.
@@ -76,7 +77,7 @@ def generate(
     competes too, refit on the points that agree with it. With ``config.multi_hypothesis`` off, one
     hypothesis: SVD on all, outliers removed by the fixed threshold, second SVD.
 
-    sigma_m (N,) is the noise of each p_cam, :func:`noise_m` where None; it sets the thresholds and the
+    sigma_m (N,) is the noise of each p_cam, :func:`depth_noise_m` where None; it sets the thresholds and the
     weights when ``config.inlier_sigmas`` is above 0. Rows that are not finite are ignored. Too few
     or collinear points: an empty list.
     """
@@ -93,16 +94,16 @@ def generate(
 
 
 def refit(
-    T_cam_obj: np.ndarray, origin: str, p_obj: np.ndarray, p_cam: np.ndarray, config: RegistrationConfig
+    T_cam_obj: np.ndarray,
+    origin: str,
+    p_obj: np.ndarray,
+    p_cam: np.ndarray,
+    config: RegistrationConfig,
+    sigma_m: np.ndarray | None = None,
 ) -> list[Hypothesis]:
     """The hypothesis that grows from a given pose, refit on the correspondences that agree with it; or none."""
-    matches, usable = _finite_matches(p_obj, p_cam, None, config)
+    matches, usable = _finite_matches(p_obj, p_cam, sigma_m, config)
     return [_spread(hypothesis, usable) for hypothesis in _from_priors(matches, {origin: T_cam_obj}, config)]
-
-
-def noise_m(p_cam: np.ndarray, config: RegistrationConfig) -> np.ndarray:
-    """Standard deviation (N,) of measured points: that of a depth sensor, growing with the range squared."""
-    return config.noise_m + config.noise_per_m2 * np.asarray(p_cam, float)[:, 2] ** 2
 
 
 def competing(hypotheses: Sequence[Hypothesis], config: RegistrationConfig) -> list[Hypothesis]:
@@ -207,7 +208,7 @@ def _finite_matches(
 ) -> tuple[_Matches, np.ndarray]:
     """The rows that are finite, and (N,) bool which those are."""
     p_obj, p_cam = np.asarray(p_obj, float).reshape(-1, 3), np.asarray(p_cam, float).reshape(-1, 3)
-    sigma_m = noise_m(p_cam, config) if sigma_m is None else np.asarray(sigma_m, float)
+    sigma_m = depth_noise_m(p_cam[:, 2]) if sigma_m is None else np.asarray(sigma_m, float)
     usable = np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1) & np.isfinite(sigma_m) & (sigma_m > 0)
     return _Matches.of(p_obj[usable], p_cam[usable], sigma_m[usable], config), usable
 

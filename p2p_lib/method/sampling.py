@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.config import SamplingConfig
+from p2p_lib.core.depth import off_edges
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Frame
 
@@ -79,10 +80,8 @@ def distance_px(uv_px: np.ndarray, others_px: np.ndarray) -> np.ndarray:
     return np.linalg.norm(uv_px[:, None] - others_px[None], axis=-1).min(1)
 
 
-def usable_region(frame: Frame, mask: np.ndarray, config: SamplingConfig) -> np.ndarray:
-    """Where a point can be lifted: in the mask, off its border, with depth, off depth edges. (H, W) bool."""
+def usable_region(frame: Frame, mask: np.ndarray, config: SamplingConfig, edge_m: float) -> np.ndarray:
+    """(H, W) bool: where points can be lifted: in the mask, off its border, measured, off depth edges of ``edge_m``."""
     size = 2 * config.edge_margin_px + 1
     inner = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0)
-    ones = np.ones((3, 3), np.uint8)
-    step_m = cv2.dilate(frame.depth_m, ones) - cv2.erode(frame.depth_m, ones)
-    return (inner > 0) & (frame.depth_m > 0) & (step_m <= config.depth_edge_m)
+    return (inner > 0) & off_edges(frame.depth_m, edge_m)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.image import nearest_px
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.sequence import Sequence as Video
@@ -220,8 +221,7 @@ def promotion_sheet(video: Video, history: MapHistory, frames: Sequence[int], wi
         promoted = history.promoted <= t
         p_obj = np.where(promoted[:, None], history.p_promoted, history.p_born)
         p_cam = se3.transform(history.T_cam_obj[t], p_obj)
-        h, w = frame.shape
-        u, v = np.clip(np.rint(np.nan_to_num(video.camera.project(p_cam))).astype(int), 0, [w - 1, h - 1]).T
+        u, v = nearest_px(video.camera.project(p_cam), frame.shape)
         alive &= np.abs(frame.depth_m[v, u] - p_cam[:, 2]) < _IN_SIGHT_M
         uv = seen_by.project(p_cam)
         image = overlay.draw_points(image, uv[alive & promoted], colour, 3)

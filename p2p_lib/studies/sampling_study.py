@@ -11,7 +11,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.backends import make_detector, make_tracker
 from p2p_lib.core.config import Config, SamplingConfig, preset
-from p2p_lib.core.depth import lift
+from p2p_lib.core.depth import depth_noise_m, lift
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import Sequence as Video
@@ -54,7 +54,7 @@ class Situation:
         """The object ``name`` in frame ``index``, with the default parameters and ``settings``."""
         config, frame = preset().with_values(dict(settings or {})), video.frame(index)
         mask = (video.masks(index) or {})[name]
-        return cls(video, name, frame, mask, usable_region(frame, mask, config.sampling), config)
+        return cls(video, name, frame, mask, usable_region(frame, mask, config.sampling, config.depth.edge_m), config)
 
     def candidates(self, detector: str = "corners", seed: int = 0) -> Candidates:
         """What a detector offers here, as far as it can be lifted."""
@@ -64,8 +64,7 @@ class Situation:
 
     def lift(self, uv_px: np.ndarray) -> np.ndarray:
         """(N, 3) in the camera frame, NaN where depth is missing."""
-        pipe, edge_m = self.config.pipeline, self.config.sampling.depth_edge_m
-        return lift(self.frame, uv_px, self.video.camera, (pipe.depth_min_m, pipe.depth_max_m), edge_m)
+        return lift(self.frame, uv_px, self.video.camera, self.config.depth)
 
 
 def greedy_terms(candidates: Candidates, chosen: np.ndarray, stored_px: np.ndarray, config: SamplingConfig) -> Terms:
@@ -90,7 +89,7 @@ def conditioning(p_cam: np.ndarray, surface_cam: np.ndarray, config: Config) -> 
     T_cam_obj = se3.from_rt(np.eye(3), surface_cam.mean(0))
     p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
     hypothesis = Hypothesis(T_cam_obj, np.ones(len(p_cam), bool), np.zeros(len(p_cam)), "truth")
-    sigma = registration.covariance(hypothesis, p_obj, p_cam, registration.noise_m(p_cam, config.registration))
+    sigma = registration.covariance(hypothesis, p_obj, p_cam, depth_noise_m(p_cam[:, 2], config.depth))
     at = se3.transform(se3.inverse(T_cam_obj), surface_cam)
     moved = np.concatenate([-se3.hat(at), np.broadcast_to(np.eye(3), (len(at), 3, 3))], -1)
     error_m = np.sqrt(np.einsum("nki,ij,nkj->n", moved, sigma, moved).mean())

@@ -9,7 +9,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.raster import in_picture
+from p2p_lib.core.image import in_image
 from p2p_lib.core.types import Frame, Tracks
 
 # Each rollout costs a whole pass per frame and holds the memory of a whole picture.
@@ -88,7 +88,7 @@ class RolloutTracker:
             live = np.isin(ids, self._ids)
             rows = np.searchsorted(self._ids, ids[live])
             uv[rows], uncertainty[rows] = told_uv[live], np.clip(told_uncertainty[live], 0, 1)
-            visible[rows] = told_visible[live] & in_picture(told_uv[live], frame.shape)
+            visible[rows] = told_visible[live] & in_image(told_uv[live], frame.shape, -0.5)
         self._visible = visible
         return Tracks(self._ids.copy(), uv, visible, uncertainty)
 

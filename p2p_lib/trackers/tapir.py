@@ -14,7 +14,8 @@ from p2p_lib.core import packages
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.raster import from_raster, in_picture, square, to_raster
+from p2p_lib.core.image import in_image
+from p2p_lib.core.raster import from_raster, square, to_raster
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.datasets import checkpoints
 
@@ -127,7 +128,7 @@ class TapirTracker:
             far = torch.sigmoid(far)
             visible = (1 - torch.sigmoid(occluded)) * (1 - far) > VISIBLE
         uv = from_raster(xy.double().cpu().numpy(), self._shape, self._size)
-        visible = visible.cpu().numpy() & in_picture(uv, self._shape)
+        visible = visible.cpu().numpy() & in_image(uv, self._shape, -0.5)
         return Tracks(self._ids.copy(), uv, visible, far.double().cpu().numpy())
 
     def drop(self, ids: np.ndarray) -> None:

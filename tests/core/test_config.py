@@ -88,14 +88,14 @@ PAPER_TEXT = {
 #: Where the text is silent: the authors' released configuration.
 RELEASE = {
     "pipeline.min_mask_px": 100,
-    "pipeline.depth_min_m": 0.1,
+    "depth.min_m": 0.1,
     "sampling.candidates": 512,
     "sampling.points": 30,
     "sampling.score_weight": 0.3,
     "sampling.cluster_weight": 0.5,
     "sampling.r_min_px": 5.0,
     "sampling.edge_margin_px": 2,
-    "sampling.depth_edge_m": 0.01,
+    "depth.edge_m": 0.01,
     "keypoint_map.min_observations": 4,
     "keypoint_map.pending_ttl": 30,
     "registration.iterations": 100,

@@ -1,16 +1,20 @@
 """Lifting: exact on surfaces that are planes, one surface at a time, and NaN where there is nothing to trust."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.depth import _RIDGE, lift
+from p2p_lib.core.config import DepthConfig
+from p2p_lib.core.depth import _RIDGE, depth_noise_m, lift, off_edges
 from p2p_lib.core.types import Frame
 
 CAMERA = Camera(300.0, 310.0, 81.3, 58.7, 160, 120)
 RANGE_M, EDGE_M = (0.1, 2.5), 0.01
+DEPTH = DepthConfig(min_m=RANGE_M[0], max_m=RANGE_M[1], edge_m=EDGE_M)
 EVERYWHERE = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), -1).reshape(-1, 2)
 
 
@@ -19,7 +23,7 @@ def frame_of(depth: np.ndarray) -> Frame:
 
 
 def lifted(depth: np.ndarray, uv, edge_m: float = EDGE_M, camera: Camera = CAMERA) -> np.ndarray:
-    return lift(frame_of(depth), np.atleast_2d(np.asarray(uv, float)), camera, RANGE_M, edge_m)
+    return lift(frame_of(depth), np.atleast_2d(np.asarray(uv, float)), camera, replace(DEPTH, edge_m=edge_m))
 
 
 def plane(tilt_deg: float, camera: Camera = CAMERA, turn_deg: float = 30.0) -> tuple[np.ndarray, float]:
@@ -197,9 +201,9 @@ def test_depth_in_range_is_a_point(z):
 
 
 def test_no_points_no_rows():
-    assert lift(frame_of(np.ones((120, 160))), np.zeros((0, 2)), CAMERA, RANGE_M, EDGE_M).shape == (0, 3)
+    assert lift(frame_of(np.ones((120, 160))), np.zeros((0, 2)), CAMERA, DEPTH).shape == (0, 3)
     nowhere = np.full((7, 2), np.nan)
-    assert np.isnan(lift(frame_of(np.ones((120, 160))), nowhere, CAMERA, RANGE_M, EDGE_M)).all()
+    assert np.isnan(lift(frame_of(np.ones((120, 160))), nowhere, CAMERA, DEPTH)).all()
 
 
 def test_rows_belong_to_their_pixels():
@@ -208,3 +212,20 @@ def test_rows_belong_to_their_pixels():
     uv = np.random.default_rng(3).uniform([-20, -20], [180, 140], (300, 2))
     together = lifted(depth, uv)
     np.testing.assert_array_equal(together, np.concatenate([lifted(depth, p) for p in uv]))
+
+
+def test_noise_grows_with_the_range_squared():
+    sensor = DepthConfig(noise_m=0.002, noise_per_m2=0.003)
+    np.testing.assert_allclose(depth_noise_m(np.array([0.0, 1, 2]), sensor), [0.002, 0.005, 0.014])
+
+
+def test_off_edges_pixel_by_pixel():
+    depth = np.full((6, 8), 0.5, np.float32)
+    depth[1, 1] = 0
+    depth[:, 5:] = 0.52
+    expected = np.zeros(depth.shape, bool)
+    for v, u in np.ndindex(depth.shape):
+        near = depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
+        expected[v, u] = near.min() > 0 and near.max() - near.min() <= 0.01
+    assert expected.any() and not expected.all()
+    np.testing.assert_array_equal(off_edges(depth, 0.01), expected)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.method import registration
 from p2p_lib.method.registration import Hypothesis, competing, fit_rigid, generate, select
 
@@ -154,7 +155,7 @@ def test_thresholds_follow_the_noise() -> None:
     p_obj, T = box_points(rng, 80, 0.1), random_pose(rng)
     T[2, 3] = 1.5
     p_cam = se3.transform(T, p_obj)
-    p_cam += registration.noise_m(p_cam, DEFAULT)[:, None] * rng.normal(size=p_cam.shape)
+    p_cam += depth_noise_m(p_cam[:, 2])[:, None] * rng.normal(size=p_cam.shape)
     ours = most_supported(generate(p_obj, p_cam, DEFAULT, np.random.default_rng(0)))
     constant = most_supported(generate(p_obj, p_cam, PAPER, np.random.default_rng(0)))
     assert ours.support >= 76 > 60 > constant.support

@@ -17,6 +17,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.method.sampling import choose, objective, usable_region
 
 DEFAULT = SamplingConfig()
+EDGE_M = 0.01
 
 
 # --- the objective -----------------------------------------------------------------------------
@@ -200,7 +201,7 @@ def slowly_usable(depth: np.ndarray, mask: np.ndarray, cfg: SamplingConfig) -> n
             around = [(v + j, u + i) for j in range(-margin, margin + 1) for i in range(-margin, margin + 1)]
             inner = all(0 <= y < H and 0 <= x < W and mask[y, x] for y, x in around)
             near = depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
-            out[v, u] = inner and depth[v, u] > 0 and near.max() - near.min() <= cfg.depth_edge_m
+            out[v, u] = inner and depth[v, u] > 0 and near.max() - near.min() <= EDGE_M
     return out
 
 
@@ -214,13 +215,13 @@ def test_usable_region_pixel_by_pixel(seed, margin):
     mask = cv2.circle(np.zeros((H, W), np.uint8), (36, 24), 20, 1, -1) > 0
     mask[20:24, 20:30] = False
     cfg = replace(DEFAULT, edge_margin_px=margin)
-    got = usable_region(frame_of(depth), mask, cfg)
+    got = usable_region(frame_of(depth), mask, cfg, EDGE_M)
     assert got.dtype == bool and got.any()
     np.testing.assert_array_equal(got, slowly_usable(depth, mask, cfg))
 
 
 def test_the_pictures_border_is_a_border():
-    got = usable_region(frame_of(np.full((H, W), 0.5, np.float32)), np.ones((H, W), bool), DEFAULT)
+    got = usable_region(frame_of(np.full((H, W), 0.5, np.float32)), np.ones((H, W), bool), DEFAULT, EDGE_M)
     expected = np.zeros((H, W), bool)
     expected[2:-2, 2:-2] = True
     np.testing.assert_array_equal(got, expected)
@@ -229,15 +230,15 @@ def test_the_pictures_border_is_a_border():
 @pytest.mark.parametrize(("mask", "depth_m"), [(0, 0.5), (1, 0.0)])
 def test_nothing_is_usable_without_mask_or_depth(mask, depth_m):
     frame = frame_of(np.full((H, W), depth_m, np.float32))
-    assert not usable_region(frame, np.full((H, W), mask, bool), DEFAULT).any()
+    assert not usable_region(frame, np.full((H, W), mask, bool), DEFAULT, EDGE_M).any()
 
 
 def test_a_step_of_just_the_limit_is_no_edge():
     depth = np.full((H, W), 0.5, np.float32)
     depth[:, 30:] = np.float32(0.5) + np.float32(1 / 128)
     inside = np.ones((H, W), bool)
-    on_step = usable_region(frame_of(depth), inside, replace(DEFAULT, depth_edge_m=1 / 128))[10, 28:32]
-    off_step = usable_region(frame_of(depth), inside, replace(DEFAULT, depth_edge_m=1 / 129))[10, 28:32]
+    on_step = usable_region(frame_of(depth), inside, DEFAULT, 1 / 128)[10, 28:32]
+    off_step = usable_region(frame_of(depth), inside, DEFAULT, 1 / 129)[10, 28:32]
     assert on_step.all() and off_step.tolist() == [True, False, False, True]
 
 

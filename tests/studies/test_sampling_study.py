@@ -5,9 +5,10 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.method.registration import fit_rigid, noise_m
+from p2p_lib.method.registration import fit_rigid
 from p2p_lib.method.sampling import choose
 from p2p_lib.studies.map_history import follow_map
 from p2p_lib.studies.sampling_study import (
@@ -42,7 +43,7 @@ def test_conditioning_is_the_error_that_registration_makes():
     p_cam = rng.uniform(-0.05, 0.05, (12, 3)) * [1, 1, 0.2] + [0, 0, 0.7]
     surface = rng.uniform(-0.08, 0.08, (200, 3)) * [1, 1, 0.2] + [0, 0, 0.7]
     turn_deg, error_m = conditioning(p_cam, surface, CONFIG)
-    sigma_m = noise_m(p_cam, CONFIG.registration)[:, None]
+    sigma_m = depth_noise_m(p_cam[:, 2], CONFIG.depth)[:, None]
     moved, turned = [], []
     for _ in range(1500):
         T = fit_rigid(p_cam, p_cam + sigma_m * rng.normal(size=p_cam.shape), 1 / sigma_m[:, 0] ** 2)

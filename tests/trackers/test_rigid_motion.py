@@ -5,8 +5,8 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.trackers.builtin.rigid_motion import apart_m, consensus, fit_pose, linked, predict
-from p2p_lib.trackers.builtin.tangent_planes import depth_noise_m
 
 CAMERA = Camera(600, 610, 318, 242, 640, 480)
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.raster import from_raster, in_picture, to_raster
+from p2p_lib.core.image import in_image
+from p2p_lib.core.raster import from_raster, to_raster
 from p2p_lib.core.types import Frame
 from p2p_lib.trackers import rollouts
 from p2p_lib.trackers.cotracker import CoTrackerModel
@@ -42,7 +43,7 @@ def test_rasters_keep_edges_and_come_back(u, v, size):
 
 def test_the_picture_ends_half_a_pixel_beyond_its_centres():
     uv = np.array([[-0.5, 0], [-0.6, 0], [639.5, 479.5], [639.6, 0], [0, 479.6], [np.nan, 0]])
-    assert in_picture(uv, (480, 640)).tolist() == [True, False, True, False, False, False]
+    assert in_image(uv, (480, 640), -0.5).tolist() == [True, False, True, False, False, False]
 
 
 # --- TAPIR ---------------------------------------------------------------------------------------
@@ -281,4 +282,4 @@ def test_cotracker_answers_for_the_frame_seven_ago_and_keeps_rollouts_apart():
         if t > 12:
             np.testing.assert_allclose(tracks.select(late).uv_px, UV[:1] + 1 + (t - 7) * scale, atol=1e-4)
     # 0.9 x 0.7 counts as visible, wherever the point is still in the picture.
-    np.testing.assert_array_equal(tracks.visible, in_picture(tracks.uv_px, SHAPE))
+    np.testing.assert_array_equal(tracks.visible, in_image(tracks.uv_px, SHAPE, -0.5))

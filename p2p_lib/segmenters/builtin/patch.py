@@ -10,6 +10,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import colour_codes
@@ -71,7 +72,7 @@ class Patch:
         size = max(2, round(w * scale)), max(2, round(h * scale))
         rgb = cv2.resize(frame.rgb[box.slices], size, interpolation=cv2.INTER_AREA)
         z = cv2.resize(frame.depth_m[box.slices], size, interpolation=cv2.INTER_NEAREST)
-        return cls(box, camera, rgb, z, config.noise_m + config.noise_per_m2 * z * z)
+        return cls(box, camera, rgb, z, depth_noise_m(z))
 
     @cached_property
     def gray(self) -> np.ndarray:

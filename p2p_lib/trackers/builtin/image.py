@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.image import in_image, in_mask, nearest_px
 from p2p_lib.core.types import Frame
 
 
@@ -45,21 +46,13 @@ class Picture:
 
     def depth_at(self, uv_px: np.ndarray) -> np.ndarray:
         """(N,) metres at the nearest pixels, 0 where nothing was measured."""
-        u, v = self._nearest(uv_px)
+        u, v = nearest_px(uv_px, self.depth_m.shape)
         return self.depth_m[v, u].astype(float)
 
     def inside(self, uv_px: np.ndarray, region: np.ndarray | None = None) -> np.ndarray:
         """(N,) bool: places in the picture, and in the region (H, W) if there is one."""
-        with np.errstate(invalid="ignore"):
-            inside = (uv_px >= 0).all(1) & (uv_px <= np.array(self.gray.shape[::-1]) - 1).all(1)
-        if region is not None:
-            u, v = self._nearest(uv_px)
-            inside &= region[v, u]
-        return inside
-
-    def _nearest(self, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        last = np.array(self.gray.shape[::-1]) - 1
-        return tuple(np.clip(np.rint(np.nan_to_num(uv_px)), 0, last).astype(int).T)
+        inside = in_image(uv_px, self.gray.shape)
+        return inside if region is None else inside & in_mask(uv_px, region)
 
 
 def flow(before: Picture, after: Picture, uv_px: np.ndarray, window_px: int, levels: int) -> tuple[np.ndarray, ...]:

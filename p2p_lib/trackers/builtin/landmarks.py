@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.image import nearest_px
 from p2p_lib.trackers.builtin import features
 from p2p_lib.trackers.builtin.image import Picture
 from p2p_lib.trackers.builtin.tangent_planes import surface_at, tangent_steps
@@ -70,8 +71,8 @@ class Landmarks:
         """Add the corners near points of the body, uv_px (N, 2) and p_body (N, 3), seen from ``eye`` now."""
         uv, p_body = points
         region, reach = np.zeros(now.gray.shape, np.uint8), 2 * cfg.anchor_px + 1
-        px = np.clip(np.rint(uv).astype(int), 0, np.array(region.shape[::-1]) - 1)
-        region[px[:, 1], px[:, 0]] = 1
+        u, v = nearest_px(uv, region.shape)
+        region[v, u] = 1
         region = cv2.dilate(region, np.ones((reach, reach), np.uint8)) > 0
         found = corners(now, region, cfg.features, range(len(STEPS_M)))
         at = (found.p_cam - T_cam_body[:3, 3]) @ T_cam_body[:3, :3]

@@ -8,10 +8,11 @@ from itertools import combinations
 import numpy as np
 
 from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.trackers.builtin.image import Picture
 from p2p_lib.trackers.builtin.landmarks import STEPS_M, Landmarks, corners
 from p2p_lib.trackers.builtin.rigid_motion import Fit, Prediction, apart_m, consensus, fit_pose, linked, predict
-from p2p_lib.trackers.builtin.tangent_planes import depth_noise_m, lifted_cov, surface_at
+from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, surface_at
 from p2p_lib.trackers.builtin.tracked_points import Points
 
 #: How well a pose is known that matches have proposed: rad, m.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.depth import depth_noise_m
 
 #: Half the window in which the surface around a pixel is taken for a plane, in steps.
 _PLANE = 3
@@ -19,11 +20,6 @@ _READINGS = 8
 def usual_camera(width: int, height: int) -> Camera:
     """A camera with the field of view that most depth cameras have about, for pictures of an unknown one."""
     return Camera(0.95 * width, 0.95 * width, (width - 1) / 2, (height - 1) / 2, width, height)
-
-
-def depth_noise_m(z_m: np.ndarray) -> np.ndarray:
-    """Standard deviation of a depth sensor at this range."""
-    return 0.001 + 0.0025 * z_m**2
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,27 @@
+"""Pixels and masks. An integer pixel is a pixel's centre, so an image of width w spans -0.5 to w - 0.5."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def in_image(uv_px: np.ndarray, shape: tuple[int, int], margin_px: float = 0.0) -> np.ndarray:
+    """(...,) bool: which of the pixels (..., 2) an image of shape (H, W) holds; NaN is outside.
+
+    margin_px  distance to the centres of the outermost pixels: 0 up to those centres, -0.5 up to the image's edge
+    """
+    u, v = uv_px[..., 0], uv_px[..., 1]
+    in_u = (u >= margin_px) & (u <= shape[1] - 1 - margin_px)
+    return in_u & (v >= margin_px) & (v <= shape[0] - 1 - margin_px)
+
+
+def nearest_px(uv_px: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Columns u and rows v (...,) int of the nearest pixels that an image of shape (H, W) has; (0, 0) for NaN."""
+    px = np.clip(np.rint(np.nan_to_num(uv_px)), 0, np.array(shape[::-1]) - 1).astype(int)
+    return px[..., 0], px[..., 1]
+
+
+def in_mask(uv_px: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(...,) bool: which of the pixels (..., 2) have their nearest pixel in a mask (H, W); NaN is outside."""
+    u, v = nearest_px(uv_px, mask.shape)
+    return in_image(uv_px, mask.shape, -0.5) & mask[v, u]
