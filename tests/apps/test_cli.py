@@ -311,7 +311,10 @@ BAD_WORDS = {
     "no config": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/no.toml"], ["no.toml", "no such"]),
     "config is no TOML": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/cam_K.txt"], ["cam_K.txt", "TOML"]),
     "config is a folder": (["run", "{seq}", "--out", "{out}", "--config", "{seq}"], ["slide", "TOML"]),
-    "unknown stage": (["run", "{seq}", "--out", "{out}", "--set", "foo.bar=1"], ["'foo.bar'", "pipeline, "]),
+    "unknown stage": (
+        ["run", "{seq}", "--out", "{out}", "--set", "foo.bar=1"],
+        ["'foo.bar'", "stage.key", "lifecycle, "],
+    ),
     "unknown scenario": (["synth", "crosing", "--out", "{out}"], ["'crosing'", "Did you mean synthetic/crossing?"]),
     "click into a file": (["click", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt/x", "can be written"]),
     "click into a folder": (["click", "{seq}", "--out", "{seq}/rgb"], ["slide/rgb", "a folder"]),
