@@ -19,7 +19,7 @@ import csv
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -35,22 +35,6 @@ from p2p_lib.datasets.models import load_points
 from p2p_lib.datasets.provenance import provenance
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
 
-#: The columns of an object in ``poses.npz``: kind of value, and its shape at one frame (see :class:`ObjectRun`).
-COLUMNS: dict[str, tuple[type, tuple[int, ...]]] = {
-    "frame_index": (int, ()),
-    "time_s": (float, ()),
-    "status": (str, ()),
-    "T_cam_obj": (float, (4, 4)),
-    "confidence": (float, ()),
-    "covariance": (float, (6, 6)),
-    "visible_points": (int, ()),
-    "inliers": (int, ()),
-    "keyframe": (bool, ()),
-    "T_cam_model": (float, (4, 4)),
-    "labelled": (bool, ()),
-    "visible_px": (int, ()),
-    "reason": (str, ()),
-}
 NO_MASKS = -1  # visible_px of sequences that come without masks
 NO_POSE = np.full((4, 4), np.nan)
 _NO_COVARIANCE = np.full((6, 6), np.nan)
@@ -88,10 +72,11 @@ class ObjectRun:
     reason: np.ndarray
 
     def __post_init__(self) -> None:
-        for name, (_, shape) in COLUMNS.items():
-            got, expected = getattr(self, name).shape, (len(self), *shape)
+        of_a_frame = {"T_cam_obj": (4, 4), "covariance": (6, 6), "T_cam_model": (4, 4)}
+        for column in COLUMNS:
+            got, expected = getattr(self, column).shape, (len(self), *of_a_frame.get(column, ()))
             if got != expected:
-                raise BadInput(f"run: {name}", f"shape {got}", f"{expected}")
+                raise BadInput(f"run: {column}", f"shape {got}", f"{expected}")
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -105,6 +90,10 @@ class ObjectRun:
     def has_truth(self) -> np.ndarray:
         """(n,) bool."""
         return np.isfinite(self.T_cam_model).all((1, 2))
+
+
+#: What ``poses.npz`` holds of an object.
+COLUMNS = tuple(column.name for column in fields(ObjectRun))
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +203,7 @@ class RunWriter:
             "masks": masks,
             "preset": config.preset,
             "seed": config.seed,
-            "models": {name: _inside(path, sequence.path) for name, path in models.items()},
+            "models": {name: str(_from(sequence.path, path)) for name, path in models.items()},
             "frames": 0,
             "finished": False,
             "stopped_by": None,
@@ -263,9 +252,9 @@ class RunWriter:
         """Make everything so far readable on disk."""
         if self._frames:
             arrays = {
-                f"{name}/{column}": np.array([row[column] for row in rows], kind)
+                f"{name}/{column}": np.array([row[column] for row in rows])
                 for name, rows in self._rows.items()
-                for column, (kind, _) in COLUMNS.items()
+                for column in COLUMNS
             }
             _save_arrays(self.path / "poses.npz", arrays)
         self.info |= {"frames": len(self._frames), "objects": list(self._rows)}
@@ -302,9 +291,8 @@ class RunWriter:
         row = {"frame_index": str(frame.index), "time_s": f"{frame.time_s:.9f}", "total_ms": f"{total_ms:.4f}"}
         row |= {"keyframe": str(int(keyframe)), **{f"{k}_ms": f"{v:.4f}" for k, v in stages_ms.items()}}
         self._timings.append(row)
-        new = [key for key in row if key not in self._timing_columns]
-        if new:  # a stage that had not run before gets a column
-            self._timing_columns += new
+        if new := [key for key in row if key not in self._timing_columns]:
+            self._timing_columns += new  # a stage that had not run before
             self._write_timings()
         else:
             _append(self.path / "timings.csv", self._csv_line(row))
@@ -313,8 +301,8 @@ class RunWriter:
         return ",".join(row.get(key, "") for key in self._timing_columns) + "\n"
 
     def _write_timings(self) -> None:
-        header = dict(zip(self._timing_columns, self._timing_columns, strict=True))
-        replace_text(self.path / "timings.csv", "".join(map(self._csv_line, [header, *self._timings])))
+        header = ",".join(self._timing_columns) + "\n"
+        replace_text(self.path / "timings.csv", header + "".join(map(self._csv_line, self._timings)))
 
     def _write_info(self) -> None:
         replace_text(self.path / "run.json", json.dumps(self.info, indent=1, ensure_ascii=False) + "\n")
@@ -340,9 +328,9 @@ def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:
     return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason="not added yet")
 
 
-def _inside(path: Path, folder: Path | None) -> str:
-    """A model's path as it is named in ``run.json``: relative to the sequence where it lies in there."""
-    return str(path.relative_to(folder)) if folder is not None and path.is_relative_to(folder) else str(path)
+def _from(folder: Path | None, path: Path) -> Path:
+    """The path as seen from the folder where it lies in there."""
+    return path.relative_to(folder) if folder is not None and path.is_relative_to(folder) else path
 
 
 def _earlier(out: Path) -> str:
