@@ -129,29 +129,25 @@ def _frames(folder: Path, stems: list[str], sequence: Sequence) -> list[int]:
 
 
 def _read_tum(path: Path, sequence: Sequence) -> np.ndarray:
-    poses = np.full((len(sequence), 4, 4), np.nan)
-    rows = [line for line in path.read_text(errors="replace").splitlines() if line.strip() and line.lstrip()[0] != "#"]
-    for number, line in enumerate(rows, 1):
-        try:
-            time_s, *t, qx, qy, qz, qw = map(float, line.split())
-            norm = np.linalg.norm([qx, qy, qz, qw])
-            fits = len(t) == 3 and np.isfinite([time_s, *t]).all() and 0.9 < norm < 1.1
-        except ValueError:
-            fits = False
-        if not fits:
-            raise BadInput(f"{path}: line {number}", repr(line[:60]), "time_s tx ty tz qx qy qz qw, a unit quaternion")
-        R = Rotation.from_quat([qx, qy, qz, qw]).as_matrix()
-        poses[_frame_at(path, time_s, sequence.times_s)] = se3.from_rt(R, t)
-    return poses
-
-
-def _frame_at(path: Path, time_s: float, times_s: np.ndarray) -> int:
-    nearest = int(np.argmin(np.abs(times_s - time_s)))
+    form = "time_s tx ty tz qx qy qz qw in a line, with a unit quaternion"
+    poses, rows = np.full((len(sequence), 4, 4), np.nan), images.read_numbers(path, form)
+    if not rows.size:
+        return poses  # lost throughout
+    if rows.shape[1] != 8:
+        raise BadInput(str(path), f"{rows.shape[1]} numbers in a line", form)
+    fits = np.isfinite(rows).all(1) & (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 0.1)
+    if not fits.all():
+        worst = int(np.argmin(fits))
+        raise BadInput(f"{path}: pose {worst + 1}", " ".join(f"{x:g}" for x in rows[worst]), form)
+    times_s, given_s = np.asarray(sequence.times_s), rows[:, 0]
+    nearest = np.abs(times_s - given_s[:, None]).argmin(1)
     # Half the time between frames: further off it belongs to none of them.
-    if abs(times_s[nearest] - time_s) > 0.5 * (np.median(np.diff(times_s)) if len(times_s) > 1 else 1.0):
+    far = np.abs(times_s[nearest] - given_s) > 0.5 * (np.median(np.diff(times_s)) if len(times_s) > 1 else 1.0)
+    if far.any():
         want = f"times of the sequence's frames, {times_s[0]:.6f} to {times_s[-1]:.6f} s"
-        raise BadInput(str(path), f"the time {time_s:.6f} s", want)
-    return nearest
+        raise BadInput(str(path), f"the time {given_s[np.argmax(far)]:.6f} s", want)
+    poses[nearest] = se3.from_rt(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])
+    return poses
 
 
 def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:

@@ -219,9 +219,9 @@ FAULTS = {
     ),
     "a quaternion too long": (
         {"can.txt": f"{STEMS[0][:10]}.1002 0 0 1 0 0 0 2\n"},
-        r"line 1: got .*quaternion",
+        r"pose 1: got .*quaternion",
     ),
-    "a word": ({"can.txt": "0 0 0 zero 0 0 0 1\n"}, r"can\.txt: line 1: got '0 0 0 zero"),
+    "a word": ({"can.txt": "0 0 0 zero 0 0 0 1\n"}, r"can\.txt: got unreadable numbers .*'zero'"),
     "another time": ({"can.txt": "0.5 0 0 1 0 0 0 1\n"}, r"can\.txt: got the time 0\.500000 s, expected times"),
     "not rigid": ({"can/0000.txt": "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"}, r"0000\.txt: got a matrix that is not"),
     "another name": ({"can/frame.txt": IDENTITY}, r"frame\.txt: got the name frame, expected the name of an image"),
