@@ -32,21 +32,6 @@ if TYPE_CHECKING:
 #: ``quick``: bundled data, CPU, about a minute a notebook. ``full``: the data and backends that are present.
 PROFILES = ("quick", "full")
 CHECKS_MIME = "application/vnd.p2p.checks+json"
-#: JupyterLab's page without the scripts that it would fetch; a table wider than the page is scrolled, not cut off.
-_PAGE = f"""{{% extends 'lab/index.html.j2' %}}
-{{% block html_head_js %}}{{% endblock %}}
-{{% block html_head_js_mathjax %}}{{% endblock %}}
-{{% block html_head_js_mermaidjs %}}{{% endblock %}}
-{{% block html_head_css %}}
-{equations.STYLE}
-<style>
-.jp-RenderedHTMLCommon {{ overflow-x: auto; }}
-.jp-RenderedHTMLCommon table {{ width: max-content; max-width: none; }}
-.jp-RenderedMarkdown td, .jp-RenderedMarkdown th {{ padding: 0.4em 0.5em; }}
-.jp-MarkdownCell table {{ width: auto; max-width: 100%; }}
-</style>
-{{% endblock %}}"""
-
 Value = bool | int | float | str
 
 
@@ -202,10 +187,10 @@ def read_result(executed: Path) -> NotebookResult:
         for cell in code
         if cell.source.strip() and "shell.execute_reply" not in cell.metadata.get("execution", {})
     ]
-    title = re.search(r"(?m)^# +(.+)$", "\n".join(c.source for c in notebook.cells if c.cell_type == "markdown"))
+    titles = re.findall(r"(?m)^# +(.+)$", "\n".join(c.source for c in notebook.cells if c.cell_type == "markdown"))
     return NotebookResult(
         name=executed.stem,
-        title=title[1].strip() if title else executed.stem,
+        title=[*titles, executed.stem][0].strip(),
         executed=executed,
         seconds=float(notebook.metadata.get("papermill", {}).get("duration") or 0.0),
         checks=checks,
@@ -327,9 +312,10 @@ def _write_page(executed: Path) -> None:
     def as_html(source: str) -> str:
         return MarkdownWithMath(renderer=Renderer(escape=False)).render(source)
 
-    exporter = HTMLExporter(embed_images=True, raw_template=_PAGE)
+    template = Path(__file__).with_name("notebook.html").read_text(encoding="utf-8")
+    exporter = HTMLExporter(embed_images=True, raw_template=template)
     exporter.register_filter("markdown2html", as_html)
-    body, _ = exporter.from_filename(str(executed))
+    body, _ = exporter.from_filename(str(executed), resources={"equation_style": equations.STYLE})
     executed.with_suffix(".html").write_text(body, encoding="utf-8")
 
 
