@@ -22,11 +22,11 @@ from p2p_lib.core.backends import make_detector
 from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.paths import data_dir
-from p2p_lib.datasets import manifests
+from p2p_lib.datasets import manifests, ycbmultitrack
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.datasets.resized import Resized
-from p2p_lib.datasets.sequence import FORMATS, SYNTHETIC, Sequence, open_sequence
+from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 from p2p_lib.run import make_config
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -230,9 +230,7 @@ def _files_hash(job: Job) -> str:
 
 
 def _load(folder: Path, name: str, masks: str | None) -> Sequence:
-    from importlib import import_module
-
-    return import_module(FORMATS["ycbmultitrack"]).load(folder, name=name, depth_scale=None, masks=masks)
+    return ycbmultitrack.load(folder, name=name, depth_scale=None, masks=masks)
 
 
 def _sha(data: bytes) -> str:

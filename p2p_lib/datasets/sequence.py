@@ -1,7 +1,6 @@
-"""RGB-D sequences: the protocol that every layout fulfils, and the one door, :func:`open_sequence`.
+"""RGB-D sequences: the protocol that every layout fulfils, and :func:`open_sequence`, which opens any of them.
 
-A layout is one module with ``recognises(folder)`` and ``load(folder, name, depth_scale, masks)``, and
-one line in :data:`FORMATS`.
+A layout is one module with ``load(folder, name, depth_scale, masks)``, and one line in :data:`FORMATS`.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.types import Frame
 
-#: Layouts by name, in the order in which they are tried on a folder.
-FORMATS: dict[str, str] = {
-    "ho3d": "p2p_lib.datasets.ho3d",
-    "bop": "p2p_lib.datasets.bop",
-    "ycbmultitrack": "p2p_lib.datasets.ycbmultitrack",
-    "ycbineoat": "p2p_lib.datasets.ycbineoat",
-    "folder": "p2p_lib.datasets.folder",
+#: Layouts, each by the name of its module: what a folder of it holds, in the order in which they are tried.
+FORMATS: dict[str, tuple[str, ...]] = {
+    "ho3d": ("meta/*.pkl",),
+    "bop": ("scene_camera.json",),
+    "ycbmultitrack": ("annotated_poses/*/",),
+    "ycbineoat": ("gt_mask/", "annotated_poses/*.txt"),
+    "folder": ("rgb/",),
 }
 
 #: Sequences that are generated rather than read are called ``synthetic/NAME``.
@@ -134,7 +133,7 @@ def open_sequence(
     else:
         folder, format = _find(path_or_name, format)
         name = os.path.basename(os.path.abspath(folder))
-    loader = import_module(FORMATS[format or recognise(folder)])
+    loader = import_module(f"p2p_lib.datasets.{format or recognise(folder)}")
     return loader.load(folder, name=name, depth_scale=depth_scale, masks=masks)
 
 
@@ -168,8 +167,8 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
 
 def recognise(folder: Path) -> str:
     """The name of a folder's layout; :class:`BadInput` where no layout fits."""
-    for name, module in FORMATS.items():
-        if import_module(module).recognises(folder):
+    for name, patterns in FORMATS.items():
+        if any(next(folder.glob(pattern), None) for pattern in patterns):
             return name
     holds = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())[:8]) or "nothing"
     if not (folder / "rgb").is_dir() and ((folder / "depth").is_dir() or (folder / "cam_K.txt").is_file()):
