@@ -15,7 +15,8 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
-from p2p_lib.method.registration import covariance, fit_rigid, generate
+from p2p_lib.core.robust import fit_rigid
+from p2p_lib.method.registration import covariance, generate
 
 SEEDS = 40
 

@@ -12,22 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from p2p_lib.core import se3
+from p2p_lib.core import robust, se3
 from p2p_lib.core.config import RegistrationConfig
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.robust import fit_rigid_inertia
 
 # A set of points determines the turn about its long axis when noise of a third of the inlier
 # threshold turns it by less than this; below, the set counts as collinear.
 _DETERMINED_RAD = 0.35
-# Weight (m^2) that holds a refit at its prior's rotation where the points say nothing (a line's
-# roll). Points spread over a centimetre outweigh it a thousandfold.
-_PRIOR_INERTIA_M2 = 1e-6
 # What is known of a pose before any point is seen: keeps covariances finite.
 _UNKNOWN_RAD, _UNKNOWN_M = np.pi, 1.0
-_REFITS = 5
-# RANSAC draws this many samples at once, and stops when the chance that no sample so far was free of
-# outliers, taking the best consensus for the truth, is below this.
-_BATCH, _MISSED = 100, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,16 +43,6 @@ class Hypothesis:
     def support(self) -> int:
         """The number of inliers."""
         return int(self.inliers.sum())
-
-
-def fit_rigid(p_obj: np.ndarray, p_cam: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """The T_cam_obj (..., 4, 4) that minimises sum of w |p_cam - T p_obj|^2 (paper: eq. corres_svd).
-
-    p_obj, p_cam (..., N, 3) finite, weights (..., N) at least 0. Always a proper rotation: never a
-    reflection. Where the points leave directions free (collinear, coincident, fewer than three) the
-    rotation is one of the many that fit.
-    """
-    return _fit(p_obj, p_cam, weights)[0]
 
 
 def generate(
@@ -199,8 +183,7 @@ class _Matches:
 
     def residual_m(self, T_cam_obj: np.ndarray) -> np.ndarray:
         """(..., n) of poses (..., 4, 4)."""
-        error = se3.transform(T_cam_obj, self.p_obj) - self.p_cam
-        return np.sqrt(np.einsum("...i,...i->...", error, error))
+        return robust.residual_m(T_cam_obj, self.p_obj, self.p_cam)
 
 
 def _finite_matches(
@@ -213,27 +196,6 @@ def _finite_matches(
     return _Matches.of(p_obj[usable], p_cam[usable], sigma_m[usable], config), usable
 
 
-def _fit(
-    p_obj: np.ndarray, p_cam: np.ndarray, weights: np.ndarray | None = None, R_prior: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """The best T_cam_obj (..., 4, 4) and the inertia (...,) in m^2 of the points about their long axis."""
-    p_obj, p_cam = np.asarray(p_obj, float), np.asarray(p_cam, float)
-    w = np.ones(p_obj.shape[:-1]) if weights is None else np.asarray(weights, float)
-    total = np.maximum(w.sum(-1), np.finfo(float).tiny)[..., None]
-    mean_obj = np.einsum("...n,...ni->...i", w, p_obj) / total
-    mean_cam = np.einsum("...n,...ni->...i", w, p_cam) / total
-    centred = (p_cam - mean_cam[..., None, :]) * w[..., None]
-    H = np.swapaxes(centred, -1, -2) @ (p_obj - mean_obj[..., None, :])
-    if R_prior is not None:
-        H = H + _PRIOR_INERTIA_M2 * R_prior
-    U, s, Vt = np.linalg.svd(H)
-    proper = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    U[..., 2] *= proper[..., None]
-    R = U @ Vt
-    t = mean_cam - np.einsum("...ij,...j->...i", R, mean_obj)
-    return se3.from_rt(R, t), s[..., 1] + proper * s[..., 2]
-
-
 def _determined(inertia_m2: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
     return inertia_m2 > (limit_m / 3 / _DETERMINED_RAD) ** 2
 
@@ -244,7 +206,8 @@ def _sequential(matches: _Matches, config: RegistrationConfig, rng: np.random.Ge
     for _ in range(config.max_hypotheses):
         if pool.sum() < max(config.sample_size, config.min_inliers):
             break
-        T = _ransac(matches, np.flatnonzero(pool), config, rng)
+        drawn = matches.p_obj[pool], matches.p_cam[pool], matches.limit_m[pool]
+        T = robust.ransac(*drawn, config.sample_size, config.iterations, rng)
         refit = None if T is None else _refit(T, matches, pool, f"ransac {len(found) + 1}", config)
         if refit is None:
             break
@@ -255,51 +218,6 @@ def _sequential(matches: _Matches, config: RegistrationConfig, rng: np.random.Ge
     return found
 
 
-def _ransac(
-    matches: _Matches, pool: np.ndarray, config: RegistrationConfig, rng: np.random.Generator
-) -> np.ndarray | None:
-    """The T_cam_obj with the most inliers in ``pool`` (indices); None without any.
-
-    Samples come in batches until a better consensus is unlikely to have been missed.
-    """
-    best, best_score, missed = None, -np.inf, 1.0
-    for drawn in range(0, config.iterations, _BATCH):
-        size = min(_BATCH, config.iterations - drawn)
-        T, score = _best_of_batch(matches, pool, size, config.sample_size, rng)
-        if score > best_score:
-            best, best_score = T, score
-            share = np.ceil(score) / len(pool)
-            missed = 1 - share**config.sample_size
-        if missed ** (drawn + size) < _MISSED:
-            break
-    return best
-
-
-def _best_of_batch(
-    matches: _Matches, pool: np.ndarray, size: int, sample_size: int, rng: np.random.Generator
-) -> tuple[np.ndarray | None, float]:
-    """The best pose of ``size`` samples and its inliers, less a share of one for how loosely they fit."""
-    order = rng.random((size, len(pool)), np.float32)
-    sample = pool[np.argpartition(order, sample_size - 1, axis=1)[:, :sample_size]]
-    sample = sample[_lengths_agree(matches, sample)]
-    if not len(sample):
-        return None, -np.inf
-    T, _ = _fit(matches.p_obj[sample], matches.p_cam[sample])
-    relative = matches.residual_m(T)[:, pool] / matches.limit_m[pool]
-    agrees = relative <= 1
-    score = agrees.sum(1) - np.sum(np.where(agrees, relative, 0), 1) / (len(pool) + 1)
-    best = np.argmax(score)
-    return T[best], float(score[best])
-
-
-def _lengths_agree(matches: _Matches, sample: np.ndarray) -> np.ndarray:
-    """Which samples (S, k) keep the distances between successive points: no rigid motion fits the others."""
-    after = np.roll(sample, 1, axis=1)
-    length_obj = np.linalg.norm(matches.p_obj[sample] - matches.p_obj[after], axis=-1)
-    length_cam = np.linalg.norm(matches.p_cam[sample] - matches.p_cam[after], axis=-1)
-    return (np.abs(length_obj - length_cam) <= matches.limit_m[sample] + matches.limit_m[after]).all(1)
-
-
 def _refit(
     T: np.ndarray,
     matches: _Matches,
@@ -308,24 +226,13 @@ def _refit(
     config: RegistrationConfig,
     R_prior: np.ndarray | None = None,
 ) -> tuple[Hypothesis, bool] | None:
-    """Refits on the inliers until they stay the same; None if too few remain. And: do they determine the turn?
-
-    Fitting and choosing inliers in turn lowers the truncated cost, sum of w min(r, limit)^2, at each step.
-    """
-    inliers = pool & (matches.residual_m(T) <= matches.limit_m)
-    for _ in range(_REFITS):
-        if inliers.sum() < config.min_inliers:
-            return None
-        fitted = inliers
-        T, inertia = _fit(matches.p_obj[fitted], matches.p_cam[fitted], matches.weight[fitted], R_prior)
-        residual = matches.residual_m(T)
-        inliers = pool & (residual <= matches.limit_m)
-        if np.array_equal(inliers, fitted):
-            break
-    if inliers.sum() < config.min_inliers:
+    """The hypothesis refit on its inliers in ``pool`` (N,) bool, None without enough; do they determine its turn?"""
+    m = matches
+    fit = robust.refit(T, m.p_obj, m.p_cam, m.limit_m, m.weight, config.min_inliers, pool, R_prior)
+    if fit is None:
         return None
-    hypothesis = Hypothesis(T, inliers, residual, origin)
-    return hypothesis, bool(_determined(inertia, np.median(matches.limit_m[inliers])))
+    hypothesis = Hypothesis(fit.T_a_b, fit.inliers, fit.residual_m, origin)
+    return hypothesis, bool(_determined(fit.inertia_m2, np.median(m.limit_m[fit.inliers])))
 
 
 def _from_priors(matches: _Matches, priors: Mapping[str, np.ndarray], config: RegistrationConfig) -> list[Hypothesis]:
@@ -336,11 +243,11 @@ def _from_priors(matches: _Matches, priors: Mapping[str, np.ndarray], config: Re
 
 
 def _svd_twice(matches: _Matches, config: RegistrationConfig) -> list[Hypothesis]:
-    T, _ = _fit(matches.p_obj, matches.p_cam)
+    T, _ = fit_rigid_inertia(matches.p_obj, matches.p_cam)
     kept = matches.residual_m(T) <= matches.limit_m
     if kept.sum() < config.min_inliers:
         return []
-    T, inertia = _fit(matches.p_obj[kept], matches.p_cam[kept])
+    T, inertia = fit_rigid_inertia(matches.p_obj[kept], matches.p_cam[kept])
     if not _determined(inertia, matches.limit_m.mean()):
         return []
     residual = matches.residual_m(T)
