@@ -44,18 +44,16 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts] + [(0, path.name)]
 
 
-def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...]) -> tuple[Path, ...]:
+def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...], hint: str = "") -> tuple[Path, ...]:
     """``files``, if there is one for each of ``reference``: the i-th belongs to the i-th in sorted order."""
     if len(files) == len(reference):
         return files
     stems, wanted = {p.stem for p in files}, {p.stem for p in reference}
-    odd = sorted(wanted - stems) if len(files) < len(reference) else sorted(stems - wanted)
-    hint = ""
+    odd, fault = (wanted - stems, "missing") if len(files) < len(reference) else (stems - wanted, "too many")
     if odd and stems & wanted:
-        hint = f"{odd[0]}{files[0].suffix} is " + ("missing." if len(files) < len(reference) else "too many.")
-    raise BadInput(
-        str(files[0].parent), f"{len(files)} files", f"{len(reference)}, one for each in {reference[0].parent}", hint
-    )
+        hint = f"{min(odd)}{files[0].suffix} is {fault}. {hint}".strip()
+    expected = f"{len(reference)}, one for each in {reference[0].parent}"
+    raise BadInput(str(files[0].parent), f"{len(files)} files", expected, hint)
 
 
 def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.progress import progress_bar
@@ -266,10 +268,5 @@ def _access(of: Manifest) -> str:
 
 
 def human_size(count: int | None) -> str:
-    """``1.2 GB``; "size unknown" of None."""
-    if count is None:
-        return "size unknown"
-    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= scale:
-            return f"{count / scale:.3g} {unit}"
-    return f"{count} bytes"
+    """``1.20GB``; "size unknown" of None."""
+    return "size unknown" if count is None else tqdm.format_sizeof(count, "B")
