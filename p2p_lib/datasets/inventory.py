@@ -188,10 +188,7 @@ def _verify_listed(path: Path) -> Check:
 def _verify_sequences(of: Manifest, folder: Path, every_frame: bool) -> Iterator[Check]:
     frames = {entry.name: entry.frames for entry in of.sequences}
     found = sorted(path.parent.name for path in folder.glob("*/rgb") if path.is_dir())
-    for name in [*frames, *(name for name in found if name not in frames)]:
-        if name not in found:
-            yield Check(name, False, "sequence not there")
-            continue
+    for name in dict.fromkeys([*frames, *found]):
         try:
             yield _verify_sequence(folder / name, of.format, frames.get(name), every_frame)
         except P2PError as error:

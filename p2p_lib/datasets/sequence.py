@@ -107,7 +107,7 @@ def open_sequence(
     seed: int = 0,
     masks: str | Path | None = None,
 ) -> Sequence:
-    """A sequence from a folder, the embedded ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
+    """A sequence from a folder, the bundled ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
 
     Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one; any
     other folder by its path below ``$P2P_DATA``.
@@ -159,7 +159,7 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
     if found is None and below is not None and below.is_dir():
         return below, format
     if found is None:
-        fix = f"Give a folder, an embedded sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
+        fix = f"Give a folder, a bundled sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
         where = "$P2P_DATA is not set" if data_dir() is None else f"no sequence of this name below {data_dir()}"
         raise MissingData(str(path_or_name), f"no such folder, and {where}", fix)
     return found[0], format or found[1].format
