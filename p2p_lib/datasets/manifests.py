@@ -119,12 +119,6 @@ class Manifest(Strict):
                 raise ValueError(f"a {what} is listed twice")
         return self
 
-    @property
-    def bytes(self) -> int | None:
-        """Of all files; None where one is unknown."""
-        sizes = [file.bytes for file in self.files]
-        return None if not sizes or None in sizes else sum(sizes)
-
 
 def names(kind: str | None = None) -> tuple[str, ...]:
     """Names of all manifests, or of those of one kind ("dataset", "checkpoint"), sorted."""
