@@ -245,8 +245,9 @@ def _holds_files(folder: Path) -> bool:
 def describe(of: Manifest) -> str:
     """All that its manifest says, for people."""
     place = f"$P2P_DATA/{of.folder}" if paths.data_dir() is None else str(folder_of(of))
+    how = f"p2p data fetch {of.name}." if of.access == "open" else "By hand."
     lines = [f"{of.title} ({of.name}, version {of.version})", f"licence   {of.licence}", f"page      {of.page}"]
-    lines += [f"place     {place}", f"get it    {_access(of)} {of.how_to_get}"]
+    lines += [f"place     {place}", f"get it    {how} {of.how_to_get}"]
     lines += [f"used by   {of.used_by}"] if of.used_by else []
     lines += [f"unit      {what}: {unit}" for what, unit in of.units.items()]
     lines += [f"layout    {line}" for line in of.layout]
@@ -258,10 +259,6 @@ def describe(of: Manifest) -> str:
         known = [f"{entry.frames} frames" if entry.frames else "", f"paper: {entry.paper}" if entry.paper else ""]
         lines.append(f"sequence  {', '.join([entry.name, *filter(None, known)])}")
     return "\n".join([*lines, f"cite      {of.citation}"])
-
-
-def _access(of: Manifest) -> str:
-    return f"p2p data fetch {of.name}." if of.access == "open" else "By hand."
 
 
 def human_size(count: int | None) -> str:

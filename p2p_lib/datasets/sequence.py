@@ -56,11 +56,10 @@ class ObjectTruth:
 class Sequence(Protocol):
     """RGB-D frames of one video, with masks and truth where the dataset has them.
 
-    name     what results call it
-    path     its folder, None where it has none
+    name     what results call it; path its folder, None where it has none
     objects  names of the objects it knows; a single unnamed one is called ``object``
-    truth    per object, empty where there is none; read when first asked for
-    times_s  (N,) seconds, increasing; frame_names what each frame's image is called
+    times_s  (N,) seconds, increasing; frame_names what each frame's image is called, without its ending
+    truth    object to its truth, empty where there is none; read when first asked for
     model_places  object to the files and folders where its model may lie, best first
     """
 
@@ -70,22 +69,14 @@ class Sequence(Protocol):
     camera: Camera
     objects: tuple[str, ...]
     times_s: np.ndarray
+    frame_names: tuple[str, ...]
+    truth: dict[str, ObjectTruth]
     model_places: Mapping[str, tuple[Path, ...]]
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """What each frame's image is called, without its ending."""
-        ...
-
-    @property
-    def truth(self) -> dict[str, ObjectTruth]:
-        """Object to its truth; empty where there is none."""
-        ...
 
     def __len__(self) -> int: ...
 
     def frame(self, i: int) -> Frame:
-        """The i-th image, read now; what is wrong with its files is said in one line that names the file."""
+        """The i-th frame, read now; :class:`BadInput` or :class:`MissingData` names a file that is wrong."""
         ...
 
     def masks(self, i: int) -> dict[str, np.ndarray] | None:
@@ -95,7 +86,7 @@ class Sequence(Protocol):
     def visible_px(self, i: int) -> dict[str, int] | None:
         """Object to the size of its visible mask at frame i, by the dataset's OWN masks whatever ``masks`` gives.
 
-        The scoring rule uses this, so that the same frames count for every source of masks.
+        Scoring uses this, so that the same frames count for every source of masks.
         """
         ...
 
