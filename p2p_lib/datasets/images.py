@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from io import StringIO
 from pathlib import Path
 
 import cv2
@@ -81,9 +80,10 @@ def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
 
 def read_numbers(path: Path, expected: str) -> np.ndarray:
     """(rows, columns) float64 of a text file of numbers between spaces or commas; ``expected`` says what they are."""
-    text = _read(path, expected).decode("utf-8", "replace")
+    lines = _read(path, expected).decode("utf-8", "replace").replace(",", " ").splitlines()
+    lines = [line for line in lines if line.partition("#")[0].strip()]
     try:
-        return np.loadtxt(StringIO(text.replace(",", " ")), ndmin=2) if text.strip() else np.empty(0)
+        return np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
     except ValueError as error:
         reason = str(error).partition(";")[0].removesuffix(".")
         raise BadInput(str(path), f"unreadable numbers ({reason})", expected) from None
