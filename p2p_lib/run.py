@@ -29,7 +29,7 @@ from p2p_lib.datasets.runs import Run, RunWriter, load_run
 from p2p_lib.evaluation.mask_score import MaskEvaluation, evaluate_masks
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
-from p2p_lib.evaluation.tracker_score import TrackerScore, score_tracker
+from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.method.mesh import save as save_mesh
 from p2p_lib.method.pipeline import Point2Pose
@@ -260,7 +260,7 @@ def evaluate_tracker(
     opened = sequences.open_sequence(sequence, format, depth_scale) if named else sequence
     chosen = _tracker(tracker, opened, config, models)
     method = make_tracker(chosen, config.tracking, np.random.default_rng(config.seed))
-    return score_tracker(opened, method, config.seed, models, count, search)
+    return TrackTask.of(opened, config.seed, models, count).score(method, search)
 
 
 def _tracker(

@@ -180,8 +180,8 @@ def _live(a: argparse.Namespace) -> None:
 
 
 def _check(a: argparse.Namespace) -> int:
+    from p2p_lib.apps.check import Level, as_lines, check_folder
     from p2p_lib.datasets.prompts import load_prompts
-    from p2p_lib.studies.own_data import Level, as_lines, check_folder
 
     prompts = load_prompts(a.prompts) if a.prompts else ()
     findings = check_folder(a.sequence, prompts=prompts, format=a.format, depth_scale=a.depth_scale)
