@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
+from pandas import DataFrame
 
 from p2p_lib.core import se3
 from p2p_lib.core.backends import make_detector, make_tracker
@@ -21,7 +23,7 @@ from p2p_lib.core.depth import depth_noise_m, lift
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.plots import panels
+from p2p_lib.figures.plots import logarithmic, panels
 from p2p_lib.method.refinement import Keypoints, refine, sample_cloud, surface_distances
 from p2p_lib.method.registration import Hypothesis, competing, select
 from p2p_lib.method.registration import generate as register
@@ -33,10 +35,6 @@ from p2p_lib.synthetic.noise import Sensor
 from p2p_lib.synthetic.render import render
 from p2p_lib.synthetic.scene import FPS, Scenario
 from p2p_lib.synthetic.shapes import Mesh
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
 
 #: The newest keyframe that the surface holds is this many frames old; keyframes are ten frames, or degrees, apart.
 _KEYFRAME_AGO, _KEYFRAME_EVERY, _POINTS = 6, 10, 90
@@ -146,8 +144,6 @@ def ways_to_decide(moment: Moment, config: Config, seed: int = 0) -> dict[str, n
 
 def mug_trials(config: Config, seeds: Iterable[int], **moment: Any) -> DataFrame:
     """A row per mug: how far it turned, the share of right tracks, and the rotation error of each way in degrees."""
-    from pandas import DataFrame
-
     rows = []
     for seed in seeds:
         one = mug_moment(config, seed, **moment)
@@ -241,7 +237,7 @@ def support_and_score(moment: Moment, hypotheses: Sequence[Hypothesis], scores_m
 def method_errors(table: DataFrame, bar_deg: float) -> Figure:
     """Rotation error of each way to decide (columns) over several mugs (rows), on a logarithmic axis."""
     methods = [c for c in table.columns if c.endswith("[°]") and c not in ("turned [°]", "best hypothesis [°]")]
-    figure, (axis,) = panels(1, (7.0, 0.9 + 0.36 * len(methods)), [1])
+    figure, (axis,) = panels(1, (7.0, 0.9 + 0.36 * len(methods)))
     for k, method in enumerate(methods):
         errors = table[method].to_numpy(float)
         at = k + np.linspace(-0.18, 0.18, len(errors))
@@ -252,9 +248,7 @@ def method_errors(table: DataFrame, bar_deg: float) -> Figure:
         none = at[np.isnan(errors)]
         axis.plot(np.ones(len(none)), none, "x", color=colour, markersize=5, **edge)
     axis.axvline(bar_deg, color=style.STATUS["lost"][0], linewidth=1, linestyle="--")
-    axis.set_xscale("log")
-    axis.xaxis.set_major_formatter("{x:g}")
-    axis.xaxis.set_minor_formatter("")
+    logarithmic(axis.xaxis)
     axis.set_yticks(range(len(methods)), [m.removesuffix(" [°]") for m in methods])
     axis.invert_yaxis()
     axis.set(xlabel=f"rotation error [°], one dot per synthetic mug; dashed: {bar_deg:g}°; cross: no pose")

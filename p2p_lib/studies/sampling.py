@@ -8,10 +8,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullLocator
 from pandas import DataFrame
 
@@ -45,6 +45,7 @@ _NOTHING = np.zeros((0, 2))
 _WIDTH_IN = 8.0
 _TERMS = (r"$\lambda\, s$", r"$(1-\lambda)\min(d/r_{ideal}, 1)$", r"$-\beta\,\rho(d)$", r"$J$")
 _TERM_COLOURS = ("#0072B2", "#56B4E9", "#D55E00")
+_RIM = [withStroke(linewidth=2.4, foreground="black")]
 # A point whose measured depth is off by more lies on a side that cannot be seen.
 _IN_SIGHT_M = 0.01
 
@@ -271,40 +272,31 @@ def term_maps(situation: Situation, candidates: Candidates, after: Sequence[int]
     figure = Figure((_WIDTH_IN, 0.9 + len(after) * (height + 0.25)), layout="constrained")
     axes = figure.subplots(len(after), 4, squeeze=False)
     for row, k in zip(axes, after, strict=True):
-        taken = candidates.uv_px[chosen[:k]]
+        taken, following = candidates.uv_px[chosen[:k]], candidates.uv_px[chosen[k : k + 1]]
         d_px = distance_px(pixels.reshape(-1, 2), taken).reshape(outside.shape)
         dense = terms(np.zeros(outside.shape), d_px, config)
         dots = terms(candidates.score, distance_px(candidates.uv_px, taken), config)
-        for axis, shown, (low, high) in zip(row, (dots.trackability, None, None, dots.total), limits, strict=True):
+        columns = (dots.trackability, dense.spread, dense.crowding, dots.total)
+        for n, (axis, values, (low, high)) in enumerate(zip(row, columns, limits, strict=True)):
+            colours = {"cmap": "cividis", "vmin": low, "vmax": high}
             axis.imshow(grey, "gray", vmin=-150, vmax=300, extent=extent)
-            if shown is not None:
-                order = np.argsort(shown)
-                colours = {"cmap": "cividis", "vmin": low, "vmax": high}
-                axis.scatter(*candidates.uv_px[order].T, 7, shown[order], linewidths=0, **colours)
-        for axis, values, (low, high) in zip(row[1:3], (dense.spread, dense.crowding), limits[1:3], strict=True):
-            axis.imshow(np.ma.masked_array(values, outside), "cividis", vmin=low, vmax=high, extent=extent)
-        # Rings would hide the few pixels that crowding, in the third column, is about.
-        _mark(row, row[[0, 1, 3]], taken, candidates.uv_px[chosen[k : k + 1]])
-        for axis in row:
+            if values.ndim == 2:
+                shown = axis.imshow(np.ma.masked_array(values, outside), extent=extent, **colours)
+            else:
+                order = np.argsort(values)
+                shown = axis.scatter(*candidates.uv_px[order].T, 7, values[order], linewidths=0, **colours)
+            if n != 2:  # a ring would hide the few pixels that crowding is about
+                axis.plot(*taken.T, "o", color="white", markersize=5, mew=0.9, mfc="none", path_effects=_RIM)
+            axis.plot(*following.T, "x", color=style.AXES[0], markersize=7, mew=1.6, path_effects=_RIM)
             axis.set(xticks=[], yticks=[], xlim=(left, right), ylim=(bottom, top))
             axis.spines[:].set_visible(False)
+            if k == after[-1]:
+                figure.colorbar(shown, ax=axes[:, n], location="bottom", shrink=0.85, aspect=18, pad=0.02)
         row[0].set_ylabel(f"after {k}")
-    for axis, column, title in zip(axes[0], axes.T, _TERMS, strict=True):
+    for axis, title in zip(axes[0], _TERMS, strict=True):
         axis.set_title(title, fontsize=9, loc="center")
-        values = [*column[-1].get_images()[1:], *column[-1].collections]
-        figure.colorbar(values[0], ax=column, location="bottom", shrink=0.85, aspect=18, pad=0.02)
     figure.suptitle(f"{situation.video.name}, {situation.name}, frame {situation.frame.index}", x=0.01, ha="left")
     return figure
-
-
-def _mark(axes: Sequence[Axes], ringed: Sequence[Axes], taken_px: np.ndarray, next_px: np.ndarray) -> None:
-    """Rings around the points that are taken, a cross on the next one."""
-    for axis in ringed:
-        for colour, width in (("black", 1.8), ("white", 0.9)):
-            axis.scatter(*taken_px.T, 26, facecolors="none", edgecolors=colour, linewidths=width)
-    for axis in axes:
-        for colour, size, width in (("black", 8, 3), (style.AXES[0], 7, 1.6)):
-            axis.plot(*next_px.T, "x", color=colour, markersize=size, markeredgewidth=width)
 
 
 @style.styled

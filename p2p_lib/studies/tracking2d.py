@@ -17,7 +17,7 @@ from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.point_tracks import FOUND_PX, Outcome, Reliability, after_query, outcomes, reliability
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.plots import panels, status_intervals
+from p2p_lib.figures.plots import logarithmic, panels, status_intervals
 
 _WIDTH_IN = 8.0
 _OUTCOMES = {
@@ -202,8 +202,8 @@ def reliability_plot(rows: Mapping[str, Reliability], uncertain_px: Mapping[str,
         if label in uncertain_px:
             stated_px = uncertain_px[label] * row.uncertainty / (1 - row.uncertainty)
             axis.plot(row.uncertainty, stated_px, "--", color=style.NEUTRAL[0], label="standard deviation stated")
-        axis.set(xlabel=r"uncertainty $\sigma_t$", yscale="log")
-        axis.yaxis.set_major_formatter("{x:g}")
+        axis.set_xlabel(r"uncertainty $\sigma_t$")
+        logarithmic(axis.yaxis)
         axis.set_title(f"{label}: rank correlation {row.rank_correlation:.2f}")
         axis.sharey(axes[0])
     axes[0].set_ylabel("error [px]")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.figures import plots, provenance, tables
+from p2p_lib.figures import plots, provenance
 from p2p_lib.figures.provenance import save_figure, save_table, save_video
 
 
