@@ -108,7 +108,7 @@ def check_folder(
     if beyond := _all_beyond(firsts, config):
         return [*findings, beyond]  # what follows would only be its consequences
     for name, (frame, mask) in firsts.items():
-        if mask.sum() < config.pipeline.min_mask_px:
+        if mask.sum() < config.lifecycle.min_mask_px:
             findings.append(_nothing_there(name, frame, mask, config))
             continue
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
@@ -245,13 +245,13 @@ def _no_masks(sequence: Sequence, drawn: bool, config: Config) -> Finding:
     fix = f"Make clicks with p2p click and give them with --prompts, or put masks into {sequence.path}/masks."
     if not drawn:
         return Finding("masks", Level.LOOK, "none", fix)
-    text = f"none that shows an object: no object has {config.pipeline.min_mask_px} pixels in any image"
+    text = f"none that shows an object: no object has {config.lifecycle.min_mask_px} pixels in any image"
     return Finding("masks", Level.WRONG, text, fix)
 
 
 def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """A click at which the segmenter found no object to speak of."""
-    count, needed = int(mask.sum()), config.pipeline.min_mask_px
+    count, needed = int(mask.sum()), config.lifecycle.min_mask_px
     what = f"only {count} pixels were segmented" if count else "nothing was segmented"
     text = f"{what} at the clicks on it in frame {frame.index}; {needed} pixels are needed"
     return Finding(f"{name}: mask", Level.WRONG, text, "Click elsewhere, in the middle of the object: p2p click.")
@@ -267,10 +267,10 @@ def _distance_m(frame: Frame, mask: np.ndarray) -> float:
 
 def _all_beyond(firsts: FirstMasks, config: Config) -> Finding | None:
     """The one finding of objects that are all too far away, or all too near: most likely depth is in another unit."""
-    pipe, away_m = config.pipeline, {name: _distance_m(*first) for name, first in firsts.items()}
+    limits, away_m = config.depth, {name: _distance_m(*first) for name, first in firsts.items()}
     distances = np.array(list(away_m.values()))
-    far = bool((distances > pipe.depth_max_m).all())
-    if not far and not (distances < pipe.depth_min_m).all():
+    far = bool((distances > limits.max_m).all())
+    if not far and not (distances < limits.min_m).all():
         return None
     (first, (frame, mask)), *others = firsts.items()
     text = f"{away_m[first]:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
@@ -280,17 +280,17 @@ def _all_beyond(firsts: FirstMasks, config: Config) -> Finding | None:
 
 def _beyond(text: str, distances: np.ndarray, config: Config) -> tuple[str, str]:
     """What is said of distances on one side of those that count, and what to do: the unit first, then the limit."""
-    pipe, far = config.pipeline, bool(distances.max() > config.pipeline.depth_max_m)
+    limits, far = config.depth, bool(distances.max() > config.depth.max_m)
     factor = _factor(float(np.median(distances)))
     guess = f": {factor:g} times the present one would make it {distances[0] * factor:.2f} m" if factor else ""
-    wider = f"depth_max_m={2 * distances.max():.1f}" if far else f"depth_min_m={distances.min() / 2:.2g}"
-    fix = f"If it was not, the depth scale is wrong (--depth-scale{guess}); if it was, --set pipeline.{wider}."
-    return f"{text}, but {pipe.depth_min_m:g} to {pipe.depth_max_m:g} m count", fix
+    wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
+    fix = f"If it was not, the depth scale is wrong (--depth-scale{guess}); if it was, --set depth.{wider}."
+    return f"{text}, but {limits.min_m:g} to {limits.max_m:g} m count", fix
 
 
 def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """Whether an object is where depth counts, and measured."""
-    pipe, depth_m = config.pipeline, frame.depth_m[mask]
+    limits, depth_m = config.depth, frame.depth_m[mask]
     share = float((depth_m > 0).mean())
     if share < MEASURED_SHARE:
         fix = "Dark, shiny and transparent things have none; change the light or the distance, or spray it matt."
@@ -298,7 +298,7 @@ def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding
         return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
     median_m = float(np.median(depth_m[depth_m > 0]))
     text = f"{median_m:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
-    if not pipe.depth_min_m <= median_m <= pipe.depth_max_m:
+    if not limits.min_m <= median_m <= limits.max_m:
         return Finding(f"{name}: depth", Level.WRONG, *_beyond(text, np.array([median_m]), config))
     return Finding(f"{name}: depth", Level.OK, text)
 
@@ -306,7 +306,7 @@ def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding
 def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Finding:
     """Whether an object's masks hold background; the first of them also whether it is background altogether."""
     first = seen[0]
-    seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.pipeline.min_mask_px]
+    seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.lifecycle.min_mask_px]
     shares = np.array([background_share(mask, frame.depth_m) for frame, mask in seen])
     if np.isnan(shares).all():
         return Finding(f"{name}: mask", Level.OK, "no depth along its rim to judge it by")
@@ -334,11 +334,11 @@ def _extent(frame: Frame, mask: np.ndarray) -> tuple[float, float, float]:
 def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """Whether an object has anything to track: points that can be lifted, with a contrast of their own."""
     detector = make_detector(DEFAULT_DETECTOR, config.sampling, np.random.default_rng(config.seed))
-    found = detector.detect(frame, usable_region(frame, mask, config.sampling))
+    found = detector.detect(frame, usable_region(frame, mask, config.sampling, config.depth.edge_m))
     taken = choose(found, np.zeros((0, 2)), config.sampling.max_visible, config.sampling)
     u, v = np.rint(found.uv_px[taken]).astype(int).T
     contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]
-    count, needed = int((contrast >= config.tracking.bare_contrast).sum()), config.pipeline.recover_min_inliers
+    count, needed = int((contrast >= config.tracking.bare_contrast).sum()), config.lifecycle.return_inliers
     text = f"places to track in frame {frame.index}: {count}"
     if count < needed:
         fix = "Come nearer, light it better, or begin with a textured side: then its surface alone carries the pose."
@@ -361,7 +361,7 @@ def _first_masks(sequence: Sequence, config: Config) -> FirstMasks:
         if masks is None or firsts.keys() >= set(sequence.objects):
             break
         for name in sorted(masks.keys() & set(sequence.objects) - firsts.keys()):
-            if masks[name].sum() >= config.pipeline.min_mask_px:
+            if masks[name].sum() >= config.lifecycle.min_mask_px:
                 firsts[name] = sequence.frame(i), masks[name]
     return firsts
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.robust import fit_rigid
 from p2p_lib.datasets.models import load_mesh
 from p2p_lib.datasets.sequence import Sequence
-from p2p_lib.method.registration import fit_rigid
 
 if TYPE_CHECKING:
     import trimesh

@@ -524,7 +524,7 @@ def reconstruction_sheet(benchmark: Benchmark, method: str, sequence: str = "", 
         chamfer_cm = benchmark.chamfer_cm(method, sequence, name)
         images += _beside_truth(run, video, evaluation, name, chamfer_cm, width_px)
     if not images:
-        raise MissingData(str(run.path), "no reconstructed surface", "Run with the setting tsdf.enabled = true.")
+        raise MissingData(str(run.path), "no reconstructed surface", "Run with the setting method.surface = true.")
     return overlay.montage(images, columns=4)
 
 

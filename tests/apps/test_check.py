@@ -220,7 +220,7 @@ def scaled_depth(folder, factor):
 
 
 @pytest.mark.parametrize(
-    ("factor", "limit", "scale"), [(0.1, "depth_min_m=0.03", "10 times"), (10, "depth_max_m=1", "0.1 times")]
+    ("factor", "limit", "scale"), [(0.1, "depth.min_m=0.03", "10 times"), (10, "depth.max_m=1", "0.1 times")]
 )
 def test_objects_all_out_of_range_are_one_finding(good, tmp_path, factor, limit, scale):
     (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)))

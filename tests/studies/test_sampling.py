@@ -11,8 +11,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.interfaces import Candidates
+from p2p_lib.core.robust import fit_rigid
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.method.registration import fit_rigid
 from p2p_lib.method.sampling import choose, objective
 from p2p_lib.studies import sampling
 from p2p_lib.studies.sampling import (
