@@ -119,11 +119,11 @@ def basins(
 
 
 @style.styled
-def held_directions(strengths: Mapping[str, np.ndarray], needed: float) -> Figure:
-    """How firmly each shape holds the six directions of its pose, least first; below ``needed`` one is left alone."""
+def held_directions(eigenvalues: Mapping[str, np.ndarray], needed: float) -> Figure:
+    """Observability of the six directions of each shape's pose, least first; below ``needed`` one is left alone."""
     lowest = needed / 12
-    figure, axes = panels(len(strengths), (8.0, 2.7), side_by_side=True)
-    for axis, (name, values) in zip(axes, strengths.items(), strict=True):
+    figure, axes = panels(len(eigenvalues), (8.0, 2.7), side_by_side=True)
+    for axis, (name, values) in zip(axes, eigenvalues.items(), strict=True):
         held = values >= needed
         colours = np.where(held, style.OBJECTS[0], style.STATUS["lost"][0])
         axis.bar(range(1, 7), np.maximum(values, 1.5 * lowest), color=colours)
@@ -132,7 +132,7 @@ def held_directions(strengths: Mapping[str, np.ndarray], needed: float) -> Figur
         axis.set_title(f"{name}: {(~held).sum()} of 6 free")
         axis.grid(axis="x", visible=False)
         axis.label_outer()
-    axes[0].set_ylabel("strength")
+    axes[0].set_ylabel("eigenvalue")
     return figure
 
 
