@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullLocator
-from pandas import DataFrame
+from pandas import DataFrame, concat
 
 from p2p_lib.core import se3
 from p2p_lib.core.backends import make_detector, make_tracker
@@ -226,31 +226,29 @@ class MapHistory:
 def follow_map(sequence: Video, name: str, frames: int, tracker: str = "builtin", seed: int = 0) -> MapHistory:
     """Run the pipeline on one object of a sequence with truth and write down what becomes of its points."""
     method = Point2Pose(sequence.camera, preset(seed=seed), tracker=tracker)
-    scene, object = TrueScene.of(sequence), tuple(sequence.truth).index(name)
     method.add_object(name, mask=sequence.masks(0)[name])
-    never = {"promoted": frames, "gone": frames, "p_promoted": np.full(3, np.nan)}
-    lives: dict[int, dict[str, Any]] = {}
-    keyframe, poses = np.zeros(frames, bool), np.full((frames, 4, 4), np.nan)
+    keyframe, poses, maps = np.zeros(frames, bool), np.full((frames, 4, 4), np.nan), []
     for t in range(frames):
-        frame, masks = sequence.frame(t), sequence.masks(t) or {}
+        masks = sequence.masks(t) or {}
         # A mask that is left out: hidden.
-        estimate = method.step(frame, {name: masks[name]} if name in masks else {})[name]
+        estimate = method.step(sequence.frame(t), {name: masks[name]} if name in masks else {})[name]
         keyframe[t], points = estimate.keyframe, method.objects[name].map
         if estimate.T_cam_obj is not None:
             poses[t] = estimate.T_cam_obj
-        T_obj_model = se3.inverse(poses[0]) @ sequence.truth[name].T_cam_model[0]
-        new = np.flatnonzero(~np.isin(points.ids, list(lives)))
-        uv_px = sequence.camera.project(se3.transform(poses[t], points.p_obj[new]))
-        true = se3.transform(T_obj_model, scene.lift(frame, np.full(len(new), object), uv_px).p_model)
-        for row, p_true in zip(new, true, strict=True):
-            lives[int(points.ids[row])] = never | {"born": t, "p_born": points.p_obj[row].copy(), "p_true": p_true}
-        for id in lives.keys() - set(points.ids.tolist()):
-            lives[id]["gone"] = min(lives[id]["gone"], t)
-        for row in np.flatnonzero(points.promoted):
-            if lives[int(points.ids[row])]["promoted"] == frames:
-                lives[int(points.ids[row])] |= {"promoted": t, "p_promoted": points.p_obj[row].copy()}
-    columns = {key: np.array([lives[id][key] for id in sorted(lives)]) for key in (*never, "born", "p_born", "p_true")}
-    return MapHistory(name, keyframe=keyframe, T_cam_obj=poses, **columns)
+        maps.append(DataFrame(points.p_obj.copy(), points.ids).assign(frame=t, promoted=points.promoted.copy()))
+    held = concat(maps)  # by id: place (columns 0, 1, 2), frame, promoted
+    born, gone = held.groupby(level=0).first(), held.groupby(level=0)["frame"].last() + 1
+    promoted = held[held["promoted"]].groupby(level=0).first().reindex(born.index)
+    p_born, p_promoted = (table[[0, 1, 2]].to_numpy(float) for table in (born, promoted))
+    scene, T_obj_model = TrueScene.of(sequence), se3.inverse(poses[0]) @ sequence.truth[name].T_cam_model[0]
+    p_true = np.full_like(p_born, np.nan)
+    for t in born["frame"].unique():
+        rows = np.flatnonzero(born["frame"] == t)
+        uv_px = sequence.camera.project(se3.transform(poses[t], p_born[rows]))
+        object = np.full(len(rows), tuple(sequence.truth).index(name))
+        p_true[rows] = se3.transform(T_obj_model, scene.lift(sequence.frame(t), object, uv_px).p_model)
+    when = (born["frame"].to_numpy(), promoted["frame"].fillna(frames).to_numpy(int), gone.to_numpy())
+    return MapHistory(name, *when, p_born, p_promoted, p_true, keyframe, poses)
 
 
 @style.styled
