@@ -185,8 +185,7 @@ def _tracked(frames: Sequence[Frame], uv_px: np.ndarray, config: Config, rng: np
 
 def draw_tracks(moment: Moment, width_px: int = 720) -> np.ndarray:
     """Where each point was sampled and where the tracker has it now: a line to a dot (follows the mug) or a cross."""
-    image, camera = _zoomed(moment, width_px)
-    image = _outline(image, camera, moment, moment.T_cam_obj, style.TRUTH)
+    image, camera = _outlined(moment, moment.T_cam_obj, style.TRUTH, width_px)
     now, before = (overlay.zoomed_px(uv, moment.camera, camera) for uv in (moment.uv_px, moment.uv_before_px))
     known = np.isfinite(moment.p_cam).all(1)
     for rows, colour in ((known & ~moment.right, _STRAYS), (known & moment.right, _FOLLOWS)):
@@ -201,9 +200,8 @@ def draw_hypotheses(moment: Moment, hypotheses: Sequence[Hypothesis], scores_m: 
     """An image per hypothesis: where it puts the mug (outline in its colour) and the points that speak for it."""
     images = []
     for k, (hypothesis, score) in enumerate(zip(hypotheses, scores_m, strict=True)):
-        image, camera = _zoomed(moment, 420)
         colour = _HYPOTHESES[k % len(_HYPOTHESES)]
-        image = _outline(image, camera, moment, hypothesis.T_cam_obj, colour)
+        image, camera = _outlined(moment, hypothesis.T_cam_obj, colour, 420)
         inliers_px = overlay.zoomed_px(moment.uv_px[hypothesis.inliers], moment.camera, camera)
         image = overlay.draw_points(image, inliers_px, colour, 3)
         caption = f"h = {k + 1}: {hypothesis.support} inliers, score {1e3 * score:.2f} mm"
@@ -255,16 +253,12 @@ def method_errors(table: DataFrame, bar_deg: float) -> Figure:
     return figure
 
 
-def _zoomed(moment: Moment, width_px: int) -> tuple[np.ndarray, Camera]:
-    """The image around the mug, and the camera that sees it so."""
+def _outlined(moment: Moment, T_cam_obj: np.ndarray, colour: str, width_px: int) -> tuple[np.ndarray, Camera]:
+    """The image around the mug with the silhouette of the true model at a pose, and the camera that sees it so."""
     region_px = overlay.region_around(moment.mask, moment.camera, (75, 30))
-    return overlay.zoomed(moment.frame.rgb, moment.camera, region_px, width_px)
-
-
-def _outline(image: np.ndarray, camera: Camera, moment: Moment, T_cam_obj: np.ndarray, colour: str) -> np.ndarray:
-    """The silhouette of the true model at a pose."""
+    image, camera = overlay.zoomed(moment.frame.rgb, moment.camera, region_px, width_px)
     uv_px = camera.project(se3.transform(T_cam_obj, moment.mesh.vertices))[moment.mesh.faces]
     mask = np.zeros(image.shape[:2], np.uint8)
     for triangle in np.rint(uv_px * 16).astype(np.int32):
         cv2.fillConvexPoly(mask, triangle, 1, shift=4)
-    return overlay.draw_mask(image, mask > 0, colour)
+    return overlay.draw_mask(image, mask > 0, colour), camera

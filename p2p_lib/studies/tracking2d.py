@@ -53,18 +53,13 @@ def tracker_table(scores: Mapping[str, TrackerScore | str]) -> DataFrame:
     """A row per tracker; one that did not run has dashes and the reason."""
     rows = []
     for label, score in scores.items():
-        reason = score if isinstance(score, str) else ""
-        plain = {} if reason else score.as_dict()
-        row = {
-            "tracker": label,
-            "AJ": plain.get("aj"),
-            "delta_avg": plain.get("delta_avg"),
-            "OA": plain.get("oa"),
-            "found again [%]": None if reason else round(100 * plain["redetection"]["found_same_view"], 1),
-            "CPU [ms/frame]": None if reason else round(plain["cpu_ms"]["mean"], 1),
-            "why not": reason,
-        }
-        rows.append(row)
+        row = {"tracker": label}
+        if isinstance(score, TrackerScore):
+            plain = score.as_dict()
+            row |= {"AJ": plain["aj"], "delta_avg": plain["delta_avg"], "OA": plain["oa"]}
+            row["found again [%]"] = round(100 * plain["redetection"]["found_same_view"], 1)
+            row["CPU [ms/frame]"] = round(plain["cpu_ms"]["mean"], 1)
+        rows.append({**row, "why not": score if isinstance(score, str) else ""})
     return DataFrame(rows).round(3)
 
 
