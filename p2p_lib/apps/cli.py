@@ -242,7 +242,7 @@ def _eval_tracks(a: argparse.Namespace) -> None:
 def _benchmark(a: argparse.Namespace) -> int:
     from p2p_lib.benchmark import plan_names, read_plan, run_benchmarks
     from p2p_lib.core.paths import data_dir
-    from p2p_lib.studies.paper_tables import write_table
+    from p2p_lib.studies.final_tables import write_table
 
     if a.list:
         for name in plan_names():

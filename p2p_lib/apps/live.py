@@ -9,6 +9,7 @@ import json
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from time import monotonic
 
@@ -19,7 +20,6 @@ from p2p_lib.core.options import RunOptions
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.cameras import LiveCamera, Newest, Still
 from p2p_lib.datasets.prompts import Prompt
-from p2p_lib.method.object_tracker import make_volume
 from p2p_lib.method.pipeline import Point2Pose
 
 
@@ -66,7 +66,7 @@ def track_live(
     segmenter = options.masks or DEFAULT_SEGMENTER
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
     if config.method.surface:
-        make_volume(config.tsdf)  # what it loads takes seconds, in which the camera need not run
+        import_module("p2p_lib.method.tsdf")  # takes seconds, in which the camera need not run
     start_s = monotonic()
     with Newest(camera, keep={p.frame for p in prompts}) as newest:
         frame = first or newest.take()
