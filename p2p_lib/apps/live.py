@@ -19,7 +19,6 @@ from p2p_lib.core.options import RunOptions
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.cameras import LiveCamera, Newest, Still
 from p2p_lib.datasets.prompts import Prompt
-from p2p_lib.method.object_tracker import make_volume
 from p2p_lib.method.pipeline import Point2Pose
 
 
@@ -66,7 +65,9 @@ def track_live(
     segmenter = options.masks or DEFAULT_SEGMENTER
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
     if config.method.surface:
-        make_volume(config.tsdf)  # what it loads takes seconds, in which the camera need not run
+        from p2p_lib.method.tsdf import TsdfVolume
+
+        TsdfVolume(config.tsdf)  # what it loads takes seconds, in which the camera need not run
     start_s = monotonic()
     with Newest(camera, keep={p.frame for p in prompts}) as newest:
         frame = first or newest.take()
