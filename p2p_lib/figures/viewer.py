@@ -162,7 +162,7 @@ class _Scene:
             )
 
     def show(self, i: int, renew: bool) -> None:
-        """Change the scene to row i; ``renew``: its points, picture and bright keypoints too."""
+        """Change the scene to row i; ``renew``: its points, image and bright keypoints too."""
         for name, nodes in self._objects.items():
             self._show_object(name, nodes, i, renew)
         frame = self._playback.frame(i) if renew else None

@@ -8,7 +8,7 @@ best among methods without a CAD model, of those that ran on the whole of what t
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -204,21 +204,17 @@ def _metrics(numbers: Numbers, paper: Reported) -> list[str]:
     return [metric for metric in METRICS if metric in printed and (metric in _AREAS or numbers.plan.chamfer)]
 
 
-def _filled(numbers: Numbers) -> Iterator[tuple[str, Job, str]]:
-    """Column, job and object of every run; one that did not run fills the columns that its plan gives it."""
+def _places(numbers: Numbers) -> dict[str, tuple[Job, str]]:
+    """Column to the first job and object that fill it; a job that did not run fills those that its plan gives it."""
+    places: dict[str, tuple[Job, str]] = {}
     for job, outcome in numbers.benchmark.results:
         names = list(outcome.objects) or list(job.sequence.columns) or job.sequence.objects or [""]
         for name in names:
             own = shown_name(job) + (f" {name}" if len(names) > 1 else "")
-            yield job.sequence.column_of(name) or own, job, name
-
-
-def _places(numbers: Numbers) -> dict[str, tuple[Job, str]]:
-    """Column to the first job that fills it, one that has run and knows its objects before one that does not."""
-    places: dict[str, tuple[Job, str]] = {}
-    for column, job, name in _filled(numbers):
-        if column not in places or (name and not places[column][1]):
-            places[column] = job, name
+            column = job.sequence.column_of(name) or own
+            # One that has run knows its objects, one that has not may not.
+            if column not in places or (name and not places[column][1]):
+                places[column] = job, name
     return places
 
 

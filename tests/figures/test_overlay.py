@@ -156,10 +156,10 @@ def test_values_go_from_dark_to_light():
 def test_near_is_lighter_than_far_and_unmeasured_is_white():
     depth = np.tile(np.linspace(0.4, 1.6, 64, dtype=np.float32), (8, 1))
     depth[:, 10] = 0
-    image = overlay.depth_picture(depth)
+    image = overlay.depth_image(depth)
     light = image[0] @ [0.2126, 0.7152, 0.0722]
     assert light[0] > light[30] > light[-1] and (image[:, 10] == 255).all()
-    assert (overlay.depth_picture(np.zeros((4, 5))) == 255).all()
+    assert (overlay.depth_image(np.zeros((4, 5))) == 255).all()
 
 
 @pytest.mark.parametrize("width_px", [200, 333, 900])
