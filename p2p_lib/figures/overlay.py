@@ -19,6 +19,7 @@ from p2p_lib.figures import style
 
 _SHIFT = 4  # OpenCV's fixed-point coordinates: sixteenths of a pixel
 _NEAR_M = 0.02  # lines are cut off here, in front of the camera
+_GAP_PX = 4  # between the images of a montage
 _FONT, _RIM = cv2.FONT_HERSHEY_SIMPLEX, "#101010"
 
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -42,18 +43,14 @@ class Box:
             raise BadInput("box size_m", self.size_m, "three lengths in metres")
 
     @classmethod
-    def around(cls, points: np.ndarray, T_obj_points: np.ndarray = se3.IDENTITY, keep: float = 1.0) -> Box:
-        """The box of points (N, 3) along the axes of their own frame; ``keep`` < 1 leaves out the farthest of them."""
+    def around(cls, points: np.ndarray, T_obj_points: np.ndarray = se3.IDENTITY) -> Box:
+        """The box of points (N, 3) along the axes of their own frame."""
         points = np.asarray(points, float)
         points = points[np.isfinite(points).all(1)]
         if not len(points):
             raise BadInput("box", "no finite points", "at least one")
-        low, high = np.quantile(points, [(1 - keep) / 2, (1 + keep) / 2], axis=0)
+        low, high = points.min(0), points.max(0)
         return cls(T_obj_points @ se3.from_rt(np.eye(3), (low + high) / 2), high - low)
-
-    def moved(self, T_new_obj: np.ndarray) -> Box:
-        """The same box in another frame."""
-        return Box(T_new_obj @ self.T_obj_box, self.size_m)
 
 
 def box_corners(size_m: np.ndarray) -> np.ndarray:
@@ -235,15 +232,15 @@ def region_around(
     return int(left), int(top), int(right), int(bottom)
 
 
-def montage(images: Sequence[np.ndarray], columns: int, gap_px: int = 4) -> np.ndarray:
+def montage(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
     """Images of one size, row by row, with white between them."""
     if not len(images) or len({image.shape for image in images}) != 1:
         raise BadInput("montage", sorted({image.shape for image in images}), "images of one size")
     h, w, _ = images[0].shape
     rows = -(-len(images) // columns)
-    sheet = np.full((rows * (h + gap_px) - gap_px, columns * (w + gap_px) - gap_px, 3), 255, np.uint8)
+    sheet = np.full((rows * (h + _GAP_PX) - _GAP_PX, columns * (w + _GAP_PX) - _GAP_PX, 3), 255, np.uint8)
     for k, image in enumerate(images):
-        top, left = k // columns * (h + gap_px), k % columns * (w + gap_px)
+        top, left = k // columns * (h + _GAP_PX), k % columns * (w + _GAP_PX)
         sheet[top : top + h, left : left + w] = image
     return sheet
 
