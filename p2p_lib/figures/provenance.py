@@ -14,9 +14,10 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from pandas import DataFrame
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import paths
@@ -28,9 +29,6 @@ from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.figures import film as video
 from p2p_lib.figures import style
 from p2p_lib.figures.tables import Table
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 _WHAT_RAN = "sequence objects start stop frames tracker masks preset seed commit modified".split()
 _SHOWN_PX = 900  # a notebook shows images at most this wide

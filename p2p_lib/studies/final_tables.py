@@ -10,9 +10,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import Job
@@ -37,10 +40,6 @@ from p2p_lib.figures.plots import logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.figures.tables import Cell, Table, emboldened, number
 from p2p_lib.synthetic.shapes import load_mesh
-
-if TYPE_CHECKING:
-    import trimesh
-    from matplotlib.figure import Figure
 
 #: The paper's metrics: what the benchmark calls them, their head, and whether more is better.
 METRICS = {
@@ -471,9 +470,6 @@ def tracks_by_error(
     The error is the distance in pixels from where the tracker saw a keypoint to the keypoint of the final map projected
     with the true pose; points that the map has dropped since are not drawn.
     """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
     scene, run, video = scene_of(benchmark, method, sequence)
     evaluation, keypoints, region_px = evaluate(run), load_keypoints(run.path), scene.region()
     images = []
@@ -527,8 +523,6 @@ def reconstruction_sheet(benchmark: Benchmark, method: str, sequence: str = "", 
 def _beside_truth(
     run: Run, video: Sequence, evaluation: Evaluation, name: str, chamfer_cm: float | None, width_px: int
 ) -> list[np.ndarray]:
-    import trimesh
-
     file, model = run.path / "meshes" / f"{name}.ply", find_models(video, MESHES).get(name)
     if not file.is_file() or model is None:
         return []

@@ -15,11 +15,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from pandas import DataFrame, concat
@@ -38,9 +38,6 @@ from p2p_lib.figures import overlay, style
 from p2p_lib.figures.plots import logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic import scenario_dir
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 #: The mask's outermost pixels are left out: their gradient is that of the outline, not of what is printed.
 MARGIN_PX = 3
