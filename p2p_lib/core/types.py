@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import StrEnum
+from typing import TypeVar
 
 import numpy as np
 
@@ -79,6 +81,15 @@ class Tracks:
         if len(ids) and (len(self.ids) == 0 or (self.ids[np.minimum(at, len(self.ids) - 1)] != ids).any()):
             raise BadInput("track ids", "ids the tracker does not hold", "ids returned by add() and not dropped")
         return Tracks(ids, self.uv_px[at], self.visible[at], self.uncertainty[at])
+
+
+Arrays = TypeVar("Arrays")
+
+
+def joined(parts: Sequence[Arrays], join: Callable[..., np.ndarray] = np.concatenate) -> Arrays:
+    """Values of one dataclass that holds arrays (or such dataclasses again), one after the other."""
+    columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(parts[0])}
+    return type(parts[0])(*(joined(c, join) if is_dataclass(c[0]) else join(c) for c in columns.values()))
 
 
 class Status(StrEnum):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.types import joined
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation.protocol import Evaluation, ObjectScore
 
@@ -28,10 +29,6 @@ class Judged:
 
     def __len__(self) -> int:
         return len(self.right)
-
-    def joined(self, other: Judged) -> Judged:
-        """These poses, then the others."""
-        return Judged(np.r_[self.confidence, other.confidence], np.r_[self.right, other.right])
 
     @property
     def calibration_error(self) -> float:
@@ -87,10 +84,7 @@ def judge(run: Run, evaluation: Evaluation) -> dict[str, Judged]:
 
 def pooled(many: Iterable[Judged]) -> Judged:
     """All of them together."""
-    total = Judged(np.zeros(0), np.zeros(0, bool))
-    for one in many:
-        total = total.joined(one)
-    return total
+    return joined([Judged(np.zeros(0), np.zeros(0, bool)), *many])
 
 
 def reliability(judged: Judged, bins: int = 10) -> Bins:

@@ -24,7 +24,7 @@ from p2p_lib.evaluation.point_tracks import (
     redetections,
     tapvid,
 )
-from p2p_lib.evaluation.true_tracks import Queries, TrueScene, TrueTracks, draw_queries, true_tracks
+from p2p_lib.evaluation.true_tracks import Queries, Sight, TrueScene, draw_queries, true_tracks
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -50,7 +50,7 @@ class TrackerScore:
 
     tapvid: TapVid
     redetections: DataFrame
-    truth: TrueTracks
+    truth: Sight
     run: TrackRun
     queries: Queries
     info: dict[str, Any]
@@ -85,7 +85,7 @@ class TrackTask:
     sequence: Sequence
     scene: TrueScene
     queries: Queries
-    truth: TrueTracks
+    truth: Sight
     seed: int
 
     @classmethod

@@ -12,7 +12,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.interfaces import PointTracker
-from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.evaluation.true_tracks import NO_POINTS, SurfacePoints, TrueScene
 
 
@@ -107,6 +107,6 @@ class RecordedTracker:
         for index, new_ids, uv_px in self._queries:
             frame = scene.sequence.frame(index)
             ids.append(new_ids)
-            points = points.joined(scene.lift(frame, scene.owners(frame, uv_px), uv_px))
+            points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
         ids = np.concatenate(ids)
         return np.sort(ids), points.select(np.argsort(ids))
