@@ -1,9 +1,8 @@
-"""Scores as tables: pandas DataFrames that say their units."""
+"""Scores as tables that say their units, and tables for papers: cells with a number, its spread and its reason."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,13 +13,6 @@ from p2p_lib.evaluation.recovery import recovery_events
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-
-def of_rows(rows: Iterable[Mapping[str, Any]]) -> DataFrame:
-    """A table of one row per mapping; the keys are its heads, units included."""
-    from pandas import DataFrame
-
-    return DataFrame(list(rows))
 
 
 def score_table(evaluation: Evaluation) -> DataFrame:
@@ -40,19 +32,17 @@ def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
         obj = run.objects[name]
         for event in recovery_events(obj, score):
             gone, back = np.searchsorted(obj.frame_index, [event.hidden_frame, event.return_frame])
-            moved_m, turned_rad = _moved(obj.T_cam_model[gone - 1], obj.T_cam_model[back])
-            times_s = round(float(obj.time_s[gone]), 2), round(float(obj.time_s[back]), 2)
-            rows.append((name, *times_s, round(100 * moved_m, 1), round(float(np.degrees(turned_rad)), 1)))
-            rows[-1] += (event.frames_to_recovery,)
-    heads = (
-        "object",
-        "hidden at [s]",
-        "back at [s]",
-        "moved unseen [cm]",
-        "turned unseen [°]",
-        "frames to a good pose",
-    )
-    return DataFrame(rows, columns=heads)
+            T_before, T_after = obj.T_cam_model[gone - 1], obj.T_cam_model[back]
+            row = {
+                "object": name,
+                "hidden at [s]": obj.time_s[gone].round(2),
+                "back at [s]": obj.time_s[back].round(2),
+                "moved unseen [cm]": (100 * np.linalg.norm(T_after[:3, 3] - T_before[:3, 3])).round(1),
+                "turned unseen [°]": np.degrees(se3.angle_rad(se3.inverse(T_before) @ T_after)).round(1),
+                "frames to a good pose": event.frames_to_recovery,
+            }
+            rows.append(row)
+    return DataFrame(rows)
 
 
 def _moved(T_cam_before: np.ndarray, T_cam_after: np.ndarray) -> tuple[float, float]:

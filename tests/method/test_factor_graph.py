@@ -9,8 +9,8 @@ from scipy.optimize import least_squares
 from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig, preset
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.robust import fit_rigid
 from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
-from p2p_lib.method.registration import fit_rigid
 
 pytest.importorskip("gtsam")
 

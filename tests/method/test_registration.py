@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.robust import fit_rigid
 from p2p_lib.method import registration
-from p2p_lib.method.registration import Hypothesis, competing, fit_rigid, generate, select
+from p2p_lib.method.registration import Hypothesis, competing, generate, select
 
 DEFAULT, PAPER = preset("default").registration, preset("paper").registration
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=["default", "paper"])

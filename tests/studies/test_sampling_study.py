@@ -7,8 +7,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.interfaces import Candidates
+from p2p_lib.core.robust import fit_rigid
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.method.registration import fit_rigid
 from p2p_lib.method.sampling import choose
 from p2p_lib.studies.map_history import follow_map
 from p2p_lib.studies.sampling_study import (

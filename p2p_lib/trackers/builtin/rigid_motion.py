@@ -15,7 +15,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depth_noise_m
-from p2p_lib.method.registration import fit_rigid
+from p2p_lib.core.robust import fit_rigid
 from p2p_lib.trackers.builtin.tangent_planes import projection
 
 _EYE2, _EYE3 = np.eye(2), np.eye(3)
