@@ -182,24 +182,18 @@ class OracleConfig(_Checked):
 
 @dataclass(frozen=True)
 class SegmentationConfig(_Checked):
-    """Of the embedded segmenter, which starts from clicks."""
+    """Of the built-in segmenter, which starts from clicks."""
 
-    side_px: int = _p(112, "longest side of the grid on which an object is cut out", "px", low=16, high=640)
-    reach_m: float = _p(0.3, "no object is larger than this to any side of its clicks", "m", low=0.01)
-    margin: float = _p(0.35, "room around the object, in its own size", low=0.05, high=2)
-    start_rounds: int = _p(3, "rounds of cutting and learning colours in the first frame", low=1)
-    iterations: int = _p(40, "conjugate gradient steps of a cut at most", low=1)
-    evidence_strength: float = _p(0.06, "weight of a pixel's certain evidence beside a tie to a like neighbour", low=0)
-    colour_weight: float = _p(0.7, "of colour evidence: neighbouring pixels repeat each other", low=0, high=1)
-    colour_rate: float = _p(0.05, "share of a frame in the object's remembered colours", low=0, high=1)
-    geometry_weight: float = _p(2.0, "log odds by hanging together in depth, and by lying in the support plane", low=0)
-    prior_weight: float = _p(2.5, "log odds by where the object was a frame ago", low=0)
-    surface_weight: float = _p(1.5, "log odds by lying on the reconstructed surface or clearly before it", low=0)
-    surface_m: float = _p(0.008, "distance to the reconstructed surface that still counts as on it", "m", low=1e-4)
-    contradiction: float = _p(3.0, "log odds against a pixel whose depth jumped since the last frame", low=0)
-    find_points: int = _p(8, "agreeing tracked points that say where an absent object is back", "points", low=3)
-    min_share: float = _p(0.03, "of the area it showed lately; an object that shows less is absent", low=0, high=1)
-    min_px: int = _p(40, "fewer pixels are absent", "px", low=1)
+    side_px: int = _p(112, "The grid on which an object is cut out has this longest side.", "px", low=16, high=640)
+    reach_m: float = _p(0.3, "No object is larger than this to any side of its clicks.", "m", low=0.01)
+    margin: float = _p(0.35, "This much room is left around the object, in its own size.", low=0.05, high=2)
+    colour_weight: float = _p(0.7, "Colour evidence counts this much: neighbours repeat each other.", low=0, high=1)
+    colour_rate: float = _p(0.05, "A frame has this share in the object's remembered colours.", low=0, high=1)
+    geometry_weight: float = _p(2.0, "These are the log odds by connected depth and by the support plane.", low=0)
+    prior_weight: float = _p(2.5, "These are the log odds by where the object was a frame ago.", low=0)
+    surface_weight: float = _p(1.5, "These are the log odds by lying on the reconstructed surface.", low=0)
+    find_points: int = _p(8, "So many agreeing tracked points say where an absent object is back.", "points", low=3)
+    min_px: int = _p(40, "An object of fewer pixels is absent.", "px", low=1)
 
 
 @dataclass(frozen=True)

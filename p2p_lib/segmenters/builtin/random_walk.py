@@ -1,23 +1,23 @@
-"""Cutting a picture in two: a random walker with priors (Grady 2005) on a small RGB-D grid.
+"""Cutting an image in two: a random walker with priors (Grady 2005) on a small RGB-D grid.
 
-Every pixel pulls towards object or background by its own evidence and is tied to its neighbours, the
-less the more colour and depth change between them. The answer is the probability that a walker who
-starts at the pixel and prefers strong ties ends at the object: the minimum of a quadratic energy.
+Every pixel is pulled towards object or background by its own evidence and tied to its neighbours, less
+where colour and depth change between them. The answer is the probability that a walker who
+starts at the pixel and prefers large edge weights ends at the object: the minimum of a quadratic energy.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Weight of a tie across the strongest edge: no pixel is ever quite alone.
+#: Edge weight across the strongest contrast: no pixel is ever quite alone.
 _LOOSE = 1e-4
-#: A tie between a measured and an unmeasured pixel: depth is missing mostly beside silhouettes.
+#: Factor of the edge weight between a measured and an unmeasured pixel: depth is missing mostly beside silhouettes.
 _INTO_THE_UNMEASURED = 0.05
-#: The walk ends when the preconditioned residual falls below this.
-_SETTLED = 1e-6
+#: Conjugate gradients end when the preconditioned residual falls below this, or after so many steps.
+_SETTLED, _STEPS = 1e-6, 40
 
 
-def ties(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def edge_weights(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weights in (0, 1] of neighbours along a row (H, W-1) and along a column (H-1, W).
 
     colour (H, W, C) float, its contrast is judged by the picture's own mean; depth_m (H, W), 0 = not measured;
@@ -39,15 +39,15 @@ def ties(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[n
 def walk(
     target: np.ndarray,
     strength: np.ndarray,
-    ties: tuple[np.ndarray, np.ndarray],
+    weights: tuple[np.ndarray, np.ndarray],
     start: np.ndarray,
-    iterations: int,
+    steps: int = _STEPS,
 ) -> np.ndarray:
-    """(H, W) float32 in [0, 1]: the x that minimises sum strength (x - target)^2 + sum ties (x_i - x_j)^2.
+    """(H, W) float32 in [0, 1]: the x that minimises sum strength (x - target)^2 + sum weights (x_i - x_j)^2.
 
     target, strength (H, W) float32, the latter at least 0; ``start`` is where the conjugate gradients begin.
     """
-    across, down = ties
+    across, down = weights
     degree = strength.copy()
     degree[:, :-1] += across
     degree[:, 1:] += across
@@ -67,7 +67,7 @@ def walk(
     residual = strength * target - apply(x)
     step = scaled = inverse * residual
     size = float((residual * scaled).sum())
-    for _ in range(iterations):
+    for _ in range(steps):
         if size < _SETTLED:
             break
         image = apply(step)
