@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.clicks import check_clicks, check_depth, depths_at
 from p2p_lib.core.config import SegmentationConfig
+from p2p_lib.core.image import bounds
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
@@ -141,9 +142,9 @@ class BuiltinSegmenter:
 
     def _fitting(self, patch: Patch, inside: np.ndarray, frame: Frame) -> Box:
         """A box with room around what is ``inside`` a patch."""
-        rows, cols = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
+        rows, columns = bounds(inside)
         scale = np.array(patch.box.shape[::-1]) / patch.shape[::-1]
-        low, high = np.array([cols[0], rows[0]]) * scale, np.array([cols[-1] + 1, rows[-1] + 1]) * scale
+        low, high = np.array([columns.start, rows.start]) * scale, np.array([columns.stop, rows.stop]) * scale
         half = (high - low) / 2 * (1 + 2 * self.config.margin) + _ROOM_PX
         return around((low + high) / 2 + [patch.box.left, patch.box.top], half, frame.shape)
 
@@ -197,11 +198,11 @@ class BuiltinSegmenter:
 
     def _seen(self, frame: Frame, box: Box, labels: np.ndarray, label: int) -> _Seen | None:
         mask = labels[box.slices] == label
-        rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        if not len(rows):
+        if not mask.any():
             return None
-        fit = Box(box.left + cols[0], box.top + rows[0], box.left + cols[-1] + 1, box.top + rows[-1] + 1)
-        mask = labels[fit.slices] == label
+        rows, columns = bounds(mask)
+        fit = Box(box.left + columns.start, box.top + rows.start, box.left + columns.stop, box.top + rows.stop)
+        mask = mask[rows, columns]
         return _Seen(fit, mask, float(np.median(frame.depth_m[fit.slices][mask])))
 
     def _remembering(self, frame: Frame, target: _Target, seen: _Seen | None) -> _Target:
