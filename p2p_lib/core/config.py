@@ -111,11 +111,11 @@ class LifecycleConfig(_Checked):
 class DepthConfig(_Checked):
     """Of measured depth: which of it is used, and how noisy it is."""
 
-    min_m: float = _p(0.1, "nearer depth is invalid", "m", "release", low=0)
-    max_m: float = _p(2.5, "farther depth is invalid", "m", low=0.1)
-    edge_m: float = _p(0.01, "a larger depth step in the 3x3 neighbourhood is an edge", "m", "release", low=0)
-    noise_m: float = _p(0.001, "standard deviation of depth at range 0", "m", low=1e-6)
-    noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
+    min_m: float = _p(0.1, "Nearer depth is invalid.", "m", "release", low=0)
+    max_m: float = _p(2.5, "Farther depth is invalid.", "m", low=0.1)
+    edge_m: float = _p(0.01, "A larger depth step in the 3x3 neighbourhood is an edge.", "m", "release", low=0)
+    noise_m: float = _p(0.001, "This is the standard deviation of depth at range 0.", "m", low=1e-6)
+    noise_per_m2: float = _p(0.0025, "The standard deviation grows by this with the range squared.", "1/m", low=0)
 
 
 @dataclass(frozen=True)
@@ -174,10 +174,12 @@ class TrackingConfig(_Checked):
 class OracleConfig(_Checked):
     """Of the tracker ``oracle``, which knows the truth; no part of the method."""
 
-    noise_px: float = _p(0.5, "standard deviation of a visible point's position, per axis", "px", low=0)
-    dropout: float = _p(0.0, "share of the visible points called invisible in a frame", low=0, high=1)
-    outliers: float = _p(0.0, "share of the visible points reported at a wrong place in a frame", low=0, high=1)
-    outlier_px: float = _p(30.0, "how far off those are", "px", low=0)
+    noise_px: float = _p(0.5, "This is the standard deviation of a visible point's position, per axis.", "px", low=0)
+    dropout: float = _p(0.0, "This share of the visible points is called invisible in a frame.", low=0, high=1)
+    outliers: float = _p(
+        0.0, "This share of the visible points is reported at a wrong place in a frame.", low=0, high=1
+    )
+    outlier_px: float = _p(30.0, "Points at a wrong place are this far off.", "px", low=0)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from p2p_lib.core import se3
+from p2p_lib.core import se3, tables
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.models import given_models, load_points
 from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run
@@ -100,7 +100,7 @@ class Evaluation:
 
     def as_table(self) -> str:
         """The same for people, with the reason for what is not there."""
-        lines = [self.as_frame().to_string(index=False, float_format="{:.2f}".format)]
+        lines = [tables.as_text(self.as_frame())]
         lines += [f"{name}: not scored, {reason}" for name, reason in self.left_out.items()]
         if self.hz is not None:
             lines.append(f"{self.hz:.1f} Hz, 95 % of the frames within {self.p95_ms:.1f} ms")

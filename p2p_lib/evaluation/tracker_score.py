@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TrackRun:
-    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms per picture.
+    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms per image.
 
     Before its query a point is invisible and NaN. cpu_ms is the processor time of all threads in a frame,
     new queries included; NaN in frames before the first query.
@@ -157,7 +157,7 @@ def compare_trackers(
 def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, search: bool = False) -> TrackRun:
     """Stream the sequence through the tracker in one pass, each query added at its frame.
 
-    What a tracker says late is scored in the frame that it is of; for the last ones the last picture is repeated.
+    What a tracker says late is scored in the frame that it is of; for the last ones the last image is repeated.
     """
     total, n, late = len(sequence), len(queries), tracker.latency_frames
     uv, visible = np.full((total, n, 2), np.nan), np.zeros((total, n), bool)

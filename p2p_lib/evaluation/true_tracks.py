@@ -1,7 +1,7 @@
 """True tracks of any pixel of a sequence with truth: lifted onto the true surface, carried by the true pose.
 
 A query is lifted onto the object's mesh at its true pose by a ray, or by the measured depth where there is no
-mesh. In another frame the point is *visible* when it lies in the picture and in the object's mask, its surface
+mesh. In another frame the point is *visible* when it lies in the image and in the object's mask, its surface
 faces the camera, no other part of the mesh is in front of it, and the depth measured at its pixel lies within
 :data:`DEPTH_TOLERANCE_M` of the true surface (a pixel without a measurement agrees where there is a mask).
 """

@@ -55,7 +55,7 @@ def by_geometry(
     component = connected(free, seeds)
     log_odds[measured & ~dilated(component, 1)] -= config.geometry_weight
     if component[patch.border()].mean() > _AT_THE_BORDER:
-        return log_odds, nothing  # it goes on beyond the patch: more than one object hangs together
+        return log_odds, nothing  # it goes on beyond the patch: more than one object is connected
     log_odds[component] += config.geometry_weight
     return log_odds, component
 

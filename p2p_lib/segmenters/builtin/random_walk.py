@@ -20,7 +20,7 @@ _SETTLED, _STEPS = 1e-6, 40
 def edge_weights(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weights in (0, 1] of neighbours along a row (H, W-1) and along a column (H-1, W).
 
-    colour (H, W, C) float, its contrast is judged by the picture's own mean; depth_m (H, W), 0 = not measured;
+    colour (H, W, C) float, its contrast is judged by the image's own mean; depth_m (H, W), 0 = not measured;
     step_m (H, W): a depth step of this size is an edge.
     """
     across = colour[:, 1:] - colour[:, :-1], colour[1:] - colour[:-1]

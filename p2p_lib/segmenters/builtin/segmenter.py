@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import check_clicks, check_depth, depths_at
+from p2p_lib.core.clicks import checked_clicks, depths_at
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.image import bounds
 from p2p_lib.core.interfaces import Hint
@@ -75,9 +75,7 @@ class BuiltinSegmenter:
         hints: Mapping[str, Hint] | None = None,
     ) -> np.ndarray:
         """One frame in, one label image out; where two objects claim a pixel the likelier one has it."""
-        new = {name: check_clicks(name, at, self.camera) for name, at in (clicks or {}).items()}
-        for name, at in new.items():
-            check_depth(name, at, frame)
+        new = checked_clicks(clicks or {}, self.camera, frame)
         found: dict[str, tuple[Box, np.ndarray] | None] = {}
         for name, target in self._targets.items():
             hint = (hints or {}).get(name) or Hint()
