@@ -99,10 +99,11 @@ class BuiltinSegmenter:
                 wins = (x > likeliest) & (frame.depth_m[box.slices] > 0)
                 part[wins], likeliest[wins] = label, x[wins]
         for label, (name, target) in enumerate(self._targets.items(), 1):
-            seen = self._seen(frame, found[name][0], labels, label) if found[name] is not None else None
-            self._targets[name] = self._remembering(frame, target, seen)
-            if seen is not None and self._targets[name].seen is None:
-                labels[seen.box.slices][seen.mask] = 0
+            mask = labels == label
+            seen = _seen(frame, mask) if mask.sum() >= self.config.min_px else None
+            self._targets[name] = self._updated(frame, target, seen)
+            if seen is None:
+                labels[mask] = 0
         self._previous = frame
         return labels
 
@@ -194,28 +195,23 @@ class BuiltinSegmenter:
         centre = np.array([seen.box.left, seen.box.top]) + extent / 2
         return around(centre, half * (1 + self.config.margin) + _ROOM_PX, shape)
 
-    def _seen(self, frame: Frame, box: Box, labels: np.ndarray, label: int) -> _Seen | None:
-        mask = labels[box.slices] == label
-        if not mask.any():
-            return None
-        rows, columns = bounds(mask)
-        fit = Box(box.left + columns.start, box.top + rows.start, box.left + columns.stop, box.top + rows.stop)
-        mask = mask[rows, columns]
-        return _Seen(fit, mask, float(np.median(frame.depth_m[fit.slices][mask])))
-
-    def _remembering(self, frame: Frame, target: _Target, seen: _Seen | None) -> _Target:
-        """What is known of an object after a frame; too little of it to be sure counts as nothing."""
-        cfg = self.config
+    def _updated(self, frame: Frame, target: _Target, seen: _Seen | None) -> _Target:
+        """What is known of an object after a frame."""
         if seen is None:
-            return replace(target, seen=None)
-        if seen.mask.sum() < cfg.min_px:
             return replace(target, seen=None)
         size_m = np.array(seen.mask.shape[::-1]) * seen.z_m / self._focal_px
         colours = histogram(colour_codes(frame.rgb[seen.box.slices][seen.mask]))
         if target.colours is None:
             return _Target(seen, colours, size_m)
-        colours = (1 - cfg.colour_rate) * target.colours + cfg.colour_rate * colours
-        return _Target(seen, colours, np.maximum(size_m, target.size_m))
+        rate = self.config.colour_rate
+        return _Target(seen, (1 - rate) * target.colours + rate * colours, np.maximum(size_m, target.size_m))
+
+
+def _seen(frame: Frame, mask: np.ndarray) -> _Seen:
+    """Where a mask (H, W) lies in a frame."""
+    rows, columns = bounds(mask)
+    box = Box(columns.start, rows.start, columns.stop, rows.stop)
+    return _Seen(box, mask[rows, columns], float(np.median(frame.depth_m[mask])))
 
 
 def _only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
