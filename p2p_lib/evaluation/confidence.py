@@ -66,10 +66,10 @@ def pose_error(obj: ObjectRun, score: ObjectScore) -> tuple[np.ndarray, np.ndarr
     return angle_rad, np.linalg.norm(T_error[:, :3, 3], axis=1)
 
 
-def right_poses(obj: ObjectRun, score: ObjectScore, max_m: float = MAX_M, max_deg: float = MAX_DEG) -> np.ndarray:
-    """(n,) bool: frames with a pose within ``max_m`` and ``max_deg`` of the truth."""
+def right_poses(obj: ObjectRun, score: ObjectScore) -> np.ndarray:
+    """(n,) bool: frames with a pose within 2 cm and 5 degrees of the truth."""
     angle_rad, apart_m = pose_error(obj, score)
-    return (np.degrees(angle_rad) <= max_deg) & (apart_m <= max_m)
+    return (np.degrees(angle_rad) <= MAX_DEG) & (apart_m <= MAX_M)
 
 
 def judge(run: Run, evaluation: Evaluation) -> dict[str, Judged]:
