@@ -17,12 +17,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from tqdm import tqdm
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import cache_dir
 from p2p_lib.synthetic.noise import NOISE, Sensor, kept_frames, measured_colour, measured_depth, measured_mask
-from p2p_lib.synthetic.render import Picture, render
+from p2p_lib.synthetic.render import Rendering, render
 from p2p_lib.synthetic.scenarios import SCENARIOS
 from p2p_lib.synthetic.scene import FPS, Body, Scenario
 from p2p_lib.synthetic.shapes import Mesh
@@ -63,7 +64,10 @@ def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, 
     work = partial(_write_frame, folder, scenario, sensor, seed, truth, room)
     with ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0)))) as pool:
         frames = kept_frames(scenario.frames, sensor, np.random.default_rng([seed, 5]))
-        rows = list(_progress(pool.map(work, frames.tolist()), len(frames), title))
+        done = pool.map(work, frames.tolist())
+        # On a terminal only, and only when it takes longer than a moment.
+        shown = {"unit": "frame", "delay": 2.0, "leave": False, "disable": None}
+        rows = list(tqdm(done, title, len(frames), **shown))
     _write_truth(folder, scenario, truth, frames, rows)
 
 
@@ -82,7 +86,7 @@ def write_sequence(
     if noise not in NOISE:
         raise BadInput("noise", repr(noise), "one of " + ", ".join(NOISE))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise BadInput(str(out), "there is something already", "a new or empty folder")
+        raise BadInput(str(out), "has files in it", "a new or empty folder")
     own, _ = _settings(name, seed, {"models": str(models)} if models else {})
     scenario = SCENARIOS[name](seed, **own)
     write_scenario(out, scenario, NOISE[noise], seed, f"rendering {name}")
@@ -108,9 +112,9 @@ def generator_version() -> str:
 
 
 def photograph(
-    scenario: Scenario, sensor: Sensor, seed: int, t: int, room: Picture | None = None
-) -> tuple[np.ndarray, np.ndarray, Picture]:
-    """Frame ``t`` as the sensor delivers it: rgb (H, W, 3) uint8, depth_m (H, W), and the exact picture.
+    scenario: Scenario, sensor: Sensor, seed: int, t: int, room: Rendering | None = None
+) -> tuple[np.ndarray, np.ndarray, Rendering]:
+    """Frame ``t`` as the sensor delivers it: rgb (H, W, 3) uint8, depth_m (H, W), and the exact image.
 
     ``room`` is the empty scene at this frame's camera pose, where the caller already has it.
     """
@@ -126,13 +130,13 @@ def photograph(
     return measured_colour(rgb, sensor, gain, rng), depth_m, exact
 
 
-def _exact(scenario: Scenario, t: float, room: Picture | None) -> Picture:
+def _exact(scenario: Scenario, t: float, room: Rendering | None) -> Rendering:
     bodies = [(body.mesh, _at(body.T_world_model, t)) for body in scenario.bodies]
     room = room or _room(scenario, t)
     return render(bodies, scenario.camera, _at(scenario.T_world_cam, t), scenario.light, room)
 
 
-def _room(scenario: Scenario, t: float) -> Picture:
+def _room(scenario: Scenario, t: float) -> Rendering:
     """The scene without its bodies; nothing in it carries a label."""
     walls = [(mesh, se3.IDENTITY) for mesh in scenario.room]
     return render(walls, scenario.camera, _at(scenario.T_world_cam, t), scenario.light)
@@ -157,7 +161,7 @@ class _Truth:
     def of(cls, label: int, body: Body, seed: int) -> _Truth:
         return cls(label, body, *body.mesh.sample(_TRACKS_PER_OBJECT, np.random.default_rng([seed, 4, label])))
 
-    def tracks(self, scenario: Scenario, t: int, exact: Picture) -> tuple[np.ndarray, np.ndarray]:
+    def tracks(self, scenario: Scenario, t: int, exact: Rendering) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (P, 2) and visibility (P,) of the points at frame t, by the exact depth."""
         camera = scenario.camera
         T_cam_model = se3.inverse(scenario.T_world_cam[t]) @ self.body.T_world_model[t]
@@ -178,7 +182,7 @@ _PER_OBJECT = ("masks", "annotated_poses", "is_mask_visible", "is_obj_in_image_l
 
 
 def _write_frame(
-    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, truth: list[_Truth], room: Picture | None, t: int
+    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, truth: list[_Truth], room: Rendering | None, t: int
 ) -> list[tuple[int, np.ndarray, np.ndarray]]:
     """Renders and writes frame t; returns visible pixels, track pixels and track visibility per object."""
     rgb, depth_m, exact = photograph(scenario, sensor, seed, t, room)
@@ -195,13 +199,13 @@ def _write_frame(
     return rows
 
 
-def _save(path: Path, picture: np.ndarray, options: list[int]) -> None:
-    if not cv2.imwrite(str(path), picture, options):
+def _save(path: Path, image: np.ndarray, options: list[int]) -> None:
+    if not cv2.imwrite(str(path), image, options):
         raise OSError(f"{path} could not be written: is the disk full?")
 
 
 def _write_truth(folder: Path, scenario: Scenario, truth: list[_Truth], frames: np.ndarray, rows: list) -> None:
-    """Camera, times, poses, labels, models and tracks: everything that is not a picture."""
+    """Camera, times, poses, labels, models and tracks: everything that is not an image."""
     np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
     np.savetxt(folder / "times.txt", frames / FPS, fmt="%.6f")
     T_cam_world = se3.inverse(scenario.T_world_cam[frames])
@@ -276,10 +280,3 @@ def _alone(folder: Path) -> Iterator[Path]:
             yield unfinished
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def _progress(items: Iterator, total: int, title: str) -> Iterator:
-    """A progress bar, shown on a terminal only and only when the work takes longer than a moment."""
-    from tqdm import tqdm
-
-    return tqdm(items, total=total, desc=title, unit="frame", delay=2.0, leave=False, disable=None)

@@ -1,4 +1,4 @@
-"""What a real RGB-D camera does to a perfect picture (active stereo, as a RealSense D435)."""
+"""What a real RGB-D camera does to a perfect image (active stereo, as a RealSense D435)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.synthetic.render import Picture
+from p2p_lib.synthetic.render import Rendering
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Sensor:
     shot_levels       colour noise at full brightness, added in variance
     exposure          largest relative change of brightness over time (slow)
     shutter_share     share of the frame time that the shutter is open: motion blur
-    blur_samples      pictures averaged for it
+    blur_samples      images averaged for it
     mask_px           standard deviation of the displacement of the masks' outlines, which wobble smoothly
     mask_loss         probability that an object's mask is missing in a frame
     drop              probability that a frame is missing (never the first)
@@ -77,9 +77,9 @@ NOISE = {
 }
 
 
-def measured_depth(picture: Picture, camera: Camera, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+def measured_depth(image: Rendering, camera: Camera, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
     """Depth (H, W) float64 in metres as the sensor reports it; 0 = no measurement."""
-    exact = picture.depth_m
+    exact = image.depth_m
     H, W = exact.shape
     hole = exact <= 0
     if sensor.baseline_m:
@@ -87,7 +87,7 @@ def measured_depth(picture: Picture, camera: Camera, sensor: Sensor, rng: np.ran
     if sensor.edge_loss:
         hole |= _edges(exact, sensor.edge_m) & (rng.random((H, W), np.float32) < sensor.edge_loss)
     if sensor.grazing_deg:
-        incidence = np.degrees(np.arccos(np.clip(picture.cos_incidence, 0, 1)))
+        incidence = np.degrees(np.arccos(np.clip(image.cos_incidence, 0, 1)))
         lost = np.clip((incidence - sensor.grazing_deg) / 10 + 0.5, 0, 1)
         hole |= rng.random((H, W), np.float32) < lost
     depth = _ragged(exact, sensor, rng) if sensor.lateral_px else exact
@@ -101,7 +101,7 @@ def measured_depth(picture: Picture, camera: Camera, sensor: Sensor, rng: np.ran
 
 
 def measured_colour(rgb: np.ndarray, sensor: Sensor, gain: float, rng: np.random.Generator) -> np.ndarray:
-    """Colour (H, W, 3) uint8 of a rendered (H, W, 3) float32 picture at a relative exposure ``gain``."""
+    """Colour (H, W, 3) uint8 of a rendered (H, W, 3) float32 image at a relative exposure ``gain``."""
     rgb = rgb * np.float32(gain)
     if sensor.psf_px:
         rgb = cv2.GaussianBlur(rgb, (0, 0), sensor.psf_px)
