@@ -6,7 +6,6 @@ a side that was seen before. Times are frames of 30 a second.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -101,15 +100,15 @@ def look_alikes(seed: int) -> Scenario:
     rng = np.random.default_rng([seed, 1])
     mesh = _carton(rng)
     red, blue = _marked(mesh, (200, 40, 40), round_mark=True), _marked(mesh, (30, 60, 190), round_mark=False)
-    left = _placed(rng, "left", lambda _: red, (-0.20, 0.0), (-0.08, 0.05), (90, 130))
-    right = _placed(rng, "right", lambda _: blue, (0.12, 0.03), (0.23, 0.0), (185, 225))
+    left = _placed(rng, "left", red, (-0.20, 0.0), (-0.08, 0.05), (90, 130))
+    right = _placed(rng, "right", blue, (0.12, 0.03), (0.23, 0.0), (185, 225))
     return _scene(rng, [left, right])
 
 
 def late_object(seed: int) -> Scenario:
     """A carton is there from the start; a tin comes in at frame 60, and is hidden later on."""
     rng = np.random.default_rng([seed, 1])
-    carton = _placed(rng, "box", _carton, (-0.20, 0.02))
+    carton = _placed(rng, "box", _carton(rng), (-0.20, 0.02))
     T = _stay(rng, (0.08, 0.0), (0.22, 0.05), (190, 230))
     T[:, 0, 3] += eased(0.62 * (1 - np.clip((np.arange(_FRAMES) - 60) / 35, 0, 1)), 4)
     return _scene(rng, [carton, (Body("can", _tin(rng), T), (190, 230))])
@@ -118,9 +117,9 @@ def late_object(seed: int) -> Scenario:
 def three_objects(seed: int) -> Scenario:
     """A carton, a tin and a block, hidden by a hand one after the other."""
     rng = np.random.default_rng([seed, 1])
-    carton = _placed(rng, "box", _carton, (-0.27, 0.02), (-0.18, 0.10), (95, 127))
-    tin = _placed(rng, "can", _tin, (-0.03, -0.02), (0.05, 0.07), (157, 189))
-    block = _placed(rng, "block", lambda r: shapes.block(r, 0.05, 0.11), (0.27, 0.02), (0.18, 0.10), (219, 251))
+    carton = _placed(rng, "box", _carton(rng), (-0.27, 0.02), (-0.18, 0.10), (95, 127))
+    tin = _placed(rng, "can", _tin(rng), (-0.03, -0.02), (0.05, 0.07), (157, 189))
+    block = _placed(rng, "block", shapes.block(rng, 0.05, 0.11), (0.27, 0.02), (0.18, 0.10), (219, 251))
     return _scene(rng, [carton, tin, block])
 
 
@@ -155,20 +154,19 @@ def _marked(mesh: Mesh, ink: tuple[int, int, int], round_mark: bool) -> Mesh:
 
 
 def _carton_and_tin(rng: np.random.Generator) -> list[Placed]:
-    carton = _placed(rng, "box", _carton, (-0.12, 0.0), (0.06, 0.05), (120, 165))
-    return [carton, _placed(rng, "can", _tin, (0.24, 0.05))]
+    carton = _placed(rng, "box", _carton(rng), (-0.12, 0.0), (0.06, 0.05), (120, 165))
+    return [carton, _placed(rng, "can", _tin(rng), (0.24, 0.05))]
 
 
 def _placed(
     rng: np.random.Generator,
     name: str,
-    make: Callable[[np.random.Generator], Mesh],
+    mesh: Mesh,
     here: Place,
     there: Place | None = None,
     hidden: tuple[int, int] | None = None,
 ) -> Placed:
     """A body about one place, and, after a hand has hidden it for the frames ``hidden``, about another."""
-    mesh = make(rng)
     return Body(name, mesh, _stay(rng, here, there or here, hidden or (120, 160))), hidden
 
 

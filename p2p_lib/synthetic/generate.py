@@ -22,8 +22,10 @@ from tqdm import tqdm
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import cache_dir
+from p2p_lib.datasets.bop_writer import write_models, write_scene
+from p2p_lib.datasets.sequence import SYNTHETIC, open_sequence, unknown_scenario
 from p2p_lib.synthetic.noise import NOISE, Sensor, kept_frames, measured_colour, measured_depth, measured_mask
-from p2p_lib.synthetic.render import Rendering, render
+from p2p_lib.synthetic.render import Rendering
 from p2p_lib.synthetic.scenarios import SCENARIOS
 from p2p_lib.synthetic.scene import FPS, Body, Scenario
 from p2p_lib.synthetic.shapes import Mesh
@@ -56,11 +58,11 @@ def scenario_dir(name: str, seed: int = 0, **overrides: object) -> Path:
 
 def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, title: str = "rendering") -> None:
     """Renders a scenario into ``folder``, which is made: colour, depth, and the truth per labelled body."""
-    truth = [_Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
+    truth = [Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
     for name in ("rgb", "depth", *(f"{kind}/{t.body.name}" for kind in _PER_OBJECT for t in truth)):
         (folder / name).mkdir(parents=True, exist_ok=True)
     still = bool((scenario.T_world_cam == scenario.T_world_cam[0]).all())
-    room = _room(scenario, 0) if still else None
+    room = scenario.empty(0) if still else None
     work = partial(_write_frame, folder, scenario, sensor, seed, truth, room)
     with ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0)))) as pool:
         frames = kept_frames(scenario.frames, sensor, np.random.default_rng([seed, 5]))
@@ -93,16 +95,9 @@ def write_sequence(
     made = {"name": name, "seed": seed, "noise": noise, "sensor": asdict(NOISE[noise]), "objects": scenario.objects}
     (out / _DONE).write_text(json.dumps(made | {"generator": generator_version()}, indent=1, sort_keys=True) + "\n")
     if bop:
-        _write_bop(out)
+        ids = write_scene(out / "bop/test/000001", open_sequence(out, format="ycbmultitrack"))
+        write_models(out / "bop/models", {k: out / f"models/{name}/textured.obj" for name, k in ids.items()})
     return out
-
-
-def _write_bop(folder: Path) -> None:
-    from p2p_lib.datasets.bop_writer import write_models, write_scene
-    from p2p_lib.datasets.sequence import open_sequence
-
-    ids = write_scene(folder / "bop/test/000001", open_sequence(folder, format="ycbmultitrack"))
-    write_models(folder / "bop/models", {k: folder / f"models/{name}/textured.obj" for name, k in ids.items()})
 
 
 def generator_version() -> str:
@@ -119,37 +114,19 @@ def photograph(
     ``room`` is the empty scene at this frame's camera pose, where the caller already has it.
     """
     rng = np.random.default_rng([seed, 2, t])
-    exact = _exact(scenario, float(t), room)
+    exact = scenario.rendered(t, room)
     rgb = exact.rgb
     if sensor.shutter_share > 0:
         times = t + sensor.shutter_share * (np.arange(sensor.blur_samples) + 0.5) / sensor.blur_samples
-        rgb = np.mean([_exact(scenario, s, room).rgb for s in np.minimum(times, scenario.frames - 1)], 0)
+        rgb = np.mean([scenario.rendered(s, room).rgb for s in np.minimum(times, scenario.frames - 1)], 0)
     phase = np.random.default_rng([seed, 3]).uniform(0, 2 * np.pi)
     gain = 1 + sensor.exposure * np.sin(2 * np.pi * t / (4 * FPS) + phase)
     depth_m = measured_depth(exact, scenario.camera, sensor, rng)
     return measured_colour(rgb, sensor, gain, rng), depth_m, exact
 
 
-def _exact(scenario: Scenario, t: float, room: Rendering | None) -> Rendering:
-    bodies = [(body.mesh, _at(body.T_world_model, t)) for body in scenario.bodies]
-    room = room or _room(scenario, t)
-    return render(bodies, scenario.camera, _at(scenario.T_world_cam, t), scenario.light, room)
-
-
-def _room(scenario: Scenario, t: float) -> Rendering:
-    """The scene without its bodies; nothing in it carries a label."""
-    walls = [(mesh, se3.IDENTITY) for mesh in scenario.room]
-    return render(walls, scenario.camera, _at(scenario.T_world_cam, t), scenario.light)
-
-
-def _at(T: np.ndarray, t: float) -> np.ndarray:
-    """The pose at a fractional frame."""
-    k = int(t)
-    return T[k] if t == k else se3.interpolate(T[k], T[k + 1], t - k)
-
-
 @dataclass(frozen=True, eq=False)
-class _Truth:
+class Truth:
     """A labelled body: its label and the surface points whose tracks are written."""
 
     label: int
@@ -158,7 +135,8 @@ class _Truth:
     normals: np.ndarray
 
     @classmethod
-    def of(cls, label: int, body: Body, seed: int) -> _Truth:
+    def of(cls, label: int, body: Body, seed: int) -> Truth:
+        """With points drawn on the body's surface."""
         return cls(label, body, *body.mesh.sample(_TRACKS_PER_OBJECT, np.random.default_rng([seed, 4, label])))
 
     def tracks(self, scenario: Scenario, t: int, exact: Rendering) -> tuple[np.ndarray, np.ndarray]:
@@ -182,7 +160,7 @@ _PER_OBJECT = ("masks", "annotated_poses", "is_mask_visible", "is_obj_in_image_l
 
 
 def _write_frame(
-    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, truth: list[_Truth], room: Rendering | None, t: int
+    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, truth: list[Truth], room: Rendering | None, t: int
 ) -> list[tuple[int, np.ndarray, np.ndarray]]:
     """Renders and writes frame t; returns visible pixels, track pixels and track visibility per object."""
     rgb, depth_m, exact = photograph(scenario, sensor, seed, t, room)
@@ -204,7 +182,7 @@ def _save(path: Path, image: np.ndarray, options: list[int]) -> None:
         raise OSError(f"{path} could not be written: is the disk full?")
 
 
-def _write_truth(folder: Path, scenario: Scenario, truth: list[_Truth], frames: np.ndarray, rows: list) -> None:
+def _write_truth(folder: Path, scenario: Scenario, truth: list[Truth], frames: np.ndarray, rows: list) -> None:
     """Camera, times, poses, labels, models and tracks: everything that is not an image."""
     np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
     np.savetxt(folder / "times.txt", frames / FPS, fmt="%.6f")
@@ -233,31 +211,27 @@ def _write_truth(folder: Path, scenario: Scenario, truth: list[_Truth], frames: 
 
 def _write_obj(folder: Path, mesh: Mesh) -> None:
     """``textured.obj`` with its material and texture."""
-    _save(folder / "texture_map.png", mesh.texture[..., ::-1], [])
-    (folder / "textured.mtl").write_text("newmtl label\nKd 1 1 1\nmap_Kd texture_map.png\n")
-    corner = np.arange(mesh.faces.size).reshape(-1, 3) + 1
-    lines = ["mtllib textured.mtl", "usemtl label"]
-    lines += ["v {:.6f} {:.6f} {:.6f}".format(*p) for p in mesh.vertices]
-    lines += ["vt {:.6f} {:.6f}".format(*p) for p in mesh.uv.reshape(-1, 2)]
-    lines += [
-        "f {}/{} {}/{} {}/{}".format(*np.stack([f, c], 1).ravel()) for f, c in zip(mesh.faces + 1, corner, strict=True)
-    ]
-    (folder / "textured.obj").write_text("\n".join(lines) + "\n")
+    import trimesh
+    from PIL import Image
+
+    corners = np.arange(mesh.faces.size)
+    material = trimesh.visual.material.SimpleMaterial(Image.fromarray(mesh.texture), name="texture_map")
+    visual = trimesh.visual.TextureVisuals(mesh.uv.reshape(-1, 2), material)
+    loose = trimesh.Trimesh(mesh.vertices[mesh.faces.ravel()], corners.reshape(-1, 3), visual=visual, process=False)
+    loose.export(folder / "textured.obj", digits=6)
 
 
 def _settings(name: str, seed: int, overrides: dict) -> tuple[dict, Sensor]:
     """The scenario's own parameters and the sensor; unknown names and keys are refused."""
-    if name not in SCENARIOS:
-        known = ", ".join(f"synthetic/{n}" for n in sorted(SCENARIOS))
-        raise BadInput("synthetic sequence", repr(name), f"one of {known}")
+    if unknown := unknown_scenario(name, SCENARIOS):
+        raise unknown
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise BadInput(f"synthetic/{name} seed", repr(seed), "a whole number, 0 or above")
+        raise BadInput(f"{SYNTHETIC}{name} seed", repr(seed), "a whole number, 0 or above")
     taken = list(inspect.signature(SCENARIOS[name]).parameters.values())[1:]
     own = {p.name: p.default for p in taken if p.kind is not p.KEYWORD_ONLY}
     known = [*own, *(f.name for f in fields(Sensor))]
-    for key in overrides:
-        if key not in known:
-            raise BadInput(f"synthetic/{name} parameter", repr(key), "one of " + ", ".join(known))
+    for key in overrides.keys() - known:
+        raise BadInput(f"{SYNTHETIC}{name} parameter", repr(key), "one of " + ", ".join(known))
     sensor = Sensor(**{k: v for k, v in overrides.items() if k not in own})
     return own | {k: v for k, v in overrides.items() if k in own}, sensor
 

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.synthetic import labels, shapes
-from p2p_lib.synthetic.render import Light
+from p2p_lib.synthetic.render import Light, Rendering, render
 from p2p_lib.synthetic.shapes import Mesh
 
 FPS = 30.0
@@ -42,6 +43,22 @@ class Scenario:
     def frames(self) -> int:
         """Number of frames."""
         return len(self.T_world_cam)
+
+    def rendered(self, t: float, room: Rendering | None = None) -> Rendering:
+        """The scene at a frame, or between two; ``room`` is :meth:`empty` there, where the caller has it already."""
+        bodies = [(body.mesh, _at(body.T_world_model, t)) for body in self.bodies]
+        return render(bodies, self.camera, _at(self.T_world_cam, t), self.light, room or self.empty(t))
+
+    def empty(self, t: float) -> Rendering:
+        """The scene without its bodies; nothing in it carries a label."""
+        walls = [(mesh, se3.IDENTITY) for mesh in self.room]
+        return render(walls, self.camera, _at(self.T_world_cam, t), self.light)
+
+
+def _at(T: np.ndarray, t: float) -> np.ndarray:
+    """The pose at a fractional frame."""
+    k = int(t)
+    return T[k] if t == k else se3.interpolate(T[k], T[k + 1], t - k)
 
 
 def check(scenario: str, **limits: tuple[float, float, float]) -> None:

@@ -8,6 +8,7 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.synthetic import SCENARIOS, generate
+from p2p_lib.synthetic.render import render
 
 SMALL = Camera(615 / 4, 615 / 4, 79.5, 59.5, 160, 120)
 STEP = 2  # every second frame is looked at
@@ -28,12 +29,12 @@ def turn_deg(R_a, R_b):
 
 def watch(scenario, seed):
     """Per object: poses (T, 4, 4) in the camera, visible pixels (T,), visible surface points (T, 256)."""
-    truth = [generate._Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
-    blank = generate.render([], SMALL, scenario.T_world_cam[0])
+    truth = [generate.Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
+    blank = render([], SMALL, scenario.T_world_cam[0])
     frames = range(0, scenario.frames, STEP)
     px, seen = np.zeros((len(truth), len(frames)), int), np.zeros((len(truth), len(frames), 256), bool)
     for i, t in enumerate(frames):
-        exact = generate._exact(scenario, float(t), blank)
+        exact = scenario.rendered(t, blank)
         for k, one in enumerate(truth):
             px[k, i] = np.count_nonzero(exact.label == one.label)
             seen[k, i] = one.tracks(scenario, t, exact)[1]

@@ -14,6 +14,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.synthetic import SCENARIOS, generate, scenario_dir
 from p2p_lib.synthetic.noise import PERFECT, Sensor
+from p2p_lib.synthetic.render import render
 
 OBJECTS = ("box", "can")
 FRAMES = 300
@@ -191,11 +192,11 @@ def test_hidden_and_back_on_the_written_sequence(folder, poses, tracks, o):
 def test_every_seed_keeps_the_promises(seed):
     small = Camera(615 / 4, 615 / 4, 79.5, 59.5, 160, 120)
     scenario = replace(SCENARIOS["crossing"](seed), camera=small)
-    truth = [generate._Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
-    room = generate._room(scenario, 0)
+    truth = [generate.Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
+    room = scenario.empty(0)
     px, seen = np.zeros((2, FRAMES), int), np.zeros((2, FRAMES, 256), bool)
     for t in range(FRAMES):
-        exact = generate._exact(scenario, t, room)
+        exact = scenario.rendered(t, room)
         for k, one in enumerate(truth):
             px[k, t] = np.count_nonzero(exact.label == one.label)
             seen[k, t] = one.tracks(scenario, t, exact)[1]
@@ -207,7 +208,7 @@ def test_every_seed_keeps_the_promises(seed):
         shares = []
         for t in frames:
             one = scenario.bodies[k]
-            alone = generate.render([(one.mesh, one.T_world_model[t])], small, scenario.T_world_cam[t])
+            alone = render([(one.mesh, one.T_world_model[t])], small, scenario.T_world_cam[t])
             shares.append(px[k, t] / np.count_nonzero(alone.label))
         assert 0.2 < min(shares) < 0.85 and max(shares) > 0.95, (one.name, shares)
 

@@ -12,6 +12,8 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.synthetic import SCENARIOS, generate, paper_subset, write_sequence
 from p2p_lib.synthetic.noise import NOISE, PERFECT, Sensor, kept_frames, measured_mask
+from p2p_lib.synthetic.render import render
+from p2p_lib.synthetic.scene import Body, Scenario
 
 
 def short(monkeypatch, name, frames=4):
@@ -20,10 +22,8 @@ def short(monkeypatch, name, frames=4):
 
     def cut(seed, models=""):
         whole = make(seed, models=models) if models else make(seed)
-        bodies = tuple(generate.Body(b.name, b.mesh, b.T_world_model[:frames], b.labelled) for b in whole.bodies)
-        return generate.Scenario(
-            whole.camera, whole.T_world_cam[:frames], bodies, whole.room, whole.light, whole.objects
-        )
+        bodies = tuple(Body(b.name, b.mesh, b.T_world_model[:frames], b.labelled) for b in whole.bodies)
+        return Scenario(whole.camera, whole.T_world_cam[:frames], bodies, whole.room, whole.light, whole.objects)
 
     monkeypatch.setitem(SCENARIOS, name, cut)
     return cut
@@ -87,8 +87,8 @@ def test_the_subset_is_as_the_papers():
             for behind, is_behind in enumerate((first[:, 2] > second[:, 2], first[:, 2] < second[:, 2])):
                 t = int(np.argmin(np.where(is_behind, aside, np.inf)))
                 placed = [(b.mesh, b.T_world_model[t]) for b in scenario.bodies]
-                both = generate.render(placed, scenario.camera, scenario.T_world_cam[t]).label == behind + 1
-                alone = generate.render([placed[behind]], scenario.camera, scenario.T_world_cam[t]).label == 1
+                both = render(placed, scenario.camera, scenario.T_world_cam[t]).label == behind + 1
+                alone = render([placed[behind]], scenario.camera, scenario.T_world_cam[t]).label == 1
                 assert both.sum() < 0.95 * alone.sum(), (name, behind)  # each is hidden in part by the other
             assert np.linalg.norm(first - second, axis=1).min() > 0.15
 
@@ -151,7 +151,7 @@ def test_frames_are_dropped_as_often_as_asked():
 
 def test_exposure_changes_by_what_is_asked():
     scenario = SCENARIOS["ycb_sugar_box"](1, frames=120)
-    blank = generate.render([], scenario.camera, scenario.T_world_cam[0])
+    blank = render([], scenario.camera, scenario.T_world_cam[0])
     sensor = Sensor(**{**vars(PERFECT), "exposure": 0.2})
     shown = []
     for t in range(0, 120, 10):
