@@ -26,7 +26,7 @@ from p2p_lib.datasets.prompts import Prompt, load_prompts
 from p2p_lib.datasets.runs import Run, RunWriter, load_run
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, rate
-from p2p_lib.evaluation.tracker_score import TrackerScore, score_tracker
+from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.method.mesh import save as save_mesh
 from p2p_lib.method.pipeline import Point2Pose
@@ -124,7 +124,7 @@ def evaluate_tracker(
         sequence = sequences.open_sequence(sequence, options.format, options.depth_scale)
     chosen = _tracker(options.tracker, sequence, config, options.models)
     tracker = make_tracker(chosen, config.tracking, np.random.default_rng(config.seed))
-    return score_tracker(sequence, tracker, config.seed, options.models, count, search)
+    return TrackTask.of(sequence, config.seed, options.models, count).score(tracker, search)
 
 
 def frame_range(count: int, start: int, stop: int | None) -> range:

@@ -108,7 +108,7 @@ def check_folder(
     if beyond := _all_beyond(firsts, config):
         return [*findings, beyond]  # what follows would only be its consequences
     for name, (frame, mask) in firsts.items():
-        if mask.sum() < config.pipeline.min_mask_px:
+        if mask.sum() < config.lifecycle.min_mask_px:
             findings.append(_nothing_there(name, frame, mask, config))
             continue
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
@@ -245,13 +245,13 @@ def _no_masks(sequence: Sequence, drawn: bool, config: Config) -> Finding:
     fix = f"Make clicks with p2p click and give them with --prompts, or put masks into {sequence.path}/masks."
     if not drawn:
         return Finding("masks", Level.LOOK, "none", fix)
-    text = f"none that shows an object: no object has {config.pipeline.min_mask_px} pixels in any image"
+    text = f"none that shows an object: no object has {config.lifecycle.min_mask_px} pixels in any image"
     return Finding("masks", Level.WRONG, text, fix)
 
 
 def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """A click at which the segmenter found no object to speak of."""
-    count, needed = int(mask.sum()), config.pipeline.min_mask_px
+    count, needed = int(mask.sum()), config.lifecycle.min_mask_px
     what = f"only {count} pixels were segmented" if count else "nothing was segmented"
     text = f"{what} at the clicks on it in frame {frame.index}; {needed} pixels are needed"
     return Finding(f"{name}: mask", Level.WRONG, text, "Click elsewhere, in the middle of the object: p2p click.")
@@ -306,7 +306,7 @@ def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding
 def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Finding:
     """Whether an object's masks hold background; the first of them also whether it is background altogether."""
     first = seen[0]
-    seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.pipeline.min_mask_px]
+    seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.lifecycle.min_mask_px]
     shares = np.array([background_share(mask, frame.depth_m) for frame, mask in seen])
     if np.isnan(shares).all():
         return Finding(f"{name}: mask", Level.OK, "no depth along its rim to judge it by")
@@ -338,7 +338,7 @@ def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Findin
     taken = choose(found, np.zeros((0, 2)), config.sampling.max_visible, config.sampling)
     u, v = np.rint(found.uv_px[taken]).astype(int).T
     contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]
-    count, needed = int((contrast >= config.tracking.bare_contrast).sum()), config.pipeline.recover_min_inliers
+    count, needed = int((contrast >= config.tracking.bare_contrast).sum()), config.lifecycle.return_inliers
     text = f"places to track in frame {frame.index}: {count}"
     if count < needed:
         fix = "Come nearer, light it better, or begin with a textured side: then its surface alone carries the pose."
@@ -361,7 +361,7 @@ def _first_masks(sequence: Sequence, config: Config) -> FirstMasks:
         if masks is None or firsts.keys() >= set(sequence.objects):
             break
         for name in sorted(masks.keys() & set(sequence.objects) - firsts.keys()):
-            if masks[name].sum() >= config.pipeline.min_mask_px:
+            if masks[name].sum() >= config.lifecycle.min_mask_px:
                 firsts[name] = sequence.frame(i), masks[name]
     return firsts
 

@@ -65,7 +65,7 @@ def track_live(
     config = options.config()
     segmenter = options.masks or DEFAULT_SEGMENTER
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
-    if config.tsdf.enabled:
+    if config.method.surface:
         make_volume(config.tsdf)  # what it loads takes seconds, in which the camera need not run
     start_s = monotonic()
     with Newest(camera, keep={p.frame for p in prompts}) as newest:

@@ -18,8 +18,7 @@ from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.figures import style
 from p2p_lib.figures.plots import panels
 from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
-from p2p_lib.method.registration import covariance
-from p2p_lib.method.registration import generate as register
+from p2p_lib.method.registration import covariance, register
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

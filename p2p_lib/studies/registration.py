@@ -22,10 +22,11 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.plots import panels
-from p2p_lib.method.refinement import Keypoints, refine, sample_cloud, surface_distances
-from p2p_lib.method.registration import Hypothesis, competing, select
-from p2p_lib.method.registration import generate as register
+from p2p_lib.method.observation import sample_cloud
+from p2p_lib.method.refinement import Keypoints, refine, surface_distances
+from p2p_lib.method.registration import Hypothesis, register
 from p2p_lib.method.sampling import choose, usable_region
+from p2p_lib.method.selection import select, supported
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.synthetic.ablations import mug
 from p2p_lib.synthetic.generate import photograph
@@ -122,23 +123,22 @@ def ways_to_decide(moment: Moment, config: Config, seed: int = 0) -> dict[str, n
     One hypothesis by SVD or by RANSAC; several and the paper's least score, the least score after each was refined,
     and the configured selection among the refined. Last, the hypothesis nearest to the truth.
     """
-    cfg, rng = config.registration, np.random.default_rng([seed, 8])
+    cfg, choice, rng = config.registration, config.selection, np.random.default_rng([seed, 8])
     sigma_m = depth_noise_m(moment.p_cam[:, 2], config.depth)
     points = moment.p_obj, moment.p_cam
-    hypotheses = competing(register(*points, cfg, rng, sigma_m=sigma_m), cfg)
-    single = register(*points, replace(cfg, multi_hypothesis=False), rng, sigma_m=sigma_m)
+    hypotheses = supported(register(*points, cfg, rng, sigma_m=sigma_m), choice)
+    single = register(*points, replace(cfg, method="svd"), rng, sigma_m=sigma_m)
     T = np.stack([h.T_cam_obj for h in hypotheses])
     inliers = [Keypoints(*(values[h.inliers] for values in (*points, sigma_m))) for h in hypotheses]
     volume = moment.cloud, moment.surface, config.refinement
     T_refined = np.stack([refine(*pair, *volume, keypoints=k).T_cam_obj for *pair, k in zip(T, inliers, strict=True)])
-    off_m, refined_m = (surface_distances(moment.surface, moment.cloud, P, cfg.unseen_share) for P in (T, T_refined))
-    chosen, _ = select(hypotheses, refined_m, cfg)
+    off_m, refined_m = (surface_distances(moment.surface, moment.cloud, P, choice.unseen_share) for P in (T, T_refined))
     return {
         "SVD, outliers out, SVD": single[0].T_cam_obj if single else np.full((4, 4), np.nan),
-        "RANSAC: most inliers": select(hypotheses, None, cfg)[0].T_cam_obj,
+        "RANSAC: most inliers": T[select(hypotheses, None, choice)[0]],
         "least score": T[off_m.mean(1).argmin()],
         "refine all, least score": T_refined[refined_m.mean(1).argmin()],
-        "configured selection": T_refined[hypotheses.index(chosen)],
+        "configured selection": T_refined[select(hypotheses, refined_m, choice)[0]],
         "best hypothesis": T[moment.error(T)[0].argmin()],
     }
 

@@ -25,7 +25,7 @@ FRAMES, W, H = 8, 160, 120
 K = np.array([[200.0, 0, 79.5], [0, 200, 59.5], [0, 0, 1]])
 DEPTH_M = 0.5
 #: Points alone: the rest of the method is tested elsewhere, and torch takes seconds to import.
-POINTS_ALONE = ["--set", "tsdf.enabled=false", "--set", "factor_graph.enabled=false", "--quiet"]
+POINTS_ALONE = ["--set", "method.surface=false", "--set", "method.graph=false", "--quiet"]
 
 
 def write_sequence(folder: Path, frames: int = FRAMES) -> Path:

@@ -25,7 +25,7 @@ from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.run import run
 
 FRAMES = 20  # then the board jumps back
-SETTINGS = {"tsdf.enabled": "false", "factor_graph.enabled": "false"}
+SETTINGS = {"method.surface": "false", "method.graph": "false"}
 PROMPTS = (Prompt("board", 0, [[60, 50]]),)
 
 

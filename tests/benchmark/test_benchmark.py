@@ -117,7 +117,7 @@ def test_a_key_is_of_everything_that_decides_a_result(slides, plan, tmp_path, mo
     assert len(set(same)) == 2
     assert keys(**{"seeds = [0]": "seeds = [4]"})[0] != same[0]
     assert keys(**{'column = "AP10" }': "stop = 4 }"})[0] != same[0]
-    assert keys(**{'"factor_graph.enabled" = false': '"factor_graph.enabled" = true'})[0] != same[0]
+    assert keys(**{'"method.graph" = false': '"method.graph" = true'})[0] != same[0]
     copy = Path(shutil.copytree(slides[0], tmp_path / "copy"))
     assert keys(**{str(slides[0]): str(copy)}) == same, "nor do folders"
     pose = copy / "annotated_poses/0003.txt"

@@ -7,7 +7,7 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
-from p2p_lib.method.refinement import sample_cloud
+from p2p_lib.method.observation import sample_cloud
 from p2p_lib.studies import refinement, turntable
 from p2p_lib.synthetic.noise import PERFECT
 from p2p_lib.synthetic.scene import VGA
