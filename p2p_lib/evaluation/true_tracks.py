@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import lift
 from p2p_lib.core.errors import MissingData
 from p2p_lib.core.image import in_mask, nearest_px
-from p2p_lib.core.native import load_open3d
+from p2p_lib.core.raycasting import cast, ray_scene
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.models import MESHES, find_models, given_models, load_mesh
 from p2p_lib.datasets.sequence import Sequence
@@ -87,7 +88,7 @@ class TrueScene:
             raise MissingData(sequence.name, "has no true poses", fix)
         self.sequence = sequence
         self.objects = tuple(sequence.truth)
-        self._scenes = {name: _ray_scene(*load_mesh(path)) for name, path in (meshes or {}).items()}
+        self._scenes = {name: ray_scene(*load_mesh(path)) for name, path in (meshes or {}).items()}
 
     @classmethod
     def of(cls, sequence: Sequence, models: Mapping[str, str | Path] | None = None) -> TrueScene:
@@ -121,7 +122,7 @@ class TrueScene:
                 continue
             if name in self._scenes:
                 rays = self.sequence.camera.unproject(uv_px[rows], np.ones(len(rows))) @ T_cam_model[:3, :3]
-                p_model[rows], normal[rows] = _cast(self._scenes[name], se3.inverse(T_cam_model)[:3, 3], rays)
+                p_model[rows], normal[rows] = _first_hits(self._scenes[name], se3.inverse(T_cam_model)[:3, 3], rays)
             else:
                 p_model[rows], normal[rows] = self._lift_by_depth(frame, uv_px[rows], T_cam_model)
         return SurfacePoints(np.asarray(object, np.int64), p_model, normal)
@@ -164,7 +165,7 @@ class TrueScene:
         visible = self.sequence.camera.inside(uv) & ~(cosine < MIN_COSINE)  # an unknown normal hides nothing
         visible &= agrees if mask is None else mask[v, u] & (agrees | (measured_m == 0))
         if name in self._scenes:
-            hit_m = _distance_m(self._scenes[name], eye, -view)
+            hit_m = cast(self._scenes[name], eye, -view)["t_hit"]
             visible &= hit_m > distance_m - _SELF_OCCLUSION_M
         return uv, visible, view
 
@@ -247,34 +248,12 @@ def _draw(scene: TrueScene, frame: Frame, wanted: int, rng: np.random.Generator)
     return Queries(np.full(len(seen), frame.index), uv[seen], points.select(seen))
 
 
-def _ray_scene(vertices: np.ndarray, faces: np.ndarray):
-    """An Open3D scene of one mesh in its own frame."""
-    open3d = load_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
-    return scene
-
-
-def _cast(scene, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _first_hits(scene: Any, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First hits (N, 3) of rays (N, 3) from one eye, and outward normals there; NaN where nothing is hit."""
-    length = np.linalg.norm(rays, axis=1, keepdims=True)
-    rays = rays / length
-    hit = _answer(scene, eye, rays)
-    distance_m = hit["t_hit"].numpy().astype(float)
-    met = np.isfinite(distance_m)[:, None]
-    normal = hit["primitive_normals"].numpy().astype(float)
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    hit = cast(scene, eye, rays)
+    distance_m = hit["t_hit"].astype(float)[:, None]
+    met, normal = np.isfinite(distance_m), hit["primitive_normals"].astype(float)
     # Towards the eye, so that a mesh wound the other way round serves as well.
     normal *= -np.sign(np.einsum("nc,nc->n", normal, rays))[:, None]
-    reach = np.where(met[:, 0], distance_m, 0)[:, None]
-    return np.where(met, eye + reach * rays, np.nan), np.where(met, normal, np.nan)
-
-
-def _distance_m(scene, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Distance (N,) from the eye to the first surface along unit rays (N, 3); infinite where there is none."""
-    return _answer(scene, eye, rays)["t_hit"].numpy().astype(float)
-
-
-def _answer(scene, eye: np.ndarray, rays: np.ndarray) -> dict:
-    open3d = load_open3d()
-    lines = np.concatenate([np.broadcast_to(eye, rays.shape), rays], 1).astype(np.float32)
-    return scene.cast_rays(open3d.core.Tensor(lines))
+    return np.where(met, eye + np.where(met, distance_m, 0) * rays, np.nan), np.where(met, normal, np.nan)
