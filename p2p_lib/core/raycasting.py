@@ -19,7 +19,8 @@ def ray_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
 
 def cast(scene: Any, eye: np.ndarray, rays: np.ndarray) -> dict[str, np.ndarray]:
     """Open3D's answer for rays (N, 3) of any length from one eye (3,): ``t_hit``, ``primitive_ids`` and so on."""
-    lines = np.concatenate([np.broadcast_to(eye, rays.shape), rays], 1).astype(np.float32)
+    lines = np.empty((len(rays), 6), np.float32)
+    lines[:, :3], lines[:, 3:] = eye, rays
     return {key: value.numpy() for key, value in scene.cast_rays(load_open3d().core.Tensor(lines)).items()}
 
 

@@ -1,4 +1,4 @@
-"""Writes a scenario as a YCBMultiTrack folder, with exact poses, masks and 2D tracks; cached by its configuration."""
+"""Writes a scenario as a YCBMultiTrack folder, with exact poses and masks; cached by its configuration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
 
@@ -30,8 +30,8 @@ from p2p_lib.synthetic.scenarios import SCENARIOS
 from p2p_lib.synthetic.scene import FPS, Body, Scenario
 from p2p_lib.synthetic.shapes import Mesh
 
-_TRACKS_PER_OBJECT = 256
 _MODEL_POINTS = 6000
+_PER_OBJECT = ("masks", "annotated_poses", "is_mask_visible", "is_obj_in_image_labels", "models")
 _DONE = "scenario.json"
 
 
@@ -58,19 +58,24 @@ def scenario_dir(name: str, seed: int = 0, **overrides: object) -> Path:
 
 def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, title: str = "rendering") -> None:
     """Renders a scenario into ``folder``, which is made: colour, depth, and the truth per labelled body."""
-    truth = [Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
-    for name in ("rgb", "depth", *(f"{kind}/{t.body.name}" for kind in _PER_OBJECT for t in truth)):
+    labelled = {k: body for k, body in enumerate(scenario.bodies, 1) if body.labelled}
+    for name in ("rgb", "depth", *(f"{kind}/{body.name}" for kind in _PER_OBJECT for body in labelled.values())):
         (folder / name).mkdir(parents=True, exist_ok=True)
     still = bool((scenario.T_world_cam == scenario.T_world_cam[0]).all())
-    room = scenario.empty(0) if still else None
-    work = partial(_write_frame, folder, scenario, sensor, seed, truth, room)
+    work = partial(_write_frame, folder, scenario, sensor, seed, scenario.empty(0) if still else None)
     with ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0)))) as pool:
         frames = kept_frames(scenario.frames, sensor, np.random.default_rng([seed, 5]))
         done = pool.map(work, frames.tolist())
         # On a terminal only, and only when it takes longer than a moment.
         shown = {"unit": "frame", "delay": 2.0, "leave": False, "disable": None}
-        rows = list(tqdm(done, title, len(frames), **shown))
-    _write_truth(folder, scenario, truth, frames, rows)
+        visible = list(tqdm(done, title, len(frames), **shown))
+    np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
+    np.savetxt(folder / "times.txt", frames / FPS, fmt="%.6f")
+    for k, body in labelled.items():
+        _write_truth(folder, scenario, body, frames, np.array([k in labels for labels in visible]))
+        points, _ = body.mesh.sample(_MODEL_POINTS, np.random.default_rng(k))
+        np.savetxt(folder / f"models/{body.name}/points.xyz", points, fmt="%.6f")
+        _write_obj(folder / f"models/{body.name}", body.mesh)
 
 
 def write_sequence(
@@ -125,56 +130,20 @@ def photograph(
     return measured_colour(rgb, sensor, gain, rng), depth_m, exact
 
 
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """A labelled body: its label and the surface points whose tracks are written."""
-
-    label: int
-    body: Body
-    p_model: np.ndarray
-    normals: np.ndarray
-
-    @classmethod
-    def of(cls, label: int, body: Body, seed: int) -> Truth:
-        """With points drawn on the body's surface."""
-        return cls(label, body, *body.mesh.sample(_TRACKS_PER_OBJECT, np.random.default_rng([seed, 4, label])))
-
-    def tracks(self, scenario: Scenario, t: int, exact: Rendering) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (P, 2) and visibility (P,) of the points at frame t, by the exact depth."""
-        camera = scenario.camera
-        T_cam_model = se3.inverse(scenario.T_world_cam[t]) @ self.body.T_world_model[t]
-        p_cam = se3.transform(T_cam_model, self.p_model)
-        uv = camera.project(p_cam)
-        inside = camera.inside(uv)
-        u, v = np.where(inside, uv.T, 0).round().astype(int)
-        away = np.linalg.norm(p_cam, axis=1)
-        cosine = -np.einsum("pc,pc->p", self.normals @ T_cam_model[:3, :3].T, p_cam) / away
-        # The depth is that of the pixel's centre, up to 0.71 px away: a slanted surface differs by its slope.
-        slope = np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, 1e-3)
-        tolerance = 0.0005 + 0.75 * p_cam[:, 2] / camera.fx * slope
-        agrees = np.abs(exact.depth_m[v, u] - p_cam[:, 2]) < tolerance
-        return uv, inside & (cosine > 0.05) & (exact.label[v, u] == self.label) & agrees
-
-
-_PER_OBJECT = ("masks", "annotated_poses", "is_mask_visible", "is_obj_in_image_labels", "models")
-
-
 def _write_frame(
-    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, truth: list[Truth], room: Rendering | None, t: int
-) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Renders and writes frame t; returns visible pixels, track pixels and track visibility per object."""
+    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, room: Rendering | None, t: int
+) -> set[int]:
+    """Renders and writes frame t; returns the labels that are visible in it."""
     rgb, depth_m, exact = photograph(scenario, sensor, seed, t, room)
     _save(folder / f"rgb/{t:06d}.jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
     depth_mm = np.minimum(np.round(depth_m * 1000), 65534).astype(np.uint16)
     _save(folder / f"depth/{t:06d}.png", depth_mm, [cv2.IMWRITE_PNG_COMPRESSION, 2])
-    rows = []
-    for one in truth:
-        visible = exact.label == one.label
-        mask = measured_mask(visible, sensor, np.random.default_rng([seed, 6, t, one.label]))
-        where = folder / f"masks/{one.body.name}/{t:06d}.png"
-        _save(where, mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_COMPRESSION, 2])
-        rows.append((int(np.count_nonzero(visible)), *one.tracks(scenario, t, exact)))
-    return rows
+    for k, body in enumerate(scenario.bodies, 1):
+        if body.labelled:
+            mask = measured_mask(exact.label == k, sensor, np.random.default_rng([seed, 6, t, k]))
+            where = folder / f"masks/{body.name}/{t:06d}.png"
+            _save(where, mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_COMPRESSION, 2])
+    return set(np.unique(exact.label).tolist())
 
 
 def _save(path: Path, image: np.ndarray, options: list[int]) -> None:
@@ -182,31 +151,15 @@ def _save(path: Path, image: np.ndarray, options: list[int]) -> None:
         raise OSError(f"{path} could not be written: is the disk full?")
 
 
-def _write_truth(folder: Path, scenario: Scenario, truth: list[Truth], frames: np.ndarray, rows: list) -> None:
-    """Camera, times, poses, labels, models and tracks: everything that is not an image."""
-    np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
-    np.savetxt(folder / "times.txt", frames / FPS, fmt="%.6f")
-    T_cam_world = se3.inverse(scenario.T_world_cam[frames])
-    for k, one in enumerate(truth):
-        name = one.body.name
-        T_cam_model = T_cam_world @ one.body.T_world_model[frames]
-        for t, T in zip(frames, T_cam_model, strict=True):
-            np.savetxt(folder / f"annotated_poses/{name}/{t:06d}.txt", T, fmt="%.9f")
-        uv = scenario.camera.project(se3.transform(T_cam_model, one.body.mesh.vertices))
-        in_image = scenario.camera.inside(uv).any(1)
-        np.save(folder / f"is_obj_in_image_labels/{name}/is_obj_in_image.npy", in_image)
-        np.save(folder / f"is_mask_visible/{name}/is_mask_visible.npy", np.array([row[k][0] > 0 for row in rows]))
-        points, _ = one.body.mesh.sample(_MODEL_POINTS, np.random.default_rng(one.label))
-        np.savetxt(folder / f"models/{name}/points.xyz", points, fmt="%.6f")
-        _write_obj(folder / f"models/{name}", one.body.mesh)
-    np.savez_compressed(
-        folder / "tracks.npz",
-        objects=np.array([one.body.name for one in truth]),
-        object_index=np.repeat(np.arange(len(truth)), _TRACKS_PER_OBJECT),
-        p_model=np.concatenate([one.p_model for one in truth]),
-        uv_px=np.stack([np.concatenate([r[1] for r in row]) for row in rows]).astype(np.float32),
-        visible=np.stack([np.concatenate([r[2] for r in row]) for row in rows]),
-    )
+def _write_truth(folder: Path, scenario: Scenario, body: Body, frames: np.ndarray, visible: np.ndarray) -> None:
+    """A body's pose and labels at every frame written."""
+    T_cam_model = se3.inverse(scenario.T_world_cam[frames]) @ body.T_world_model[frames]
+    for t, T in zip(frames, T_cam_model, strict=True):
+        np.savetxt(folder / f"annotated_poses/{body.name}/{t:06d}.txt", T, fmt="%.9f")
+    uv = scenario.camera.project(se3.transform(T_cam_model, body.mesh.vertices))
+    in_image = scenario.camera.inside(uv).any(1)
+    np.save(folder / f"is_obj_in_image_labels/{body.name}/is_obj_in_image.npy", in_image)
+    np.save(folder / f"is_mask_visible/{body.name}/is_mask_visible.npy", visible)
 
 
 def _write_obj(folder: Path, mesh: Mesh) -> None:

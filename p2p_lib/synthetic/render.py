@@ -112,7 +112,7 @@ def _hits(mesh: Mesh, T_cam_model: np.ndarray, camera: Camera) -> tuple[_Hits, n
     p_cam = se3.transform(T_cam_model, mesh.vertices)
     pixel = _pixels_around(p_cam, camera)
     T_model_cam = se3.inverse(T_cam_model)
-    rays = camera.rays.reshape(-1, 3)[pixel] @ T_model_cam[:3, :3].T
+    rays = camera.rays.reshape(-1, 3)[pixel].astype(float) @ T_model_cam[:3, :3].T
     face = first_faces(mesh.ray_scene, T_model_cam[:3, 3], rays)
     met = face >= 0
     pixel, face = pixel[met], face[met]
@@ -124,8 +124,9 @@ def _hits(mesh: Mesh, T_cam_model: np.ndarray, camera: Camera) -> tuple[_Hits, n
     inverse /= np.einsum("nc,nc->n", a, inverse[:, 0])[:, None, None]
     planes = inverse @ np.linalg.inv(camera.K)
     v, u = np.divmod(pixel, camera.width)
-    per_u, per_v, offset = planes.sum(1)[row].T
-    return _Hits(mesh, T_cam_model[:3, :3], pixel, shown, planes, row), 1 / (per_u * u + per_v * v + offset)
+    per_u, per_v, offset = planes.sum(1).T
+    depth_m = 1 / (per_u[row] * u + per_v[row] * v + offset[row])
+    return _Hits(mesh, T_cam_model[:3, :3], pixel, shown, planes, row), depth_m
 
 
 def _pixels_around(p_cam: np.ndarray, camera: Camera) -> np.ndarray:

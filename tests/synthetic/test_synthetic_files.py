@@ -34,7 +34,6 @@ def test_what_is_written_is_read_back(tmp_path, monkeypatch, noise):
     scenario = short(monkeypatch, "ycb_meat_sugar", 6)(3)
     out = write_sequence("ycb_meat_sugar", tmp_path / "s", 3, noise, bop=True)
     kept = kept_frames(6, NOISE[noise], np.random.default_rng([3, 5]))
-    tracks = np.load(out / "tracks.npz")
     numbers = {k: i for i, k in enumerate(kept)}
     obj_id = {name: f"obj_{k:06d}" for k, name in enumerate(sorted(b.name for b in scenario.bodies), 1)}
     flat, bop = open_sequence(out), open_sequence(out / "bop/test/000001", format="bop")
@@ -54,9 +53,6 @@ def test_what_is_written_is_read_back(tmp_path, monkeypatch, noise):
             rng = np.random.default_rng([3, 6, t, k])
             mask = measured_mask(exact.label == k, NOISE[noise], rng)
             np.testing.assert_array_equal(flat.masks(i)[body.name], mask)
-            mine = tracks["object_index"] == k - 1
-            uv = scenario.camera.project(se3.transform(T, tracks["p_model"][mine]))
-            np.testing.assert_allclose(tracks["uv_px"][i, mine], uv, atol=1e-3)
     made = json.loads((out / "scenario.json").read_text())
     assert made["objects"].startswith("procedural stand-ins") and made["noise"] == noise and made["seed"] == 3
 
