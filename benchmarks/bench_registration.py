@@ -16,7 +16,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.robust import fit_rigid
-from p2p_lib.method.registration import covariance, generate
+from p2p_lib.method.registration import covariance, register
 
 SEEDS = 40
 
@@ -43,7 +43,7 @@ def main() -> None:
     """Every preset and the single-hypothesis variant, over numbers of points and shares of outliers."""
     variants = {name: preset(name).registration for name in ("default", "paper")}
     variants["single"] = replace(variants["paper"], multi_hypothesis=False)
-    generate(*scene(np.random.default_rng(0), 60, 0.1)[:2], variants["default"], np.random.default_rng(0))
+    register(*scene(np.random.default_rng(0), 60, 0.1)[:2], variants["default"], np.random.default_rng(0))
     print(f"{'variant':8} {'points':>6} {'wrong':>6} {'median':>8} {'p95':>8} {'found':>6} {'right':>6}")
     for name, config in variants.items():
         for n in (60, 100, 150):
@@ -53,7 +53,7 @@ def main() -> None:
                     p_obj, p_cam, T = scene(np.random.default_rng(seed), n, outliers)
                     priors = {"last pose": T @ se3.exp(np.full(6, 0.01)), "constant velocity": T}
                     rng = np.random.default_rng(seed)
-                    ms, hypotheses = cpu_ms(lambda: generate(p_obj, p_cam, config, rng, priors=priors))  # noqa: B023
+                    ms, hypotheses = cpu_ms(lambda: register(p_obj, p_cam, config, rng, priors=priors))  # noqa: B023
                     off = [se3.angle_rad(se3.inverse(T) @ h.T_cam_obj) for h in hypotheses]
                     times.append(ms)
                     found.append(len(hypotheses))
@@ -63,7 +63,7 @@ def main() -> None:
                     f" {np.mean(found):6.1f} {np.mean(right):6.0%}"
                 )
     p_obj, p_cam, T = scene(np.random.default_rng(0), 100, 0.0)
-    (best, *_) = generate(p_obj, p_cam, variants["default"], np.random.default_rng(0))
+    (best, *_) = register(p_obj, p_cam, variants["default"], np.random.default_rng(0))
     samples = np.random.default_rng(0).normal(size=(2, 100, 4, 3))
     for what, run in {
         "fit_rigid, 100 samples of 4": lambda: [fit_rigid(*samples) for _ in range(20)],

@@ -8,7 +8,6 @@ from p2p_lib.core.types import WITH_POSE
 
 CAPS = {
     "factor_graph.max_keyframes": 5,
-    "keypoint_map.max_views": 6,
     "keypoint_map.max_points": 60,
     "keypoint_map.pending_ttl": 10,
     "tsdf.max_voxels": 40_000,

@@ -7,6 +7,7 @@ A page of the standard library's web server, on this machine alone, shows the fr
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from functools import lru_cache
 from http import HTTPStatus
@@ -42,7 +43,7 @@ class Clicker:
             raise BadInput("frame", frame, f"a number from 0 to {len(sequence) - 1}")
         self.sequence, self.path, self.first = sequence, Path(path), frame
         self.prompts: tuple[Prompt, ...] = load_prompts(path) if self.path.is_file() else ()
-        self.picture = lru_cache(maxsize=8)(self._picture)
+        self.image_png = lru_cache(maxsize=8)(self._image_png)
         self._saved = Event()
         try:
             self._server = ThreadingHTTPServer((HOST, port), _handler(self))
@@ -86,7 +87,7 @@ class Clicker:
             "objects": [{"name": p.name, "frame": p.frame, "points": p.points_px.tolist()} for p in self.prompts],
         }
 
-    def _picture(self, i: int) -> bytes:
+    def _image_png(self, i: int) -> bytes:
         return cv2.imencode(".png", cv2.cvtColor(self.sequence.frame(i).rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
 
     def save(self, content: object) -> None:
@@ -113,6 +114,14 @@ def collect_clicks(sequence: Sequence, path: str | Path, frame: int = 0, port: i
     return Clicker(sequence, path, frame, port)
 
 
+def check_writable(path: Path) -> None:
+    """Refuse a file that could not be written in the end, before anyone works for it."""
+    folder = next(p for p in path.absolute().parents if p.exists())
+    if path.is_dir() or not folder.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
+        what = "a folder" if path.is_dir() else "what cannot be written"
+        raise BadInput(f"--out {path}", what, "a file in a folder that can be written")
+
+
 def wait_for_clicks(clicker: Clicker, say: Callable[[str], object], open_browser: bool = True) -> tuple[Prompt, ...]:
     """What the page saves: says where the page is, opens it where there is a desktop, waits, closes."""
     with clicker:
@@ -135,7 +144,7 @@ def _handler(clicker: Clicker) -> type[BaseHTTPRequestHandler]:
                 self._answer(json.dumps(clicker.session()).encode(), _JSON)
             elif what == "frame" and number.isdecimal() and int(number) < len(clicker.sequence):
                 try:
-                    self._answer(clicker.picture(int(number)), _PNG)
+                    self._answer(clicker.image_png(int(number)), _PNG)
                 except P2PError as error:
                     self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
             else:

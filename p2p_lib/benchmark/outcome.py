@@ -58,11 +58,6 @@ class Outcome(_Record):
     times: dict[str, float] = {}
 
 
-def record_path(out: Path, key: str) -> Path:
-    """Where the record of a key lies."""
-    return out / "records" / f"{key}.json"
-
-
 def run_path(out: Path, key: str) -> Path:
     """Where the run of a key lies (see :mod:`p2p_lib.datasets.runs`)."""
     return out / "runs" / key
@@ -70,18 +65,19 @@ def run_path(out: Path, key: str) -> Path:
 
 def load_outcome(out: Path, key: str) -> Outcome | None:
     """The record of a key; None where there is none."""
+    path = out / "records" / f"{key}.json"
     try:
-        return Outcome.model_validate_json(record_path(out, key).read_bytes())
+        return Outcome.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         return None
     except ValueError as error:
         fix = "Delete it and run the benchmark again."
-        raise BadInput(str(record_path(out, key)), f"a damaged record ({type(error).__name__})", "JSON", fix) from None
+        raise BadInput(str(path), f"a damaged record ({type(error).__name__})", "JSON", fix) from None
 
 
 def save_outcome(out: Path, outcome: Outcome) -> None:
     """Keep a record, so that a kill leaves either all of it or nothing."""
-    replace_text(record_path(out, outcome.key), outcome.model_dump_json() + "\n")
+    replace_text(out / "records" / f"{outcome.key}.json", outcome.model_dump_json() + "\n")
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -27,7 +27,7 @@ _FORMS = "realsense, realsense:RECORDING or folder:PATH"
 class LiveCamera(Protocol):
     """A stream of frames that nobody can hold up.
 
-    A frame's index counts the camera's own pictures from 0: what is missing between two of them was dropped.
+    A frame's index counts the camera's own images from 0: what is missing between two of them was dropped.
     """
 
     name: str
@@ -140,5 +140,5 @@ class Still:
         return 1
 
     def frame(self, i: int) -> Frame:
-        """The picture, whatever its number."""
+        """The image, whatever its number."""
         return self.picture

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -27,6 +27,9 @@ class Strict(BaseModel):
     """Values as written: no unknown field, no conversion, no change afterwards."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+Checked = TypeVar("Checked", bound=Strict)
 
 
 class RemoteFile(Strict):
@@ -144,19 +147,23 @@ def manifest(name: str) -> Manifest:
     return read_manifest(found)
 
 
-@cache
-def read_manifest(path: Path) -> Manifest:
-    """One file, checked; :class:`BadInput` names the file and the first field that does not fit."""
+def read_strict(path: Path, schema: type[Checked], what: str) -> Checked:
+    """A JSON file by its schema; :class:`BadInput` names the file and the first field that does not fit."""
     try:
-        read = Manifest.model_validate_json(path.read_bytes())
+        return schema.model_validate_json(path.read_bytes())
     except FileNotFoundError:
-        raise MissingData(str(path), "no such manifest") from None
+        raise MissingData(str(path), f"no such file, expected {what}") from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the file"
-        raise BadInput(
-            str(path), f"{where}: {first['msg']}", "a manifest (see p2p_lib/datasets/manifests.py)"
-        ) from None
+        expected = f"{what} (see {schema.__module__})"
+        raise BadInput(str(path), f"{where}: {first['msg']}", expected) from None
+
+
+@cache
+def read_manifest(path: Path) -> Manifest:
+    """One file, checked: it lies and is called as it says."""
+    read = read_strict(path, Manifest, "a manifest")
     if (read.name, read.kind) != (path.stem, _kind(path)):
         got = f"the {read.kind} {read.name!r}"
         raise BadInput(str(path), got, f"the {_kind(path)} {path.stem!r}, as the file lies and is called")

@@ -16,7 +16,7 @@ from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_fil
 class MaskFiles:
     """Masks on disk: for each object its files, and the label that means it (None: anything but 0).
 
-    An object has one file a frame (None: it is not in this picture), or a single one for the first frame alone.
+    An object has one file a frame (None: it is not in this image), or a single one for the first frame alone.
     """
 
     files: dict[str, tuple[Path | None, ...]]
@@ -32,12 +32,12 @@ class MaskFiles:
     def read(self, i: int) -> dict[str, np.ndarray] | None:
         """Object to (H, W) bool at frame i; None where no object has a mask for it."""
         at_i = {name: files[i] for name, files in self.files.items() if i < len(files)}
-        pictures = {path: read_labels(path, self.shape) for path in set(at_i.values()) if path}
-        pictures[None] = np.zeros(self.shape, np.uint8)
+        images = {path: read_labels(path, self.shape) for path in set(at_i.values()) if path}
+        images[None] = np.zeros(self.shape, np.uint8)
         masks = {}
         for name, path in at_i.items():
             label = self.labels[name]
-            masks[name] = pictures[path] > 0 if label is None else pictures[path] == label
+            masks[name] = images[path] > 0 if label is None else images[path] == label
         self._counts[i] = {name: int(np.count_nonzero(mask)) for name, mask in masks.items()}
         return masks or None
 
@@ -73,7 +73,7 @@ def find_masks(
         try:
             return files if len(files) == 1 else check_paired(files, rgb_files)
         except BadInput as error:
-            alone = "One mask alone, of the first picture, is allowed too."
+            alone = "One mask alone, of the first image, is allowed too."
             raise BadInput(error.name, error.got, error.expected, f"{error.fix} {alone}".strip()) from None
 
     if below:
@@ -96,12 +96,6 @@ def _labels_in(files: tuple[Path, ...], shape: tuple[int, int]) -> list[int]:
     return [int(k) for k in np.flatnonzero(present) if k > 0]
 
 
-def masks_folder(folder: Path, masks: str | Path) -> Path:
-    """The folder of masks that was asked for: a name inside the sequence, else a path."""
-    inside = folder / masks
-    return inside if inside.is_dir() else Path(masks).expanduser()
-
-
 def read_labels(path: Path, shape: tuple[int, int]) -> np.ndarray:
     """(H, W) integer labels of a mask image; 0 is background. Palette images give their indices."""
     labels = read_image(path, cv2.IMREAD_UNCHANGED, "a mask image")
@@ -120,6 +114,6 @@ def _palette_indices(path: Path) -> np.ndarray:
     with Image.open(path) as image:
         if image.mode != "P":
             raise BadInput(
-                str(path), f"a colour picture ({image.mode})", "one label per pixel", "Save it with one channel."
+                str(path), f"a colour image ({image.mode})", "one label per pixel", "Save it with one channel."
             )
         return np.asarray(image)

@@ -46,7 +46,7 @@ class Resized:
         )
 
     def frame(self, i: int) -> Frame:
-        """The i-th picture, smaller."""
+        """The i-th image, smaller."""
         frame, size = self.original.frame(i), (self.camera.width, self.camera.height)
         depth_m = cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT)
         return replace(frame, rgb=cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), depth_m=depth_m)

@@ -61,7 +61,7 @@ class Sequence(Protocol):
     path     its folder, None where it has none
     objects  names of the objects it knows; a single unnamed one is called ``object``
     truth    per object, empty where there is none; read when first asked for
-    times_s  (N,) seconds, increasing; frame_names what each frame's picture is called
+    times_s  (N,) seconds, increasing; frame_names what each frame's image is called
     model_places  object to the files and folders where its model may lie, best first
     """
 
@@ -75,7 +75,7 @@ class Sequence(Protocol):
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """What each frame's picture is called, without its ending."""
+        """What each frame's image is called, without its ending."""
         ...
 
     @property
@@ -86,7 +86,7 @@ class Sequence(Protocol):
     def __len__(self) -> int: ...
 
     def frame(self, i: int) -> Frame:
-        """The i-th picture, read now; what is wrong with its files is said in one line that names the file."""
+        """The i-th image, read now; what is wrong with its files is said in one line that names the file."""
         ...
 
     def masks(self, i: int) -> dict[str, np.ndarray] | None:
@@ -173,7 +173,7 @@ def recognise(folder: Path) -> str:
             return name
     holds = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())[:8]) or "nothing"
     if not (folder / "rgb").is_dir() and ((folder / "depth").is_dir() or (folder / "cam_K.txt").is_file()):
-        fix = "rgb/ is missing: put the colour pictures there, one for each depth image."
+        fix = "rgb/ is missing: put the colour images there, one for each depth image."
         raise BadInput(str(folder), f"a folder with {holds}", "rgb/, depth/ and cam_K.txt", fix)
     raise BadInput(
         str(folder),

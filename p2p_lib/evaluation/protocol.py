@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,9 +25,20 @@ from p2p_lib.datasets.models import given_models, load_points
 from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run
 from p2p_lib.evaluation import metrics
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 ALIGNMENTS = ("first", "all")
 MIN_VISIBLE_PX = 300
-SCORES = ("add_auc", "adds_auc", "add_auc_voc", "adds_auc_voc")
+#: Areas under the curve, and what tables call them.
+HEADS = {
+    "adds_auc": "ADD-S AUC [%]",
+    "add_auc": "ADD AUC [%]",
+    "adds_auc_voc": "ADD-S AUC, VOC [%]",
+    "add_auc_voc": "ADD AUC, VOC [%]",
+}
+#: What a score says of the run.
+WHAT_RAN = ("tracker", "masks", "preset", "seed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,27 +84,28 @@ class Evaluation:
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as ``p2p eval --json`` prints them: areas in percent, the mean is over objects."""
         objects = {name: score.as_dict() for name, score in self.objects.items()}
-        mean = {key: float(np.mean([o[key] for o in objects.values()])) for key in SCORES}
-        what_ran = {key: self.info.get(key) for key in ("tracker", "masks", "preset", "seed")}
+        mean = {key: float(np.mean([o[key] for o in objects.values()])) for key in HEADS}
+        what_ran = {key: self.info.get(key) for key in WHAT_RAN}
         return {"objects": objects, "mean": mean, "hz": self.hz, "p95_ms": self.p95_ms, **what_ran, "align": self.align}
+
+    def as_frame(self) -> DataFrame:
+        """A row per object and their mean: areas under the curve in percent, frames scored, frames lost among them."""
+        from pandas import DataFrame
+
+        plain = self.as_dict()
+        rows = [{"object": name, **scores} for name, scores in plain["objects"].items()]
+        total = {key: sum(row[key] for row in rows) for key in ("frames", "lost")}
+        rows += [{"object": "mean", **plain["mean"], **total}] if len(rows) > 1 else []
+        return DataFrame(rows)[["object", *HEADS, "frames", "lost"]].round(2).rename(columns=HEADS)
 
     def as_table(self) -> str:
         """The same for people, with the reason for what is not there."""
-        plain = self.as_dict()
-        rows = [(name, o, f"{o['frames']:7d} {o['lost']:5d}") for name, o in plain["objects"].items()]
-        rows += [("mean", plain["mean"], "")] if len(rows) > 1 else []
-        width = max(len(name) for name, _, _ in [*rows, ("object", {}, "")])
-        lines = [f"{'object':{width}}  ADD-S    ADD  ADD-S voc  ADD voc   frames  lost"]
-        for name, o, counts in rows:
-            exact = f"{o['adds_auc']:6.2f} {o['add_auc']:6.2f}"
-            voc = f"{o['adds_auc_voc']:6.2f}   {o['add_auc_voc']:6.2f}"
-            lines.append(f"{name:{width}} {exact}     {voc}  {counts}".rstrip())
+        lines = [self.as_frame().to_string(index=False, float_format="{:.2f}".format)]
         lines += [f"{name}: not scored, {reason}" for name, reason in self.left_out.items()]
         if self.hz is not None:
             lines.append(f"{self.hz:.1f} Hz, 95 % of the frames within {self.p95_ms:.1f} ms")
-        names = ("tracker", "masks", "preset", "seed")
-        lines.append(", ".join(f"{key} {plain[key]}" for key in names) + f", aligned by {self.align}")
-        return "\n".join(["AUC over 0 to 0.1 m in percent (exact, and in the VOC form)", *lines])
+        ran = ", ".join(f"{key} {self.info.get(key)}" for key in WHAT_RAN)
+        return "\n".join(["AUC over 0 to 0.1 m, exact and in the VOC form", *lines, f"{ran}, aligned by {self.align}"])
 
 
 def evaluate(

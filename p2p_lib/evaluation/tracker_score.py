@@ -6,25 +6,28 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from p2p_lib.core.backends import make_tracker
-from p2p_lib.core.config import preset
+from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.point_tracks import (
     THRESHOLDS_PX,
-    Redetections,
     TapVid,
     after_query,
+    redetection_shares,
     redetections,
     tapvid,
 )
 from p2p_lib.evaluation.true_tracks import Queries, TrueScene, TrueTracks, draw_queries, true_tracks
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +49,7 @@ class TrackerScore:
     """A tracker's scores on one sequence, with what they were measured on."""
 
     tapvid: TapVid
-    redetections: Redetections
+    redetections: DataFrame
     truth: TrueTracks
     run: TrackRun
     queries: Queries
@@ -58,7 +61,7 @@ class TrackerScore:
         for name in ("jaccard", "within"):
             scores[name] = {f"{px}_px": value for px, value in zip(THRESHOLDS_PX, scores[name], strict=True)}
         cpu_ms = {"mean": float(cost.mean()), "p95": float(np.percentile(cost, 95))} if len(cost) else {}
-        return {**self.info, **scores, "redetection": self.redetections.as_dict(), "cpu_ms": cpu_ms}
+        return {**self.info, **scores, "redetection": redetection_shares(self.redetections), "cpu_ms": cpu_ms}
 
     def as_table(self) -> str:
         """The same for people."""
@@ -102,6 +105,11 @@ class TrackTask:
         """(T, N) bool: after the query, where truth says whether the point is visible."""
         return after_query(self.queries.frame, len(self.sequence)) & self.truth.known
 
+    def tracker(self, name: str, config: Config) -> PointTracker:
+        """The tracker of this name: ``oracle``, which knows the truth, or one of the known trackers."""
+        known = OracleTracker(self.scene, config.oracle, self.seed) if name == OracleTracker.name else name
+        return make_tracker(known, config.tracking, np.random.default_rng(self.seed))
+
     def score(self, tracker: PointTracker, search: bool = False) -> TrackerScore:
         """Run a tracker over the queries; ``search`` tells it where the objects' masks are, as the pipeline does."""
         sequence, scene, queries, truth = self.sequence, self.scene, self.queries, self.truth
@@ -126,18 +134,6 @@ class TrackTask:
         )
 
 
-def score_tracker(
-    sequence: Sequence,
-    tracker: PointTracker,
-    seed: int = 0,
-    models: Mapping[str, str | Path] | None = None,
-    count: int = 256,
-    search: bool = False,
-) -> TrackerScore:
-    """Draw queries, find their true tracks, run the tracker over them, and score it: one :class:`TrackTask`."""
-    return TrackTask.of(sequence, seed, models, count).score(tracker, search)
-
-
 def compare_trackers(
     task: TrackTask,
     contestants: Mapping[str, tuple[str, Mapping[str, Any]]],
@@ -148,16 +144,14 @@ def compare_trackers(
     contestants  label to tracker and settings, e.g. ``"SH(10)": ("builtin", {"tracking.forget_after": 10})``
     left_out     labels that are not to run, with the reason
     """
-    return {label: (left_out or {}).get(label) or _try(task, *one) for label, one in contestants.items()}
-
-
-def _try(task: TrackTask, name: str, settings: Mapping[str, Any]) -> TrackerScore | str:
-    config = preset(seed=task.seed).with_values(dict(settings))
-    try:
-        known = OracleTracker(task.scene, config.oracle, task.seed) if name == OracleTracker.name else name
-        return task.score(make_tracker(known, config.tracking, np.random.default_rng(task.seed)))
-    except MissingBackend as error:
-        return str(error)
+    scores: dict[str, TrackerScore | str] = dict(left_out or {})
+    for label, (name, settings) in contestants.items():
+        if label not in scores:
+            try:
+                scores[label] = task.score(task.tracker(name, preset(seed=task.seed).with_values(dict(settings))))
+            except MissingBackend as error:
+                scores[label] = str(error)
+    return {label: scores[label] for label in contestants}
 
 
 def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, search: bool = False) -> TrackRun:

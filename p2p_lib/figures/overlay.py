@@ -227,6 +227,22 @@ def zoomed(
     return part, replace(camera, fx=camera.fx * s, fy=camera.fy * s_v, cx=cx, cy=cy, width=width_px, height=height_px)
 
 
+def zoomed_px(uv_px: np.ndarray, camera: Camera, seen_by: Camera) -> np.ndarray:
+    """Pixels (..., 2) of one camera in the image of the camera that :func:`zoomed` returned."""
+    scale = np.array([seen_by.fx / camera.fx, seen_by.fy / camera.fy])
+    return scale * (uv_px - np.array([camera.cx, camera.cy])) + [seen_by.cx, seen_by.cy]
+
+
+def region_around(
+    shown: np.ndarray, camera: Camera, margin_px: tuple[int, int] = (12, 12)
+) -> tuple[int, int, int, int]:
+    """The rectangle (left, top, right, bottom) around a mask (H, W) bool or pixels (N, 2), with margins (u, v)."""
+    uv_px = np.argwhere(shown)[:, ::-1] if shown.dtype == bool else shown
+    left, top = np.maximum(np.floor(uv_px.min(0)).astype(int) - margin_px, 0)
+    right, bottom = np.minimum(np.ceil(uv_px.max(0)).astype(int) + margin_px + 1, [camera.width, camera.height])
+    return int(left), int(top), int(right), int(bottom)
+
+
 def montage(images: Sequence[np.ndarray], columns: int, gap_px: int = 4) -> np.ndarray:
     """Pictures of one size, row by row, with white between them."""
     if not len(images) or len({image.shape for image in images}) != 1:

@@ -18,6 +18,7 @@ from p2p_lib.figures import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 _WIDTH_IN = 8.0
@@ -54,7 +55,7 @@ def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
             _draw_errors(axes, name, run.objects[name], evaluation.objects[name], _colours(run)[name])
         for axis, unit in zip(axes, ("ADD [mm]", "rotation [°]", "translation [mm]")):
             axis.set_ylabel(unit)
-            _logarithmic(axis)
+            _decade(axis)
         axes[0].legend(loc="upper left", ncols=len(names))
         axes[0].set_title(f"Error over time, {run.info['sequence']}, {_ALIGNED[evaluation.align]}")
         draw_strip(axes[3], run)
@@ -152,15 +153,13 @@ def _draw_errors(axes: list[Axes], name: str, obj: ObjectRun, score: ObjectScore
         axes[0].plot(failed, np.full(len(failed), 0.97), "x", color=colour, markersize=4, transform=edge, clip_on=False)
 
 
-def _logarithmic(axis: Axes) -> None:
-    """A drift of a millimetre and a flip of the object both belong into the picture; at least one decade is shown."""
+def _decade(axis: Axes) -> None:
+    """A logarithmic axis of at least one decade: a drift of a millimetre and a flip both belong into the figure."""
     values = np.concatenate([line.get_ydata() for line in axis.get_lines() if line.get_marker() != "x"])
     values = values[np.isfinite(values)]
     low, high = (values.min(), values.max()) if len(values) else (1.0, 10.0)
-    axis.set_yscale("log")
+    logarithmic(axis.yaxis)
     axis.set_ylim(min(low / 1.6, high / 6), max(high * 1.6, low * 6))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter("")
 
 
 def draw_strip(axis: Axes, run: Run, named: Iterable[str] | None = None) -> None:
@@ -206,7 +205,7 @@ def _colours(run: Run) -> dict[str, str]:
 
 
 def panels(
-    count: int, size_in: tuple[float, float], ratios: list[float], side_by_side: bool = False
+    count: int, size_in: tuple[float, float], ratios: list[float] | None = None, side_by_side: bool = False
 ) -> tuple[Figure, list[Axes]]:
     """A figure that no global state knows of, and its axes below each other (sharing time) or side by side."""
     from matplotlib.figure import Figure
@@ -217,3 +216,11 @@ def panels(
     else:
         axes = figure.subplots(count, 1, height_ratios=ratios, sharex=True, squeeze=False)[:, 0]
     return figure, list(axes)
+
+
+def logarithmic(*axes: Axis, base: float = 10) -> None:
+    """Logarithmic scales (``axes.xaxis``, ``axes.yaxis``) with plain numbers at their ticks."""
+    for axis in axes:
+        getattr(axis.axes, f"set_{axis.axis_name}scale")("log", base=base)
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")

@@ -9,25 +9,28 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import html
 import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.tables import as_html, as_markdown
 from p2p_lib.datasets.provenance import provenance
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.figures import film as video
 from p2p_lib.figures import style
-from p2p_lib.figures.typeset import Table
+from p2p_lib.figures.tables import Table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _WHAT_RAN = (
     "sequence",
@@ -96,51 +99,20 @@ def save_video(
 
 
 def save_table(
-    table: Any, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
+    table: DataFrame | Table, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
 ) -> Saved:
-    """Write a pandas DataFrame as CSV and Markdown, with its note. What is missing is a dash in Markdown.
-
-    A :class:`~p2p_lib.figures.typeset.Table` is written as LaTeX besides.
-    """
+    """Write a table as CSV and Markdown, one for papers as LaTeX besides, with its note."""
     target = _target(paths.table_dir(), name)
     if isinstance(table, Table):
-        return _save_typeset(table, target, sources, parameters)
-    target.with_name(f"{name}.csv").write_text(table.to_csv(index=False, lineterminator="\n"), encoding="utf-8")
-    markdown = as_markdown(table)
-    target.with_name(f"{name}.md").write_text(markdown, encoding="utf-8")
-    _write_note(target, [".csv", ".md"], sources, parameters, ["pandas"])
-    return Saved(target.with_name(f"{name}.csv"), ({"text/html": as_html(table), "text/plain": markdown}, {}))
-
-
-def _save_typeset(table: Table, target: Path, sources: Iterable[Any], parameters: Mapping[str, Any] | None) -> Saved:
-    markdown = table.markdown()
-    for suffix, text in ((".csv", table.csv()), (".md", markdown), (".tex", table.latex())):
-        target.with_name(f"{target.name}{suffix}").write_text(text, encoding="utf-8")
-    _write_note(target, [".csv", ".md", ".tex"], sources, parameters, [])
-    return Saved(target.with_name(f"{target.name}.csv"), ({"text/html": table.html(), "text/plain": markdown}, {}))
-
-
-def as_markdown(table: Any) -> str:
-    """A DataFrame as a Markdown table, numbers to the right, its index left out."""
-    numeric = [kind in "fiu" for kind in (table[c].dtype.kind for c in table.columns)]
-    rows = [[_cell(value) for value in row] for row in table.itertuples(index=False)]
-    lines = [[str(c) for c in table.columns], ["---:" if n else "---" for n in numeric], *rows]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
-def as_html(table: Any) -> str:
-    """A DataFrame as HTML, numbers to the right, words to the left, its index left out."""
-    sides = ["right" if table[c].dtype.kind in "fiu" else "left" for c in table.columns]
-    rows = [("th", table.columns), *(("td", row) for row in table.itertuples(index=False))]
-    lines = [
-        "".join(f'<{tag} style="text-align: {side}">{_html_cell(v)}</{tag}>' for side, v in zip(sides, row))
-        for tag, row in rows
-    ]
-    return "<table>\n" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>\n"
-
-
-def _html_cell(value: Any) -> str:
-    return html.escape(_cell(value).replace("\\|", "|")).replace("$", "<span>$</span>")
+        files = {".csv": table.csv(), ".md": table.markdown(), ".tex": table.latex()}
+        page = table.html()
+    else:
+        files = {".csv": table.to_csv(index=False, lineterminator="\n"), ".md": as_markdown(table)}
+        page = as_html(table)
+    for suffix, text in files.items():
+        target.with_name(f"{name}{suffix}").write_text(text, encoding="utf-8")
+    _write_note(target, list(files), sources, parameters, ["pandas"])
+    return Saved(target.with_name(f"{name}.csv"), ({"text/html": page, "text/plain": files[".md"]}, {}))
 
 
 def describe(source: Any) -> dict[str, Any]:
@@ -232,9 +204,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return value.name
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-
-
-def _cell(value: Any) -> str:
-    if value is None or value != value:  # NaN
-        return "-"
-    return f"{value:g}" if isinstance(value, float) else str(value).replace("|", "\\|")

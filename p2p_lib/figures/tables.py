@@ -1,47 +1,23 @@
-"""Scores as tables: pandas DataFrames that say their units."""
+"""Scores as tables that say their units, and tables for papers: cells with a number, its spread and its reason."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.datasets.runs import Run
-from p2p_lib.evaluation.protocol import SCORES, Evaluation
+from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import recovery_events
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: Scores by the words of a table's head; the areas are over 0 to 0.1 m.
-HEADS = {
-    "adds_auc": "ADD-S AUC [%]",
-    "add_auc": "ADD AUC [%]",
-    "adds_auc_voc": "ADD-S AUC, VOC [%]",
-    "add_auc_voc": "ADD AUC, VOC [%]",
-}
-
-
-def of_rows(rows: Iterable[Mapping[str, Any]]) -> DataFrame:
-    """A table of one row per mapping; the keys are its heads, units included."""
-    from pandas import DataFrame
-
-    return DataFrame(list(rows))
-
 
 def score_table(evaluation: Evaluation) -> DataFrame:
     """A row per object and their mean: areas under the curve in percent, frames scored, frames lost among them."""
-    from pandas import DataFrame
-
-    plain = evaluation.as_dict()
-    rows = [
-        {"object": name, **_areas(scores), "frames": scores["frames"], "lost": scores["lost"]}
-        for name, scores in plain["objects"].items()
-    ]
-    total = {key: sum(row[key] for row in rows) for key in ("frames", "lost")}
-    return DataFrame([*rows, {"object": "mean", **_areas(plain["mean"]), **total}] if len(rows) > 1 else rows)
+    return evaluation.as_frame()
 
 
 def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
@@ -56,25 +32,19 @@ def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
         obj = run.objects[name]
         for event in recovery_events(obj, score):
             gone, back = np.searchsorted(obj.frame_index, [event.hidden_frame, event.return_frame])
-            moved_m, turned_rad = _moved(obj.T_cam_model[gone - 1], obj.T_cam_model[back])
-            times_s = round(float(obj.time_s[gone]), 2), round(float(obj.time_s[back]), 2)
-            rows.append((name, *times_s, round(100 * moved_m, 1), round(float(np.degrees(turned_rad)), 1)))
-            rows[-1] += (event.frames_to_recovery,)
-    heads = (
-        "object",
-        "hidden at [s]",
-        "back at [s]",
-        "moved unseen [cm]",
-        "turned unseen [°]",
-        "frames to a good pose",
-    )
-    return DataFrame(rows, columns=heads)
+            T_before, T_after = obj.T_cam_model[gone - 1], obj.T_cam_model[back]
+            row = {
+                "object": name,
+                "hidden at [s]": obj.time_s[gone].round(2),
+                "back at [s]": obj.time_s[back].round(2),
+                "moved unseen [cm]": (100 * np.linalg.norm(T_after[:3, 3] - T_before[:3, 3])).round(1),
+                "turned unseen [°]": np.degrees(se3.angle_rad(se3.inverse(T_before) @ T_after)).round(1),
+                "frames to a good pose": event.frames_to_recovery,
+            }
+            rows.append(row)
+    return DataFrame(rows)
 
 
 def _moved(T_cam_before: np.ndarray, T_cam_after: np.ndarray) -> tuple[float, float]:
     moved_m = np.linalg.norm(T_cam_after[:3, 3] - T_cam_before[:3, 3])
     return float(moved_m), float(se3.angle_rad(se3.inverse(T_cam_before) @ T_cam_after))
-
-
-def _areas(scores: dict[str, float]) -> dict[str, float]:
-    return {HEADS[key]: round(scores[key], 2) for key in HEADS if key in SCORES}

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,10 +29,13 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
-from p2p_lib.method.object_tracker import TrackedObject
+from p2p_lib.method.object_model import NO_IDS, Requests
+from p2p_lib.method.object_tracker import ObjectTracker, Proposal
 
 #: Object to (H, W) bool; None where nobody knows.
 Masks = dict[str, np.ndarray | None]
+#: How often a better pose may find more points in one frame.
+_REDETECTION_ROUNDS = 3
 NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
@@ -52,11 +55,9 @@ class Point2Pose:
         self._rng = np.random.default_rng(self.config.seed)
         self.tracker = make_tracker(tracker, self.config.tracking, self._rng)
         self.detector = make_detector(detector, self.config.sampling, self._rng)
-        if isinstance(segmenter, str):
-            rng = np.random.default_rng([self.config.seed, 1])
-            segmenter = make_segmenter(segmenter, camera, self.config.segmentation, rng)
-        self.segmenter = segmenter
-        self.objects: dict[str, TrackedObject] = {}
+        rng = np.random.default_rng([self.config.seed, 1])
+        self.segmenter = make_segmenter(segmenter, camera, self.config.segmentation, rng)
+        self.objects: dict[str, ObjectTracker] = {}
         self.masks: Masks = {}
         self.tracks = NOTHING_TRACKED
         self.stopwatch = Stopwatch()
@@ -89,8 +90,8 @@ class Point2Pose:
             check_apart(name, clicks, self._first_clicks)
             self._first_clicks[name] = clicks
             self._clicked.add(name)
-        self.objects[name] = TrackedObject(
-            name, self.camera, self.config, self.tracker, self.detector, self._rng.spawn(1)[0], self.stopwatch
+        self.objects[name] = ObjectTracker(
+            name, self.camera, self.config, self.detector, self._rng.spawn(1)[0], self.stopwatch
         )
 
     def remove_object(self, name: str) -> None:
@@ -135,11 +136,52 @@ class Point2Pose:
         if len(self._waiting) <= self.tracker.latency_frames:
             return {}
         frame, masks, clicks = self._waiting.popleft()
-        self.tracks = tracks
         self.masks = masks | self._segment(frame, tracks, clicks)
         # An object added since then is not in that frame's masks yet.
-        objects = {name: obj for name, obj in self.objects.items() if name in masks}
-        return {name: obj.step(frame, self.masks[name], tracks) for name, obj in objects.items()}
+        objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
+        proposals = {name: obj.propose(frame, self.masks[name], tracks) for name, obj in objects.items()}
+        self._reject(proposal.reject for proposal in proposals.values())
+        self.tracks, proposals = self._redetect(objects, proposals, tracks)
+        steps = {name: obj.step(proposals[name]) for name, obj in objects.items()}
+        self._apply({name: step.requests for name, step in steps.items()})
+        return {name: steps[name].estimate for name in self.objects if name in steps}
+
+    def _redetect(
+        self, objects: dict[str, ObjectTracker], proposals: dict[str, Proposal], tracks: Tracks
+    ) -> tuple[Tracks, dict[str, Proposal]]:
+        """Guided re-detection: the tracker looks for points where their object expects them.
+
+        A pose from a few points finds more points, which make a better pose, which finds more.
+        """
+        seeking = dict(objects) if not self.tracker.latency_frames else {}
+        for _ in range(_REDETECTION_ROUNDS):
+            expected = {name: obj.expected_px(proposals[name]) for name, obj in seeking.items()}
+            seeking = {name: obj for name, obj in seeking.items() if expected[name] is not None}
+            for name, obj in list(seeking.items()):
+                with self.stopwatch("tracking"):
+                    found = self.tracker.suggest(obj.map.ids, expected[name])
+                if found is None:
+                    return tracks, proposals
+                before, proposals[name] = proposals[name], obj.redetected(proposals[name], found)
+                tracks = found
+                if proposals[name].observation.seen.sum() <= before.observation.seen.sum():
+                    del seeking[name]
+        return tracks, proposals
+
+    def _reject(self, rejected: Iterable[np.ndarray]) -> None:
+        ids = np.concatenate([NO_IDS, *rejected])
+        if len(ids):
+            self.tracker.reject(ids)
+
+    def _apply(self, requests: dict[str, Requests]) -> None:
+        """The one place where what objects ask of the shared tracker is done."""
+        self._reject(request.reject for request in requests.values())
+        for name, request in requests.items():
+            if len(request.keys):
+                unused = self.objects[name].map.assign(request.keys, self.tracker.add(request.add_px))
+                self.tracker.drop(np.concatenate([request.drop, unused]))
+            elif len(request.drop):
+                self.tracker.drop(request.drop)
 
     def _given(self, frame: Frame, masks: Mapping[str, np.ndarray] | None) -> Masks:
         """Every object's checked mask in this frame; None for one of which nobody knows (yet)."""
@@ -170,7 +212,8 @@ class Point2Pose:
             return {}
         with self.stopwatch("segmentation"):
             hints = {name: self.objects[name].hint(frame, tracks) for name in self.segmenter.names}
-            labels = self.segmenter.segment(frame, clicks, hints)
+            self._reject(rejected for _, rejected in hints.values())
+            labels = self.segmenter.segment(frame, clicks, {name: hint for name, (hint, _) in hints.items()})
             return {name: labels == label for label, name in enumerate(self.segmenter.names, 1)}
 
     def _track(self, frame: Frame, masks: dict[str, np.ndarray | None]) -> Tracks:

@@ -123,7 +123,7 @@ def reconstruction_sheet(benchmark: Benchmark, method: str, sequence: str = "", 
     for name in evaluation.objects:
         pictures += _rows(benchmark, run, video, evaluation, name, method, width_px)
     if not pictures:
-        raise MissingData(str(run.path), "no reconstructed surface", "Run with the setting tsdf.enabled = true.")
+        raise MissingData(str(run.path), "no reconstructed surface", "Run with the setting method.surface = true.")
     return overlay.montage(pictures, columns=4)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.plan import Method
 from p2p_lib.benchmark.rows import MEAN, Row, shown_name
-from p2p_lib.figures.typeset import Cell, number
+from p2p_lib.figures.tables import Cell, number
 
 #: What a cell shows where a run failed.
 FAIL = "fail"

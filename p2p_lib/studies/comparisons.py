@@ -11,7 +11,7 @@ from p2p_lib.benchmark.plan import Method
 from p2p_lib.benchmark.rows import POOLED, shown_name
 from p2p_lib.datasets.paper_reported import paper_reported
 from p2p_lib.evaluation import metrics
-from p2p_lib.figures.typeset import Cell, Table, emboldened, number
+from p2p_lib.figures.tables import Cell, Table, emboldened, number
 from p2p_lib.studies.benchmark_numbers import Numbers
 
 _AREAS = {"adds_auc": ("ADD-S AUC", "ADD-S (%)"), "add_auc": ("ADD AUC", "ADD (%)")}

@@ -14,7 +14,7 @@ from p2p_lib.benchmark.rows import MEAN, shown_name
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.paper_reported import Table as Reported
 from p2p_lib.datasets.paper_reported import paper_reported
-from p2p_lib.figures.typeset import Cell, Table, emboldened, number
+from p2p_lib.figures.tables import Cell, Table, emboldened, number
 from p2p_lib.studies.benchmark_numbers import FAIL, Numbers
 
 #: The paper's metrics: what the benchmark calls them, their head, and whether more is better.

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.outcome import replace_text
-from p2p_lib.figures.typeset import Table
+from p2p_lib.figures.tables import Table
 from p2p_lib.studies import comparisons, paper_columns
 from p2p_lib.studies.benchmark_numbers import Numbers
 

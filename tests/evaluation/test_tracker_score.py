@@ -11,7 +11,7 @@ from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.types import Tracks
 from p2p_lib.datasets.models import MESHES, find_models
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.evaluation.tracker_score import run_tracker, score_tracker
+from p2p_lib.evaluation.tracker_score import TrackTask, run_tracker
 from p2p_lib.evaluation.true_tracks import TrueScene, draw_queries
 
 
@@ -86,7 +86,7 @@ def test_a_late_answer_belongs_to_an_earlier_frame(crossing, queries):
 
 def test_plain_lk_scores_as_lucas_kanade_does(crossing):
     """It follows well and finds nothing again."""
-    score = score_tracker(crossing, make_tracker("lk", TrackingConfig()), 1, count=48)
+    score = TrackTask.of(crossing, 1, count=48).score(make_tracker("lk", TrackingConfig()))
     plain = score.as_dict()
     assert 0.2 < plain["aj"] < plain["delta_avg"] < 0.6 and plain["jaccard"]["16_px"] > plain["jaccard"]["1_px"]
     assert plain["redetection"]["returns"] > 10 and plain["redetection"]["found"] == 0

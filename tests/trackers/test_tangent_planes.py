@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, projection, planes_at, tangent_steps
+from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, planes_at, projection, tangent_steps
 
 CAMERA = Camera(580, 600, 159, 121, 320, 240)
 NORMAL, OFFSET = np.array([0.5, -0.3, 1.0]) / np.linalg.norm([0.5, -0.3, 1.0]), 0.6

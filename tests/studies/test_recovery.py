@@ -1,4 +1,4 @@
-"""Figures of a return say what the runs say: pictures, curves, statuses, counts."""
+"""Figures of a return say what the runs say: images, curves, statuses, counts."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.evaluation.confidence import Judged, judge
 from p2p_lib.evaluation.recovery import RecoveryEvent
 from p2p_lib.figures.scenes import Scene
-from p2p_lib.studies import recovery_plots
+from p2p_lib.studies import recovery
 
 EVENT = RecoveryEvent(hidden_frame=16, return_frame=21, frames_to_recovery=1, frames_visible=15)
 
@@ -25,7 +25,7 @@ def test_a_row_is_found_by_its_frame(scenes):
 
 
 def test_the_strip_has_a_row_per_method_and_says_which_frames(scenes):
-    figure = recovery_plots.return_strip(scenes, "can", EVENT)
+    figure = recovery.return_strip(scenes, "can", EVENT)
     titles = [axis.get_title(loc="left") for axis in figure.axes[:5]]
     assert titles[0] == "last in sight\n(frame 14)" and titles[2:4] == ["return\n(frame 21)", "return + 1\n(frame 22)"]
     assert len(figure.axes) == 10 and figure.axes[5].get_ylabel() == "forgets"
@@ -33,7 +33,7 @@ def test_the_strip_has_a_row_per_method_and_says_which_frames(scenes):
 
 def test_pictures_are_cut_to_where_the_object_truly_is(scenes, made):
     frames = [0, 20, 39]
-    regions = recovery_plots.around(scenes["remembers"], "can", frames)
+    regions = recovery.around(scenes["remembers"], "can", frames)
     sizes = {(right - left, bottom - top) for left, top, right, bottom in regions}
     assert len(sizes) == 1
     for (left, top, right, bottom), i in zip(regions, frames, strict=True):
@@ -44,7 +44,7 @@ def test_pictures_are_cut_to_where_the_object_truly_is(scenes, made):
 
 def test_curves_around_the_return_are_those_of_the_run(scenes, made):
     evaluations = dict.fromkeys(scenes, made.evaluation)
-    figure = recovery_plots.around_return(scenes, evaluations, "box", RecoveryEvent(12, 18, 0, 10), span=10)
+    figure = recovery.around_return(scenes, evaluations, "box", RecoveryEvent(12, 18, 0, 10), span=10)
     obj = made.run.objects["box"]
     points, errors, sure = (axis.get_lines()[0] for axis in figure.axes[1:])
     assert points.get_xdata().tolist() == list(range(-16, 10))
@@ -57,19 +57,19 @@ def test_curves_around_the_return_are_those_of_the_run(scenes, made):
 
 
 def test_statuses_of_all_methods_are_in_the_legend(scenes):
-    figure = recovery_plots.status_strips(scenes)
+    figure = recovery.status_strips(scenes)
     (legend,) = figure.legends
     assert [t.get_text() for t in legend.get_texts()] == ["tracked", "degraded", "occluded", "lost"]
     assert [axis.get_title(loc="left") for axis in figure.axes] == [f"{k}, {scenes[k].sequence.name}" for k in scenes]
 
 
 def test_the_film_shows_the_methods_side_by_side(scenes):
-    pictures = list(recovery_plots.film(scenes, [3, 20], 200))
+    pictures = list(recovery.film(scenes, [3, 20], 200))
     assert len(pictures) == 2 and pictures[0].shape[1] == 404 and (pictures[0] != pictures[1]).any()
 
 
 def test_returns_are_counted_per_method(made):
-    table = recovery_plots.recovery_counts({("crossing", "remembers"): (made.run, made.evaluation)})
+    table = recovery.recovery_counts({("crossing", "remembers"): (made.run, made.evaluation)})
     assert table.to_dict("records") == [
         {
             "sequence": "crossing",
@@ -84,7 +84,7 @@ def test_returns_are_counted_per_method(made):
 
 
 def test_confidence_marks_wrong_poses(made):
-    figure = recovery_plots.confidence_over_time(made.run, made.evaluation)
+    figure = recovery.confidence_over_time(made.run, made.evaluation)
     _, right, wrong = figure.axes[list(made.evaluation.objects).index("box")].get_lines()
     times = made.run.objects["box"].time_s
     assert times[7] in wrong.get_xdata() and times[20] not in wrong.get_xdata() and times[0] in right.get_xdata()
@@ -92,7 +92,7 @@ def test_confidence_marks_wrong_poses(made):
 
 def test_the_reliability_plot_says_the_share_of_right_poses():
     one = Judged(np.array([0.05, 0.95, 0.95, 0.95, 0.95]), np.array([0, 1, 1, 1, 0], bool))
-    figure = recovery_plots.reliability_plot({"one": one, "all right": Judged(np.ones(3), np.ones(3, bool))})
+    figure = recovery.reliability_plot({"one": one, "all right": Judged(np.ones(3), np.ones(3, bool))})
     _, line, other = figure.axes[0].get_lines()
     np.testing.assert_allclose(line.get_xydata(), [[0.05, 0], [0.95, 75]])
     assert line.get_label() == "one: ECE 0.17, AUROC 0.75" and other.get_label() == "all right: ECE 0.00, AUROC -"

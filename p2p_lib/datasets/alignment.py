@@ -1,7 +1,8 @@
-"""Whether depth pictures lie on their colour pictures: where an object ends, its colour usually ends too.
+"""Whether depth lies on its colour image, and masks on depth: what goes wrong when one records one's own data.
 
-Edges of depth are laid over the edges of colour at every offset and at a number of sizes; a depth picture that was
-registered to the colour camera fits best where it is.
+Where an object ends, its colour usually ends too: edges of depth are laid over the edges of colour at every offset and
+at several sizes; depth that was registered to the colour camera fits best where it is. Along a mask's rim, depth must
+not fall off to what stands behind.
 """
 
 from __future__ import annotations
@@ -25,10 +26,16 @@ _MIN_EDGE_PX = 300
 #: How far a fit must stand out from those elsewhere, in their standard deviations, to be one at all.
 _MIN_CONTRAST = 3.5
 
+#: A mask's outermost pixels are left out: no silhouette is that exact, and sensors blur depth there. Its rim is
+#: compared with what the mask holds within a distance of it.
+_INSET_PX, _NEARBY_PX = 2, 12
+#: So much farther than that is background, plus a fraction of the range.
+_GAP_M, _GAP_SHARE = 0.03, 0.02
+
 
 @dataclass(frozen=True)
 class Misfit:
-    """Where the depth pictures fit best, as they are found: ``scale`` times as large, moved by (du, dv) in pixels.
+    """Where the depth images fit best, as they are found: ``scale`` times as large, moved by (du, dv) in pixels.
 
     gain  how much better the edges fit once that is undone than as they are (1: just as well)
     """
@@ -93,3 +100,25 @@ def _colour_edges(rgb: np.ndarray) -> np.ndarray:
     strength = cv2.magnitude(cv2.Scharr(gray, cv2.CV_32F, 1, 0), cv2.Scharr(gray, cv2.CV_32F, 0, 1))
     around = cv2.blur(strength, (61, 61)) + 0.5 * strength.mean() + 1e-6
     return cv2.GaussianBlur(np.minimum(strength / around, 3), (0, 0), 2)
+
+
+def background_share(mask: np.ndarray, depth_m: np.ndarray) -> float:
+    """The fraction of a mask's measured rim that lies clearly behind the mask nearby; NaN where no rim is measured.
+
+    mask  (H, W) bool; depth_m (H, W) metres, 0 = no measurement
+    """
+    on_rim, behind = rim(mask, depth_m)
+    return float(behind.sum() / on_rim.sum()) if on_rim.any() else float("nan")
+
+
+def rim(mask: np.ndarray, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) bool each: the measured pixels of a mask's rim, and those of them that lie on the background."""
+    inner = cv2.erode(mask.astype(np.uint8), _disc(_INSET_PX), borderValue=0)
+    on_rim = (inner > 0) & (cv2.erode(inner, np.ones((3, 3), np.uint8), borderValue=0) == 0) & (depth_m > 0)
+    own = np.where((inner > 0) & (depth_m > 0), depth_m, np.float32(1e3))
+    behind_m = depth_m - cv2.erode(own, _disc(_NEARBY_PX))
+    return on_rim, on_rim & (behind_m > _GAP_M + _GAP_SHARE * depth_m)
+
+
+def _disc(radius: int) -> np.ndarray:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
