@@ -277,7 +277,6 @@ class SelectionConfig(_Checked):
         choices=("surface", "support"),
     )
     surface_sigmas: float = _p(2.5, "The surface must prefer another one by so many standard errors.", low=0)
-    surface_margin_m: float = _p(2e-4, "It must prefer it by this mean distance too.", "m", low=0)
     unseen_share: float = _p(
         0.4, "A point where nothing was observed counts this share of the truncation.", low=0, high=1
     )

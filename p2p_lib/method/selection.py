@@ -60,8 +60,8 @@ def best_supported(
 ) -> tuple[int | None, str]:
     """The best supported hypothesis unless the surface prefers another, and why; see :func:`select`.
 
-    It does where the other one is nearer by ``surface_sigmas`` standard errors and ``surface_margin_m``. The same
-    points are compared under both poses, so the difference of each counts.
+    It does where the other one is nearer by more than ``surface_sigmas`` standard errors. The same points are
+    compared under both poses, so the difference of each counts.
     """
     best = _best(hypotheses, weight)
     scores = _scores(distance_m)
@@ -70,7 +70,7 @@ def best_supported(
     nearest = int(np.argmin(scores))
     nearer = distance_m[best] - distance_m[nearest]
     chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
-    if scores[best] - scores[nearest] > max(chance, config.surface_margin_m):
+    if scores[best] - scores[nearest] > chance:
         return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
     return best, "most inliers, the surface does not tell the hypotheses apart"
 
