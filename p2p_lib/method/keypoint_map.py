@@ -86,7 +86,7 @@ class KeypointMap:
         at = np.flatnonzero(passed)
         self._history[at, self._observations[at] % _HISTORY] = p_obj[at]
         self._observations[at] += 1
-        ready = np.flatnonzero(passed & (self._streak >= cfg.streak) & (self._observations >= cfg.min_observations))
+        ready = np.flatnonzero(passed & (self._streak >= cfg.streak))
         if not len(ready):
             return np.zeros(0, np.int64)
         centre = np.nanmedian(self._history[ready], 1)

@@ -16,12 +16,6 @@ from p2p_lib.core.config import SelectionConfig
 from p2p_lib.method.registration import Hypothesis
 
 
-def supported(hypotheses: Sequence[Hypothesis], config: SelectionConfig) -> list[Hypothesis]:
-    """Those with enough support to be compared on the surface, in the same order."""
-    most = max((h.support for h in hypotheses), default=0)
-    return [h for h in hypotheses if h.support >= min(config.min_support, config.min_support_share * most)]
-
-
 def motion_weight(
     T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray], config: SelectionConfig
 ) -> np.ndarray | None:
