@@ -61,7 +61,7 @@ class ObjectModel:
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
         self._observer, self._stopwatch = observer, stopwatch
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
-        self._since_keyframe = 0
+        self._since_keyframe, self._next_key = 0, 0
 
     @property
     def empty(self) -> bool:
@@ -116,7 +116,9 @@ class ObjectModel:
         """
         p_obj = se3.transform(se3.inverse(T_cam_obj), new.p_cam)
         old_keys = self.map.keys[agrees]
-        keys = self.map.add(p_obj, promoted=self.empty, confidence=confidence)
+        keys = self._next_key + np.arange(len(new))
+        self._next_key += len(new)
+        self.map.add(keys, p_obj, promoted=self.empty, confidence=confidence)
         vertex, registered = None, T_cam_obj
         if self.graph is not None:
             with self._stopwatch("graph"):

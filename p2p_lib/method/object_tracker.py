@@ -85,7 +85,7 @@ class ObjectTracker:
     # -- the step ------------------------------------------------------------------------------
 
     def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
-        """The object's share of a frame, by its mask (H, W) bool, None where it is not known, and everybody's tracks."""
+        """The object's share of a frame; mask (H, W) bool, None where it is not known, and everybody's tracks."""
         with self._stopwatch("observation"):
             return self.observer.observe(frame, mask, tracks.select(self.map.ids))
 

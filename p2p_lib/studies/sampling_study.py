@@ -54,7 +54,7 @@ class Situation:
         """The object ``name`` in frame ``index``, with the default parameters and ``settings``."""
         config, frame = preset().with_values(dict(settings or {})), video.frame(index)
         mask = (video.masks(index) or {})[name]
-        return cls(video, name, frame, mask, usable_region(frame, mask, config.sampling, config.depth.edge_m), config)
+        return cls(video, name, frame, mask, usable_region(frame, mask, config.depth.edge_m), config)
 
     def candidates(self, detector: str = "corners", seed: int = 0) -> Candidates:
         """What a detector offers here, as far as it can be lifted."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from p2p_lib.method.confidence import confidence
+from p2p_lib.method.confidence import confidence, pose_covariance
 
 
 def covariance(largest_deg: float, metres: float = 0.001) -> np.ndarray:
@@ -45,3 +45,17 @@ def test_the_log_odds_are_linear_in_the_logarithms():
 def test_never_outside_its_range(deg):
     assert 0 <= confidence(covariance(deg), 10**6, 1.0) <= 1
     assert 0 <= confidence(covariance(deg), 0, 0.0) <= 1
+
+
+def test_drift_is_a_share_of_the_accumulated_rotation_along_what_is_free():
+    spin, nothing = np.array([[0, 0, 1.0, 0.05, 0, 0]]), np.zeros((6, 6))
+    one, two = (np.sqrt(np.diag(pose_covariance(nothing, nothing, spin, turn))) for turn in (np.pi, 2 * np.pi))
+    assert one[2] > 0 and not one[:2].any() and one[3] == pytest.approx(0.05 * one[2])
+    np.testing.assert_allclose(two, 2 * one)
+    assert not pose_covariance(nothing, nothing, np.zeros((0, 6)), 3.0).any()
+
+
+def test_frame_and_map_add_up():
+    frame, of_map = np.diag([1.0, 2, 3, 4, 5, 6]), np.diag([6.0, 5, 4, 3, 2, 1])
+    together = pose_covariance(frame, of_map, np.zeros((0, 6)), 0.0)
+    np.testing.assert_allclose(together / together[0, 0], np.eye(6))

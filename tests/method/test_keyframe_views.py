@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
 from p2p_lib.method.keyframe_views import KeyframeViews
-from p2p_lib.method.observability import drift_covariance
 
 AXIS = np.array([0.36, 0.48, 0.8])
 
@@ -37,12 +36,3 @@ def test_the_cap_holds_and_takes_what_is_most_alike():
     kept = np.degrees(se3.angle_rad(se3.inverse(views.T_cam_obj) @ turned(0)))
     np.testing.assert_allclose(np.sort(kept), [0, 100, 180], atol=1e-4)
     assert np.degrees(views.accumulated_rad(turned(100))) == pytest.approx(100)
-
-
-def test_slide_is_a_share_of_the_way_along_what_is_free():
-    spin = np.array([[0, 0, 1.0, 0.05, 0, 0]])
-    cov = drift_covariance(spin, np.pi, 0.02)
-    sigma_deg = np.degrees(np.sqrt(np.diag(cov)[:3]))
-    np.testing.assert_allclose(sigma_deg, [0, 0, 180 * 0.02])
-    assert np.linalg.matrix_rank(cov) == 1
-    assert not drift_covariance(np.zeros((0, 6)), 3.0, 0.02).any()

@@ -15,7 +15,7 @@ from p2p_lib.run import run
 
 FRAMES = range(0, 60, 4)
 # A late tracker cannot look again in a frame that is past: on time, it must not either.
-CONFIG = preset().with_values({"method.surface": False, "method.graph": False, "method.redetection": "none"})
+CONFIG = preset().with_values({"method.surface": False, "method.graph": False, "method.redetection": False})
 
 
 class Late:

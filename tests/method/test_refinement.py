@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from p2p_lib.core import se3
 from p2p_lib.core.config import RefinementConfig, TsdfConfig, preset
 from p2p_lib.method import refinement
-from p2p_lib.method import refinement
 from p2p_lib.method.observation import sample_cloud
 from p2p_lib.method.refinement import Keypoints, refine, surface_jacobian, surface_score
 from p2p_lib.method.tsdf import TsdfVolume

@@ -8,7 +8,7 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.method.registration import Hypothesis
-from p2p_lib.method.selection import motion_weight, select, supported
+from p2p_lib.method.selection import motion_weight, select
 
 DEFAULT, PAPER = preset("default").selection, preset("paper").selection
 
@@ -20,13 +20,6 @@ def made(support: int, n: int = 100) -> Hypothesis:
 def test_the_paper_takes_the_least_mean_distance():
     row, reason = select([made(80), made(6), made(12)], np.array([0.0020, 0.00199, np.nan])[:, None], PAPER)
     assert row == 1 and "surface" in reason
-
-
-def test_only_the_supported_are_compared():
-    """With 8 inliers, or a quarter of the best supported's."""
-    assert [h.support for h in supported([made(n) for n in (80, 7, 12, 8)], DEFAULT)] == [80, 12, 8]
-    assert [h.support for h in supported([made(n) for n in (20, 5, 4)], DEFAULT)] == [20, 5]
-    assert supported([], DEFAULT) == []
 
 
 @pytest.mark.parametrize(("sigmas", "gap", "wins"), [(2.0, 2.5, True), (2.0, 1.5, False), (4.0, 2.5, False)])
