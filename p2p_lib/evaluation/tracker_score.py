@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from p2p_lib.core.backends import make_tracker
-from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.config import Config
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.oracle import OracleTracker
@@ -132,26 +131,6 @@ class TrackTask:
             queries,
             info,
         )
-
-
-def compare_trackers(
-    task: TrackTask,
-    contestants: Mapping[str, tuple[str, Mapping[str, Any]]],
-    left_out: Mapping[str, str] | None = None,
-) -> dict[str, TrackerScore | str]:
-    """The same queries to several trackers: a score by label, or the reason why there is none.
-
-    contestants  label to tracker and settings, e.g. ``"SH(10)": ("builtin", {"tracking.forget_after": 10})``
-    left_out     labels that are not to run, with the reason
-    """
-    scores: dict[str, TrackerScore | str] = dict(left_out or {})
-    for label, (name, settings) in contestants.items():
-        if label not in scores:
-            try:
-                scores[label] = task.score(task.tracker(name, preset(seed=task.seed).with_values(dict(settings))))
-            except MissingBackend as error:
-                scores[label] = str(error)
-    return {label: scores[label] for label in contestants}
 
 
 def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, search: bool = False) -> TrackRun:

@@ -19,7 +19,7 @@ from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import lift
 from p2p_lib.core.errors import MissingData
 from p2p_lib.core.image import in_mask, nearest_px
-from p2p_lib.core.native import load_open3d
+from p2p_lib.core.raycasting import cast, ray_scene
 from p2p_lib.core.types import Frame, joined
 from p2p_lib.datasets.models import MESHES, find_models, given_models, load_mesh
 from p2p_lib.datasets.sequence import Sequence
@@ -82,7 +82,7 @@ class TrueScene:
             raise MissingData(sequence.name, "has no true poses", fix)
         self.sequence = sequence
         self.objects = tuple(sequence.truth)
-        self._scenes = {name: _ray_scene(*load_mesh(path)) for name, path in (meshes or {}).items()}
+        self._scenes = {name: ray_scene(*load_mesh(path)) for name, path in (meshes or {}).items()}
 
     @classmethod
     def of(cls, sequence: Sequence, models: Mapping[str, str | Path] | None = None) -> TrueScene:
@@ -183,9 +183,8 @@ class TrueScene:
 
     def _first_hits(self, name: str, centre: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance (N,) along unit rays (N, 3) to the mesh, infinite without a hit, and the triangles' normals."""
-        lines = np.concatenate([np.broadcast_to(centre, rays.shape), rays], 1).astype(np.float32)
-        hit = self._scenes[name].cast_rays(load_open3d().core.Tensor(lines))
-        return hit["t_hit"].numpy().astype(float), hit["primitive_normals"].numpy().astype(float)
+        hit = cast(self._scenes[name], centre, rays)
+        return hit["t_hit"].astype(float), hit["primitive_normals"].astype(float)
 
     def _masks(self, i: int) -> dict[str, np.ndarray]:
         return self.sequence.masks(i) or {}
@@ -242,11 +241,3 @@ def _draw(scene: TrueScene, frame: Frame, wanted: int, rng: np.random.Generator)
     points, uv = points.select(met), uv[met]
     seen = np.flatnonzero(scene.see(frame, points).visible)[:wanted]
     return Queries(np.full(len(seen), frame.index), uv[seen], points.select(seen))
-
-
-def _ray_scene(vertices: np.ndarray, faces: np.ndarray):
-    """An Open3D scene of one mesh in its own frame."""
-    open3d = load_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
-    return scene
