@@ -9,7 +9,6 @@ import json
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from time import monotonic
 
@@ -66,7 +65,9 @@ def track_live(
     segmenter = options.masks or DEFAULT_SEGMENTER
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
     if config.method.surface:
-        import_module("p2p_lib.method.tsdf")  # takes seconds, in which the camera need not run
+        from p2p_lib.method.tsdf import TsdfVolume
+
+        TsdfVolume(config.tsdf)  # what it loads takes seconds, in which the camera need not run
     start_s = monotonic()
     with Newest(camera, keep={p.frame for p in prompts}) as newest:
         frame = first or newest.take()

@@ -1,4 +1,4 @@
-"""One self-contained page that lists results: a picture, a title, a line and a small table each."""
+"""One self-contained page that lists results: an image, a title, a line and a small table each."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class GalleryEntry:
 
 
 def gallery_page(title: str, entries: Sequence[GalleryEntry], summary: str = "") -> str:
-    """The HTML of the page, pictures included; the summary is followed by how many of the results failed."""
+    """The HTML of the page, images included; the summary is followed by how many of the results failed."""
     failed = sum(bool(entry.failure) for entry in entries)
     outcome = f'<b class="failed">{failed} failed</b>' if failed else "none failed"
     line = f"{html.escape(summary)}, {outcome}" if summary else ""

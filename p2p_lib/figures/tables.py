@@ -6,9 +6,9 @@ import html
 import string
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from pandas import DataFrame, MultiIndex
 
 from p2p_lib.core import se3
 from p2p_lib.core.tables import as_html, as_markdown
@@ -16,17 +16,12 @@ from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import recovery_events
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
 
 def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
     """A row per return after complete occlusion: when, how far the object had moved unseen, how soon it had a pose.
 
     A good pose is one with an ADD-S of at most 2 cm; a dash where there was none before the object was hidden again.
     """
-    from pandas import DataFrame
-
     rows = []
     for name, score in evaluation.objects.items():
         obj = run.objects[name]
@@ -171,8 +166,6 @@ class Table:
 
     def _frame(self, language: _Language, between: str = "") -> DataFrame:
         """The cells as a format writes them; groups are a level of their own, or stand before ``between`` and head."""
-        from pandas import DataFrame, MultiIndex
-
         letters = self.letters()
         cells = [[language.cell(cell, letters) for cell in row] for row in self.rows]
         groups = [group for group, span in self.groups for _ in range(span)]

@@ -8,11 +8,14 @@ best among methods without a CAD model, of those that ran on the whole of what t
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import Job
@@ -37,10 +40,6 @@ from p2p_lib.figures.plots import logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.figures.tables import Cell, Table, emboldened, number
 from p2p_lib.synthetic.shapes import load_mesh
-
-if TYPE_CHECKING:
-    import trimesh
-    from matplotlib.figure import Figure
 
 #: The paper's metrics: what the benchmark calls them, their head, and whether more is better.
 METRICS = {
@@ -204,21 +203,17 @@ def _metrics(numbers: Numbers, paper: Reported) -> list[str]:
     return [metric for metric in METRICS if metric in printed and (metric in _AREAS or numbers.plan.chamfer)]
 
 
-def _filled(numbers: Numbers) -> Iterator[tuple[str, Job, str]]:
-    """Column, job and object of every run; one that did not run fills the columns that its plan gives it."""
+def _places(numbers: Numbers) -> dict[str, tuple[Job, str]]:
+    """Column to the first job and object that fill it; a job that did not run fills those that its plan gives it."""
+    places: dict[str, tuple[Job, str]] = {}
     for job, outcome in numbers.benchmark.results:
         names = list(outcome.objects) or list(job.sequence.columns) or job.sequence.objects or [""]
         for name in names:
             own = shown_name(job) + (f" {name}" if len(names) > 1 else "")
-            yield job.sequence.column_of(name) or own, job, name
-
-
-def _places(numbers: Numbers) -> dict[str, tuple[Job, str]]:
-    """Column to the first job that fills it, one that has run and knows its objects before one that does not."""
-    places: dict[str, tuple[Job, str]] = {}
-    for column, job, name in _filled(numbers):
-        if column not in places or (name and not places[column][1]):
-            places[column] = job, name
+            column = job.sequence.column_of(name) or own
+            # One that has run knows its objects, one that has not may not.
+            if column not in places or (name and not places[column][1]):
+                places[column] = job, name
     return places
 
 
@@ -475,9 +470,6 @@ def tracks_by_error(
     The error is the distance in pixels from where the tracker saw a keypoint to the keypoint of the final map projected
     with the true pose; points that the map has dropped since are not drawn.
     """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
     scene, run, video = scene_of(benchmark, method, sequence)
     evaluation, keypoints, region_px = evaluate(run), load_keypoints(run.path), scene.region()
     images = []
@@ -531,8 +523,6 @@ def reconstruction_sheet(benchmark: Benchmark, method: str, sequence: str = "", 
 def _beside_truth(
     run: Run, video: Sequence, evaluation: Evaluation, name: str, chamfer_cm: float | None, width_px: int
 ) -> list[np.ndarray]:
-    import trimesh
-
     file, model = run.path / "meshes" / f"{name}.ply", find_models(video, MESHES).get(name)
     if not file.is_file() or model is None:
         return []
