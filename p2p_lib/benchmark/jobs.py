@@ -11,7 +11,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -24,11 +23,11 @@ from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
-from p2p_lib.datasets import manifests
+from p2p_lib.datasets import manifests, ycbmultitrack
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.datasets.resized import Resized
-from p2p_lib.datasets.sequence import FORMATS, SYNTHETIC, Sequence, open_sequence
+from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 # What only shows results cannot change them.
@@ -117,8 +116,7 @@ def open_planned(job: Job) -> Sequence:
 
         scenario = planned.name.removeprefix(SYNTHETIC)
         folder = scenario_dir(scenario, job.sequence_seed, **_synthetic(planned, method)[0])
-        layout = import_module(FORMATS["ycbmultitrack"])
-        sequence = layout.load(folder, name=planned.name, depth_scale=None, masks=masks)
+        sequence = ycbmultitrack.load(folder, name=planned.name, depth_scale=None, masks=masks)
     else:
         sequence = open_sequence(planned.name, masks=masks)
     return Resized(sequence, method.scale) if method.scale != 1 else sequence

@@ -111,11 +111,11 @@ class LifecycleConfig(_Checked):
 class DepthConfig(_Checked):
     """Of measured depth: which of it is used, and how noisy it is."""
 
-    min_m: float = _p(0.1, "nearer depth is invalid", "m", "release", low=0)
-    max_m: float = _p(2.5, "farther depth is invalid", "m", low=0.1)
-    edge_m: float = _p(0.01, "a larger depth step in the 3x3 neighbourhood is an edge", "m", "release", low=0)
-    noise_m: float = _p(0.001, "standard deviation of depth at range 0", "m", low=1e-6)
-    noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
+    min_m: float = _p(0.1, "Nearer depth is invalid.", "m", "release", low=0)
+    max_m: float = _p(2.5, "Farther depth is invalid.", "m", low=0.1)
+    edge_m: float = _p(0.01, "A larger depth step in the 3x3 neighbourhood is an edge.", "m", "release", low=0)
+    noise_m: float = _p(0.001, "This is the standard deviation of depth at range 0.", "m", low=1e-6)
+    noise_per_m2: float = _p(0.0025, "The standard deviation grows by this with the range squared.", "1/m", low=0)
 
 
 @dataclass(frozen=True)
@@ -174,32 +174,28 @@ class TrackingConfig(_Checked):
 class OracleConfig(_Checked):
     """Of the tracker ``oracle``, which knows the truth; no part of the method."""
 
-    noise_px: float = _p(0.5, "standard deviation of a visible point's position, per axis", "px", low=0)
-    dropout: float = _p(0.0, "share of the visible points called invisible in a frame", low=0, high=1)
-    outliers: float = _p(0.0, "share of the visible points reported at a wrong place in a frame", low=0, high=1)
-    outlier_px: float = _p(30.0, "how far off those are", "px", low=0)
+    noise_px: float = _p(0.5, "This is the standard deviation of a visible point's position, per axis.", "px", low=0)
+    dropout: float = _p(0.0, "This share of the visible points is called invisible in a frame.", low=0, high=1)
+    outliers: float = _p(
+        0.0, "This share of the visible points is reported at a wrong place in a frame.", low=0, high=1
+    )
+    outlier_px: float = _p(30.0, "Points at a wrong place are this far off.", "px", low=0)
 
 
 @dataclass(frozen=True)
 class SegmentationConfig(_Checked):
-    """Of the embedded segmenter, which starts from clicks."""
+    """Of the built-in segmenter, which starts from clicks."""
 
-    side_px: int = _p(112, "longest side of the grid on which an object is cut out", "px", low=16, high=640)
-    reach_m: float = _p(0.3, "no object is larger than this to any side of its clicks", "m", low=0.01)
-    margin: float = _p(0.35, "room around the object, in its own size", low=0.05, high=2)
-    start_rounds: int = _p(3, "rounds of cutting and learning colours in the first frame", low=1)
-    iterations: int = _p(40, "conjugate gradient steps of a cut at most", low=1)
-    evidence_strength: float = _p(0.06, "weight of a pixel's certain evidence beside a tie to a like neighbour", low=0)
-    colour_weight: float = _p(0.7, "of colour evidence: neighbouring pixels repeat each other", low=0, high=1)
-    colour_rate: float = _p(0.05, "share of a frame in the object's remembered colours", low=0, high=1)
-    geometry_weight: float = _p(2.0, "log odds by hanging together in depth, and by lying in the support plane", low=0)
-    prior_weight: float = _p(2.5, "log odds by where the object was a frame ago", low=0)
-    surface_weight: float = _p(1.5, "log odds by lying on the reconstructed surface or clearly before it", low=0)
-    surface_m: float = _p(0.008, "distance to the reconstructed surface that still counts as on it", "m", low=1e-4)
-    contradiction: float = _p(3.0, "log odds against a pixel whose depth jumped since the last frame", low=0)
-    find_points: int = _p(8, "agreeing tracked points that say where an absent object is back", "points", low=3)
-    min_share: float = _p(0.03, "of the area it showed lately; an object that shows less is absent", low=0, high=1)
-    min_px: int = _p(40, "fewer pixels are absent", "px", low=1)
+    side_px: int = _p(112, "The grid on which an object is cut out has this longest side.", "px", low=16, high=640)
+    reach_m: float = _p(0.3, "No object is larger than this to any side of its clicks.", "m", low=0.01)
+    margin: float = _p(0.35, "This much room is left around the object, in its own size.", low=0.05, high=2)
+    colour_weight: float = _p(0.7, "Colour evidence counts this much: neighbours repeat each other.", low=0, high=1)
+    colour_rate: float = _p(0.05, "A frame has this share in the object's remembered colours.", low=0, high=1)
+    geometry_weight: float = _p(2.0, "These are the log odds by connected depth and by the support plane.", low=0)
+    prior_weight: float = _p(2.5, "These are the log odds by where the object was a frame ago.", low=0)
+    surface_weight: float = _p(1.5, "These are the log odds by lying on the reconstructed surface.", low=0)
+    find_points: int = _p(8, "So many agreeing tracked points say where an absent object is back.", "points", low=3)
+    min_px: int = _p(40, "An object of fewer pixels is absent.", "px", low=1)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from p2p_lib.evaluation.point_tracks import (
     redetections,
     tapvid,
 )
-from p2p_lib.evaluation.true_tracks import Queries, TrueScene, TrueTracks, draw_queries, true_tracks
+from p2p_lib.evaluation.true_tracks import Queries, Sight, TrueScene, draw_queries, true_tracks
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TrackRun:
-    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms per picture.
+    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms per image.
 
     Before its query a point is invisible and NaN. cpu_ms is the processor time of all threads in a frame,
     new queries included; NaN in frames before the first query.
@@ -49,7 +49,7 @@ class TrackerScore:
 
     tapvid: TapVid
     redetections: DataFrame
-    truth: TrueTracks
+    truth: Sight
     run: TrackRun
     queries: Queries
     info: dict[str, Any]
@@ -84,7 +84,7 @@ class TrackTask:
     sequence: Sequence
     scene: TrueScene
     queries: Queries
-    truth: TrueTracks
+    truth: Sight
     seed: int
 
     @classmethod
@@ -136,7 +136,7 @@ class TrackTask:
 def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, search: bool = False) -> TrackRun:
     """Stream the sequence through the tracker in one pass, each query added at its frame.
 
-    What a tracker says late is scored in the frame that it is of; for the last ones the last picture is repeated.
+    What a tracker says late is scored in the frame that it is of; for the last ones the last image is repeated.
     """
     total, n, late = len(sequence), len(queries), tracker.latency_frames
     uv, visible = np.full((total, n, 2), np.nan), np.zeros((total, n), bool)

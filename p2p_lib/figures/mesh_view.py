@@ -46,4 +46,4 @@ def as_body(mesh: trimesh.Trimesh) -> Mesh:
     uv = np.stack([(column + 0.5) / side, 1 - (row + 0.5) / side], -1)
     normals = np.asarray(mesh.vertex_normals)[faces]
     vertices = np.asarray(mesh.vertices, float)
-    return Mesh(vertices, faces, np.repeat(uv[:, None], 3, 1), texture, normals, closed=False)
+    return Mesh(vertices, faces, np.repeat(uv[:, None], 3, 1), texture, normals)

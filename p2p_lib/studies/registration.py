@@ -33,7 +33,6 @@ from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.synthetic.ablations import mug
 from p2p_lib.synthetic.generate import photograph
 from p2p_lib.synthetic.noise import Sensor
-from p2p_lib.synthetic.render import render
 from p2p_lib.synthetic.scene import FPS, Scenario
 from p2p_lib.synthetic.shapes import Mesh
 
@@ -168,7 +167,7 @@ def _handle_in_view(poses: np.ndarray, frames: int) -> int:
 
 def _shots(scenario: Scenario, seed: int, times: Iterable[int]) -> dict[int, tuple[Frame, np.ndarray]]:
     """Frame and mask at each time, with the sensor's noise."""
-    room = render([(m, se3.IDENTITY) for m in scenario.room], scenario.camera, scenario.T_world_cam[0], scenario.light)
+    room = scenario.empty(0)
     taken = {t: photograph(scenario, Sensor(), seed, t, room) for t in times}
     return {t: (Frame(t, t / FPS, rgb, depth_m), exact.label == 1) for t, (rgb, depth_m, exact) in taken.items()}
 

@@ -27,7 +27,7 @@ from scipy import stats
 
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.interfaces import PointTracker
-from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.datasets import ycbmultitrack
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.datasets.sequence import open_sequence
@@ -122,7 +122,7 @@ class RecordedTracker:
         for index, new_ids, uv_px in self._queries:
             frame = scene.sequence.frame(index)
             ids.append(new_ids)
-            points = points.joined(scene.lift(frame, scene.owners(frame, uv_px), uv_px))
+            points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
         ids = np.concatenate(ids)
         return np.sort(ids), points.select(np.argsort(ids))
 
