@@ -221,18 +221,16 @@ def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
 
 def _files_hash(job: Job) -> str:
     """Content of the truth, of the models, of the first image and its masks; names and sizes of everything else."""
-    sequence = open_planned(job)
-    first, masks = sequence.frame(job.sequence.start), sequence.masks(job.sequence.start) or {}
-    digest = hashlib.sha256(first.rgb.tobytes() + first.depth_m.tobytes())
+    sequence, start = open_planned(job), job.sequence.start
+    first = sequence.frame(start)
+    parts = [("rgb", first.rgb.tobytes()), ("depth", first.depth_m.tobytes())]
+    parts += [(name, mask.tobytes()) for name, mask in sorted((sequence.masks(start) or {}).items())]
     for name, truth in sorted(sequence.truth.items()):
-        digest.update(name.encode() + truth.T_cam_model.tobytes() + truth.labelled.tobytes())
-    for name, mask in sorted(masks.items()):
-        digest.update(name.encode() + mask.tobytes())
-    for name, path in sorted({**find_models(sequence), **job.models}.items()):
-        digest.update(name.encode() + (path.read_bytes() if path.is_file() else b""))
-    if sequence.path is not None:
-        digest.update(_listing(sequence.path))
-    return digest.hexdigest()
+        parts.append((name, truth.T_cam_model.tobytes() + truth.labelled.tobytes()))
+    models = sorted((find_models(sequence) | job.models).items())
+    parts += [(name, path.read_bytes() if path.is_file() else b"") for name, path in models]
+    parts += [] if sequence.path is None else [("files", _listing(sequence.path))]
+    return _sha(b"".join(name.encode() + content for name, content in parts))
 
 
 def _listing(folder: Path) -> bytes:

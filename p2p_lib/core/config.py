@@ -66,10 +66,8 @@ class MethodConfig(_Checked):
     motion: bool = _p(
         True, "The motion so far is evidence: last poses compete, jumps need support, surfaces may track."
     )
-    redetection: str = _p(
-        "guided",
-        "A pose from a few points tells the tracker where to look for the others, or nothing does.",
-        choices=("none", "guided"),
+    redetection: bool = _p(
+        True, "Where few points are seen, their pose tells the tracker where to look for the others."
     )
     gates: str = _p("all", "A pose has to pass all gates of the life cycle, or none.", choices=("none", "all"))
     noise: str = _p(
@@ -86,25 +84,15 @@ class LifecycleConfig(_Checked):
     """Of an object's life cycle: when it is hidden, started, recovered, and when its pose stands."""
 
     min_mask_px: int = _p(100, "An object with a smaller mask counts as hidden.", "px", "release", low=1)
-    start_growth: float = _p(
-        1.1, "An object whose mask grows by more than this factor from frame to frame is not started yet.", low=1
+    return_inliers: int = _p(
+        8, "A return needs so many agreeing points; a pose with fewer is degraded.", "points", low=3
     )
-    confirm_frames: int = _p(5, "A return has to be confirmed for so many frames.", "frames", low=0)
-    return_inliers: int = _p(8, "A return, or a jump, needs so many agreeing points.", "points", low=3)
-    return_surface_share: float = _p(
-        0.3, "A return needs this share of the depth points on the surface.", low=0, high=1
+    surface_only_share: float = _p(
+        0.6,
+        "The surface tracks without agreeing points where this share of the depth points lies on it.",
+        low=0,
+        high=1,
     )
-    redetect_below: int = _p(25, "Guided re-detection runs when fewer keypoints are seen.", "points", low=0)
-    redetect_depth_m: float = _p(
-        0.015, "A keypoint farther from the depth measured at its pixel is hidden.", "m", low=1e-4
-    )
-    max_jump_m: float = _p(0.08, "A larger move between frames is a jump.", "m", "release", low=0)
-    max_jump_deg: float = _p(25.0, "A larger turn between frames is a jump.", "deg", "release", low=0)
-    surface_only_frames: int = _p(
-        60, "The surface may track for so many frames in a row without agreeing points.", "frames", low=0
-    )
-    surface_only_share: float = _p(0.6, "For that it needs this share of the depth points.", low=0, high=1)
-    degraded_inliers: int = _p(8, "A pose from fewer agreeing points is degraded.", "points", low=3)
 
 
 @dataclass(frozen=True)
@@ -120,54 +108,62 @@ class DepthConfig(_Checked):
 
 @dataclass(frozen=True)
 class TrackingConfig(_Checked):
-    """Of the embedded tracker, but for ``forget_after``, which all keep."""
+    """Of the built-in tracker, but for ``forget_after``, which all trackers keep."""
 
-    forget_after: int = _p(0, "SH(n): points are dropped after n invisible frames; 0 = never", "frames", low=0)
-    window_px: int = _p(13, "side of the Lucas-Kanade window", "px", low=5, high=63)
-    levels: int = _p(3, "pyramid levels of Lucas-Kanade above full resolution", low=0, high=6)
-    iterations: int = _p(4, "steps of an alignment, per resolution", low=1, high=50)
-    min_ncc: float = _p(0.7, "correlation with its appearance that a followed point keeps", low=0, high=1)
-    return_ncc: float = _p(0.8, "correlation that brings an invisible point back", low=0, high=1)
-    renew_sigma_px: float = _p(1.5, "standard deviation of a place that gives a new appearance, at most", "px", low=0)
-    colour_change: float = _p(12.0, "chroma farther from the appearance's (CIELAB) is another place", "", low=0)
-    grey_change: float = _p(50.0, "brightness farther from the appearance's is, too", "grey levels", low=0)
-    contrast_change: float = _p(2.5, "ratio of contrasts, likewise", low=1)
-    area_change: float = _p(5.0, "ratio of areas, likewise", low=1)
-    search_px: float = _p(8.0, "an alignment that ends farther off is another place", "px", low=0.5)
-    forward_backward_px: float = _p(0.7, "error there and back of a point that coasts", "px", low=0.05)
-    coast_ncc: float = _p(0.4, "correlation that a point keeps while it coasts", low=-1, high=1)
-    coast_frames: int = _p(8, "frames that Lucas-Kanade may carry a point whose looks changed", "frames", low=0)
-    coast_sigma_px: float = _p(0.7, "what each of them adds to the standard deviation", "px", low=0)
-    appearances: int = _p(5, "appearances kept per point", low=2, high=20)
-    renew_every: int = _p(3, "frames between looks for points that need a new appearance", "frames", low=1)
-    renew_stretch: float = _p(1.35, "stretch of the best appearance that asks for a new one", low=1.01)
-    renew_ncc: float = _p(0.85, "correlation below which a point wants a new appearance", low=0, high=1)
-    linger_frames: int = _p(5, "frames for which a lost point is looked for where it was", "frames", low=0)
-    redetect_every: int = _p(2, "frames between searches of a pyramid level for invisible points", "frames", low=1)
-    features: int = _p(200, "corners per searched level", "points", low=10)
-    ratio: float = _p(0.85, "nearest to second-nearest descriptor distance of a candidate", low=0.1, high=1)
-    candidates: int = _p(2, "corners tried per invisible point", low=1)
-    support: int = _p(5, "corners that must agree on where a lost body is", "points", low=0)
-    depth_jump_m: float = _p(0.02, "change of depth between frames of a point that is no longer seen", "m", low=1e-3)
-    tries: int = _p(96, "invisible points looked for per frame", "points", low=1)
-    bare_contrast: float = _p(6.0, "contrast below which a point has no looks of its own", "grey levels", low=0)
-    body_points: int = _p(3, "points that must agree on a body's pose", "points", low=3)
-    body_reach_m: float = _p(0.04, "points nearer than this start as one rigid body", "m", low=1e-3)
-    body_m: float = _p(0.008, "residual of a match that agrees on a body's pose when it is found", "m", low=1e-4)
-    find_share: float = _p(0.5, "of the points that a found body should show, those that must be there", low=0, high=1)
-    keep_share: float = _p(0.2, "the same while it is followed", low=0, high=1)
-    split_points: int = _p(8, "points that must leave a body together to be another one", "points", low=3)
-    split_m: float = _p(0.02, "how far they must be from where it takes them", "m", low=1e-3)
-    join_looks: int = _p(5, "looks, renew_every apart, over which two bodies that are one move alike", low=2)
-    guess_px: float = _p(3.0, "standard deviation up to which a body alone shows a point", "px", low=0)
-    min_cosine: float = _p(0.1, "of surface normal and view: surface turned away further is invisible", low=-1, high=1)
-    repeats: float = _p(4.0, "frames in a row whose errors count as one observation of a place on a body", low=1)
-    shun_frames: int = _p(15, "frames for which a body is not looked for where it was found in error", "frames", low=0)
-    survey_deg: float = _p(15.0, "turn that shows a new side of a body", "deg", low=1)
-    max_landmarks: int = _p(2500, "corners remembered of a body", "points", low=100)
-    landmarks: int = _p(400, "corners of a lost body looked for in a frame", "points", low=10)
-    anchor_px: int = _p(24, "corners nearer than this are remembered with a point", "px", low=1)
-    uncertain_px: float = _p(1.5, "standard deviation that reads as an uncertainty of 1/2", "px", low=0.01)
+    forget_after: int = _p(
+        0, "SH(n): points are dropped after this many invisible frames; 0 means never.", "frames", low=0
+    )
+    window_px: int = _p(13, "Side of the Lucas-Kanade window.", "px", low=5, high=63)
+    templates: int = _p(5, "Templates kept of a point's appearance.", low=2, high=20)
+    update_every: int = _p(3, "Templates, segments and landmarks are updated every so many frames.", "frames", low=1)
+    update_scale_change: float = _p(
+        1.35, "A new template is taken when the best one appears scaled by this factor or more.", low=1.01
+    )
+    update_ncc: float = _p(
+        0.85, "A new template is taken when the correlation with the best one is lower.", low=0, high=1
+    )
+    min_ncc: float = _p(0.7, "A followed point keeps at least this correlation with its template.", low=0, high=1)
+    return_ncc: float = _p(0.8, "A point that was invisible returns with at least this one.", low=0, high=1)
+    max_colour_change: float = _p(12.0, "A larger difference of chroma (CIELAB) means another point.", low=0)
+    max_contrast_change: float = _p(2.5, "A larger ratio of contrasts means another point.", low=1)
+    search_px: float = _p(8.0, "A point is searched for no farther from its prediction than this.", "px", low=0.5)
+    coast_frames: int = _p(
+        8, "Lucas-Kanade alone carries a point whose appearance changed for at most so many frames.", "frames", low=0
+    )
+    forward_backward_px: float = _p(
+        0.7, "Lucas-Kanade forward and backward may differ by this much for such a point.", "px", low=0.05
+    )
+    linger_frames: int = _p(
+        5, "A point or segment that was lost is searched for where it was for so many frames.", "frames", low=0
+    )
+    depth_jump_m: float = _p(
+        0.02, "Depth that differs more from a point's prediction belongs to another surface.", "m", low=1e-3
+    )
+    textureless_contrast: float = _p(6.0, "A point with less contrast is not searched for.", "grey levels", low=0)
+    max_predicted_sigma_px: float = _p(
+        3.0, "A point that is not recognised counts as visible if its segment predicts it this well.", "px", low=0
+    )
+    uncertain_px: float = _p(1.5, "A position with this standard deviation has an uncertainty of 1/2.", "px", low=0.01)
+    segment_min_points: int = _p(3, "A segment's pose needs so many points, its start twice as many.", "points", low=3)
+    segment_reach_m: float = _p(0.04, "Points nearer to each other than this start in one segment.", "m", low=1e-3)
+    segment_inlier_m: float = _p(
+        0.008, "Pairs of points with a smaller residual agree with a motion that is searched for.", "m", low=1e-4
+    )
+    split_points: int = _p(8, "So many points that leave a segment together make another one.", "points", low=3)
+    split_m: float = _p(0.02, "They do so when they are this far from their segment's motion.", "m", low=1e-3)
+    redetect_every: int = _p(2, "Lost segments are searched for everywhere every so many frames.", "frames", low=1)
+    corners: int = _p(200, "So many corners of an image are described.", "points", low=10)
+    match_ratio: float = _p(
+        0.85, "A corner matches a landmark if it is nearer than this times the next best place.", low=0.1, high=1
+    )
+    min_landmark_matches: int = _p(5, "A lost segment is found where so many corners agree.", "points", low=3)
+    reject_frames: int = _p(
+        15, "A segment is not searched for where the caller rejected it for so many frames.", "frames", low=0
+    )
+    landmark_view_deg: float = _p(
+        15.0, "Landmarks are added when a segment is seen from a direction this far from all before.", "deg", low=1
+    )
+    max_landmarks: int = _p(2500, "No more landmarks of a segment are kept.", "points", low=100)
 
 
 @dataclass(frozen=True)
@@ -211,7 +207,6 @@ class SamplingConfig(_Checked):
     cluster_weight: float = _p(0.5, "This is beta of the objective.", "", "release", low=0)
     r_ideal_px: float = _p(20.0, "This is r_ideal of the objective, for which the paper gives no value.", "px", low=1)
     r_min_px: float = _p(5.0, "This is r_min of the objective.", "px", "release", low=0)
-    edge_margin_px: int = _p(2, "Points keep this distance to the border of the mask.", "px", "release", low=0)
 
 
 @dataclass(frozen=True)
@@ -224,10 +219,7 @@ class KeypointMapConfig(_Checked):
     keyframe_min_points: int = _p(25, "Fewer visible points ask for a keyframe.", "points", "paper", low=0)
     cooldown: int = _p(5, "Keyframes asked for by too few points are so many frames apart.", "frames", low=0)
     streak: int = _p(3, "A point is promoted after N_streak verified frames in a row.", "frames", "paper", low=1)
-    stable_rotation_deg: float = _p(2.0, "A frame with a larger turn verifies nothing.", "deg", "paper", low=0)
-    stable_translation_m: float = _p(0.01, "A frame with a larger move verifies nothing.", "m", "paper", low=0)
     max_uncertainty: float = _p(0.3, "A more uncertain track verifies nothing.", "", "paper", low=0, high=1)
-    min_observations: int = _p(4, "A point is promoted after so many observations.", "frames", "release", low=1)
     max_scatter_m: float = _p(
         0.008,
         "A point is promoted when the median absolute deviation of its observations is smaller.",
@@ -256,7 +248,6 @@ class RegistrationConfig(_Checked):
     min_inliers: int = _p(5, "A hypothesis has at least so many inliers.", "points", "release", low=3)
     max_hypotheses: int = _p(10, "There are at most H hypotheses.", "", "release", low=1)
     max_uncertainty: float = _p(0.5, "More uncertain tracks are left out.", low=0, high=1)
-    min_promoted: int = _p(12, "With fewer visible keypoints, pending ones help out.", "points", "release", low=3)
     contradicted: float = _p(
         0.7, "When a smaller share of the keypoints agrees, pending points and the surface propose too.", low=0, high=1
     )
@@ -273,18 +264,8 @@ class SelectionConfig(_Checked):
         choices=("surface", "support"),
     )
     surface_sigmas: float = _p(2.5, "The surface must prefer another one by so many standard errors.", low=0)
-    surface_margin_m: float = _p(2e-4, "It must prefer it by this mean distance too.", "m", low=0)
-    unseen_share: float = _p(
-        0.4, "A point where nothing was observed counts this share of the truncation.", low=0, high=1
-    )
     motion_deg: float = _p(5.0, "This turn off the motion so far halves the support of a hypothesis.", "deg", low=0.01)
     motion_m: float = _p(0.02, "This move off the motion so far does so too.", "m", low=1e-5)
-    min_support: int = _p(
-        8, "A hypothesis with so many inliers is compared on the surface.", "points", "release", low=0
-    )
-    min_support_share: float = _p(
-        0.25, "One with this share of the best supported one's inliers is compared too.", "", "release", low=0, high=1
-    )
 
 
 @dataclass(frozen=True)
@@ -294,7 +275,6 @@ class TsdfConfig(_Checked):
     voxel_m: float = _p(0.003, "A voxel has this edge.", "m", low=2e-4)
     truncation_voxels: float = _p(5.0, "The truncation tau is so many voxels.", "voxels", "release", low=1)
     max_voxels: int = _p(8_000_000, "A volume has at most so many voxels; parts beyond are left out.", low=1000)
-    max_moves: int = _p(1, "So many moved keyframes are re-integrated in a frame, the farthest moved first.", low=0)
     carve: bool = _p(True, "Depth behind the object, outside the mask, carves free space.")
 
 
@@ -310,12 +290,8 @@ class RefinementConfig(_Checked):
     )
     iterations: int = _p(8, "Levenberg-Marquardt makes at most L steps.", "", "release", low=1)
     max_points: int = _p(700, "At most so many depth points are used.", "points", low=10)
-    mad_trim: float = _p(
-        2.5, "Residuals beyond so many median absolute deviations are left out.", "", "release", low=0.5
-    )
     huber_m: float = _p(0.005, "This is the Huber threshold of the surface residual.", "m", low=1e-5)
     min_eigenvalue: float = _p(0.0005, "Directions with a smaller eigenvalue are not determined by the shape.", low=0)
-    independent_points: int = _p(100, "Depth points, whose errors are correlated, count as so many.", "points", low=1)
 
 
 @dataclass(frozen=True)
@@ -334,14 +310,7 @@ class FactorGraphConfig(_Checked):
     between_sigma_m: float = _p(
         0.005, "This is the noise of a relative translation at the object where it is constant.", "m", low=1e-6
     )
-    damping: float = _p(1e-4, "Levenberg-Marquardt starts with this lambda_0.", low=0)
     iterations: int = _p(5, "Levenberg-Marquardt makes at most so many steps.", low=1)
-    covariance_scale: float = _p(
-        0.55, "The noise of points is set for a poor sensor; the pose's covariance is scaled by this.", low=0.01
-    )
-    drift_share: float = _p(
-        0.03, "Points on a round body drift by this share of its accumulated rotation.", low=0, high=1
-    )
     max_keyframes: int = _p(30, "Keyframes beyond this number are merged, the most similar first; 0 keeps all.", low=0)
 
 
@@ -412,7 +381,7 @@ _STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.def
 _PAPER: dict[str, Any] = {
     "method.object_frame": "camera",
     "method.motion": False,
-    "method.redetection": "none",
+    "method.redetection": False,
     "method.gates": "none",
     "method.noise": "constant",
     "sampling.max_visible": 50,
@@ -420,14 +389,12 @@ _PAPER: dict[str, Any] = {
     "registration.iterations": 100,
     "registration.sample_size": 4,
     "selection.rule": "surface",
-    "selection.unseen_share": 1.0,
     "tsdf.voxel_m": 0.005,
     "tsdf.carve": False,
     "refinement.residuals": "surface",
     "refinement.max_points": 1500,
     "refinement.huber_m": 0.01,
     "factor_graph.bearing_sigma_rad": 0.01,
-    "factor_graph.damping": 0.1,
     "factor_graph.iterations": 20,
     "factor_graph.max_keyframes": 0,
 }

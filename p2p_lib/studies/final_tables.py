@@ -19,12 +19,13 @@ from matplotlib.figure import Figure
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import Job
-from p2p_lib.benchmark.outcome import Outcome, replace_text
+from p2p_lib.benchmark.outcome import Outcome
 from p2p_lib.benchmark.plan import Method
 from p2p_lib.benchmark.rows import MEAN, POOLED, Row, shown_name
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import MissingData
+from p2p_lib.core.files import replace_text
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.models import MESHES, find_models

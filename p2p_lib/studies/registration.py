@@ -28,7 +28,7 @@ from p2p_lib.method.observation import sample_cloud
 from p2p_lib.method.refinement import Keypoints, refine, surface_distances
 from p2p_lib.method.registration import Hypothesis, register
 from p2p_lib.method.sampling import choose, usable_region
-from p2p_lib.method.selection import select, supported
+from p2p_lib.method.selection import select
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.synthetic.ablations import mug
 from p2p_lib.synthetic.generate import photograph
@@ -101,7 +101,7 @@ def mug_moment(config: Config, seed: int = 0, frames: int = 16, marks: int = 2) 
         frame, mask = shots[t]
         surface.integrate(frame.depth_m, frame.rgb, mask, camera, poses[t])
     (first, first_mask), (frame, mask) = shots[before], shots[now]
-    region = usable_region(first, first_mask, config.sampling, config.depth.edge_m)
+    region = usable_region(first, first_mask, config.depth.edge_m)
     found = make_detector("corners", config.sampling, rng).detect(first, region)
     uv_before = found.uv_px[choose(found, np.zeros((0, 2)), _POINTS, config.sampling)]
     uv = _tracked([shots[t][0] for t in range(before, now + 1)], uv_before, config, rng)
@@ -124,13 +124,13 @@ def ways_to_decide(moment: Moment, config: Config, seed: int = 0) -> dict[str, n
     cfg, choice, rng = config.registration, config.selection, np.random.default_rng([seed, 8])
     sigma_m = depth_noise_m(moment.p_cam[:, 2], config.depth)
     points = moment.p_obj, moment.p_cam
-    hypotheses = supported(register(*points, cfg, rng, sigma_m=sigma_m), choice)
+    hypotheses = register(*points, cfg, rng, sigma_m=sigma_m)
     single = register(*points, replace(cfg, method="svd"), rng, sigma_m=sigma_m)
     T = np.stack([h.T_cam_obj for h in hypotheses])
     inliers = [Keypoints(*(values[h.inliers] for values in (*points, sigma_m))) for h in hypotheses]
     volume = moment.cloud, moment.surface, config.refinement
     T_refined = np.stack([refine(*pair, *volume, keypoints=k).T_cam_obj for *pair, k in zip(T, inliers, strict=True)])
-    off_m, refined_m = (surface_distances(moment.surface, moment.cloud, P, choice.unseen_share) for P in (T, T_refined))
+    off_m, refined_m = (surface_distances(moment.surface, moment.cloud, P) for P in (T, T_refined))
     return {
         "SVD, outliers out, SVD": single[0].T_cam_obj if single else np.full((4, 4), np.nan),
         "RANSAC: most inliers": T[select(hypotheses, None, choice)[0]],

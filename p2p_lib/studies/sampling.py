@@ -68,7 +68,7 @@ class Situation:
     def of(cls, video: Video, name: str, index: int, settings: Mapping[str, Any] | None = None) -> Situation:
         """The object ``name`` in frame ``index``, with the default parameters and ``settings``."""
         config, frame, mask = preset().with_values(dict(settings or {})), video.frame(index), video.masks(index)[name]
-        return cls(video, name, frame, mask, usable_region(frame, mask, config.sampling, config.depth.edge_m), config)
+        return cls(video, name, frame, mask, usable_region(frame, mask, config.depth.edge_m), config)
 
     def candidates(self, detector: str = "corners", seed: int = 0) -> Candidates:
         """What a detector offers here, as far as it can be lifted."""
