@@ -266,19 +266,19 @@ def _log_keypoints(log: KeypointLog, frame: Frame, method: Point2Pose) -> None:
     """Keep where each object's points were seen in the frame that has just been estimated."""
     tracks = method.tracks
     for name, obj in method.objects.items():
-        seen = tracks.visible & np.isin(tracks.ids, obj.map.ids)
+        seen = tracks.visible & np.isin(tracks.ids, obj.model.map.ids)
         log.add(frame.index, name, tracks.ids[seen], tracks.uv_px[seen])
 
 
 def _save_maps(method: Point2Pose, keypoints: KeypointLog, out: Path) -> None:
     """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
     for name, obj in method.objects.items():
-        if obj.surface is None or obj.surface.empty:
+        if not obj.model.has_surface:
             continue
-        mesh = obj.surface.mesh()
+        mesh = obj.model.surface.mesh()
         if len(mesh.faces):
             save_mesh(mesh, out / "meshes" / f"{name}.ply")
-    maps = {name: obj.map for name, obj in method.objects.items()}
+    maps = {name: obj.model.map for name, obj in method.objects.items()}
     keypoints.save(out, {name: (m.ids, m.p_obj, m.promoted) for name, m in maps.items()})
 
 

@@ -334,7 +334,7 @@ def _extent(frame: Frame, mask: np.ndarray) -> tuple[float, float, float]:
 def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """Whether an object has anything to track: points that can be lifted, with a contrast of their own."""
     detector = make_detector(DEFAULT_DETECTOR, config.sampling, np.random.default_rng(config.seed))
-    found = detector.detect(frame, usable_region(frame, mask, config.sampling, config.depth.edge_m))
+    found = detector.detect(frame, usable_region(frame, mask, config.depth.edge_m))
     taken = choose(found, np.zeros((0, 2)), config.sampling.max_visible, config.sampling)
     u, v = np.rint(found.uv_px[taken]).astype(int).T
     contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]

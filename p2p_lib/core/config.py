@@ -66,10 +66,8 @@ class MethodConfig(_Checked):
     motion: bool = _p(
         True, "The motion so far is evidence: last poses compete, jumps need support, surfaces may track."
     )
-    redetection: str = _p(
-        "guided",
-        "A pose from a few points tells the tracker where to look for the others, or nothing does.",
-        choices=("none", "guided"),
+    redetection: bool = _p(
+        True, "Where few points are seen, their pose tells the tracker where to look for the others."
     )
     gates: str = _p("all", "A pose has to pass all gates of the life cycle, or none.", choices=("none", "all"))
     noise: str = _p(
@@ -86,36 +84,26 @@ class LifecycleConfig(_Checked):
     """Of an object's life cycle: when it is hidden, started, recovered, and when its pose stands."""
 
     min_mask_px: int = _p(100, "An object with a smaller mask counts as hidden.", "px", "release", low=1)
-    start_growth: float = _p(
-        1.1, "An object whose mask grows by more than this factor from frame to frame is not started yet.", low=1
+    return_inliers: int = _p(
+        8, "A return needs so many agreeing points; a pose with fewer is degraded.", "points", low=3
     )
-    confirm_frames: int = _p(5, "A return has to be confirmed for so many frames.", "frames", low=0)
-    return_inliers: int = _p(8, "A return, or a jump, needs so many agreeing points.", "points", low=3)
-    return_surface_share: float = _p(
-        0.3, "A return needs this share of the depth points on the surface.", low=0, high=1
+    surface_only_share: float = _p(
+        0.6,
+        "The surface tracks without agreeing points where this share of the depth points lies on it.",
+        low=0,
+        high=1,
     )
-    redetect_below: int = _p(25, "Guided re-detection runs when fewer keypoints are seen.", "points", low=0)
-    redetect_depth_m: float = _p(
-        0.015, "A keypoint farther from the depth measured at its pixel is hidden.", "m", low=1e-4
-    )
-    max_jump_m: float = _p(0.08, "A larger move between frames is a jump.", "m", "release", low=0)
-    max_jump_deg: float = _p(25.0, "A larger turn between frames is a jump.", "deg", "release", low=0)
-    surface_only_frames: int = _p(
-        60, "The surface may track for so many frames in a row without agreeing points.", "frames", low=0
-    )
-    surface_only_share: float = _p(0.6, "For that it needs this share of the depth points.", low=0, high=1)
-    degraded_inliers: int = _p(8, "A pose from fewer agreeing points is degraded.", "points", low=3)
 
 
 @dataclass(frozen=True)
 class DepthConfig(_Checked):
     """Of measured depth: which of it is used, and how noisy it is."""
 
-    min_m: float = _p(0.1, "nearer depth is invalid", "m", "release", low=0)
-    max_m: float = _p(2.5, "farther depth is invalid", "m", low=0.1)
-    edge_m: float = _p(0.01, "a larger depth step in the 3x3 neighbourhood is an edge", "m", "release", low=0)
-    noise_m: float = _p(0.001, "standard deviation of depth at range 0", "m", low=1e-6)
-    noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
+    min_m: float = _p(0.1, "Nearer depth is invalid.", "m", "release", low=0)
+    max_m: float = _p(2.5, "Farther depth is invalid.", "m", low=0.1)
+    edge_m: float = _p(0.01, "A larger depth step in the 3x3 neighbourhood is an edge.", "m", "release", low=0)
+    noise_m: float = _p(0.001, "This is the standard deviation of depth at range 0.", "m", low=1e-6)
+    noise_per_m2: float = _p(0.0025, "The standard deviation grows by this with the range squared.", "1/m", low=0)
 
 
 @dataclass(frozen=True)
@@ -182,32 +170,28 @@ class TrackingConfig(_Checked):
 class OracleConfig(_Checked):
     """Of the tracker ``oracle``, which knows the truth; no part of the method."""
 
-    noise_px: float = _p(0.5, "standard deviation of a visible point's position, per axis", "px", low=0)
-    dropout: float = _p(0.0, "share of the visible points called invisible in a frame", low=0, high=1)
-    outliers: float = _p(0.0, "share of the visible points reported at a wrong place in a frame", low=0, high=1)
-    outlier_px: float = _p(30.0, "how far off those are", "px", low=0)
+    noise_px: float = _p(0.5, "This is the standard deviation of a visible point's position, per axis.", "px", low=0)
+    dropout: float = _p(0.0, "This share of the visible points is called invisible in a frame.", low=0, high=1)
+    outliers: float = _p(
+        0.0, "This share of the visible points is reported at a wrong place in a frame.", low=0, high=1
+    )
+    outlier_px: float = _p(30.0, "Points at a wrong place are this far off.", "px", low=0)
 
 
 @dataclass(frozen=True)
 class SegmentationConfig(_Checked):
-    """Of the embedded segmenter, which starts from clicks."""
+    """Of the built-in segmenter, which starts from clicks."""
 
-    side_px: int = _p(112, "longest side of the grid on which an object is cut out", "px", low=16, high=640)
-    reach_m: float = _p(0.3, "no object is larger than this to any side of its clicks", "m", low=0.01)
-    margin: float = _p(0.35, "room around the object, in its own size", low=0.05, high=2)
-    start_rounds: int = _p(3, "rounds of cutting and learning colours in the first frame", low=1)
-    iterations: int = _p(40, "conjugate gradient steps of a cut at most", low=1)
-    evidence_strength: float = _p(0.06, "weight of a pixel's certain evidence beside a tie to a like neighbour", low=0)
-    colour_weight: float = _p(0.7, "of colour evidence: neighbouring pixels repeat each other", low=0, high=1)
-    colour_rate: float = _p(0.05, "share of a frame in the object's remembered colours", low=0, high=1)
-    geometry_weight: float = _p(2.0, "log odds by hanging together in depth, and by lying in the support plane", low=0)
-    prior_weight: float = _p(2.5, "log odds by where the object was a frame ago", low=0)
-    surface_weight: float = _p(1.5, "log odds by lying on the reconstructed surface or clearly before it", low=0)
-    surface_m: float = _p(0.008, "distance to the reconstructed surface that still counts as on it", "m", low=1e-4)
-    contradiction: float = _p(3.0, "log odds against a pixel whose depth jumped since the last frame", low=0)
-    find_points: int = _p(8, "agreeing tracked points that say where an absent object is back", "points", low=3)
-    min_share: float = _p(0.03, "of the area it showed lately; an object that shows less is absent", low=0, high=1)
-    min_px: int = _p(40, "fewer pixels are absent", "px", low=1)
+    side_px: int = _p(112, "The grid on which an object is cut out has this longest side.", "px", low=16, high=640)
+    reach_m: float = _p(0.3, "No object is larger than this to any side of its clicks.", "m", low=0.01)
+    margin: float = _p(0.35, "This much room is left around the object, in its own size.", low=0.05, high=2)
+    colour_weight: float = _p(0.7, "Colour evidence counts this much: neighbours repeat each other.", low=0, high=1)
+    colour_rate: float = _p(0.05, "A frame has this share in the object's remembered colours.", low=0, high=1)
+    geometry_weight: float = _p(2.0, "These are the log odds by connected depth and by the support plane.", low=0)
+    prior_weight: float = _p(2.5, "These are the log odds by where the object was a frame ago.", low=0)
+    surface_weight: float = _p(1.5, "These are the log odds by lying on the reconstructed surface.", low=0)
+    find_points: int = _p(8, "So many agreeing tracked points say where an absent object is back.", "points", low=3)
+    min_px: int = _p(40, "An object of fewer pixels is absent.", "px", low=1)
 
 
 @dataclass(frozen=True)
@@ -223,7 +207,6 @@ class SamplingConfig(_Checked):
     cluster_weight: float = _p(0.5, "This is beta of the objective.", "", "release", low=0)
     r_ideal_px: float = _p(20.0, "This is r_ideal of the objective, for which the paper gives no value.", "px", low=1)
     r_min_px: float = _p(5.0, "This is r_min of the objective.", "px", "release", low=0)
-    edge_margin_px: int = _p(2, "Points keep this distance to the border of the mask.", "px", "release", low=0)
 
 
 @dataclass(frozen=True)
@@ -236,10 +219,7 @@ class KeypointMapConfig(_Checked):
     keyframe_min_points: int = _p(25, "Fewer visible points ask for a keyframe.", "points", "paper", low=0)
     cooldown: int = _p(5, "Keyframes asked for by too few points are so many frames apart.", "frames", low=0)
     streak: int = _p(3, "A point is promoted after N_streak verified frames in a row.", "frames", "paper", low=1)
-    stable_rotation_deg: float = _p(2.0, "A frame with a larger turn verifies nothing.", "deg", "paper", low=0)
-    stable_translation_m: float = _p(0.01, "A frame with a larger move verifies nothing.", "m", "paper", low=0)
     max_uncertainty: float = _p(0.3, "A more uncertain track verifies nothing.", "", "paper", low=0, high=1)
-    min_observations: int = _p(4, "A point is promoted after so many observations.", "frames", "release", low=1)
     max_scatter_m: float = _p(
         0.008,
         "A point is promoted when the median absolute deviation of its observations is smaller.",
@@ -268,7 +248,6 @@ class RegistrationConfig(_Checked):
     min_inliers: int = _p(5, "A hypothesis has at least so many inliers.", "points", "release", low=3)
     max_hypotheses: int = _p(10, "There are at most H hypotheses.", "", "release", low=1)
     max_uncertainty: float = _p(0.5, "More uncertain tracks are left out.", low=0, high=1)
-    min_promoted: int = _p(12, "With fewer visible keypoints, pending ones help out.", "points", "release", low=3)
     contradicted: float = _p(
         0.7, "When a smaller share of the keypoints agrees, pending points and the surface propose too.", low=0, high=1
     )
@@ -285,18 +264,8 @@ class SelectionConfig(_Checked):
         choices=("surface", "support"),
     )
     surface_sigmas: float = _p(2.5, "The surface must prefer another one by so many standard errors.", low=0)
-    surface_margin_m: float = _p(2e-4, "It must prefer it by this mean distance too.", "m", low=0)
-    unseen_share: float = _p(
-        0.4, "A point where nothing was observed counts this share of the truncation.", low=0, high=1
-    )
     motion_deg: float = _p(5.0, "This turn off the motion so far halves the support of a hypothesis.", "deg", low=0.01)
     motion_m: float = _p(0.02, "This move off the motion so far does so too.", "m", low=1e-5)
-    min_support: int = _p(
-        8, "A hypothesis with so many inliers is compared on the surface.", "points", "release", low=0
-    )
-    min_support_share: float = _p(
-        0.25, "One with this share of the best supported one's inliers is compared too.", "", "release", low=0, high=1
-    )
 
 
 @dataclass(frozen=True)
@@ -306,7 +275,6 @@ class TsdfConfig(_Checked):
     voxel_m: float = _p(0.003, "A voxel has this edge.", "m", low=2e-4)
     truncation_voxels: float = _p(5.0, "The truncation tau is so many voxels.", "voxels", "release", low=1)
     max_voxels: int = _p(8_000_000, "A volume has at most so many voxels; parts beyond are left out.", low=1000)
-    max_moves: int = _p(1, "So many moved keyframes are re-integrated in a frame, the farthest moved first.", low=0)
     carve: bool = _p(True, "Depth behind the object, outside the mask, carves free space.")
 
 
@@ -322,12 +290,8 @@ class RefinementConfig(_Checked):
     )
     iterations: int = _p(8, "Levenberg-Marquardt makes at most L steps.", "", "release", low=1)
     max_points: int = _p(700, "At most so many depth points are used.", "points", low=10)
-    mad_trim: float = _p(
-        2.5, "Residuals beyond so many median absolute deviations are left out.", "", "release", low=0.5
-    )
     huber_m: float = _p(0.005, "This is the Huber threshold of the surface residual.", "m", low=1e-5)
     min_eigenvalue: float = _p(0.0005, "Directions with a smaller eigenvalue are not determined by the shape.", low=0)
-    independent_points: int = _p(100, "Depth points, whose errors are correlated, count as so many.", "points", low=1)
 
 
 @dataclass(frozen=True)
@@ -346,14 +310,7 @@ class FactorGraphConfig(_Checked):
     between_sigma_m: float = _p(
         0.005, "This is the noise of a relative translation at the object where it is constant.", "m", low=1e-6
     )
-    damping: float = _p(1e-4, "Levenberg-Marquardt starts with this lambda_0.", low=0)
     iterations: int = _p(5, "Levenberg-Marquardt makes at most so many steps.", low=1)
-    covariance_scale: float = _p(
-        0.55, "The noise of points is set for a poor sensor; the pose's covariance is scaled by this.", low=0.01
-    )
-    drift_share: float = _p(
-        0.03, "Points on a round body drift by this share of its accumulated rotation.", low=0, high=1
-    )
     max_keyframes: int = _p(30, "Keyframes beyond this number are merged, the most similar first; 0 keeps all.", low=0)
 
 
@@ -424,7 +381,7 @@ _STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.def
 _PAPER: dict[str, Any] = {
     "method.object_frame": "camera",
     "method.motion": False,
-    "method.redetection": "none",
+    "method.redetection": False,
     "method.gates": "none",
     "method.noise": "constant",
     "sampling.max_visible": 50,
@@ -432,14 +389,12 @@ _PAPER: dict[str, Any] = {
     "registration.iterations": 100,
     "registration.sample_size": 4,
     "selection.rule": "surface",
-    "selection.unseen_share": 1.0,
     "tsdf.voxel_m": 0.005,
     "tsdf.carve": False,
     "refinement.residuals": "surface",
     "refinement.max_points": 1500,
     "refinement.huber_m": 0.01,
     "factor_graph.bearing_sigma_rad": 0.01,
-    "factor_graph.damping": 0.1,
     "factor_graph.iterations": 20,
     "factor_graph.max_keyframes": 0,
 }

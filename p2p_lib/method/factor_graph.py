@@ -27,6 +27,8 @@ _X, _P = ord("x") << 56, ord("p") << 56
 _ANCHORING_POINTS = 3
 # Noise of the prior on the first pose (rad, m): it defines the object frame, so there is next to none.
 _PRIOR_SIGMA = 1e-4
+# Levenberg-Marquardt's first lambda. (The release starts at 0.1 and makes more steps, to the same minimum.)
+_LAMBDA = 1e-4
 # A smaller relative decrease of the loss ends Levenberg-Marquardt.
 _RELATIVE_TOLERANCE = 1e-3
 # A variance above this means that nothing determines the direction: a turn, or ten metres.
@@ -260,7 +262,7 @@ def _solve(
                 keyframe.factors = _observations(key, keyframe, config)
             graph.push_back(keyframe.factors)
     params = gtsam.LevenbergMarquardtParams()
-    params.setlambdaInitial(config.damping)
+    params.setlambdaInitial(_LAMBDA)
     params.setMaxIterations(config.iterations)
     params.setRelativeErrorTol(_RELATIVE_TOLERANCE)
     params.setOrdering(ordering)

@@ -32,7 +32,6 @@ class KeypointMap:
         self.p_obj = np.zeros((0, 3))
         self.promoted = np.zeros(0, bool)
         self.confidence = np.zeros(0)
-        self._next_key = 0
         self._streak, self._age = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._agreed, self._disagreed = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._history = np.zeros((0, _HISTORY, 3))
@@ -41,18 +40,17 @@ class KeypointMap:
     def __len__(self) -> int:
         return len(self.keys)
 
-    def add(self, p_obj: np.ndarray, promoted: bool = False, confidence: float = 1.0) -> np.ndarray:
-        """New points at p_obj (N, 3); returns their keys. The first frame's are promoted at once: they define the map.
+    def add(self, keys: np.ndarray, p_obj: np.ndarray, promoted: bool = False, confidence: float = 1.0) -> None:
+        """New points (N,) at p_obj (N, 3), with larger keys than all before. The first frame's are promoted at once.
 
-        ``confidence`` is that of the pose that places them. Their ids are unknown until :meth:`assign`.
+        They define the map. ``confidence`` is that of the pose that places them. Their ids are unknown until
+        :meth:`assign`.
         """
-        n = len(p_obj)
-        keys = self._next_key + np.arange(n)
-        self._next_key += n
+        n = len(keys)
         history = np.full((n, _HISTORY, 3), np.nan)
         history[:, 0] = p_obj
         new = {
-            "keys": keys,
+            "keys": np.asarray(keys, np.int64),
             "ids": np.full(n, -1),
             "p_obj": p_obj,
             "promoted": np.full(n, promoted),
@@ -63,7 +61,6 @@ class KeypointMap:
         nothing = np.zeros(n, np.int64)
         for name in self._columns():
             setattr(self, name, np.concatenate([getattr(self, name), new.get(name, nothing)]))
-        return keys
 
     def assign(self, keys: np.ndarray, ids: np.ndarray) -> np.ndarray:
         """Set the tracker's ids of points by key; returns the ids of points that are gone already."""
@@ -86,7 +83,7 @@ class KeypointMap:
         at = np.flatnonzero(passed)
         self._history[at, self._observations[at] % _HISTORY] = p_obj[at]
         self._observations[at] += 1
-        ready = np.flatnonzero(passed & (self._streak >= cfg.streak) & (self._observations >= cfg.min_observations))
+        ready = np.flatnonzero(passed & (self._streak >= cfg.streak))
         if not len(ready):
             return np.zeros(0, np.int64)
         centre = np.nanmedian(self._history[ready], 1)

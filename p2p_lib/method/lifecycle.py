@@ -15,6 +15,9 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import LifecycleConfig
 from p2p_lib.core.types import WITH_POSE, Status
 
+#: A return has to be confirmed for so many frames, and is marked as recovered meanwhile.
+CONFIRM_FRAMES = 5
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -47,7 +50,6 @@ class Lifecycle:
     T_previous      pose of the frame before it; None after a gap
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
-    surface_only    frames in a row that the surface tracked without any agreeing keypoint
     start_px        pixels of the newest mask before the first pose; None without a mask
     """
 
@@ -57,7 +59,6 @@ class Lifecycle:
     T_previous: np.ndarray | None = None
     T_left: np.ndarray | None = None
     confirming: int = 0
-    surface_only: int = 0
     start_px: int | None = None
 
     @property
@@ -79,41 +80,38 @@ class Lifecycle:
             priors["constant velocity"] = self.T_cam_obj @ se3.inverse(self.T_previous) @ self.T_cam_obj
         return priors
 
-    def moved_from_last(self, T_cam_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Metres and degrees (...,) from the pose of the frame before to poses (..., 4, 4); None after a gap."""
-        if not self.has_pose or self.T_cam_obj is None:
+    def moved_from_last(self, T_cam_obj: np.ndarray) -> tuple[float, float] | None:
+        """Metres and degrees from the pose of the frame before to another (4, 4); None after a gap."""
+        if not self.has_pose:
             return None
-        moved_m = np.linalg.norm(T_cam_obj[..., :3, 3] - self.T_cam_obj[:3, 3], axis=-1)
-        return moved_m, np.degrees(se3.angle_rad(se3.inverse(self.T_cam_obj) @ T_cam_obj))
+        moved_m = np.linalg.norm(T_cam_obj[:3, 3] - self.T_cam_obj[:3, 3])
+        return float(moved_m), float(np.degrees(se3.angle_rad(se3.inverse(self.T_cam_obj) @ T_cam_obj)))
 
     def judge(self, evidence: Evidence, gates: tuple[str, ...], config: LifecycleConfig) -> Verdict:
         """The verdict on a pose: refused by the first of ``gates`` that refuses it, else accepted."""
         for name in gates:
             if reason := GATES[name](self, evidence, config):
                 return Verdict(False, Status.LOST, reason)
-        if evidence.support < config.degraded_inliers:
+        if evidence.support < config.return_inliers:
             return Verdict(True, Status.DEGRADED, f"only {evidence.support} points agree")
         confirming = not self.has_pose or self.confirming > 1
-        return Verdict(True, Status.RECOVERED if confirming and config.confirm_frames else Status.TRACKED)
+        return Verdict(True, Status.RECOVERED if confirming else Status.TRACKED)
 
-    def with_pose(
-        self, T_cam_obj: np.ndarray, time_s: float, verdict: Verdict, support: int, config: LifecycleConfig
-    ) -> Lifecycle:
+    def with_pose(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:
         """The state after a frame with an accepted pose."""
         return replace(
             self,
-            status=verdict.status,
+            status=status,
             T_cam_obj=T_cam_obj,
             seen_s=time_s,
             T_previous=self.T_cam_obj if self.has_pose else None,
             T_left=self.T_left if self.has_pose else self.T_cam_obj,
-            confirming=max(self.confirming - 1, 0) if self.has_pose else config.confirm_frames,
-            surface_only=0 if support else self.surface_only + 1,
+            confirming=max(self.confirming - 1, 0) if self.has_pose else CONFIRM_FRAMES,
         )
 
-    def started(self, T_cam_obj: np.ndarray, time_s: float, verdict: Verdict) -> Lifecycle:
+    def started(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:
         """The state after the first pose."""
-        return replace(self, status=verdict.status, T_cam_obj=T_cam_obj, seen_s=time_s)
+        return replace(self, status=status, T_cam_obj=T_cam_obj, seen_s=time_s)
 
     def without_pose(self, status: Status) -> Lifecycle:
         """The state after a frame without a pose. A return that was not confirmed is taken back."""
@@ -126,12 +124,6 @@ def _few_points_on_return(life: Lifecycle, evidence: Evidence, config: Lifecycle
     return f"only {evidence.support} points agree on a return" if few else ""
 
 
-def _off_surface_on_return(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
-    share = evidence.surface_share
-    off = life.unconfirmed and share is not None and share < config.return_surface_share
-    return f"{100 * share:.0f} % of the depth lies on the surface: not a return" if off else ""
-
-
 def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
     nothing = not evidence.support and (evidence.surface_share or 0.0) < config.surface_only_share
     return "too few points, and the surface does not fit either" if nothing else ""
@@ -140,6 +132,5 @@ def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: Life
 #: Every reason to refuse a pose, in the order in which they are asked: state, evidence and bounds to words, or "".
 GATES: dict[str, Callable[[Lifecycle, Evidence, LifecycleConfig], str]] = {
     "return_inliers": _few_points_on_return,
-    "return_surface": _off_surface_on_return,
     "surface_only": _no_points_and_off_surface,
 }

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from p2p_lib.method.tsdf import TsdfVolume
 
 NO_IDS = np.zeros(0, np.int64)
+#: A frame with a larger move or turn verifies no point (appendix, "Point Promotion Strategy").
+_STABLE_M, _STABLE_DEG = 0.01, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ class ObjectModel:
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
         self._observer, self._stopwatch = observer, stopwatch
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
-        self._since_keyframe = 0
+        self._since_keyframe, self._next_key = 0, 0
 
     @property
     def empty(self) -> bool:
@@ -75,8 +77,14 @@ class ObjectModel:
         """(N,) standard deviation of measured points by the sensor's model; None where one noise is assumed for all."""
         return self._observer.noise_m(p_cam) if self.config.method.noise == "sensor" else None
 
-    def observe(self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray, stable: bool) -> None:
-        """Take an accepted frame into the map: count the keypoints that agree (N,), verify the pending ones."""
+    def observe(
+        self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray, moved: tuple[float, float] | None
+    ) -> None:
+        """Take an accepted frame into the map: count the keypoints that agree (N,), verify the pending ones.
+
+        moved  metres and degrees since the frame before, None after a gap: "Pose Stability" of the appendix
+        """
+        stable = moved is not None and moved[0] < _STABLE_M and moved[1] < _STABLE_DEG
         self.map.count(obs.seen & self.map.promoted, agrees)
         self.map.observe(se3.transform(se3.inverse(T_cam_obj), obs.p_cam), obs.tracks.uncertainty, stable)
         self._since_keyframe += 1
@@ -108,7 +116,9 @@ class ObjectModel:
         """
         p_obj = se3.transform(se3.inverse(T_cam_obj), new.p_cam)
         old_keys = self.map.keys[agrees]
-        keys = self.map.add(p_obj, promoted=self.empty, confidence=confidence)
+        keys = self._next_key + np.arange(len(new))
+        self._next_key += len(new)
+        self.map.add(keys, p_obj, promoted=self.empty, confidence=confidence)
         vertex, registered = None, T_cam_obj
         if self.graph is not None:
             with self._stopwatch("graph"):
@@ -126,10 +136,10 @@ class ObjectModel:
         return T_cam_obj, Requests(drop=drop, add_px=new.uv_px, keys=keys)
 
     def settle_surface(self) -> None:
-        """Re-integrate some of the keyframes that the graph has moved: a few per frame, so that no frame waits long."""
+        """Re-integrate the keyframe that the graph has moved farthest: one a frame, so that no frame waits long."""
         if self.surface is not None and self._corrected:
             with self._stopwatch("fusion"):
-                if not self.surface.move(self._corrected, self.config.tsdf.max_moves):
+                if not self.surface.move(self._corrected, limit=1):
                     self._corrected = {}
 
     def _optimise(

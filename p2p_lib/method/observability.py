@@ -63,11 +63,3 @@ def rotations_in(tangents: np.ndarray) -> np.ndarray:
     _, size, mix = np.linalg.svd(tangents[:3])
     size, mix = size[size > _MOSTLY], mix[: len(size)][size > _MOSTLY]
     return tangents @ mix.T / size
-
-
-def drift_covariance(free_rotations: np.ndarray, rotated_rad: float, share: float) -> np.ndarray:
-    """(6, 6) by how much keypoints may have drifted around: ``share`` of the accumulated rotation along each.
-
-    free_rotations  (K, 6) tangents of one radian each that the shape leaves free, right tangent of T_cam_obj
-    """
-    return (share * rotated_rad) ** 2 * free_rotations.T @ free_rotations

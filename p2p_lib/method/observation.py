@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -18,6 +18,9 @@ from p2p_lib.core.types import Frame, Tracks
 _BORDER_PX = 2
 #: A larger step in the 3x3 neighbourhood of a pixel of the cloud is an edge, m.
 _CLOUD_EDGE_M = 0.02
+
+#: A keypoint farther from the depth measured at its pixel is hidden, m.
+_HIDDEN_M = 0.015
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,20 +62,13 @@ class Observer:
 
     def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
         """The observation of an object whose points have these ``tracks``."""
-        nothing = Observation(frame, mask, tracks, np.zeros((0, 3)), np.zeros((0, 3)))
-        cloud = nothing.cloud
-        if mask is not None and self.cloud_points:
-            cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
-        return self.tracked(replace(nothing, cloud=cloud), tracks)
-
-    def tracked(self, observation: Observation, tracks: Tracks) -> Observation:
-        """The same observation with other tracks."""
-        p_cam = np.full((len(tracks), 3), np.nan)
+        p_cam, cloud = np.full((len(tracks), 3), np.nan), np.zeros((0, 3))
         rows = np.flatnonzero(tracks.visible)
-        if observation.mask is not None:
-            rows = rows[in_mask(tracks.uv_px[rows], observation.mask)]
-        p_cam[rows] = self.lift(observation.frame, tracks.uv_px[rows])
-        return replace(observation, tracks=tracks, p_cam=p_cam)
+        if mask is not None:
+            rows = rows[in_mask(tracks.uv_px[rows], mask)]
+            cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
+        p_cam[rows] = self.lift(frame, tracks.uv_px[rows])
+        return Observation(frame, mask, tracks, p_cam, cloud)
 
     def lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
         """(N, 3) points behind pixels (N, 2); NaN where there is no trustworthy depth."""
@@ -86,19 +82,17 @@ class Observer:
         """(H, W) bool: pixels of the mask with a depth within range."""
         return observation.mask & in_range(observation.frame.depth_m, self.config)
 
-    def expected_px(
-        self, observation: Observation, T_cam_obj: np.ndarray, p_obj: np.ndarray, off_m: float
-    ) -> np.ndarray:
+    def expected_px(self, obs: Observation, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> np.ndarray:
         """(N, 2) where points p_obj (N, 3) show under a pose.
 
-        NaN for those outside the mask, and for those that measured depth contradicts by more than ``off_m``: something
-        hides them, the object itself included.
+        NaN for those outside the mask, and for those that the measured depth contradicts: something hides them, the
+        object itself included.
         """
         p_cam = se3.transform(T_cam_obj, p_obj)
         uv_px = self.camera.project(p_cam)
         at = np.flatnonzero((p_cam[:, 2] > 0) & self.camera.inside(uv_px))
         u, v = np.rint(uv_px[at]).astype(int).T
-        at = at[observation.mask[v, u] & (np.abs(observation.frame.depth_m[v, u] - p_cam[at, 2]) < off_m)]
+        at = at[obs.mask[v, u] & (np.abs(obs.frame.depth_m[v, u] - p_cam[at, 2]) < _HIDDEN_M)]
         expected = np.full_like(uv_px, np.nan)
         expected[at] = uv_px[at]
         return expected

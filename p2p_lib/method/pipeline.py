@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,12 +30,11 @@ from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
 from p2p_lib.method.object_model import NO_IDS, Requests
-from p2p_lib.method.object_tracker import ObjectTracker, Proposal
+from p2p_lib.method.object_tracker import ObjectTracker
+from p2p_lib.method.observation import Observation
 
 #: Object to (H, W) bool; None where nobody knows.
 Masks = dict[str, np.ndarray | None]
-#: How often a better pose may find more points in one frame.
-_REDETECTION_ROUNDS = 3
 NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
@@ -136,52 +135,40 @@ class Point2Pose:
         if len(self._waiting) <= self.tracker.latency_frames:
             return {}
         frame, masks, clicks = self._waiting.popleft()
-        self.masks = masks | self._segment(frame, tracks, clicks)
-        # An object added since then is not in that frame's masks yet.
+        self.tracks, self.masks = tracks, masks | self._segment(frame, tracks, clicks)
+        # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
         objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
-        proposals = {name: obj.propose(frame, self.masks[name], tracks) for name, obj in objects.items()}
-        self._reject(proposal.reject for proposal in proposals.values())
-        self.tracks, proposals = self._redetect(objects, proposals, tracks)
-        steps = {name: obj.step(proposals[name]) for name, obj in objects.items()}
+        seen = {name: obj.observe(frame, self.masks[name], tracks) for name, obj in objects.items()}
+        self._apply({name: obj.misplaced(seen[name]) for name, obj in objects.items()})
+        seen |= self._redetect(seen)
+        steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
         self._apply({name: step.requests for name, step in steps.items()})
         return {name: steps[name].estimate for name in self.objects if name in steps}
 
-    def _redetect(
-        self, objects: dict[str, ObjectTracker], proposals: dict[str, Proposal], tracks: Tracks
-    ) -> tuple[Tracks, dict[str, Proposal]]:
-        """Guided re-detection: the tracker looks for points where their object expects them.
+    def _redetect(self, seen: Mapping[str, Observation]) -> dict[str, Observation]:
+        """Guided re-detection: the tracker looks for points where their objects expect them; what is seen then."""
+        if self.tracker.latency_frames:
+            return {}
+        expected = {name: self.objects[name].expected_px(obs) for name, obs in seen.items()}
+        with self.stopwatch("tracking"):
+            for name, uv_px in expected.items():
+                found = None if uv_px is None else self.tracker.suggest(self.objects[name].map.ids, uv_px)
+                self.tracks = self.tracks if found is None else found
+        sought = [name for name, uv_px in expected.items() if uv_px is not None]
+        return {name: self.objects[name].observe(seen[name].frame, seen[name].mask, self.tracks) for name in sought}
 
-        A pose from a few points finds more points, which make a better pose, which finds more.
-        """
-        seeking = dict(objects) if not self.tracker.latency_frames else {}
-        for _ in range(_REDETECTION_ROUNDS):
-            expected = {name: obj.expected_px(proposals[name]) for name, obj in seeking.items()}
-            seeking = {name: obj for name, obj in seeking.items() if expected[name] is not None}
-            for name, obj in list(seeking.items()):
-                with self.stopwatch("tracking"):
-                    found = self.tracker.suggest(obj.map.ids, expected[name])
-                if found is None:
-                    return tracks, proposals
-                before, proposals[name] = proposals[name], obj.redetected(proposals[name], found)
-                tracks = found
-                if proposals[name].observation.seen.sum() <= before.observation.seen.sum():
-                    del seeking[name]
-        return tracks, proposals
-
-    def _reject(self, rejected: Iterable[np.ndarray]) -> None:
-        ids = np.concatenate([NO_IDS, *rejected])
-        if len(ids):
-            self.tracker.reject(ids)
-
-    def _apply(self, requests: dict[str, Requests]) -> None:
-        """The one place where what objects ask of the shared tracker is done."""
-        self._reject(request.reject for request in requests.values())
+    def _apply(self, requests: Mapping[str, Requests]) -> None:
+        """The one place where the shared tracker is changed, after all objects have been looked at."""
+        rejected = np.concatenate([NO_IDS, *(request.reject for request in requests.values())])
+        if len(rejected):
+            self.tracker.reject(rejected)
         for name, request in requests.items():
+            dropped = request.drop
             if len(request.keys):
                 unused = self.objects[name].map.assign(request.keys, self.tracker.add(request.add_px))
-                self.tracker.drop(np.concatenate([request.drop, unused]))
-            elif len(request.drop):
-                self.tracker.drop(request.drop)
+                dropped = np.concatenate([dropped, unused])
+            if len(dropped):
+                self.tracker.drop(dropped)
 
     def _given(self, frame: Frame, masks: Mapping[str, np.ndarray] | None) -> Masks:
         """Every object's checked mask in this frame; None for one of which nobody knows (yet)."""
@@ -212,7 +199,7 @@ class Point2Pose:
             return {}
         with self.stopwatch("segmentation"):
             hints = {name: self.objects[name].hint(frame, tracks) for name in self.segmenter.names}
-            self._reject(rejected for _, rejected in hints.values())
+            self._apply({name: requests for name, (_, requests) in hints.items()})
             labels = self.segmenter.segment(frame, clicks, {name: hint for name, (hint, _) in hints.items()})
             return {name: labels == label for label, name in enumerate(self.segmenter.names, 1)}
 

@@ -28,6 +28,10 @@ _DAMPING, _DAMPING_FACTOR = 1e-4, 5.0
 _MAX_STEP_M, _MAX_STEP_RAD = 0.02, 0.2
 #: A smaller gain, in squared standard deviations, ends the iterations.
 _TOLERANCE = 0.2
+#: Residuals beyond so many median absolute deviations are left out (the release's).
+_MAD_TRIM = 2.5
+#: Depth errors of neighbours are correlated: together, the points are worth so many independent ones.
+_INDEPENDENT_POINTS = 100
 #: Step of the numeric gradient (the release's).
 _GRADIENT_VOXELS = 0.5
 #: No map is exact to less than this share of its voxels, however little the points scatter.
@@ -40,6 +44,10 @@ class Surface(Protocol):
 
     tau_m: float
     voxel_m: float
+
+    def corners_m(self) -> np.ndarray:
+        """(8, 3) corners that bound it in the object frame."""
+        ...
 
     def query(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance in metres and validity at points of the object frame."""
@@ -207,7 +215,7 @@ class _Problem:
         middle = _median(value[near])
         scatter = _MAD_TO_SIGMA * _median(np.abs(value[near] - middle))
         sigma = max(scatter, _SIGMA_FLOOR_VOXELS * self.volume.voxel_m)
-        cut = max(abs(middle) + self.config.mad_trim * sigma, self.config.huber_m, widest_m)
+        cut = max(abs(middle) + _MAD_TRIM * sigma, self.config.huber_m, widest_m)
         used = near[np.abs(value[near]) <= cut]
         r = value[used]
         J = surface_jacobian((p_obj[used] - self.centre) / self.radius, gradient[used])
@@ -245,7 +253,7 @@ class _Problem:
 
     def effective_information(self, at: _Linear) -> float:
         """Independent observations per squared metre: depth errors of neighbours are correlated."""
-        return min(at.used, self.config.independent_points) / at.sigma_m**2
+        return min(at.used, _INDEPENDENT_POINTS) / at.sigma_m**2
 
     @property
     def floor(self) -> float:
@@ -333,21 +341,21 @@ def surface_jacobian(q: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x, -a, -b, -c], -1)
 
 
-def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
+def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H, N) absolute TSDF value in metres of the points p_cam (N, 3) under poses (H, 4, 4).
 
     Its mean over the points is the paper's measure for choosing a hypothesis. A point that falls where nothing was
-    observed counts ``unseen`` times the truncation distance, so that no pose wins by turning away from the surface.
+    observed counts the truncation distance, so that no pose wins by turning away from the surface.
     Points that are not finite are left out.
     """
     T_cam_obj = np.asarray(T_cam_obj, float).reshape(-1, 4, 4)
     value, valid = volume.query(se3.transform(se3.inverse(T_cam_obj), _usable(p_cam, len(p_cam))))
-    return np.where(valid, np.abs(value), unseen * volume.tau_m)
+    return np.where(valid, np.abs(value), volume.tau_m)
 
 
-def surface_score(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
+def surface_score(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H,) mean of :func:`surface_distances`; infinite without any finite point."""
-    distance_m = surface_distances(volume, p_cam, T_cam_obj, unseen)
+    distance_m = surface_distances(volume, p_cam, T_cam_obj)
     return distance_m.mean(1) if distance_m.size else np.full(len(distance_m), np.inf)
 
 
@@ -371,15 +379,13 @@ def _usable_keypoints(keypoints: Keypoints | None, config: RefinementConfig) -> 
 _STRIDE = 2
 
 
-def surface_distance(
-    surface: Surface, corners_obj: np.ndarray, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray
-) -> np.ndarray:
-    """(H, W) float32 of :class:`Hint`, from every second pixel where the surface can be seen.
+def surface_distance(volume: Surface, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray) -> np.ndarray:
+    """(H, W) float32 signed distance of each measured pixel to the surface under a pose, in metres.
 
-    corners_obj (8, 3) bound the surface in the object frame.
+    Positive in front of it; NaN where it is not known. Every second pixel is asked, where the surface can be seen.
     """
     distance = np.full(depth_m.shape, np.nan, np.float32)
-    uv = camera.project(se3.transform(T_cam_obj, corners_obj))
+    uv = camera.project(se3.transform(T_cam_obj, volume.corners_m()))
     if not np.isfinite(uv).all():
         return distance
     size = np.array(depth_m.shape[::-1])
@@ -387,7 +393,7 @@ def surface_distance(
     v, u = np.mgrid[top:bottom:_STRIDE, left:right:_STRIDE]
     z = depth_m[v, u]
     p_obj = se3.transform(se3.inverse(T_cam_obj), camera.unproject(np.stack([u, v], -1), z).reshape(-1, 3))
-    value, known = surface.query(p_obj)
+    value, known = volume.query(p_obj)
     found = np.where(known & (z.ravel() > 0), value, np.nan).reshape(z.shape)
     coarse = np.repeat(np.repeat(found, _STRIDE, 0), _STRIDE, 1)
     distance[top:bottom, left:right] = coarse[: bottom - top, : right - left]

@@ -21,8 +21,6 @@ from p2p_lib.core.robust import fit_rigid_inertia
 _DETERMINED_RAD = 0.35
 # What is known of a pose before any point is seen: keeps covariances finite.
 _UNKNOWN_RAD, _UNKNOWN_M = np.pi, 1.0
-#: Fewest inliers of a pose by which to look for more.
-MINIMAL = 3
 #: An inlier's residual is at most this many standard deviations of the point's noise, where that is known.
 _INLIER_SIGMAS = 3.0
 

@@ -16,12 +16,6 @@ from p2p_lib.core.config import SelectionConfig
 from p2p_lib.method.registration import Hypothesis
 
 
-def supported(hypotheses: Sequence[Hypothesis], config: SelectionConfig) -> list[Hypothesis]:
-    """Those with enough support to be compared on the surface, in the same order."""
-    most = max((h.support for h in hypotheses), default=0)
-    return [h for h in hypotheses if h.support >= min(config.min_support, config.min_support_share * most)]
-
-
 def motion_weight(
     T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray], config: SelectionConfig
 ) -> np.ndarray | None:
@@ -60,8 +54,8 @@ def best_supported(
 ) -> tuple[int | None, str]:
     """The best supported hypothesis unless the surface prefers another, and why; see :func:`select`.
 
-    It does where the other one is nearer by ``surface_sigmas`` standard errors and ``surface_margin_m``. The same
-    points are compared under both poses, so the difference of each counts.
+    It does where the other one is nearer by more than ``surface_sigmas`` standard errors. The same points are
+    compared under both poses, so the difference of each counts.
     """
     best = _best(hypotheses, weight)
     scores = _scores(distance_m)
@@ -70,7 +64,7 @@ def best_supported(
     nearest = int(np.argmin(scores))
     nearer = distance_m[best] - distance_m[nearest]
     chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
-    if scores[best] - scores[nearest] > max(chance, config.surface_margin_m):
+    if scores[best] - scores[nearest] > chance:
         return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
     return best, "most inliers, the surface does not tell the hypotheses apart"
 
