@@ -273,9 +273,9 @@ def _log_keypoints(log: KeypointLog, frame: Frame, method: Point2Pose) -> None:
 def _save_maps(method: Point2Pose, keypoints: KeypointLog, out: Path) -> None:
     """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
     for name, obj in method.objects.items():
-        if obj.surface is None or obj.surface.empty:
+        if not obj.model.has_surface:
             continue
-        mesh = obj.surface.mesh()
+        mesh = obj.model.surface.mesh()
         if len(mesh.faces):
             save_mesh(mesh, out / "meshes" / f"{name}.ply")
     maps = {name: obj.map for name, obj in method.objects.items()}
