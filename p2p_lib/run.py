@@ -266,7 +266,7 @@ def _log_keypoints(log: KeypointLog, frame: Frame, method: Point2Pose) -> None:
     """Keep where each object's points were seen in the frame that has just been estimated."""
     tracks = method.tracks
     for name, obj in method.objects.items():
-        seen = tracks.visible & np.isin(tracks.ids, obj.map.ids)
+        seen = tracks.visible & np.isin(tracks.ids, obj.model.map.ids)
         log.add(frame.index, name, tracks.ids[seen], tracks.uv_px[seen])
 
 
@@ -278,7 +278,7 @@ def _save_maps(method: Point2Pose, keypoints: KeypointLog, out: Path) -> None:
         mesh = obj.model.surface.mesh()
         if len(mesh.faces):
             save_mesh(mesh, out / "meshes" / f"{name}.ply")
-    maps = {name: obj.map for name, obj in method.objects.items()}
+    maps = {name: obj.model.map for name, obj in method.objects.items()}
     keypoints.save(out, {name: (m.ids, m.p_obj, m.promoted) for name, m in maps.items()})
 
 

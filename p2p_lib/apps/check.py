@@ -338,7 +338,7 @@ def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Findin
     taken = choose(found, np.zeros((0, 2)), config.sampling.max_visible, config.sampling)
     u, v = np.rint(found.uv_px[taken]).astype(int).T
     contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]
-    count, needed = int((contrast >= config.tracking.bare_contrast).sum()), config.lifecycle.return_inliers
+    count, needed = int((contrast >= config.tracking.textureless_contrast).sum()), config.lifecycle.return_inliers
     text = f"places to track in frame {frame.index}: {count}"
     if count < needed:
         fix = "Come nearer, light it better, or begin with a textured side: then its surface alone carries the pose."

@@ -59,7 +59,7 @@ def _arg(*flags: str, **how: Any) -> Argument:
 
 
 def _options(*wanted: str, **helps: str) -> Argument:
-    """Options of a run (:class:`RunOptions`) that a command has as well."""
+    """Options of a run (:class:`RunOptions`) that a command has as well; ``helps`` says what some mean to it."""
     return lambda parser: add_options(parser, *wanted, **helps)
 
 
@@ -124,13 +124,7 @@ def _run(a: argparse.Namespace) -> int:
     "track objects before a camera; a line of JSON per object and frame",
     _arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
     _arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
-    _options(
-        *METHOD,
-        "prompts",
-        "masks",
-        prompts="clicks; without, the first image is clicked on",
-        masks="segmenter: builtin (default) or sam2",
-    ),
+    _options(*METHOD, prompts="clicks; without, the first image is clicked on", masks="segmenter (default: builtin)"),
     _NO_BROWSER,
 )
 def _live(a: argparse.Namespace) -> None:
@@ -145,9 +139,8 @@ def _live(a: argparse.Namespace) -> None:
     try:
         if not prompts:
             prompts, first = click_first(camera, _warn, not a.no_browser)
-        track_live(
-            camera, prompts, lambda estimate: print(json_line(estimate), flush=True), options, first=first, count=count
-        )
+        show = partial(print, flush=True)
+        track_live(camera, prompts, lambda e: show(json_line(e)), options, first=first, count=count)
     except KeyboardInterrupt:
         pass  # how one stops a camera
     finally:
@@ -164,15 +157,10 @@ def _live(a: argparse.Namespace) -> None:
     _arg("run", type=Path, nargs="?", metavar="DIR", help="folder written by p2p run"),
     _arg("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)"),
     _arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
-    _options("format", "start", "stop", "models", format="layout of --sequence (default: recognised)"),
+    _options("start", "stop", "models", format="layout of --sequence (default: recognised)"),
     _JSON,
     _arg("--rows", action="store_true", help="every number as a CSV row: all forms, Chamfer, returns"),
-    _arg(
-        "--align",
-        choices=("first", "all"),
-        default="first",
-        help="object frame fixed at the first scored frame (default), or by one constant over all",
-    ),
+    _arg("--align", choices=("first", "all"), default="first", help="object frame: by the first scored frame, or all"),
     _MIN_VISIBLE,
 )
 def _eval(a: argparse.Namespace) -> None:
@@ -210,14 +198,9 @@ def _eval_masks(a: argparse.Namespace) -> None:
     "eval-tracks",
     "score a 2D point tracker against true tracks",
     _SEQUENCE,
-    _options("settings", "seed", "tracker", "format", "depth_scale", "models", models="meshes; else by measured depth"),
+    _options("settings", "seed", "tracker", "format", "depth_scale", models="meshes; else by measured depth"),
     _arg("--queries", type=int, default=256, metavar="N", help="points to follow (default 256)"),
-    _arg(
-        "--search",
-        choices=("image", "picture", "masks"),
-        default="image",
-        help="where invisible points are looked for",
-    ),
+    _arg("--search", choices=("picture", "masks"), default="picture", help="where invisible points are looked for"),
     _JSON,
 )
 def _eval_tracks(a: argparse.Namespace) -> None:
@@ -242,7 +225,7 @@ def _eval_tracks(a: argparse.Namespace) -> None:
 def _benchmark(a: argparse.Namespace) -> int:
     from p2p_lib.benchmark import plan_names, read_plan, run_benchmarks
     from p2p_lib.core.paths import data_dir
-    from p2p_lib.studies.paper_tables import write_table
+    from p2p_lib.studies.final_tables import write_table
 
     if a.list:
         for name in plan_names():
@@ -251,8 +234,7 @@ def _benchmark(a: argparse.Namespace) -> int:
         print("(data: ...) is looked for below $P2P_DATA, see p2p data list; with --quick no plan needs any.")
         return 0
     if not a.plan or a.out is None:
-        usage = "p2p benchmark PLAN --out DIR; p2p benchmark --list names them"
-        raise BadInput("benchmark", "no plan or no --out", usage)
+        raise BadInput("benchmark", "no plan or no --out", "PLAN --out DIR; p2p benchmark --list names the plans")
     if not a.quick and data_dir() is None and (lacking := [str(plan) for plan in a.plan if read_plan(plan).data]):
         what = f"{', '.join(lacking)}: $P2P_DATA is not set, so what needs data will not run"
         _warn(f"p2p benchmark: {what}. Set it (see p2p data list), or add --quick.")
@@ -278,11 +260,7 @@ def _benchmark(a: argparse.Namespace) -> int:
     _RUN,
     _arg("--format", required=True, choices=("bop", "tum", "poses"), help="BOP CSV, TUM, or 4x4 files"),
     _arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
-    _arg(
-        "--frame",
-        choices=("object", "model"),
-        help="the tracker's own object frame, or the model's by the truth of the first scored frame (default for bop)",
-    ),
+    _arg("--frame", choices=("object", "model"), help="of the tracker, or by truth the model's (default for bop)"),
 )
 def _export(a: argparse.Namespace) -> None:
     from p2p_lib.apps.evaluate import export_run
@@ -339,7 +317,7 @@ def _notebooks(a: argparse.Namespace) -> None:
     _arg("--frame", type=int, default=0, metavar="I", help="frame to begin with (default 0)"),
     _arg("--port", type=int, default=0, metavar="N", help="of the page (default: a free one)"),
     _NO_BROWSER,
-    _options("format", "depth_scale", "seed", seed="of a synthetic sequence (default 0)"),
+    _options("format", "depth_scale", seed="of a synthetic sequence (default 0)"),
 )
 def _click(a: argparse.Namespace) -> None:
     from p2p_lib.apps.click import check_writable, collect_clicks, wait_for_clicks
@@ -356,7 +334,7 @@ def _click(a: argparse.Namespace) -> None:
     "check",
     "look at data of your own: what is wrong with it and what to do",
     _arg("sequence", metavar="FOLDER", help="rgb/ depth/ cam_K.txt masks/, or any sequence"),
-    _options("prompts", "format", "depth_scale", prompts="clicks, where there are no masks"),
+    _options("format", "depth_scale", prompts="clicks, where there are no masks"),
     _JSON,
 )
 def _check(a: argparse.Namespace) -> int:
@@ -388,7 +366,7 @@ def _synth(a: argparse.Namespace) -> None:
         print("\n".join(f"{name:18}{re.sub('`+', '', describe(name))}" for name in SCENARIOS))
         return
     if a.scenario is None or a.out is None:
-        raise BadInput("synth", "no scenario or no --out", "p2p synth SCENARIO --out DIR; p2p synth --list names them")
+        raise BadInput("synth", "no scenario or no --out", "SCENARIO --out DIR; p2p synth --list names the scenarios")
     if unknown := unknown_scenario(a.scenario, SCENARIOS):
         raise unknown
     out = write_sequence(a.scenario.removeprefix(SYNTHETIC), a.out, a.seed, a.noise, a.models or "", a.bop)

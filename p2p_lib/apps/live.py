@@ -9,8 +9,11 @@ import json
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from time import monotonic
+
+import numpy as np
 
 from p2p_lib.apps.click import collect_clicks, wait_for_clicks
 from p2p_lib.core.backends import DEFAULT_SEGMENTER
@@ -19,7 +22,6 @@ from p2p_lib.core.options import RunOptions
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.cameras import LiveCamera, Newest, Still
 from p2p_lib.datasets.prompts import Prompt
-from p2p_lib.method.object_tracker import make_volume
 from p2p_lib.method.pipeline import Point2Pose
 
 
@@ -66,7 +68,7 @@ def track_live(
     segmenter = options.masks or DEFAULT_SEGMENTER
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
     if config.method.surface:
-        make_volume(config.tsdf)  # what it loads takes seconds, in which the camera need not run
+        import_module("torch")  # which takes seconds, in which the camera need not run
     start_s = monotonic()
     with Newest(camera, keep={p.frame for p in prompts}) as newest:
         frame = first or newest.take()
@@ -107,17 +109,14 @@ def json_line(estimate: PoseEstimate) -> str:
     ``T_cam_obj`` (4x4, metres) and ``covariance`` (6x6, [rotation rad, translation m] on the right) are null without
     a pose.
     """
-    T_cam_obj, covariance = estimate.T_cam_obj, estimate.covariance
-    return json.dumps(
-        {
-            "time_s": round(estimate.time_s, 6),
-            "frame": estimate.frame_index,
-            "object": estimate.object,
-            "status": str(estimate.status),
-            "confidence": round(estimate.confidence, 4),
-            "T_cam_obj": None if T_cam_obj is None else T_cam_obj.tolist(),
-            "covariance": None if covariance is None else covariance.tolist(),
-            "reason": estimate.reason,
-        },
-        allow_nan=False,
-    )
+    line = {
+        "time_s": round(estimate.time_s, 6),
+        "frame": estimate.frame_index,
+        "object": estimate.object,
+        "status": str(estimate.status),
+        "confidence": round(estimate.confidence, 4),
+        "T_cam_obj": estimate.T_cam_obj,
+        "covariance": estimate.covariance,
+        "reason": estimate.reason,
+    }
+    return json.dumps(line, allow_nan=False, default=np.ndarray.tolist)

@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING, Any
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.paths import PROJECT
 from p2p_lib.figures import equations
-from p2p_lib.figures.gallery import GalleryEntry, gallery_page
 
 if TYPE_CHECKING:
     from nbformat import NotebookNode
@@ -33,21 +32,6 @@ if TYPE_CHECKING:
 #: ``quick``: bundled data, CPU, about a minute a notebook. ``full``: the data and backends that are present.
 PROFILES = ("quick", "full")
 CHECKS_MIME = "application/vnd.p2p.checks+json"
-#: JupyterLab's page without the scripts that it would fetch; a table wider than the page is scrolled, not cut off.
-_PAGE = f"""{{% extends 'lab/index.html.j2' %}}
-{{% block html_head_js %}}{{% endblock %}}
-{{% block html_head_js_mathjax %}}{{% endblock %}}
-{{% block html_head_js_mermaidjs %}}{{% endblock %}}
-{{% block html_head_css %}}
-{equations.STYLE}
-<style>
-.jp-RenderedHTMLCommon {{ overflow-x: auto; }}
-.jp-RenderedHTMLCommon table {{ width: max-content; max-width: none; }}
-.jp-RenderedMarkdown td, .jp-RenderedMarkdown th {{ padding: 0.4em 0.5em; }}
-.jp-MarkdownCell table {{ width: auto; max-width: 100%; }}
-</style>
-{{% endblock %}}"""
-
 Value = bool | int | float | str
 
 
@@ -61,13 +45,13 @@ class NotebookFailed(P2PError):
 class NotebookResult:
     """What one executed notebook holds.
 
-    name         file name without suffix, e.g. ``00_quickstart``
-    title        its first heading
-    executed     the executed notebook; its page for the browser is beside it with the suffix ``.html``
-    seconds      wall-clock time of the whole run
-    checks       what the last cell recorded
-    picture_png  its first image in base64, or empty
-    error        empty, or the cell and the message that ended the run
+    name       file name without suffix, e.g. ``00_quickstart``
+    title      its first heading
+    executed   the executed notebook; its page for the browser is beside it with the suffix ``.html``
+    seconds    wall-clock time of the whole run
+    checks     what the last cell recorded
+    image_png  its first image in base64, or empty
+    error      empty, or the cell and the message that ended the run
     """
 
     name: str
@@ -75,7 +59,7 @@ class NotebookResult:
     executed: Path
     seconds: float
     checks: dict[str, Value]
-    picture_png: str
+    image_png: str
     error: str
 
 
@@ -191,7 +175,7 @@ def read_result(executed: Path) -> NotebookResult:
     checks: dict[str, Value] = {}
     for _, output in outputs:
         checks |= output.get("data", {}).get(CHECKS_MIME, {})
-    pictures = [output.data["image/png"] for _, output in outputs if "image/png" in output.get("data", {})]
+    images = [output.data["image/png"] for _, output in outputs if "image/png" in output.get("data", {})]
     errors = [
         f"cell [{cell.execution_count}] {_failing_line(cell.source, output)!r}: "
         + " ".join(f"{output['ename']}: {output['evalue']}".split()).removesuffix(":")
@@ -203,36 +187,34 @@ def read_result(executed: Path) -> NotebookResult:
         for cell in code
         if cell.source.strip() and "shell.execute_reply" not in cell.metadata.get("execution", {})
     ]
-    title = re.search(r"(?m)^# +(.+)$", "\n".join(c.source for c in notebook.cells if c.cell_type == "markdown"))
+    titles = re.findall(r"(?m)^# +(.+)$", "\n".join(c.source for c in notebook.cells if c.cell_type == "markdown"))
     return NotebookResult(
         name=executed.stem,
-        title=title[1].strip() if title else executed.stem,
+        title=[*titles, executed.stem][0].strip(),
         executed=executed,
         seconds=float(notebook.metadata.get("papermill", {}).get("duration") or 0.0),
         checks=checks,
-        picture_png="".join(pictures[0].split()) if pictures else "",
+        image_png="".join(images[0].split()) if images else "",
         error=errors[0] if errors else "",
     )
 
 
 def write_gallery(home: Path, profile: str) -> Path:
     """``index.html`` over all executed notebooks in ``home/notebooks``: title, first image, seconds, checks."""
+    import jinja2
+
     results = [read_result(path) for path in sorted((home / "notebooks").glob("*.ipynb"))]
-    entries = [
-        GalleryEntry(
-            title=result.title,
-            line=f"{result.name}, {result.seconds:.0f} s",
-            link=result.executed.with_suffix(".html").relative_to(home).as_posix(),
-            picture_png=result.picture_png,
-            table={name: _shown(value) for name, value in result.checks.items()},
-            failure=result.error,
-        )
-        for result in results
-    ]
     seconds, numbers = sum(r.seconds for r in results), sum(len(r.checks) for r in results)
-    summary = f"{_counted(results)}, {seconds:.0f} s, {numbers} numbers recorded"
+    templates = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
+    templates.filters["shown"] = _shown
+    html = templates.get_template("gallery.html").render(
+        title=f"Point2Pose notebooks, profile {profile}",
+        summary=f"{_counted(results)}, {seconds:.0f} s, {numbers} numbers recorded",
+        failed=sum(bool(result.error) for result in results),
+        results=results,
+    )
     page = home / "index.html"
-    page.write_text(gallery_page(f"Point2Pose notebooks, profile {profile}", entries, summary), encoding="utf-8")
+    page.write_text(html, encoding="utf-8")
     return page
 
 
@@ -330,9 +312,10 @@ def _write_page(executed: Path) -> None:
     def as_html(source: str) -> str:
         return MarkdownWithMath(renderer=Renderer(escape=False)).render(source)
 
-    exporter = HTMLExporter(embed_images=True, raw_template=_PAGE)
+    template = Path(__file__).with_name("notebook.html").read_text(encoding="utf-8")
+    exporter = HTMLExporter(embed_images=True, raw_template=template)
     exporter.register_filter("markdown2html", as_html)
-    body, _ = exporter.from_filename(str(executed))
+    body, _ = exporter.from_filename(str(executed), resources={"equation_style": equations.STYLE})
     executed.with_suffix(".html").write_text(body, encoding="utf-8")
 
 

@@ -22,10 +22,11 @@ from typing import Any
 from p2p_lib.benchmark import rows
 from p2p_lib.benchmark.execution import execute
 from p2p_lib.benchmark.jobs import Job, jobs_of, open_planned
-from p2p_lib.benchmark.outcome import Outcome, load_outcome, replace_text, run_path, save_outcome
+from p2p_lib.benchmark.outcome import Outcome, load_outcome, run_path, save_outcome
 from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.benchmark.rows import Row
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import replace_text
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence

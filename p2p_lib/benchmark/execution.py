@@ -11,18 +11,19 @@ import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from multiprocessing.connection import Connection
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
 from multiprocessing.context import BaseContext
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
 
 from p2p_lib.benchmark.jobs import Job, library_version, open_planned
-from p2p_lib.benchmark.outcome import Outcome, replace_text, run_path
+from p2p_lib.benchmark.outcome import Outcome, run_path
 from p2p_lib.benchmark.scoring import scored
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from p2p_lib.core.files import replace_text
 from p2p_lib.core.packages import PIP, command
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.protocol import rate
@@ -108,50 +109,32 @@ def _on_this_machine(jobs: Iterable[Job], out: Path, at_a_time: int) -> Iterator
             shutil.rmtree(folder, ignore_errors=True)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
-    running: set[BaseProcess] = set()
+    not_ours = set(multiprocessing.active_children())
     pool = ThreadPoolExecutor(at_a_time)
     try:
-        waiting = {pool.submit(_in_a_process, context, job, out, running): job for job in jobs}
+        waiting = {pool.submit(_in_a_process, context, job, out): job for job in jobs}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in tuple(running):
+        for process in set(multiprocessing.active_children()) - not_ours:
             process.kill()
         pool.shutdown(wait=True)
 
 
-def _in_a_process(context: BaseContext, job: Job, out: Path, running: set[BaseProcess]) -> Outcome:
-    here, there = context.Pipe()
-    process = context.Process(target=_report, args=(there, job, out, library_version()))
-    process.start()
-    running.add(process)
-    there.close()  # so that its end is seen here
+def _in_a_process(context: BaseContext, job: Job, out: Path) -> Outcome:
     try:
-        outcome = here.recv()
-        process.join()
-    except EOFError:
-        process.join()
-        ended = f"by signal {-process.exitcode}" if process.exitcode < 0 else f"with exit code {process.exitcode}"
-        outcome = Outcome(key=job.key, status="failed", reason=f"its process was ended {ended}: out of memory?")
-    finally:
-        running.discard(process)
-        here.close()  # not before its end, which that would hasten
-    return outcome
+        with ProcessPoolExecutor(1, context, _end_with_parent) as process:
+            return process.submit(perform, job, out, library_version()).result()
+    except BrokenProcessPool:
+        return Outcome(key=job.key, status="failed", reason="its process was ended from outside: out of memory?")
 
 
-def _report(parent: Connection, job: Job, out: Path, library: str) -> None:
-    """What the process of a run does; it ends with its parent, which alone hears Ctrl-C."""
+def _end_with_parent() -> None:
+    """The process of a run ends with its parent, which alone hears Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    parent.send(perform(job, out, library))
-
-
-def _end_with(parent: Connection) -> None:
-    try:
-        parent.recv()  # nothing is ever sent: it returns when the parent is gone
-    except (EOFError, OSError):
-        os._exit(1)
+    gone = multiprocessing.parent_process().sentinel
+    threading.Thread(target=lambda: wait([gone]) and os._exit(1), daemon=True).start()
 
 
 def _on_cluster(jobs: Sequence[Job], out: Path, scheduler: str) -> Iterator[tuple[Job, Outcome]]:

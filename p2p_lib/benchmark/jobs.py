@@ -11,7 +11,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -24,11 +23,11 @@ from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
-from p2p_lib.datasets import manifests
+from p2p_lib.datasets import manifests, ycbmultitrack
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.datasets.resized import Resized
-from p2p_lib.datasets.sequence import FORMATS, SYNTHETIC, Sequence, open_sequence
+from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 # What only shows results cannot change them.
@@ -117,8 +116,7 @@ def open_planned(job: Job) -> Sequence:
 
         scenario = planned.name.removeprefix(SYNTHETIC)
         folder = scenario_dir(scenario, job.sequence_seed, **_synthetic(planned, method)[0])
-        layout = import_module(FORMATS["ycbmultitrack"])
-        sequence = layout.load(folder, name=planned.name, depth_scale=None, masks=masks)
+        sequence = ycbmultitrack.load(folder, name=planned.name, depth_scale=None, masks=masks)
     else:
         sequence = open_sequence(planned.name, masks=masks)
     return Resized(sequence, method.scale) if method.scale != 1 else sequence
@@ -223,18 +221,16 @@ def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
 
 def _files_hash(job: Job) -> str:
     """Content of the truth, of the models, of the first image and its masks; names and sizes of everything else."""
-    sequence = open_planned(job)
-    first, masks = sequence.frame(job.sequence.start), sequence.masks(job.sequence.start) or {}
-    digest = hashlib.sha256(first.rgb.tobytes() + first.depth_m.tobytes())
+    sequence, start = open_planned(job), job.sequence.start
+    first = sequence.frame(start)
+    parts = [("rgb", first.rgb.tobytes()), ("depth", first.depth_m.tobytes())]
+    parts += [(name, mask.tobytes()) for name, mask in sorted((sequence.masks(start) or {}).items())]
     for name, truth in sorted(sequence.truth.items()):
-        digest.update(name.encode() + truth.T_cam_model.tobytes() + truth.labelled.tobytes())
-    for name, mask in sorted(masks.items()):
-        digest.update(name.encode() + mask.tobytes())
-    for name, path in sorted({**find_models(sequence), **job.models}.items()):
-        digest.update(name.encode() + (path.read_bytes() if path.is_file() else b""))
-    if sequence.path is not None:
-        digest.update(_listing(sequence.path))
-    return digest.hexdigest()
+        parts.append((name, truth.T_cam_model.tobytes() + truth.labelled.tobytes()))
+    models = sorted((find_models(sequence) | job.models).items())
+    parts += [(name, path.read_bytes() if path.is_file() else b"") for name, path in models]
+    parts += [] if sequence.path is None else [("files", _listing(sequence.path))]
+    return _sha(b"".join(name.encode() + content for name, content in parts))
 
 
 def _listing(folder: Path) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import replace_text
 
 
 class _Record(BaseModel):
@@ -78,14 +78,3 @@ def load_outcome(out: Path, key: str) -> Outcome | None:
 def save_outcome(out: Path, outcome: Outcome) -> None:
     """Keep a record, so that a kill leaves either all of it or nothing."""
     replace_text(out / "records" / f"{outcome.key}.json", outcome.model_dump_json() + "\n")
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a file so that readers and crashes see either the old one or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with partial.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)

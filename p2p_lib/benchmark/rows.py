@@ -13,8 +13,8 @@ from p2p_lib.benchmark.jobs import Job
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome
 from p2p_lib.benchmark.plan import Plan
 from p2p_lib.evaluation import numbers
+from p2p_lib.evaluation.alignment import ALIGNMENTS
 from p2p_lib.evaluation.numbers import Number
-from p2p_lib.evaluation.protocol import ALIGNMENTS
 from p2p_lib.evaluation.recovery import WITHIN_FRAMES
 
 #: What the ``sequence`` of a row says where it is about several.

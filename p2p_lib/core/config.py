@@ -99,95 +99,99 @@ class LifecycleConfig(_Checked):
 class DepthConfig(_Checked):
     """Of measured depth: which of it is used, and how noisy it is."""
 
-    min_m: float = _p(0.1, "nearer depth is invalid", "m", "release", low=0)
-    max_m: float = _p(2.5, "farther depth is invalid", "m", low=0.1)
-    edge_m: float = _p(0.01, "a larger depth step in the 3x3 neighbourhood is an edge", "m", "release", low=0)
-    noise_m: float = _p(0.001, "standard deviation of depth at range 0", "m", low=1e-6)
-    noise_per_m2: float = _p(0.0025, "its growth with the range squared", "1/m", low=0)
+    min_m: float = _p(0.1, "Nearer depth is invalid.", "m", "release", low=0)
+    max_m: float = _p(2.5, "Farther depth is invalid.", "m", low=0.1)
+    edge_m: float = _p(0.01, "A larger depth step in the 3x3 neighbourhood is an edge.", "m", "release", low=0)
+    noise_m: float = _p(0.001, "This is the standard deviation of depth at range 0.", "m", low=1e-6)
+    noise_per_m2: float = _p(0.0025, "The standard deviation grows by this with the range squared.", "1/m", low=0)
 
 
 @dataclass(frozen=True)
 class TrackingConfig(_Checked):
-    """Of the embedded tracker, but for ``forget_after``, which all keep."""
+    """Of the built-in tracker, but for ``forget_after``, which all trackers keep."""
 
-    forget_after: int = _p(0, "SH(n): points are dropped after n invisible frames; 0 = never", "frames", low=0)
-    window_px: int = _p(13, "side of the Lucas-Kanade window", "px", low=5, high=63)
-    levels: int = _p(3, "pyramid levels of Lucas-Kanade above full resolution", low=0, high=6)
-    iterations: int = _p(4, "steps of an alignment, per resolution", low=1, high=50)
-    min_ncc: float = _p(0.7, "correlation with its appearance that a followed point keeps", low=0, high=1)
-    return_ncc: float = _p(0.8, "correlation that brings an invisible point back", low=0, high=1)
-    renew_sigma_px: float = _p(1.5, "standard deviation of a place that gives a new appearance, at most", "px", low=0)
-    colour_change: float = _p(12.0, "chroma farther from the appearance's (CIELAB) is another place", "", low=0)
-    grey_change: float = _p(50.0, "brightness farther from the appearance's is, too", "grey levels", low=0)
-    contrast_change: float = _p(2.5, "ratio of contrasts, likewise", low=1)
-    area_change: float = _p(5.0, "ratio of areas, likewise", low=1)
-    search_px: float = _p(8.0, "an alignment that ends farther off is another place", "px", low=0.5)
-    forward_backward_px: float = _p(0.7, "error there and back of a point that coasts", "px", low=0.05)
-    coast_ncc: float = _p(0.4, "correlation that a point keeps while it coasts", low=-1, high=1)
-    coast_frames: int = _p(8, "frames that Lucas-Kanade may carry a point whose looks changed", "frames", low=0)
-    coast_sigma_px: float = _p(0.7, "what each of them adds to the standard deviation", "px", low=0)
-    appearances: int = _p(5, "appearances kept per point", low=2, high=20)
-    renew_every: int = _p(3, "frames between looks for points that need a new appearance", "frames", low=1)
-    renew_stretch: float = _p(1.35, "stretch of the best appearance that asks for a new one", low=1.01)
-    renew_ncc: float = _p(0.85, "correlation below which a point wants a new appearance", low=0, high=1)
-    linger_frames: int = _p(5, "frames for which a lost point is looked for where it was", "frames", low=0)
-    redetect_every: int = _p(2, "frames between searches of a pyramid level for invisible points", "frames", low=1)
-    features: int = _p(200, "corners per searched level", "points", low=10)
-    ratio: float = _p(0.85, "nearest to second-nearest descriptor distance of a candidate", low=0.1, high=1)
-    candidates: int = _p(2, "corners tried per invisible point", low=1)
-    support: int = _p(5, "corners that must agree on where a lost body is", "points", low=0)
-    depth_jump_m: float = _p(0.02, "change of depth between frames of a point that is no longer seen", "m", low=1e-3)
-    tries: int = _p(96, "invisible points looked for per frame", "points", low=1)
-    bare_contrast: float = _p(6.0, "contrast below which a point has no looks of its own", "grey levels", low=0)
-    body_points: int = _p(3, "points that must agree on a body's pose", "points", low=3)
-    body_reach_m: float = _p(0.04, "points nearer than this start as one rigid body", "m", low=1e-3)
-    body_m: float = _p(0.008, "residual of a match that agrees on a body's pose when it is found", "m", low=1e-4)
-    find_share: float = _p(0.5, "of the points that a found body should show, those that must be there", low=0, high=1)
-    keep_share: float = _p(0.2, "the same while it is followed", low=0, high=1)
-    split_points: int = _p(8, "points that must leave a body together to be another one", "points", low=3)
-    split_m: float = _p(0.02, "how far they must be from where it takes them", "m", low=1e-3)
-    join_looks: int = _p(5, "looks, renew_every apart, over which two bodies that are one move alike", low=2)
-    guess_px: float = _p(3.0, "standard deviation up to which a body alone shows a point", "px", low=0)
-    min_cosine: float = _p(0.1, "of surface normal and view: surface turned away further is invisible", low=-1, high=1)
-    repeats: float = _p(4.0, "frames in a row whose errors count as one observation of a place on a body", low=1)
-    shun_frames: int = _p(15, "frames for which a body is not looked for where it was found in error", "frames", low=0)
-    survey_deg: float = _p(15.0, "turn that shows a new side of a body", "deg", low=1)
-    max_landmarks: int = _p(2500, "corners remembered of a body", "points", low=100)
-    landmarks: int = _p(400, "corners of a lost body looked for in a frame", "points", low=10)
-    anchor_px: int = _p(24, "corners nearer than this are remembered with a point", "px", low=1)
-    uncertain_px: float = _p(1.5, "standard deviation that reads as an uncertainty of 1/2", "px", low=0.01)
+    forget_after: int = _p(
+        0, "SH(n): points are dropped after this many invisible frames; 0 means never.", "frames", low=0
+    )
+    window_px: int = _p(13, "Side of the Lucas-Kanade window.", "px", low=5, high=63)
+    templates: int = _p(5, "Templates kept of a point's appearance.", low=2, high=20)
+    update_every: int = _p(3, "Templates, segments and landmarks are updated every so many frames.", "frames", low=1)
+    update_scale_change: float = _p(
+        1.35, "A new template is taken when the best one appears scaled by this factor or more.", low=1.01
+    )
+    update_ncc: float = _p(
+        0.85, "A new template is taken when the correlation with the best one is lower.", low=0, high=1
+    )
+    min_ncc: float = _p(0.7, "A followed point keeps at least this correlation with its template.", low=0, high=1)
+    return_ncc: float = _p(0.8, "A point that was invisible returns with at least this one.", low=0, high=1)
+    max_colour_change: float = _p(12.0, "A larger difference of chroma (CIELAB) means another point.", low=0)
+    max_contrast_change: float = _p(2.5, "A larger ratio of contrasts means another point.", low=1)
+    search_px: float = _p(8.0, "A point is searched for no farther from its prediction than this.", "px", low=0.5)
+    coast_frames: int = _p(
+        8, "Lucas-Kanade alone carries a point whose appearance changed for at most so many frames.", "frames", low=0
+    )
+    forward_backward_px: float = _p(
+        0.7, "Lucas-Kanade forward and backward may differ by this much for such a point.", "px", low=0.05
+    )
+    linger_frames: int = _p(
+        5, "A point or segment that was lost is searched for where it was for so many frames.", "frames", low=0
+    )
+    depth_jump_m: float = _p(
+        0.02, "Depth that differs more from a point's prediction belongs to another surface.", "m", low=1e-3
+    )
+    textureless_contrast: float = _p(6.0, "A point with less contrast is not searched for.", "grey levels", low=0)
+    max_predicted_sigma_px: float = _p(
+        3.0, "A point that is not recognised counts as visible if its segment predicts it this well.", "px", low=0
+    )
+    uncertain_px: float = _p(1.5, "A position with this standard deviation has an uncertainty of 1/2.", "px", low=0.01)
+    segment_min_points: int = _p(3, "A segment's pose needs so many points, its start twice as many.", "points", low=3)
+    segment_reach_m: float = _p(0.04, "Points nearer to each other than this start in one segment.", "m", low=1e-3)
+    segment_inlier_m: float = _p(
+        0.008, "Pairs of points with a smaller residual agree with a motion that is searched for.", "m", low=1e-4
+    )
+    split_points: int = _p(8, "So many points that leave a segment together make another one.", "points", low=3)
+    split_m: float = _p(0.02, "They do so when they are this far from their segment's motion.", "m", low=1e-3)
+    redetect_every: int = _p(2, "Lost segments are searched for everywhere every so many frames.", "frames", low=1)
+    corners: int = _p(200, "So many corners of an image are described.", "points", low=10)
+    match_ratio: float = _p(
+        0.85, "A corner matches a landmark if it is nearer than this times the next best place.", low=0.1, high=1
+    )
+    min_landmark_matches: int = _p(5, "A lost segment is found where so many corners agree.", "points", low=3)
+    reject_frames: int = _p(
+        15, "A segment is not searched for where the caller rejected it for so many frames.", "frames", low=0
+    )
+    landmark_view_deg: float = _p(
+        15.0, "Landmarks are added when a segment is seen from a direction this far from all before.", "deg", low=1
+    )
+    max_landmarks: int = _p(2500, "No more landmarks of a segment are kept.", "points", low=100)
 
 
 @dataclass(frozen=True)
 class OracleConfig(_Checked):
     """Of the tracker ``oracle``, which knows the truth; no part of the method."""
 
-    noise_px: float = _p(0.5, "standard deviation of a visible point's position, per axis", "px", low=0)
-    dropout: float = _p(0.0, "share of the visible points called invisible in a frame", low=0, high=1)
-    outliers: float = _p(0.0, "share of the visible points reported at a wrong place in a frame", low=0, high=1)
-    outlier_px: float = _p(30.0, "how far off those are", "px", low=0)
+    noise_px: float = _p(0.5, "This is the standard deviation of a visible point's position, per axis.", "px", low=0)
+    dropout: float = _p(0.0, "This share of the visible points is called invisible in a frame.", low=0, high=1)
+    outliers: float = _p(
+        0.0, "This share of the visible points is reported at a wrong place in a frame.", low=0, high=1
+    )
+    outlier_px: float = _p(30.0, "Points at a wrong place are this far off.", "px", low=0)
 
 
 @dataclass(frozen=True)
 class SegmentationConfig(_Checked):
-    """Of the embedded segmenter, which starts from clicks."""
+    """Of the built-in segmenter, which starts from clicks."""
 
-    side_px: int = _p(112, "longest side of the grid on which an object is cut out", "px", low=16, high=640)
-    reach_m: float = _p(0.3, "no object is larger than this to any side of its clicks", "m", low=0.01)
-    margin: float = _p(0.35, "room around the object, in its own size", low=0.05, high=2)
-    start_rounds: int = _p(3, "rounds of cutting and learning colours in the first frame", low=1)
-    iterations: int = _p(40, "conjugate gradient steps of a cut at most", low=1)
-    evidence_strength: float = _p(0.06, "weight of a pixel's certain evidence beside a tie to a like neighbour", low=0)
-    colour_weight: float = _p(0.7, "of colour evidence: neighbouring pixels repeat each other", low=0, high=1)
-    colour_rate: float = _p(0.05, "share of a frame in the object's remembered colours", low=0, high=1)
-    geometry_weight: float = _p(2.0, "log odds by hanging together in depth, and by lying in the support plane", low=0)
-    prior_weight: float = _p(2.5, "log odds by where the object was a frame ago", low=0)
-    surface_weight: float = _p(1.5, "log odds by lying on the reconstructed surface or clearly before it", low=0)
-    surface_m: float = _p(0.008, "distance to the reconstructed surface that still counts as on it", "m", low=1e-4)
-    contradiction: float = _p(3.0, "log odds against a pixel whose depth jumped since the last frame", low=0)
-    find_points: int = _p(8, "agreeing tracked points that say where an absent object is back", "points", low=3)
-    min_share: float = _p(0.03, "of the area it showed lately; an object that shows less is absent", low=0, high=1)
-    min_px: int = _p(40, "fewer pixels are absent", "px", low=1)
+    side_px: int = _p(112, "The grid on which an object is cut out has this longest side.", "px", low=16, high=640)
+    reach_m: float = _p(0.3, "No object is larger than this to any side of its clicks.", "m", low=0.01)
+    margin: float = _p(0.35, "This much room is left around the object, in its own size.", low=0.05, high=2)
+    colour_weight: float = _p(0.7, "Colour evidence counts this much: neighbours repeat each other.", low=0, high=1)
+    colour_rate: float = _p(0.05, "A frame has this share in the object's remembered colours.", low=0, high=1)
+    geometry_weight: float = _p(2.0, "These are the log odds by connected depth and by the support plane.", low=0)
+    prior_weight: float = _p(2.5, "These are the log odds by where the object was a frame ago.", low=0)
+    surface_weight: float = _p(1.5, "These are the log odds by lying on the reconstructed surface.", low=0)
+    find_points: int = _p(8, "So many agreeing tracked points say where an absent object is back.", "points", low=3)
+    min_px: int = _p(40, "An object of fewer pixels is absent.", "px", low=1)
 
 
 @dataclass(frozen=True)

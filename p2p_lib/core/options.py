@@ -127,14 +127,12 @@ class RunOptions:
 
 
 def add_options(parser: argparse.ArgumentParser, *wanted: str, **helps: str) -> None:
-    """Make command-line arguments of these fields of :class:`RunOptions`; none named: of all.
+    """Make command-line arguments of the fields of :class:`RunOptions` that are wanted; none named: of all.
 
-    helps  field to what it means to this command, where that is not what it means to a run
+    helps  further fields, with what they mean to this command where that is not what they mean to a run
     """
     for option in fields(RunOptions):
-        if not wanted or option.name in wanted:
+        if option.name in (*wanted, *helps) or not (wanted or helps):
             flag = option.metadata["flag"] or "--" + option.name.replace("_", "-")
-            argument = {**option.metadata["how"], "dest": option.name, "default": option.default}
-            if option.name in helps:
-                argument["help"] = helps[option.name]
-            parser.add_argument(flag, **argument)
+            how = {**option.metadata["how"], "dest": option.name, "default": option.default}
+            parser.add_argument(flag, **how | ({"help": helps[option.name]} if option.name in helps else {}))

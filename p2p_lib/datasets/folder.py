@@ -20,11 +20,6 @@ from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import Sequence
 
 
-def recognises(folder: Path) -> bool:
-    """Whether a folder has ``rgb/``."""
-    return (folder / "rgb").is_dir()
-
-
 def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)

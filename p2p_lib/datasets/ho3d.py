@@ -29,11 +29,6 @@ DEPTH_SCALE = 0.00012498664727900177  # metres per unit, from the dataset's own 
 T_CV_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def recognises(folder: Path) -> bool:
-    """Whether a folder has ``meta/*.pkl``."""
-    return any((folder / "meta").glob("*.pkl"))
-
-
 def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     rgb, depth = paired_images(folder)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from io import StringIO
 from pathlib import Path
 
 import cv2
@@ -44,18 +43,16 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts] + [(0, path.name)]
 
 
-def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...]) -> tuple[Path, ...]:
+def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...], hint: str = "") -> tuple[Path, ...]:
     """``files``, if there is one for each of ``reference``: the i-th belongs to the i-th in sorted order."""
     if len(files) == len(reference):
         return files
     stems, wanted = {p.stem for p in files}, {p.stem for p in reference}
-    odd = sorted(wanted - stems) if len(files) < len(reference) else sorted(stems - wanted)
-    hint = ""
+    odd, fault = (wanted - stems, "missing") if len(files) < len(reference) else (stems - wanted, "too many")
     if odd and stems & wanted:
-        hint = f"{odd[0]}{files[0].suffix} is " + ("missing." if len(files) < len(reference) else "too many.")
-    raise BadInput(
-        str(files[0].parent), f"{len(files)} files", f"{len(reference)}, one for each in {reference[0].parent}", hint
-    )
+        hint = f"{min(odd)}{files[0].suffix} is {fault}. {hint}".strip()
+    expected = f"{len(reference)}, one for each in {reference[0].parent}"
+    raise BadInput(str(files[0].parent), f"{len(files)} files", expected, hint)
 
 
 def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
@@ -83,9 +80,10 @@ def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
 
 def read_numbers(path: Path, expected: str) -> np.ndarray:
     """(rows, columns) float64 of a text file of numbers between spaces or commas; ``expected`` says what they are."""
-    text = _read(path, expected).decode("utf-8", "replace")
+    lines = _read(path, expected).decode("utf-8", "replace").replace(",", " ").splitlines()
+    lines = [line for line in lines if line.partition("#")[0].strip()]
     try:
-        return np.loadtxt(StringIO(text.replace(",", " ")), ndmin=2) if text.strip() else np.empty(0)
+        return np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
     except ValueError as error:
         reason = str(error).partition(";")[0].removesuffix(".")
         raise BadInput(str(path), f"unreadable numbers ({reason})", expected) from None

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.progress import progress_bar
@@ -186,10 +188,7 @@ def _verify_listed(path: Path) -> Check:
 def _verify_sequences(of: Manifest, folder: Path, every_frame: bool) -> Iterator[Check]:
     frames = {entry.name: entry.frames for entry in of.sequences}
     found = sorted(path.parent.name for path in folder.glob("*/rgb") if path.is_dir())
-    for name in [*frames, *(name for name in found if name not in frames)]:
-        if name not in found:
-            yield Check(name, False, "sequence not there")
-            continue
+    for name in dict.fromkeys([*frames, *found]):
         try:
             yield _verify_sequence(folder / name, of.format, frames.get(name), every_frame)
         except P2PError as error:
@@ -246,8 +245,9 @@ def _holds_files(folder: Path) -> bool:
 def describe(of: Manifest) -> str:
     """All that its manifest says, for people."""
     place = f"$P2P_DATA/{of.folder}" if paths.data_dir() is None else str(folder_of(of))
+    how = f"p2p data fetch {of.name}." if of.access == "open" else "By hand."
     lines = [f"{of.title} ({of.name}, version {of.version})", f"licence   {of.licence}", f"page      {of.page}"]
-    lines += [f"place     {place}", f"get it    {_access(of)} {of.how_to_get}"]
+    lines += [f"place     {place}", f"get it    {how} {of.how_to_get}"]
     lines += [f"used by   {of.used_by}"] if of.used_by else []
     lines += [f"unit      {what}: {unit}" for what, unit in of.units.items()]
     lines += [f"layout    {line}" for line in of.layout]
@@ -261,15 +261,6 @@ def describe(of: Manifest) -> str:
     return "\n".join([*lines, f"cite      {of.citation}"])
 
 
-def _access(of: Manifest) -> str:
-    return f"p2p data fetch {of.name}." if of.access == "open" else "By hand."
-
-
 def human_size(count: int | None) -> str:
-    """``1.2 GB``; "size unknown" of None."""
-    if count is None:
-        return "size unknown"
-    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= scale:
-            return f"{count / scale:.3g} {unit}"
-    return f"{count} bytes"
+    """``1.20GB``; "size unknown" of None."""
+    return "size unknown" if count is None else tqdm.format_sizeof(count, "B")

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.datasets.schema import Strict, read_json
 
 CHECKPOINTS = "checkpoints"
 
@@ -21,15 +22,6 @@ Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_]*$")]
 Text = Annotated[str, Field(min_length=1)]
 Url = Annotated[str, Field(pattern=r"^https?://[^\s/]+(/\S*)?$")]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
-class Strict(BaseModel):
-    """Values as written: no unknown field, no conversion, no change afterwards."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-
-Checked = TypeVar("Checked", bound=Strict)
 
 
 class RemoteFile(Strict):
@@ -127,12 +119,6 @@ class Manifest(Strict):
                 raise ValueError(f"a {what} is listed twice")
         return self
 
-    @property
-    def bytes(self) -> int | None:
-        """Of all files; None where one is unknown."""
-        sizes = [file.bytes for file in self.files]
-        return None if not sizes or None in sizes else sum(sizes)
-
 
 def names(kind: str | None = None) -> tuple[str, ...]:
     """Names of all manifests, or of those of one kind ("dataset", "checkpoint"), sorted."""
@@ -147,23 +133,10 @@ def manifest(name: str) -> Manifest:
     return read_manifest(found)
 
 
-def read_strict(path: Path, schema: type[Checked], what: str) -> Checked:
-    """A JSON file by its schema; :class:`BadInput` names the file and the first field that does not fit."""
-    try:
-        return schema.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
-        raise MissingData(str(path), f"no such file, expected {what}") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        expected = f"{what} (see {schema.__module__})"
-        raise BadInput(str(path), f"{where}: {first['msg']}", expected) from None
-
-
 @cache
 def read_manifest(path: Path) -> Manifest:
     """One file, checked: it lies and is called as it says."""
-    read = read_strict(path, Manifest, "a manifest")
+    read: Manifest = read_json(path, Manifest, f"a manifest (see {__name__})")
     if (read.name, read.kind) != (path.stem, _kind(path)):
         got = f"the {read.kind} {read.name!r}"
         raise BadInput(str(path), got, f"the {_kind(path)} {path.stem!r}, as the file lies and is called")

@@ -65,20 +65,15 @@ def find_masks(
         raise MissingData(str(folder), "no such folder of masks", "Name a folder inside the sequence, or a path.")
     below = tuple(sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")))
     names = below if objects is None else objects
+    hint = "One mask alone, of the first image, is allowed too." if first_frame_alone else ""
 
-    def images(where: Path) -> tuple[Path, ...]:
+    def paired(where: Path) -> tuple[Path, ...]:
         files = list_files(where, LOSSLESS, "mask images")
-        if not first_frame_alone:
-            return check_paired(files, rgb_files)
-        try:
-            return files if len(files) == 1 else check_paired(files, rgb_files)
-        except BadInput as error:
-            alone = "One mask alone, of the first image, is allowed too."
-            raise BadInput(error.name, error.got, error.expected, f"{error.fix} {alone}".strip()) from None
+        return files if first_frame_alone and len(files) == 1 else check_paired(files, rgb_files, hint)
 
     if below:
-        return MaskFiles({name: images(folder / name) for name in names}, dict.fromkeys(names), shape)
-    files = images(folder)
+        return MaskFiles({name: paired(folder / name) for name in names}, dict.fromkeys(names), shape)
+    files = paired(folder)
     labels: dict[str, int | None]
     if objects is None:
         found = _labels_in(files, shape)
@@ -90,10 +85,8 @@ def find_masks(
 
 def _labels_in(files: tuple[Path, ...], shape: tuple[int, int]) -> list[int]:
     """All labels above 0 of a set of label images: an object may enter late, so every image is looked at."""
-    present = np.zeros(65536, bool)
-    for path in files:
-        present |= np.bincount(read_labels(path, shape).ravel(), minlength=65536) > 0
-    return [int(k) for k in np.flatnonzero(present) if k > 0]
+    counts = (np.bincount(read_labels(path, shape).ravel()) for path in files)
+    return sorted({int(k) for count in counts for k in np.flatnonzero(count)} - {0})
 
 
 def read_labels(path: Path, shape: tuple[int, int]) -> np.ndarray:
@@ -113,7 +106,6 @@ def _palette_indices(path: Path) -> np.ndarray:
 
     with Image.open(path) as image:
         if image.mode != "P":
-            raise BadInput(
-                str(path), f"a colour image ({image.mode})", "one label per pixel", "Save it with one channel."
-            )
+            fix = "Save it with one channel."
+            raise BadInput(str(path), f"a colour image ({image.mode})", "one label per pixel", fix)
         return np.asarray(image)

@@ -12,7 +12,8 @@ from pydantic import model_validator
 
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput
-from p2p_lib.datasets.manifests import Strict, Text, read_strict
+from p2p_lib.datasets.manifests import Text
+from p2p_lib.datasets.schema import Strict, read_json
 
 FAIL = "fail"
 
@@ -108,4 +109,5 @@ class PaperReported(Strict):
 @cache
 def paper_reported() -> PaperReported:
     """What the paper reports; :class:`BadInput` names the field where the file is wrong."""
-    return read_strict(paths.manifest_dir() / paths.PAPER_REPORTED, PaperReported, "the paper's numbers")
+    what = f"the paper's numbers (see {__name__})"
+    return read_json(paths.manifest_dir() / paths.PAPER_REPORTED, PaperReported, what)

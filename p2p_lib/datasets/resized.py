@@ -59,13 +59,9 @@ class Resized:
         nearest = cv2.INTER_NEAREST_EXACT
         return {k: cv2.resize(m.astype(np.uint8), size, interpolation=nearest) > 0 for k, m in masks.items()}
 
-    def visible_px(self, i: int) -> dict[str, int] | None:
-        """Sizes of the original's masks."""
-        return self.original.visible_px(i)
-
     def __len__(self) -> int:
         return len(self.original)
 
     def __getattr__(self, name: str) -> Any:
-        """Names, times, truth, models: the original's."""
+        """The original's names, times, truth, models and sizes of masks."""
         return getattr(self.original, name)

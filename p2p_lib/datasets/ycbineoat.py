@@ -26,11 +26,6 @@ YCB_NAMES = {
 }
 
 
-def recognises(folder: Path) -> bool:
-    """Whether a folder has ``gt_mask/`` or ``annotated_poses/*.txt``."""
-    return (folder / "gt_mask").is_dir() or any((folder / "annotated_poses").glob("*.txt"))
-
-
 def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)

@@ -23,11 +23,6 @@ DEPTH_INVALID = 65535
 LABELS = {"is_mask_visible": "is_mask_visible.npy", "is_obj_in_image_labels": "is_obj_in_image.npy"}
 
 
-def recognises(folder: Path) -> bool:
-    """Whether a folder has ``annotated_poses/<obj>/``."""
-    return bool(_objects(folder))
-
-
 def _objects(folder: Path) -> tuple[str, ...]:
     poses = folder / "annotated_poses"
     return tuple(sorted(p.name for p in poses.iterdir() if p.is_dir())) if poses.is_dir() else ()

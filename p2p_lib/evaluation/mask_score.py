@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from p2p_lib.core import tables
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets.masks import read_labels
 from p2p_lib.datasets.runs import Run
@@ -60,8 +61,7 @@ class MaskEvaluation:
         """The same for people."""
         heads = ["mean IoU", "visible", "missed", "absent", "px labelled while absent"]
         table = self.as_frame().set_axis(heads, axis=1).round({"mean IoU": 3, heads[-1]: 1}).reset_index()
-        said = table.to_string(index=False, na_rep="-")
-        return f"{said}\nmasks {self.info['masks']} on {self.info['sequence']}"
+        return f"{tables.as_text(table)}\nmasks {self.info['masks']} on {self.info['sequence']}"
 
 
 def agreement(found: np.ndarray, truth: np.ndarray, min_visible_px: int = MIN_VISIBLE_PX) -> tuple[float, float]:

@@ -17,10 +17,10 @@ import numpy as np
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: TAP-Vid measures pixels after both axes of the picture are scaled to this many.
+#: TAP-Vid measures pixels after both axes of the image are scaled to this many.
 RASTER_PX = 256
 THRESHOLDS_PX = (1, 2, 4, 8, 16)
-#: Re-detection: frames of absence, radius in pixels of the picture as it is, visible frames to be found in.
+#: Re-detection: frames of absence, radius in pixels of the image as it is, visible frames to be found in.
 MIN_ABSENT_FRAMES, FOUND_PX, FOUND_WITHIN_FRAMES = 30, 8.0, 5
 #: A return counts as "the same surface again" up to this angle from a view it was seen from.
 SAME_VIEW_DEG = 40.0
@@ -54,7 +54,7 @@ def tapvid(
     scored: np.ndarray,
     shape: tuple[int, int],
 ) -> TapVid:
-    """TAP-Vid scores over the ``scored`` (T, N) frames; positions in pixels of a picture of ``shape`` (H, W).
+    """TAP-Vid scores over the ``scored`` (T, N) frames; positions in pixels of an image of ``shape`` (H, W).
 
     A predicted position that is NaN is wrong at every threshold.
     """
@@ -92,7 +92,7 @@ class Outcome(IntEnum):
 def outcomes(
     uv_true: np.ndarray, visible_true: np.ndarray, uv_px: np.ndarray, visible: np.ndarray, scored: np.ndarray
 ) -> np.ndarray:
-    """(T, N) uint8 of :class:`Outcome`; pixels are those of the picture as it is."""
+    """(T, N) uint8 of :class:`Outcome`; pixels are those of the image as it is."""
     near = visible_true & (np.linalg.norm(uv_px - uv_true, axis=-1) < FOUND_PX)
     said = np.where(near, Outcome.RIGHT, Outcome.WRONG)
     silent = np.where(visible_true, Outcome.MISSED, Outcome.HIDDEN)

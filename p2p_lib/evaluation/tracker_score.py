@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from p2p_lib.core.backends import make_tracker
-from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.config import Config
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.oracle import OracleTracker
@@ -24,7 +23,7 @@ from p2p_lib.evaluation.point_tracks import (
     redetections,
     tapvid,
 )
-from p2p_lib.evaluation.true_tracks import Queries, TrueScene, TrueTracks, draw_queries, true_tracks
+from p2p_lib.evaluation.true_tracks import Queries, Sight, TrueScene, draw_queries, true_tracks
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TrackRun:
-    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms per picture.
+    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms per image.
 
     Before its query a point is invisible and NaN. cpu_ms is the processor time of all threads in a frame,
     new queries included; NaN in frames before the first query.
@@ -50,7 +49,7 @@ class TrackerScore:
 
     tapvid: TapVid
     redetections: DataFrame
-    truth: TrueTracks
+    truth: Sight
     run: TrackRun
     queries: Queries
     info: dict[str, Any]
@@ -85,7 +84,7 @@ class TrackTask:
     sequence: Sequence
     scene: TrueScene
     queries: Queries
-    truth: TrueTracks
+    truth: Sight
     seed: int
 
     @classmethod
@@ -134,30 +133,10 @@ class TrackTask:
         )
 
 
-def compare_trackers(
-    task: TrackTask,
-    contestants: Mapping[str, tuple[str, Mapping[str, Any]]],
-    left_out: Mapping[str, str] | None = None,
-) -> dict[str, TrackerScore | str]:
-    """The same queries to several trackers: a score by label, or the reason why there is none.
-
-    contestants  label to tracker and settings, e.g. ``"SH(10)": ("builtin", {"tracking.forget_after": 10})``
-    left_out     labels that are not to run, with the reason
-    """
-    scores: dict[str, TrackerScore | str] = dict(left_out or {})
-    for label, (name, settings) in contestants.items():
-        if label not in scores:
-            try:
-                scores[label] = task.score(task.tracker(name, preset(seed=task.seed).with_values(dict(settings))))
-            except MissingBackend as error:
-                scores[label] = str(error)
-    return {label: scores[label] for label in contestants}
-
-
 def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, search: bool = False) -> TrackRun:
     """Stream the sequence through the tracker in one pass, each query added at its frame.
 
-    What a tracker says late is scored in the frame that it is of; for the last ones the last picture is repeated.
+    What a tracker says late is scored in the frame that it is of; for the last ones the last image is repeated.
     """
     total, n, late = len(sequence), len(queries), tracker.latency_frames
     uv, visible = np.full((total, n, 2), np.nan), np.zeros((total, n), bool)

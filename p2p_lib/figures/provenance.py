@@ -1,6 +1,6 @@
-"""The only way out for a picture, a film or a table: each with a note of what it was made from.
+"""Figures, films and tables are written here alone, each with a note of what it was made from.
 
-Pictures and films go to ``$P2P_FIGURES`` (else ``figures/`` of the project), tables to ``$P2P_TABLES`` (else
+Figures and films go to ``$P2P_FIGURES`` (else ``figures/`` of the project), tables to ``$P2P_TABLES`` (else
 ``out/tables/``). Beside ``NAME.png`` lies ``NAME.json``: parameters, what was read, versions, commit. Neither holds a
 time or a folder of this machine, so that the same work gives the same bytes.
 """
@@ -14,9 +14,10 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from pandas import DataFrame
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import paths
@@ -29,23 +30,8 @@ from p2p_lib.figures import film as video
 from p2p_lib.figures import style
 from p2p_lib.figures.tables import Table
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
-_WHAT_RAN = (
-    "sequence",
-    "objects",
-    "start",
-    "stop",
-    "frames",
-    "tracker",
-    "masks",
-    "preset",
-    "seed",
-    "commit",
-    "modified",
-)
-_SHOWN_PX = 900  # a notebook shows pictures at most this wide
+_WHAT_RAN = "sequence objects start stop frames tracker masks preset seed commit modified".split()
+_SHOWN_PX = 900  # a notebook shows images at most this wide
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +48,14 @@ class Saved:
 def save_figure(
     figure: Any, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
 ) -> Saved:
-    """Write a Matplotlib figure as PNG and PDF, or a picture (H, W, 3) uint8 as PNG, with its note.
+    """Write a Matplotlib figure as PNG and PDF, or an image (H, W, 3) uint8 as PNG, with its note.
 
     sources     what it was drawn from: runs, evaluations, sequences, files
     parameters  what decided how it was made: profile, seed, ...
     """
     target = _target(paths.figure_dir(), name)
     if isinstance(figure, np.ndarray):
-        width_px = _write_picture(figure, target)
+        width_px = _write_image(figure, target)
         suffixes, drawn_with = [".png"], []
     else:
         width_px = _write_plot(figure, target)
@@ -88,14 +74,12 @@ def save_video(
     sources: Iterable[Any] = (),
     parameters: Mapping[str, Any] | None = None,
 ) -> Saved:
-    """Write pictures as a film (see :func:`~p2p_lib.figures.film.write_video`) with its note; shown embedded."""
+    """Write images as a film (see :func:`~p2p_lib.figures.film.write_video`) with its note; shown embedded."""
     target = _target(paths.figure_dir(), name)
     path = video.write_video(images, target.with_name(f"{name}.mp4"), fps)
     _write_note(target, [path.suffix], sources, {**(parameters or {}), "fps": fps}, ["av"])
-    film = video.show_video(path)
-    data = film._repr_mimebundle_() if path.suffix == ".gif" else {"text/html": film._repr_html_()}
-    bundle = data if isinstance(data, tuple) else (data, {})
-    return Saved(path, ({**bundle[0], "text/plain": f"<{path.name}>"}, bundle[1]))
+    shown = {"text/html": video.show_video(path)._repr_html_(), "text/plain": f"<{path.name}>"}
+    return Saved(path, (shown, {}))
 
 
 def save_table(
@@ -151,7 +135,7 @@ def _sha256(path: Path) -> str | None:
 
 
 def _target(folder: Path, name: str) -> Path:
-    """Where NAME goes, without a suffix."""
+    """The path of NAME, without a suffix."""
     if not re.fullmatch(r"\w[\w-]*", name):
         raise BadInput("figure name", repr(name), "letters, digits, '_' and '-': it names files")
     folder.mkdir(parents=True, exist_ok=True)
@@ -166,7 +150,7 @@ def _write_plot(figure: Any, target: Path) -> int:
         return round(figure.get_figwidth() * figure.dpi)
 
 
-def _write_picture(image: np.ndarray, target: Path) -> int:
+def _write_image(image: np.ndarray, target: Path) -> int:
     from PIL import Image
 
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:

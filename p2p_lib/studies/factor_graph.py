@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
+from pandas import DataFrame
+from scipy.stats import chi2
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
@@ -19,10 +21,6 @@ from p2p_lib.figures import style
 from p2p_lib.figures.plots import panels
 from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
 from p2p_lib.method.registration import covariance, register
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +45,13 @@ class Solved:
 
     T_cam_obj   (M, 4, 4), NaN for keyframes that were left out
     p_obj       (N, 3), NaN where never seen
-    covariance  (6, 6) of the newest keyframe, None where the graph does not determine it; of registration, a list
-                with one for each keyframe relative to the map, None for the first
+    covariance  (6, 6) of the newest keyframe, None where the graph does not determine it; of registration alone
+                (M, 6, 6), each relative to the map, NaN for the first
     """
 
     T_cam_obj: np.ndarray
     p_obj: np.ndarray
-    covariance: np.ndarray | list[np.ndarray | None] | None
+    covariance: np.ndarray | None
 
     @classmethod
     def of(cls, turn: Turn, result: GraphResult) -> Solved:
@@ -111,7 +109,7 @@ def register_turn(turn: Turn, config: Config, seed: int = 0) -> Solved:
     A keyframe that cannot be registered repeats the last motion, with 3 degrees and 1 cm of standard deviation.
     """
     rng = np.random.default_rng(seed)
-    T, p_obj, covariances = [turn.T_cam_obj[0]], np.full_like(turn.p_obj, np.nan), [None]
+    T, p_obj, covariances = [turn.T_cam_obj[0]], np.full_like(turn.p_obj, np.nan), [np.full((6, 6), np.nan)]
     for m, p_cam in enumerate(turn.p_cam):
         sigma_m = depth_noise_m(p_cam[:, 2], config.depth)
         found = register(p_obj, p_cam, config.registration, rng, sigma_m=sigma_m)
@@ -123,7 +121,7 @@ def register_turn(turn: Turn, config: Config, seed: int = 0) -> Solved:
             covariances.append(np.diag(np.repeat([np.radians(3), 0.01], 3) ** 2))
         new = turn.seen[m] & np.isnan(p_obj[:, 0])
         p_obj[new] = se3.transform(se3.inverse(T[m]), p_cam[new])
-    return Solved(np.stack(T), p_obj, covariances)
+    return Solved(np.stack(T), p_obj, np.stack(covariances))
 
 
 def optimise(turn: Turn, registered: Solved, config: Config) -> Solved:
@@ -154,8 +152,6 @@ def _growing_graph(turn: Turn, registered: Solved, config: Config) -> Iterator[O
 
 def outlier_trials(seeds: Iterable[int], config: Config, outliers: float) -> DataFrame:
     """A row per turn: mean rotation error in degrees of each way, without outliers and with that share of them."""
-    from pandas import DataFrame
-
     squares, rows = config.with_values({"factor_graph.huber": 1e6}), []
     for seed in seeds:
         clean, spoilt = (simulate_turn(np.random.default_rng(seed), config, outliers=s) for s in (0.0, outliers))
@@ -208,7 +204,7 @@ def turn_from_above(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
     where the way puts them.
     """
     true_xz = 100 * se3.inverse(turn.T_cam_obj)[:, [0, 2], 3]
-    figure, axes = panels(len(solved), (4.0 * len(solved), 4.4), [1] * len(solved), side_by_side=True)
+    figure, axes = panels(len(solved), (4.0 * len(solved), 4.4), side_by_side=True)
     for axis, (name, one) in zip(axes, solved.items(), strict=True):
         colour, _ = _LINES[name]
         xz = 100 * se3.inverse(one.T_cam_obj)[:, [0, 2], 3]
@@ -234,7 +230,7 @@ def errors_by_way(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
     common = np.isfinite(sum(errors.values())).all(0)
     over = "mean" if common.all() else f"mean of the {common.sum()} that all have"
     shaded = np.flatnonzero(turn.seen.sum(1) <= 2)
-    figure, axes = panels(2, (8.0, 4.6), [1, 1])
+    figure, axes = panels(2, (8.0, 4.6))
     for k, (axis, unit) in enumerate(zip(axes, _UNITS, strict=True)):
         for name, error in errors.items():
             colour, line = _LINES[name]
@@ -253,11 +249,10 @@ def errors_by_way(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
 def known_when(turn: Turn, online: Sequence[Solved]) -> Figure:
     """Error of the newest keyframe when it was new, beside one and two standard deviations by its covariance."""
     errors = np.stack([one.errors(turn)[:, m] for m, one in enumerate(online)], 1)
-    unknown = np.full((6, 6), np.nan)
-    variance = np.array([np.diag(unknown if one.covariance is None else one.covariance) for one in online])
+    variance = np.array([np.full(6, np.nan) if one.covariance is None else np.diag(one.covariance) for one in online])
     # The root of the trace is the expected length of the error.
     sigma = np.sqrt(variance.reshape(-1, 2, 3).sum(-1)).T * [[np.degrees(1)], [1e3]]
-    figure, axes = panels(2, (8.0, 4.2), [1, 1])
+    figure, axes = panels(2, (8.0, 4.2))
     for axis, error, width, unit in zip(axes, errors, sigma, _UNITS, strict=True):
         axis.fill_between(range(len(online)), 0, 2 * width, color="#DCEAF5", lw=0, label="two of them")
         axis.fill_between(range(len(online)), 0, width, color="#A9CCE8", lw=0, label="one standard deviation")
@@ -273,10 +268,8 @@ def known_when(turn: Turn, online: Sequence[Solved]) -> Figure:
 @style.styled
 def consistency_plot(nees: np.ndarray) -> Figure:
     """Normalised squared errors (trials, 2) beside the chi square distribution that an honest covariance gives them."""
-    from scipy.stats import chi2
-
     at, bins = np.linspace(0, 14, 200), np.linspace(0, 14, 22)
-    figure, axes = panels(2, (8.0, 2.8), [1, 1], side_by_side=True)
+    figure, axes = panels(2, (8.0, 2.8), side_by_side=True)
     for axis, values, name in zip(axes, nees.T, ("rotation", "translation"), strict=True):
         weights = np.full(len(values), 1 / (len(values) * (bins[1] - bins[0])))
         axis.hist(np.minimum(values, 13.99), bins, weights=weights, color="#A9CCE8", edgecolor="white")

@@ -7,11 +7,12 @@ be: a wrong pose, or a surface that bulges. What lies in front of it hides it an
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import trimesh
+from matplotlib.figure import Figure
 from pandas import DataFrame, Series
 
 from p2p_lib.core import se3
@@ -30,9 +31,6 @@ from p2p_lib.figures.plots import panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic.render import render
 from p2p_lib.synthetic.shapes import Mesh, load_mesh
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: As near to the surface is on it; so much before it is something else that hides it.
 ON_M, BEFORE_M = 0.005, 0.01

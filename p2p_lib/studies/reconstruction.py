@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
+from matplotlib.figure import Figure
+from pandas import Series, cut
+from scipy.spatial import cKDTree
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import TsdfConfig
@@ -13,10 +16,6 @@ from p2p_lib.figures import style
 from p2p_lib.figures.plots import logarithmic, panels
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.studies.turntable import Body, Shot, around_surface, draw_slice, fuse, seen_distance, slice_points
-
-if TYPE_CHECKING:
-    import trimesh
-    from matplotlib.figure import Figure
 
 
 def exact_distance(volume: TsdfVolume, body: Body, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -39,9 +38,6 @@ def seen_points(body: Body, T_cam_obj: np.ndarray, count: int, rng: np.random.Ge
 
 def mesh_errors(mesh: trimesh.Trimesh, body: Body, seen: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:
     """Mean distance in metres from the mesh to the exact surface, and from the seen points (n, 3) to the mesh."""
-    import trimesh
-    from scipy.spatial import cKDTree
-
     on_mesh, _ = trimesh.sample.sample_surface(mesh, 20000, seed=int(rng.integers(2**31)))
     to_mesh, _ = cKDTree(on_mesh).query(seen)
     return float(np.abs(body.distance_m(on_mesh)).mean()), float(to_mesh.mean())
@@ -70,8 +66,6 @@ def drifted(T_cam_obj: np.ndarray, degrees: float, millimetres: float, rng: np.r
 @style.styled
 def slices_beside_exact(volume: TsdfVolume, body: Body, heights_m: Sequence[float]) -> Figure:
     """A row per height: the fused distance, the exact one where it was observed, and their difference."""
-    from matplotlib.figure import Figure
-
     corners = np.array([around_surface(volume, z) for z in heights_m])
     figure = Figure((8.6, 1.75 * len(heights_m) + 0.6), layout="constrained")
     axes = figure.subplots(len(heights_m), 3, sharex=True, sharey=True, squeeze=False)
@@ -95,8 +89,6 @@ def slices_beside_exact(volume: TsdfVolume, body: Body, heights_m: Sequence[floa
 @style.styled
 def fused_against_exact(fused_m: np.ndarray, exact_m: np.ndarray, tau_m: float) -> Figure:
     """Fused over exact distance at many points: median and the middle 80 % in bins of the exact one."""
-    from pandas import Series, cut
-
     inside = np.isfinite(fused_m) & (np.abs(exact_m) < 0.999 * tau_m)
     bins = cut(1e3 * exact_m[inside], 1e3 * np.linspace(-tau_m, tau_m, 41))
     groups = Series(1e3 * fused_m[inside]).groupby(bins, observed=True)

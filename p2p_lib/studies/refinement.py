@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import RefinementConfig
 from p2p_lib.figures import style
-from p2p_lib.figures.plots import panels
+from p2p_lib.figures.plots import logarithmic, panels
 from p2p_lib.method.refinement import Keypoints, refine
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.studies.turntable import around_surface, draw_slice, seen_distance, slice_points
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def perturbed(T: np.ndarray, degrees: float, millimetres: float, rng: np.random.Generator) -> np.ndarray:
@@ -75,7 +72,7 @@ def label_points(
 def onto_the_surface(volume: TsdfVolume, p_cam: np.ndarray, poses: Mapping[str, np.ndarray]) -> Figure:
     """The slice z = 0 through the fused surface, with the measured points within 6 mm of it as each pose puts them."""
     points = slice_points(*around_surface(volume, 0.0), 0.0)
-    figure, axes = panels(len(poses), (4.2 * len(poses), 4.0), [1] * len(poses), side_by_side=True)
+    figure, axes = panels(len(poses), (4.2 * len(poses), 4.0), side_by_side=True)
     for axis, (name, T_cam_obj) in zip(axes, poses.items(), strict=True):
         shown = draw_slice(axis, points, seen_distance(volume, points), volume.tau_m)
         p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
@@ -91,14 +88,12 @@ def onto_the_surface(volume: TsdfVolume, p_cam: np.ndarray, poses: Mapping[str, 
 @style.styled
 def step_by_step(errors: np.ndarray) -> Figure:
     """Error (starts, steps + 1, 2) after every iteration, degrees and millimetres, a line per start."""
-    figure, axes = panels(2, (8.0, 2.8), [1, 1], side_by_side=True)
+    figure, axes = panels(2, (8.0, 2.8), side_by_side=True)
     for axis, values, unit in zip(axes, np.moveaxis(errors, -1, 0), ("rotation [°]", "translation [mm]"), strict=True):
         axis.plot(values.T, color=style.OBJECTS[0], alpha=0.6, marker=".", markersize=4)
-        axis.set(xlabel="iterations", ylabel=unit, yscale="log")
-        axis.set_yticks([0.1, 0.2, 0.5, 1, 2, 5, 10])
+        logarithmic(axis.yaxis)
+        axis.set(xlabel="iterations", ylabel=unit, yticks=[0.1, 0.2, 0.5, 1, 2, 5, 10])
         axis.set_ylim(0.7 * values.min(), 1.3 * values.max())
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter("")
     axes[0].set_title("synthetic block, one line per start")
     return figure
 
@@ -108,7 +103,7 @@ def basins(
     errors: Mapping[str, np.ndarray], degrees: Sequence[float], millimetres: Sequence[float], limit: tuple[float, float]
 ) -> Figure:
     """The share of starts that come back to within ``limit`` (degrees, millimetres), by how far they were off."""
-    figure, axes = panels(len(errors), (4.0 * len(errors), 3.4), [1] * len(errors), side_by_side=True)
+    figure, axes = panels(len(errors), (4.0 * len(errors), 3.4), side_by_side=True)
     for axis, (name, found) in zip(axes, errors.items(), strict=True):
         share = 100 * (found <= limit).all(-1).mean(-1)
         axis.imshow(share, cmap="cividis", vmin=0, vmax=100, origin="lower", aspect="auto")
@@ -124,11 +119,11 @@ def basins(
 
 
 @style.styled
-def held_directions(strengths: Mapping[str, np.ndarray], needed: float) -> Figure:
-    """How firmly each shape holds the six directions of its pose, least first; below ``needed`` one is left alone."""
+def held_directions(eigenvalues: Mapping[str, np.ndarray], needed: float) -> Figure:
+    """Observability of the six directions of each shape's pose, least first; below ``needed`` one is left alone."""
     lowest = needed / 12
-    figure, axes = panels(len(strengths), (8.0, 2.7), [1] * len(strengths), side_by_side=True)
-    for axis, (name, values) in zip(axes, strengths.items(), strict=True):
+    figure, axes = panels(len(eigenvalues), (8.0, 2.7), side_by_side=True)
+    for axis, (name, values) in zip(axes, eigenvalues.items(), strict=True):
         held = values >= needed
         colours = np.where(held, style.OBJECTS[0], style.STATUS["lost"][0])
         axis.bar(range(1, 7), np.maximum(values, 1.5 * lowest), color=colours)
@@ -137,14 +132,14 @@ def held_directions(strengths: Mapping[str, np.ndarray], needed: float) -> Figur
         axis.set_title(f"{name}: {(~held).sum()} of 6 free")
         axis.grid(axis="x", visible=False)
         axis.label_outer()
-    axes[0].set_ylabel("strength")
+    axes[0].set_ylabel("eigenvalue")
     return figure
 
 
 @style.styled
 def spins_left(spins_deg: Mapping[str, np.ndarray], start_deg: float) -> Figure:
     """The spin that is left after refinement, a dot per noisy image, for each way to refine."""
-    figure, (axis,) = panels(1, (8.0, 0.9 + 0.4 * len(spins_deg)), [1])
+    figure, (axis,) = panels(1, (8.0, 0.9 + 0.4 * len(spins_deg)))
     for k, values in enumerate(spins_deg.values()):
         at = k + np.linspace(-0.15, 0.15, len(values))
         axis.plot(values, at, "o", color=style.OBJECTS[0], markersize=5, alpha=0.8)

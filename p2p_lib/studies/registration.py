@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
+from pandas import DataFrame
 
 from p2p_lib.core import se3
 from p2p_lib.core.backends import make_detector, make_tracker
@@ -21,7 +23,7 @@ from p2p_lib.core.depth import depth_noise_m, lift
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.plots import panels
+from p2p_lib.figures.plots import logarithmic, panels
 from p2p_lib.method.observation import sample_cloud
 from p2p_lib.method.refinement import Keypoints, refine, surface_distances
 from p2p_lib.method.registration import Hypothesis, register
@@ -31,13 +33,8 @@ from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.synthetic.ablations import mug
 from p2p_lib.synthetic.generate import photograph
 from p2p_lib.synthetic.noise import Sensor
-from p2p_lib.synthetic.render import render
 from p2p_lib.synthetic.scene import FPS, Scenario
 from p2p_lib.synthetic.shapes import Mesh
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
 
 #: The newest keyframe that the surface holds is this many frames old; keyframes are ten frames, or degrees, apart.
 _KEYFRAME_AGO, _KEYFRAME_EVERY, _POINTS = 6, 10, 90
@@ -146,8 +143,6 @@ def ways_to_decide(moment: Moment, config: Config, seed: int = 0) -> dict[str, n
 
 def mug_trials(config: Config, seeds: Iterable[int], **moment: Any) -> DataFrame:
     """A row per mug: how far it turned, the share of right tracks, and the rotation error of each way in degrees."""
-    from pandas import DataFrame
-
     rows = []
     for seed in seeds:
         one = mug_moment(config, seed, **moment)
@@ -172,7 +167,7 @@ def _handle_in_view(poses: np.ndarray, frames: int) -> int:
 
 def _shots(scenario: Scenario, seed: int, times: Iterable[int]) -> dict[int, tuple[Frame, np.ndarray]]:
     """Frame and mask at each time, with the sensor's noise."""
-    room = render([(m, se3.IDENTITY) for m in scenario.room], scenario.camera, scenario.T_world_cam[0], scenario.light)
+    room = scenario.empty(0)
     taken = {t: photograph(scenario, Sensor(), seed, t, room) for t in times}
     return {t: (Frame(t, t / FPS, rgb, depth_m), exact.label == 1) for t, (rgb, depth_m, exact) in taken.items()}
 
@@ -189,8 +184,7 @@ def _tracked(frames: Sequence[Frame], uv_px: np.ndarray, config: Config, rng: np
 
 def draw_tracks(moment: Moment, width_px: int = 720) -> np.ndarray:
     """Where each point was sampled and where the tracker has it now: a line to a dot (follows the mug) or a cross."""
-    image, camera = _zoomed(moment, width_px)
-    image = _outline(image, camera, moment, moment.T_cam_obj, style.TRUTH)
+    image, camera = _outlined(moment, moment.T_cam_obj, style.TRUTH, width_px)
     now, before = (overlay.zoomed_px(uv, moment.camera, camera) for uv in (moment.uv_px, moment.uv_before_px))
     known = np.isfinite(moment.p_cam).all(1)
     for rows, colour in ((known & ~moment.right, _STRAYS), (known & moment.right, _FOLLOWS)):
@@ -205,9 +199,8 @@ def draw_hypotheses(moment: Moment, hypotheses: Sequence[Hypothesis], scores_m: 
     """An image per hypothesis: where it puts the mug (outline in its colour) and the points that speak for it."""
     images = []
     for k, (hypothesis, score) in enumerate(zip(hypotheses, scores_m, strict=True)):
-        image, camera = _zoomed(moment, 420)
         colour = _HYPOTHESES[k % len(_HYPOTHESES)]
-        image = _outline(image, camera, moment, hypothesis.T_cam_obj, colour)
+        image, camera = _outlined(moment, hypothesis.T_cam_obj, colour, 420)
         inliers_px = overlay.zoomed_px(moment.uv_px[hypothesis.inliers], moment.camera, camera)
         image = overlay.draw_points(image, inliers_px, colour, 3)
         caption = f"h = {k + 1}: {hypothesis.support} inliers, score {1e3 * score:.2f} mm"
@@ -241,7 +234,7 @@ def support_and_score(moment: Moment, hypotheses: Sequence[Hypothesis], scores_m
 def method_errors(table: DataFrame, bar_deg: float) -> Figure:
     """Rotation error of each way to decide (columns) over several mugs (rows), on a logarithmic axis."""
     methods = [c for c in table.columns if c.endswith("[°]") and c not in ("turned [°]", "best hypothesis [°]")]
-    figure, (axis,) = panels(1, (7.0, 0.9 + 0.36 * len(methods)), [1])
+    figure, (axis,) = panels(1, (7.0, 0.9 + 0.36 * len(methods)))
     for k, method in enumerate(methods):
         errors = table[method].to_numpy(float)
         at = k + np.linspace(-0.18, 0.18, len(errors))
@@ -252,25 +245,19 @@ def method_errors(table: DataFrame, bar_deg: float) -> Figure:
         none = at[np.isnan(errors)]
         axis.plot(np.ones(len(none)), none, "x", color=colour, markersize=5, **edge)
     axis.axvline(bar_deg, color=style.STATUS["lost"][0], linewidth=1, linestyle="--")
-    axis.set_xscale("log")
-    axis.xaxis.set_major_formatter("{x:g}")
-    axis.xaxis.set_minor_formatter("")
+    logarithmic(axis.xaxis)
     axis.set_yticks(range(len(methods)), [m.removesuffix(" [°]") for m in methods])
     axis.invert_yaxis()
     axis.set(xlabel=f"rotation error [°], one dot per synthetic mug; dashed: {bar_deg:g}°; cross: no pose")
     return figure
 
 
-def _zoomed(moment: Moment, width_px: int) -> tuple[np.ndarray, Camera]:
-    """The image around the mug, and the camera that sees it so."""
+def _outlined(moment: Moment, T_cam_obj: np.ndarray, colour: str, width_px: int) -> tuple[np.ndarray, Camera]:
+    """The image around the mug with the silhouette of the true model at a pose, and the camera that sees it so."""
     region_px = overlay.region_around(moment.mask, moment.camera, (75, 30))
-    return overlay.zoomed(moment.frame.rgb, moment.camera, region_px, width_px)
-
-
-def _outline(image: np.ndarray, camera: Camera, moment: Moment, T_cam_obj: np.ndarray, colour: str) -> np.ndarray:
-    """The silhouette of the true model at a pose."""
+    image, camera = overlay.zoomed(moment.frame.rgb, moment.camera, region_px, width_px)
     uv_px = camera.project(se3.transform(T_cam_obj, moment.mesh.vertices))[moment.mesh.faces]
     mask = np.zeros(image.shape[:2], np.uint8)
     for triangle in np.rint(uv_px * 16).astype(np.int32):
         cv2.fillConvexPoly(mask, triangle, 1, shift=4)
-    return overlay.draw_mask(image, mask > 0, colour)
+    return overlay.draw_mask(image, mask > 0, colour), camera

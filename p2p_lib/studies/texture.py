@@ -15,11 +15,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from pandas import DataFrame, concat
@@ -27,7 +27,7 @@ from scipy import stats
 
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.interfaces import PointTracker
-from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.datasets import ycbmultitrack
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.datasets.sequence import open_sequence
@@ -38,9 +38,6 @@ from p2p_lib.figures import overlay, style
 from p2p_lib.figures.plots import logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic import scenario_dir
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 #: The mask's outermost pixels are left out: their gradient is that of the outline, not of what is printed.
 MARGIN_PX = 3
@@ -116,7 +113,7 @@ class RecordedTracker:
         for index, new_ids, uv_px in self._queries:
             frame = scene.sequence.frame(index)
             ids.append(new_ids)
-            points = points.joined(scene.lift(frame, scene.owners(frame, uv_px), uv_px))
+            points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
         ids = np.concatenate(ids)
         return np.sort(ids), points.select(np.argsort(ids))
 
@@ -146,48 +143,44 @@ class Measure:
 
 @dataclass(frozen=True, eq=False)
 class ObjectTexture:
-    """One object of a run, over its m scored frames.
+    """One object of a run, over its scored frames.
 
-    frame_index    (m,) of the sequence
-    texture        (m,) mean Sobel gradient magnitude in the mask; NaN where the mask is too thin
-    add_m, adds_m  (m,) metres; infinite where there was no pose
-    tracks         of its keypoints, in all frames, as :meth:`RecordedTracker.keypoints` gives them
+    frames  a row each: ``frame`` of the sequence; ``texture``, the mean Sobel gradient magnitude in the mask, NaN where
+            it is too thin; ``add_m`` and ``adds_m``, infinite where there was no pose
+    tracks  of its keypoints, in all frames, as :meth:`RecordedTracker.keypoints` gives them
     """
 
     sequence: str
     object: str
-    frame_index: np.ndarray
-    texture: np.ndarray
-    add_m: np.ndarray
-    adds_m: np.ndarray
+    frames: DataFrame
     tracks: DataFrame
 
     def measure(self, start: int = 0, stop: int | None = None) -> Measure:
         """Over the frames [start, stop); :class:`MissingData` where none of them is scored."""
-        stop = int(self.frame_index[-1]) + 1 if stop is None else stop
-        at = (self.frame_index >= start) & (self.frame_index < stop)
-        if not at.any():
+        stop = int(self.frames.frame.max()) + 1 if stop is None else stop
+        rows = self.frames[self.frames.frame.between(start, stop, inclusive="left")]
+        if not len(rows):
             raise MissingData(f"{self.object} of {self.sequence}", f"no scored frame from {start} to {stop}")
-        error_px = self.tracks.error_px[self.tracks.frame.isin(self.frame_index[at])]
+        error_px = self.tracks.error_px[self.tracks.frame.isin(rows.frame)]
         return Measure(
             self.sequence,
             self.object,
             start,
             stop,
-            frames=int(at.sum()),
-            texture=float(np.nanmean(self.texture[at])),
+            frames=len(rows),
+            texture=float(rows.texture.mean()),
             track_px=float(error_px.median()),
-            tracks=len(error_px) / int(at.sum()),
-            add_auc=metrics.auc_exact(self.add_m[at]),
-            adds_auc=metrics.auc_exact(self.adds_m[at]),
+            tracks=len(error_px) / len(rows),
+            add_auc=metrics.auc_exact(rows.add_m.to_numpy()),
+            adds_auc=metrics.auc_exact(rows.adds_m.to_numpy()),
         )
 
     def windows(self, size: int = 15) -> list[Measure]:
         """One measure per window of ``size`` frames; those with fewer than half of them scored are left out."""
-        first, last = int(self.frame_index[0]), int(self.frame_index[-1])
-        starts = np.arange(first, last + 1, size)
-        scored = ((self.frame_index >= starts[:, None]) & (self.frame_index < starts[:, None] + size)).sum(1)
-        return [self.measure(start, start + size) for start in starts[2 * scored >= size].tolist()]
+        first = int(self.frames.frame.min())
+        scored = ((self.frames.frame - first) // size).value_counts().sort_index()
+        starts = [first + size * int(k) for k in scored.index[2 * scored >= size]]
+        return [self.measure(start, start + size) for start in starts]
 
 
 def sobel_magnitude(rgb: np.ndarray) -> np.ndarray:
@@ -231,19 +224,15 @@ def study(
 
     models  object to mesh, besides those that lie with the sequence; the others' surface is the measured depth
     """
-    tracks = recorded.keypoints(TrueScene.of(sequence, models))
-    texture: dict[str, list[float]] = {name: [] for name in evaluation.objects}
-    for i in sorted({int(i) for score in evaluation.objects.values() for i in score.frame_index}):
-        rgb, masks = sequence.frame(i).rgb, sequence.masks(i) or {}
-        for name, score in evaluation.objects.items():
-            if i in score.frame_index:
-                texture[name].append(visible_texture(rgb, masks[name]) if name in masks else float("nan"))
-    return {
-        name: ObjectTexture(
-            sequence.name, name, score.frame_index, np.array(texture[name]), score.add_m, score.adds_m, tracks[name]
-        )
-        for name, score in evaluation.objects.items()
-    }
+    tracks, studies = recorded.keypoints(TrueScene.of(sequence, models)), {}
+    for name, score in evaluation.objects.items():
+        texture = []
+        for i in score.frame_index.tolist():
+            mask = (sequence.masks(i) or {}).get(name)
+            texture.append(np.nan if mask is None else visible_texture(sequence.frame(i).rgb, mask))
+        columns = {"frame": score.frame_index, "texture": texture, "add_m": score.add_m, "adds_m": score.adds_m}
+        studies[name] = ObjectTexture(sequence.name, name, DataFrame(columns), tracks[name])
+    return studies
 
 
 @dataclass(frozen=True)
@@ -368,24 +357,23 @@ def texture_story(images: Mapping[str, np.ndarray], measures: Mapping[str, Seque
 
 @style.styled
 def windows_against_texture(
-    windows: Mapping[str, Sequence[Measure]], correlations: Sequence[RankCorrelation] = ()
+    windows: Mapping[str, Sequence[Measure]],
+    correlations: Sequence[RankCorrelation] = (),
+    synthetic: Sequence[Measure] = (),
 ) -> Figure:
-    """Every window of every study; above the panels the rank correlations with track error and with ADD AUC."""
+    """Every window of every study; above the panels the rank correlations with track error and with ADD AUC.
+
+    synthetic  windows that are drawn in grey behind those of real objects
+    """
     figure, axes = panels(2, (_WIDTH_IN, 3.4), side_by_side=True)
-    _against_texture(axes, windows, 16, _colours(len(windows)))
+    if synthetic:
+        _against_texture(axes, {"synthetic": synthetic} | dict(windows), 16, [style.NEUTRAL[1], *style.OBJECTS])
+    else:
+        _against_texture(axes, windows, 16, _colours(len(windows)))
     for axis, found in zip(axes, correlations):
         axis.set_title(f"Spearman {found.rho:+.2f}, 95 % [{found.low:+.2f}, {found.high:+.2f}], n = {found.pairs}")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=9, fontsize=8, title=LEGEND)
-    return figure
-
-
-@style.styled
-def real_against_texture(real: Mapping[str, Sequence[Measure]], synthetic: Mapping[str, Sequence[Measure]]) -> Figure:
-    """Every window of real objects, a colour for each, before those of the synthetic ones in grey."""
-    figure, axes = panels(2, (_WIDTH_IN, 3.4), side_by_side=True)
-    behind = {"synthetic": [w for many in synthetic.values() for w in many]}
-    _against_texture(axes, behind | dict(real), 16, [style.NEUTRAL[1], *style.OBJECTS])
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    entries, title = axes[0].get_legend_handles_labels(), None if synthetic else LEGEND
+    figure.legend(*entries, loc="outside lower center", ncols=3 if synthetic else 9, fontsize=8, title=title)
     return figure
 
 

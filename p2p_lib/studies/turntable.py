@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.image import AxesImage
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
@@ -20,10 +22,6 @@ from p2p_lib.synthetic.motion import look_at
 from p2p_lib.synthetic.noise import Sensor, measured_colour, measured_depth
 from p2p_lib.synthetic.render import render
 from p2p_lib.synthetic.scene import VGA
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.image import AxesImage
 
 #: What stands behind the body: depth there lets the volume carve.
 _BEHIND_M = 1.5
@@ -136,8 +134,6 @@ def draw_slice(
     axis: Axes, points: np.ndarray, value_m: np.ndarray, limit_m: float, colours: str = "BrBG", zero_level: bool = True
 ) -> AxesImage:
     """Signed distance (rows, columns) over slice points: negative brown, positive green, NaN grey."""
-    import matplotlib
-
     x, y = 1e3 * points[0, :, 0], 1e3 * points[:, 0, 1]
     shown = axis.imshow(
         1e3 * value_m,

@@ -263,7 +263,7 @@ BAD_FILES = {
     "empty sequence": (no_pictures, ["rgb", "no files"]),
     "no depth folder": (lambda s: shutil.rmtree(s / "depth"), ["depth"]),
     "K of two rows": (lambda s: spoil(s / "cam_K.txt", b"600 0 320\n0 600 240\n"), ["cam_K.txt", "(2, 3)", "3x3"]),
-    "K of words": (lambda s: spoil(s / "cam_K.txt", b"fx fy cx\n"), ["cam_K.txt", "fx fy cx", "3x3"]),
+    "K of words": (lambda s: spoil(s / "cam_K.txt", b"fx fy cx\n"), ["cam_K.txt", "'fx'", "3x3"]),
     "K transposed": (lambda s: np.savetxt(s / "cam_K.txt", K.T), ["cam_K.txt", "fx 0 cx 0 fy cy 0 0 1"]),
     "no K": (lambda s: spoil(s / "cam_K.txt", None), ["cam_K.txt"]),
     "NaN pose": (
@@ -311,7 +311,10 @@ BAD_WORDS = {
     "no config": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/no.toml"], ["no.toml", "no such"]),
     "config is no TOML": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/cam_K.txt"], ["cam_K.txt", "TOML"]),
     "config is a folder": (["run", "{seq}", "--out", "{out}", "--config", "{seq}"], ["slide", "TOML"]),
-    "unknown stage": (["run", "{seq}", "--out", "{out}", "--set", "foo.bar=1"], ["'foo.bar'", "pipeline, "]),
+    "unknown stage": (
+        ["run", "{seq}", "--out", "{out}", "--set", "foo.bar=1"],
+        ["'foo.bar'", "stage.key", "lifecycle, "],
+    ),
     "unknown scenario": (["synth", "crosing", "--out", "{out}"], ["'crosing'", "Did you mean synthetic/crossing?"]),
     "click into a file": (["click", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt/x", "can be written"]),
     "click into a folder": (["click", "{seq}", "--out", "{seq}/rgb"], ["slide/rgb", "a folder"]),

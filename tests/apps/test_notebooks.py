@@ -168,7 +168,7 @@ def test_what_a_notebook_recorded_is_read_back(run):
     result = read_result(run[1] / "notebooks" / "00_first.ipynb")
     assert result.checks == {"seed": 3, "scale": 2.0, "profile": "quick"}
     assert isinstance(result.checks["scale"], float)
-    assert result.title == "A story" and result.picture_png == PNG and result.error == ""
+    assert result.title == "A story" and result.image_png == PNG and result.error == ""
     assert result.seconds > 0
 
 

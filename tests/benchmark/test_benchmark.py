@@ -177,7 +177,7 @@ def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp
     done = run_benchmark(plan, tmp_path, "quick", progress=False, jobs=1)
     assert done.counts() == {"done": 1, "failed": 1, "not run": 0}
     (reason,) = (outcome.reason for _, outcome in done.results if outcome.status == "failed")
-    assert reason == "its process was ended by signal 9: out of memory?"
+    assert "its process was ended" in reason
     assert run_benchmark(plan, tmp_path, "quick", progress=False).counts()["failed"] == 1, "not without being told"
     assert run_benchmark(plan, tmp_path, "quick", progress=False, retry=True).counts()["done"] == 2
 

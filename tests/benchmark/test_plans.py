@@ -86,7 +86,7 @@ def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):
     jobs = jobs_of(read_plan("ycbmultitrack_real"), "full")
     names = list(dict.fromkeys(job.sequence.name for job in jobs))
     assert names == ["ycbmultitrack_real/a_one", "ycbmultitrack_real/b_two"]
-    assert all("no files, expected colour pictures" in job.reason for job in jobs), "and what is wrong with it"
+    assert all("no files, expected colour" in job.reason for job in jobs), "and what is wrong with it"
 
 
 def test_a_detector_of_choice_is_the_first_that_is_there(monkeypatch):

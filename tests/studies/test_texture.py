@@ -147,7 +147,8 @@ def made(frame_index, error_px, add_m):
     uv = np.tile(np.array(error_px, float), n)
     tracks = DataFrame({"frame": np.repeat(frame_index, k), "u_px": uv, "v_px": 0 * uv, "error_px": uv})
     add_m = np.asarray(add_m, float)
-    return texture.ObjectTexture("s", "o", np.asarray(frame_index), np.arange(n, dtype=float), add_m, add_m / 2, tracks)
+    frames = DataFrame({"frame": frame_index, "texture": np.arange(float(n)), "add_m": add_m, "adds_m": add_m / 2})
+    return texture.ObjectTexture("s", "o", frames, tracks)
 
 
 def test_a_measure_is_of_its_own_frames():

@@ -91,6 +91,6 @@ def test_correlations_need_three_sequences(told):
 
 def test_real_windows_stand_before_the_synthetic_ones(told):
     windows = told[1].windows(7)
-    figure = texture.real_against_texture({"mustard": windows[:1]}, {"1": windows, "0": windows})
+    figure = texture.windows_against_texture({"mustard": windows[:1]}, synthetic=[*windows, *windows])
     assert [len(c.get_offsets()) for c in figure.axes[0].collections] == [4, 1]
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["synthetic", "mustard"]

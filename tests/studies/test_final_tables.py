@@ -14,7 +14,7 @@ from p2p_lib.benchmark.plan import Plan
 from p2p_lib.benchmark.rows import shown_name
 from p2p_lib.datasets.paper_reported import FAIL, paper_reported
 from p2p_lib.figures.tables import Cell, Table, emboldened
-from p2p_lib.studies.paper_tables import paper_table, write_table
+from p2p_lib.studies.final_tables import paper_table, write_table
 
 MUSTARD = {"name": "ycbineoat/mustard0", "column": "mustard v1"}
 

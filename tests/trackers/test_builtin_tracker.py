@@ -175,14 +175,6 @@ def test_causal_bit_for_bit():
             np.testing.assert_array_equal(getattr(mine, name), getattr(whole, name))
 
 
-def test_points_hide_while_something_is_nearer_than_they_can_be():
-    frames = film(hide=False)[:8]
-    near = [Frame(f.index, f.time_s, f.rgb, f.depth_m - 0.2 * (f.index in (4, 5))) for f in frames]
-    tracks = follow(BuiltinTracker(TrackingConfig()), near)
-    assert tracks[2].visible.mean() > 0.9 and tracks[3].visible.mean() < 0.05
-    assert tracks[-1].visible.mean() > 0.9, "they are back when it is gone"
-
-
 def test_rejected_points_are_looked_for_anew_and_dropped_ones_are_gone():
     tracker = BuiltinTracker(TrackingConfig())
     tracker.start(film()[0])

@@ -7,9 +7,9 @@ import pytest
 
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.point_tracks import Outcome
-from p2p_lib.evaluation.tracker_score import TrackTask, compare_trackers
-from p2p_lib.figures import style
-from p2p_lib.studies import track_plots as tracks
+from p2p_lib.evaluation.tracker_score import TrackTask
+from p2p_lib.figures import overlay, style
+from p2p_lib.studies import tracking2d as tracks
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def task():
 @pytest.fixture(scope="module")
 def scores(task):
     contestants = {"perfect": ("oracle", {"oracle.noise_px": 0.0}), "learned": ("tapir", {})}
-    return compare_trackers(task, contestants, {"learned": "no weights"})
+    return tracks.compare_trackers(task, contestants, {"learned": "no weights"})
 
 
 def test_a_perfect_tracker_is_right_or_rightly_silent(scores):
@@ -37,7 +37,7 @@ def test_a_tracker_that_did_not_run_has_dashes_and_a_reason(scores):
 
 def test_a_backend_that_is_missing_gives_its_reason(task, monkeypatch):
     monkeypatch.delenv("P2P_DATA", raising=False)
-    reason = compare_trackers(task, {"tapir": ("tapir", {})})["tapir"]
+    reason = tracks.compare_trackers(task, {"tapir": ("tapir", {})})["tapir"]
     assert isinstance(reason, str) and "Run: " in reason
 
 
@@ -55,11 +55,13 @@ def test_the_story_shows_before_while_and_after_each_absence(task, scores):
 def test_right_and_wrong_points_look_different(task, scores):
     score, blue = scores["perfect"], np.array(style.rgb(style.OBJECTS[0]))
     strayed = replace(score, run=replace(score.run, uv_px=score.run.uv_px + 30.0))
-    right, wrong = (tracks.TrackScene(task.sequence, s).draw(60, trail=0) for s in (score, strayed))
-    before = task.sequence.frame(60).rgb
+    scenes = [tracks.TrackScene(task.sequence, s) for s in (score, strayed)]
+    right, wrong = (scene.draw(60, width_px=640, trail=0) for scene in scenes)
+    rgb, camera = task.sequence.frame(60).rgb, task.sequence.camera
+    before, seen_by = overlay.zoomed(rgb, camera, scenes[0].region_px, 640)
     seen = score.truth.visible[60] & (score.queries.frame < 60) & (score.queries.points.object == 0)
     assert seen.any()
-    u, v = np.rint(score.truth.uv_px[60, seen]).astype(int).T
+    u, v = np.rint(overlay.zoomed_px(score.truth.uv_px[60, seen], camera, seen_by)).astype(int).T
     assert (np.abs(right[v, u].astype(int) - blue).max(1) < 30).all()
     assert not (right == before).all() and not (wrong == right).all()
     assert np.abs(wrong[v, u].astype(int) - blue).max(1).mean() > 60

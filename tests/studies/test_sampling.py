@@ -1,7 +1,11 @@
-"""What points are worth: coverage by hand, a pose held by known points, the terms of every choice, lives of a map."""
+"""What points are worth: coverage by hand, a pose held by known points, the terms of every choice, lives of a map.
+
+And what is drawn is what was computed.
+"""
 
 import numpy as np
 import pytest
+from pandas import DataFrame
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
@@ -9,13 +13,15 @@ from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.robust import fit_rigid
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.method.sampling import choose
-from p2p_lib.studies.map_history import follow_map
-from p2p_lib.studies.sampling_study import (
+from p2p_lib.method.sampling import choose, objective
+from p2p_lib.studies import sampling
+from p2p_lib.studies.sampling import (
+    MapHistory,
     Situation,
     compare_choices,
     conditioning,
     coverage,
+    follow_map,
     greedy_terms,
     open_views,
 )
@@ -73,14 +79,14 @@ def test_terms_of_the_choices_sum_to_what_was_maximised():
 
 def test_choices_are_scored_on_the_same_ground(crossing):
     at = Situation.of(crossing, "box", 0)
-    scores = {s.label: s for s in compare_choices([at], frames_on=0)}
-    assert [len(s.uv_px) for s in scores.values()] == [CONFIG.sampling.points] * 6
-    assert scores["farthest"].coverage > scores["score alone"].coverage
-    assert scores["farthest"].error_m < scores["score alone"].error_m
-    again = compare_choices([at], frames_on=0)[0]
-    np.testing.assert_array_equal(again.uv_px, scores["J"].uv_px)
-    (followed,) = compare_choices([at], {"J": ("corners", {})}, frames_on=3)
-    assert 0.8 < followed.kept <= 1
+    scores = compare_choices([at], frames_on=0).set_index("choice")
+    assert [len(uv_px) for uv_px in scores["uv_px"]] == [CONFIG.sampling.points] * 6
+    assert scores["covered [%]"]["farthest"] > scores["covered [%]"]["score alone"]
+    assert scores["pose error [mm]"]["farthest"] < scores["pose error [mm]"]["score alone"]
+    again = compare_choices([at], frames_on=0)
+    np.testing.assert_array_equal(again["uv_px"][0], scores["uv_px"]["J"])
+    followed = compare_choices([at], {"J": ("corners", {})}, frames_on=3)
+    assert 80 < followed["still tracked [%]"][0] <= 100
 
 
 def test_views_are_of_objects_in_sight(crossing):
@@ -99,3 +105,48 @@ def test_the_life_of_a_map_follows_the_rules_of_promotion(crossing):
     np.testing.assert_array_equal(np.isfinite(history.p_promoted[:, 0]), history.promoted < 30)
     known = np.isfinite(history.p_true[:, 0])
     assert known.mean() > 0.9 and np.median(history.born_error_m[known]) < 0.004
+
+
+def test_maps_show_the_terms_and_the_next_choice(crossing):
+    situation = Situation.of(crossing, "box", 0)
+    candidates, config = situation.candidates(), situation.config.sampling
+    figure = sampling.term_maps(situation, candidates, after=(0, 4))
+    axes = figure.axes  # two rows of four, then the colour bars
+    chosen = choose(candidates, np.zeros((0, 2)), 5, config)
+    spread = axes[5].get_images()[-1].get_array()
+    assert spread.max() == pytest.approx(1 - config.score_weight) and spread.min() < 0.05
+    assert np.ma.is_masked(spread), "nothing is drawn beside the object"
+    crosses = [tuple(line.get_xydata()[0]) for line in axes[7].get_lines()]
+    np.testing.assert_allclose(crosses[-1], candidates.uv_px[chosen[4]])
+    dots = axes[3].collections[0].get_array()
+    np.testing.assert_allclose(np.sort(dots), np.sort(objective(candidates.score, np.full(len(dots), np.inf), config)))
+
+
+def test_the_table_is_of_means_over_situations():
+    columns = ["choice", "uv_px", "covered [%]", "pose error [mm]", "still tracked [%]"]
+    rows = [("J", None, 50, 2, 80), ("J", None, 70, 2, np.nan), ("uniform", None, 50, 4, 80)]
+    table = sampling.choice_table(DataFrame(rows, columns=columns))
+    assert table.to_numpy().tolist() == [["J", 60, 2, 80], ["uniform", 50, 4, 80]]
+    assert len(sampling.choice_plot(table).axes) == 3
+
+
+@pytest.fixture
+def history():
+    """Two founders, three pending from frame 4: promoted at 7 and 8, and retired at 9."""
+    born, promoted, gone = np.array([0, 0, 4, 4, 4]), np.array([0, 0, 7, 8, 10]), np.array([10, 6, 10, 10, 9])
+    p = np.zeros((5, 3))
+    later = np.where((promoted < 10)[:, None], p, np.nan)
+    keyframe, poses = np.isin(np.arange(10), [0, 4]), np.tile(np.eye(4), (10, 1, 1))
+    return MapHistory("box", born, promoted, gone, p, later, p, keyframe, poses)
+
+
+def test_lives_are_bars_of_the_right_length(history, crossing):
+    bars = sampling.life_lines(history, crossing).axes[0].patches
+    spans = sorted((bar.get_x(), bar.get_x() + bar.get_width()) for bar in bars if bar.get_width())
+    assert spans == [(0, 6), (0, 10), (4, 7), (4, 8), (4, 9), (7, 10), (8, 10)]
+
+
+def test_the_moments_of_promotion(history):
+    assert history.founding.tolist() == [True, True, False, False, False]
+    moments = sampling.promotion_moments(history)
+    assert moments[0] == 4 and moments[-1] == 7 and len(moments) == 4

@@ -1,12 +1,18 @@
-"""Solids of revolution and bent tubes: a mug with its handle."""
+"""Solids of revolution and bent tubes: a mug with its handle, a hand with its forearm."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.synthetic import labels
-from p2p_lib.synthetic.shapes import TEXELS_PER_M, Mesh, grid, welded
+from p2p_lib.synthetic.shapes import TEXELS_PER_M, Mesh, Patch, assembled, grid
+
+#: Corners of a profile that bend by less than this are shaded smooth.
+_CREASE_COSINE = np.cos(np.radians(35))
 
 
 def mug(rng: np.random.Generator, radius_m: float, height_m: float, reflectance: float, marks: int) -> Mesh:
@@ -25,44 +31,63 @@ def mug(rng: np.random.Generator, radius_m: float, height_m: float, reflectance:
     body = revolved(profile, glaze)
     t = np.linspace(-1.0, 1.0, 17)
     bow = np.stack([np.cos(t * np.pi / 2) ** 0.6 * 0.75 * radius_m, np.zeros_like(t), t * 0.30 * height_m], 1)
+    outside = profile[1:26]
     # Both ends end inside the wall, which is 4 mm thick.
-    inner = np.interp(bow[:, 2], *_outside(profile)) - 0.002
-    handle = tube(bow + np.stack([inner, 0 * t, 0 * t], 1), 0.008, _speckled(rng))
-    return _united(body, handle, reflectance)
+    bow[:, 0] += np.interp(bow[:, 2], outside[:, 1], outside[:, 0]) - 0.002
+    handle = tube(bow, 0.008, _speckled(rng))
+    mirrors = np.repeat([reflectance, 0.0], [len(body.corners), len(handle.corners)])
+    return replace(assembled([body, handle], [[0], [1]], ground=96), reflectance=mirrors)
 
 
-def revolved(profile: np.ndarray, texture: np.ndarray, segments: int = 72) -> Mesh:
-    """The surface of a profile (P, 2) of radius and height turned about z; the texture runs around and up along it.
+def hand(rng: np.random.Generator) -> Mesh:
+    """A right hand held flat, fingers together and up (+z), palm towards -y, its middle at the origin; plain skin."""
+    size = rng.uniform(0.95, 1.08)
+    tone = np.float32([205, 160, 132]) * np.float32(rng.uniform(0.55, 1.05))
+    blotches = labels.smooth_noise(rng, 256, 512, (3, 6), 5)[..., None]
+    skin = np.clip(tone * (1 + 0.08 * blotches), 0, 255).astype(np.uint8)
+    fingers = [(-0.0285, 0.066), (-0.0095, 0.078), (0.0095, 0.073), (0.0285, 0.058)]
+    limbs = [
+        _limb(skin, 0.030, 0.30, (0, 0, -0.20), (1.0, 0.8, 1.0)),
+        _limb(skin, 0.046, 0.112, (0, 0, -0.035), (1.0, 0.35, 1.0)),
+        _limb(skin, 0.011, 0.075, (-0.050, 0, -0.025), lean_rad=-0.5),
+        *(_limb(skin, 0.0105, 2 * tall, (x, 0, 0.016)) for x, tall in fingers),
+    ]
+    corners, uv, normals = (np.concatenate([getattr(p, a) for p in limbs]) for a in ("corners", "uv", "normals"))
+    return assembled([Patch(size * corners, uv, normals, skin)])
+
+
+def revolved(profile: np.ndarray, image: np.ndarray, segments: int = 72) -> Patch:
+    """The surface of a profile (P, 2) of radius and height turned about z; the image runs around and up along it.
 
     The profile goes from bottom to top on the outside: its right side is outside.
     """
     step = np.diff(profile, axis=0)
     length = np.linalg.norm(step, axis=1)
     flat = np.stack([step[:, 1], -step[:, 0]], 1) / length[:, None]
-    smooth = np.einsum("ij,ij->i", flat[:-1], flat[1:]) > np.cos(np.radians(35))
+    smooth = np.einsum("ij,ij->i", flat[:-1], flat[1:]) > _CREASE_COSINE
     mean = flat[:-1] + flat[1:]
     mean /= np.linalg.norm(mean, axis=1, keepdims=True)
     start, stop = flat.copy(), flat.copy()
     start[1:][smooth], stop[:-1][smooth] = mean[smooth], mean[smooth]
     for end, one in ((start, 0), (stop, -1)):
-        if profile[one, 0] < 1e-9 and abs(flat[one, 1]) > np.cos(np.radians(35)):
+        if profile[one, 0] < 1e-9 and abs(flat[one, 1]) > _CREASE_COSINE:
             end[one] = 0, np.sign(flat[one, 1])  # a smooth pole
     along = np.r_[0, np.cumsum(length)] / length.sum()
     cells = grid(np.linspace(0, 1, segments + 1), along)
     row = np.clip(np.searchsorted(along, cells[..., 1].mean(1)) - 1, 0, len(length) - 1)
-    share = (cells[..., 1] - along[row, None]) / (along[row + 1] - along[row])[:, None]
-    rz = profile[row][:, None] + share[..., None] * step[row][:, None]
-    normal = start[row][:, None] + share[..., None] * (stop[row] - start[row])[:, None]
+    share = ((cells[..., 1] - along[row, None]) / (along[row + 1] - along[row])[:, None])[..., None]
+    radius_height = profile[row][:, None] + share * step[row][:, None]
+    normal = start[row][:, None] + share * (stop[row] - start[row])[:, None]
     angle = 2 * np.pi * cells[..., 0]
     out = np.stack([np.cos(angle), np.sin(angle)], -1)
-    lifted = [np.concatenate([out * a[..., :1], a[..., 1:]], -1) for a in (rz, normal)]
-    area = np.linalg.norm(np.cross(lifted[0][:, 1] - lifted[0][:, 0], lifted[0][:, 2] - lifted[0][:, 0]), axis=1)
+    corners, normals = (np.concatenate([out * a[..., :1], a[..., 1:]], -1) for a in (radius_height, normal))
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     solid = area > 1e-12  # where the profile meets the axis one triangle of each cell vanishes
-    return welded(lifted[0][solid], cells[solid], texture, lifted[1][solid])
+    return Patch(corners[solid], cells[solid], normals[solid], image)
 
 
-def tube(path: np.ndarray, radius_m: float, texture: np.ndarray, segments: int = 14) -> Mesh:
-    """A round tube along points (P, 3) of the plane y = 0, its ends open; the texture runs around and along."""
+def tube(path: np.ndarray, radius_m: float, image: np.ndarray, segments: int = 14) -> Patch:
+    """A round tube along points (P, 3) of the plane y = 0, its ends open; the image runs around and along."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     side = np.array([0, 1.0, 0])
@@ -72,11 +97,11 @@ def tube(path: np.ndarray, radius_m: float, texture: np.ndarray, segments: int =
     row = np.argmin(np.abs(cells[..., 1:] - length / length[-1]), -1)
     angle = -2 * np.pi * cells[..., :1]
     out = np.cos(angle) * across[row] + np.sin(angle) * side
-    return welded(path[row] + radius_m * out, cells, texture, out)
+    return Patch(path[row] + radius_m * out, cells, out, image)
 
 
 def _mug_profile(radius_m: float, height_m: float) -> np.ndarray:
-    """Radius and height from the middle of the foot up the belly, over the rim, down to the middle inside."""
+    """Radius and height from the middle of the foot up the belly (rows 1 to 25), over the rim, to the middle inside."""
     h = height_m / 2
     z = np.linspace(-h, h, 25)
     outside = np.stack([radius_m * (0.62 + 0.38 * np.cos(z / h * 1.15)), z], 1)
@@ -84,13 +109,8 @@ def _mug_profile(radius_m: float, height_m: float) -> np.ndarray:
     return np.concatenate([[[0, -h]], outside, inside, [[0, inside[-1, 1]]]])
 
 
-def _outside(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Heights and radii of the outer wall."""
-    return profile[1:26, 1], profile[1:26, 0]
-
-
 def _print_marks(rng: np.random.Generator, glaze: np.ndarray, marks: int, tall: int) -> None:
-    """Small prints, evenly around the belly at different heights; the outside starts at the texture's bottom."""
+    """Small prints, evenly around the belly at different heights; the outside starts at the image's bottom."""
     along, around = glaze.shape[:2]
     foot = round(0.032 * TEXELS_PER_M)
     for k in range(marks):
@@ -114,14 +134,20 @@ def _speckled(rng: np.random.Generator, width: int = 128, height: int = 512) -> 
     return page
 
 
-def _united(glossy: Mesh, matt: Mesh, reflectance: float) -> Mesh:
-    """Two meshes with one texture, the first one's above; only the first mirrors."""
-    (h0, w0), (h1, w1) = glossy.texture.shape[:2], matt.texture.shape[:2]
-    H, W = h0 + h1, max(w0, w1)
-    texture = np.full((H, W, 3), 96, np.uint8)
-    texture[:h0, :w0], texture[h0:, :w1] = glossy.texture, matt.texture
-    uv = np.concatenate([(glossy.uv * [w0, h0] + [0, h1]) / [W, H], matt.uv * [w1, h1] / [W, H]])
-    faces = np.concatenate([glossy.faces, matt.faces + len(glossy.vertices)])
-    mirrors = np.repeat([reflectance, 0.0], [len(glossy.faces), len(matt.faces)])
-    vertices = np.concatenate([glossy.vertices, matt.vertices])
-    return Mesh(vertices, faces, uv, texture, np.concatenate([glossy.normals, matt.normals]), reflectance=mirrors)
+def _limb(
+    skin: np.ndarray,
+    radius_m: float,
+    length_m: float,
+    at: tuple[float, float, float],
+    squash: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    lean_rad: float = 0.0,
+) -> Patch:
+    """A capsule along z, squashed along its axes, leant sideways, moved."""
+    angle = np.linspace(0, np.pi / 2, 6)
+    cap = radius_m * np.stack([np.sin(angle), 1 - np.cos(angle)], 1)
+    profile = np.concatenate([cap - [0, length_m / 2], [1, -1] * cap[::-1] + [0, length_m / 2]])
+    capsule = revolved(profile, skin, segments=20)
+    R = se3.exp(np.array([0, lean_rad, 0, 0, 0, 0.0]))[:3, :3]
+    normals = capsule.normals / np.array(squash)
+    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True) @ R.T
+    return replace(capsule, corners=capsule.corners * squash @ R.T + at, normals=normals)

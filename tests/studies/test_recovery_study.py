@@ -9,7 +9,7 @@ from p2p_lib.evaluation.recovery import RecoveryEvent
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.studies import recovery
 
-EVENT = RecoveryEvent(hidden_frame=16, return_frame=21, frames_to_recovery=1, frames_visible=15)
+EVENT = RecoveryEvent(hidden_frame=16, return_frame=21, frames_to_recovery=1)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_pictures_are_cut_to_where_the_object_truly_is(scenes, made):
 
 def test_curves_around_the_return_are_those_of_the_run(scenes, made):
     evaluations = dict.fromkeys(scenes, made.evaluation)
-    figure = recovery.around_return(scenes, evaluations, "box", RecoveryEvent(12, 18, 0, 10), span=10)
+    figure = recovery.around_return(scenes, evaluations, "box", RecoveryEvent(12, 18, 0), span=10)
     obj = made.run.objects["box"]
     points, errors, sure = (axis.get_lines()[0] for axis in figure.axes[1:])
     assert points.get_xdata().tolist() == list(range(-16, 10))
