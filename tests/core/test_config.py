@@ -234,7 +234,9 @@ def test_words_are_read_as_values(key, words, value):
 
 @pytest.mark.parametrize("words", ["", "many", "3,", "3 4", "[3]", "0.5", "nan", "1e3", "true"])
 def test_unreadable_words_are_refused(words):
-    with pytest.raises(BadInput, match=r"config sampling.points: got .*expected a whole number: K, points chosen"):
+    with pytest.raises(
+        BadInput, match=r"config sampling.points: got .*expected a whole number: At a keyframe K points"
+    ):
         Config().with_values({"sampling.points": words})
 
 
@@ -323,13 +325,15 @@ def written(tmp_path, text: str):
 
 
 def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
-    path = written(tmp_path, "[sampling]\npoints = 12\n[tsdf]\nenabled = false\n")
+    path = written(tmp_path, "[sampling]\npoints = 12\n[method]\nsurface = false\n")
     expected = {"sampling.points": 12, "method.surface": False}
     assert from_toml(path) == Config().with_values(expected)
     assert from_toml(path, preset("paper", 3)) == preset("paper", 3).with_values(expected)
     assert from_toml(written(tmp_path, "")) == Config()
     assert from_toml(written(tmp_path, 'preset = "paper"\nseed = 4')) == preset("paper", 4)
-    assert from_toml(written(tmp_path, "sampling.points = 12\nmethod.surface = false")) == Config().with_values(expected)
+    assert from_toml(written(tmp_path, "sampling.points = 12\nmethod.surface = false")) == Config().with_values(
+        expected
+    )
 
 
 @pytest.mark.parametrize(
