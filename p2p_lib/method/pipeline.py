@@ -90,7 +90,12 @@ class Point2Pose:
             self._first_clicks[name] = clicks
             self._clicked.add(name)
         self.objects[name] = ObjectTracker(
-            name, self.camera, self.config, self.detector, self._rng.spawn(1)[0], self.stopwatch
+            name,
+            self.camera,
+            self.config,
+            self.detector,
+            np.random.default_rng([self.config.seed, *name.encode()]),
+            self.stopwatch,
         )
 
     def remove_object(self, name: str) -> None:
