@@ -102,7 +102,8 @@ class Point2Pose:
         """Stop following an object; its points are dropped from the tracker."""
         if name not in self.objects:
             raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        self.tracker.drop(self.objects.pop(name).map.ids)
+        if len(ids := self.objects.pop(name).map.ids):
+            self.tracker.drop(ids)
         self._first_masks.pop(name, None)
         self._first_clicks.pop(name, None)
         self._clicked.discard(name)

@@ -2,18 +2,20 @@
 
 import numpy as np
 import pytest
-from test_pipeline import CAMERA, HIDDEN, Shy, film
 
 from p2p_lib.core.config import diff, preset
 from p2p_lib.method.pipeline import Point2Pose
+from tests.method.test_pipeline import CAMERA, HIDDEN, Shy, film
 
 #: Where the film has no occasion for a key: other values of it, and settings that give it one.
 OCCASIONS = {
     "keypoint_map.cooldown": ((0, 8), {"keypoint_map.keyframe_min_points": 200}),
     "factor_graph.max_keyframes": ((0, 3), {"keypoint_map.keyframe_angle_deg": 3.0}),
     "sampling.max_visible": ((50, 60), {"sampling.points": 60}),
+    "method.gates": (("none", "all"), {"method.redetection": False}),
 }
-FEW_POINTS = {"method.redetection": 5, "method.gates": 5}
+#: A tracker that finds so few points again tells these.
+FEW_POINTS = {"method.redetection": 5, "method.gates": 6}
 
 
 def run(key: str, value, settings: dict) -> list[np.ndarray]:
@@ -25,7 +27,8 @@ def run(key: str, value, settings: dict) -> list[np.ndarray]:
     for frame, masks in film(board=True)[: HIDDEN.stop + 3]:
         estimate = method.step(frame, {"left": masks["left"]})["left"]
         poses.append(np.full((4, 4), np.nan) if estimate.T_cam_obj is None else estimate.T_cam_obj)
-    return [np.stack(poses), method.objects["left"].map.p_obj]
+    model = method.objects["left"].model
+    return [np.stack(poses), model.map.p_obj, model.surface.weights()]
 
 
 @pytest.mark.parametrize("key", diff())

@@ -8,7 +8,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from surface_points import see, watch
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
@@ -16,6 +15,7 @@ from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.synthetic import SCENARIOS, generate, scenario_dir
 from p2p_lib.synthetic.noise import PERFECT, Sensor
 from p2p_lib.synthetic.render import render
+from tests.synthetic.surface_points import see, watch
 
 OBJECTS = ("box", "can")
 FRAMES = 300
