@@ -19,8 +19,8 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig, preset
+from p2p_lib.core.robust import fit_rigid
 from p2p_lib.method.factor_graph import ObjectGraph
-from p2p_lib.method.registration import fit_rigid
 
 SIGMA_RAD, SIGMA_M = 0.0015, 0.003
 

@@ -46,7 +46,7 @@ def held(method: Point2Pose) -> str:
     words = []
     for name, obj in method.objects.items():
         voxels = np.prod(obj.surface.shape) / 1e6
-        counts = (len(obj.map), len(obj.graph.keys), len(obj.views), len(obj.surface.keys))
+        counts = (len(obj.map), len(obj.model.graph.keys), len(obj.model.views), len(obj.model.surface.keys))
         words.append(f"{name} {'/'.join(map(str, counts))}/{voxels:.2f}")
     return "  ".join(words)
 

@@ -19,7 +19,8 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TsdfConfig, preset
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.native import load_open3d
-from p2p_lib.method.refinement import refine, sample_cloud, surface_score
+from p2p_lib.method.observation import sample_cloud
+from p2p_lib.method.refinement import refine, surface_score
 from p2p_lib.method.tsdf import TsdfVolume
 
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)

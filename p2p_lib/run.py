@@ -3,33 +3,30 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from p2p_lib.core import config as configuration
-from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, DEFAULT_TRACKER, SEGMENTERS, make_tracker
+from p2p_lib.core.backends import ALIASES, DEFAULT_SEGMENTER, SEGMENTERS, make_tracker
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.clicks import check_apart, check_clicks
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.interfaces import PointTracker
+from p2p_lib.core.options import RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets import sequence as sequences
-from p2p_lib.datasets.export import export
-from p2p_lib.datasets.imported import as_run, read_poses
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import Prompt, load_prompts
 from p2p_lib.datasets.runs import Run, RunWriter, load_run
-from p2p_lib.evaluation.mask_score import MaskEvaluation, evaluate_masks
 from p2p_lib.evaluation.oracle import OracleTracker
-from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
-from p2p_lib.evaluation.tracker_score import TrackerScore, score_tracker
+from p2p_lib.evaluation.protocol import Evaluation, evaluate, rate
+from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.method.mesh import save as save_mesh
 from p2p_lib.method.pipeline import Point2Pose
@@ -55,97 +52,45 @@ class RunResult:
     tracked: bool = True
 
 
-def make_config(
-    preset: str | None = None,
-    config_file: Path | None = None,
-    settings: Mapping[str, Any] | None = None,
-    seed: int | None = None,
-) -> Config:
-    """The configuration of a run: preset, then file, then single settings, then seed."""
-    config = configuration.preset(preset or "default")
-    if config_file is not None:
-        config = configuration.from_toml(config_file, config if preset else None)
-    config = config.with_values(dict(settings or {}), source="--set")
-    return config if seed is None else config.with_values({"seed": seed})
-
-
 def run(
     sequence: str | Path | sequences.Sequence,
     out: str | Path,
+    options: RunOptions | None = None,
     *,
-    preset: str | None = None,
-    config_file: Path | None = None,
-    settings: Mapping[str, Any] | None = None,
-    seed: int | None = None,
-    tracker: str | PointTracker | None = None,
-    detector: str | None = None,
-    masks: str | None = None,
-    prompts: str | Path | Iterable[Prompt] | None = None,
-    save_masks: bool = False,
-    format: str | None = None,
-    depth_scale: float | None = None,
-    objects: Iterable[str] | None = None,
-    start: int = 0,
-    stop: int | None = None,
-    models: Mapping[str, str | Path] | None = None,
     progress: bool = True,
     say: Callable[[str], object] = lambda line: None,
+    **changes: Any,
 ) -> RunResult:
     """Track the objects of a sequence and write a run folder (see :mod:`p2p_lib.datasets.runs`).
 
-    ``masks`` says where masks come from: ``dataset``, ``dataset:FOLDER``, or a segmenter by name, which
-    starts from ``prompts`` (a file, or values). The default is the dataset's, or with prompts the
-    embedded segmenter. With the dataset's, each object is started by its first mask that is large enough.
+    ``changes`` are fields of :class:`RunOptions` over those of ``options``: ``run("synthetic/mug", "out", seed=3)``.
+    ``options.masks`` says where masks come from: ``dataset``, ``dataset:FOLDER``, or a segmenter by name, which starts
+    from ``options.prompts``. The default is the dataset's, or with prompts the built-in segmenter. With the dataset's,
+    each object is started by its first mask that is large enough.
 
-    Arguments are those of ``p2p run``; ``sequence`` may also be an open one. An earlier run in ``out`` is replaced, of
-    which ``say`` is told before anything is tracked. Raises :class:`P2PError` with a
-    one-line message for anything that does not fit; Ctrl-C ends the run early and is reported in the result.
+    ``sequence`` may be an open one. An earlier run in ``out`` is replaced, of which ``say`` is told before anything is
+    tracked. Raises :class:`P2PError` for anything that does not fit; Ctrl-C ends the run early and is reported in the
+    result.
     """
-    config = make_config(preset, config_file, settings, seed)
-    source = " ".join(map(str, (sequence, *(("--prompts", prompts) if isinstance(prompts, str | Path) else ()))))
-    prompts = load_prompts(prompts) if isinstance(prompts, str | Path) else tuple(prompts or ())
-    masks = _mask_source(masks, prompts)
-    segmenter = masks if masks in SEGMENTERS else None
-    if isinstance(sequence, str | Path):
-        folder = None if segmenter else masks.partition(":")[2] or None
-        sequence = sequences.open_sequence(sequence, format, depth_scale, config.seed, masks=folder)
-    frames = _frames(len(sequence), start, stop)
-    chosen = _chosen([p.name for p in prompts] if segmenter else sequence.objects, objects)
-    clicked = _by_frame([p for p in prompts if p.name in chosen], frames, sequence.camera)
-    if not segmenter and all(sequence.masks(i) is None for i in frames):
-        fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
-        expected = "masks of the first picture at least, or clicks"
-        raise BadInput("masks", f"none in frames {frames[0]} to {frames[-1]} of {sequence.name}", expected, fix)
+    options = replace(options or RunOptions(), **changes)
+    job = _prepare(sequence, options)
     method = Point2Pose(
-        sequence.camera,
-        config,
-        _tracker(tracker, sequence, config, models),
-        detector or DEFAULT_DETECTOR,
-        segmenter or DEFAULT_SEGMENTER,
+        job.sequence.camera,
+        job.config,
+        _tracker(options.tracker, job.sequence, job.config, options.models),
+        options.detector,
+        job.segmenter or DEFAULT_SEGMENTER,
     )
-    for name in () if segmenter else chosen:
+    for name in () if job.segmenter else job.objects:
         method.add_object(name)
-    known = find_models(sequence) | given_models(models or {}, sequence.objects)
-    writer = RunWriter(
-        out,
-        sequence,
-        config,
-        method.tracker.name,
-        masks,
-        chosen,
-        frames.start,
-        frames.stop,
-        {name: path for name, path in known.items() if name in chosen},
-    )
+    writer = _writer(job, options, method, out)
     if writer.replaced:
         say(f"{out} held {writer.replaced}, which this one replaces.")
-    writer.info["detector"] = method.detector.name
-    writer.info["prompts"] = [{"name": p.name, "frame": p.frame, "points": p.points_px.tolist()} for p in prompts]
-    interrupted, keypoints = False, KeypointLog()
-    with writer, progress_bar(sequence.name, len(frames), shown=progress) as bar:
+    keypoints = KeypointLog()
+    with writer, progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
         try:
-            for frame, estimates in _estimates(method, sequence, frames, None if segmenter is None else clicked):
-                if save_masks:
+            for frame, estimates in _estimates(method, job):
+                if options.save_masks:
                     writer.add_masks(frame, method.masks)
                 _log_keypoints(keypoints, frame, method)
                 times = method.stopwatch.last_ms
@@ -153,191 +98,89 @@ def run(
                 bar.set_postfix_str(_postfix(times["total"], estimates), refresh=False)
                 bar.update()
         except KeyboardInterrupt:
-            interrupted = True
             writer.info["stopped_by"] = "KeyboardInterrupt"
+    interrupted = writer.info["stopped_by"] is not None
     if not writer.info["frames"]:
-        return RunResult(Path(out), None, "no frame was finished", (f"0 of {len(frames)} frames",), interrupted)
-    _save_meshes(method, Path(out))
-    maps = {name: obj.map for name, obj in method.objects.items()}
-    keypoints.save(Path(out), {name: (m.ids, m.p_obj, m.promoted) for name, m in maps.items()})
-    done = load_run(out)
-    try:
-        evaluation, not_scored = evaluate(done), ""
-    except MissingData as error:
-        evaluation, not_scored = None, str(error)
-    if not any(obj.has_truth.any() for obj in done.objects.values()):
-        not_scored = "the sequence has no truth"
-    tracked = any(obj.has_pose.any() for obj in done.objects.values())
-    advice = "" if interrupted else _advice(done, source, bool(segmenter))
-    return RunResult(Path(out), evaluation, not_scored, _summary(done, len(frames)), interrupted, advice, tracked)
-
-
-def _estimates(
-    method: Point2Pose,
-    sequence: sequences.Sequence,
-    frames: range,
-    clicked: Mapping[int, Mapping[str, np.ndarray]] | None,
-) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
-    """Every frame with its estimates, which a late 2D tracker gives some frames later.
-
-    clicked  frame to the clicks that start objects there; None: the sequence's masks do
-    """
-    waiting: deque[Frame] = deque()
-    for i in frames:
-        frame, seen = sequence.frame(i), sequence.masks(i) if clicked is None else None
-        for name, clicks in (clicked or {}).get(i, {}).items():
-            method.add_object(name, clicks=clicks)
-        waiting.append(frame)
-        known = None if seen is None else {name: seen[name] for name in method.objects if name in seen}
-        estimates = method.step(frame, known)
-        if len(waiting) > method.tracker.latency_frames:
-            yield waiting.popleft(), estimates
-    for estimates in method.finish():
-        yield waiting.popleft(), estimates
-
-
-def evaluate_run(
-    out: str | Path, models: Mapping[str, str | Path] | None = None, align: str = "first", min_visible_px: int = 300
-) -> Evaluation:
-    """Score a run folder; what ``p2p eval`` prints."""
-    return evaluate(load_run(out), models, align, min_visible_px)
-
-
-def evaluate_poses(
-    poses: str | Path,
-    sequence: str | Path | sequences.Sequence,
-    models: Mapping[str, str | Path] | None = None,
-    align: str = "first",
-    min_visible_px: int = 300,
-    format: str | None = None,
-    start: int = 0,
-    stop: int | None = None,
-) -> Evaluation:
-    """Score any method's poses (:mod:`p2p_lib.datasets.imported`) by the rules of a run of ours over these frames."""
-    if isinstance(sequence, str | Path):
-        sequence = sequences.open_sequence(sequence, format)
-    known = find_models(sequence) | given_models(models or {}, sequence.objects)
-    frames = _frames(len(sequence), start, stop)
-    run = as_run(read_poses(poses, sequence), sequence, known, path=Path(poses), frames=frames)
-    return evaluate(run, None, align, min_visible_px)
-
-
-def export_run(folder: str | Path, format: str, out: str | Path, frame: str | None = None) -> list[Path]:
-    """Write a run's poses in another tool's form; what ``p2p export`` does.
-
-    frame  "object": T_cam_obj, the tracker's own frame; "model": T_cam_model, by the truth of the first scored frame
-           as scoring fixes it. By default the model's for ``bop``, which knows no other, else the object's
-    """
-    frames = ("object", "model")
-    if frame not in (None, *frames):
-        raise BadInput("frame", repr(frame), " or ".join(frames))
-    run = load_run(folder)
-    in_model = (frame or ("model" if format == "bop" else "object")) == "model"
-    T_obj_model = model_frames(run) if in_model else None
-    path = run.info.get("path")
-    there = path is not None and Path(path).is_dir()
-    return export(run, out, format, T_obj_model, sequences.open_sequence(path, run.info["format"]) if there else None)
+        return RunResult(Path(out), None, "no frame was finished", (f"0 of {len(job.frames)} frames",), interrupted)
+    _save_maps(method, keypoints, Path(out))
+    return _result(job, Path(out), interrupted)
 
 
 def evaluate_tracker(
     sequence: str | Path | sequences.Sequence,
-    tracker: str | None = None,
+    options: RunOptions | None = None,
     *,
-    seed: int = 0,
-    models: Mapping[str, str | Path] | None = None,
     count: int = 256,
     search: bool = False,
-    format: str | None = None,
-    depth_scale: float | None = None,
-    settings: Mapping[str, Any] | None = None,
+    **changes: Any,
 ) -> TrackerScore:
-    """Score a 2D tracker against true tracks; what ``p2p eval-tracks`` prints.
+    """Score the 2D tracker of ``options`` by itself against ``count`` true tracks; what ``p2p eval-tracks`` prints.
 
-    A synthetic sequence named is always that of seed 0; ``seed`` draws the queries and serves the tracker.
+    A synthetic sequence named is always that of seed 0; the seed given draws the queries and serves the tracker.
     """
-    config = make_config(settings=settings, seed=seed)
-    named = isinstance(sequence, str | Path)
-    opened = sequences.open_sequence(sequence, format, depth_scale) if named else sequence
-    chosen = _tracker(tracker, opened, config, models)
-    method = make_tracker(chosen, config.tracking, np.random.default_rng(config.seed))
-    return score_tracker(opened, method, config.seed, models, count, search)
+    options = replace(options or RunOptions(), **changes)
+    config = options.config()
+    if isinstance(sequence, str | Path):
+        sequence = sequences.open_sequence(sequence, options.format, options.depth_scale)
+    chosen = _tracker(options.tracker, sequence, config, options.models)
+    tracker = make_tracker(chosen, config.tracking, np.random.default_rng(config.seed))
+    return TrackTask.of(sequence, config.seed, options.models, count).score(tracker, search)
 
 
-def _tracker(
-    name: str | PointTracker | None,
-    sequence: sequences.Sequence,
-    config: Config,
-    models: Mapping[str, str | Path] | None,
-) -> str | PointTracker:
-    """The name of a tracker, but the tracker itself where it must know the sequence: ``oracle``."""
-    if name != OracleTracker.name:
-        return name or DEFAULT_TRACKER
-    return OracleTracker(TrueScene.of(sequence, models), config.oracle, config.seed)
+def frame_range(count: int, start: int, stop: int | None) -> range:
+    """The frames from ``start`` to ``stop`` of a sequence of ``count``; :class:`BadInput` where there are none."""
+    end = count if stop is None else min(stop, count)
+    if not 0 <= start < end:
+        raise BadInput("frames", f"start {start}, stop {stop}", f"0 <= start < stop within {count} frames")
+    return range(start, end)
 
 
-def evaluate_run_masks(out: str | Path, min_visible_px: int = 300) -> MaskEvaluation:
-    """Score the masks that a run kept; what ``p2p eval-masks`` prints."""
-    return evaluate_masks(load_run(out), min_visible_px=min_visible_px)
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A run whose options have been checked.
 
-
-def _log_keypoints(log: KeypointLog, frame: Frame, method: Point2Pose) -> None:
-    """Keep where each object's points were seen in the frame that has just been estimated."""
-    tracks = method.tracks
-    for name, obj in method.objects.items():
-        seen = tracks.visible & np.isin(tracks.ids, obj.map.ids)
-        log.add(frame.index, name, tracks.ids[seen], tracks.uv_px[seen])
-
-
-def _save_meshes(method: Point2Pose, out: Path) -> None:
-    """``meshes/<object>.ply``: each object's surface in its own frame; nothing of one that was never seen."""
-    for name, obj in method.objects.items():
-        if obj.surface is None or obj.surface.empty:
-            continue
-        mesh = obj.surface.mesh()
-        if len(mesh.faces):
-            save_mesh(mesh, out / "meshes" / f"{name}.ply")
-
-
-def _summary(run: Run, wanted: int) -> tuple[str, ...]:
-    """How far the run came; per object how many frames have a pose and what mostly kept it from the others."""
-    count = len(next(iter(run.objects.values())))
-    hz, _ = rate(run.timings)
-    lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
-    for name, obj in run.objects.items():
-        without = Counter(
-            f"{s}: {r}" for s, r in zip(obj.status[~obj.has_pose], obj.reason[~obj.has_pose], strict=True)
-        )
-        most = f"; without one mostly {without.most_common(1)[0][0]}" if without else ""
-        lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{most}")
-    return tuple(lines)
-
-
-def _advice(run: Run, source: str, clicks: bool) -> str:
-    """What to do about objects that never had a pose, by what kept it from them; "" where there are none.
-
-    source  the sequence, and the prompts, as they were given to the command line
+    source   the sequence, and the prompts, as they would be given to the command line
+    masks    where they come from; ``segmenter`` is its name where that is a segmenter
+    clicked  frame to the clicks (N, 2) that start objects there, by object
     """
-    reasons = {
-        name: Counter(obj.reason).most_common(1)[0][0] for name, obj in run.objects.items() if not obj.has_pose.any()
-    }
-    if not reasons:
-        return ""
-    who, why = f"{', '.join(reasons)} never had a pose", " ".join(reasons.values())
-    fix = "see what is wrong with the data"
-    if "not seen yet" in why:
-        fix = (
-            "click in the middle of it, elsewhere"
-            if clicks
-            else "its masks are empty or too small: draw it, or use p2p click"
-        )
-    if "pixels with depth" in why:
-        fix = "its depth is missing or out of range, or in another unit (--depth-scale)"
-    return f"{who} ({next(iter(reasons.values()))}); {fix}. Next: p2p check {source}"
+
+    source: str
+    config: Config
+    sequence: sequences.Sequence
+    frames: range
+    objects: tuple[str, ...]
+    masks: str
+    segmenter: str | None
+    prompts: tuple[Prompt, ...]
+    clicked: Mapping[int, Mapping[str, np.ndarray]]
+
+
+def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> _Job:
+    """Whatever can be wrong with the options is said here, before anything is tracked."""
+    config, prompts, source = options.config(), options.prompts, str(sequence)
+    if isinstance(prompts, str | Path):
+        source += f" --prompts {prompts}"
+        prompts = load_prompts(prompts)
+    prompts = tuple(prompts or ())
+    masks = _mask_source(options.masks, prompts)
+    segmenter = masks if masks in SEGMENTERS else None
+    if isinstance(sequence, str | Path):
+        folder = None if segmenter else masks.partition(":")[2] or None
+        sequence = sequences.open_sequence(sequence, options.format, options.depth_scale, config.seed, masks=folder)
+    frames = frame_range(len(sequence), options.start, options.stop)
+    objects = _chosen([p.name for p in prompts] if segmenter else sequence.objects, options.objects)
+    clicked = _by_frame([p for p in prompts if p.name in objects], frames, sequence.camera)
+    if not segmenter and all(sequence.masks(i) is None for i in frames):
+        fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
+        expected = "masks of the first image at least, or clicks"
+        raise BadInput("masks", f"none in frames {frames[0]} to {frames[-1]} of {sequence.name}", expected, fix)
+    return _Job(source, config, sequence, frames, objects, masks, segmenter, prompts, clicked)
 
 
 def _mask_source(masks: str | None, prompts: Sequence[Prompt]) -> str:
     """The checked source of masks; None means the dataset, or with prompts the segmenter that is the default."""
     source = masks or (DEFAULT_SEGMENTER if prompts else "dataset")
+    source = ALIASES.get(source, source)
     kind, colon, folder = source.partition(":")
     if (kind != "dataset" or (colon and not folder)) and source not in SEGMENTERS:
         raise BadInput("masks", repr(masks), f"dataset, dataset:FOLDER, or {', '.join(SEGMENTERS)}")
@@ -349,8 +192,8 @@ def _mask_source(masks: str | None, prompts: Sequence[Prompt]) -> str:
     return source
 
 
-def _chosen(known: Sequence[str], objects: Iterable[str] | None) -> tuple[str, ...]:
-    chosen = tuple(known) if objects is None else tuple(objects)
+def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> tuple[str, ...]:
+    chosen = tuple(known if wanted is None else wanted)
     for name in chosen:
         if name not in known:
             raise BadInput("objects", repr(name), "some of " + ", ".join(known))
@@ -360,7 +203,7 @@ def _chosen(known: Sequence[str], objects: Iterable[str] | None) -> tuple[str, .
 
 
 def _by_frame(prompts: Sequence[Prompt], frames: range, camera: Camera) -> dict[int, dict[str, np.ndarray]]:
-    """Frame to the clicks in it by object; whatever can be wrong with them is said before the run begins."""
+    """Frame to the clicks in it by object."""
     clicked: dict[int, dict[str, np.ndarray]] = {}
     for prompt in prompts:
         if prompt.frame not in frames:
@@ -372,11 +215,117 @@ def _by_frame(prompts: Sequence[Prompt], frames: range, camera: Camera) -> dict[
     return clicked
 
 
-def _frames(count: int, start: int, stop: int | None) -> range:
-    end = count if stop is None else min(stop, count)
-    if not 0 <= start < end:
-        raise BadInput("frames", f"start {start}, stop {stop}", f"0 <= start < stop within {count} frames")
-    return range(start, end)
+def _tracker(
+    tracker: str | PointTracker,
+    sequence: sequences.Sequence,
+    config: Config,
+    models: Mapping[str, str | Path] | None,
+) -> str | PointTracker:
+    """What was asked for, but the tracker itself where it must know the sequence: ``oracle``."""
+    if tracker != OracleTracker.name:
+        return tracker
+    return OracleTracker(TrueScene.of(sequence, models), config.oracle, config.seed)
+
+
+def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path) -> RunWriter:
+    """The writer of the run, told all that ``run.json`` says of it."""
+    known = find_models(job.sequence) | given_models(options.models or {}, job.sequence.objects)
+    writer = RunWriter(
+        out,
+        job.sequence,
+        job.config,
+        method.tracker.name,
+        job.masks,
+        job.objects,
+        job.frames.start,
+        job.frames.stop,
+        {name: path for name, path in known.items() if name in job.objects},
+    )
+    prompts = [{"name": p.name, "frame": p.frame, "points": p.points_px.tolist()} for p in job.prompts]
+    writer.info |= {"detector": method.detector.name, "prompts": prompts, "options": options.as_dict()}
+    return writer
+
+
+def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
+    """Every frame with its estimates, which a late 2D tracker gives some frames later."""
+    waiting: deque[Frame] = deque()
+    for i in job.frames:
+        frame, seen = job.sequence.frame(i), None if job.segmenter else job.sequence.masks(i)
+        for name, clicks in job.clicked.get(i, {}).items():
+            method.add_object(name, clicks=clicks)
+        waiting.append(frame)
+        known = None if seen is None else {name: seen[name] for name in method.objects if name in seen}
+        estimates = method.step(frame, known)
+        if len(waiting) > method.tracker.latency_frames:
+            yield waiting.popleft(), estimates
+    for estimates in method.finish():
+        yield waiting.popleft(), estimates
+
+
+def _log_keypoints(log: KeypointLog, frame: Frame, method: Point2Pose) -> None:
+    """Keep where each object's points were seen in the frame that has just been estimated."""
+    tracks = method.tracks
+    for name, obj in method.objects.items():
+        seen = tracks.visible & np.isin(tracks.ids, obj.model.map.ids)
+        log.add(frame.index, name, tracks.ids[seen], tracks.uv_px[seen])
+
+
+def _save_maps(method: Point2Pose, keypoints: KeypointLog, out: Path) -> None:
+    """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
+    for name, obj in method.objects.items():
+        if not obj.model.has_surface:
+            continue
+        mesh = obj.model.surface.mesh()
+        if len(mesh.faces):
+            save_mesh(mesh, out / "meshes" / f"{name}.ply")
+    maps = {name: obj.model.map for name, obj in method.objects.items()}
+    keypoints.save(out, {name: (m.ids, m.p_obj, m.promoted) for name, m in maps.items()})
+
+
+def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
+    done = load_run(out)
+    try:
+        evaluation, not_scored = evaluate(done), ""
+    except MissingData as error:
+        evaluation, not_scored = None, str(error)
+    if not any(obj.has_truth.any() for obj in done.objects.values()):
+        not_scored = "the sequence has no truth"
+    tracked = any(obj.has_pose.any() for obj in done.objects.values())
+    advice = "" if interrupted else _advice(done, job)
+    return RunResult(out, evaluation, not_scored, _summary(done, len(job.frames)), interrupted, advice, tracked)
+
+
+def _summary(run: Run, wanted: int) -> tuple[str, ...]:
+    """How far the run came; per object how many frames have a pose and what mostly kept it from the others."""
+    count = len(next(iter(run.objects.values())))
+    hz, _ = rate(run.timings)
+    lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
+    for name, obj in run.objects.items():
+        lost = ~obj.has_pose
+        why = Counter(f"{status}: {reason}" for status, reason in zip(obj.status[lost], obj.reason[lost], strict=True))
+        most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
+        lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{most}")
+    return tuple(lines)
+
+
+def _advice(run: Run, job: _Job) -> str:
+    """What to do about objects that never had a pose, by what kept it from them; "" where there are none."""
+    reasons = {
+        name: Counter(obj.reason).most_common(1)[0][0] for name, obj in run.objects.items() if not obj.has_pose.any()
+    }
+    if not reasons:
+        return ""
+    why = " ".join(reasons.values())
+    if "pixels with depth" in why:
+        fix = "its depth is missing or out of range, or in another unit (--depth-scale)"
+    elif "not seen yet" in why and job.segmenter:
+        fix = "click in the middle of it, elsewhere"
+    elif "not seen yet" in why:
+        fix = "its masks are empty or too small: draw it, or use p2p click"
+    else:
+        fix = "see what is wrong with the data"
+    first = next(iter(reasons.values()))
+    return f"{', '.join(reasons)} never had a pose ({first}); {fix}. Next: p2p check {job.source}"
 
 
 def _postfix(total_ms: float, estimates: Mapping[str, PoseEstimate]) -> str:

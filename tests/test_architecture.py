@@ -96,6 +96,30 @@ def test_loads_nothing_heavy(code):
     assert ran.stdout.splitlines()[-1] == "LOADED"
 
 
+def answer(code: str) -> str:
+    """The last line that a fresh Python prints."""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return ran.stdout.splitlines()[-1]
+
+
+def test_the_package_is_imported_at_once():
+    code = "import time\nstart = time.process_time()\nimport p2p_lib\nprint(time.process_time() - start)"
+    assert float(answer(code)) < 0.3, "seconds of processor time"
+
+
+METHOD = "import p2p_lib.method.pipeline as pipeline"
+MADE = METHOD + "\nfrom p2p_lib import Camera\npipeline.Point2Pose(Camera(300, 300, 160, 120, 320, 240))"
+
+
+@pytest.mark.parametrize(("code", "parts"), [(METHOD, 0), (MADE, 3)], ids=["imported", "made with what is built in"])
+def test_the_method_loads_neither_datasets_nor_downloads_nor_drawing(code, parts):
+    allowed = {"core", "method", *("trackers", "detectors", "segmenters")[:parts]}
+    loaded = answer(f"import sys\n{code}\nprint(*sys.modules)").split()
+    ours = {module.split(".")[1] for module in loaded if module.startswith("p2p_lib.")}
+    assert {"core", "method"} <= ours <= allowed
+    assert not {"pooch", "requests", "urllib3", "tqdm", "pydantic", "PIL", *LAZY} & set(loaded)
+
+
 def test_every_module_imports_without_torch_open3d_and_plots():
     """Importing any file of ours alone must not load them; figures and studies may plot."""
     names = [".".join(path.relative_to(PROJECT).with_suffix("").parts) for path in sources()]

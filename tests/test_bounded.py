@@ -8,7 +8,6 @@ from p2p_lib.core.types import WITH_POSE
 
 CAPS = {
     "factor_graph.max_keyframes": 5,
-    "keypoint_map.max_views": 6,
     "keypoint_map.max_points": 60,
     "keypoint_map.pending_ttl": 10,
     "tsdf.max_voxels": 40_000,
@@ -30,12 +29,12 @@ def stream():
         counts = {
             "keypoints": int(box.map.promoted.sum()),
             "pending": int((~box.map.promoted).sum()),
-            "tracked": len(box.tracker._points),
+            "tracked": len(method.tracker._points),
             "mapped": len(box.map),
-            "views": len(box.views),
-            "pictures": len(box.surface.keys),
-            "graph": len(box.graph.keys),
-            "voxels": int(np.prod(box.surface.shape)),
+            "views": len(box.model.views),
+            "pictures": len(box.model.surface.keys),
+            "graph": len(box.model.graph.keys),
+            "voxels": int(np.prod(box.model.surface.shape)),
             "tracked pose": estimate.status in WITH_POSE,
             "keyframe": estimate.keyframe,
         }
@@ -46,7 +45,6 @@ def stream():
 def test_caps_hold_at_every_frame(stream):
     assert stream["keyframe"].sum() > 50, "far more keyframes than are kept"
     assert stream["graph"].max() == CAPS["factor_graph.max_keyframes"]
-    assert stream["views"].max() == CAPS["keypoint_map.max_views"]
     assert stream["voxels"].max() <= CAPS["tsdf.max_voxels"]
     # Between two keyframes a point more may be promoted than the cap, and pictures wait for the graph's next word.
     assert stream["pictures"].max() <= CAPS["factor_graph.max_keyframes"] + 2

@@ -74,7 +74,7 @@ def test_the_example_tracker_tracks():
     exec(source, names)
     camera = Camera(300, 300, 79.5, 59.5, 160, 120)
     rgb = np.kron(np.random.default_rng(0).integers(0, 255, (15, 20, 3)), np.ones((8, 8, 1))).astype(np.uint8)
-    config = preset("default").with_values({"tsdf.enabled": False, "factor_graph.enabled": False})
+    config = preset("default").with_values({"method.surface": False, "method.graph": False})
     method, mask = Point2Pose(camera, config, tracker=names["StillTracker"]()), np.zeros((120, 160), bool)
     mask[20:100, 30:130] = True
     method.add_object("poster")

@@ -7,6 +7,7 @@ A page of the standard library's web server, on this machine alone, shows the fr
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from functools import lru_cache
 from http import HTTPStatus
@@ -31,7 +32,7 @@ _JSON, _HTML, _PNG = "application/json", "text/html; charset=utf-8", "image/png"
 
 
 class Clicker:
-    """A page that is being served; ``prompts`` is what was saved last.
+    """A page that is being served, a context manager; ``prompts`` is what was saved last.
 
     url   where the page is
     path  the file that saving writes; the prompts it holds already are shown to begin with
@@ -42,14 +43,13 @@ class Clicker:
             raise BadInput("frame", frame, f"a number from 0 to {len(sequence) - 1}")
         self.sequence, self.path, self.first = sequence, Path(path), frame
         self.prompts: tuple[Prompt, ...] = load_prompts(path) if self.path.is_file() else ()
-        self.picture = lru_cache(maxsize=8)(self._picture)
+        self.image_png = lru_cache(maxsize=8)(self._image_png)
         self._saved = Event()
         try:
-            self._server = ThreadingHTTPServer((HOST, port), _handler(self))
+            self._server = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"clicker": self}))
         except OSError as error:
-            raise BadInput(
-                "port", port, f"a free port ({error.strerror})", "Leave --port out: one is chosen."
-            ) from None
+            free = f"a free port ({error.strerror})"
+            raise BadInput("port", port, free, "Leave --port out: one is chosen.") from None
         self._server.daemon_threads = True
         self.url = f"http://{HOST}:{self._server.server_address[1]}/"
         Thread(target=self._server.serve_forever, daemon=True).start()
@@ -74,19 +74,18 @@ class Clicker:
 
     def session(self) -> dict[str, Any]:
         """What the page needs to know."""
-        camera = self.sequence.camera
         return {
             "sequence": self.sequence.name,
             "frames": len(self.sequence),
             "first": self.first,
-            "width": camera.width,
-            "height": camera.height,
+            "width": self.sequence.camera.width,
+            "height": self.sequence.camera.height,
             "names": list(self.sequence.objects),
             "file": str(self.path),
             "objects": [{"name": p.name, "frame": p.frame, "points": p.points_px.tolist()} for p in self.prompts],
         }
 
-    def _picture(self, i: int) -> bytes:
+    def _image_png(self, i: int) -> bytes:
         return cv2.imencode(".png", cv2.cvtColor(self.sequence.frame(i).rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
 
     def save(self, content: object) -> None:
@@ -106,11 +105,19 @@ class Clicker:
 
 
 def collect_clicks(sequence: Sequence, path: str | Path, frame: int = 0, port: int = 0) -> Clicker:
-    """Serve the page and come back at once: show the value in a notebook, or open its ``url``.
+    """Serve the page and come back at once: show the value in a notebook, or open its ``url``; close it when done.
 
-    ``port`` 0 takes a free one. Close it, or use it as a context manager, when done.
+    ``port`` 0 takes a free one.
     """
     return Clicker(sequence, path, frame, port)
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a file that could not be written in the end, before anyone works for it."""
+    folder = next(p for p in path.absolute().parents if p.exists())
+    if path.is_dir() or not folder.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
+        what = "a folder" if path.is_dir() else "what cannot be written"
+        raise BadInput(f"--out {path}", what, "a file in a folder that can be written")
 
 
 def wait_for_clicks(clicker: Clicker, say: Callable[[str], object], open_browser: bool = True) -> tuple[Prompt, ...]:
@@ -123,51 +130,49 @@ def wait_for_clicks(clicker: Clicker, say: Callable[[str], object], open_browser
     return clicker.prompts
 
 
-def _handler(clicker: Clicker) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
+class _Handler(BaseHTTPRequestHandler):
+    clicker: Clicker
+    protocol_version = "HTTP/1.1"
 
-        def do_GET(self) -> None:
-            what, _, number = self.path.strip("/").partition("/")
-            if self.path == "/":
-                self._answer(PAGE.read_bytes(), _HTML)
-            elif self.path == "/session":
-                self._answer(json.dumps(clicker.session()).encode(), _JSON)
-            elif what == "frame" and number.isdecimal() and int(number) < len(clicker.sequence):
-                try:
-                    self._answer(clicker.picture(int(number)), _PNG)
-                except P2PError as error:
-                    self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
-            else:
-                self._refuse(HTTPStatus.NOT_FOUND, f"{self.path}: no such page")
-
-        def do_POST(self) -> None:
-            length = self.headers.get("Content-Length", "")
-            # Pages of other sites cannot send this type here without being asked first, which this server never is.
-            if self.path != "/prompts" or self.headers.get_content_type() != _JSON:
-                return self._refuse(HTTPStatus.NOT_FOUND, "expected JSON, sent to /prompts")
-            if not length.isdecimal() or int(length) > _LARGEST_BODY:
-                return self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {_LARGEST_BODY} bytes")
+    def do_GET(self) -> None:
+        what, _, number = self.path.strip("/").partition("/")
+        if self.path == "/":
+            self._answer(PAGE.read_bytes(), _HTML)
+        elif self.path == "/session":
+            self._answer(json.dumps(self.clicker.session()).encode(), _JSON)
+        elif what == "frame" and number.isdecimal() and int(number) < len(self.clicker.sequence):
             try:
-                clicker.save(json.loads(self.rfile.read(int(length))))
-            except (P2PError, ValueError) as error:
-                return self._refuse(HTTPStatus.BAD_REQUEST, str(error))
-            except OSError as error:
-                return self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"{clicker.path}: {error.strerror}")
-            self._answer(json.dumps({"saved": str(clicker.path)}).encode(), _JSON)
+                self._answer(self.clicker.image_png(int(number)), _PNG)
+            except P2PError as error:
+                self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, f"{self.path}: no such page")
 
-        def _answer(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
+    def do_POST(self) -> None:
+        length = self.headers.get("Content-Length", "")
+        # Pages of other sites cannot send this type here without being asked first, which this server never is.
+        if self.path != "/prompts" or self.headers.get_content_type() != _JSON:
+            return self._refuse(HTTPStatus.NOT_FOUND, "expected JSON, sent to /prompts")
+        if not length.isdecimal() or int(length) > _LARGEST_BODY:
+            return self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {_LARGEST_BODY} bytes")
+        try:
+            self.clicker.save(json.loads(self.rfile.read(int(length))))
+        except (P2PError, ValueError) as error:
+            return self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+        except OSError as error:
+            return self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"{self.clicker.path}: {error.strerror}")
+        self._answer(json.dumps({"saved": str(self.clicker.path)}).encode(), _JSON)
 
-        def _refuse(self, status: HTTPStatus, why: str) -> None:
-            self.close_connection = True  # what was sent may not have been read
-            self._answer(json.dumps({"error": why}).encode(), _JSON, status)
+    def _answer(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
 
-        def log_message(self, *_: object) -> None:
-            """The terminal is for the user."""
+    def _refuse(self, status: HTTPStatus, why: str) -> None:
+        self.close_connection = True  # what was sent may not have been read
+        self._answer(json.dumps({"error": why}).encode(), _JSON, status)
 
-    return Handler
+    def log_message(self, *_: object) -> None:
+        """The terminal is for the user."""

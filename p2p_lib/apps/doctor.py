@@ -47,9 +47,8 @@ class Check:
 
 def run_doctor() -> list[Check]:
     """Python, required packages (each really imported, in a process of its own), libraries, GPU, backends, data."""
-    packages = required_packages()
     with ThreadPoolExecutor(2) as pool:  # torch and open3d take seconds each
-        imports = list(pool.map(_package, packages))
+        imports = list(pool.map(_package, required_packages()))
     libraries = [_library(library, package) for library, package in native.SYSTEM_LIBRARIES.items()]
     optional = [_optional(name, *about) for name, about in OPTIONAL.items()]
     return [_python(), *imports, *libraries, _kernel(), _gpu(), *optional, _cotracker(), _data(), _cache(), _disk()]
@@ -62,11 +61,9 @@ def format_checks(checks: list[Check]) -> str:
     for check in checks:
         mark = "ok" if check.ok else "-" if check.optional else "MISSING"
         lines.append(f"{mark:8}{check.name:{width}}  {check.found}")
-        if not check.ok:
-            lines.append(f"{'':8}{'':{width}}  -> {check.remedy}")
-    wrong = [check.name for check in checks if not (check.ok or check.optional)]
-    lines.append(f"To mend: {', '.join(wrong)}" if wrong else "All that is required is there. A dash is optional.")
-    return "\n".join(lines)
+        lines += [] if check.ok else [f"{'':8}{'':{width}}  -> {check.remedy}"]
+    wrong = ", ".join(check.name for check in checks if not (check.ok or check.optional))
+    return "\n".join([*lines, f"To mend: {wrong}" if wrong else "All that is required is there. A dash is optional."])
 
 
 def required_packages() -> list[str]:
@@ -82,8 +79,7 @@ def _python() -> Check:
 
 
 def _package(name: str) -> Check:
-    module = MODULES.get(name, name.replace("-", "_"))
-    load = f"import {module}"
+    load = f"import {MODULES.get(name, name.replace('-', '_'))}"
     if name == "open3d":
         load = "from p2p_lib.core.native import load_open3d; load_open3d()"
     elif name == "libusb-package" and native.loads("libusb-1.0.so.0"):
@@ -113,8 +109,8 @@ def _library(library: str, package: str) -> Check:
 
 
 def _kernel() -> Check:
-    folder = Path(sys.prefix) / "share" / "jupyter" / "kernels" / "python3"
-    return Check("Jupyter kernel", folder.is_dir(), False, "python3" if folder.is_dir() else "none", "make setup")
+    there = (Path(sys.prefix) / "share" / "jupyter" / "kernels" / "python3").is_dir()
+    return Check("Jupyter kernel", there, False, "python3" if there else "none", "make setup")
 
 
 def _gpu() -> Check:
@@ -136,32 +132,28 @@ def _optional(name: str, module: str, serves: str, remedy: str) -> Check:
 
 
 def _cotracker() -> Check:
-    """CoTracker comes through torch.hub, which keeps it under its own cache folder."""
-    there, remedy = cotracker_folder() is not None, install_command("co-tracker")
-    serves = "2D tracker cotracker3, CC BY-NC: not for commercial use"
-    return Check("cotracker", there, True, serves + ("" if there else "; not there"), remedy)
+    there = cotracker_folder() is not None  # it comes through torch.hub, which keeps it under its own cache folder
+    serves = "2D tracker cotracker3, CC BY-NC: not for commercial use" + ("" if there else "; not there")
+    return Check("cotracker", there, True, serves, install_command("co-tracker"))
 
 
 def _data() -> Check:
     folder = data_dir()
     if folder is None:
-        return Check("$P2P_DATA", False, True, "not set; embedded data only", "export P2P_DATA=FOLDER of your datasets")
-    remedy = "point P2P_DATA at an existing folder"
-    return Check("$P2P_DATA", folder.is_dir(), True, f"{folder}{'' if folder.is_dir() else ' does not exist'}", remedy)
+        return Check("$P2P_DATA", False, True, "not set; bundled data only", "export P2P_DATA=FOLDER of your datasets")
+    found = f"{folder}{'' if folder.is_dir() else ' does not exist'}"
+    return Check("$P2P_DATA", folder.is_dir(), True, found, "point P2P_DATA at an existing folder")
 
 
 def _cache() -> Check:
     folder = cache_dir()
     nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-    used_mb = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6 if folder.is_dir() else 0.0
-    found = f"{folder}, {used_mb:.0f} MB used"
-    return Check(
-        "cache folder", os.access(nearest, os.W_OK), False, found, "set P2P_CACHE to a folder you may write to"
-    )
+    used_mb = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
+    remedy = "set P2P_CACHE to a folder you may write to"
+    return Check("cache folder", os.access(nearest, os.W_OK), False, f"{folder}, {used_mb:.0f} MB used", remedy)
 
 
 def _disk() -> Check:
     free_gb = shutil.disk_usage(PROJECT).free / 1e9
-    return Check(
-        "disk", free_gb >= FREE_GB, False, f"{free_gb:.0f} GB free", f"free {FREE_GB:.0f} GB beside the project"
-    )
+    remedy = f"free {FREE_GB:.0f} GB beside the project"
+    return Check("disk", free_gb >= FREE_GB, False, f"{free_gb:.0f} GB free", remedy)

@@ -9,18 +9,19 @@ import json
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from time import monotonic
 
+import numpy as np
+
 from p2p_lib.apps.click import collect_clicks, wait_for_clicks
-from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, DEFAULT_TRACKER
-from p2p_lib.core.config import Config, preset
+from p2p_lib.core.backends import DEFAULT_SEGMENTER
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.interfaces import PointTracker
+from p2p_lib.core.options import RunOptions
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.cameras import LiveCamera, Newest, Still
 from p2p_lib.datasets.prompts import Prompt
-from p2p_lib.method.object_tracker import make_volume
 from p2p_lib.method.pipeline import Point2Pose
 
 
@@ -47,27 +48,27 @@ def track_live(
     camera: LiveCamera,
     prompts: Iterable[Prompt],
     on_estimate: Callable[[PoseEstimate], None],
+    options: RunOptions | None = None,
     *,
-    config: Config | None = None,
-    tracker: str | PointTracker = DEFAULT_TRACKER,
-    detector: str = DEFAULT_DETECTOR,
-    segmenter: str = DEFAULT_SEGMENTER,
     first: Frame | None = None,
     count: LiveCount | None = None,
 ) -> LiveCount:
     """Follow the objects of the prompts until the camera ends; every estimate goes to ``on_estimate`` at once.
 
-    prompts  clicks; those of frame k start their object at the camera's k-th picture, which is not dropped
-    first    a picture that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
+    prompts  clicks; those of frame k start their object at the camera's k-th image, which is not dropped
+    options  the method and its parameters; ``masks`` names the segmenter
+    first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
 
     Closes the camera at the end, whatever ends it. Raises :class:`BadInput` for clicks that do not fit.
     """
-    prompts, count = sorted(prompts, key=lambda p: p.frame), count or LiveCount()
-    config = config or preset()
-    method = Point2Pose(camera.camera, config, tracker, detector, segmenter)
-    if config.tsdf.enabled:
-        make_volume(config.tsdf)  # what it loads takes seconds, in which the camera need not run
+    options, count = options or RunOptions(), count or LiveCount()
+    prompts = sorted(prompts, key=lambda p: p.frame)
+    config = options.config()
+    segmenter = options.masks or DEFAULT_SEGMENTER
+    method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
+    if config.method.surface:
+        import_module("torch")  # which takes seconds, in which the camera need not run
     start_s = monotonic()
     with Newest(camera, keep={p.frame for p in prompts}) as newest:
         frame = first or newest.take()
@@ -93,13 +94,13 @@ def track_live(
 def click_first(
     camera: LiveCamera, say: Callable[[str], object], open_browser: bool = True
 ) -> tuple[tuple[Prompt, ...], Frame]:
-    """Let the user click on objects in the camera's next picture: the prompts, and that picture, for ``track_live``."""
-    picture = camera.read()
-    if picture is None:
-        raise BadInput(camera.name, "no picture", "one to click on")
+    """Let the user click on objects in the camera's next image: the prompts, and that image, for ``track_live``."""
+    image = camera.read()
+    if image is None:
+        raise BadInput(camera.name, "no image", "one to click on")
     with tempfile.TemporaryDirectory() as folder:
-        page = collect_clicks(Still(camera.name, camera.camera, picture), Path(folder) / "prompts.json")
-        return wait_for_clicks(page, say, open_browser), picture
+        page = collect_clicks(Still(camera.name, camera.camera, image), Path(folder) / "prompts.json")
+        return wait_for_clicks(page, say, open_browser), image
 
 
 def json_line(estimate: PoseEstimate) -> str:
@@ -108,17 +109,14 @@ def json_line(estimate: PoseEstimate) -> str:
     ``T_cam_obj`` (4x4, metres) and ``covariance`` (6x6, [rotation rad, translation m] on the right) are null without
     a pose.
     """
-    T_cam_obj, covariance = estimate.T_cam_obj, estimate.covariance
-    return json.dumps(
-        {
-            "time_s": round(estimate.time_s, 6),
-            "frame": estimate.frame_index,
-            "object": estimate.object,
-            "status": str(estimate.status),
-            "confidence": round(estimate.confidence, 4),
-            "T_cam_obj": None if T_cam_obj is None else T_cam_obj.tolist(),
-            "covariance": None if covariance is None else covariance.tolist(),
-            "reason": estimate.reason,
-        },
-        allow_nan=False,
-    )
+    line = {
+        "time_s": round(estimate.time_s, 6),
+        "frame": estimate.frame_index,
+        "object": estimate.object,
+        "status": str(estimate.status),
+        "confidence": round(estimate.confidence, 4),
+        "T_cam_obj": estimate.T_cam_obj,
+        "covariance": estimate.covariance,
+        "reason": estimate.reason,
+    }
+    return json.dumps(line, allow_nan=False, default=np.ndarray.tolist)

@@ -1,4 +1,4 @@
-"""The notebooks of the suite: list, check, run headless, and collect what their last cells recorded.
+"""The notebooks of the suite: list, run headless, and collect what their last cells recorded.
 
 A notebook has one cell tagged ``parameters`` (literals alone, ``PROFILE`` among them) and ends with a cell tagged
 ``checks`` that asserts what the notebook claimed and calls :func:`record` with the numbers. Whatever a run leaves
@@ -17,6 +17,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,30 +25,13 @@ from typing import TYPE_CHECKING, Any
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.paths import PROJECT
 from p2p_lib.figures import equations
-from p2p_lib.figures.gallery import GalleryEntry, gallery_page
 
 if TYPE_CHECKING:
     from nbformat import NotebookNode
 
-#: ``quick``: embedded data, CPU, about a minute a notebook. ``full``: the data and backends that are present.
+#: ``quick``: bundled data, CPU, about a minute a notebook. ``full``: the data and backends that are present.
 PROFILES = ("quick", "full")
 CHECKS_MIME = "application/vnd.p2p.checks+json"
-MAX_CELL_LINES = 15
-#: JupyterLab's page without the scripts that it would fetch; a table wider than the page is scrolled, not cut off.
-_PAGE = f"""{{% extends 'lab/index.html.j2' %}}
-{{% block html_head_js %}}{{% endblock %}}
-{{% block html_head_js_mathjax %}}{{% endblock %}}
-{{% block html_head_js_mermaidjs %}}{{% endblock %}}
-{{% block html_head_css %}}
-{equations.STYLE}
-<style>
-.jp-RenderedHTMLCommon {{ overflow-x: auto; }}
-.jp-RenderedHTMLCommon table {{ width: max-content; max-width: none; }}
-.jp-RenderedMarkdown td, .jp-RenderedMarkdown th {{ padding: 0.4em 0.5em; }}
-.jp-MarkdownCell table {{ width: auto; max-width: 100%; }}
-</style>
-{{% endblock %}}"""
-
 Value = bool | int | float | str
 
 
@@ -61,23 +45,21 @@ class NotebookFailed(P2PError):
 class NotebookResult:
     """What one executed notebook holds.
 
-    name          file name without suffix, e.g. ``00_quickstart``
-    title         its first heading
-    executed      the executed notebook; its page for the browser is beside it with the suffix ``.html``
-    seconds       wall-clock time of the whole run
-    cell_seconds  of each code cell, in order
-    checks        what the last cell recorded
-    picture_png   its first picture in base64, or empty
-    error         empty, or the cell and the message that ended the run
+    name       file name without suffix, e.g. ``00_quickstart``
+    title      its first heading
+    executed   the executed notebook; its page for the browser is beside it with the suffix ``.html``
+    seconds    wall-clock time of the whole run
+    checks     what the last cell recorded
+    image_png  its first image in base64, or empty
+    error      empty, or the cell and the message that ended the run
     """
 
     name: str
     title: str
     executed: Path
     seconds: float
-    cell_seconds: tuple[float, ...]
     checks: dict[str, Value]
-    picture_png: str
+    image_png: str
     error: str
 
 
@@ -121,25 +103,18 @@ def run_notebooks(
     folder: Path | None = None,
     say: Callable[[str], None] = print,
 ) -> list[NotebookResult]:
-    """Run the notebooks in order and write executed copies, pages, pictures, tables and a gallery.
+    """Run the notebooks in order and write executed copies, pages, images, tables and a gallery.
 
-    Args:
-        profile: ``quick`` or ``full``, handed to each notebook as ``PROFILE``.
-        only: numbers or names of notebooks; all by default.
-        out: folder of the results, default ``out/<profile>``. Notebooks find the folders of their pictures, tables
-            and runs in ``$P2P_FIGURES``, ``$P2P_TABLES`` and ``$P2P_RUNS``. Pictures of the full profile go to
-            ``figures/`` of the project unless ``out`` is given.
-        jobs: how many run at a time.
-        parameters: further parameters; a string is read as the kind of value the notebook has. Unknown ones are
-            refused before anything runs.
-        folder: where the notebooks are, default ``notebooks/`` of the project.
-        say: gets a line of progress at a time.
+    only        numbers or names of notebooks; all by default
+    out         folder of the results, default ``out/<profile>``; images of the full profile then go to ``figures/``.
+                Notebooks find their folders in ``$P2P_FIGURES``, ``$P2P_TABLES`` and ``$P2P_RUNS``
+    jobs        how many run at a time
+    parameters  of the notebooks, besides ``PROFILE``; a string is read as the kind of value the notebook has
+    folder      where the notebooks are, default ``notebooks/`` of the project
+    say         is told of progress, line by line
 
-    Returns:
-        A result per notebook, in order.
-
-    Raises:
-        NotebookFailed: at the first notebook with a failing cell; what ran so far is on disk and in the gallery.
+    Raises :class:`BadInput` for unknown parameters before anything runs, and :class:`NotebookFailed` at the first
+    notebook with a failing cell; what ran so far is on disk and in the gallery.
     """
     if profile not in PROFILES:
         raise BadInput("profile", repr(profile), "one of " + ", ".join(PROFILES))
@@ -175,50 +150,13 @@ def run_notebooks(
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         index = write_gallery(home, profile)
-    say(f"Look at {_near(index)}: {_counted(results)}; pictures are in {_near(figures)}/")
+    say(f"Look at {_near(index)}: {_counted(results)}; images are in {_near(figures)}/")
     return results
-
-
-def check_notebook(path: Path) -> list[str]:
-    """What is wrong with a notebook's source as we keep it in git; empty when nothing is."""
-    code = [cell for cell in _read(path).cells if cell.cell_type == "code"]
-    problems = []
-    for number, cell in enumerate(code, 1):
-        found = ["has outputs (run nbstripout)"] if cell.outputs or cell.execution_count else []
-        problems += [f"code cell {number} {problem}" for problem in found + _source_problems(cell.source)]
-    if sum("parameters" in _tags(cell) for cell in code) != 1:
-        problems.append("needs exactly one cell tagged parameters")
-    else:
-        try:
-            problems += [] if "PROFILE" in notebook_parameters(path) else ["has no parameter PROFILE"]
-        except BadInput as error:
-            problems.append(str(error))
-    if not code or "checks" not in _tags(code[-1]):
-        problems.append("needs a last code cell tagged checks")
-    return problems
-
-
-def _source_problems(source: str) -> list[str]:
-    lines = len(source.splitlines())
-    problems = [f"has {lines} lines, more than {MAX_CELL_LINES}"] if lines > MAX_CELL_LINES else []
-    try:
-        nodes = list(ast.walk(ast.parse(source)))
-    except SyntaxError:
-        return [*problems, "is not plain Python (no shell, no magics)"]
-    if any(isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) for node in nodes):
-        problems.append("defines a function or class (it belongs in p2p_lib)")
-    modules = [name.name for node in nodes if isinstance(node, ast.Import) for name in node.names]
-    modules += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
-    if {module.split(".")[0] for module in modules} & {"os", "subprocess"}:
-        problems.append("imports os or subprocess (the library has a function for it)")
-    texts = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
-    problems += [f"holds the absolute path {text!r}" for text in texts if re.match(r"(/|~/|[A-Za-z]:\\)\w", text)]
-    return problems
 
 
 def notebook_parameters(path: Path) -> dict[str, Value]:
     """Names and values in the cell tagged ``parameters``, which holds assignments of literals and nothing else."""
-    source = "\n".join(cell.source for cell in _read(path).cells if "parameters" in _tags(cell))
+    source = "\n".join(cell.source for cell in _read(path).cells if "parameters" in cell.metadata.get("tags", []))
     values = {}
     try:
         for statement in ast.parse(source).body:
@@ -237,9 +175,10 @@ def read_result(executed: Path) -> NotebookResult:
     checks: dict[str, Value] = {}
     for _, output in outputs:
         checks |= output.get("data", {}).get(CHECKS_MIME, {})
-    pictures = [output.data["image/png"] for _, output in outputs if "image/png" in output.get("data", {})]
+    images = [output.data["image/png"] for _, output in outputs if "image/png" in output.get("data", {})]
     errors = [
-        f"cell [{cell.execution_count}] {_failing_line(cell.source, output)!r}: {_message(output)}"
+        f"cell [{cell.execution_count}] {_failing_line(cell.source, output)!r}: "
+        + " ".join(f"{output['ename']}: {output['evalue']}".split()).removesuffix(":")
         for cell, output in outputs
         if output.output_type == "error"
     ]
@@ -248,39 +187,34 @@ def read_result(executed: Path) -> NotebookResult:
         for cell in code
         if cell.source.strip() and "shell.execute_reply" not in cell.metadata.get("execution", {})
     ]
-    run = notebook.metadata.get("papermill", {})
-    durations = [cell.metadata.get("papermill", {}).get("duration") for cell in code]
-    title = re.search(r"(?m)^# +(.+)$", "\n".join(c.source for c in notebook.cells if c.cell_type == "markdown"))
+    titles = re.findall(r"(?m)^# +(.+)$", "\n".join(c.source for c in notebook.cells if c.cell_type == "markdown"))
     return NotebookResult(
         name=executed.stem,
-        title=title[1].strip() if title else executed.stem,
+        title=[*titles, executed.stem][0].strip(),
         executed=executed,
-        seconds=float(run.get("duration") or 0.0),
-        cell_seconds=tuple(float(duration or 0.0) for duration in durations),
+        seconds=float(notebook.metadata.get("papermill", {}).get("duration") or 0.0),
         checks=checks,
-        picture_png="".join(pictures[0].split()) if pictures else "",
+        image_png="".join(images[0].split()) if images else "",
         error=errors[0] if errors else "",
     )
 
 
 def write_gallery(home: Path, profile: str) -> Path:
-    """``index.html`` over all executed notebooks in ``home/notebooks``: title, first picture, seconds, checks."""
+    """``index.html`` over all executed notebooks in ``home/notebooks``: title, first image, seconds, checks."""
+    import jinja2
+
     results = [read_result(path) for path in sorted((home / "notebooks").glob("*.ipynb"))]
-    entries = [
-        GalleryEntry(
-            title=result.title,
-            line=f"{result.name}, {result.seconds:.0f} s",
-            link=result.executed.with_suffix(".html").relative_to(home).as_posix(),
-            picture_png=result.picture_png,
-            table={name: _shown(value) for name, value in result.checks.items()},
-            failure=result.error,
-        )
-        for result in results
-    ]
     seconds, numbers = sum(r.seconds for r in results), sum(len(r.checks) for r in results)
-    summary = f"{_counted(results)}, {seconds:.0f} s, {numbers} numbers recorded"
+    templates = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
+    templates.filters["shown"] = _shown
+    html = templates.get_template("gallery.html").render(
+        title=f"Point2Pose notebooks, profile {profile}",
+        summary=f"{_counted(results)}, {seconds:.0f} s, {numbers} numbers recorded",
+        failed=sum(bool(result.error) for result in results),
+        results=results,
+    )
     page = home / "index.html"
-    page.write_text(gallery_page(f"Point2Pose notebooks, profile {profile}", entries, summary), encoding="utf-8")
+    page.write_text(html, encoding="utf-8")
     return page
 
 
@@ -294,7 +228,7 @@ def _run_one(
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it warns of widgets that a page does not have
     executed = home / "notebooks" / source.name
     say(f"{source.stem} ...")
-    try:
+    with suppress(papermill.PapermillExecutionError, DeadKernelError):  # the executed notebook says so, and where
         papermill.execute_notebook(
             source,
             executed,
@@ -304,8 +238,6 @@ def _run_one(
             kernel_manager_class=kernel_manager,
             progress_bar=False,
         )
-    except (papermill.PapermillExecutionError, DeadKernelError):
-        pass  # the executed notebook says so, and where
     _write_page(executed)
     result = read_result(executed)
     outcome = "FAILED" if result.error else f"{len(result.checks)} numbers recorded"
@@ -355,10 +287,8 @@ def _fitting_parameters(path: Path, given: Mapping[str, Any]) -> dict[str, Value
             raise BadInput(f"{path.stem} parameter", name, "one of " + ", ".join(known), fix)
         kind = type(known[name])
         if isinstance(value, str) and kind is not str:
-            try:
+            with suppress(ValueError, SyntaxError):  # refused just below
                 value = ast.literal_eval(value)
-            except (ValueError, SyntaxError):
-                pass  # refused just below
         if kind is float and type(value) is int:
             value = float(value)
         if known[name] is not None and type(value) is not kind:
@@ -382,9 +312,10 @@ def _write_page(executed: Path) -> None:
     def as_html(source: str) -> str:
         return MarkdownWithMath(renderer=Renderer(escape=False)).render(source)
 
-    exporter = HTMLExporter(embed_images=True, raw_template=_PAGE)
+    template = Path(__file__).with_name("notebook.html").read_text(encoding="utf-8")
+    exporter = HTMLExporter(embed_images=True, raw_template=template)
     exporter.register_filter("markdown2html", as_html)
-    body, _ = exporter.from_filename(str(executed))
+    body, _ = exporter.from_filename(str(executed), resources={"equation_style": equations.STYLE})
     executed.with_suffix(".html").write_text(body, encoding="utf-8")
 
 
@@ -397,20 +328,12 @@ def _read(path: Path) -> NotebookNode:
         raise BadInput(path.name, "a file that is not JSON", "a Jupyter notebook (.ipynb)") from None
 
 
-def _tags(cell: NotebookNode) -> list[str]:
-    return cell.metadata.get("tags", [])
-
-
 def _failing_line(source: str, error: Mapping[str, Any]) -> str:
     """The line of the cell that raised, else its first."""
     lines = source.splitlines() or [""]
     plain = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(error["traceback"]))
     at = re.search(r"(?m)^-+> +(\d+) ", plain)
     return lines[min(int(at[1]), len(lines)) - 1 if at else 0].strip()
-
-
-def _message(error: Mapping[str, Any]) -> str:
-    return " ".join(f"{error['ename']}: {error['evalue']}".split()).removesuffix(":")
 
 
 def _shown(value: Value) -> str:

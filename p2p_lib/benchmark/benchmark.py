@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,11 @@ from typing import Any
 from p2p_lib.benchmark import rows
 from p2p_lib.benchmark.execution import execute
 from p2p_lib.benchmark.jobs import Job, jobs_of, open_planned
-from p2p_lib.benchmark.outcome import Outcome, load_outcome, replace_text, run_path, save_outcome
+from p2p_lib.benchmark.outcome import Outcome, load_outcome, run_path, save_outcome
 from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.benchmark.rows import Row
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import replace_text
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence
@@ -87,12 +88,21 @@ class Benchmark:
         """The Chamfer distance of an object in that run; None where it was not measured."""
         return self._finished(method, sequence)[1].objects[object].chamfer_cm.get(form)
 
+    def write_tables(self) -> None:
+        """``results.csv``, ``summary.csv`` and ``timings.csv`` in :attr:`folder`."""
+        for name, content, columns in (
+            ("results", self.rows, rows.COLUMNS),
+            ("summary", self.summary, rows.SUMMARY_COLUMNS),
+            ("timings", self.times, rows.TIME_COLUMNS),
+        ):
+            replace_text(self.folder / f"{name}.csv", rows.as_csv(content, columns))
+
     def _finished(self, method: str, sequence: str) -> tuple[Job, Outcome]:
-        for job, outcome in self.results:
-            wanted = job.method.name == method and sequence in ("", job.sequence.name)
-            if wanted and job.measure == "poses" and outcome.status == "done":
+        done = [(j, o) for j, o in self.results if o.status == "done" and j.measure == "poses"]
+        for job, outcome in done:
+            if job.method.name == method and sequence in ("", job.sequence.name):
                 return job, outcome
-        known = ", ".join(sorted({job.method.name for job, o in self.results if o.status == "done"})) or "none"
+        known = ", ".join(sorted({job.method.name for job, _ in done})) or "none"
         raise BadInput("benchmark run", f"{method} {sequence}".strip(), f"a method that ran: {known}")
 
 
@@ -114,7 +124,7 @@ def run_benchmarks(
     """Run what is not on disk yet, keep it, and write the tables of the plans; what ``p2p benchmark`` does.
 
     plans      TOML files, names of plans of this package, or plans
-    profile    ``full``, or ``quick``: a few frames of embedded data
+    profile    ``full``, or ``quick``: a few frames of bundled data
     jobs       runs at a time on this machine; default: one a core, or one where a plan measures times
     scheduler  address of a Dask scheduler, ``tcp://HOST:PORT``, whose workers see ``out`` under the same path
     retry      whether runs that failed before are tried again
@@ -124,31 +134,40 @@ def run_benchmarks(
     """
     if jobs is not None and jobs < 1:
         raise BadInput("jobs", jobs, "at least 1")
-    waiting = [load_benchmark(plan, out, profile) for plan in plans]
+    benchmarks = [load_benchmark(plan, out, profile) for plan in plans]
+    wanted = ("not run", "failed") if retry else ("not run",)
     found: dict[str, Outcome] = {}
     interrupted = False
-    for alone in (False, True):
+    for alone in (False, True):  # what measures times runs when nothing else does
         todo = {
             job.key: job
-            for benchmark in waiting
+            for benchmark in benchmarks
+            if benchmark.plan.scope(profile).alone == alone
             for job, outcome in benchmark.results
-            if benchmark.plan.scope(profile).alone == alone and _to_run(job, outcome, retry) and job.key not in found
+            if job.key and outcome.status in wanted and job.key not in found
         }
         if todo and not interrupted:
             at_a_time = min(jobs or (1 if alone else len(os.sched_getaffinity(0))), len(todo))
-            outcomes = execute(list(todo.values()), waiting[0].out, at_a_time, scheduler)
-            ran = _run(outcomes, len(todo), waiting[0].out, progress)
+            outcomes = execute(list(todo.values()), benchmarks[0].out, at_a_time, scheduler)
+            ran = _run(outcomes, len(todo), benchmarks[0].out, progress)
             interrupted, found = len(ran) < len(todo), found | ran
-    return [_with_tables(benchmark, found, interrupted) for benchmark in waiting]
+    finished = []
+    for benchmark in benchmarks:
+        results = tuple((job, found.get(job.key, outcome)) for job, outcome in benchmark.results)
+        finished.append(replace(benchmark, results=results, interrupted=interrupted))
+        finished[-1].write_tables()
+    return finished
 
 
 def load_benchmark(plan: str | Path | Plan, out: str | Path, profile: str = "full") -> Benchmark:
     """What is on disk of a plan; nothing is run. What is not there is ``not run``, with what would run it."""
     plan, out = plan if isinstance(plan, Plan) else read_plan(plan), Path(out).absolute()
-    results = tuple(
-        (job, (job.key and load_outcome(out, job.key)) or _not_run(plan, job)) for job in jobs_of(plan, profile)
-    )
-    return Benchmark(plan, profile, out, results)
+    results = []
+    for job in jobs_of(plan, profile):
+        reason = job.reason or f"not run yet: p2p benchmark {plan.name}"
+        known = load_outcome(out, job.key) if job.key else None
+        results.append((job, known or Outcome(key=job.key, status="not run", reason=reason)))
+    return Benchmark(plan, profile, out, tuple(results))
 
 
 def load_or_run_quick(
@@ -163,10 +182,6 @@ def load_or_run_quick(
     full = {name: benchmark for name, benchmark in full.items() if benchmark.counts()["done"]}
     quick = run_benchmarks([name for name in names if name not in full], out, "quick", progress=progress)
     return {name: full[name] for name in names if name in full} | {b.plan.name: b for b in quick}
-
-
-def _to_run(job: Job, outcome: Outcome, retry: bool) -> bool:
-    return bool(job.key) and (outcome.status == "not run" or (retry and outcome.status == "failed"))
 
 
 def _run(outcomes: Iterator[tuple[Job, Outcome]], total: int, out: Path, progress: bool) -> dict[str, Outcome]:
@@ -191,21 +206,3 @@ def _run(outcomes: Iterator[tuple[Job, Outcome]], total: int, out: Path, progres
         finally:
             outcomes.close()
     return found
-
-
-def _with_tables(benchmark: Benchmark, found: Mapping[str, Outcome], interrupted: bool) -> Benchmark:
-    """With what was found since, its tables written."""
-    results = tuple((job, found.get(job.key, outcome)) for job, outcome in benchmark.results)
-    benchmark = replace(benchmark, results=results, interrupted=interrupted)
-    for name, content, columns in (
-        ("results", benchmark.rows, rows.COLUMNS),
-        ("summary", benchmark.summary, rows.SUMMARY_COLUMNS),
-        ("timings", benchmark.times, rows.TIME_COLUMNS),
-    ):
-        replace_text(benchmark.folder / f"{name}.csv", rows.as_csv(content, columns))
-    return benchmark
-
-
-def _not_run(plan: Plan, job: Job) -> Outcome:
-    reason = job.reason or f"not run yet: p2p benchmark {plan.name}"
-    return Outcome(key=job.key, status="not run", reason=reason)

@@ -1,4 +1,4 @@
-"""Where the runs of a benchmark happen: processes of this machine, or the workers of a Dask cluster."""
+"""One run of a benchmark from beginning to end, and where runs happen: processes here, or workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -8,24 +8,88 @@ import platform
 import shutil
 import signal
 import threading
+import time
+import traceback
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from multiprocessing.connection import Connection
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
 from multiprocessing.context import BaseContext
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from p2p_lib.benchmark.jobs import Job, library_version
-from p2p_lib.benchmark.outcome import Outcome
-from p2p_lib.benchmark.worker import perform
-from p2p_lib.core.errors import BadInput, MissingBackend
+import numpy as np
+
+from p2p_lib.benchmark.jobs import Job, library_version, open_planned
+from p2p_lib.benchmark.outcome import Outcome, run_path
+from p2p_lib.benchmark.scoring import scored
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from p2p_lib.core.files import replace_text
 from p2p_lib.core.packages import PIP, command
+from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.evaluation.protocol import rate
+from p2p_lib.run import evaluate_tracker, run
 
 # Loaded once, in the process from which those of the runs are forked.
-_PRELOADED = ["p2p_lib.benchmark.worker", "p2p_lib.method.factor_graph", "torch", "scipy.spatial", "scipy.optimize"]
+_PRELOADED = ["p2p_lib.benchmark.execution", "p2p_lib.method.factor_graph", "torch", "scipy.spatial", "scipy.optimize"]
 _PRELOADED += ["trimesh", "skimage.measure"]
 # How long a scheduler may take to answer.
 _CONNECT_S = 20
+
+
+def perform(job: Job, out: Path, library: str) -> Outcome:
+    """Run a job and score it. Nothing that goes wrong in it is raised: the outcome says so, and the others go on.
+
+    library  of whoever gave the job: results of another source would not be what its key says
+    """
+    try:
+        if library != library_version():
+            fix = "Install the same version of p2p-lib, numpy, scipy, opencv and gtsam on every worker."
+            raise BadInput("benchmark worker", f"source {library_version()}", library, fix)
+        return _poses(job, out) if job.measure == "poses" else _tracks(job)
+    except (MissingData, MissingBackend) as error:
+        return Outcome(key=job.key, status="not run", reason=str(error))
+    except Exception as error:  # noqa: BLE001 one failing run must not end the others
+        replace_text(out / "failures" / f"{job.key}.txt", traceback.format_exc())
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return Outcome(key=job.key, status="failed", reason=reason[:500])
+
+
+def _poses(job: Job, out: Path) -> Outcome:
+    sequence = open_planned(job)
+    unfinished = run_path(out, f".{job.key}.{platform.node()}.{os.getpid()}")
+    started_s = time.process_time()
+    try:
+        result = run(sequence, unfinished, job.options(sequence.objects), progress=False)
+        cpu_s = time.process_time() - started_s
+        if result.interrupted:
+            raise KeyboardInterrupt
+        done = load_run(unfinished)
+        outcome = scored(done, sequence if job.chamfer else None, job.models, job.key)
+        times = _times(done, cpu_s) | {"width_px": sequence.camera.width}
+        outcome = outcome.model_copy(update={"times": times, "ran": outcome.ran | {"library": library_version()}})
+        shutil.rmtree(run_path(out, job.key), ignore_errors=True)
+        os.rename(unfinished, run_path(out, job.key))
+        return outcome
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _times(done: Run, cpu_s: float) -> dict[str, float]:
+    hz, p95_ms = rate(done.timings)
+    stages = {k.removesuffix("_ms"): v for k, v in done.timings.items() if k.endswith("_ms") and k != "total_ms"}
+    times = {f"stage {name} [ms]": float(np.nan_to_num(ms).mean()) for name, ms in stages.items()}
+    times |= {"rate [Hz]": hz or float("nan"), "95th percentile [ms]": p95_ms or float("nan")}
+    return times | {"processor time, files included [ms]": 1e3 * cpu_s / done.info["frames"]}
+
+
+def _tracks(job: Job) -> Outcome:
+    """The 2D tracker by itself, on true tracks (see :mod:`p2p_lib.evaluation.tracker_score`)."""
+    plain = evaluate_tracker(open_planned(job), job.options(), preset=None).as_dict()
+    found = plain["redetection"]["found"]
+    scores = {"AJ": plain["aj"], "delta_avg": plain["delta_avg"], "OA": plain["oa"], "found again": found}
+    ran = {"tracker": plain["tracker"], "frames": plain["frames"], "preset": "default", "library": library_version()}
+    times = {"tracker's processor time [ms]": plain["cpu_ms"]["mean"]}
+    return Outcome(key=job.key, status="done", ran=ran, tracks=scores, times=times)
 
 
 def execute(jobs: Sequence[Job], out: Path, at_a_time: int, scheduler: str | None) -> Iterator[tuple[Job, Outcome]]:
@@ -33,69 +97,44 @@ def execute(jobs: Sequence[Job], out: Path, at_a_time: int, scheduler: str | Non
 
     scheduler  address of a Dask scheduler, whose workers see ``out`` under the same path; None: this machine
     """
-    if scheduler is not None:
-        return _on_cluster(jobs, out, scheduler)
-    return _on_this_machine(jobs, out, at_a_time)
+    return _on_this_machine(jobs, out, at_a_time) if scheduler is None else _on_cluster(jobs, out, scheduler)
 
 
 def _on_this_machine(jobs: Iterable[Job], out: Path, at_a_time: int) -> Iterator[tuple[Job, Outcome]]:
     """A process for each run, so many at a time. One that dies, of a lack of memory say, takes no other with it."""
     for library in ("OMP", "OPENBLAS", "MKL"):  # runs share the cores: more threads would wait for each other
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
-    _sweep(out)
+    for folder in (out / "runs").glob(f".*.{platform.node()}.*"):  # left unfinished by processes that are no more
+        if not Path("/proc", folder.name.rpartition(".")[2]).exists():
+            shutil.rmtree(folder, ignore_errors=True)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
-    running: set[BaseProcess] = set()
+    not_ours = set(multiprocessing.active_children())
     pool = ThreadPoolExecutor(at_a_time)
     try:
-        waiting = {pool.submit(_in_a_process, context, job, out, running): job for job in jobs}
+        waiting = {pool.submit(_in_a_process, context, job, out): job for job in jobs}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in tuple(running):
+        for process in set(multiprocessing.active_children()) - not_ours:
             process.kill()
         pool.shutdown(wait=True)
 
 
-def _sweep(out: Path) -> None:
-    """Remove what processes of this machine left unfinished that are no more."""
-    for folder in (out / "runs").glob(f".*.{platform.node()}.*"):
-        if not Path("/proc", folder.name.rpartition(".")[2]).exists():
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _in_a_process(context: BaseContext, job: Job, out: Path, running: set[BaseProcess]) -> Outcome:
-    here, there = context.Pipe()
-    process = context.Process(target=_report, args=(there, job, out, library_version()))
-    process.start()
-    running.add(process)
-    there.close()  # so that its end is seen here
+def _in_a_process(context: BaseContext, job: Job, out: Path) -> Outcome:
     try:
-        outcome = here.recv()
-        process.join()
-    except EOFError:
-        process.join()
-        ended = f"by signal {-process.exitcode}" if process.exitcode < 0 else f"with exit code {process.exitcode}"
-        outcome = Outcome(key=job.key, status="failed", reason=f"its process was ended {ended}: out of memory?")
-    finally:
-        running.discard(process)
-        here.close()  # not before its end, which that would hasten
-    return outcome
+        with ProcessPoolExecutor(1, context, _end_with_parent) as process:
+            return process.submit(perform, job, out, library_version()).result()
+    except BrokenProcessPool:
+        return Outcome(key=job.key, status="failed", reason="its process was ended from outside: out of memory?")
 
 
-def _report(parent: Connection, job: Job, out: Path, library: str) -> None:
-    """What the process of a run does; it ends with its parent, which alone hears Ctrl-C."""
+def _end_with_parent() -> None:
+    """The process of a run ends with its parent, which alone hears Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    parent.send(perform(job, out, library))
-
-
-def _end_with(parent: Connection) -> None:
-    try:
-        parent.recv()  # nothing is ever sent: it returns when the parent is gone
-    except (EOFError, OSError):
-        os._exit(1)
+    gone = multiprocessing.parent_process().sentinel
+    threading.Thread(target=lambda: wait([gone]) and os._exit(1), daemon=True).start()
 
 
 def _on_cluster(jobs: Sequence[Job], out: Path, scheduler: str) -> Iterator[tuple[Job, Outcome]]:
@@ -109,18 +148,12 @@ def _on_cluster(jobs: Sequence[Job], out: Path, scheduler: str) -> Iterator[tupl
     try:
         client = Client(scheduler, timeout=_CONNECT_S)
     except (OSError, ValueError, TimeoutError) as error:
-        fix = "Start one with: dask scheduler"
-        raise BadInput(
-            "scheduler", f"{scheduler} ({type(error).__name__})", "a Dask scheduler that answers", fix
-        ) from None
+        got = f"{scheduler} ({type(error).__name__})"
+        raise BadInput("scheduler", got, "a Dask scheduler that answers", "Start one with: dask scheduler") from None
     with client:
         futures = [client.submit(perform, job, out, library_version(), pure=False) for job in jobs]
         by_key = {future.key: job for future, job in zip(futures, jobs, strict=True)}
         for future in completed(futures):
-            job = by_key[future.key]
-            error = future.exception()
-            if error is None:
-                yield job, future.result()
-            else:
-                reason = f"its worker was lost ({type(error).__name__})"
-                yield job, Outcome(key=job.key, status="failed", reason=reason)
+            job, error = by_key[future.key], future.exception()
+            reason = f"its worker was lost ({type(error).__name__})"
+            yield job, Outcome(key=job.key, status="failed", reason=reason) if error else future.result()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -21,17 +21,17 @@ from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, uses_clicks
 from p2p_lib.core.backends import make_detector
 from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
+from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
-from p2p_lib.datasets import manifests
+from p2p_lib.datasets import manifests, ycbmultitrack
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.datasets.resized import Resized
-from p2p_lib.datasets.sequence import FORMATS, SYNTHETIC, Sequence, open_sequence
-from p2p_lib.run import make_config
+from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 # What only shows results cannot change them.
-_WITHOUT = {"report", "notebooks.py", "doctor.py", "cli.py", "click.py", "live.py"}
+_WITHOUT = {"figures", "studies", "apps"}
 _NUMERICS = ("numpy", "scipy", "opencv-python-headless", "gtsam")
 
 
@@ -41,8 +41,7 @@ class Job:
 
     measure  "poses": the whole method; "tracks": its 2D tracker alone
     chamfer  whether the reconstruction is scored
-    key      16 digits, "" where it cannot run
-    reason   why it cannot
+    key      16 digits, "" where it cannot run; then ``reason`` says why
     """
 
     method: Method
@@ -52,6 +51,44 @@ class Job:
     chamfer: bool
     key: str = ""
     reason: str = ""
+
+    @property
+    def models(self) -> dict[str, Path]:
+        """Models that the plan names, below ``$P2P_DATA``."""
+        return {name: (data_dir() or Path()) / where for name, where in self.sequence.models.items()}
+
+    @property
+    def sequence_seed(self) -> int:
+        """The seed of a synthetic sequence."""
+        return self.seed if self.sequence.seed is None else self.sequence.seed
+
+    def options(self, known: tuple[str, ...] = ()) -> RunOptions:
+        """What its run is asked for, on a sequence of the ``known`` objects.
+
+        Raises :class:`MissingData` where the method starts from clicks and the plan has none.
+        """
+        planned, method, prompts = self.sequence, self.method, None
+        if uses_clicks(method):
+            if not planned.clicks:
+                fix = "Give the plan's sequence clicks = { object = [[u, v], ...] }."
+                what = f"no clicks in the plan, which masks = {method.masks!r} needs"
+                raise MissingData(planned.name, what, fix)
+            clicks = {name: np.array(at) * method.scale for name, at in planned.clicks.items()}
+            prompts = [Prompt(name, planned.start, at) for name, at in clicks.items()]
+        objects = tuple(planned.objects) or (tuple(planned.clicks) if prompts else known)
+        return RunOptions(
+            preset=method.preset,
+            settings=method.settings,
+            seed=self.seed,
+            tracker=method.tracker,
+            detector=method.detector,
+            masks=method.masks,
+            prompts=prompts,
+            objects=objects[: method.count or None] or None,
+            start=planned.start,
+            stop=planned.stop,
+            models=self.models,
+        )
 
 
 def jobs_of(plan: Plan, profile: str) -> list[Job]:
@@ -65,46 +102,24 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
             for method in (m for m in plan.methods(profile) if not m.only or planned.name in m.only):
                 for measure in measures:
                     for seed in scope.seeds:
-                        job = Job(_with_detector(method), sequence, seed, measure, plan.chamfer)
-                        jobs.append(_keyed(job, missing, known))
+                        job = Job(_with_detector(method), sequence, seed, measure, plan.chamfer, reason=missing)
+                        jobs.append(job if missing else _keyed(job, known))
     return jobs
 
 
 def open_planned(job: Job) -> Sequence:
     """The sequence of a job, rendered first where it is synthetic and the cache lacks it."""
     planned, method = job.sequence, job.method
-    seed = job.seed if planned.seed is None else planned.seed
-    folder = None if uses_clicks(method) else method.masks.partition(":")[2] or None
+    masks = None if uses_clicks(method) else method.masks.partition(":")[2] or None
     if planned.name.startswith(SYNTHETIC):
         from p2p_lib.synthetic import scenario_dir
 
-        where = scenario_dir(planned.name.removeprefix(SYNTHETIC), seed, **_synthetic(planned, method)[0])
-        sequence = _load(where, planned.name, folder)
+        scenario = planned.name.removeprefix(SYNTHETIC)
+        folder = scenario_dir(scenario, job.sequence_seed, **_synthetic(planned, method)[0])
+        sequence = ycbmultitrack.load(folder, name=planned.name, depth_scale=None, masks=masks)
     else:
-        sequence = open_sequence(planned.name, masks=folder)
+        sequence = open_sequence(planned.name, masks=masks)
     return Resized(sequence, method.scale) if method.scale != 1 else sequence
-
-
-def objects_of(job: Job, sequence: Sequence) -> tuple[str, ...]:
-    """The objects that a job tracks."""
-    names = tuple(job.sequence.objects) or (tuple(job.sequence.clicks) if uses_clicks(job.method) else sequence.objects)
-    return names[: job.method.count or None]
-
-
-def prompts_of(job: Job) -> list[Prompt] | None:
-    """The clicks that start a job's objects; None where masks do."""
-    if not uses_clicks(job.method):
-        return None
-    if not job.sequence.clicks:
-        fix = "Give the plan's sequence clicks = { object = [[u, v], ...] }."
-        raise MissingData(job.sequence.name, f"no clicks in the plan, which masks = {job.method.masks!r} needs", fix)
-    pairs = job.sequence.clicks.items()
-    return [Prompt(name, job.sequence.start, np.array(at) * job.method.scale) for name, at in pairs]
-
-
-def models_of(job: Job) -> dict[str, Path]:
-    """Models that the plan names, below ``$P2P_DATA``."""
-    return {name: (data_dir() or Path()) / where for name, where in job.sequence.models.items()}
 
 
 @cache
@@ -115,33 +130,27 @@ def library_version() -> str:
     return _sha("\n".join([*lines, *(f"{name} {version(name)}" for name in _NUMERICS)]).encode())[:12]
 
 
-def _keyed(job: Job, missing: str, known: dict[tuple, str]) -> Job:
+def _keyed(job: Job, known: dict[tuple, str]) -> Job:
     """The job with its key, or with the reason why it cannot run."""
-    if missing:
-        return Job(**{**_fields(job), "reason": missing})
-    method = job.method
-    config = make_config(method.preset, settings=method.settings, seed=job.seed)
+    method, planned = job.method, job.sequence
+    config = RunOptions(preset=method.preset, settings=method.settings, seed=job.seed).config()
     try:
-        prompts_of(job)
+        job.options()
         decides = {
             "library": library_version(),
             "measure": job.measure,
             "config": config.as_dict(),
             "method": {k: getattr(method, k) for k in ("tracker", "detector", "masks", "scale", "count")},
             "sequence": _fingerprint(job, known),
-            "cut": [job.sequence.start, job.sequence.stop, job.sequence.objects],
-            "clicks": job.sequence.clicks if uses_clicks(method) else {},
+            "cut": [planned.start, planned.stop, planned.objects],
+            "clicks": planned.clicks if uses_clicks(method) else {},
             "chamfer": job.chamfer,
         }
     except P2PError as error:
-        if isinstance(error, BadInput) and job.sequence.name.startswith(SYNTHETIC):
+        if isinstance(error, BadInput) and planned.name.startswith(SYNTHETIC):
             raise  # the plan's mistake; of files, it is theirs
-        return Job(**{**_fields(job), "reason": str(error)})
-    return Job(**{**_fields(job), "key": _sha(json.dumps(decides, sort_keys=True).encode())[:16]})
-
-
-def _fields(job: Job) -> dict[str, Any]:
-    return {k: getattr(job, k) for k in Job.__dataclass_fields__}
+        return replace(job, reason=str(error))
+    return replace(job, key=_sha(json.dumps(decides, sort_keys=True).encode())[:16])
 
 
 def _present(planned: PlannedSequence) -> Iterator[tuple[PlannedSequence, str]]:
@@ -188,14 +197,13 @@ def _synthetic(planned: PlannedSequence, method: Method) -> tuple[dict[str, Any]
     noise = given.pop("noise", "realsense")
     if noise not in NOISE:
         raise BadInput(f"plan: noise of {planned.name}", repr(noise), "one of " + ", ".join(NOISE))
-    sensor = asdict(NOISE[noise])
+    given = asdict(NOISE[noise]) | given
     if "models" not in given:
-        return sensor | given, sensor | given
-    folder = manifests.folder_of(manifests.manifest(given.pop("models")))
+        return given, given
+    folder = manifests.folder_of(manifests.manifest(given["models"]))
     if not folder.is_dir():
         raise MissingData(str(folder), "no such folder of models", "See p2p data info ycb_models.")
-    files = _sha("\n".join(f"{p.relative_to(folder)} {p.stat().st_size}" for p in sorted(folder.rglob("*"))).encode())
-    return sensor | given | {"models": str(folder)}, sensor | given | {"models": files}
+    return given | {"models": str(folder)}, given | {"models": _sha(_listing(folder))}
 
 
 def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
@@ -204,8 +212,7 @@ def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
     if planned.name.startswith(SYNTHETIC):
         from p2p_lib.synthetic.generate import generator_version
 
-        seed = job.seed if planned.seed is None else planned.seed
-        return [planned.name, seed, generator_version(), _synthetic(planned, method)[1]]
+        return [planned.name, job.sequence_seed, generator_version(), _synthetic(planned, method)[1]]
     key = (planned.name, method.masks, tuple(planned.models.items()))
     if key not in known:
         known[key] = _files_hash(job)
@@ -213,26 +220,23 @@ def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
 
 
 def _files_hash(job: Job) -> str:
-    """Content of the truth, of the models, of the first picture and its masks; names and sizes of everything else."""
-    sequence = open_planned(job)
-    first, masks = sequence.frame(job.sequence.start), sequence.masks(job.sequence.start) or {}
-    digest = hashlib.sha256(first.rgb.tobytes() + first.depth_m.tobytes())
+    """Content of the truth, of the models, of the first image and its masks; names and sizes of everything else."""
+    sequence, start = open_planned(job), job.sequence.start
+    first = sequence.frame(start)
+    parts = [("rgb", first.rgb.tobytes()), ("depth", first.depth_m.tobytes())]
+    parts += [(name, mask.tobytes()) for name, mask in sorted((sequence.masks(start) or {}).items())]
     for name, truth in sorted(sequence.truth.items()):
-        digest.update(name.encode() + truth.T_cam_model.tobytes() + truth.labelled.tobytes())
-    for name, mask in sorted(masks.items()):
-        digest.update(name.encode() + mask.tobytes())
-    for name, path in sorted({**find_models(sequence), **models_of(job)}.items()):
-        digest.update(name.encode() + (path.read_bytes() if path.is_file() else b""))
-    if sequence.path is not None:
-        files = sorted(path for path in sequence.path.rglob("*") if path.is_file())
-        digest.update("\n".join(f"{p.relative_to(sequence.path)} {p.stat().st_size}" for p in files).encode())
-    return digest.hexdigest()
+        parts.append((name, truth.T_cam_model.tobytes() + truth.labelled.tobytes()))
+    models = sorted((find_models(sequence) | job.models).items())
+    parts += [(name, path.read_bytes() if path.is_file() else b"") for name, path in models]
+    parts += [] if sequence.path is None else [("files", _listing(sequence.path))]
+    return _sha(b"".join(name.encode() + content for name, content in parts))
 
 
-def _load(folder: Path, name: str, masks: str | None) -> Sequence:
-    from importlib import import_module
-
-    return import_module(FORMATS["ycbmultitrack"]).load(folder, name=name, depth_scale=None, masks=masks)
+def _listing(folder: Path) -> bytes:
+    """Names and sizes of all files below a folder."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return "\n".join(f"{path.relative_to(folder)} {path.stat().st_size}" for path in files).encode()
 
 
 def _sha(data: bytes) -> str:

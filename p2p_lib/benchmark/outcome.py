@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import replace_text
 
 
 class _Record(BaseModel):
@@ -58,11 +58,6 @@ class Outcome(_Record):
     times: dict[str, float] = {}
 
 
-def record_path(out: Path, key: str) -> Path:
-    """Where the record of a key lies."""
-    return out / "records" / f"{key}.json"
-
-
 def run_path(out: Path, key: str) -> Path:
     """Where the run of a key lies (see :mod:`p2p_lib.datasets.runs`)."""
     return out / "runs" / key
@@ -70,26 +65,16 @@ def run_path(out: Path, key: str) -> Path:
 
 def load_outcome(out: Path, key: str) -> Outcome | None:
     """The record of a key; None where there is none."""
+    path = out / "records" / f"{key}.json"
     try:
-        return Outcome.model_validate_json(record_path(out, key).read_bytes())
+        return Outcome.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         return None
     except ValueError as error:
         fix = "Delete it and run the benchmark again."
-        raise BadInput(str(record_path(out, key)), f"a damaged record ({type(error).__name__})", "JSON", fix) from None
+        raise BadInput(str(path), f"a damaged record ({type(error).__name__})", "JSON", fix) from None
 
 
 def save_outcome(out: Path, outcome: Outcome) -> None:
     """Keep a record, so that a kill leaves either all of it or nothing."""
-    replace_text(record_path(out, outcome.key), outcome.model_dump_json() + "\n")
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a file so that readers and crashes see either the old one or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with partial.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
+    replace_text(out / "records" / f"{outcome.key}.json", outcome.model_dump_json() + "\n")

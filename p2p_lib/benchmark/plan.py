@@ -1,7 +1,7 @@
-"""What a benchmark is to run: methods on sequences with seeds, as a TOML file says it.
+"""What a benchmark is to run, as a TOML file says it: methods, and what they run on with which seeds.
 
-A plan has the methods, and two scopes of what they run on: ``full`` (the data of the paper, where it is present) and
-``quick`` (embedded data, a few frames). Plans of this package lie in ``plans/`` and are known by their names.
+That is in ``full`` the data of the paper, where it is present, in ``quick`` a few frames of bundled data. Plans of this
+package lie in ``plans/`` and are known by their names.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_TRACKER, SEGMENTERS
+from p2p_lib.core.backends import ALIASES, DEFAULT_DETECTOR, DEFAULT_TRACKER, SEGMENTERS
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.sequence import SYNTHETIC
 
@@ -25,8 +25,7 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class _Strict(BaseModel):
-    """Values as written: no unknown key, no conversion, no change afterwards."""
-
+    # Values as written: no unknown key, no conversion, no change afterwards.
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
@@ -38,7 +37,7 @@ class Method(_Strict):
     masks     dataset, dataset:FOLDER, or a segmenter, which starts from the sequence's clicks
     settings  single parameters of the configuration, ``{"stage.key" = value}``
     synthetic parameters of synthetic sequences; ``noise`` is one of exact, realsense, hard
-    scale     of the pictures, 1 = as they are
+    scale     of the images, 1 = as they are
     count     only so many of the objects, 0 = all
     only      names of the sequences that it runs on, none for all
     """
@@ -104,7 +103,7 @@ class Plan(_Strict):
 
     name     of its file
     paper    LaTeX label of the paper's table that it re-creates, "" for none
-    kind     how its table is arranged (see :mod:`p2p_lib.studies.paper_tables`)
+    kind     how its table is arranged (see :mod:`p2p_lib.studies.final_tables`)
     chamfer  whether reconstructions are scored as well
     tracks   whether the 2D trackers are scored by themselves as well
     """
@@ -119,19 +118,13 @@ class Plan(_Strict):
     quick: Scope
     full: Scope
 
-    @field_validator("method")
-    @classmethod
-    def _distinct(cls, methods: list[Method]) -> list[Method]:
-        names = [method.name for method in methods]
+    @model_validator(mode="after")
+    def _consistent(self) -> Plan:
+        names = [method.name for method in self.method]
         if len(set(names)) < len(names):
             raise ValueError("two methods have one name")
-        return methods
-
-    @model_validator(mode="after")
-    def _known(self) -> Plan:
-        for scope in (self.quick, self.full):
-            if unknown := set(scope.methods) - {method.name for method in self.method}:
-                raise ValueError(f"methods: no method is called {unknown.pop()!r}")
+        if unknown := {*self.quick.methods, *self.full.methods} - set(names):
+            raise ValueError(f"methods: no method is called {unknown.pop()!r}")
         return self
 
     @property
@@ -167,23 +160,21 @@ def read_plan(plan: str | Path) -> Plan:
     path = Path(plan).expanduser()
     if path.suffix != ".toml":
         path = PLANS / f"{plan}.toml"
+    expected = "a plan (see p2p_lib/benchmark/plan.py)"
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
+        return Plan.model_validate({"name": path.stem, **content})
     except (FileNotFoundError, IsADirectoryError):
         fix = "Give a TOML file, or one of " + ", ".join(plan_names()) + "."
         raise MissingData(str(plan), "no such plan", fix) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BadInput(str(path), f"unreadable TOML ({error})", "a plan (see p2p_lib/benchmark/plan.py)") from None
-    try:
-        return Plan.model_validate({"name": path.stem, **content})
+        raise BadInput(str(path), f"unreadable TOML ({error})", expected) from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the file"
-        raise BadInput(
-            f"plan {path.name}", f"{where}: {first['msg']}", "a plan (see p2p_lib/benchmark/plan.py)"
-        ) from None
+        raise BadInput(f"plan {path.name}", f"{where}: {first['msg']}", expected) from None
 
 
 def uses_clicks(method: Method) -> bool:
     """Whether its masks come from a segmenter."""
-    return method.masks in SEGMENTERS
+    return ALIASES.get(method.masks, method.masks) in SEGMENTERS

@@ -34,12 +34,11 @@ def scored(done: Run, sequence: Sequence | None, models: Models, key: str = "") 
     first, over_all = (evaluate(done, models, align) for align in ("first", "all"))
     objects = {}
     for name, score in first.objects.items():
-        events = recovery_events(done.objects[name], score)
         objects[name] = ObjectOutcome(
             lost=score.lost,
             first=_errors(score),
             all=_errors(over_all.objects[name]),
-            returns=[event.frames_to_recovery for event in events],
+            returns=[event.frames_to_recovery for event in recovery_events(done.objects[name], score)],
             **(_chamfer(done, sequence, models, name, score) if sequence else {}),
         )
     ran = {key: done.info.get(key) for key in RAN}
@@ -52,26 +51,19 @@ def run_rows(folder: str | Path, models: Models | None = None) -> list[Row]:
     The Chamfer distance needs the sequence; where that has gone, a row says so.
     """
     done, models = load_run(folder), models or {}
+    name, seed = done.info["sequence"], done.info["seed"]
     try:
-        place = done.info.get("path") or done.info["sequence"]
-        outcome = scored(done, open_sequence(place, done.info["format"], seed=done.info["seed"]), models)
+        sequence = open_sequence(done.info.get("path") or name, done.info["format"], seed=seed)
+        outcome = scored(done, sequence, models)
     except MissingData as error:
         outcome = scored(done, None, models)
         objects = {n: o.model_copy(update={"no_chamfer": str(error)}) for n, o in outcome.objects.items()}
         outcome = outcome.model_copy(update={"objects": objects})
     method = Method(name=str(done.info["tracker"]))
-    scope = Scope(seeds=[done.info["seed"]], sequence=[PlannedSequence(name=done.info["sequence"])])
+    scope = Scope(seeds=[seed], sequence=[PlannedSequence(name=name)])
     plan = Plan(name="run", title="one run", method=[method], quick=scope, full=scope)
-    job = Job(method, scope.sequence[0], done.info["seed"], "poses", True)
-    rows = result_rows(plan, "full", [(job, outcome)])
+    rows = result_rows(plan, "full", [(Job(method, scope.sequence[0], seed, "poses", True), outcome)])
     return [row | {"sequence": MEAN_OF_ONE} if row["sequence"] == MEAN else row for row in rows]
-
-
-def _made_with(done: Run) -> dict[str, Path]:
-    """The models that the run was scored with, where they are still there."""
-    folder = Path(done.info.get("path") or ".")
-    paths = {name: folder / where for name, where in (done.info.get("models") or {}).items()}
-    return {name: path for name, path in paths.items() if path.is_file()}
 
 
 def _errors(score: ObjectScore) -> dict[str, list[float]]:
@@ -87,7 +79,10 @@ def _chamfer(done: Run, sequence: Sequence, models: Models, name: str, score: Ob
         return {"no_chamfer": "no surface was reconstructed"}
     if not np.isfinite(score.T_obj_model).all():
         return {"no_chamfer": "no pose, so no model frame"}
-    known = find_models(sequence, MESHES) | _made_with(done) | given_models(models, sequence.objects, MESHES)
+    folder = Path(done.info.get("path") or ".")
+    made_with = {name: folder / where for name, where in (done.info.get("models") or {}).items()}
+    made_with = {name: path for name, path in made_with.items() if path.is_file()}
+    known = find_models(sequence, MESHES) | made_with | given_models(models, sequence.objects, MESHES)
     model = known[name] if name in known and known[name].suffix != ".xyz" else done.points[name]
     truth, reference = reconstruction.seen_surface(sequence, name, model, score.frame_index)
     surface = trimesh.load(mesh, process=False)

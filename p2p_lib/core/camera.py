@@ -13,7 +13,7 @@ from p2p_lib.core.image import in_image
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels and picture size in pixels, no distortion."""
+    """Intrinsics in pixels and image size in pixels, no distortion."""
 
     fx: float
     fy: float
@@ -27,7 +27,7 @@ class Camera:
         if not np.isfinite(values).all() or self.fx <= 0 or self.fy <= 0:
             raise BadInput("camera", f"fx, fy, cx, cy = {values}", "finite numbers, focal lengths above 0 (pixels)")
         if self.width < 1 or self.height < 1:
-            raise BadInput("camera", f"{self.width}x{self.height}", "a picture size of at least 1x1 pixels")
+            raise BadInput("camera", f"{self.width}x{self.height}", "an image size of at least 1x1 pixels")
 
     @classmethod
     def from_K(cls, K: np.ndarray, width: int, height: int, name: str = "K") -> Camera:
@@ -65,5 +65,5 @@ class Camera:
         return self.unproject(np.stack([u, v], -1), np.ones((self.height, self.width))).astype(np.float32)
 
     def inside(self, uv_px: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
-        """Which pixels (..., 2) lie in the picture; NaN does not."""
+        """Which pixels (..., 2) lie in the image; NaN does not."""
         return in_image(uv_px, (self.height, self.width), margin_px)

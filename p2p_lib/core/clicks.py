@@ -48,6 +48,14 @@ def depths_at(clicks: np.ndarray, frame: Frame, radius: int = 2) -> np.ndarray:
     return result
 
 
+def checked_clicks(clicks: Mapping[str, ArrayLike], camera: Camera, frame: Frame) -> dict[str, np.ndarray]:
+    """New objects' clicks in a frame, (N, 2) float64 each: in the image, and where depth is measured."""
+    checked = {name: check_clicks(name, at, camera) for name, at in clicks.items()}
+    for name, at in checked.items():
+        check_depth(name, at, frame)
+    return checked
+
+
 def check_depth(name: str, clicks: np.ndarray, frame: Frame) -> None:
     """Refuse clicks where nothing is measured."""
     missing = ~np.isfinite(depths_at(clicks, frame))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 
@@ -25,3 +26,11 @@ def in_mask(uv_px: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """(...,) bool: which of the pixels (..., 2) have their nearest pixel in a mask (H, W); NaN is outside."""
     u, v = nearest_px(uv_px, mask.shape)
     return in_image(uv_px, mask.shape, -0.5) & mask[v, u]
+
+
+def bounds(mask: np.ndarray, margin_px: int = 0) -> tuple[slice, slice]:
+    """Rows and columns of a mask's (H, W) bounding box with a margin around it, cut to the image."""
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    spans = ((top, height, mask.shape[0]), (left, width, mask.shape[1]))
+    rows, columns = (slice(max(at - margin_px, 0), min(at + size + margin_px, end)) for at, size, end in spans)
+    return rows, columns

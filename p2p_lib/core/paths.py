@@ -32,7 +32,7 @@ def data_dir() -> Path | None:
 
 
 def figure_dir() -> Path:
-    """Where pictures go: ``$P2P_FIGURES``, else ``figures/`` of the project."""
+    """Where images go: ``$P2P_FIGURES``, else ``figures/`` of the project."""
     return _given("P2P_FIGURES") or _home() / "figures"
 
 

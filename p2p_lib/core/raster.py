@@ -1,4 +1,4 @@
-"""Pixels of ours, whose integers are centres, and coordinates in a network's raster, where 0 is the picture's edge."""
+"""Pixels of ours, whose integers are centres, and coordinates in a network's raster, where 0 is the image's edge."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def to_raster(uv_px: np.ndarray, shape: tuple[int, int], size: int) -> np.ndarray:
-    """Pixels (N, 2) of a picture of shape (H, W) to coordinates x, y in a raster of size x size."""
+    """Pixels (N, 2) of an image of shape (H, W) to coordinates x, y in a raster of size x size."""
     return (np.asarray(uv_px, float) + 0.5) * (size / np.array(shape[::-1], float))
 
 
@@ -21,9 +21,9 @@ def from_raster(xy: np.ndarray, shape: tuple[int, int], size: int) -> np.ndarray
 
 
 def square(rgb: np.ndarray, size: int, device: str) -> torch.Tensor:
-    """(1, 1, size, size, 3) float32 in [-1, 1]: the picture scaled to a square raster, as the models were trained."""
+    """(1, 1, size, size, 3) float32 in [-1, 1]: the image scaled to a square raster, as the models were trained."""
     import torch
 
-    picture = torch.from_numpy(np.ascontiguousarray(rgb)).to(device).permute(2, 0, 1)[None].float()
-    scaled = torch.nn.functional.interpolate(picture, (size, size), mode="bilinear", align_corners=False)
+    image = torch.from_numpy(np.ascontiguousarray(rgb)).to(device).permute(2, 0, 1)[None].float()
+    scaled = torch.nn.functional.interpolate(image, (size, size), mode="bilinear", align_corners=False)
     return scaled.div(127.5).sub(1).permute(0, 2, 3, 1)[None]

@@ -112,6 +112,12 @@ def angle_rad(T: np.ndarray) -> np.ndarray:
     return np.linalg.norm(so3_log(T[..., :3, :3]), axis=-1)
 
 
+def error_deg_mm(T: np.ndarray, T_true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation in degrees (...,) and translation in millimetres (...,) between two poses; NaN where one is NaN."""
+    T_error = inverse(T_true) @ T
+    return np.degrees(angle_rad(T_error)), 1e3 * np.linalg.norm(T_error[..., :3, 3], axis=-1)
+
+
 def adjoint(T: np.ndarray) -> np.ndarray:
     """Ad_T (..., 6, 6), rotation first: ``T exp(xi) T^-1 = exp(Ad_T xi)``."""
     R = T[..., :3, :3]

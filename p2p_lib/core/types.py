@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import StrEnum
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from p2p_lib.core.errors import BadInput
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One RGB-D picture.
+    """One RGB-D image.
 
     rgb      (H, W, 3) uint8, red first
     depth_m  (H, W) float32, metres along the optical axis, registered to rgb; 0 = no measurement
@@ -31,7 +33,7 @@ class Frame:
             raise BadInput(f"frame {self.index} colour", f"{rgb.shape} {rgb.dtype}", "(H, W, 3) uint8")
         if depth.shape != rgb.shape[:2]:
             got = "x".join(map(str, depth.shape[::-1]))
-            want = f"{rgb.shape[1]}x{rgb.shape[0]} as the colour picture"
+            want = f"{rgb.shape[1]}x{rgb.shape[0]} as the colour image"
             raise BadInput(f"frame {self.index} depth", got, want, "Register the depth to the colour camera first.")
         if not np.issubdtype(depth.dtype, np.floating):
             raise BadInput(f"frame {self.index} depth", depth.dtype, "metres as floats", "Apply the depth scale first.")
@@ -81,6 +83,15 @@ class Tracks:
         return Tracks(ids, self.uv_px[at], self.visible[at], self.uncertainty[at])
 
 
+Arrays = TypeVar("Arrays")
+
+
+def joined(parts: Sequence[Arrays], join: Callable[..., np.ndarray] = np.concatenate) -> Arrays:
+    """Values of one dataclass that holds arrays (or such dataclasses again), one after the other."""
+    columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(parts[0])}
+    return type(parts[0])(*(joined(c, join) if is_dataclass(c[0]) else join(c) for c in columns.values()))
+
+
 class Status(StrEnum):
     """What a pose estimate is worth; `WITH_POSE` lists those that carry a pose."""
 
@@ -98,7 +109,7 @@ WITH_POSE = frozenset({Status.TRACKED, Status.DEGRADED, Status.RECOVERED})
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """One object's pose at one frame, or the honest absence of it.
+    """One object's pose at one frame, or the absence of it.
 
     T_cam_obj       (4, 4) or None. None whenever the status is not one of :data:`WITH_POSE`
     covariance      (6, 6) or None: right tangent of T_cam_obj, [rotation rad, translation m]

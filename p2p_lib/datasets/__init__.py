@@ -1,4 +1,9 @@
-"""Sequences in, runs out: one loader per layout, manifests and downloads, run folders, export and import.
+"""RGB-D sequences from disk and cameras, their truth and models, and the folders that runs are written to.
 
-Look first at :mod:`p2p_lib.datasets.sequence` and :mod:`p2p_lib.datasets.runs`.
+Sequences: look first at :mod:`~p2p_lib.datasets.sequence`, which opens any layout. A layout (``folder``,
+``ycbineoat``, ``ycbmultitrack``, ``ho3d``, ``bop``) says where files lie, in which units and axes;
+``image_sequence``, ``images`` and ``masks`` read and check them for all. ``cameras`` and ``realsense`` are live.
+Runs: ``runs`` writes and reads them, ``export`` and ``imported`` exchange poses with other tools.
+On this machine: ``manifests`` say what a dataset or checkpoint is, ``inventory`` fetches and verifies it.
+Own recordings: ``recording`` makes truth out of motion capture.
 """

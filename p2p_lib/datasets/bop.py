@@ -1,37 +1,46 @@
 """A scene in the BOP format: ``<split>/<scene>/`` of a BOP dataset.
 
-``rgb/000001.png``, ``depth/000001.png``, ``mask_visib/000001_000000.png`` (picture, index in its list of objects),
+``rgb/000001.png``, ``depth/000001.png``, ``mask_visib/000001_000000.png`` (image, index in its list of objects),
 ``scene_camera.json``, ``scene_gt.json`` (millimetres, OpenCV axes), ``scene_gt_info.json``; models in
-``models_eval/`` or ``models/`` of the dataset. Pictures may be keyframes with gaps: their numbers give the times.
-An object is called ``obj_000005``; a second one of the same kind in a picture ``obj_000005_2``, in the file's order.
+``models_eval/`` or ``models/`` of the dataset. Images may be keyframes with gaps: their numbers give the times.
+An object is called ``obj_000005``; a second one of the same kind in an image ``obj_000005_2``, in the file's order.
 """
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageSequence
-from p2p_lib.datasets.masks import MaskFiles, find_masks, masks_folder
+from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, paired_images
+from p2p_lib.datasets.masks import MaskFiles
+from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import ObjectTruth
 
 MM = 0.001
-#: Frame number to what a scene file says of it; a list per object in scene_gt.json and scene_gt_info.json.
-Scene = dict[int, Any]
+Nine = Annotated[list[float], Field(min_length=9, max_length=9)]
 
 
-def recognises(folder: Path) -> bool:
-    """Whether a folder has ``scene_camera.json``."""
-    return (folder / "scene_camera.json").is_file()
+class _Camera(BaseModel):
+    cam_K: Nine
+    depth_scale: float
+
+
+class _Pose(BaseModel):
+    obj_id: int
+    cam_R_m2c: Nine
+    cam_t_m2c: Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+class _Info(BaseModel):
+    px_count_visib: int = 1
 
 
 def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
@@ -39,29 +48,24 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
 
     The depth scale is the scene's own unless another is given.
     """
-    rgb_files = images.list_files(folder / "rgb", images.COLOUR, "colour pictures")
-    depth_files = images.check_paired(images.list_files(folder / "depth", images.LOSSLESS, "depth images"), rgb_files)
-    numbers = [_number(path) for path in rgb_files]
-    camera, scale_mm = _camera(folder / "scene_camera.json", numbers, rgb_files[0])
-    listed = _named(folder / "scene_gt.json", numbers)
+    rgb, depth = paired_images(folder)
+    numbers = [_number(path) for path in rgb]
+    camera, scale_mm = _camera(folder / "scene_camera.json", numbers, rgb[0])
+    files = ImageFiles(folder, rgb, depth, camera, (np.array(numbers) - numbers[0]) / images.DEFAULT_HZ)
+    listed = _named(_lists(folder / "scene_gt.json", _Pose), numbers)
     objects = tuple(sorted({obj for at in listed for obj in at}))
-    shape = camera.height, camera.width
-    own = _visible_masks(folder, numbers, listed, objects, shape)
-    chosen = find_masks(masks_folder(folder, masks), rgb_files, shape, objects or None) if masks else own
+    own = _visible_masks(folder, numbers, listed, objects, files.shape)
+    chosen = files.masks(masks, (), objects or None)[0] if masks else own
 
     def read_truth() -> dict[str, ObjectTruth]:
-        visible = _visibility(folder / "scene_gt_info.json", numbers, listed)
-        return {obj: _truth(folder, obj, numbers, listed, visible) for obj in objects}
+        info = _lists(folder / "scene_gt_info.json", _Info)
+        return {obj: _truth(folder, obj, numbers, listed, info) for obj in objects}
 
     return ImageSequence(
         name=name,
         format="bop",
-        path=folder,
-        camera=camera,
+        files=files,
         objects=objects or ("object",),
-        rgb_files=rgb_files,
-        depth_files=depth_files,
-        times_s=(np.array(numbers) - numbers[0]) / images.DEFAULT_HZ,
         depth_scale=depth_scale or scale_mm * MM,
         mask_files=chosen,
         own_masks=own or chosen,
@@ -70,51 +74,38 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
     )
 
 
-def read_scene(path: Path) -> Scene:
-    """A scene file with its frame numbers as integers; :class:`BadInput` names the file where it is none."""
-    try:
-        return {int(number): value for number, value in json.loads(path.read_text()).items()}
-    except FileNotFoundError:
-        raise MissingData(str(path), "no such file, expected a BOP scene's") from None
-    except (ValueError, AttributeError) as error:
-        raise BadInput(str(path), f"unreadable ({error})", "a JSON object with one entry for each picture") from None
-
-
 def _number(path: Path) -> int:
     if not path.stem.isdigit():
-        raise BadInput(str(path), f"the name {path.name!r}", "a number, as BOP names pictures")
+        raise BadInput(str(path), f"the name {path.name!r}", "a number, as BOP names images")
     return int(path.stem)
 
 
-def _camera(path: Path, numbers: list[int], picture: Path) -> tuple[Camera, float]:
+def _camera(path: Path, numbers: list[int], image: Path) -> tuple[Camera, float]:
     """The one camera of a scene, and its depth scale in millimetres per unit."""
-    scene = read_scene(path)
-    try:
-        found = {(tuple(scene[i]["cam_K"]), float(scene[i]["depth_scale"])) for i in numbers}
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadInput(str(path), f"no {error} for a picture", "cam_K and depth_scale for every picture") from None
+    scene = read_json(path, dict[int, _Camera], "cam_K and depth_scale for every image")
+    if gone := set(numbers) - scene.keys():
+        raise BadInput(str(path), f"no image {min(gone)}", "cam_K and depth_scale for every image")
+    found = {(tuple(scene[i].cam_K), scene[i].depth_scale) for i in numbers}
     if len(found) > 1:
-        fix = "T-LESS, whose pictures are crops, cannot be tracked."
+        fix = "T-LESS, whose images are crops, cannot be tracked."
         raise BadInput(str(path), f"{len(found)} cameras", "one camera and depth scale for the whole scene", fix)
     K, scale_mm = found.pop()
-    height, width = images.read_rgb(picture).shape[:2]
-    if len(K) != 9:
-        raise BadInput(str(path), f"cam_K with {len(K)} numbers", "9, row by row")
-    return Camera.from_K(np.reshape(K, (3, 3)), width, height, name=str(path)), scale_mm
+    return camera_for(image, np.reshape(K, (3, 3)), str(path)), scale_mm
 
 
-def _named(path: Path, numbers: list[int]) -> list[dict[str, tuple[int, Mapping]]]:
-    """For each picture: object to its index in the list and what the list says. Without truth: nothing."""
-    scene = read_scene(path) if path.is_file() else {}
+def _lists(path: Path, entry: type) -> dict[int, list]:
+    """Image number to its list of entries; nothing where there is no such file."""
+    return read_json(path, dict[int, list[entry]], "a list of objects for each image") if path.is_file() else {}
+
+
+def _named(scene: dict[int, list[_Pose]], numbers: list[int]) -> list[dict[str, tuple[int, _Pose]]]:
+    """For each image: object to its index in the list and its pose."""
     named = []
     for i in numbers:
         count: Counter = Counter()
-        at: dict[str, tuple[int, Mapping]] = {}
+        at: dict[str, tuple[int, _Pose]] = {}
         for index, entry in enumerate(scene.get(i, [])):
-            try:
-                kind = f"obj_{int(entry['obj_id']):06d}"
-            except (KeyError, TypeError, ValueError):
-                raise BadInput(str(path), f"picture {i}: no obj_id at {index}", "a list of objects") from None
+            kind = f"obj_{entry.obj_id:06d}"
             count[kind] += 1
             at[kind if count[kind] == 1 else f"{kind}_{count[kind]}"] = index, entry
         named.append(at)
@@ -134,31 +125,15 @@ def _visible_masks(folder: Path, numbers, listed, objects, shape: tuple[int, int
     return MaskFiles(files, dict.fromkeys(objects), shape)
 
 
-def _visibility(path: Path, numbers: list[int], listed) -> Callable[[int, str], bool]:
-    """Whether an object shows at all in a picture, by ``px_count_visib``; True where the scene does not say."""
-    info = read_scene(path) if path.is_file() else {}
-
-    def visible(at: int, obj: str) -> bool:
-        entries, index = info.get(numbers[at], []), listed[at][obj][0]
-        return index >= len(entries) or entries[index].get("px_count_visib", 1) > 0
-
-    return visible
-
-
-def _truth(folder: Path, obj: str, numbers: list[int], listed, visible) -> ObjectTruth:
+def _truth(folder: Path, obj: str, numbers: list[int], listed, info: dict[int, list[_Info]]) -> ObjectTruth:
     poses, labelled = np.full((len(numbers), 4, 4), np.nan), np.zeros(len(numbers), bool)
     for at in (at for at in range(len(numbers)) if obj in listed[at]):
-        entry, name = listed[at][obj][1], f"{folder / 'scene_gt.json'}: picture {numbers[at]}, {obj}"
-        try:
-            R, t = np.reshape(entry["cam_R_m2c"], (3, 3)).astype(float), np.array(entry["cam_t_m2c"], float)
-            poses[at] = se3.check(name, se3.from_rt(R, t * MM), images.NOT_RIGID)
-        except (KeyError, ValueError, TypeError) as error:
-            if isinstance(error, BadInput):
-                raise
-            raise BadInput(name, f"unreadable ({error})", "cam_R_m2c with 9 and cam_t_m2c with 3 numbers") from None
-        labelled[at] = visible(at, obj)
-    seen = np.isfinite(poses).all((1, 2))
-    poses[seen] = se3.orthonormalised(poses[seen])
+        index, entry = listed[at][obj]
+        T = se3.from_rt(np.reshape(entry.cam_R_m2c, (3, 3)), np.array(entry.cam_t_m2c) * MM)
+        T = se3.check(f"{folder / 'scene_gt.json'}: image {numbers[at]}, {obj}", T, images.NOT_RIGID)
+        poses[at] = se3.orthonormalised(T)
+        counts = info.get(numbers[at], [])
+        labelled[at] = index >= len(counts) or counts[index].px_count_visib > 0
     return ObjectTruth(poses, labelled)
 
 

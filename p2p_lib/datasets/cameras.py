@@ -1,7 +1,7 @@
-"""Cameras that run while others work: a RealSense, one of its recordings, or a folder played at some rate.
+"""Live cameras: a RealSense, one of its recordings, or a folder played at some rate.
 
-A camera does not wait. :class:`Newest` reads it in a thread of its own and hands out the newest frame alone:
-whoever is slower than the camera misses frames instead of falling behind.
+A camera does not wait. :class:`Newest` reads it in a thread of its own and hands out the newest frame alone, so that
+a tracker that is slower than the camera skips frames instead of falling behind.
 """
 
 from __future__ import annotations
@@ -25,10 +25,7 @@ _FORMS = "realsense, realsense:RECORDING or folder:PATH"
 
 
 class LiveCamera(Protocol):
-    """A stream of frames that nobody can hold up.
-
-    A frame's index counts the camera's own pictures from 0: what is missing between two of them was dropped.
-    """
+    """A stream of frames; a frame's index counts the camera's own from 0, so that dropped ones leave gaps."""
 
     name: str
     camera: Camera
@@ -85,10 +82,7 @@ def open_camera(spec: str, rate_hz: float | None = None) -> LiveCamera:
 
 
 class Newest:
-    """A camera's newest frame; older ones that nobody took in time are gone. A context manager.
-
-    keep  indices of frames that wait to be taken, such as those that were clicked in
-    """
+    """A camera's newest frame; older ones are dropped, but for those of the indices ``keep``. A context manager."""
 
     def __init__(self, source: LiveCamera, keep: Collection[int] = ()):
         self._source, self._keep = source, frozenset(keep)
@@ -133,12 +127,12 @@ class Still:
 
     name: str
     camera: Camera
-    picture: Frame
+    still: Frame
     objects: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return 1
 
     def frame(self, i: int) -> Frame:
-        """The picture, whatever its number."""
-        return self.picture
+        """The frame, whatever its number."""
+        return self.still

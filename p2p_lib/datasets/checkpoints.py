@@ -37,12 +37,10 @@ def load_weights(name: str) -> dict[str, torch.Tensor]:
     (path,) = checked_files(name)
     try:
         read = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+        what = "more than tensors" if isinstance(error, pickle.UnpicklingError) else "an unreadable file"
         reason = " ".join(str(error).split())[:120]
-        raise BadInput(str(path), f"more than tensors ({reason})", "a checkpoint of tensors", _fetch(name)) from None
-    except (RuntimeError, EOFError, ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise BadInput(str(path), f"an unreadable file ({reason})", "a PyTorch checkpoint", _fetch(name)) from None
+        raise BadInput(str(path), f"{what} ({reason})", "a checkpoint of tensors", _fetch(name)) from None
     weights = read.get("state_dict", read.get("model", read)) if isinstance(read, dict) else read
     if not isinstance(weights, dict) or not all(isinstance(value, torch.Tensor) for value in weights.values()):
         raise BadInput(str(path), f"a {type(weights).__name__} of other values", "a dictionary of tensors")

@@ -1,7 +1,7 @@
-"""Fetching one file: by pooch, which checks the checksum, with a downloader of ours that resumes where it stopped.
+"""Fetching one file by pooch, which checks the checksum, with a downloader that resumes where it stopped.
 
-Half a file is kept as ``.NAME.part`` beside its place, with the server's mark of which version it is half of; the
-next call asks the server to go on from there, and starts anew where the file has changed since.
+A part of a file is kept as ``.NAME.part`` beside its place, with the server's mark of its version; the next call
+asks the server to go on from there, and starts anew where the file has changed since.
 """
 
 from __future__ import annotations
@@ -21,11 +21,8 @@ TIMEOUT_S = 30.0
 
 def sha256(path: Path) -> str:
     """The checksum of a file, in hex."""
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while chunk := file.read(CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def download(file: RemoteFile, folder: Path, known_sha256: str | None, progress: bool = True) -> str:
@@ -83,38 +80,36 @@ class _Resuming:
                 return self(url, output_file, pooch)
             response.raise_for_status()
             self._write(response, begun if response.status_code == 206 else 0)
-        if self.size is not None and self.part.stat().st_size != self.size:
-            got = self.part.stat().st_size
-            self._forget()
-            raise BadInput(url, f"{got} bytes", f"{self.size}, as the manifest says")
-        os.replace(self.part, output_file)
+        got = self.part.stat().st_size
+        if self.size in (None, got):
+            os.replace(self.part, output_file)
         self._forget()
+        if self.size not in (None, got):
+            raise BadInput(url, f"{got} bytes", f"{self.size}, as the manifest says")
         return None
 
     def _write(self, response, begun: int) -> None:
+        import requests
+
         mark = response.headers.get("ETag", "")
         # A weak ETag does not vouch for bytes; the time of the last change has to do.
         mark = mark if mark and not mark.startswith("W/") else response.headers.get("Last-Modified", "")
+        self.mark.unlink(missing_ok=True)
         if mark:
             self.mark.write_text(mark)
-        else:
-            self.mark.unlink(missing_ok=True)
         left = int(response.headers.get("Content-Length", 0))
         if left > shutil.disk_usage(self.part.parent).free:
             raise BadInput(response.url, f"{left} bytes", f"room for them in {self.part.parent}")
         name = self.part.name.removeprefix(".").removesuffix(".part")
         options = {"unit": "B", "unit_scale": True, "initial": begun, "shown": self.progress}
-        with (
-            progress_bar(name, begun + left or None, **options) as bar,
-            self.part.open("ab" if begun else "wb") as sink,
-        ):
+        bar = progress_bar(name, begun + left or None, **options)
+        with bar, self.part.open("ab" if begun else "wb") as sink:
             for chunk in response.iter_content(CHUNK):
                 sink.write(chunk)
                 bar.update(len(chunk))
-        if left and self.part.stat().st_size != begun + left:
-            import requests
-
-            raise requests.ConnectionError(f"{self.part.stat().st_size} of {begun + left} bytes came")
+        came = self.part.stat().st_size
+        if left and came != begun + left:
+            raise requests.ConnectionError(f"{came} of {begun + left} bytes came")
 
     def _forget(self) -> None:
         self.part.unlink(missing_ok=True)

@@ -5,7 +5,7 @@
            results (``ob_in_cam``); a sequence of one unnamed object has ``annotated_poses/<frame>.txt``
 ``bop``    one CSV of the BOP challenge: scene_id,im_id,obj_id,score,R,t,time with millimetres and seconds
 
-Frames are named as the sequence's pictures are. :mod:`p2p_lib.datasets.imported` reads all three back.
+Frames are named as the sequence's images are. :mod:`p2p_lib.datasets.imported` reads all three back.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.datasets.runs import ObjectRun, Run, tum_line
+from p2p_lib.datasets.runs import Run, tum_line
 from p2p_lib.datasets.sequence import Sequence
 
 FORMATS = ("tum", "poses", "bop")
@@ -47,11 +47,21 @@ def export(
     poses = {name: run.objects[name].T_cam_obj @ T for name, T in frames.items()}
     if format == "bop":
         return [_write_bop(out, run, poses, sequence)]
-    if format == "tum":
-        return [_write_tum(out / f"{name}.txt", run.objects[name], T) for name, T in poses.items()]
-    unnamed = tuple(poses) == ("object",)
-    folders = {name: out / "annotated_poses" / ("" if unnamed else name) for name in poses}
-    return [_write_matrices(folders[name], run.objects[name], T, sequence) for name, T in poses.items()]
+    written = []
+    for name, T in poses.items():
+        obj = run.objects[name]
+        has_pose = np.flatnonzero(obj.has_pose)
+        if format == "tum":
+            written.append(out / f"{name}.txt")
+            written[-1].write_text("".join(tum_line(obj.time_s[i], T[i]) for i in has_pose))
+        else:
+            written.append(out / "annotated_poses" / ("" if tuple(poses) == ("object",) else name))
+            written[-1].mkdir(parents=True, exist_ok=True)
+            for i in has_pose:
+                index = int(obj.frame_index[i])
+                stem = f"{index:07d}" if sequence is None else sequence.frame_names[index]
+                np.savetxt(written[-1] / f"{stem}.txt", T[i], fmt="%.12g")
+    return written
 
 
 def scene_id(sequence: Sequence | None) -> int:
@@ -67,24 +77,10 @@ def obj_ids(objects: tuple[str, ...]) -> dict[str, int]:
 
 
 def image_ids(sequence: Sequence | None, frame_index: np.ndarray) -> np.ndarray:
-    """BOP's number of each frame: the picture's in a BOP scene, else the frame's own."""
+    """BOP's number of each frame: the image's in a BOP scene, else the frame's own."""
     if sequence is None or sequence.format != "bop":
         return frame_index
     return np.array([int(sequence.frame_names[i]) for i in frame_index], int)
-
-
-def _write_tum(path: Path, obj: ObjectRun, T: np.ndarray) -> Path:
-    path.write_text("".join(tum_line(obj.time_s[i], T[i]) for i in np.flatnonzero(obj.has_pose)))
-    return path
-
-
-def _write_matrices(folder: Path, obj: ObjectRun, T: np.ndarray, sequence: Sequence | None) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    for i in np.flatnonzero(obj.has_pose):
-        index = int(obj.frame_index[i])
-        name = sequence.frame_names[index] if sequence is not None else f"{index:07d}"
-        np.savetxt(folder / f"{name}.txt", T[i], fmt="%.12g")
-    return folder
 
 
 def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: Sequence | None) -> Path:
@@ -94,7 +90,7 @@ def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: S
     for name, T in poses.items():
         obj = run.objects[name]
         images = image_ids(sequence, obj.frame_index)
-        # BOP wants one time for all estimates of a picture, -1 where it is unknown.
+        # BOP wants one time for all estimates of an image, -1 where it is unknown.
         times_s = total_ms / 1000 if len(total_ms) == len(obj) else np.full(len(obj), -1.0)
         for i in np.flatnonzero(obj.has_pose):
             R, t_mm = (" ".join(f"{x:.12g}" for x in v) for v in (T[i, :3, :3].ravel(), T[i, :3, 3] * 1000))

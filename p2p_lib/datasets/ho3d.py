@@ -1,6 +1,6 @@
 """HO-3D, version 3: one object in a hand, as BundleSDF evaluates on it.
 
-``HO3D_v3/evaluation/<sequence>/`` with ``rgb/0000.jpg``, ``depth/0000.png`` (see :func:`read_depth_m`) and
+``HO3D_v3/evaluation/<sequence>/`` with ``rgb/0000.jpg``, ``depth/0000.png`` (see :func:`read_raw_depth`) and
 ``meta/0000.pkl``: camera matrix, object pose (OpenGL camera axes) or None, object name. The dataset has no masks of
 the object; those of others lie in ``HO3D_v3/masks/<sequence>/`` or ``HO3D_v3/masks_XMem/<sequence>/``, models in
 ``HO3D_v3/models/<YCB name>/``. Every frame with truth is scored, as the field does it: such masks are not truth.
@@ -18,8 +18,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageSequence
-from p2p_lib.datasets.masks import MaskFiles, find_masks, masks_folder
+from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.pickles import load_plain
 from p2p_lib.datasets.sequence import ObjectTruth
 
@@ -30,19 +29,15 @@ DEPTH_SCALE = 0.00012498664727900177  # metres per unit, from the dataset's own 
 T_CV_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def recognises(folder: Path) -> bool:
-    """Whether a folder has ``meta/*.pkl``."""
-    return any((folder / "meta").glob("*.pkl"))
-
-
 def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
-    rgb_files = images.list_files(folder / "rgb", images.COLOUR, "colour pictures")
-    depth_files = images.check_paired(images.list_files(folder / "depth", images.LOSSLESS, "depth images"), rgb_files)
-    meta_files = images.check_paired(images.list_files(folder / "meta", (".pkl",), "meta files"), rgb_files)
+    rgb, depth = paired_images(folder)
+    meta_files = images.check_paired(images.list_files(folder / "meta", (".pkl",), "meta files"), rgb)
     first = read_meta(meta_files[0])
-    height, width = images.read_rgb(rgb_files[0]).shape[:2]
-    camera = Camera.from_K(first["camMat"], width, height, name=f"{meta_files[0]}: camMat")
+    camera = camera_for(rgb[0], first["camMat"], f"{meta_files[0]}: camMat")
+    files = ImageFiles(folder, rgb, depth, camera, images.frame_times(folder, rgb))
+    beside = [_root(folder) / str(where) / images.full(folder).name for where in ([masks] if masks else MASKS)]
+    found, _ = files.masks(next((where for where in beside if where.is_dir()), masks), (), (OBJECT,))
 
     def read_truth() -> dict[str, ObjectTruth]:
         poses = [read_pose(path, read_meta(path), camera) for path in meta_files]
@@ -51,15 +46,11 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
     return ImageSequence(
         name=name,
         format="ho3d",
-        path=folder,
-        camera=camera,
+        files=files,
         objects=(OBJECT,),
-        rgb_files=rgb_files,
-        depth_files=depth_files,
-        times_s=images.frame_times(folder, rgb_files),
         depth_scale=depth_scale or DEPTH_SCALE,
-        read_depth=read_depth_m,
-        mask_files=_masks(folder, masks, rgb_files, (height, width)),
+        read_depth=read_raw_depth,
+        mask_files=found,
         read_truth=read_truth,
         model_places={OBJECT: _models(folder, first)},
     )
@@ -92,23 +83,16 @@ def read_pose(path: Path, meta: dict, camera: Camera) -> np.ndarray:
     return T_CV_GL @ se3.from_rt(se3.exp(np.r_[w.ravel().astype(float), 0, 0, 0])[:3, :3], t.ravel().astype(float))
 
 
-def read_depth_m(path: Path, shape: tuple[int, int], scale: float, invalid: int | None = None) -> np.ndarray:
-    """(H, W) float32 metres of a PNG whose red byte is the low one and whose green byte the high one."""
+def read_raw_depth(path: Path) -> np.ndarray:
+    """(H, W) uint16 of a PNG whose red byte is the low one and whose green byte the high one."""
     bgr = images.read_image(path, cv2.IMREAD_COLOR, "a depth image in two colour bytes")
-    images.check_size(path, bgr, shape)
     # uint16 first: NumPy 2 refuses 256 * uint8, older versions overflowed.
-    raw = bgr[..., 2].astype(np.uint16) + (bgr[..., 1].astype(np.uint16) << 8)
-    return raw.astype(np.float32) * np.float32(scale)
+    return bgr[..., 2].astype(np.uint16) + (bgr[..., 1].astype(np.uint16) << 8)
 
 
-def _masks(
-    folder: Path, masks: str | Path | None, rgb_files: tuple[Path, ...], shape: tuple[int, int]
-) -> MaskFiles | None:
-    """Those asked for (a name beside ``evaluation/``, or a path), else the first of :data:`MASKS` that is there."""
-    root, sequence = images.full(folder).parent.parent, images.full(folder).name
-    beside = [root / name / sequence for name in ([str(masks)] if masks else MASKS)]
-    found = next((place for place in beside if place.is_dir()), masks_folder(folder, masks) if masks else None)
-    return find_masks(found, rgb_files, shape, (OBJECT,)) if found else None
+def _root(folder: Path) -> Path:
+    """``HO3D_v3``, two folders above the sequence."""
+    return images.full(folder).parent.parent
 
 
 def _models(folder: Path, meta: dict) -> tuple[Path, ...]:
@@ -116,5 +100,5 @@ def _models(folder: Path, meta: dict) -> tuple[Path, ...]:
     own, known = folder / "models" / OBJECT, meta.get("objName")
     if not isinstance(known, str) or not re.fullmatch(r"[\w-]+", known):
         return (own,)
-    beside = images.full(folder).parent.parent / "models" / known
+    beside = _root(folder) / "models" / known
     return own, beside / "textured_simple.obj", beside

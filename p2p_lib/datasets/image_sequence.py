@@ -1,8 +1,8 @@
-"""A sequence of image files, which every layout of this kind becomes."""
+"""A sequence of image files, which every layout of this kind becomes: the layouts differ in values only."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,16 +13,74 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
-from p2p_lib.datasets.masks import MaskFiles
+from p2p_lib.datasets.masks import MaskFiles, find_masks
 from p2p_lib.datasets.sequence import ObjectTruth
 
 
 @dataclass(frozen=True, eq=False)
+class ImageFiles:
+    """What every layout has: a folder with one ``rgb/`` and one ``depth/`` image a frame, a camera, times (N,)."""
+
+    folder: Path
+    rgb: tuple[Path, ...]
+    depth: tuple[Path, ...]
+    camera: Camera
+    times_s: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.camera.height, self.camera.width
+
+    def masks(
+        self,
+        asked: str | Path | None,
+        places: Iterable[Path],
+        objects: tuple[str, ...] | None = None,
+        first_frame_alone: bool = False,
+    ) -> tuple[MaskFiles | None, MaskFiles | None]:
+        """The masks to use and the dataset's own, which are in the first of ``places`` that there is.
+
+        asked  another folder to use: a name inside the sequence, or a path. Other arguments as of ``find_masks``.
+        """
+
+        def find(where: Path) -> MaskFiles:
+            return find_masks(where, self.rgb, self.shape, objects, first_frame_alone)
+
+        own = next((find(where) for where in places if where.is_dir()), None)
+        if asked is None:
+            return own, own
+        inside = self.folder / asked
+        chosen = find(inside if inside.is_dir() else Path(asked).expanduser())
+        return chosen, own or chosen
+
+
+def paired_images(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """The files of ``rgb/`` and ``depth/``, one of each a frame."""
+    rgb = images.list_files(folder / "rgb", images.COLOUR, "colour images")
+    return rgb, images.check_paired(images.list_files(folder / "depth", images.LOSSLESS, "depth images"), rgb)
+
+
+def camera_for(rgb: Path, K: np.ndarray, name: str) -> Camera:
+    """The camera with this matrix for images as large as the one in the file; ``name`` is for messages."""
+    height, width = images.read_rgb(rgb).shape[:2]
+    return Camera.from_K(K, width, height, name=name)
+
+
+def image_files(folder: Path) -> ImageFiles:
+    """The files of a folder with ``rgb/``, ``depth/``, ``cam_K.txt`` and times, paired and checked."""
+    rgb, depth = paired_images(folder)
+    path = folder / "cam_K.txt"
+    camera = camera_for(rgb[0], images.read_numbers(path, "a 3x3 camera matrix in pixels"), str(path))
+    return ImageFiles(folder, rgb, depth, camera, images.frame_times(folder, rgb))
+
+
+@dataclass(frozen=True, eq=False)
 class ImageSequence:
-    """A :class:`~p2p_lib.datasets.sequence.Sequence` of image files; the layouts differ in where these lie.
+    """A :class:`~p2p_lib.datasets.sequence.Sequence` of image files.
 
     depth_invalid  raw depth value that means "no measurement" besides 0
-    read_depth     reads a depth file: path, (height, width), depth_scale, depth_invalid to (H, W) metres
+    read_depth     reads a depth file: (H, W) in the file's unit, of which depth_scale is metres
     mask_files     what :meth:`masks` gives; ``own_masks`` the dataset's own, which scoring counts
     read_truth     called once, when truth is first asked for
     model_places   object to the files and folders where its model may lie, best first
@@ -30,22 +88,33 @@ class ImageSequence:
 
     name: str
     format: str
-    path: Path
-    camera: Camera
+    files: ImageFiles
     objects: tuple[str, ...]
-    rgb_files: tuple[Path, ...]
-    depth_files: tuple[Path, ...]
-    times_s: np.ndarray
-    depth_scale: float = images.DEPTH_SCALE
-    depth_invalid: int | None = None
-    read_depth: Callable[[Path, tuple[int, int], float, int | None], np.ndarray] = images.read_depth_m
+    depth_scale: float
+    depth_invalid: int = 0
+    read_depth: Callable[[Path], np.ndarray] = images.read_raw_depth
     mask_files: MaskFiles | None = None
     own_masks: MaskFiles | None = None
     read_truth: Callable[[], dict[str, ObjectTruth]] = dict
     model_places: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.rgb_files)
+        return len(self.files.rgb)
+
+    @property
+    def path(self) -> Path:
+        """The folder."""
+        return self.files.folder
+
+    @property
+    def camera(self) -> Camera:
+        """The colour camera's, which depth is registered to."""
+        return self.files.camera
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """(N,) seconds, increasing."""
+        return self.files.times_s
 
     @cached_property
     def truth(self) -> dict[str, ObjectTruth]:
@@ -54,22 +123,18 @@ class ImageSequence:
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """What each frame's picture is called, without its ending."""
-        return tuple(path.stem for path in self.rgb_files)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(height, width) in pixels."""
-        return self.camera.height, self.camera.width
+        """What each frame's image is called, without its ending."""
+        return tuple(path.stem for path in self.files.rgb)
 
     def frame(self, i: int) -> Frame:
-        """The i-th picture."""
+        """The i-th frame."""
         self._check_index(i)
-        rgb = images.read_rgb(self.rgb_files[i])
-        if rgb.shape[:2] != self.shape:
-            got, want = (f"{w}x{h}" for h, w in (rgb.shape[:2], self.shape))
-            raise BadInput(str(self.rgb_files[i]), f"{got} pixels", f"{want} as the first picture")
-        depth_m = self.read_depth(self.depth_files[i], self.shape, self.depth_scale, self.depth_invalid)
+        rgb = images.read_rgb(self.files.rgb[i])
+        images.check_size(self.files.rgb[i], rgb, self.files.shape, "the first image")
+        raw, fix = self.read_depth(self.files.depth[i]), "Register the depth to the colour camera first."
+        images.check_size(self.files.depth[i], raw, self.files.shape, fix=fix)
+        depth_m = raw.astype(np.float32) * np.float32(self.depth_scale)
+        depth_m[raw == self.depth_invalid] = 0
         return Frame(i, float(self.times_s[i]), rgb, depth_m)
 
     def masks(self, i: int) -> dict[str, np.ndarray] | None:
@@ -85,11 +150,3 @@ class ImageSequence:
     def _check_index(self, i: int) -> None:
         if not 0 <= i < len(self):
             raise BadInput(f"{self.name}: frame", i, f"a number from 0 to {len(self) - 1}")
-
-
-def pictures(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...], Camera, np.ndarray]:
-    """What every layout has: ``rgb/``, ``depth/``, ``cam_K.txt`` and times, paired and checked."""
-    rgb_files = images.list_files(folder / "rgb", images.COLOUR, "colour pictures")
-    depth_files = images.check_paired(images.list_files(folder / "depth", images.LOSSLESS, "depth images"), rgb_files)
-    camera = images.read_camera(folder / "cam_K.txt", rgb_files[0])
-    return rgb_files, depth_files, camera, images.frame_times(folder, rgb_files)

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 
 COLOUR = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -44,18 +43,16 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts] + [(0, path.name)]
 
 
-def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...]) -> tuple[Path, ...]:
+def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...], hint: str = "") -> tuple[Path, ...]:
     """``files``, if there is one for each of ``reference``: the i-th belongs to the i-th in sorted order."""
     if len(files) == len(reference):
         return files
     stems, wanted = {p.stem for p in files}, {p.stem for p in reference}
-    odd = sorted(wanted - stems) if len(files) < len(reference) else sorted(stems - wanted)
-    hint = ""
+    odd, fault = (wanted - stems, "missing") if len(files) < len(reference) else (stems - wanted, "too many")
     if odd and stems & wanted:
-        hint = f"{odd[0]}{files[0].suffix} is " + ("missing." if len(files) < len(reference) else "too many.")
-    raise BadInput(
-        str(files[0].parent), f"{len(files)} files", f"{len(reference)}, one for each in {reference[0].parent}", hint
-    )
+        hint = f"{min(odd)}{files[0].suffix} is {fault}. {hint}".strip()
+    expected = f"{len(reference)}, one for each in {reference[0].parent}"
+    raise BadInput(str(files[0].parent), f"{len(files)} files", expected, hint)
 
 
 def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
@@ -82,40 +79,24 @@ def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
 
 
 def read_numbers(path: Path, expected: str) -> np.ndarray:
-    """(rows, columns) float64 of a text file of numbers; ``expected`` says what the file should hold."""
-    rows = [line.split() for line in _read(path, expected).decode("utf-8", "replace").splitlines() if line.strip()]
+    """(rows, columns) float64 of a text file of numbers between spaces or commas; ``expected`` says what they are."""
+    lines = _read(path, expected).decode("utf-8", "replace").replace(",", " ").splitlines()
+    lines = [line for line in lines if line.partition("#")[0].strip()]
     try:
-        return np.array([[float(x) for x in row] for row in rows])
-    except ValueError:
-        bad = next((f"{' '.join(r)[:40]!r}" for r in rows if not _are_numbers(r)), "rows of unequal length")
-        raise BadInput(str(path), bad, expected) from None
+        return np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
+    except ValueError as error:
+        reason = str(error).partition(";")[0].removesuffix(".")
+        raise BadInput(str(path), f"unreadable numbers ({reason})", expected) from None
 
 
-def _are_numbers(row: list[str]) -> bool:
-    try:
-        return bool([float(x) for x in row])
-    except ValueError:
-        return False
+def read_poses(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
+    """(N, 4, 4) from one text file a frame, each the rigid transformation nearest to what is written."""
+    files = check_paired(list_files(folder, (".txt",), "pose files"), rgb_files)
+    T = [se3.check(str(p), read_numbers(p, "a 4x4 transformation in metres"), NOT_RIGID) for p in files]
+    return se3.orthonormalised(np.stack(T))
 
 
-def read_camera(path: Path, picture: Path) -> Camera:
-    """The camera of ``cam_K.txt`` (three rows of three) for pictures as large as this one."""
-    K = read_numbers(path, "a 3x3 camera matrix in pixels")
-    height, width = read_rgb(picture).shape[:2]
-    return Camera.from_K(K, width, height, name=str(path))
-
-
-def read_pose(path: Path) -> np.ndarray:
-    """One (4, 4) transformation, rigid to within :data:`NOT_RIGID`, as written."""
-    return se3.check(str(path), read_numbers(path, "a 4x4 transformation in metres"), NOT_RIGID)
-
-
-def read_poses(files: tuple[Path, ...]) -> np.ndarray:
-    """(N, 4, 4), one file each, each the rigid transformation nearest to what is written."""
-    return se3.orthonormalised(np.stack([read_pose(p) for p in files]))
-
-
-# --- pictures --------------------------------------------------------------------------------------
+# --- images --------------------------------------------------------------------------------------
 
 
 def _read(path: Path, expected: str) -> bytes:
@@ -128,7 +109,7 @@ def _read(path: Path, expected: str) -> bytes:
 
 
 def read_image(path: Path, flags: int, expected: str) -> np.ndarray:
-    """A decoded picture, or an error that names the file and what it should have been."""
+    """A decoded image, or an error that names the file and what it should have been."""
     data = _read(path, expected)
     # A PNG that was cut off lacks its end mark; the decoder would complain on stderr before it gives up.
     whole = data and (not data.startswith(b"\x89PNG") or b"IEND" in data[-16:])
@@ -140,25 +121,30 @@ def read_image(path: Path, flags: int, expected: str) -> np.ndarray:
 
 def read_rgb(path: Path) -> np.ndarray:
     """(H, W, 3) uint8, red first."""
-    # A rotation in a picture's EXIF would turn it away from its depth image.
-    bgr = read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, "a colour picture")
+    # A rotation in an image's EXIF would turn it away from its depth image.
+    bgr = read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, "a colour image")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
-def read_depth_m(path: Path, shape: tuple[int, int], scale: float, invalid: int | None = None) -> np.ndarray:
-    """(H, W) float32 metres; 0 where there is no measurement or the raw value is ``invalid``."""
+def read_raw_depth(path: Path) -> np.ndarray:
+    """(H, W) uint16 or float32 in the file's own unit."""
     raw = read_image(path, cv2.IMREAD_UNCHANGED, "a 16-bit depth image")
     if raw.ndim != 2 or raw.dtype not in (np.uint16, np.float32):
         raise BadInput(str(path), f"{'x'.join(map(str, raw.shape))} {raw.dtype}", "one channel, uint16 or float32")
-    check_size(path, raw, shape, "Register the depth to the colour camera first.")
-    depth_m = raw.astype(np.float32) * np.float32(scale)
-    if invalid is not None:
-        depth_m[raw == invalid] = 0
-    return depth_m
+    return raw
 
 
-def check_size(path: Path, image: np.ndarray, shape: tuple[int, int], fix: str = "") -> None:
-    """:class:`BadInput` naming the file where an image is not (height, width) as the colour pictures are."""
+def check_size(
+    path: Path, image: np.ndarray, shape: tuple[int, int], like: str = "the colour image", fix: str = ""
+) -> None:
+    """:class:`BadInput` naming the file where an image is not of the (height, width) that ``like`` has."""
     if image.shape[:2] != shape:
-        got = f"{image.shape[1]}x{image.shape[0]} pixels"
-        raise BadInput(str(path), got, f"{shape[1]}x{shape[0]} as the colour picture", fix)
+        got, want = (f"{w}x{h}" for h, w in (image.shape[:2], shape))
+        raise BadInput(str(path), f"{got} pixels", f"{want} as {like}", fix)
+
+
+def save_png(path: Path, image: np.ndarray) -> None:
+    """Write an image (H, W) or (H, W, 3), red first, and the folders above it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    path.write_bytes(cv2.imencode(".png", bgr)[1].tobytes())

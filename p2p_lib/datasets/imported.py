@@ -2,10 +2,10 @@
 
 What may be given (see :mod:`p2p_lib.datasets.export`, which writes all of them):
 
-- a BOP challenge CSV: the best-scored estimate of an object in a picture counts;
+- a BOP challenge CSV: the best-scored estimate of an object in an image counts;
 - TUM trajectories: ``<object>.txt`` in a folder, or one file; times are matched to the sequence's;
 - 4x4 matrices, one file a frame: ``ob_in_cam/*.txt`` of BundleSDF, ``annotated_poses/``, or a folder of such, with
-  one folder per object where there are several. Files are named as the pictures, or by frame number from 0.
+  one folder per object where there are several. Files are named as the images, or by frame number from 0.
 
 A frame for which there is nothing, or a matrix of zeros or NaN, is lost, and lost it is scored.
 """
@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
@@ -75,24 +75,23 @@ def as_run(
     visible = [sequence.visible_px(int(i)) for i in at]
     objects = {}
     for name in sequence.objects:
-        T, truth = poses.get(name, nothing)[at], sequence.truth.get(name)
-        seen = np.isfinite(T).all((1, 2))
-        columns = {
-            "frame_index": at,
-            "time_s": np.asarray(sequence.times_s, float)[at],
-            "status": np.where(seen, str(Status.TRACKED), str(Status.LOST)),
-            "T_cam_obj": T,
-            "confidence": seen.astype(float),
-            "covariance": np.full((n, 6, 6), np.nan),
-            "visible_points": np.zeros(n, int),
-            "inliers": np.zeros(n, int),
-            "keyframe": np.zeros(n, bool),
-            "T_cam_model": truth.T_cam_model[at] if truth else nothing[at],
-            "labelled": truth.labelled[at] if truth else np.zeros(n, bool),
-            "visible_px": np.array([NO_MASKS if v is None else v.get(name, 0) for v in visible]),
-            "reason": np.where(seen, "", "no pose given"),
-        }
-        objects[name] = ObjectRun(**{f.name: columns[f.name] for f in fields(ObjectRun)})
+        T_cam_obj, truth = poses.get(name, nothing)[at], sequence.truth.get(name)
+        has_pose = np.isfinite(T_cam_obj).all((1, 2))
+        objects[name] = ObjectRun(
+            frame_index=at,
+            time_s=np.asarray(sequence.times_s, float)[at],
+            status=np.where(has_pose, str(Status.TRACKED), str(Status.LOST)),
+            T_cam_obj=T_cam_obj,
+            confidence=has_pose.astype(float),
+            covariance=np.full((n, 6, 6), np.nan),
+            visible_points=np.zeros(n, int),
+            inliers=np.zeros(n, int),
+            keyframe=np.zeros(n, bool),
+            T_cam_model=truth.T_cam_model[at] if truth else nothing[at],
+            labelled=truth.labelled[at] if truth else np.zeros(n, bool),
+            visible_px=np.array([NO_MASKS if v is None else v.get(name, 0) for v in visible]),
+            reason=np.where(has_pose, "", "no pose given"),
+        )
     info = {"sequence": sequence.name, "objects": list(sequence.objects), "tracker": method, "masks": None}
     points = {name: load_points(file) for name, file in models.items()}
     return Run(path or Path(method), info, objects, points, {})
@@ -118,45 +117,37 @@ def _read_matrices(folder: Path, sequence: Sequence) -> np.ndarray:
 
 
 def _frames(folder: Path, stems: list[str], sequence: Sequence) -> list[int]:
-    """The frame of each file: by the picture's name, else by number."""
+    """The frame of each file: by the image's name, else by number."""
     of_name = {name: i for i, name in enumerate(sequence.frame_names)}
     if set(stems) <= set(of_name):
         return [of_name[stem] for stem in stems]
     if all(stem.isdigit() and int(stem) < len(sequence) for stem in stems):
         return [int(stem) for stem in stems]
     odd = next(stem for stem in stems if stem not in of_name)
-    want = f"the name of a picture such as {sequence.frame_names[0]}, or a frame number below {len(sequence)}"
+    want = f"the name of an image such as {sequence.frame_names[0]}, or a frame number below {len(sequence)}"
     raise BadInput(str(folder / f"{odd}.txt"), f"the name {odd}", want)
 
 
 def _read_tum(path: Path, sequence: Sequence) -> np.ndarray:
-    poses = np.full((len(sequence), 4, 4), np.nan)
-    rows = [line for line in path.read_text(errors="replace").splitlines() if line.strip() and line.lstrip()[0] != "#"]
-    for number, line in enumerate(rows, 1):
-        try:
-            values = np.array(line.split(), float)
-        except ValueError:
-            values = np.empty(0)
-        if values.shape != (8,) or not np.isfinite(values).all() or not 0.9 < np.linalg.norm(values[4:]) < 1.1:
-            raise BadInput(f"{path}: line {number}", repr(line[:60]), "time_s tx ty tz qx qy qz qw, a unit quaternion")
-        poses[_frame_at(path, values[0], sequence.times_s)] = se3.from_rt(_rotation(values[4:]), values[1:4])
-    return poses
-
-
-def _frame_at(path: Path, time_s: float, times_s: np.ndarray) -> int:
-    nearest = int(np.argmin(np.abs(times_s - time_s)))
+    form = "time_s tx ty tz qx qy qz qw in a line, with a unit quaternion"
+    poses, rows = np.full((len(sequence), 4, 4), np.nan), images.read_numbers(path, form)
+    if not rows.size:
+        return poses  # lost throughout
+    if rows.shape[1] != 8:
+        raise BadInput(str(path), f"{rows.shape[1]} numbers in a line", form)
+    fits = np.isfinite(rows).all(1) & (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 0.1)
+    if not fits.all():
+        worst = int(np.argmin(fits))
+        raise BadInput(f"{path}: pose {worst + 1}", " ".join(f"{x:g}" for x in rows[worst]), form)
+    times_s, given_s = np.asarray(sequence.times_s), rows[:, 0]
+    nearest = np.abs(times_s - given_s[:, None]).argmin(1)
     # Half the time between frames: further off it belongs to none of them.
-    if abs(times_s[nearest] - time_s) > 0.5 * (np.median(np.diff(times_s)) if len(times_s) > 1 else 1.0):
+    far = np.abs(times_s[nearest] - given_s) > 0.5 * (np.median(np.diff(times_s)) if len(times_s) > 1 else 1.0)
+    if far.any():
         want = f"times of the sequence's frames, {times_s[0]:.6f} to {times_s[-1]:.6f} s"
-        raise BadInput(str(path), f"the time {time_s:.6f} s", want)
-    return nearest
-
-
-def _rotation(xyzw: np.ndarray) -> np.ndarray:
-    x, y, z, w = xyzw / np.linalg.norm(xyzw)
-    angle = 2 * np.arctan2(np.linalg.norm([x, y, z]), w)
-    axis = np.array([x, y, z]) / max(np.linalg.norm([x, y, z]), 1e-300)
-    return se3.exp(np.r_[axis * angle, 0, 0, 0])[:3, :3]
+        raise BadInput(str(path), f"the time {given_s[np.argmax(far)]:.6f} s", want)
+    poses[nearest] = se3.from_rt(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])
+    return poses
 
 
 def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
@@ -166,22 +157,23 @@ def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
     poses: dict[str, np.ndarray] = {}
     best: dict[tuple[str, int], float] = {}
     for number, row in enumerate(_bop_rows(path), 2):
+        where = f"{path}: line {number}"
         try:
             scene, image, obj = (int(row[key]) for key in ("scene_id", "im_id", "obj_id"))
             score = float(row["score"])
             R, t_mm = np.array(row["R"].split(), float).reshape(3, 3), np.array(row["t"].split(), float)
             T = se3.from_rt(R, t_mm * 0.001)
         except (KeyError, ValueError, TypeError, AttributeError) as error:
-            raise BadInput(f"{path}: line {number}", f"unreadable ({error})", BOP_HEADER) from None
+            raise BadInput(where, f"unreadable ({error})", BOP_HEADER) from None
         if scene != scene_id(sequence) or obj not in name_of:
             continue  # another scene's, or an object that this one does not have
         if image not in frame_of:
-            raise BadInput(f"{path}: line {number}", f"im_id {image}", "the number of a picture of the sequence")
+            raise BadInput(where, f"im_id {image}", "the number of an image of the sequence")
         name, frame = name_of[obj], frame_of[image]
         if score > best.get((name, frame), -np.inf) and np.isfinite(T).all():
             best[name, frame] = score
             poses.setdefault(name, np.full((len(sequence), 4, 4), np.nan))
-            poses[name][frame] = se3.orthonormalised(se3.check(f"{path}: line {number}", T, images.NOT_RIGID))
+            poses[name][frame] = se3.orthonormalised(se3.check(where, T, images.NOT_RIGID))
     if not poses:
         raise BadInput(str(path), f"nothing of scene {scene_id(sequence)}", f"poses of {', '.join(sequence.objects)}")
     return poses

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.progress import progress_bar
@@ -31,6 +33,37 @@ class Check:
     text: str
 
 
+class _Record:
+    """What ``.p2p-NAME.json`` of a manifest's folder says of its files: sha256, bytes, and which were unpacked."""
+
+    def __init__(self, of: Manifest):
+        self.folder = folder_of(of)
+        self._path = self.folder / f".p2p-{of.name}.json"
+        try:
+            self._files: dict[str, dict[str, Any]] = json.loads(self._path.read_text())["files"]
+        except FileNotFoundError:
+            self._files = {}
+        except (ValueError, KeyError, TypeError) as error:
+            fix = "Delete it; files are then checked against the manifest alone."
+            raise BadInput(str(self._path), f"unreadable ({error})", "a record of what was fetched", fix) from None
+
+    def sha256(self, file: RemoteFile) -> str | None:
+        """The checksum that a file must have: the manifest's, else that of the first time."""
+        return file.sha256 or self._files.get(file.path, {}).get("sha256")
+
+    def unpacked(self, file: RemoteFile) -> dict[str, int] | None:
+        """Files out of an archive and their sizes; None where it was not unpacked."""
+        return self._files.get(file.path, {}).get("unpacked")
+
+    def keep(self, file: RemoteFile, digest: str, unpacked: dict[str, int] | None = None) -> None:
+        """Write down what a file is like, and what came out of it."""
+        known = {"sha256": digest, "bytes": (self.folder / file.path).stat().st_size}
+        self._files[file.path] = known if unpacked is None else {**known, "unpacked": unpacked}
+        partial = self._path.with_name(self._path.name + ".partial")
+        partial.write_text(json.dumps({"files": self._files}, indent=1) + "\n")
+        os.replace(partial, self._path)
+
+
 # --- fetching --------------------------------------------------------------------------------------
 
 
@@ -42,46 +75,38 @@ def fetch(of: Manifest, only: tuple[str, ...] = (), progress: bool = True) -> It
     An archive that lies in its place already, had by hand, is recorded and unpacked just so. Raises
     :class:`MissingData` with what to do where something must be requested by hand.
     """
-    folder = folder_of(of)
     chosen = [file for file in of.files if not only or any(part in file.path for part in only)]
     if only and not chosen:
         raise BadInput("--only", ",".join(only), "part of one of " + ", ".join(file.path for file in of.files))
-    record, by_hand = _read_record(folder, of), []
+    record, by_hand = _Record(of), []
     for file in chosen:
-        known = record.get(file.path, {})
-        if known.get("unpacked") and not (folder / file.path).is_file():
+        here = (record.folder / file.path).is_file()
+        if record.unpacked(file) and not here:
             yield f"{file.path}: unpacked already"
-        elif file.url is None and not (folder / file.path).is_file():
+        elif file.url is None and not here:
             by_hand.append(file.path)
         else:
-            yield _fetch_one(of, file, folder, record, progress)
+            yield _fetch_one(file, record, progress)
     if by_hand or not of.files:
-        what = f"{', '.join(by_hand)} must be had by hand and put into {folder}" if by_hand else "must be had by hand"
-        raise MissingData(of.name, what, f"{of.how_to_get} Page: {of.page}")
+        listed = f"{', '.join(by_hand)} must be had by hand and put into {record.folder}"
+        raise MissingData(of.name, listed if by_hand else "must be had by hand", f"{of.how_to_get} Page: {of.page}")
 
 
-def _fetch_one(of: Manifest, file: RemoteFile, folder: Path, record: dict, progress: bool) -> str:
-    known = record.get(file.path, {})
-    expected = file.sha256 or known.get("sha256")
-    if file.url is None:
-        digest = sha256(folder / file.path)
-        if expected not in (None, digest):
-            raise BadInput(str(folder / file.path), f"sha256 {digest}", f"sha256 {expected}")
-    else:
-        digest = download(file, folder, expected, progress)
-    new = known.get("sha256") != digest
-    size = (folder / file.path).stat().st_size
-    record[file.path] = {**({} if new else known), "sha256": digest, "bytes": size}
-    _write_record(folder, of, record)
+def _fetch_one(file: RemoteFile, record: _Record, progress: bool) -> str:
+    path, expected = record.folder / file.path, record.sha256(file)
+    digest = sha256(path) if file.url is None else download(file, record.folder, expected, progress)
+    if expected not in (None, digest):
+        raise BadInput(str(path), f"sha256 {digest}", f"sha256 {expected}")
+    unpacked = record.unpacked(file)
+    record.keep(file, digest, unpacked)
     said = "checked" if expected else "its checksum is recorded"
-    if file.unpack_to is not None and "unpacked" not in record[file.path]:
-        into = folder / file.unpack_to
+    if file.unpack_to is not None and unpacked is None:
+        into = record.folder / file.unpack_to
         with progress_bar(f"unpacking {file.path}", unit="B", unit_scale=True, shown=progress) as bar:
-            written = unpack(folder / file.path, into, bar.update)
-        record[file.path]["unpacked"] = written
-        _write_record(folder, of, record)
-        said += f", {len(written)} files unpacked into {into}"
-    return f"{file.path}: {human_size(size)}, {said}"
+            unpacked = unpack(path, into, bar.update)
+        record.keep(file, digest, unpacked)
+        said += f", {len(unpacked)} files unpacked into {into}"
+    return f"{file.path}: {human_size(path.stat().st_size)}, {said}"
 
 
 def require(of: Manifest) -> list[Path]:
@@ -90,42 +115,18 @@ def require(of: Manifest) -> list[Path]:
     A file that was put there by hand and whose checksum nobody knows is recorded: it holds from then on.
     Raises :class:`MissingData` with the command that fetches it, :class:`BadInput` for a file that differs.
     """
-    folder = folder_of(of)
-    record = _read_record(folder, of)
+    record = _Record(of)
     for file in of.files:
-        path = folder / file.path
+        path = record.folder / file.path
         if not path.is_file():
             raise MissingData(of.name, f"{path} is not there", f"Run: p2p data fetch {of.name}")
-        digest, expected = sha256(path), file.sha256 or record.get(file.path, {}).get("sha256")
+        digest, expected = sha256(path), record.sha256(file)
         if expected is None:
-            record[file.path] = {"sha256": digest, "bytes": path.stat().st_size}
-            _write_record(folder, of, record)
+            record.keep(file, digest)
         elif digest != expected:
             fix = f"Delete it and run: p2p data fetch {of.name}"
             raise BadInput(str(path), f"sha256 {digest}", f"sha256 {expected}", fix)
-    return [folder / file.path for file in of.files]
-
-
-def _record_file(folder: Path, of: Manifest) -> Path:
-    return folder / f".p2p-{of.name}.json"
-
-
-def _read_record(folder: Path, of: Manifest) -> dict[str, dict[str, Any]]:
-    path = _record_file(folder, of)
-    try:
-        return json.loads(path.read_text())["files"]
-    except FileNotFoundError:
-        return {}
-    except (ValueError, KeyError, TypeError) as error:
-        fix = "Delete it; files are then checked against the manifest alone."
-        raise BadInput(str(path), f"unreadable ({error})", "a record of what was fetched", fix) from None
-
-
-def _write_record(folder: Path, of: Manifest, record: dict) -> None:
-    path = _record_file(folder, of)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps({"files": record}, indent=1) + "\n")
-    os.replace(partial, path)
+    return [record.folder / file.path for file in of.files]
 
 
 # --- verifying -------------------------------------------------------------------------------------
@@ -134,76 +135,60 @@ def _write_record(folder: Path, of: Manifest, record: dict) -> None:
 def verify(of: Manifest, every_frame: bool = False) -> Iterator[Check]:
     """Look at what is on disk: files against checksums, unpacked files, every sequence opened and its truth read.
 
-    every_frame  read all pictures of every sequence, else the first and the last
+    every_frame  read all images of every sequence, else the first and the last
     """
     folder = folder_of(of)
     if not folder.is_dir():
         yield Check(str(folder), False, f"not there. Next: p2p data info {of.name}")
         return
-    record = _read_record(folder, of)
+    record = _Record(of)
     for file in of.files:
-        yield _verify_file(file, folder, record.get(file.path, {}))
-    yield from _verify_listed(folder / "sequences.json")
+        yield _verify_file(file, record)
+    if (folder / "sequences.json").is_file():
+        yield _verify_listed(folder / "sequences.json")
     if of.format:
         yield from _verify_sequences(of, folder / of.sequences_in, every_frame)
 
 
-def _verify_file(file: RemoteFile, folder: Path, known: dict) -> Check:
-    path, expected = folder / file.path, file.sha256 or known.get("sha256")
-    if not path.is_file():
-        into = folder / (file.unpack_to or ".")
-        gone = [name for name, size in known.get("unpacked", {}).items() if not _has_size(into / name, size)]
-        if "unpacked" not in known:
-            return Check(file.path, False, "not there")
-        text = f"{len(gone)} unpacked files are missing or changed, {gone[0]} first" if gone else "unpacked, all there"
-        return Check(file.path, not gone, text)
-    digest = sha256(path)
-    if expected is None:
-        return Check(file.path, True, f"there, nothing to compare with; sha256 {digest}")
-    return Check(file.path, digest == expected, "sha256 as expected" if digest == expected else f"sha256 {digest}")
+def _verify_file(file: RemoteFile, record: _Record) -> Check:
+    path, expected, unpacked = record.folder / file.path, record.sha256(file), record.unpacked(file)
+    if path.is_file():
+        digest = sha256(path)
+        if expected is None:
+            return Check(file.path, True, f"there, nothing to compare with; sha256 {digest}")
+        return Check(file.path, digest == expected, "sha256 as expected" if digest == expected else f"sha256 {digest}")
+    if unpacked is None:
+        return Check(file.path, False, "not there")
+    into = record.folder / (file.unpack_to or ".")
+    gone = [n for n, size in unpacked.items() if not ((into / n).is_file() and (into / n).stat().st_size == size)]
+    text = f"{len(gone)} unpacked files are missing or changed, {gone[0]} first" if gone else "unpacked, all there"
+    return Check(file.path, not gone, text)
 
 
-def _has_size(path: Path, size: int) -> bool:
-    return path.is_file() and path.stat().st_size == size
-
-
-def _verify_listed(path: Path) -> Iterator[Check]:
+def _verify_listed(path: Path) -> Check:
     """The checksums that a dataset's own ``sequences.json`` lists, of those files that are there."""
-    if not path.is_file():
-        return
-    try:
-        listed = dict(_checksums(json.loads(path.read_text())))
-    except ValueError as error:
-        yield Check(path.name, False, f"unreadable ({error})")
-        return
-    here = {name: digest for name, digest in listed.items() if (path.parent / name).is_file()}
-    wrong = [name for name, digest in here.items() if sha256(path.parent / name) != digest.lower()]
-    text = f"{len(here)} of the {len(listed)} files it lists are here" + (
-        f", wrong: {', '.join(wrong)}" if wrong else ""
-    )
-    yield Check(path.name, not wrong, text)
+    listed: dict[str, str] = {}
 
-
-def _checksums(found: Any) -> Iterator[tuple[str, str]]:
-    """(file, sha256) wherever an object has ``sha256`` beside the name of a file."""
-    if isinstance(found, list):
-        for item in found:
-            yield from _checksums(item)
-    elif isinstance(found, dict):
+    def note(found: dict[str, Any]) -> dict[str, Any]:
         name = next((found[key] for key in ("path", "file", "archive", "filename") if key in found), None)
         if isinstance(found.get("sha256"), str) and isinstance(name, str):
-            yield name, found["sha256"]
-        for item in found.values():
-            yield from _checksums(item)
+            listed[name] = found["sha256"].lower()
+        return found
+
+    try:
+        json.loads(path.read_text(), object_hook=note)
+    except ValueError as error:
+        return Check(path.name, False, f"unreadable ({error})")
+    here = [name for name in listed if (path.parent / name).is_file()]
+    wrong = [name for name in here if sha256(path.parent / name) != listed[name]]
+    text = f"{len(here)} of the {len(listed)} files it lists are here"
+    return Check(path.name, not wrong, f"{text}, wrong: {', '.join(wrong)}" if wrong else text)
 
 
 def _verify_sequences(of: Manifest, folder: Path, every_frame: bool) -> Iterator[Check]:
     frames = {entry.name: entry.frames for entry in of.sequences}
     found = sorted(path.parent.name for path in folder.glob("*/rgb") if path.is_dir())
-    for name in [*frames, *(name for name in found if name not in frames)]:
-        if name not in found:
-            yield Check(name, False, "sequence not there")
-            continue
+    for name in dict.fromkeys([*frames, *found]):
         try:
             yield _verify_sequence(folder / name, of.format, frames.get(name), every_frame)
         except P2PError as error:
@@ -241,13 +226,13 @@ def where(name: str) -> Path:
 
 def overview() -> str:
     """A table of all manifests: name, kind, whether it is here, how it is had, title."""
+    root = paths.data_dir()
     rows = [("name", "kind", "here", "access", "what")]
     for of in map(manifest, names()):
-        here = "?" if paths.data_dir() is None else "yes" if _holds_files(folder_of(of)) else "no"
+        here = "?" if root is None else "yes" if _holds_files(folder_of(of)) else "no"
         rows.append((of.name, of.kind, here, of.access, of.title))
-    widths = [max(len(row[k]) for row in rows) for k in range(4)]
-    lines = ["  ".join([*(cell.ljust(width) for cell, width in zip(row, widths)), row[4]]) for row in rows]
-    root = paths.data_dir()
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
     lines.append(f"In {root}" if root else "$P2P_DATA is not set: it says in which folder datasets live.")
     return "\n".join(lines)
 
@@ -260,8 +245,9 @@ def _holds_files(folder: Path) -> bool:
 def describe(of: Manifest) -> str:
     """All that its manifest says, for people."""
     place = f"$P2P_DATA/{of.folder}" if paths.data_dir() is None else str(folder_of(of))
+    how = f"p2p data fetch {of.name}." if of.access == "open" else "By hand."
     lines = [f"{of.title} ({of.name}, version {of.version})", f"licence   {of.licence}", f"page      {of.page}"]
-    lines += [f"place     {place}", f"get it    {_access(of)} {of.how_to_get}"]
+    lines += [f"place     {place}", f"get it    {how} {of.how_to_get}"]
     lines += [f"used by   {of.used_by}"] if of.used_by else []
     lines += [f"unit      {what}: {unit}" for what, unit in of.units.items()]
     lines += [f"layout    {line}" for line in of.layout]
@@ -275,15 +261,6 @@ def describe(of: Manifest) -> str:
     return "\n".join([*lines, f"cite      {of.citation}"])
 
 
-def _access(of: Manifest) -> str:
-    return f"p2p data fetch {of.name}." if of.access == "open" else "By hand."
-
-
 def human_size(count: int | None) -> str:
-    """``1.2 GB``; "size unknown" of None."""
-    if count is None:
-        return "size unknown"
-    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= scale:
-            return f"{count / scale:.3g} {unit}"
-    return f"{count} bytes"
+    """``1.20GB``; "size unknown" of None."""
+    return "size unknown" if count is None else tqdm.format_sizeof(count, "B")

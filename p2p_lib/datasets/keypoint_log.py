@@ -1,12 +1,11 @@
 """``keypoints.npz`` of a run: where the 2D tracker saw each object's points, and the map that they made.
 
-Written once, at the end of a run; what the viewers (``p2p view``) show besides poses and surface. About 10 bytes a
-point and frame.
+Written once, at the end of a run, for the viewers (``p2p view``). About 10 bytes a point and frame.
 """
 
 from __future__ import annotations
 
-import zipfile
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import load_arrays
 
 FILE = "keypoints.npz"
 
@@ -43,33 +43,31 @@ class KeypointLog:
     """Collects observations frame by frame; :meth:`save` writes them with the final maps."""
 
     def __init__(self) -> None:
-        self._seen: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {}
+        self._seen: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = defaultdict(list)
 
     def add(self, frame_index: int, name: str, ids: np.ndarray, uv_px: np.ndarray) -> None:
         """What was visible of one object in a frame: ids (K,) and uv_px (K, 2)."""
-        self._seen.setdefault(name, []).append((frame_index, ids.astype(np.int32), uv_px.astype(np.float32)))
+        self._seen[name].append((frame_index, ids.astype(np.int32), uv_px.astype(np.float32)))
 
     def save(self, folder: Path, maps: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
         """Write the file; ``maps`` is object to ids, p_obj and promoted."""
         arrays = {}
         for name, (ids, p_obj, promoted) in maps.items():
-            seen = self._seen.get(name, [])
+            seen = self._seen[name]
             frames = np.repeat([f for f, _, _ in seen], [len(i) for _, i, _ in seen]).astype(np.int32)
             track_id = np.concatenate([np.zeros(0, np.int32), *(i for _, i, _ in seen)])
             uv_px = np.concatenate([np.zeros((0, 2), np.float32), *(uv for _, _, uv in seen)])
             values = ids.astype(np.int32), p_obj.astype(np.float32), promoted, frames, track_id, uv_px
-            arrays |= {f"{name}/{f.name}": value for f, value in zip(fields(ObjectKeypoints), values)}
+            arrays |= {f"{name}/{f.name}": value for f, value in zip(fields(ObjectKeypoints), values, strict=True)}
         np.savez_compressed(folder / FILE, allow_pickle=False, **arrays)
 
 
 def load_keypoints(folder: str | Path) -> dict[str, ObjectKeypoints]:
     """Object to its keypoints; empty for a run that was killed before it could write them."""
     path = Path(folder) / FILE
-    if not path.is_file():
-        return {}
+    arrays = load_arrays(path)
+    names = dict.fromkeys(key.rsplit("/", 1)[0] for key in arrays)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            names = dict.fromkeys(key.rsplit("/", 1)[0] for key in file.files)
-            return {n: ObjectKeypoints(*(file[f"{n}/{f.name}"] for f in fields(ObjectKeypoints))) for n in names}
-    except (ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
-        raise BadInput(str(path), f"an unreadable archive ({error})", "arrays as p2p run wrote them") from None
+        return {n: ObjectKeypoints(*(arrays[f"{n}/{f.name}"] for f in fields(ObjectKeypoints))) for n in names}
+    except KeyError as error:
+        raise BadInput(str(path), f"an archive without {error}", "arrays as p2p run wrote them") from None

@@ -10,10 +10,11 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.datasets.schema import Strict, read_json
 
 CHECKPOINTS = "checkpoints"
 
@@ -21,12 +22,6 @@ Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_]*$")]
 Text = Annotated[str, Field(min_length=1)]
 Url = Annotated[str, Field(pattern=r"^https?://[^\s/]+(/\S*)?$")]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
-class Strict(BaseModel):
-    """Values as written: no unknown field, no conversion, no change afterwards."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class RemoteFile(Strict):
@@ -124,12 +119,6 @@ class Manifest(Strict):
                 raise ValueError(f"a {what} is listed twice")
         return self
 
-    @property
-    def bytes(self) -> int | None:
-        """Of all files; None where one is unknown."""
-        sizes = [file.bytes for file in self.files]
-        return None if not sizes or None in sizes else sum(sizes)
-
 
 def names(kind: str | None = None) -> tuple[str, ...]:
     """Names of all manifests, or of those of one kind ("dataset", "checkpoint"), sorted."""
@@ -146,17 +135,8 @@ def manifest(name: str) -> Manifest:
 
 @cache
 def read_manifest(path: Path) -> Manifest:
-    """One file, checked; :class:`BadInput` names the file and the first field that does not fit."""
-    try:
-        read = Manifest.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
-        raise MissingData(str(path), "no such manifest") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        raise BadInput(
-            str(path), f"{where}: {first['msg']}", "a manifest (see p2p_lib/datasets/manifests.py)"
-        ) from None
+    """One file, checked: it lies and is called as it says."""
+    read: Manifest = read_json(path, Manifest, f"a manifest (see {__name__})")
     if (read.name, read.kind) != (path.stem, _kind(path)):
         got = f"the {read.kind} {read.name!r}"
         raise BadInput(str(path), got, f"the {_kind(path)} {path.stem!r}, as the file lies and is called")

@@ -16,7 +16,7 @@ from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_fil
 class MaskFiles:
     """Masks on disk: for each object its files, and the label that means it (None: anything but 0).
 
-    An object has one file a frame (None: it is not in this picture), or a single one for the first frame alone.
+    An object has one file a frame (None: it is not in this image), or a single one for the first frame alone.
     """
 
     files: dict[str, tuple[Path | None, ...]]
@@ -32,12 +32,12 @@ class MaskFiles:
     def read(self, i: int) -> dict[str, np.ndarray] | None:
         """Object to (H, W) bool at frame i; None where no object has a mask for it."""
         at_i = {name: files[i] for name, files in self.files.items() if i < len(files)}
-        pictures = {path: read_labels(path, self.shape) for path in set(at_i.values()) if path}
-        pictures[None] = np.zeros(self.shape, np.uint8)
+        images = {path: read_labels(path, self.shape) for path in set(at_i.values()) if path}
+        images[None] = np.zeros(self.shape, np.uint8)
         masks = {}
         for name, path in at_i.items():
             label = self.labels[name]
-            masks[name] = pictures[path] > 0 if label is None else pictures[path] == label
+            masks[name] = images[path] > 0 if label is None else images[path] == label
         self._counts[i] = {name: int(np.count_nonzero(mask)) for name, mask in masks.items()}
         return masks or None
 
@@ -65,20 +65,15 @@ def find_masks(
         raise MissingData(str(folder), "no such folder of masks", "Name a folder inside the sequence, or a path.")
     below = tuple(sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")))
     names = below if objects is None else objects
+    hint = "One mask alone, of the first image, is allowed too." if first_frame_alone else ""
 
-    def images(where: Path) -> tuple[Path, ...]:
+    def paired(where: Path) -> tuple[Path, ...]:
         files = list_files(where, LOSSLESS, "mask images")
-        if not first_frame_alone:
-            return check_paired(files, rgb_files)
-        try:
-            return files if len(files) == 1 else check_paired(files, rgb_files)
-        except BadInput as error:
-            alone = "One mask alone, of the first picture, is allowed too."
-            raise BadInput(error.name, error.got, error.expected, f"{error.fix} {alone}".strip()) from None
+        return files if first_frame_alone and len(files) == 1 else check_paired(files, rgb_files, hint)
 
     if below:
-        return MaskFiles({name: images(folder / name) for name in names}, dict.fromkeys(names), shape)
-    files = images(folder)
+        return MaskFiles({name: paired(folder / name) for name in names}, dict.fromkeys(names), shape)
+    files = paired(folder)
     labels: dict[str, int | None]
     if objects is None:
         found = _labels_in(files, shape)
@@ -90,16 +85,8 @@ def find_masks(
 
 def _labels_in(files: tuple[Path, ...], shape: tuple[int, int]) -> list[int]:
     """All labels above 0 of a set of label images: an object may enter late, so every image is looked at."""
-    present = np.zeros(65536, bool)
-    for path in files:
-        present |= np.bincount(read_labels(path, shape).ravel(), minlength=65536) > 0
-    return [int(k) for k in np.flatnonzero(present) if k > 0]
-
-
-def masks_folder(folder: Path, masks: str | Path) -> Path:
-    """The folder of masks that was asked for: a name inside the sequence, else a path."""
-    inside = folder / masks
-    return inside if inside.is_dir() else Path(masks).expanduser()
+    counts = (np.bincount(read_labels(path, shape).ravel()) for path in files)
+    return sorted({int(k) for count in counts for k in np.flatnonzero(count)} - {0})
 
 
 def read_labels(path: Path, shape: tuple[int, int]) -> np.ndarray:
@@ -119,7 +106,6 @@ def _palette_indices(path: Path) -> np.ndarray:
 
     with Image.open(path) as image:
         if image.mode != "P":
-            raise BadInput(
-                str(path), f"a colour picture ({image.mode})", "one label per pixel", "Save it with one channel."
-            )
+            fix = "Save it with one channel."
+            raise BadInput(str(path), f"a colour image ({image.mode})", "one label per pixel", fix)
         return np.asarray(image)

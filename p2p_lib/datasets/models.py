@@ -37,21 +37,10 @@ def model_in(place: Path, preferred: tuple[str, ...] = PREFERRED) -> Path | None
     return next((p for pattern in preferred for p in sorted(place.glob(pattern))), None)
 
 
-def parse_models(assignments: Iterable[str], objects: Iterable[str]) -> dict[str, Path]:
-    """``NAME=PATH`` of the command line to object and model file; errors as of :func:`given_models`."""
-    given = {}
-    for assignment in assignments:
-        name, _, where = assignment.partition("=")
-        if not (name and where):
-            raise BadInput("model", repr(assignment), "NAME=PATH")
-        given[name] = where
-    return given_models(given, objects)
-
-
 def given_models(
     given: Mapping[str, str | Path], objects: Iterable[str], preferred: tuple[str, ...] = PREFERRED
 ) -> dict[str, Path]:
-    """Object to model file of what was given; a path may be a model's folder.
+    """Object to model file of what was given (``--models NAME=PATH``); a path may be a model's folder.
 
     Raises :class:`BadInput` for a name that is none of ``objects``, :class:`MissingData` for a file not there.
     """

@@ -1,21 +1,19 @@
 """The numbers that the paper reports: ``data_manifests/paper_reported.json``, the only place they come from.
 
-Failures stand as the paper prints them. A printed mean is kept as printed, whatever its row gives:
-:func:`recomputed_means` says where the two differ and how many failures a mean leaves out.
+Failures stand as the paper prints them, and a printed mean is kept as printed, whatever its row gives.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
-import numpy as np
-from pydantic import ValidationError, model_validator
+from pydantic import model_validator
 
 from p2p_lib.core import paths
-from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.datasets.manifests import Strict, Text
+from p2p_lib.core.errors import BadInput
+from p2p_lib.datasets.manifests import Text
+from p2p_lib.datasets.schema import Strict, read_json
 
 FAIL = "fail"
 
@@ -111,52 +109,5 @@ class PaperReported(Strict):
 @cache
 def paper_reported() -> PaperReported:
     """What the paper reports; :class:`BadInput` names the field where the file is wrong."""
-    path = paths.manifest_dir() / paths.PAPER_REPORTED
-    try:
-        return PaperReported.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
-        raise MissingData(str(path), "no such file, expected the paper's numbers") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        raise BadInput(str(path), f"{where}: {first['msg']}", "the paper's numbers (see its module)") from None
-
-
-@dataclass(frozen=True)
-class Mean:
-    """A printed mean beside what its row gives.
-
-    printed       as in the paper
-    of_successes  over the values that are numbers
-    of_all        with a failure as 0 (an area under a curve; NaN for the Chamfer distance, which has no worst value)
-    failures      how many of the ``count`` values are failures
-    """
-
-    table: str
-    method: str
-    metric: str
-    printed: float
-    of_successes: float
-    of_all: float
-    failures: int
-    count: int
-
-    @property
-    def differs(self) -> bool:
-        """Whether the printed mean is not that of the successes, rounded to two places either way."""
-        return abs(self.printed - self.of_successes) > 0.005 + 1e-9
-
-
-def recomputed_means() -> list[Mean]:
-    """Every printed mean that has a row of values, in the tables' order."""
-    means = []
-    for table in paper_reported().tables:
-        for row in table.rows:
-            if not row.values:
-                continue
-            good = np.array([value for value in row.values if value != FAIL], float)
-            count = len(row.values)
-            whole = float("nan") if row.metric == "chamfer_cm" and len(good) < count else good.sum() / count
-            key = (table.label, row.method, row.metric, row.mean)
-            means.append(Mean(*key, float(good.mean()), float(whole), count - len(good), count))
-    return means
+    what = f"the paper's numbers (see {__name__})"
+    return read_json(paths.manifest_dir() / paths.PAPER_REPORTED, PaperReported, what)

@@ -1,8 +1,8 @@
 """Pickles from the internet, read without running them: NumPy arrays and plain values, nothing else.
 
-A pickle is a program that may call anything. Here it may name only what a pickled array consists of, and even that
-gets a stand-in that notes what was said: the arrays are made afterwards, from checked types, shapes and bytes.
-(NumPy's own parts are not handed out: a hostile stream can reach into them and change what float32 means.)
+A pickle may call anything that it names. Here it may name only what a pickled array consists of, and gets a stand-in
+that records the state: the arrays are made afterwards, from checked types, shapes and bytes. NumPy's own functions
+are not handed out, since a hostile stream can change NumPy's types through them.
 """
 
 from __future__ import annotations
@@ -19,25 +19,15 @@ from p2p_lib.core.errors import BadInput, MissingData
 
 EXPECTED = "a pickle of NumPy arrays and plain values"
 # What a damaged or hostile stream makes the unpickler raise.
-_FAULTS = (
-    pickle.UnpicklingError,
-    EOFError,
-    ValueError,
-    TypeError,
-    LookupError,
-    AttributeError,
-    ArithmeticError,
-    MemoryError,
-    RecursionError,
-)
+_FAULTS = (pickle.UnpicklingError, EOFError, ValueError, TypeError, LookupError, AttributeError)
+_LIMITS = (ArithmeticError, MemoryError, RecursionError)
 _PLAIN = (str, bytes, int, float, complex, bool, type(None))
-_TYPE = re.compile(r"[biufcSU]\d{1,4}")
+_TYPE = re.compile(r"[<>|=][biufcSU]\d{1,4}")
+_DEEPEST = 20
 
 
 class _Dtype:
-    """What a pickled ``numpy.dtype`` says of itself."""
-
-    __slots__ = ("code", "order")
+    """The state of a pickled ``numpy.dtype``."""
 
     def __init__(self, code: str, align: object = False, copy: object = False):
         self.code, self.order = code, "|"
@@ -48,15 +38,16 @@ class _Dtype:
             raise ValueError("an array of records")
 
     def made(self) -> np.dtype:
-        if self.order not in ("<", ">", "|", "=") or not _TYPE.fullmatch(self.code):
+        if not _TYPE.fullmatch(self.order + self.code):
             raise ValueError(f"an array of type {self.order}{self.code}")
         return np.dtype(self.order + self.code)
 
 
 class _Array:
-    """What a pickled ``numpy.ndarray`` says of itself: shape, type, whether in Fortran's order, bytes."""
+    """The state of a pickled ``numpy.ndarray``: bytes, type, shape, order of its axes."""
 
-    __slots__ = ("parts",)
+    def __init__(self, *parts: Any):
+        self.parts = parts
 
     def __setstate__(self, state: tuple) -> None:
         _version, shape, dtype, fortran, data = state
@@ -72,20 +63,6 @@ class _Array:
         return np.frombuffer(data, dtype.made()).reshape(shape, order=order).copy()
 
 
-def _reconstruct(*_: object) -> _Array:
-    return _Array()
-
-
-def _frombuffer(data: bytes, dtype: _Dtype, shape: tuple, order: str, *_: object) -> _Array:
-    array = _Array()
-    array.parts = data, dtype, shape, order
-    return array
-
-
-def _scalar(dtype: _Dtype, data: bytes) -> _Array:
-    return _frombuffer(data, dtype, (), "C")
-
-
 def _latin1(text: str, encoding: str) -> bytes:
     """What protocol 2 calls to rebuild bytes; the codecs that unpack archives stay out."""
     if encoding != "latin1":
@@ -98,10 +75,11 @@ _ADMITTED = {
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _Dtype,
     ("_codecs", "encode"): _latin1,
-    **{(f"numpy.{core}.multiarray", "_reconstruct"): _reconstruct for core in ("core", "_core")},
-    **{(f"numpy.{core}.multiarray", "scalar"): _scalar for core in ("core", "_core")},
-    **{(f"numpy.{core}.numeric", "_frombuffer"): _frombuffer for core in ("core", "_core")},
 }
+for _core in ("numpy.core", "numpy._core"):
+    _ADMITTED[f"{_core}.multiarray", "_reconstruct"] = lambda *_: _Array()
+    _ADMITTED[f"{_core}.multiarray", "scalar"] = lambda dtype, data: _Array(data, dtype, (), "C")
+    _ADMITTED[f"{_core}.numeric", "_frombuffer"] = lambda *parts: _Array(*parts[:4])
 
 
 class _ArraysOnly(pickle.Unpickler):
@@ -126,16 +104,16 @@ def load_plain(path: str | Path) -> Any:
     try:
         # latin1: HO-3D's files were written by Python 2, whose strings are bytes.
         return _plain(_ArraysOnly(io.BytesIO(data), encoding="latin1").load(), 0)
-    except _FAULTS as error:
+    except (*_FAULTS, *_LIMITS) as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise BadInput(str(path), f"an unreadable or unsafe pickle ({reason})", EXPECTED) from None
 
 
 def _plain(value: Any, depth: int) -> Any:
     """The value with its arrays made; ValueError for anything that is no plain value."""
-    if depth > 20:
-        raise ValueError("nested more than 20 deep")
-    if isinstance(value, _Array):
+    if depth > _DEEPEST:
+        raise ValueError(f"nested more than {_DEEPEST} deep")
+    if type(value) is _Array:
         return value.made()
     if isinstance(value, dict):
         return {_plain(k, depth + 1): _plain(v, depth + 1) for k, v in value.items()}

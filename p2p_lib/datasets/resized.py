@@ -46,7 +46,7 @@ class Resized:
         )
 
     def frame(self, i: int) -> Frame:
-        """The i-th picture, smaller."""
+        """The i-th image, smaller."""
         frame, size = self.original.frame(i), (self.camera.width, self.camera.height)
         depth_m = cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT)
         return replace(frame, rgb=cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), depth_m=depth_m)
@@ -59,13 +59,9 @@ class Resized:
         nearest = cv2.INTER_NEAREST_EXACT
         return {k: cv2.resize(m.astype(np.uint8), size, interpolation=nearest) > 0 for k, m in masks.items()}
 
-    def visible_px(self, i: int) -> dict[str, int] | None:
-        """Sizes of the original's masks."""
-        return self.original.visible_px(i)
-
     def __len__(self) -> int:
         return len(self.original)
 
     def __getattr__(self, name: str) -> Any:
-        """Names, times, truth, models: the original's."""
+        """The original's names, times, truth, models and sizes of masks."""
         return getattr(self.original, name)

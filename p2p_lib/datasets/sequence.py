@@ -1,7 +1,6 @@
-"""RGB-D sequences: the protocol that every layout fulfils, and the one door, :func:`open_sequence`.
+"""RGB-D sequences: the protocol that every layout fulfils, and :func:`open_sequence`, which opens any of them.
 
-A layout is one module with ``recognises(folder)`` and ``load(folder, name, depth_scale, masks)``, and
-one line in :data:`FORMATS`.
+A layout is one module with ``load(folder, name, depth_scale, masks)``, and one line in :data:`FORMATS`.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.types import Frame
 
-#: Layouts by name, in the order in which they are tried on a folder.
-FORMATS: dict[str, str] = {
-    "ho3d": "p2p_lib.datasets.ho3d",
-    "bop": "p2p_lib.datasets.bop",
-    "ycbmultitrack": "p2p_lib.datasets.ycbmultitrack",
-    "ycbineoat": "p2p_lib.datasets.ycbineoat",
-    "folder": "p2p_lib.datasets.folder",
+#: Layouts, each by the name of its module: what a folder of it holds, in the order in which they are tried.
+FORMATS: dict[str, tuple[str, ...]] = {
+    "ho3d": ("meta/*.pkl",),
+    "bop": ("scene_camera.json",),
+    "ycbmultitrack": ("annotated_poses/*/",),
+    "ycbineoat": ("gt_mask/", "annotated_poses/*.txt"),
+    "folder": ("rgb/",),
 }
 
 #: Sequences that are generated rather than read are called ``synthetic/NAME``.
@@ -57,11 +56,10 @@ class ObjectTruth:
 class Sequence(Protocol):
     """RGB-D frames of one video, with masks and truth where the dataset has them.
 
-    name     what results call it
-    path     its folder, None where it has none
+    name     what results call it; path its folder, None where it has none
     objects  names of the objects it knows; a single unnamed one is called ``object``
-    truth    per object, empty where there is none; read when first asked for
-    times_s  (N,) seconds, increasing; frame_names what each frame's picture is called
+    times_s  (N,) seconds, increasing; frame_names what each frame's image is called, without its ending
+    truth    object to its truth, empty where there is none; read when first asked for
     model_places  object to the files and folders where its model may lie, best first
     """
 
@@ -71,22 +69,14 @@ class Sequence(Protocol):
     camera: Camera
     objects: tuple[str, ...]
     times_s: np.ndarray
+    frame_names: tuple[str, ...]
+    truth: dict[str, ObjectTruth]
     model_places: Mapping[str, tuple[Path, ...]]
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """What each frame's picture is called, without its ending."""
-        ...
-
-    @property
-    def truth(self) -> dict[str, ObjectTruth]:
-        """Object to its truth; empty where there is none."""
-        ...
 
     def __len__(self) -> int: ...
 
     def frame(self, i: int) -> Frame:
-        """The i-th picture, read now; what is wrong with its files is said in one line that names the file."""
+        """The i-th frame, read now; :class:`BadInput` or :class:`MissingData` names a file that is wrong."""
         ...
 
     def masks(self, i: int) -> dict[str, np.ndarray] | None:
@@ -96,7 +86,7 @@ class Sequence(Protocol):
     def visible_px(self, i: int) -> dict[str, int] | None:
         """Object to the size of its visible mask at frame i, by the dataset's OWN masks whatever ``masks`` gives.
 
-        The scoring rule uses this, so that the same frames count for every source of masks.
+        Scoring uses this, so that the same frames count for every source of masks.
         """
         ...
 
@@ -108,7 +98,7 @@ def open_sequence(
     seed: int = 0,
     masks: str | Path | None = None,
 ) -> Sequence:
-    """A sequence from a folder, the embedded ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
+    """A sequence from a folder, the bundled ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
 
     Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one; any
     other folder by its path below ``$P2P_DATA``.
@@ -134,7 +124,7 @@ def open_sequence(
     else:
         folder, format = _find(path_or_name, format)
         name = os.path.basename(os.path.abspath(folder))
-    loader = import_module(FORMATS[format or recognise(folder)])
+    loader = import_module(f"p2p_lib.datasets.{format or recognise(folder)}")
     return loader.load(folder, name=name, depth_scale=depth_scale, masks=masks)
 
 
@@ -160,7 +150,7 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
     if found is None and below is not None and below.is_dir():
         return below, format
     if found is None:
-        fix = f"Give a folder, an embedded sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
+        fix = f"Give a folder, a bundled sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
         where = "$P2P_DATA is not set" if data_dir() is None else f"no sequence of this name below {data_dir()}"
         raise MissingData(str(path_or_name), f"no such folder, and {where}", fix)
     return found[0], format or found[1].format
@@ -168,12 +158,12 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
 
 def recognise(folder: Path) -> str:
     """The name of a folder's layout; :class:`BadInput` where no layout fits."""
-    for name, module in FORMATS.items():
-        if import_module(module).recognises(folder):
+    for name, patterns in FORMATS.items():
+        if any(next(folder.glob(pattern), None) for pattern in patterns):
             return name
     holds = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())[:8]) or "nothing"
     if not (folder / "rgb").is_dir() and ((folder / "depth").is_dir() or (folder / "cam_K.txt").is_file()):
-        fix = "rgb/ is missing: put the colour pictures there, one for each depth image."
+        fix = "rgb/ is missing: put the colour images there, one for each depth image."
         raise BadInput(str(folder), f"a folder with {holds}", "rgb/, depth/ and cam_K.txt", fix)
     raise BadInput(
         str(folder),

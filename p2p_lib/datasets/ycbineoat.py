@@ -1,7 +1,7 @@
 """YCBInEOAT: one object moved by a robot's hand, seen by a fixed camera.
 
 ``rgb/``, ``depth/`` (uint16 millimetres), ``cam_K.txt``, ``gt_mask/`` (masks from the arm's kinematics),
-``annotated_poses/*.txt`` (4x4 T_cam_model, metres, OpenCV axes; the i-th belongs to the i-th picture).
+``annotated_poses/*.txt`` (4x4 T_cam_model, metres, OpenCV axes; the i-th belongs to the i-th image).
 ``masks/``, a separate download, serves where ``gt_mask/`` is not there. Models lie in ``models/object/``, or by
 their YCB name in ``models/`` of the dataset, one folder above: the sequence's name begins with the object's.
 """
@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageSequence, pictures
-from p2p_lib.datasets.masks import MaskFiles, find_masks, masks_folder
+from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import ObjectTruth
 
 OBJECT = "object"
@@ -27,41 +26,25 @@ YCB_NAMES = {
 }
 
 
-def recognises(folder: Path) -> bool:
-    """Whether a folder has ``gt_mask/`` or ``annotated_poses/*.txt``."""
-    return (folder / "gt_mask").is_dir() or any((folder / "annotated_poses").glob("*.txt"))
-
-
 def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
-    rgb_files, depth_files, camera, times_s = pictures(folder)
-    shape = camera.height, camera.width
-
-    def find(where: Path) -> MaskFiles:
-        return find_masks(where, rgb_files, shape, (OBJECT,))
-
-    own = next((find(folder / m) for m in ("gt_mask", "masks") if (folder / m).is_dir()), None)
-    chosen = find(masks_folder(folder, masks)) if masks else own
+    files = image_files(folder)
+    chosen, own = files.masks(masks, [folder / "gt_mask", folder / "masks"], (OBJECT,))
 
     def read_truth() -> dict[str, ObjectTruth]:
         if not (folder / "annotated_poses").is_dir():
             return {}
-        files = images.list_files(folder / "annotated_poses", (".txt",), "pose files")
-        files = images.check_paired(files, rgb_files)
-        return {OBJECT: ObjectTruth(images.read_poses(files), np.ones(len(files), bool))}
+        poses = images.read_poses(folder / "annotated_poses", files.rgb)
+        return {OBJECT: ObjectTruth(poses, np.ones(len(poses), bool))}
 
     return ImageSequence(
         name=name,
         format="ycbineoat",
-        path=folder,
-        camera=camera,
+        files=files,
         objects=(OBJECT,),
-        rgb_files=rgb_files,
-        depth_files=depth_files,
-        times_s=times_s,
         depth_scale=depth_scale or images.DEPTH_SCALE,
         mask_files=chosen,
-        own_masks=own or chosen,
+        own_masks=own,
         read_truth=read_truth,
         model_places={OBJECT: _models(folder)},
     )

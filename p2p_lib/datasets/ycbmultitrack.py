@@ -16,17 +16,11 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageSequence, pictures
-from p2p_lib.datasets.masks import MaskFiles, find_masks, masks_folder
+from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import ObjectTruth
 
 DEPTH_INVALID = 65535
 LABELS = {"is_mask_visible": "is_mask_visible.npy", "is_obj_in_image_labels": "is_obj_in_image.npy"}
-
-
-def recognises(folder: Path) -> bool:
-    """Whether a folder has ``annotated_poses/<obj>/``."""
-    return bool(_objects(folder))
 
 
 def _objects(folder: Path) -> tuple[str, ...]:
@@ -36,43 +30,27 @@ def _objects(folder: Path) -> tuple[str, ...]:
 
 def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
-    rgb_files, depth_files, camera, times_s = pictures(folder)
-    shape = camera.height, camera.width
-    objects = _objects(folder)
+    files, objects = image_files(folder), _objects(folder)
     if not objects:
         raise BadInput(str(folder / "annotated_poses"), "no folders", "one folder of poses for each object")
-
-    def find(where: Path) -> MaskFiles:
-        return find_masks(where, rgb_files, shape, objects)
-
-    own = find(folder / "masks") if (folder / "masks").is_dir() else None
-    chosen = find(masks_folder(folder, masks)) if masks else own
+    chosen, own = files.masks(masks, [folder / "masks"], objects)
 
     def read_truth() -> dict[str, ObjectTruth]:
-        truth = {}
-        for obj in objects:
-            files = images.list_files(folder / "annotated_poses" / obj, (".txt",), "pose files")
-            poses = images.read_poses(images.check_paired(files, rgb_files))
-            truth[obj] = ObjectTruth(poses, read_labels(folder, obj, len(rgb_files)))
-        return truth
+        poses = {obj: images.read_poses(folder / "annotated_poses" / obj, files.rgb) for obj in objects}
+        return {obj: ObjectTruth(T, read_labels(folder, obj, len(T))) for obj, T in poses.items()}
 
+    roots = folder, images.full(folder).parent
     return ImageSequence(
         name=name,
         format="ycbmultitrack",
-        path=folder,
-        camera=camera,
+        files=files,
         objects=objects,
-        rgb_files=rgb_files,
-        depth_files=depth_files,
-        times_s=times_s,
         depth_scale=depth_scale or images.DEPTH_SCALE,
         depth_invalid=DEPTH_INVALID,
         mask_files=chosen,
-        own_masks=own or chosen,
+        own_masks=own,
         read_truth=read_truth,
-        model_places={
-            obj: tuple(root / "models" / obj for root in (folder, images.full(folder).parent)) for obj in objects
-        },
+        model_places={obj: tuple(root / "models" / obj for root in roots) for obj in objects},
     )
 
 
@@ -88,6 +66,6 @@ def read_labels(folder: Path, obj: str, n: int) -> np.ndarray:
         except (ValueError, EOFError, OSError) as error:
             raise BadInput(str(path), f"an unreadable array ({error})", f"{n} labels as a .npy of bool") from None
         if label.size != n or label.dtype.kind not in "biuf":
-            raise BadInput(str(path), f"shape {label.shape} {label.dtype}", f"{n} labels, one for each picture")
+            raise BadInput(str(path), f"shape {label.shape} {label.dtype}", f"{n} labels, one for each image")
         holds &= label.ravel().astype(bool)
     return holds

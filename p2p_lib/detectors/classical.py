@@ -1,4 +1,4 @@
-"""Other sources of candidates than the embedded corners, for comparison (appendix: "Keypoint Sampling Strategies")."""
+"""Sources of candidates without weights: the default, and those of the appendix "Keypoint Sampling Strategies"."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.config import SamplingConfig
+from p2p_lib.core.image import bounds
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Frame
 
@@ -13,27 +14,13 @@ from p2p_lib.core.types import Frame
 _POOL = 4000
 # ORB looks at a patch this large around a feature, so this much around the mask is looked at too.
 _ORB_PATCH_PX = 31
-
-#: Detector and settings of the appendix's comparison; ``detector only`` takes the best scores, wherever they are.
-SAMPLING_VARIANTS: dict[str, tuple[str, dict[str, float]]] = {
-    "proposed": ("superpoint", {}),
-    "detector only": (
-        "superpoint",
-        {"sampling.score_weight": 1.0, "sampling.cluster_weight": 0.0, "sampling.r_min_px": 0.0},
-    ),
-    "uniform": (
-        "uniform",
-        {"sampling.score_weight": 1.0, "sampling.cluster_weight": 0.0, "sampling.r_min_px": 0.0},
-    ),
-    "farthest": (
-        "farthest",
-        {"sampling.score_weight": 1.0, "sampling.cluster_weight": 0.0, "sampling.r_min_px": 0.0},
-    ),
-}
+# The same for blobs and corners.
+_CORNER_PATCH_PX = 16
+NO_CANDIDATES = Candidates(np.zeros((0, 2)), np.zeros(0))
 
 
 class CornerDetector:
-    """Embedded detector: SIFT blobs, which the embedded tracker can re-detect, and corners, which it follows best.
+    """Built-in detector: SIFT blobs, which the built-in tracker can re-detect, and corners, which it follows best.
 
     The score is the feature's strength relative to the strongest of its kind, blobs above corners.
     """
@@ -46,13 +33,9 @@ class CornerDetector:
 
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Candidates in the mask, best first."""
-        x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
-        if not w:
-            return Candidates(np.zeros((0, 2)), np.zeros(0))
-        x0, y0 = max(0, x - 16), max(0, y - 16)
-        crop = (slice(y0, y + h + 16), slice(x0, x + w + 16))
-        gray = cv2.cvtColor(frame.rgb[crop], cv2.COLOR_RGB2GRAY)
-        inside = np.ascontiguousarray(mask[crop]).astype(np.uint8)
+        if not mask.any():
+            return NO_CANDIDATES
+        gray, inside, corner_px = _cropped(frame, mask, _CORNER_PATCH_PX)
         blobs = self._sift.detect(gray, inside)
         corners, quality = cv2.goodFeaturesToTrackWithQuality(gray, self._limit, 0.01, 3, inside, blockSize=5)[:2]
         uv, score = [np.zeros((0, 2))], [np.zeros(0)]
@@ -63,7 +46,7 @@ class CornerDetector:
         if corners is not None:
             uv.append(corners.reshape(-1, 2))
             score.append(0.5 * quality.ravel() / quality.max())
-        uv_px, score = np.concatenate(uv) + np.array([x0, y0], float), np.concatenate(score).astype(float)
+        uv_px, score = np.concatenate(uv) + corner_px, np.concatenate(score).astype(float)
         order = np.argsort(-score, kind="stable")[: self._limit]
         return Candidates(uv_px[order], score[order])
 
@@ -95,7 +78,7 @@ class FarthestDetector:
         pool = self._rng.permutation(_pixels(mask))[:_POOL]
         count = min(self._limit, len(pool))
         if not count:
-            return Candidates(np.zeros((0, 2)), np.zeros(0))
+            return NO_CANDIDATES
         taken = np.zeros(count, int)
         taken[0] = np.square(pool - pool.mean(0)).sum(1).argmin()
         distance = np.square(pool - pool[taken[0]]).sum(1)
@@ -116,20 +99,21 @@ class OrbDetector:
 
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Corners in the mask, best first."""
-        x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
-        points = ()
-        if w:
-            margin = _ORB_PATCH_PX + 1
-            x0, y0 = max(0, x - margin), max(0, y - margin)
-            crop = (slice(y0, y + h + margin), slice(x0, x + w + margin))
-            gray = cv2.cvtColor(frame.rgb[crop], cv2.COLOR_RGB2GRAY)
-            points = self._orb.detect(gray, np.ascontiguousarray(mask[crop]).astype(np.uint8))
+        gray, inside, corner_px = _cropped(frame, mask, _ORB_PATCH_PX + 1)
+        points = self._orb.detect(gray, inside) if mask.any() else ()
         if not points:
-            return Candidates(np.zeros((0, 2)), np.zeros(0))
+            return NO_CANDIDATES
         response = np.array([point.response for point in points])
         order = np.argsort(-response, kind="stable")
-        uv_px = cv2.KeyPoint.convert(points).astype(float) + np.array([x0, y0])
+        uv_px = cv2.KeyPoint.convert(points).astype(float) + corner_px
         return Candidates(uv_px[order], np.clip(response[order] / max(response.max(), 1e-12), 0, 1))
+
+
+def _cropped(frame: Frame, mask: np.ndarray, margin_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Brightness and mask (h, w) uint8 around the mask, and the pixel (2,) of their upper left corner."""
+    rows, columns = bounds(mask, margin_px)
+    gray = cv2.cvtColor(frame.rgb[rows, columns], cv2.COLOR_RGB2GRAY)
+    return gray, mask[rows, columns].astype(np.uint8), np.array([columns.start, rows.start], float)
 
 
 def _pixels(mask: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from p2p_lib.core import packages
 from p2p_lib.core.config import SamplingConfig
-from p2p_lib.core.image import in_mask
+from p2p_lib.core.image import bounds, in_mask
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import checkpoints
@@ -49,16 +49,16 @@ class SuperPointDetector:
         """Keypoints in the mask, best first, looked for around it alone."""
         import torch
 
-        x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
-        if not w:
+        if not mask.any():
             return Candidates(np.zeros((0, 2)), np.zeros(0))
-        x0, y0 = (max(0, (at - _MARGIN_PX) // _CELL_PX * _CELL_PX) for at in (x, y))
-        crop = frame.rgb[y0 : y + h + _MARGIN_PX, x0 : x + w + _MARGIN_PX]
+        rows, columns = bounds(mask, _MARGIN_PX)
+        x0, y0 = (span.start // _CELL_PX * _CELL_PX for span in (columns, rows))
+        crop = frame.rgb[y0 : rows.stop, x0 : columns.stop]
         gray = torch.from_numpy(cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)).to(self._device).float() / 255
         with torch.inference_mode():
             found = self._model(pixel_values=gray.expand(1, 3, *gray.shape))
         kept = found.mask[0].bool()
-        # The class gives indices of pixels over the size of the picture.
+        # The class gives indices of pixels over the size of the image.
         uv_px = found.keypoints[0][kept].double().cpu().numpy() * gray.shape[::-1] + [x0, y0]
         score = found.scores[0][kept].double().cpu().numpy()
         inside = np.flatnonzero(in_mask(uv_px, mask))

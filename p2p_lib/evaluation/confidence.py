@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.types import joined
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation.protocol import Evaluation, ObjectScore
 
@@ -28,10 +29,6 @@ class Judged:
 
     def __len__(self) -> int:
         return len(self.right)
-
-    def joined(self, other: Judged) -> Judged:
-        """These poses, then the others."""
-        return Judged(np.r_[self.confidence, other.confidence], np.r_[self.right, other.right])
 
     @property
     def calibration_error(self) -> float:
@@ -69,10 +66,10 @@ def pose_error(obj: ObjectRun, score: ObjectScore) -> tuple[np.ndarray, np.ndarr
     return angle_rad, np.linalg.norm(T_error[:, :3, 3], axis=1)
 
 
-def right_poses(obj: ObjectRun, score: ObjectScore, max_m: float = MAX_M, max_deg: float = MAX_DEG) -> np.ndarray:
-    """(n,) bool: frames with a pose within ``max_m`` and ``max_deg`` of the truth."""
+def right_poses(obj: ObjectRun, score: ObjectScore) -> np.ndarray:
+    """(n,) bool: frames with a pose within 2 cm and 5 degrees of the truth."""
     angle_rad, apart_m = pose_error(obj, score)
-    return (np.degrees(angle_rad) <= max_deg) & (apart_m <= max_m)
+    return (np.degrees(angle_rad) <= MAX_DEG) & (apart_m <= MAX_M)
 
 
 def judge(run: Run, evaluation: Evaluation) -> dict[str, Judged]:
@@ -87,10 +84,7 @@ def judge(run: Run, evaluation: Evaluation) -> dict[str, Judged]:
 
 def pooled(many: Iterable[Judged]) -> Judged:
     """All of them together."""
-    total = Judged(np.zeros(0), np.zeros(0, bool))
-    for one in many:
-        total = total.joined(one)
-    return total
+    return joined([Judged(np.zeros(0), np.zeros(0, bool)), *many])
 
 
 def reliability(judged: Judged, bins: int = 10) -> Bins:

@@ -7,74 +7,65 @@ none. Visible frames are scored by intersection over union, absent ones by the p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from p2p_lib.core import tables
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets.masks import read_labels
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 
-
-@dataclass(frozen=True, eq=False)
-class MaskScore:
-    """One object's masks over n frames.
-
-    frame_index        (n,)
-    iou                (n,) intersection over union in visible frames, NaN in the others
-    false_positive_px  (n,) labelled pixels in absent frames, NaN in the others
-    """
-
-    frame_index: np.ndarray
-    iou: np.ndarray
-    false_positive_px: np.ndarray
-
-    def as_dict(self) -> dict[str, float | int | None]:
-        """Means over the visible and over the absent frames, None where there are none."""
-        seen, absent = self.iou[np.isfinite(self.iou)], self.false_positive_px[np.isfinite(self.false_positive_px)]
-        return {
-            "mean_iou": float(seen.mean()) if len(seen) else None,
-            "visible_frames": len(seen),
-            "missed_frames": int((seen == 0).sum()),
-            "absent_frames": len(absent),
-            "false_positive_px": float(absent.mean()) if len(absent) else None,
-        }
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True, eq=False)
 class MaskEvaluation:
-    """The scores of every object, and which masks they are of."""
+    """How every mask of a run agrees with the true one, and which masks they are.
 
-    objects: dict[str, MaskScore]
+    frames  a row per object and frame: ``object``, ``frame``, ``iou`` (NaN unless visible), ``false_positive_px``
+            (NaN unless absent)
+    """
+
+    frames: DataFrame
     info: dict[str, Any]
+
+    def as_frame(self) -> DataFrame:
+        """A row per object: means over its visible and over its absent frames, NaN where there are none."""
+        by_object = self.frames.groupby("object", sort=False)
+        iou, extra = by_object["iou"], by_object["false_positive_px"]
+        scores = {
+            "mean_iou": iou.mean(),
+            "visible_frames": iou.count(),
+            "missed_frames": iou.agg(lambda values: (values == 0).sum()).astype(int),
+            "absent_frames": extra.count(),
+            "false_positive_px": extra.mean(),
+        }
+        return iou.first().to_frame().assign(**scores)[list(scores)]
 
     @property
     def mean_iou(self) -> float:
         """The mean over the objects of their mean over visible frames; NaN where nothing was visible."""
-        means = [s.as_dict()["mean_iou"] for s in self.objects.values()]
-        return float(np.mean([m for m in means if m is not None] or [np.nan]))
+        return float(self.as_frame()["mean_iou"].mean())
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as ``p2p eval-masks --json`` prints them."""
-        scores = {name: score.as_dict() for name, score in self.objects.items()}
-        return {**self.info, "objects": scores, "mean_iou": self.mean_iou}
+        """Plain values, as ``p2p eval-masks --json`` prints them; None where there is nothing to measure."""
+        table = self.as_frame().astype(object)
+        objects = table.where(table.notna(), None).to_dict("index")
+        return {**self.info, "objects": objects, "mean_iou": self.mean_iou}
 
     def as_table(self) -> str:
         """The same for people."""
-        width = max(len(name) for name in (*self.objects, "object"))
-        lines = [f"{'object':{width}}  mean IoU  visible  missed  absent  px labelled while absent"]
-        for name, score in self.objects.items():
-            s = score.as_dict()
-            iou, extra = (f"{s[k]:.3f}" if s[k] is not None else "-" for k in ("mean_iou", "false_positive_px"))
-            counts = f"{s['visible_frames']:7}  {s['missed_frames']:6}  {s['absent_frames']:6}"
-            lines.append(f"{name:{width}}  {iou:>8}  {counts}  {extra:>24}")
-        return "\n".join([*lines, f"masks {self.info['masks']} on {self.info['sequence']}"])
+        heads = ["mean IoU", "visible", "missed", "absent", "px labelled while absent"]
+        table = self.as_frame().set_axis(heads, axis=1).round({"mean IoU": 3, heads[-1]: 1}).reset_index()
+        return f"{tables.as_text(table)}\nmasks {self.info['masks']} on {self.info['sequence']}"
 
 
 def agreement(found: np.ndarray, truth: np.ndarray, min_visible_px: int = MIN_VISIBLE_PX) -> tuple[float, float]:
-    """(iou, false_positive_px) of one mask (H, W) bool: NaN for what does not apply, see :class:`MaskScore`."""
+    """(iou, false_positive_px) of one mask (H, W) bool: NaN for what does not apply."""
     true_px = int(truth.sum())
     if not true_px:
         return np.nan, float(found.sum())
@@ -87,6 +78,8 @@ def evaluate_masks(run: Run, sequence: Sequence | None = None, min_visible_px: i
     The sequence is opened anew, as the run says, unless it is given. An object without a true mask in a frame is
     absent there; frames without any are left out. Raises :class:`MissingData` where either side has no masks.
     """
+    from pandas import DataFrame
+
     info = run.info
     sequence = sequence or open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
     kept = {path for name in run.objects for path in (run.path / "masks" / name).glob("*.png")}
@@ -94,13 +87,13 @@ def evaluate_masks(run: Run, sequence: Sequence | None = None, min_visible_px: i
         raise MissingData(str(run.path / "masks"), "the run kept no masks", "Run it again with --save-masks.")
     known = [name for name in run.objects if name in sequence.objects]
     shape = sequence.camera.height, sequence.camera.width
-    rows: dict[str, list[tuple[int, float, float]]] = {name: [] for name in known}
+    rows = []
     for i in sorted({int(path.stem) for path in kept}):
         truth = sequence.masks(i)
         for name in known if truth is not None else ():
             found = read_labels(run.path / "masks" / name / f"{i:06d}.png", shape) > 0
-            rows[name].append((i, *agreement(found, truth.get(name, np.zeros(shape, bool)), min_visible_px)))
-    if not any(rows.values()):
+            rows.append((name, i, *agreement(found, truth.get(name, np.zeros(shape, bool)), min_visible_px)))
+    if not rows:
         raise MissingData(sequence.name, f"no masks of {', '.join(run.objects)}", "Only a dataset's masks can tell.")
-    scores = {name: MaskScore(*(np.array(column) for column in zip(*r, strict=True))) for name, r in rows.items()}
-    return MaskEvaluation(scores, {key: info[key] for key in ("sequence", "masks")})
+    frames = DataFrame(rows, columns=["object", "frame", "iou", "false_positive_px"])
+    return MaskEvaluation(frames, {key: info[key] for key in ("sequence", "masks")})

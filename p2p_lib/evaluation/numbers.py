@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 
 from p2p_lib.evaluation import metrics
+from p2p_lib.evaluation.recovery import recovered_within
 
 #: The errors of a frame, by what their area under the curve is called.
 AREAS = {"ADD-S AUC": "adds_m", "ADD AUC": "add_m"}
@@ -56,10 +57,8 @@ def chamfer(values_cm: Mapping[str, float], align: str) -> list[Number]:
 
 def returns(frames_to_recovery: Sequence[int | None], within: Sequence[int], align: str) -> list[Number]:
     """How often an object returned from complete occlusion, and how often it was recovered within so many frames."""
-    counts = {"all": len(frames_to_recovery)}
-    counts |= {
-        f"recovered within {n} frames": sum(f is not None and f <= n for f in frames_to_recovery) for n in within
-    }
+    recovered = recovered_within(frames_to_recovery, within)
+    counts = {"all": len(frames_to_recovery)} | {f"recovered within {n} frames": k for n, k in recovered.items()}
     return [Number("returns", form, NOT_APPLICABLE, align, "events", count) for form, count in counts.items()]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import OracleConfig
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.evaluation.true_tracks import NO_POINTS, TrueScene
 
 # What is drawn for a frame; each kind has a stream of its own, so that points added later change no earlier draw.
@@ -50,7 +50,8 @@ class OracleTracker:
         ids = np.arange(self._next_id, self._next_id + len(uv))
         self._next_id += len(uv)
         self._ids = np.concatenate([self._ids, ids])
-        self._points = self._points.joined(self._scene.lift(self._frame, self._scene.owners(self._frame, uv), uv))
+        new = self._scene.lift(self._frame, self._scene.owners(self._frame, uv), uv)
+        self._points = joined([self._points, new])
         return ids
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:

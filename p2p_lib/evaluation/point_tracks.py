@@ -9,13 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-#: TAP-Vid measures pixels after both axes of the picture are scaled to this many.
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+#: TAP-Vid measures pixels after both axes of the image are scaled to this many.
 RASTER_PX = 256
 THRESHOLDS_PX = (1, 2, 4, 8, 16)
-#: Re-detection: frames of absence, radius in pixels of the picture as it is, visible frames to be found in.
+#: Re-detection: frames of absence, radius in pixels of the image as it is, visible frames to be found in.
 MIN_ABSENT_FRAMES, FOUND_PX, FOUND_WITHIN_FRAMES = 30, 8.0, 5
 #: A return counts as "the same surface again" up to this angle from a view it was seen from.
 SAME_VIEW_DEG = 40.0
@@ -36,35 +41,6 @@ class TapVid:
     within: tuple[float, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class Redetections:
-    """Returns of points after a long absence, one row each.
-
-    point, frame  (E,) which point, and the first frame in which it shows again
-    view_deg      (E,) angle from there to the nearest view it was seen from since its query
-    found         (E,) bool: within 8 px and called visible in at least one of the first 5 visible frames
-    share_found   (E,) share of those up to 5 frames in which it was
-    """
-
-    point: np.ndarray
-    frame: np.ndarray
-    view_deg: np.ndarray
-    found: np.ndarray
-    share_found: np.ndarray
-
-    def as_dict(self, max_view_deg: float = SAME_VIEW_DEG) -> dict[str, float | int]:
-        """Counts and shares over all returns, and over those within ``max_view_deg`` of a known view."""
-        same = self.view_deg <= max_view_deg
-        return {
-            "returns": len(self.point),
-            "found": _share(self.found),
-            "found_frames": _share(self.share_found),
-            "returns_same_view": int(same.sum()),
-            "found_same_view": _share(self.found[same]),
-            "found_frames_same_view": _share(self.share_found[same]),
-        }
-
-
 def after_query(query_frame: np.ndarray, frames: int) -> np.ndarray:
     """(T, N) bool: the frames after each point's query, which the query-first protocol scores."""
     return np.arange(frames)[:, None] > query_frame[None]
@@ -78,7 +54,7 @@ def tapvid(
     scored: np.ndarray,
     shape: tuple[int, int],
 ) -> TapVid:
-    """TAP-Vid scores over the ``scored`` (T, N) frames; positions in pixels of a picture of ``shape`` (H, W).
+    """TAP-Vid scores over the ``scored`` (T, N) frames; positions in pixels of an image of ``shape`` (H, W).
 
     A predicted position that is NaN is wrong at every threshold.
     """
@@ -116,7 +92,7 @@ class Outcome(IntEnum):
 def outcomes(
     uv_true: np.ndarray, visible_true: np.ndarray, uv_px: np.ndarray, visible: np.ndarray, scored: np.ndarray
 ) -> np.ndarray:
-    """(T, N) uint8 of :class:`Outcome`; pixels are those of the picture as it is."""
+    """(T, N) uint8 of :class:`Outcome`; pixels are those of the image as it is."""
     near = visible_true & (np.linalg.norm(uv_px - uv_true, axis=-1) < FOUND_PX)
     said = np.where(near, Outcome.RIGHT, Outcome.WRONG)
     silent = np.where(visible_true, Outcome.MISSED, Outcome.HIDDEN)
@@ -162,48 +138,42 @@ def redetections(
     uv_px: np.ndarray,
     visible: np.ndarray,
     query_frame: np.ndarray,
-) -> Redetections:
-    """Every return of a point after at least 30 frames in a row in which it was truly invisible.
+) -> DataFrame:
+    """A row for every return of a point after at least 30 frames in a row in which it was truly invisible.
 
     known  (T, N) bool: truth says whether the point is visible; an absence with unknown frames is none
     view   (T, N, 3) unit vectors from the point to the camera, in the object's frame
+
+    Columns: ``point``; ``frame``, the first in which it shows again; ``view_deg``, the angle from there to the nearest
+    view it was seen from since its query; ``share_found`` of the first 5 visible frames, in which it is called visible
+    within 8 px; ``found``, whether it is in one of them.
     """
-    seen = visible_true & known
-    seen &= np.arange(len(seen))[:, None] >= query_frame
-    point, frame = np.nonzero(seen.T)  # by point, then by frame
-    new_point = np.diff(point, prepend=-1) > 0
-    unknown_before = np.vstack([np.zeros(known.shape[1], int), np.cumsum(~known, 0)])
-    last = np.concatenate([[0], frame[:-1]])[: len(frame)]
-    certain = unknown_before[frame, point] == unknown_before[last, point]
-    returns = ~new_point & (frame - last > MIN_ABSENT_FRAMES) & certain
-    stretch_start = np.flatnonzero(new_point | (np.diff(frame, prepend=0) > MIN_ABSENT_FRAMES))
-    stretch = np.searchsorted(stretch_start, np.arange(len(frame)), side="right") - 1
-    first = np.flatnonzero(returns)
-    rows = first[:, None] + np.arange(FOUND_WITHIN_FRAMES)
-    within = rows < len(frame)
-    rows = np.minimum(rows, max(len(frame) - 1, 0))
-    within &= stretch[rows] == stretch[first][:, None]
-    at = frame[rows], point[rows]
-    off_px = np.linalg.norm(uv_px[at] - uv_true[at], axis=-1)
-    good = within & visible[at] & (off_px < FOUND_PX)
-    return Redetections(
-        point[first],
-        frame[first],
-        _nearest_view_deg(seen, view, point[first], frame[first]),
-        good.any(1),
-        good.sum(1) / np.maximum(within.sum(1), 1),
-    )
+    from pandas import DataFrame
+
+    seen = visible_true & known & (np.arange(len(known))[:, None] >= query_frame)
+    right = visible & (np.linalg.norm(uv_px - uv_true, axis=-1) < FOUND_PX)
+    rows = []
+    for k in range(seen.shape[1]):
+        frames = np.flatnonzero(seen[:, k])
+        returns = np.flatnonzero(np.diff(frames) > MIN_ABSENT_FRAMES) + 1
+        for at, end in pairwise([*returns, len(frames)]):
+            frame = frames[at]
+            if known[frames[at - 1] : frame, k].all():
+                cosine = (view[frames[:at], k] @ view[frame, k]).max()
+                share = right[frames[at : min(end, at + FOUND_WITHIN_FRAMES)], k].mean()
+                rows.append((k, frame, np.degrees(np.arccos(np.clip(cosine, -1, 1))), share, share > 0))
+    columns = {"point": int, "frame": int, "view_deg": float, "share_found": float, "found": bool}
+    return DataFrame(rows, columns=list(columns)).astype(columns)
 
 
-def _nearest_view_deg(seen: np.ndarray, view: np.ndarray, point: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """(E,) angle between the view at ``frame`` and the nearest one in which the point was seen before."""
-    if not len(point):
-        return np.zeros(0)
-    cosine = np.einsum("tec,ec->te", view[:, point], view[frame, point])
-    earlier = seen[:, point] & (np.arange(len(seen))[:, None] < frame)
-    nearest = np.where(earlier, cosine, -1.0).max(0)
-    return np.degrees(np.arccos(np.clip(nearest, -1, 1)))
-
-
-def _share(values: np.ndarray) -> float:
-    return float(values.mean()) if len(values) else float("nan")
+def redetection_shares(returns: DataFrame) -> dict[str, float | int]:
+    """Counts and shares over all :func:`redetections`, and over those within 40 degrees of a known view."""
+    same = returns[returns.view_deg <= SAME_VIEW_DEG]
+    return {
+        "returns": len(returns),
+        "found": float(returns.found.mean()),
+        "found_frames": float(returns.share_found.mean()),
+        "returns_same_view": len(same),
+        "found_same_view": float(same.found.mean()),
+        "found_frames_same_view": float(same.share_found.mean()),
+    }

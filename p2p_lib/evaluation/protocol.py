@@ -5,9 +5,8 @@ labels hold and its visible mask has at least ``min_visible_px`` pixels. A score
 failure: its error is infinite and counts as 0 in every area under a curve. Frames in which the object is
 hidden are not scored.
 
-The tracker's object frame is its own choice, so one rigid constant T_obj_model is free. ``first`` takes it
-from the first scored frame (the field's habit); ``all`` fits it over all scored frames, so that noise of the
-truth in one frame is told apart from tracking error.
+The tracker's object frame is its own choice, so one rigid constant T_obj_model is free, see
+:mod:`p2p_lib.evaluation.alignment`.
 """
 
 from __future__ import annotations
@@ -15,19 +14,30 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from p2p_lib.core import se3
+from p2p_lib.core import tables
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.models import given_models, load_points
 from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run
 from p2p_lib.evaluation import metrics
+from p2p_lib.evaluation.alignment import ALIGNMENTS, align_first
 
-ALIGNMENTS = ("first", "all")
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 MIN_VISIBLE_PX = 300
-SCORES = ("add_auc", "adds_auc", "add_auc_voc", "adds_auc_voc")
+#: Areas under the curve, and what tables call them.
+HEADS = {
+    "adds_auc": "ADD-S AUC [%]",
+    "add_auc": "ADD AUC [%]",
+    "adds_auc_voc": "ADD-S AUC, VOC [%]",
+    "add_auc_voc": "ADD AUC, VOC [%]",
+}
+#: What a score says of the run.
+WHAT_RAN = ("tracker", "masks", "preset", "seed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,27 +83,28 @@ class Evaluation:
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as ``p2p eval --json`` prints them: areas in percent, the mean is over objects."""
         objects = {name: score.as_dict() for name, score in self.objects.items()}
-        mean = {key: float(np.mean([o[key] for o in objects.values()])) for key in SCORES}
-        what_ran = {key: self.info.get(key) for key in ("tracker", "masks", "preset", "seed")}
+        mean = {key: float(np.mean([o[key] for o in objects.values()])) for key in HEADS}
+        what_ran = {key: self.info.get(key) for key in WHAT_RAN}
         return {"objects": objects, "mean": mean, "hz": self.hz, "p95_ms": self.p95_ms, **what_ran, "align": self.align}
+
+    def as_frame(self) -> DataFrame:
+        """A row per object and their mean: areas under the curve in percent, frames scored, frames lost among them."""
+        from pandas import DataFrame
+
+        plain = self.as_dict()
+        rows = [{"object": name, **scores} for name, scores in plain["objects"].items()]
+        total = {key: sum(row[key] for row in rows) for key in ("frames", "lost")}
+        rows += [{"object": "mean", **plain["mean"], **total}] if len(rows) > 1 else []
+        return DataFrame(rows)[["object", *HEADS, "frames", "lost"]].round(2).rename(columns=HEADS)
 
     def as_table(self) -> str:
         """The same for people, with the reason for what is not there."""
-        plain = self.as_dict()
-        rows = [(name, o, f"{o['frames']:7d} {o['lost']:5d}") for name, o in plain["objects"].items()]
-        rows += [("mean", plain["mean"], "")] if len(rows) > 1 else []
-        width = max(len(name) for name, _, _ in [*rows, ("object", {}, "")])
-        lines = [f"{'object':{width}}  ADD-S    ADD  ADD-S voc  ADD voc   frames  lost"]
-        for name, o, counts in rows:
-            exact = f"{o['adds_auc']:6.2f} {o['add_auc']:6.2f}"
-            voc = f"{o['adds_auc_voc']:6.2f}   {o['add_auc_voc']:6.2f}"
-            lines.append(f"{name:{width}} {exact}     {voc}  {counts}".rstrip())
+        lines = [tables.as_text(self.as_frame())]
         lines += [f"{name}: not scored, {reason}" for name, reason in self.left_out.items()]
         if self.hz is not None:
             lines.append(f"{self.hz:.1f} Hz, 95 % of the frames within {self.p95_ms:.1f} ms")
-        names = ("tracker", "masks", "preset", "seed")
-        lines.append(", ".join(f"{key} {plain[key]}" for key in names) + f", aligned by {self.align}")
-        return "\n".join(["AUC over 0 to 0.1 m in percent (exact, and in the VOC form)", *lines])
+        ran = ", ".join(f"{key} {self.info.get(key)}" for key in WHAT_RAN)
+        return "\n".join(["AUC over 0 to 0.1 m, exact and in the VOC form", *lines, f"{ran}, aligned by {self.align}"])
 
 
 def evaluate(
@@ -139,8 +150,7 @@ def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) ->
     has_pose = obj.has_pose[scored]
     T_obj_model = np.full((4, 4), np.nan)
     if has_pose.any():
-        fit = align_first if align == "first" else align_all
-        T_obj_model = fit(T_cam_obj[has_pose], T_cam_model[has_pose], points)
+        T_obj_model = ALIGNMENTS[align](T_cam_obj[has_pose], T_cam_model[has_pose], points)
     T_pred = T_cam_obj @ T_obj_model
     return ObjectScore(
         frame_index=obj.frame_index[scored],
@@ -152,15 +162,6 @@ def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) ->
     )
 
 
-def align_first(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """T_obj_model (4, 4) from the first of the (m, 4, 4) poses, so that its error is zero.
-
-    The prediction at t is then T_cam_obj(t) inv(T_cam_obj(f)) T_cam_model(f). f is the object's first scored
-    frame; where the object has no pose there, the first scored frame that has one (those before are failures).
-    """
-    return se3.inverse(T_cam_obj[0]) @ T_cam_model[0]
-
-
 def model_frames(run: Run, min_visible_px: int = MIN_VISIBLE_PX) -> dict[str, np.ndarray]:
     """Object to T_obj_model (4, 4) by :func:`align_first`, for those with a pose in a scored frame.
 
@@ -170,70 +171,8 @@ def model_frames(run: Run, min_visible_px: int = MIN_VISIBLE_PX) -> dict[str, np
     if not any(at.any() for at in usable.values()):
         fix = "Take the tracker's own object frame."
         raise MissingData(str(run.path), "no scored frame with truth and a pose, so no model frame", fix)
-    unused = np.empty((0, 3))
     found = {name: run.objects[name] for name, at in usable.items() if at.any()}
-    return {n: align_first(o.T_cam_obj[usable[n]], o.T_cam_model[usable[n]], unused) for n, o in found.items()}
-
-
-def align_all(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """T_obj_model (4, 4) that fits all (m, 4, 4) poses best, with few of them wild.
-
-    Every frame proposes Y_t = inv(T_cam_obj) T_cam_model. With M = mean of p p' over the homogeneous model points
-    and M = L L', the root mean square distance of the points under X and under Y_t is the Frobenius norm of
-    (X - Y_t) L. The constant minimises the sum of these distances, each cut off at 0.1 m where a pose
-    scores nothing anyway: it starts at the best of the proposals and is refined by reweighted least squares,
-    each step of which is closed form (the rigid transformation nearest to the weighted mean).
-    """
-    Y = (se3.inverse(T_cam_obj) @ T_cam_model)[:, :3]
-    homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
-    L = _square_root(homogeneous.T @ homogeneous / len(points))
-    best = _best_proposal(Y, L)
-    distances = _distances(best, Y, L)
-    for _ in range(200):
-        # 1e-9 m: a frame that fits exactly would otherwise have an infinite weight.
-        weights = (distances < metrics.MAX_M) / np.maximum(distances, 1e-9)
-        if not weights.any():
-            break
-        X = _nearest_rigid(np.einsum("t,tij->ij", weights / weights.sum(), Y), points)
-        moved = _distances(X, Y, L)
-        gain = _cost(distances) - _cost(moved)
-        if gain <= 0:
-            break
-        best, distances = X, moved
-        if gain < 1e-9 * len(Y):
-            break
-    return se3.from_rt(best[:, :3], best[:, 3])
-
-
-def _square_root(M: np.ndarray) -> np.ndarray:
-    values, vectors = np.linalg.eigh(M)
-    return vectors * np.sqrt(np.maximum(values, 0))
-
-
-def _distances(X: np.ndarray, Y: np.ndarray, L: np.ndarray) -> np.ndarray:
-    """Root mean square distance (..., m) in metres of the model's points under X (..., 3, 4) and under each Y."""
-    return np.linalg.norm((X[..., None, :, :] - Y) @ L, axis=(-2, -1))
-
-
-def _cost(distances: np.ndarray) -> np.ndarray:
-    return np.minimum(distances, metrics.MAX_M).sum(-1)
-
-
-def _best_proposal(Y: np.ndarray, L: np.ndarray) -> np.ndarray:
-    """The frame whose constant suits the others best; of long runs 400 evenly spread ones are tried, the first too."""
-    tried = np.unique(np.linspace(0, len(Y) - 1, 400).astype(int))
-    return Y[tried[int(np.argmin([_cost(_distances(Y[t], Y, L)) for t in tried]))]]
-
-
-def _nearest_rigid(mean: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The rigid (3, 4) that moves the points nearest, in the mean square, to where the affine ``mean`` moves them."""
-    centre = points.mean(0)
-    spread = (points - centre).T @ (points - centre) / len(points)
-    # A thousandth of isotropic spread: decides the turn about an axis on which all points lie, and nothing else.
-    spread += np.eye(3) * (np.trace(spread) * 1e-3 + 1e-12)
-    U, _, Vt = np.linalg.svd(mean[:, :3] @ spread)
-    R = U * [1, 1, np.linalg.det(U @ Vt)] @ Vt
-    return np.c_[R, mean[:, :3] @ centre + mean[:, 3] - R @ centre]
+    return {n: align_first(o.T_cam_obj[usable[n]], o.T_cam_model[usable[n]]) for n, o in found.items()}
 
 
 def rate(timings: Mapping[str, np.ndarray]) -> tuple[float | None, float | None]:

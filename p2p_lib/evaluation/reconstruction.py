@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.native import load_open3d
 from p2p_lib.datasets.models import load_mesh
 from p2p_lib.datasets.sequence import Sequence
-from p2p_lib.method.registration import fit_rigid
 
 if TYPE_CHECKING:
     import trimesh
@@ -119,17 +119,9 @@ def _cleaned(mesh: trimesh.Trimesh, T_model_obj: np.ndarray, truth: np.ndarray) 
 
 def _icp(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """T_target_source (4, 4) by point-to-point ICP from the identity; pairs beyond 2 cm are left out."""
-    from scipy.spatial import cKDTree
-
-    tree, T, last_m = cKDTree(target), np.eye(4), np.inf
-    for _ in range(_ICP_STEPS):
-        moved = se3.transform(T, source)
-        apart_m, nearest = tree.query(moved, distance_upper_bound=ICP_M)
-        paired = np.isfinite(apart_m)
-        if paired.sum() < 3:
-            return T
-        mean_m = float(np.sqrt((apart_m[paired] ** 2).mean()))
-        if abs(last_m - mean_m) < 1e-6:
-            return T
-        T, last_m = fit_rigid(source[paired], target[nearest[paired]]), mean_m
-    return T
+    open3d = load_open3d()
+    registration = open3d.pipelines.registration
+    clouds = (open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points)) for points in (source, target))
+    method = registration.TransformationEstimationPointToPoint()
+    end = registration.ICPConvergenceCriteria(1e-6, 1e-6, _ICP_STEPS)
+    return registration.registration_icp(*clouds, ICP_M, np.eye(4), method, end).transformation

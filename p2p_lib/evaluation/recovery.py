@@ -6,6 +6,7 @@ by one in which it is. The object is recovered at the first visible frame whose 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,26 +26,14 @@ class RecoveryEvent:
     hidden_frame        frame index at which it went out of sight, return_frame the first visible one after
     frames_to_recovery  frames from the return to the first good pose (0: at once); None: not before it
                         was hidden again or the run ended
-    frames_visible      frames scored from the return on until then
     """
 
     hidden_frame: int
     return_frame: int
     frames_to_recovery: int | None
-    frames_visible: int
-
-    def within(self, frames: int) -> bool:
-        """Whether it was recovered at most so many frames after its return."""
-        return self.frames_to_recovery is not None and self.frames_to_recovery <= frames
 
 
-def recovery_events(
-    obj: ObjectRun,
-    score: ObjectScore,
-    min_visible_px: int = MIN_VISIBLE_PX,
-    min_hidden: int = MIN_HIDDEN_FRAMES,
-    max_adds_m: float = MAX_ADDS_M,
-) -> list[RecoveryEvent]:
+def recovery_events(obj: ObjectRun, score: ObjectScore, min_visible_px: int = MIN_VISIBLE_PX) -> list[RecoveryEvent]:
     """The returns of one object in a run, by the rule that also decides which frames are scored.
 
     ``score`` is the object's from :func:`~p2p_lib.evaluation.protocol.evaluate` with the same ``min_visible_px``.
@@ -54,18 +43,19 @@ def recovery_events(
     adds_m[visible] = score.adds_m
     seen = np.flatnonzero(visible)
     # Rows of the last visible frame before, and of the first after, each stretch that is long enough.
-    gap = np.diff(obj.frame_index[seen]) > min_hidden
+    gap = np.diff(obj.frame_index[seen]) > MIN_HIDDEN_FRAMES
     before, after = seen[:-1][gap], seen[1:][gap]
     ends = np.append(after[1:], len(obj))
     events = []
     for last, first, end in zip(before, after, ends):
-        good = np.flatnonzero(adds_m[first:end] <= max_adds_m)
+        good = np.flatnonzero(adds_m[first:end] <= MAX_ADDS_M)
         returned = int(obj.frame_index[first])
         delay = int(obj.frame_index[first + good[0]]) - returned if len(good) else None
-        events.append(RecoveryEvent(int(obj.frame_index[last]) + 1, returned, delay, int(visible[first:end].sum())))
+        events.append(RecoveryEvent(int(obj.frame_index[last]) + 1, returned, delay))
     return events
 
 
-def recovered_within(events: list[RecoveryEvent], frames: tuple[int, ...] = WITHIN_FRAMES) -> dict[int, int]:
-    """For each N, the number of events that were recovered at most N frames after the return."""
-    return {n: sum(event.within(n) for event in events) for n in frames}
+def recovered_within(frames_to_recovery: Iterable[int | None], within: Iterable[int] = WITHIN_FRAMES) -> dict[int, int]:
+    """For each N, the number of returns after which the object was recovered within N frames."""
+    delays = [delay for delay in frames_to_recovery if delay is not None]
+    return {n: sum(delay <= n for delay in delays) for n in within}

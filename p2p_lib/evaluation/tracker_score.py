@@ -6,30 +6,32 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from p2p_lib.core.backends import make_tracker
-from p2p_lib.core.config import preset
-from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.config import Config
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.point_tracks import (
     THRESHOLDS_PX,
-    Redetections,
     TapVid,
     after_query,
+    redetection_shares,
     redetections,
     tapvid,
 )
-from p2p_lib.evaluation.true_tracks import Queries, TrueScene, TrueTracks, draw_queries, true_tracks
+from p2p_lib.evaluation.true_tracks import Queries, Sight, TrueScene, draw_queries, true_tracks
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True, eq=False)
 class TrackRun:
-    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms per picture.
+    """What a tracker said of the queries: uv_px (T, N, 2), visible and uncertainty (T, N), cpu_ms per image.
 
     Before its query a point is invisible and NaN. cpu_ms is the processor time of all threads in a frame,
     new queries included; NaN in frames before the first query.
@@ -46,8 +48,8 @@ class TrackerScore:
     """A tracker's scores on one sequence, with what they were measured on."""
 
     tapvid: TapVid
-    redetections: Redetections
-    truth: TrueTracks
+    redetections: DataFrame
+    truth: Sight
     run: TrackRun
     queries: Queries
     info: dict[str, Any]
@@ -58,7 +60,7 @@ class TrackerScore:
         for name in ("jaccard", "within"):
             scores[name] = {f"{px}_px": value for px, value in zip(THRESHOLDS_PX, scores[name], strict=True)}
         cpu_ms = {"mean": float(cost.mean()), "p95": float(np.percentile(cost, 95))} if len(cost) else {}
-        return {**self.info, **scores, "redetection": self.redetections.as_dict(), "cpu_ms": cpu_ms}
+        return {**self.info, **scores, "redetection": redetection_shares(self.redetections), "cpu_ms": cpu_ms}
 
     def as_table(self) -> str:
         """The same for people."""
@@ -82,7 +84,7 @@ class TrackTask:
     sequence: Sequence
     scene: TrueScene
     queries: Queries
-    truth: TrueTracks
+    truth: Sight
     seed: int
 
     @classmethod
@@ -101,6 +103,11 @@ class TrackTask:
     def scored(self) -> np.ndarray:
         """(T, N) bool: after the query, where truth says whether the point is visible."""
         return after_query(self.queries.frame, len(self.sequence)) & self.truth.known
+
+    def tracker(self, name: str, config: Config) -> PointTracker:
+        """The tracker of this name: ``oracle``, which knows the truth, or one of the known trackers."""
+        known = OracleTracker(self.scene, config.oracle, self.seed) if name == OracleTracker.name else name
+        return make_tracker(known, config.tracking, np.random.default_rng(self.seed))
 
     def score(self, tracker: PointTracker, search: bool = False) -> TrackerScore:
         """Run a tracker over the queries; ``search`` tells it where the objects' masks are, as the pipeline does."""
@@ -126,44 +133,10 @@ class TrackTask:
         )
 
 
-def score_tracker(
-    sequence: Sequence,
-    tracker: PointTracker,
-    seed: int = 0,
-    models: Mapping[str, str | Path] | None = None,
-    count: int = 256,
-    search: bool = False,
-) -> TrackerScore:
-    """Draw queries, find their true tracks, run the tracker over them, and score it: one :class:`TrackTask`."""
-    return TrackTask.of(sequence, seed, models, count).score(tracker, search)
-
-
-def compare_trackers(
-    task: TrackTask,
-    contestants: Mapping[str, tuple[str, Mapping[str, Any]]],
-    left_out: Mapping[str, str] | None = None,
-) -> dict[str, TrackerScore | str]:
-    """The same queries to several trackers: a score by label, or the reason why there is none.
-
-    contestants  label to tracker and settings, e.g. ``"SH(10)": ("builtin", {"tracking.forget_after": 10})``
-    left_out     labels that are not to run, with the reason
-    """
-    return {label: (left_out or {}).get(label) or _try(task, *one) for label, one in contestants.items()}
-
-
-def _try(task: TrackTask, name: str, settings: Mapping[str, Any]) -> TrackerScore | str:
-    config = preset(seed=task.seed).with_values(dict(settings))
-    try:
-        known = OracleTracker(task.scene, config.oracle, task.seed) if name == OracleTracker.name else name
-        return task.score(make_tracker(known, config.tracking, np.random.default_rng(task.seed)))
-    except MissingBackend as error:
-        return str(error)
-
-
 def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, search: bool = False) -> TrackRun:
     """Stream the sequence through the tracker in one pass, each query added at its frame.
 
-    What a tracker says late is scored in the frame that it is of; for the last ones the last picture is repeated.
+    What a tracker says late is scored in the frame that it is of; for the last ones the last image is repeated.
     """
     total, n, late = len(sequence), len(queries), tracker.latency_frames
     uv, visible = np.full((total, n, 2), np.nan), np.zeros((total, n), bool)

@@ -1,7 +1,7 @@
 """True tracks of any pixel of a sequence with truth: lifted onto the true surface, carried by the true pose.
 
 A query is lifted onto the object's mesh at its true pose by a ray, or by the measured depth where there is no
-mesh. In another frame the point is *visible* when it lies in the picture and in the object's mask, its surface
+mesh. In another frame the point is *visible* when it lies in the image and in the object's mask, its surface
 faces the camera, no other part of the mesh is in front of it, and the depth measured at its pixel lies within
 :data:`DEPTH_TOLERANCE_M` of the true surface (a pixel without a measurement agrees where there is a mask).
 """
@@ -19,8 +19,8 @@ from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import lift
 from p2p_lib.core.errors import MissingData
 from p2p_lib.core.image import in_mask, nearest_px
-from p2p_lib.core.native import load_open3d
-from p2p_lib.core.types import Frame
+from p2p_lib.core.raycasting import cast, ray_scene
+from p2p_lib.core.types import Frame, joined
 from p2p_lib.datasets.models import MESHES, find_models, given_models, load_mesh
 from p2p_lib.datasets.sequence import Sequence
 
@@ -49,23 +49,18 @@ class SurfacePoints:
         """The points at these indices or under this mask."""
         return SurfacePoints(self.object[keep], self.p_model[keep], self.normal[keep])
 
-    def joined(self, other: SurfacePoints) -> SurfacePoints:
-        """These points, then the others."""
-        pairs = ((self.object, other.object), (self.p_model, other.p_model), (self.normal, other.normal))
-        return SurfacePoints(*(np.concatenate(pair) for pair in pairs))
-
 
 NO_POINTS = SurfacePoints(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """Surface points in one frame, as truth has them.
+    """Surface points as truth has them, in one frame (N, ...) or in all frames of a sequence (T, N, ...).
 
-    uv_px    (N, 2) NaN where the object's pose is not known
-    visible  (N,) bool
-    known    (N,) bool: truth can say whether the point is visible
-    view     (N, 3) unit vectors from the point to the camera, in the model frame
+    uv_px    (..., 2) NaN where the object's pose is not known
+    visible  (...,) bool
+    known    (...,) bool: truth can say whether the point is visible
+    view     (..., 3) unit vectors from the point to the camera, in the model frame
     """
 
     uv_px: np.ndarray
@@ -87,7 +82,7 @@ class TrueScene:
             raise MissingData(sequence.name, "has no true poses", fix)
         self.sequence = sequence
         self.objects = tuple(sequence.truth)
-        self._scenes = {name: _ray_scene(*load_mesh(path)) for name, path in (meshes or {}).items()}
+        self._scenes = {name: ray_scene(*load_mesh(path)) for name, path in (meshes or {}).items()}
 
     @classmethod
     def of(cls, sequence: Sequence, models: Mapping[str, str | Path] | None = None) -> TrueScene:
@@ -121,7 +116,7 @@ class TrueScene:
                 continue
             if name in self._scenes:
                 rays = self.sequence.camera.unproject(uv_px[rows], np.ones(len(rows))) @ T_cam_model[:3, :3]
-                p_model[rows], normal[rows] = _cast(self._scenes[name], se3.inverse(T_cam_model)[:3, 3], rays)
+                p_model[rows], normal[rows] = self._lift_by_ray(name, T_cam_model, rays)
             else:
                 p_model[rows], normal[rows] = self._lift_by_depth(frame, uv_px[rows], T_cam_model)
         return SurfacePoints(np.asarray(object, np.int64), p_model, normal)
@@ -151,8 +146,8 @@ class TrueScene:
         self, frame: Frame, name: str, mask: np.ndarray | None, T_cam_model: np.ndarray, points: SurfacePoints
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixels, visibility and view of one object's points at its pose."""
-        eye = se3.inverse(T_cam_model)[:3, 3]
-        away = eye - points.p_model
+        centre = se3.inverse(T_cam_model)[:3, 3]
+        away = centre - points.p_model
         distance_m = np.linalg.norm(away, axis=1)
         view = away / distance_m[:, None]
         p_cam = se3.transform(T_cam_model, points.p_model)
@@ -164,7 +159,7 @@ class TrueScene:
         visible = self.sequence.camera.inside(uv) & ~(cosine < MIN_COSINE)  # an unknown normal hides nothing
         visible &= agrees if mask is None else mask[v, u] & (agrees | (measured_m == 0))
         if name in self._scenes:
-            hit_m = _distance_m(self._scenes[name], eye, -view)
+            hit_m, _ = self._first_hits(name, centre, -view)
             visible &= hit_m > distance_m - _SELF_OCCLUSION_M
         return uv, visible, view
 
@@ -175,6 +170,21 @@ class TrueScene:
         normal = np.cross(p_cam[4] - p_cam[3], p_cam[2] - p_cam[1])  # y down times x right: towards the camera
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         return se3.transform(se3.inverse(T_cam_model), p_cam[0]), normal @ T_cam_model[:3, :3]
+
+    def _lift_by_ray(self, name: str, T_cam_model: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        centre = se3.inverse(T_cam_model)[:3, 3]
+        distance_m, normal = self._first_hits(name, centre, rays)
+        met = np.isfinite(distance_m)[:, None]
+        # Towards the camera, so that a mesh wound the other way round serves as well.
+        normal *= -np.sign(np.einsum("nc,nc->n", normal, rays))[:, None]
+        reach = np.where(met, distance_m[:, None], 0)
+        return np.where(met, centre + reach * rays, np.nan), np.where(met, normal, np.nan)
+
+    def _first_hits(self, name: str, centre: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distance (N,) along unit rays (N, 3) to the mesh, infinite without a hit, and the triangles' normals."""
+        hit = cast(self._scenes[name], centre, rays)
+        return hit["t_hit"].astype(float), hit["primitive_normals"].astype(float)
 
     def _masks(self, i: int) -> dict[str, np.ndarray]:
         return self.sequence.masks(i) or {}
@@ -190,16 +200,6 @@ class Queries:
 
     def __len__(self) -> int:
         return len(self.frame)
-
-
-@dataclass(frozen=True, eq=False)
-class TrueTracks:
-    """Queries over the whole sequence: as :class:`Sight`, each array with a leading axis of frames."""
-
-    uv_px: np.ndarray
-    visible: np.ndarray
-    known: np.ndarray
-    view: np.ndarray
 
 
 def draw_queries(scene: TrueScene, rng: np.random.Generator, count: int = 256, at: int = 4) -> Queries:
@@ -221,16 +221,12 @@ def draw_queries(scene: TrueScene, rng: np.random.Generator, count: int = 256, a
                 break
     if not drawn:
         raise MissingData(scene.sequence.name, "no visible point to ask for", "Masks and true poses are needed.")
-    points = drawn[0].points
-    for one in drawn[1:]:
-        points = points.joined(one.points)
-    return Queries(np.concatenate([d.frame for d in drawn]), np.concatenate([d.uv_px for d in drawn]), points)
+    return joined(drawn)
 
 
-def true_tracks(scene: TrueScene, points: SurfacePoints) -> TrueTracks:
+def true_tracks(scene: TrueScene, points: SurfacePoints) -> Sight:
     """The true tracks of surface points over the whole sequence."""
-    sights = [scene.see(scene.sequence.frame(i), points) for i in range(len(scene.sequence))]
-    return TrueTracks(*(np.stack([getattr(s, name) for s in sights]) for name in ("uv_px", "visible", "known", "view")))
+    return joined([scene.see(scene.sequence.frame(i), points) for i in range(len(scene.sequence))], np.stack)
 
 
 def _draw(scene: TrueScene, frame: Frame, wanted: int, rng: np.random.Generator) -> Queries:
@@ -245,36 +241,3 @@ def _draw(scene: TrueScene, frame: Frame, wanted: int, rng: np.random.Generator)
     points, uv = points.select(met), uv[met]
     seen = np.flatnonzero(scene.see(frame, points).visible)[:wanted]
     return Queries(np.full(len(seen), frame.index), uv[seen], points.select(seen))
-
-
-def _ray_scene(vertices: np.ndarray, faces: np.ndarray):
-    """An Open3D scene of one mesh in its own frame."""
-    open3d = load_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
-    return scene
-
-
-def _cast(scene, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First hits (N, 3) of rays (N, 3) from one eye, and outward normals there; NaN where nothing is hit."""
-    length = np.linalg.norm(rays, axis=1, keepdims=True)
-    rays = rays / length
-    hit = _answer(scene, eye, rays)
-    distance_m = hit["t_hit"].numpy().astype(float)
-    met = np.isfinite(distance_m)[:, None]
-    normal = hit["primitive_normals"].numpy().astype(float)
-    # Towards the eye, so that a mesh wound the other way round serves as well.
-    normal *= -np.sign(np.einsum("nc,nc->n", normal, rays))[:, None]
-    reach = np.where(met[:, 0], distance_m, 0)[:, None]
-    return np.where(met, eye + reach * rays, np.nan), np.where(met, normal, np.nan)
-
-
-def _distance_m(scene, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Distance (N,) from the eye to the first surface along unit rays (N, 3); infinite where there is none."""
-    return _answer(scene, eye, rays)["t_hit"].numpy().astype(float)
-
-
-def _answer(scene, eye: np.ndarray, rays: np.ndarray) -> dict:
-    open3d = load_open3d()
-    lines = np.concatenate([np.broadcast_to(eye, rays.shape), rays], 1).astype(np.float32)
-    return scene.cast_rays(open3d.core.Tensor(lines))

@@ -1,9 +1,11 @@
-"""Films: pictures to MP4 (or GIF) files, and into a notebook."""
+"""Films: images to MP4 files, and into a notebook."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,61 +15,19 @@ CRF = 23  # x264's constant quality: smaller is better and larger
 
 
 def write_video(images: Iterable[np.ndarray], path: str | Path, fps: float = 30.0) -> Path:
-    """Write pictures (H, W, 3) uint8 of one size as H.264 in MP4, or as a GIF where the path ends so.
+    """Write images (H, W, 3) uint8 of one size as H.264 in MP4; the path written.
 
-    Returns the path written: a ``.gif`` beside the one asked for where PyAV is missing or built without an H.264
-    encoder. The last row or column of a picture of odd size is left out, which the pixel format wants.
+    The last row or column of an image of odd size is left out, as the pixel format requires.
     """
-    path = Path(path)
-    if path.suffix not in (".mp4", ".gif"):
-        raise BadInput("video", path.name, "a name that ends in .mp4 or .gif")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".mp4" and not _can_encode():
-        path = path.with_suffix(".gif")
-    writer = _write_mp4 if path.suffix == ".mp4" else _write_gif
-    if not writer(_checked(images), path, fps):
-        raise BadInput("video", "no pictures", "at least one")
-    return path
-
-
-def show_video(path: str | Path, width_px: int | None = None):
-    """The film inside the notebook itself, so that exported pages play it too: an IPython display object."""
-    from IPython.display import Image, Video
-
-    path = Path(path)
-    if not path.is_file():
-        raise MissingData(str(path), "no such film")
-    if path.suffix == ".gif":
-        return Image(filename=str(path), width=width_px)
-    return Video(str(path), embed=True, width=width_px, html_attributes="controls autoplay loop muted playsinline")
-
-
-def _can_encode() -> bool:
-    try:
-        import av
-    except ImportError:
-        return False
-    return "libx264" in av.codecs_available
-
-
-def _checked(images: Iterable[np.ndarray]) -> Iterable[np.ndarray]:
-    shape = None
-    for image in images:
-        shape = shape or image.shape
-        if image.shape != shape or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise BadInput("video", f"a picture {image.shape} {image.dtype}", "(H, W, 3) uint8, all of one size")
-        yield image[: shape[0] // 2 * 2, : shape[1] // 2 * 2]
-
-
-def _write_mp4(images: Iterable[np.ndarray], path: Path, fps: float) -> bool:
-    from fractions import Fraction
-
     import av
 
-    stream = None
+    path, stream = Path(path), None
+    if path.suffix != ".mp4":
+        raise BadInput("video", path.name, "a name that ends in .mp4")
+    path.parent.mkdir(parents=True, exist_ok=True)
     # Without "bitexact" the file would name the builds that wrote it.
     with av.open(str(path), "w", options={"movflags": "+faststart", "fflags": "+bitexact"}) as container:
-        for image in images:
+        for image in _checked(images):
             if stream is None:
                 stream = container.add_stream("libx264", Fraction(fps).limit_denominator(1000))
                 stream.height, stream.width = image.shape[:2]
@@ -75,17 +35,25 @@ def _write_mp4(images: Iterable[np.ndarray], path: Path, fps: float) -> bool:
                 # How many threads encode changes the bytes, and x264's macroblock tree reads memory it never wrote.
                 stream.options = {"crf": str(CRF), "preset": "medium", "threads": "2", "x264-params": "mbtree=0"}
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24")))
-        if stream is not None:
-            container.mux(stream.encode())
-    return stream is not None
+        if stream is None:
+            raise BadInput("video", "no images", "at least one")
+        container.mux(stream.encode())
+    return path
 
 
-def _write_gif(images: Iterable[np.ndarray], path: Path, fps: float) -> bool:
-    from PIL import Image
+def show_video(path: str | Path, width_px: int | None = None) -> Any:
+    """The film inside the notebook itself, so that exported pages play it too: an IPython display object."""
+    from IPython.display import Video
 
-    pages = [Image.fromarray(image).quantize(128) for image in images]
-    if pages:
-        # GIF counts in hundredths of a second, and players take less than two for ten.
-        duration_ms = max(20, round(100 / fps) * 10)
-        pages[0].save(path, save_all=True, append_images=pages[1:], duration=duration_ms, loop=0)
-    return bool(pages)
+    if not Path(path).is_file():
+        raise MissingData(str(path), "no such film")
+    return Video(str(path), embed=True, width=width_px, html_attributes="controls autoplay loop muted playsinline")
+
+
+def _checked(images: Iterable[np.ndarray]) -> Iterable[np.ndarray]:
+    shape = None
+    for image in images:
+        shape = shape or image.shape
+        if image.shape != shape or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise BadInput("video", f"an image {image.shape} {image.dtype}", "(H, W, 3) uint8, all of one size")
+        yield image[: shape[0] // 2 * 2, : shape[1] // 2 * 2]

@@ -1,4 +1,4 @@
-"""Pictures of reconstructed meshes: rendered with their own colours, as the synthetic bodies are."""
+"""Images of reconstructed meshes: rendered with their own colours, as the synthetic bodies are."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def draw_mesh(mesh: trimesh.Trimesh | Mesh, camera: Camera, T_cam_obj: np.ndarra
     if clay:
         body = replace(body, texture=np.full((2, 2, 3), _CLAY, np.uint8))
     lamp = Light(towards=tuple(T_cam_obj[:3, :3].T @ _LAMP), ambient=0.3) if clay else _AS_SEEN
-    picture = render([(body, se3.IDENTITY)], camera, se3.inverse(T_cam_obj), lamp)
-    image = np.where((picture.label > 0)[..., None], picture.rgb, 255)
+    drawn = render([(body, se3.IDENTITY)], camera, se3.inverse(T_cam_obj), lamp)
+    image = np.where((drawn.label > 0)[..., None], drawn.rgb, 255)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
@@ -46,4 +46,4 @@ def as_body(mesh: trimesh.Trimesh) -> Mesh:
     uv = np.stack([(column + 0.5) / side, 1 - (row + 0.5) / side], -1)
     normals = np.asarray(mesh.vertex_normals)[faces]
     vertices = np.asarray(mesh.vertices, float)
-    return Mesh(vertices, faces, np.repeat(uv[:, None], 3, 1), texture, normals, closed=False)
+    return Mesh(vertices, faces, np.repeat(uv[:, None], 3, 1), texture, normals)

@@ -1,12 +1,12 @@
-"""Drawing on pictures: boxes, axes, masks, points, labels.
+"""Drawing on images: boxes, axes, masks, points, labels.
 
-Every function takes an RGB picture (H, W, 3) uint8 and returns a new one. Colours are ``#RRGGBB``; lines are
+Every function takes an RGB image (H, W, 3) uint8 and returns a new one. Colours are ``#RRGGBB``; lines are
 antialiased, placed to a sixteenth of a pixel, and carry a dark rim so that they show on any background.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,6 +19,7 @@ from p2p_lib.figures import style
 
 _SHIFT = 4  # OpenCV's fixed-point coordinates: sixteenths of a pixel
 _NEAR_M = 0.02  # lines are cut off here, in front of the camera
+_GAP_PX = 4  # between the images of a montage
 _FONT, _RIM = cv2.FONT_HERSHEY_SIMPLEX, "#101010"
 
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -42,18 +43,14 @@ class Box:
             raise BadInput("box size_m", self.size_m, "three lengths in metres")
 
     @classmethod
-    def around(cls, points: np.ndarray, T_obj_points: np.ndarray = se3.IDENTITY, keep: float = 1.0) -> Box:
-        """The box of points (N, 3) along the axes of their own frame; ``keep`` < 1 leaves out the farthest of them."""
+    def around(cls, points: np.ndarray, T_obj_points: np.ndarray = se3.IDENTITY) -> Box:
+        """The box of points (N, 3) along the axes of their own frame."""
         points = np.asarray(points, float)
         points = points[np.isfinite(points).all(1)]
         if not len(points):
             raise BadInput("box", "no finite points", "at least one")
-        low, high = np.quantile(points, [(1 - keep) / 2, (1 + keep) / 2], axis=0)
+        low, high = points.min(0), points.max(0)
         return cls(T_obj_points @ se3.from_rt(np.eye(3), (low + high) / 2), high - low)
-
-    def moved(self, T_new_obj: np.ndarray) -> Box:
-        """The same box in another frame."""
-        return Box(T_new_obj @ self.T_obj_box, self.size_m)
 
 
 def box_corners(size_m: np.ndarray) -> np.ndarray:
@@ -95,14 +92,11 @@ def draw_mask(image: np.ndarray, mask: np.ndarray, colour: str, width_px: int = 
     """A mask's (H, W) outline, and its inside tinted by a share ``fill``."""
     image, mask = image.copy(), np.asarray(mask, bool)
     if mask.shape != image.shape[:2]:
-        raise BadInput("mask", mask.shape, f"{image.shape[:2]} as the picture")
+        raise BadInput("mask", mask.shape, f"{image.shape[:2]} as the image")
     if fill > 0:
         image[mask] = np.rint((1 - fill) * image[mask] + fill * np.array(style.rgb(colour))).astype(np.uint8)
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    for paint, thickness, share in ((_RIM, width_px + 2, 0.6), (colour, width_px, 1.0)):
-        drawn = cv2.drawContours(image.copy(), outlines, -1, style.rgb(paint), thickness, cv2.LINE_AA)
-        image = cv2.addWeighted(drawn, share, image, 1 - share, 0)
-    return image
+    return _rimmed(image, lambda on, *paint: cv2.drawContours(on, outlines, -1, *paint, cv2.LINE_AA), colour, width_px)
 
 
 def draw_masks(
@@ -123,13 +117,11 @@ def draw_points(
         colours = np.tile(np.array(style.rgb(colours), np.uint8), (len(uv_px), 1))
     shown = np.flatnonzero(np.isfinite(uv_px).all(1) & (np.abs(uv_px) < 1e5).all(1))
     one, radius = 1 << _SHIFT, round(radius_px * (1 << _SHIFT))
-    for (u, v), colour in zip(np.rint(uv_px[shown] * one).astype(int).tolist(), colours[shown].tolist()):
-        if filled:
-            cv2.circle(image, (u, v), radius + one, style.rgb(_RIM), -1, cv2.LINE_AA, _SHIFT)
-            cv2.circle(image, (u, v), radius, colour, -1, cv2.LINE_AA, _SHIFT)
-        else:
-            cv2.circle(image, (u, v), radius, style.rgb(_RIM), 3, cv2.LINE_AA, _SHIFT)
-            cv2.circle(image, (u, v), radius, colour, 1, cv2.LINE_AA, _SHIFT)
+    # A dark disc behind a dot, a thicker dark ring behind a ring.
+    behind, before = ((radius + one, -1), (radius, -1)) if filled else ((radius, 3), (radius, 1))
+    for at, colour in zip(np.rint(uv_px[shown] * one).astype(int).tolist(), colours[shown].tolist()):
+        for (size, thickness), paint in ((behind, style.rgb(_RIM)), (before, colour)):
+            cv2.circle(image, at, size, paint, thickness, cv2.LINE_AA, _SHIFT)
     return image
 
 
@@ -150,7 +142,7 @@ def value_colours(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def depth_scale(depth_m: np.ndarray) -> str:
-    """What the colours of :func:`depth_picture` mean, in words for a caption."""
+    """What the colours of :func:`depth_image` mean, for a caption."""
     near, far = _depth_range(depth_m)
     return f"yellow {near:.2f} m to dark blue {far:.2f} m"
 
@@ -161,18 +153,15 @@ def _depth_range(depth_m: np.ndarray) -> tuple[float, float]:
     return tuple(np.quantile(known, [0.005, 0.995]).tolist()) if len(known) else (np.nan, np.nan)
 
 
-def depth_picture(depth_m: np.ndarray) -> np.ndarray:
-    """Depth (H, W) as a picture: near is yellow, far is dark blue (cividis), no measurement is white."""
-    known = depth_m > 0
-    if not known.any():
-        return np.full((*depth_m.shape, 3), 255, np.uint8)
+def depth_image(depth_m: np.ndarray) -> np.ndarray:
+    """Depth (H, W) as an image: near is yellow, far is dark blue (cividis), no measurement is white."""
     near, far = _depth_range(depth_m)
-    values = np.where(known, -depth_m, np.nan).ravel()
+    values = np.where(depth_m > 0, -depth_m, np.nan).ravel()
     return value_colours(values, -max(far, near + 1e-6), -near).reshape(*depth_m.shape, 3)
 
 
 def draw_trail(image: np.ndarray, uv_px: np.ndarray, colour: str, width_px: int = 2) -> np.ndarray:
-    """A path (N, 2) through the picture; NaN interrupts it."""
+    """A path (N, 2) through the image; NaN interrupts it."""
     pairs = np.stack([uv_px[:-1], uv_px[1:]], 1) if len(uv_px) > 1 else np.zeros((0, 2, 2))
     return _stroke(image, pairs[np.isfinite(pairs).all((1, 2))], colour, width_px, rim=0)
 
@@ -227,15 +216,31 @@ def zoomed(
     return part, replace(camera, fx=camera.fx * s, fy=camera.fy * s_v, cx=cx, cy=cy, width=width_px, height=height_px)
 
 
-def montage(images: Sequence[np.ndarray], columns: int, gap_px: int = 4) -> np.ndarray:
-    """Pictures of one size, row by row, with white between them."""
+def zoomed_px(uv_px: np.ndarray, camera: Camera, seen_by: Camera) -> np.ndarray:
+    """Pixels (..., 2) of one camera in the image of the camera that :func:`zoomed` returned."""
+    scale = np.array([seen_by.fx / camera.fx, seen_by.fy / camera.fy])
+    return scale * (uv_px - np.array([camera.cx, camera.cy])) + [seen_by.cx, seen_by.cy]
+
+
+def region_around(
+    shown: np.ndarray, camera: Camera, margin_px: tuple[int, int] = (12, 12)
+) -> tuple[int, int, int, int]:
+    """The rectangle (left, top, right, bottom) around a mask (H, W) bool or pixels (N, 2), with margins (u, v)."""
+    uv_px = np.argwhere(shown)[:, ::-1] if shown.dtype == bool else shown
+    left, top = np.maximum(np.floor(uv_px.min(0)).astype(int) - margin_px, 0)
+    right, bottom = np.minimum(np.ceil(uv_px.max(0)).astype(int) + margin_px + 1, [camera.width, camera.height])
+    return int(left), int(top), int(right), int(bottom)
+
+
+def montage(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """Images of one size, row by row, with white between them."""
     if not len(images) or len({image.shape for image in images}) != 1:
-        raise BadInput("montage", sorted({image.shape for image in images}), "pictures of one size")
+        raise BadInput("montage", sorted({image.shape for image in images}), "images of one size")
     h, w, _ = images[0].shape
     rows = -(-len(images) // columns)
-    sheet = np.full((rows * (h + gap_px) - gap_px, columns * (w + gap_px) - gap_px, 3), 255, np.uint8)
+    sheet = np.full((rows * (h + _GAP_PX) - _GAP_PX, columns * (w + _GAP_PX) - _GAP_PX, 3), 255, np.uint8)
     for k, image in enumerate(images):
-        top, left = k // columns * (h + gap_px), k % columns * (w + gap_px)
+        top, left = k // columns * (h + _GAP_PX), k % columns * (w + _GAP_PX)
         sheet[top : top + h, left : left + w] = image
     return sheet
 
@@ -264,11 +269,20 @@ def _stroke(
 ) -> np.ndarray:
     """Segments (M, 2, 2) in pixels; ``rim`` is how dark the rim is, ``strength`` how opaque the line."""
     lines = list(np.rint(segments * (1 << _SHIFT)).astype(np.int32)[:, :, None])
-    image = image.copy()
-    for paint, thickness, share in ((_RIM, width_px + 2, rim), (colour, width_px, strength)):
-        if lines and share:
-            drawn = cv2.polylines(image.copy(), lines, False, style.rgb(paint), thickness, cv2.LINE_AA, _SHIFT)
-            image = cv2.addWeighted(drawn, share, image, 1 - share, 0)
+
+    def draw(on: np.ndarray, *paint) -> np.ndarray:
+        return cv2.polylines(on, lines, False, *paint, cv2.LINE_AA, _SHIFT)
+
+    return _rimmed(image, draw, colour, width_px, rim, strength) if lines else image.copy()
+
+
+def _rimmed(
+    image: np.ndarray, draw: Callable, colour: str, width_px: int, rim: float = 0.6, strength: float = 1.0
+) -> np.ndarray:
+    """``draw(image, rgb, thickness)`` first for a dark rim, then in colour, each as opaque as it says."""
+    for paint, thickness, opacity in ((_RIM, width_px + 2, rim), (colour, width_px, strength)):
+        drawn = draw(image.copy(), style.rgb(paint), thickness)
+        image = cv2.addWeighted(drawn, opacity, image, 1 - opacity, 0)
     return image
 
 

@@ -30,7 +30,7 @@ CLOUD_MAX_M = 2.5
 class Playback:
     """One run over its frames; rows i are those of the run, whatever frame of the sequence they are.
 
-    sequence  None where its folder is gone: then there are no pictures, points and masks
+    sequence  None where its folder is gone: then there are no images, points and masks
     """
 
     run: Run
@@ -89,7 +89,7 @@ class Playback:
         return rows, se3.inverse(obj.T_cam_obj[rows])
 
     def frame(self, i: int) -> Frame | None:
-        """The picture of row i, where it can still be had."""
+        """The image of row i, where it can still be had."""
         return None if self.sequence is None else self.sequence.frame(int(self.frame_index[i]))
 
     def cloud(self, frame: Frame, points: int) -> tuple[np.ndarray, np.ndarray]:

@@ -18,28 +18,50 @@ from p2p_lib.figures import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 _WIDTH_IN = 8.0
 _ALIGNED = {"first": "aligned at the first scored frame", "all": "aligned by one constant over all frames"}
+_EDGE = {"edgecolor": "#333333", "linewidth": 0.3}
+
+
+def panels(
+    count: int, size_in: tuple[float, float], ratios: list[float] | None = None, side_by_side: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """A figure without global state, and its axes below each other (sharing time) or side by side."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(size_in, layout="constrained")
+    if side_by_side:
+        axes = figure.subplots(1, count, width_ratios=ratios, squeeze=False)[0]
+    else:
+        axes = figure.subplots(count, 1, height_ratios=ratios, sharex=True, squeeze=False)[:, 0]
+    return figure, list(axes)
+
+
+def logarithmic(*axes: Axis, base: float = 10) -> None:
+    """Logarithmic scales (``axes.xaxis``, ``axes.yaxis``) with plain numbers at their ticks."""
+    for axis in axes:
+        getattr(axis.axes, f"set_{axis.axis_name}scale")("log", base=base)
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
 
 
 def status_intervals(status: np.ndarray) -> list[tuple[str, int, int]]:
-    """Runs of equal values: (value, start, stop) of every span [start, stop), in order, without holes."""
+    """Spans of equal values, without holes: (value, start, stop) of every span [start, stop), in order."""
     status = np.asarray(status)
-    if not len(status):
-        return []
     edges = [0, *(np.flatnonzero(status[1:] != status[:-1]) + 1).tolist(), len(status)]
-    return [(str(status[a]), a, b) for a, b in pairwise(edges)]
+    return [(str(status[a]), a, b) for a, b in pairwise(edges) if a < b]
 
 
 def gaps(obj: ObjectRun, at_least: int = 5) -> list[tuple[int, int]]:
     """Spans [start, stop) of at least so many frames without a pose, after the object was first seen."""
-    with_pose = np.isin(obj.status, [str(s) for s in WITH_POSE])
-    spans = status_intervals(np.where(with_pose, "pose", "none"))
-    return [(a, b) for kind, a, b in spans if kind == "none" and a > 0 and b - a >= at_least]
+    spans = status_intervals(np.isin(obj.status, [str(status) for status in WITH_POSE]))
+    return [(a, b) for with_pose, a, b in spans if with_pose == "False" and a > 0 and b - a >= at_least]
 
 
+@style.styled
 def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
     """ADD, rotation and translation error of every object over time, above its statuses.
 
@@ -47,83 +69,78 @@ def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
     without a pose, whose error is infinite, is a cross at the upper edge.
     """
     names = [name for name in run.objects if name in evaluation.objects]
-    with style.applied():
-        ratios = [3, 2, 2, 0.42 * len(run.objects)]
-        figure, axes = panels(4, (_WIDTH_IN, 6.4), ratios)
-        for name in names:
-            _draw_errors(axes, name, run.objects[name], evaluation.objects[name], _colours(run)[name])
-        for axis, unit in zip(axes, ("ADD [mm]", "rotation [°]", "translation [mm]")):
-            axis.set_ylabel(unit)
-            _logarithmic(axis)
-        axes[0].legend(loc="upper left", ncols=len(names))
-        axes[0].set_title(f"Error over time, {run.info['sequence']}, {_ALIGNED[evaluation.align]}")
-        draw_strip(axes[3], run)
-        figure.align_ylabels(axes[:3])
+    colours = style.object_colours(run.objects)
+    figure, axes = panels(4, (_WIDTH_IN, 6.4), [3, 2, 2, 0.42 * len(run.objects)])
+    for name in names:
+        _draw_errors(axes, name, run.objects[name], evaluation.objects[name], colours[name])
+    for axis, unit in zip(axes, ("ADD [mm]", "rotation [°]", "translation [mm]")):
+        axis.set_ylabel(unit)
+        _at_least_a_decade(axis)
+    axes[0].legend(loc="upper left", ncols=len(names))
+    axes[0].set_title(f"Error over time, {run.info['sequence']}, {_ALIGNED[evaluation.align]}")
+    draw_strip(axes[3], run)
+    figure.align_ylabels(axes[:3])
     return figure
 
 
+@style.styled
 def status_strip(run: Run) -> Figure:
-    """One line per object: what its pose estimate was worth at every moment."""
-    with style.applied():
-        figure, (axis,) = panels(1, (_WIDTH_IN, 1.0 + 0.32 * len(run.objects)), [1])
-        draw_strip(axis, run)
-        axis.set_title(f"Status over time, {run.info['sequence']}")
+    """One line per object: its status at every moment."""
+    figure, (axis,) = panels(1, (_WIDTH_IN, 1.0 + 0.32 * len(run.objects)))
+    draw_strip(axis, run)
+    axis.set_title(f"Status over time, {run.info['sequence']}")
     return figure
 
 
+@style.styled
 def accuracy_threshold(evaluation: Evaluation, max_m: float = metrics.MAX_M) -> Figure:
-    """The share of scored frames with an error below a threshold; its area is the AUC in the legend (exact form)."""
-    with style.applied():
-        figure, axes = panels(2, (_WIDTH_IN, 2.9), [1, 1], side_by_side=True)
-        colours = style.object_colours(evaluation.info.get("objects") or evaluation.objects)
-        for axis, metric in zip(axes, ("add_m", "adds_m")):
-            title = {"add_m": "ADD", "adds_m": "ADD-S"}[metric]
-            for name, score in evaluation.objects.items():
-                errors = getattr(score, metric)
-                threshold, share = accuracy_curve(errors, max_m)
-                label = f"{name}: {metrics.auc_exact(errors, max_m):.1f} %"
-                axis.step(100 * threshold, 100 * share, where="post", color=colours[name], label=label)
-            axis.set(xlabel=f"threshold on {title} [cm]", xlim=(0, 100 * max_m), ylim=(0, 102))
-            axis.set_title(f"{title}: area under the curve")
-            axis.legend(loc="lower right")
-        axes[0].set_ylabel("frames below [%]")
-        figure.suptitle(evaluation.info.get("sequence"), x=0.01, ha="left", fontsize=9)
+    """The fraction of scored frames with an error below a threshold; its area is the AUC in the legend (exact form)."""
+    figure, axes = panels(2, (_WIDTH_IN, 2.9), side_by_side=True)
+    colours = style.object_colours(evaluation.info.get("objects") or evaluation.objects)
+    for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S"))):
+        for name, score in evaluation.objects.items():
+            errors_m = getattr(score, key)
+            threshold_m, fraction = accuracy_curve(errors_m, max_m)
+            label = f"{name}: {metrics.auc_exact(errors_m, max_m):.1f} %"
+            axis.step(100 * threshold_m, 100 * fraction, where="post", color=colours[name], label=label)
+        axis.set(xlabel=f"threshold on {title} [cm]", xlim=(0, 100 * max_m), ylim=(0, 102))
+        axis.set_title(f"{title}: area under the curve")
+        axis.legend(loc="lower right")
+    axes[0].set_ylabel("frames below [%]")
+    figure.suptitle(evaluation.info.get("sequence"), x=0.01, ha="left", fontsize=9)
     return figure
 
 
-def accuracy_curve(errors: np.ndarray, max_m: float = metrics.MAX_M) -> tuple[np.ndarray, np.ndarray]:
-    """Thresholds and the share of errors at or below each: the corners of the accuracy-threshold curve."""
-    below = np.sort(errors[errors < max_m])
-    share = np.arange(1, len(below) + 1) / max(len(errors), 1)
-    last = share[-1] if len(below) else 0.0
-    return np.r_[0.0, below, max_m], np.r_[0.0, share, last]
+def accuracy_curve(errors_m: np.ndarray, max_m: float = metrics.MAX_M) -> tuple[np.ndarray, np.ndarray]:
+    """Thresholds and the fraction of errors at or below each: the corners of the accuracy-threshold curve."""
+    below = np.sort(errors_m[errors_m < max_m])
+    fraction = np.arange(len(below) + 1) / max(len(errors_m), 1)
+    return np.r_[0.0, below, max_m], np.r_[fraction, fraction[-1]]
 
 
+@style.styled
 def stage_timings(run: Run) -> Figure:
     """Mean milliseconds per stage, in frames that added a keyframe and in the others."""
     if not len(run.timings.get("total_ms", ())):
         raise BadInput("timings", "a run without timings", "what p2p run wrote")
     key = run.timings["keyframe"] > 0
-    stages = [c for c in run.timings if c.endswith("_ms") and c != "total_ms"]
     # A stage that did not run took no time.
-    ms = {c: np.nan_to_num(run.timings[c]) for c in [*stages, "total_ms"]}
-    order = [*sorted(stages, key=lambda c: -ms[c].mean()), "total_ms"]
-    with style.applied():
-        figure, (axis,) = panels(1, (_WIDTH_IN, 0.6 + 0.36 * len(order)), [1])
-        for k, (which, colour, label) in enumerate(zip((~key, key), style.NEUTRAL, ("other frames", "keyframes"))):
-            if not which.any():
-                continue
-            means = [ms[c][which].mean() for c in order]
+    ms = {name: np.nan_to_num(values) for name, values in run.timings.items() if name.endswith("_ms")}
+    order = sorted(ms, key=lambda name: (name == "total_ms", -ms[name].mean()))
+    figure, (axis,) = panels(1, (_WIDTH_IN, 0.6 + 0.36 * len(order)))
+    for k, (which, colour, label) in enumerate(zip((~key, key), style.NEUTRAL, ("other frames", "keyframes"))):
+        if which.any():
+            means = [ms[name][which].mean() for name in order]
             at = np.arange(len(order)) + 0.4 * k - 0.2
             bars = axis.barh(at, means, 0.38, color=colour, label=f"{label} ({which.sum()})")
             axis.bar_label(bars, [f"{m:.1f}" if m else "" for m in means], padding=2, fontsize=7)
-        axis.set_yticks(range(len(order)), [c.removesuffix("_ms") for c in order])
-        axis.invert_yaxis()
-        axis.margins(x=0.08)
-        axis.grid(axis="y", visible=False)
-        axis.set(xlabel="milliseconds a frame, mean")
-        axis.legend(loc="upper right")
-        axis.set_title(f"Where the time goes, {run.info['sequence']}, tracker {run.info['tracker']}")
+    axis.set_yticks(range(len(order)), [name.removesuffix("_ms") for name in order])
+    axis.invert_yaxis()
+    axis.margins(x=0.08)
+    axis.grid(axis="y", visible=False)
+    axis.set(xlabel="milliseconds a frame, mean")
+    axis.legend(loc="upper right")
+    axis.set_title(f"Where the time goes, {run.info['sequence']}, tracker {run.info['tracker']}")
     return figure
 
 
@@ -131,19 +148,12 @@ def _draw_errors(axes: list[Axes], name: str, obj: ObjectRun, score: ObjectScore
     """One object's three lines over all frames; what is not scored is left out."""
     rows = np.searchsorted(obj.frame_index, score.frame_index)
     angle_rad, apart_m = pose_error(obj, score)
-    add_m = np.full(len(obj), np.nan)
-    add_m[rows] = np.where(np.isfinite(score.add_m), score.add_m, np.nan)
-    scored = np.isin(np.arange(len(obj)), rows)
+    add_m, scored = np.full(len(obj), np.nan), np.zeros(len(obj), bool)
+    add_m[rows], scored[rows] = np.where(np.isfinite(score.add_m), score.add_m, np.nan), True
     for axis, values in zip(axes, (1e3 * add_m, np.degrees(angle_rad), 1e3 * apart_m)):
         # The frame of the alignment has no error at all, which a logarithm cannot show: below a micrometre is none.
-        axis.plot(
-            obj.time_s,
-            np.where(scored & (values > 1e-3), values, np.nan),
-            color=colour,
-            marker=".",
-            markersize=2.5,
-            label=name,
-        )
+        shown = np.where(scored & (values > 1e-3), values, np.nan)
+        axis.plot(obj.time_s, shown, color=colour, marker=".", markersize=2.5, label=name)
         for start, stop in gaps(obj):
             axis.axvspan(*_span_s(obj, start, stop), color=colour, alpha=0.13, lw=0)
     failed = obj.time_s[rows[~np.isfinite(score.add_m)]]
@@ -152,30 +162,27 @@ def _draw_errors(axes: list[Axes], name: str, obj: ObjectRun, score: ObjectScore
         axes[0].plot(failed, np.full(len(failed), 0.97), "x", color=colour, markersize=4, transform=edge, clip_on=False)
 
 
-def _logarithmic(axis: Axes) -> None:
-    """A drift of a millimetre and a flip of the object both belong into the picture; at least one decade is shown."""
+def _at_least_a_decade(axis: Axes) -> None:
+    """A logarithmic axis on which a drift of a millimetre and a flip of the object both have their place."""
     values = np.concatenate([line.get_ydata() for line in axis.get_lines() if line.get_marker() != "x"])
     values = values[np.isfinite(values)]
     low, high = (values.min(), values.max()) if len(values) else (1.0, 10.0)
-    axis.set_yscale("log")
+    logarithmic(axis.yaxis)
     axis.set_ylim(min(low / 1.6, high / 6), max(high * 1.6, low * 6))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter("")
 
 
 def draw_strip(axis: Axes, run: Run, named: Iterable[str] | None = None) -> None:
     """Statuses as coloured, hatched bars, a line per object; a legend of those ``named``, else of those that occur."""
     from matplotlib.patches import Patch
 
-    names = list(run.objects)
-    occurring = []
-    for k, name in enumerate(names):
-        obj = run.objects[name]
+    names, occurring, times_s = list(run.objects), set(), []
+    for k, obj in enumerate(run.objects.values()):
         for status, start, stop in status_intervals(obj.status):
             fill, hatch = style.STATUS[Status(status)]
             left, right = _span_s(obj, start, stop)
-            axis.barh(k, right - left, 0.72, left, color=fill, hatch=hatch, edgecolor="#333333", linewidth=0.3)
-            occurring.append(status)
+            axis.barh(k, right - left, 0.72, left, color=fill, hatch=hatch, **_EDGE)
+            occurring.add(status)
+            times_s += [left, right]
     axis.set_yticks(range(len(names)), names)
     for label, colour in zip(axis.get_yticklabels(), style.object_colours(names).values()):
         label.set(color=colour, fontweight="bold")
@@ -184,10 +191,9 @@ def draw_strip(axis: Axes, run: Run, named: Iterable[str] | None = None) -> None
     axis.spines["left"].set_visible(False)
     axis.tick_params(left=False)
     axis.set_xlabel("time [s]", loc="left")
-    times = [t for obj in run.objects.values() for t in (obj.time_s[0], _span_s(obj, len(obj) - 1, len(obj))[1])]
-    axis.set_xlim(min(times), max(times))
+    axis.set_xlim(min(times_s), max(times_s))
     patches = [
-        Patch(facecolor=fill, hatch=hatch, edgecolor="#333333", linewidth=0.3, label=str(status))
+        Patch(facecolor=fill, hatch=hatch, label=str(status), **_EDGE)
         for status, (fill, hatch) in style.STATUS.items()
         if str(status) in (occurring if named is None else named)
     ]
@@ -199,21 +205,3 @@ def _span_s(obj: ObjectRun, start: int, stop: int) -> tuple[float, float]:
     """The time that rows [start, stop) last: up to the next frame, and as long as the last one at the end."""
     end = obj.time_s[stop] if stop < len(obj) else 2 * obj.time_s[-1] - obj.time_s[-2] if len(obj) > 1 else 1.0
     return float(obj.time_s[start]), float(end)
-
-
-def _colours(run: Run) -> dict[str, str]:
-    return style.object_colours(run.objects)
-
-
-def panels(
-    count: int, size_in: tuple[float, float], ratios: list[float], side_by_side: bool = False
-) -> tuple[Figure, list[Axes]]:
-    """A figure that no global state knows of, and its axes below each other (sharing time) or side by side."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(size_in, layout="constrained")
-    if side_by_side:
-        axes = figure.subplots(1, count, width_ratios=ratios, squeeze=False)[0]
-    else:
-        axes = figure.subplots(count, 1, height_ratios=ratios, sharex=True, squeeze=False)[:, 0]
-    return figure, list(axes)

@@ -1,6 +1,6 @@
-"""The only way out for a picture, a film or a table: each with a note of what it was made from.
+"""Figures, films and tables are written here alone, each with a note of what it was made from.
 
-Pictures and films go to ``$P2P_FIGURES`` (else ``figures/`` of the project), tables to ``$P2P_TABLES`` (else
+Figures and films go to ``$P2P_FIGURES`` (else ``figures/`` of the project), tables to ``$P2P_TABLES`` (else
 ``out/tables/``). Beside ``NAME.png`` lies ``NAME.json``: parameters, what was read, versions, commit. Neither holds a
 time or a folder of this machine, so that the same work gives the same bytes.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import html
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -18,31 +17,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pandas import DataFrame
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.tables import as_html, as_markdown
 from p2p_lib.datasets.provenance import provenance
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.figures import film as video
 from p2p_lib.figures import style
-from p2p_lib.figures.typeset import Table
+from p2p_lib.figures.tables import Table
 
-_WHAT_RAN = (
-    "sequence",
-    "objects",
-    "start",
-    "stop",
-    "frames",
-    "tracker",
-    "masks",
-    "preset",
-    "seed",
-    "commit",
-    "modified",
-)
-_SHOWN_PX = 900  # a notebook shows pictures at most this wide
+_WHAT_RAN = "sequence objects start stop frames tracker masks preset seed commit modified".split()
+_SHOWN_PX = 900  # a notebook shows images at most this wide
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +48,14 @@ class Saved:
 def save_figure(
     figure: Any, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
 ) -> Saved:
-    """Write a Matplotlib figure as PNG and PDF, or a picture (H, W, 3) uint8 as PNG, with its note.
+    """Write a Matplotlib figure as PNG and PDF, or an image (H, W, 3) uint8 as PNG, with its note.
 
     sources     what it was drawn from: runs, evaluations, sequences, files
     parameters  what decided how it was made: profile, seed, ...
     """
     target = _target(paths.figure_dir(), name)
     if isinstance(figure, np.ndarray):
-        width_px = _write_picture(figure, target)
+        width_px = _write_image(figure, target)
         suffixes, drawn_with = [".png"], []
     else:
         width_px = _write_plot(figure, target)
@@ -85,62 +74,29 @@ def save_video(
     sources: Iterable[Any] = (),
     parameters: Mapping[str, Any] | None = None,
 ) -> Saved:
-    """Write pictures as a film (see :func:`~p2p_lib.figures.film.write_video`) with its note; shown embedded."""
+    """Write images as a film (see :func:`~p2p_lib.figures.film.write_video`) with its note; shown embedded."""
     target = _target(paths.figure_dir(), name)
     path = video.write_video(images, target.with_name(f"{name}.mp4"), fps)
     _write_note(target, [path.suffix], sources, {**(parameters or {}), "fps": fps}, ["av"])
-    film = video.show_video(path)
-    data = film._repr_mimebundle_() if path.suffix == ".gif" else {"text/html": film._repr_html_()}
-    bundle = data if isinstance(data, tuple) else (data, {})
-    return Saved(path, ({**bundle[0], "text/plain": f"<{path.name}>"}, bundle[1]))
+    shown = {"text/html": video.show_video(path)._repr_html_(), "text/plain": f"<{path.name}>"}
+    return Saved(path, (shown, {}))
 
 
 def save_table(
-    table: Any, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
+    table: DataFrame | Table, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
 ) -> Saved:
-    """Write a pandas DataFrame as CSV and Markdown, with its note. What is missing is a dash in Markdown.
-
-    A :class:`~p2p_lib.figures.typeset.Table` is written as LaTeX besides.
-    """
+    """Write a table as CSV and Markdown, one for papers as LaTeX besides, with its note."""
     target = _target(paths.table_dir(), name)
     if isinstance(table, Table):
-        return _save_typeset(table, target, sources, parameters)
-    target.with_name(f"{name}.csv").write_text(table.to_csv(index=False, lineterminator="\n"), encoding="utf-8")
-    markdown = as_markdown(table)
-    target.with_name(f"{name}.md").write_text(markdown, encoding="utf-8")
-    _write_note(target, [".csv", ".md"], sources, parameters, ["pandas"])
-    return Saved(target.with_name(f"{name}.csv"), ({"text/html": as_html(table), "text/plain": markdown}, {}))
-
-
-def _save_typeset(table: Table, target: Path, sources: Iterable[Any], parameters: Mapping[str, Any] | None) -> Saved:
-    markdown = table.markdown()
-    for suffix, text in ((".csv", table.csv()), (".md", markdown), (".tex", table.latex())):
-        target.with_name(f"{target.name}{suffix}").write_text(text, encoding="utf-8")
-    _write_note(target, [".csv", ".md", ".tex"], sources, parameters, [])
-    return Saved(target.with_name(f"{target.name}.csv"), ({"text/html": table.html(), "text/plain": markdown}, {}))
-
-
-def as_markdown(table: Any) -> str:
-    """A DataFrame as a Markdown table, numbers to the right, its index left out."""
-    numeric = [kind in "fiu" for kind in (table[c].dtype.kind for c in table.columns)]
-    rows = [[_cell(value) for value in row] for row in table.itertuples(index=False)]
-    lines = [[str(c) for c in table.columns], ["---:" if n else "---" for n in numeric], *rows]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
-def as_html(table: Any) -> str:
-    """A DataFrame as HTML, numbers to the right, words to the left, its index left out."""
-    sides = ["right" if table[c].dtype.kind in "fiu" else "left" for c in table.columns]
-    rows = [("th", table.columns), *(("td", row) for row in table.itertuples(index=False))]
-    lines = [
-        "".join(f'<{tag} style="text-align: {side}">{_html_cell(v)}</{tag}>' for side, v in zip(sides, row))
-        for tag, row in rows
-    ]
-    return "<table>\n" + "".join(f"<tr>{line}</tr>\n" for line in lines) + "</table>\n"
-
-
-def _html_cell(value: Any) -> str:
-    return html.escape(_cell(value).replace("\\|", "|")).replace("$", "<span>$</span>")
+        files = {".csv": table.csv(), ".md": table.markdown(), ".tex": table.latex()}
+        page = table.html()
+    else:
+        files = {".csv": table.to_csv(index=False, lineterminator="\n"), ".md": as_markdown(table)}
+        page = as_html(table)
+    for suffix, text in files.items():
+        target.with_name(f"{name}{suffix}").write_text(text, encoding="utf-8")
+    _write_note(target, list(files), sources, parameters, ["pandas"])
+    return Saved(target.with_name(f"{name}.csv"), ({"text/html": page, "text/plain": files[".md"]}, {}))
 
 
 def describe(source: Any) -> dict[str, Any]:
@@ -179,7 +135,7 @@ def _sha256(path: Path) -> str | None:
 
 
 def _target(folder: Path, name: str) -> Path:
-    """Where NAME goes, without a suffix."""
+    """The path of NAME, without a suffix."""
     if not re.fullmatch(r"\w[\w-]*", name):
         raise BadInput("figure name", repr(name), "letters, digits, '_' and '-': it names files")
     folder.mkdir(parents=True, exist_ok=True)
@@ -194,7 +150,7 @@ def _write_plot(figure: Any, target: Path) -> int:
         return round(figure.get_figwidth() * figure.dpi)
 
 
-def _write_picture(image: np.ndarray, target: Path) -> int:
+def _write_image(image: np.ndarray, target: Path) -> int:
     from PIL import Image
 
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
@@ -232,9 +188,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return value.name
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-
-
-def _cell(value: Any) -> str:
-    if value is None or value != value:  # NaN
-        return "-"
-    return f"{value:g}" if isinstance(value, float) else str(value).replace("|", "\\|")

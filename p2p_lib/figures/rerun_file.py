@@ -22,7 +22,7 @@ JPEG_QUALITY = 80
 #: Points of a frame, and the radii in metres of those points and of keypoints.
 POINTS, _POINT_M, _KEYPOINT_M, _AXES_M = 5000, 0.002, 0.002, 0.06
 #: Where things are: as parts, since an object's name may hold what a path may not.
-_PICTURE, _SCENE = ["camera", "picture"], ["scene"]
+_IMAGE, _SCENE = ["camera", "picture"], ["scene"]
 
 
 def write_rerun(run: str | Path, out: str | Path, sequence: Sequence | None = None) -> Path:
@@ -42,7 +42,7 @@ def write_rerun(run: str | Path, out: str | Path, sequence: Sequence | None = No
     for i in range(len(playback)):
         stream.set_time("frame", sequence=int(playback.frame_index[i]))
         stream.set_time("time", duration=float(playback.times_s[i]))
-        _log_pictures(rr, stream, playback, i)
+        _log_images(rr, stream, playback, i)
         for name in playback.run.objects:
             _log_object(rr, stream, playback, name, i)
     stream.flush()
@@ -81,7 +81,7 @@ def _log_constants(rr: Any, stream: Any, playback: Playback) -> None:
         pinhole = rr.Pinhole(
             image_from_camera=camera.K, width=camera.width, height=camera.height, image_plane_distance=0.1
         )
-        stream.log(_PICTURE, pinhole, static=True)
+        stream.log(_IMAGE, pinhole, static=True)
     statuses = [str(status) for status in Status]
     fills = [style.rgb(style.STATUS[status][0]) for status in Status]
     for name in names:
@@ -96,19 +96,19 @@ def _log_constants(rr: Any, stream: Any, playback: Playback) -> None:
             stream.log(["paths", name], path, static=True)
 
 
-def _log_pictures(rr: Any, stream: Any, playback: Playback, i: int) -> None:
-    """The picture, the masks on it, and the points behind it."""
+def _log_images(rr: Any, stream: Any, playback: Playback, i: int) -> None:
+    """The image, the masks on it, and the points behind it."""
     frame = playback.frame(i)
     if frame is None:
         return
-    stream.log([*_PICTURE, "rgb"], rr.Image(frame.rgb).compress(jpeg_quality=JPEG_QUALITY))
+    stream.log([*_IMAGE, "rgb"], rr.Image(frame.rgb).compress(jpeg_quality=JPEG_QUALITY))
     labels = np.zeros(frame.shape, np.uint8)
     masks = playback.masks(i)
     for k, name in enumerate(playback.run.objects, 1):
         if name in masks:
             labels[masks[name]] = k
     if masks:
-        stream.log([*_PICTURE, "masks"], rr.SegmentationImage(labels, opacity=0.4))
+        stream.log([*_IMAGE, "masks"], rr.SegmentationImage(labels, opacity=0.4))
     p_cam, colours = playback.cloud(frame, POINTS)
     stream.log("points", rr.Points3D(p_cam, colors=colours, radii=_POINT_M))
 
@@ -125,7 +125,7 @@ def _log_object(rr: Any, stream: Any, playback: Playback, name: str, i: int) -> 
     points = playback.keypoints.get(name)
     if points is not None:
         seen = points.at(int(playback.frame_index[i]))
-        stream.log([*_PICTURE, "tracks", name], rr.Points2D(points.uv_px[seen], colors=colour, radii=2.5))
+        stream.log([*_IMAGE, "tracks", name], rr.Points2D(points.uv_px[seen], colors=colour, radii=2.5))
     if not has[i]:
         if i and has[i - 1]:
             stream.log([*_SCENE, name], rr.Clear(recursive=True))

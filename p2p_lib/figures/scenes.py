@@ -1,4 +1,4 @@
-"""What a run shows at a frame: boxes, axes, paths and statuses on its video; single pictures, stories, films."""
+"""What a run shows at a frame: boxes, axes, paths and statuses on its video; single images, stories, films."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Scene:
         return overlay.draw_caption(image, f"{self.sequence.name}  {frame.time_s:.2f} s")
 
     def film(self, rows: Iterable[int] | None = None, **drawing) -> Iterator[np.ndarray]:
-        """The pictures of these rows (default: all) one after the other; ``drawing`` as of :meth:`draw`."""
+        """The images of these rows (default: all) one after the other; ``drawing`` as of :meth:`draw`."""
         return (self.draw(row, **drawing) for row in (range(len(self)) if rows is None else rows))
 
     def story(self, count: int = 6, columns: int = 3, width_px: int = 360) -> np.ndarray:
@@ -110,14 +110,14 @@ class Scene:
         return rows
 
     def region(self, margin: float = 0.08) -> tuple[int, int, int, int]:
-        """Where in the picture the objects are over the whole run, with a margin (a share of the picture's width)."""
+        """The rectangle of the objects over the whole run, with a margin (a fraction of the image's width)."""
         camera = self.sequence.camera
-        uv = [
-            camera.project(se3.transform(T, overlay.box_corners(box.size_m)))
-            for name, obj in self.run.objects.items()
-            for T, box in self._placed(name, obj)
-        ]
-        uv = np.concatenate([x.reshape(-1, 2) for x in uv]) if uv else np.zeros((0, 2))
+        uv = [np.zeros((0, 2))]
+        for name, obj in self.run.objects.items():
+            for T_cam_box, box in self._placed(name, obj):
+                p_cam = se3.transform(T_cam_box, overlay.box_corners(box.size_m))
+                uv.append(camera.project(p_cam).reshape(-1, 2))
+        uv = np.concatenate(uv)
         uv = uv[camera.inside(uv)]
         if not len(uv):
             return 0, 0, camera.width, camera.height
@@ -137,34 +137,29 @@ class Scene:
         self, image: np.ndarray, camera: Camera, name: str, obj: ObjectRun, row: int, axes: bool, trail: int
     ) -> np.ndarray:
         colour, box, true_box = self.colours[name], self._boxes.get(name), self._model_boxes.get(name)
-        T_obj_centre = box.T_obj_box if box else se3.IDENTITY
         if true_box and obj.has_truth[row]:
-            image = overlay.draw_box(
-                image, camera, obj.T_cam_model[row] @ true_box.T_obj_box, true_box.size_m, style.TRUTH, 1, dashed=True
-            )
+            T_cam_box = obj.T_cam_model[row] @ true_box.T_obj_box
+            image = overlay.draw_box(image, camera, T_cam_box, true_box.size_m, style.TRUTH, 1, dashed=True)
         if not obj.has_pose[row]:
             return image
-        path = camera.project((obj.T_cam_obj[max(row - trail, 0) : row + 1] @ T_obj_centre)[:, :3, 3])
-        image = overlay.draw_trail(image, path, colour)
-        T_cam_box = obj.T_cam_obj[row] @ T_obj_centre
+        T_cam_box = obj.T_cam_obj[max(row - trail, 0) : row + 1] @ (box.T_obj_box if box else se3.IDENTITY)
+        image = overlay.draw_trail(image, camera.project(T_cam_box[:, :3, 3]), colour)
         if box:
-            image = overlay.draw_box(image, camera, T_cam_box, box.size_m, colour)
+            image = overlay.draw_box(image, camera, T_cam_box[-1], box.size_m, colour)
         length_m = 0.45 * float(np.max(box.size_m)) if box else 0.05
-        return overlay.draw_axes(image, camera, T_cam_box, length_m) if axes else image
+        return overlay.draw_axes(image, camera, T_cam_box[-1], length_m) if axes else image
 
     def _label(self, camera: Camera, name: str, obj: ObjectRun, row: int) -> Label | None:
         """The object's name and status, at its estimated box, else its true one, else where it was last seen."""
-        box, true_box = self._boxes.get(name), self._model_boxes.get(name)
-        T_cam_box, size_m = None, np.zeros(3)
-        before = np.flatnonzero(obj.has_pose[: row + 1])
-        if not obj.has_pose[row] and true_box and obj.has_truth[row]:
-            T_cam_box, size_m = obj.T_cam_model[row] @ true_box.T_obj_box, true_box.size_m
+        box, before = self._boxes.get(name), np.flatnonzero(obj.has_pose[: row + 1])
+        if not obj.has_pose[row] and name in self._model_boxes and obj.has_truth[row]:
+            box, T_cam_obj = self._model_boxes[name], obj.T_cam_model[row]
         elif len(before):
-            T_cam_box = obj.T_cam_obj[before[-1]] @ (box.T_obj_box if box else se3.IDENTITY)
-            size_m = box.size_m if box else size_m
-        if T_cam_box is None:
+            T_cam_obj = obj.T_cam_obj[before[-1]]
+        else:
             return None
-        uv = camera.project(se3.transform(T_cam_box, overlay.box_corners(size_m)))
+        corners = se3.transform(box.T_obj_box, overlay.box_corners(box.size_m)) if box else np.zeros((1, 3))
+        uv = camera.project(se3.transform(T_cam_obj, corners))
         if not np.isfinite(uv).all():
             return None
         return Label(f"{name}: {obj.status[row]}", self.colours[name], (*uv.min(0), *uv.max(0)))

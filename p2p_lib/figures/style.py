@@ -6,8 +6,9 @@ vermillion are kept for statuses, whose strips are hatched besides, so that they
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
+from functools import wraps
 
 from p2p_lib.core.types import Status
 from p2p_lib.evaluation.point_tracks import Outcome
@@ -82,3 +83,14 @@ def applied() -> AbstractContextManager:
     import matplotlib
 
     return matplotlib.rc_context(_RC)
+
+
+def styled(plot: Callable) -> Callable:
+    """A function that draws with this style."""
+
+    @wraps(plot)
+    def draw(*args, **kwargs):
+        with applied():
+            return plot(*args, **kwargs)
+
+    return draw

@@ -1,47 +1,20 @@
-"""Scores as tables: pandas DataFrames that say their units."""
+"""Returns after occlusion as a table, and tables for papers: cells with a number, its spread and its reason."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+import html
+import string
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from pandas import DataFrame, MultiIndex
 
 from p2p_lib.core import se3
+from p2p_lib.core.tables import as_html, as_markdown
 from p2p_lib.datasets.runs import Run
-from p2p_lib.evaluation.protocol import SCORES, Evaluation
+from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import recovery_events
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
-#: Scores by the words of a table's head; the areas are over 0 to 0.1 m.
-HEADS = {
-    "adds_auc": "ADD-S AUC [%]",
-    "add_auc": "ADD AUC [%]",
-    "adds_auc_voc": "ADD-S AUC, VOC [%]",
-    "add_auc_voc": "ADD AUC, VOC [%]",
-}
-
-
-def of_rows(rows: Iterable[Mapping[str, Any]]) -> DataFrame:
-    """A table of one row per mapping; the keys are its heads, units included."""
-    from pandas import DataFrame
-
-    return DataFrame(list(rows))
-
-
-def score_table(evaluation: Evaluation) -> DataFrame:
-    """A row per object and their mean: areas under the curve in percent, frames scored, frames lost among them."""
-    from pandas import DataFrame
-
-    plain = evaluation.as_dict()
-    rows = [
-        {"object": name, **_areas(scores), "frames": scores["frames"], "lost": scores["lost"]}
-        for name, scores in plain["objects"].items()
-    ]
-    total = {key: sum(row[key] for row in rows) for key in ("frames", "lost")}
-    return DataFrame([*rows, {"object": "mean", **_areas(plain["mean"]), **total}] if len(rows) > 1 else rows)
 
 
 def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
@@ -49,32 +22,161 @@ def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
 
     A good pose is one with an ADD-S of at most 2 cm; a dash where there was none before the object was hidden again.
     """
-    from pandas import DataFrame
-
     rows = []
     for name, score in evaluation.objects.items():
         obj = run.objects[name]
         for event in recovery_events(obj, score):
             gone, back = np.searchsorted(obj.frame_index, [event.hidden_frame, event.return_frame])
-            moved_m, turned_rad = _moved(obj.T_cam_model[gone - 1], obj.T_cam_model[back])
-            times_s = round(float(obj.time_s[gone]), 2), round(float(obj.time_s[back]), 2)
-            rows.append((name, *times_s, round(100 * moved_m, 1), round(float(np.degrees(turned_rad)), 1)))
-            rows[-1] += (event.frames_to_recovery,)
-    heads = (
-        "object",
-        "hidden at [s]",
-        "back at [s]",
-        "moved unseen [cm]",
-        "turned unseen [°]",
-        "frames to a good pose",
-    )
-    return DataFrame(rows, columns=heads)
+            T_before, T_after = obj.T_cam_model[gone - 1], obj.T_cam_model[back]
+            row = {
+                "object": name,
+                "hidden at [s]": obj.time_s[gone].round(2),
+                "back at [s]": obj.time_s[back].round(2),
+                "moved unseen [cm]": (100 * np.linalg.norm(T_after[:3, 3] - T_before[:3, 3])).round(1),
+                "turned unseen [°]": np.degrees(se3.angle_rad(se3.inverse(T_before) @ T_after)).round(1),
+                "frames to a good pose": event.frames_to_recovery,
+            }
+            rows.append(row)
+    return DataFrame(rows)
 
 
-def _moved(T_cam_before: np.ndarray, T_cam_after: np.ndarray) -> tuple[float, float]:
-    moved_m = np.linalg.norm(T_cam_after[:3, 3] - T_cam_before[:3, 3])
-    return float(moved_m), float(se3.angle_rad(se3.inverse(T_cam_before) @ T_cam_after))
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a table for papers.
+
+    text  as it is shown: a number, ``fail``, or a dash
+    bold  the best of those that may be compared
+    note  what has to be said of it; of a dash, its reason. Equal notes share a letter below the table
+    """
+
+    text: str = "-"
+    bold: bool = False
+    note: str = ""
 
 
-def _areas(scores: dict[str, float]) -> dict[str, float]:
-    return {HEADS[key]: round(scores[key], 2) for key in HEADS if key in SCORES}
+def number(value: float | None, spread: float | None = None, digits: int = 2, note: str = "") -> Cell:
+    """A number with its spread behind a ±; a dash where there is none."""
+    if value is None or value != value:
+        return Cell(note=note)
+    shown = f"{value:.{digits}f}" + (f" ± {spread:.{digits}f}" if spread is not None else "")
+    return Cell(shown, note=note)
+
+
+def emboldened(cells: Sequence[Cell], more_is_better: bool) -> list[Cell]:
+    """The cells of methods that may be compared, the best number in bold: as printed, so that equals share it.
+
+    A number beats one that failed; a dash takes no part.
+    """
+    values = [_printed(cell) for cell in cells]
+    known = [value for value in values if value is not None]
+    if not known or sum(cell.text != "-" for cell in cells) < 2:
+        return list(cells)
+    best = max(known) if more_is_better else min(known)
+    return [replace(cell, bold=value == best) for cell, value in zip(cells, values, strict=True)]
+
+
+def _printed(cell: Cell) -> float | None:
+    try:
+        return float(cell.text.partition(" ")[0])
+    except ValueError:
+        return None
+
+
+_TEX = {"\\": r"\textbackslash{}", "±": r"$\pm$", "Δ": r"$\Delta$", "°": r"$^\circ$", "~": r"\textasciitilde{}"}
+_TEX |= {c: "\\" + c for c in "&%$#_{}"} | {"^": r"\textasciicircum{}"}
+
+
+def _tex(text: str) -> str:
+    return "--" if text == "-" else text.translate(str.maketrans(_TEX))
+
+
+@dataclass(frozen=True)
+class _Language:
+    """How a format writes text, bold text, and the letter of a note."""
+
+    escape: Callable[[str], str]
+    bold: str
+    letter: str
+
+    def cell(self, cell: Cell, letters: dict[str, str]) -> str:
+        text = self.escape(cell.text)
+        text = self.bold.format(text) if cell.bold else text
+        return text + (self.letter.format(letters[cell.note]) if cell.note else "")
+
+
+_MARKDOWN = _Language(str, "**{}**", " ({})")
+_HTML = _Language(html.escape, "<b>{}</b>", "<sup>{}</sup>")
+_LATEX = _Language(_tex, r"\textbf{{{}}}", r"\textsuperscript{{{}}}")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table for papers.
+
+    groups  heads above the heads, each with the number of columns it spans; none where empty
+    words   how many columns at the left are words
+    rules   rows above which a line is drawn
+    notes   sentences below it that belong to the whole
+    """
+
+    title: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    groups: Sequence[tuple[str, int]] = ()
+    words: int = 1
+    rules: Sequence[int] = ()
+    notes: Sequence[str] = ()
+
+    def letters(self) -> dict[str, str]:
+        """Note to its letter, in the order in which they occur."""
+        found = dict.fromkeys(cell.note for row in self.rows for cell in row if cell.note)
+        names = [a + b for a in ["", *string.ascii_lowercase] for b in string.ascii_lowercase]
+        return dict(zip(found, names, strict=False))
+
+    def markdown(self) -> str:
+        """For pages and README files."""
+        table = as_markdown(self._frame(_MARKDOWN, ": "), self.words)
+        said = "".join(f"{line}  \n" for line in self._said("({}) "))
+        return f"**{self.title}**\n\n{table}\n" + said.replace("$", r"\$")  # else it is an equation
+
+    def html(self) -> str:
+        """For notebooks: small, with the groups in a line of their own, so that all columns fit on a page."""
+        table = as_html(self._frame(_HTML), self.words, self.rules, escape=False)
+        said = "<br>\n".join(map(html.escape, self._said("({}) "))).replace("$", "<span>$</span>")
+        return f'<p><b>{html.escape(self.title)}</b></p>\n{table}\n<p style="font-size: 11px">{said}</p>\n'
+
+    def latex(self) -> str:
+        """For papers; needs the package booktabs."""
+        table = self._frame(_LATEX)
+        table.iloc[list(self.rules), 0] = [rf"\midrule {cell}" for cell in table.iloc[list(self.rules), 0]]
+        sides = "l" * self.words + "c" * (len(self.heads) - self.words)
+        style = {"column_format": f"@{{}}{sides}@{{}}", "multicol_align": "c", "position_float": "centering"}
+        lines = table.style.hide(axis="index").to_latex(hrules=True, caption=_LATEX.escape(self.title), **style)
+        said = " ".join(self._said(r"\textsuperscript{{{}}}~", _LATEX.escape))
+        return lines.replace(r"\end{table}", rf"\par\footnotesize {said}" + "\n" + r"\end{table}")
+
+    def csv(self) -> str:
+        """Values alone, and a column that says why some are missing."""
+        table = self._frame(_Language(lambda text: "" if text == "-" else text, "{}", ""), " ")
+        table["notes"] = [self._reasons(row, table.columns) for row in self.rows]
+        return table.to_csv(index=False, lineterminator="\n")
+
+    def _reasons(self, row: Sequence[Cell], heads: Sequence[str]) -> str:
+        return "; ".join(dict.fromkeys(f"{head}: {cell.note}" for head, cell in zip(heads, row) if cell.note))
+
+    def _frame(self, language: _Language, between: str = "") -> DataFrame:
+        """The cells as a format writes them; groups are a level of their own, or stand before ``between`` and head."""
+        letters = self.letters()
+        cells = [[language.cell(cell, letters) for cell in row] for row in self.rows]
+        groups = [group for group, span in self.groups for _ in range(span)]
+        if not between:
+            heads = [language.escape(head) for head in self.heads]
+            columns = MultiIndex.from_arrays([list(map(language.escape, groups)), heads]) if groups else heads
+            return DataFrame(cells, columns=columns)
+        pairs = zip(groups or [""] * len(self.heads), self.heads, strict=True)
+        return DataFrame(cells, columns=[f"{group}{between}{head}" if group else head for group, head in pairs])
+
+    def _said(self, letter: str, escape: Callable[[str], str] = str) -> list[str]:
+        """What stands below the table: its notes with their letters, then those of the whole."""
+        noted = [letter.format(name) + escape(note) + "." for note, name in self.letters().items()]
+        return [*noted, *(escape(note) + "." for note in self.notes)]

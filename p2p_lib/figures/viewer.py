@@ -1,6 +1,6 @@
 """A run in 3D with a time slider, as one page that needs nothing else: what ``p2p view`` opens.
 
-In camera coordinates: what the camera saw as points, its picture, and each object where it was estimated to be: axes,
+In camera coordinates: what the camera saw as points, its image, and each object where it was estimated to be: axes,
 reconstructed surface, keypoints (those seen at the moment are bright), the keyframes as the small cameras they were
 taken from. An object without a pose is not drawn; its path stays, coloured by status. The page is made with viser.
 """
@@ -17,15 +17,15 @@ from typing import Any
 import cv2
 import numpy as np
 
+from p2p_lib.core.native import load_open3d
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.runs import quaternion_xyzw
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
 from p2p_lib.figures.playback import Playback
 
-#: Moments at which points and picture are renewed, points each time, and the picture's width: about 2 MB with all that
-#: draws them.
-MOMENTS, POINTS, PICTURE_PX = 30, 5000, 240
+#: Moments at which points and image are renewed, points each time, and the image's width: a page of about 2 MB.
+MOMENTS, POINTS, IMAGE_PX = 30, 5000, 240
 #: Sizes in metres of what is drawn at the object, its keyframes and its points.
 _AXES_M, _KEYFRAME_M, _POINT_M = 0.06, 0.012, 0.003
 _CLOUD_POINT_M, _CAMERA_M = 0.006, 0.08
@@ -58,7 +58,7 @@ def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS)
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Viser greets and takes its leave, whatever it is told."""
+    """Viser prints when it starts and stops, even with verbose=False."""
     import rich
 
     console = rich.get_console()
@@ -162,14 +162,14 @@ class _Scene:
             )
 
     def show(self, i: int, renew: bool) -> None:
-        """Change the scene to row i; ``renew``: its points, picture and bright keypoints too."""
+        """Change the scene to row i; ``renew``: its points, image and bright keypoints too."""
         for name, nodes in self._objects.items():
             self._show_object(name, nodes, i, renew)
         frame = self._playback.frame(i) if renew else None
         if frame is not None:
             p_cam, colours = self._playback.cloud(frame, self._points)
             self._scene.add_point_cloud("/points", p_cam, colours, point_size=_CLOUD_POINT_M)
-            size = (PICTURE_PX, round(PICTURE_PX * frame.shape[0] / frame.shape[1]))
+            size = (IMAGE_PX, round(IMAGE_PX * frame.shape[0] / frame.shape[1]))
             self._camera.image = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
 
     def _show_object(self, name: str, nodes: dict[str, Any], i: int, renew: bool) -> None:
@@ -202,19 +202,19 @@ def _middle(playback: Playback) -> np.ndarray:
 
 
 def _thinned(mesh: Any) -> Any:
-    """A surface of at most so many faces, by merging the corners within a cell that grows until that is reached."""
+    """A surface of at most so many faces, as a trimesh."""
     import trimesh
 
-    cell_m, whole = 0.003, mesh
-    while len(mesh.faces) > _FACES:
-        keys = np.floor(np.asarray(whole.vertices) / cell_m).astype(np.int64)
-        _, first, to = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        faces = to.ravel()[np.asarray(whole.faces)]
-        distinct = (faces != np.roll(faces, 1, 1)).all(1)
-        colours = np.asarray(whole.visual.vertex_colors)[first]
-        mesh = trimesh.Trimesh(whole.vertices[first], faces[distinct], vertex_colors=colours, process=False)
-        cell_m *= 1.4
-    return mesh
+    if len(mesh.faces) <= _FACES:
+        return mesh
+    open3d = load_open3d()
+    vectors = open3d.utility.Vector3dVector
+    whole = open3d.geometry.TriangleMesh(vectors(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces))
+    whole.vertex_colors = vectors(mesh.visual.vertex_colors[:, :3] / 255)
+    thin = whole.simplify_quadric_decimation(_FACES)
+    colours = np.rint(255 * np.asarray(thin.vertex_colors)).astype(np.uint8)
+    faces = np.asarray(thin.triangles)
+    return trimesh.Trimesh(np.asarray(thin.vertices), faces, vertex_colors=colours, process=False)
 
 
 def _legend(playback: Playback) -> str:

@@ -19,12 +19,18 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig
 from p2p_lib.core.errors import BadInput
-from p2p_lib.method.keyframes import Keyframe, Link, condense, misfit
+from p2p_lib.method.keyframes import Keyframe, Link, merge_keyframes
 
 # gtsam's keys: a letter in the highest byte.
 _X, _P = ord("x") << 56, ord("p") << 56
 # Points that a keyframe must share with the others where no relative pose holds it.
 _ANCHORING_POINTS = 3
+# Noise of the prior on the first pose (rad, m): it defines the object frame, so there is next to none.
+_PRIOR_SIGMA = 1e-4
+# Levenberg-Marquardt's first lambda. (The release starts at 0.1 and makes more steps, to the same minimum.)
+_LAMBDA = 1e-4
+# A smaller relative decrease of the loss ends Levenberg-Marquardt.
+_RELATIVE_TOLERANCE = 1e-3
 # A variance above this means that nothing determines the direction: a turn, or ten metres.
 _UNDETERMINED = np.repeat([(2 * np.pi) ** 2, 10.0**2], 3)
 
@@ -37,8 +43,6 @@ class GraphResult:
     keys (M,)              as returned by ``add_keyframe``; keyframes merged into others are no longer listed
     T_cam_obj (M, 4, 4)    poses of those keyframes
     point_ids (N,), p_obj (N, 3)  keypoints, sorted by id
-    residual_sigmas (N,)   median over a point's observations of the misfit, in standard deviations
-    suspects (K,)          ids of points seen at least twice that disagree in most of their observations
     covariance             (6, 6) of the newest keyframe, right tangent of T_cam_obj in the object
                            frame, rotation first; None where the graph does not determine it
     error_before, error_after  value of the loss
@@ -50,8 +54,6 @@ class GraphResult:
     T_cam_obj: np.ndarray
     point_ids: np.ndarray
     p_obj: np.ndarray
-    residual_sigmas: np.ndarray
-    suspects: np.ndarray
     covariance: np.ndarray | None
     error_before: float
     error_after: float
@@ -78,8 +80,7 @@ class ObjectGraph:
         self._next_key = 0
         self._last: _Solution | None = None
         self._anchor = se3.IDENTITY
-        if config.enabled:  # its import takes a second that no frame should wait for
-            importlib.import_module("gtsam")
+        importlib.import_module("gtsam")  # takes a second that no frame should wait for
 
     @property
     def keys(self) -> tuple[int, ...]:
@@ -161,7 +162,7 @@ class ObjectGraph:
         self._points |= solution.points
         self._new, self._last = [], solution
         result = self._result(True, solution.note)
-        condense(self._keyframes, self._points, self.config.max_keyframes, self.config.suspect_sigmas)
+        merge_keyframes(self._keyframes, self._points, self.config.max_keyframes)
         self._drop_unseen()
         return result
 
@@ -208,7 +209,6 @@ class ObjectGraph:
         ids = np.array(sorted(self._points), np.int64)
         poses = [self._keyframes[k].T_obj_cam for k in keys.tolist()]
         p_obj = np.array([self._points[i] for i in ids.tolist()]).reshape(-1, 3)
-        residual, suspects = self._misfits(ids, p_obj)
         last = self._last
         return GraphResult(
             ok,
@@ -217,28 +217,10 @@ class ObjectGraph:
             se3.inverse(np.array(poses).reshape(-1, 4, 4)),
             ids,
             p_obj,
-            residual,
-            suspects,
             last.covariance if last else None,
             last.error_before if last else 0.0,
             last.error_after if last else 0.0,
         )
-
-    def _misfits(self, ids: np.ndarray, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Median misfit of each point in standard deviations, and which points disagree mostly."""
-        if not len(ids):
-            return np.zeros(0), np.zeros(0, np.int64)
-        keyframes = self._keyframes.values()
-        rows = np.searchsorted(ids, np.concatenate([k.ids for k in keyframes]))
-        expected = [se3.transform(se3.inverse(k.T_obj_cam), p_obj[np.searchsorted(ids, k.ids)]) for k in keyframes]
-        expected, seen = np.concatenate(expected), np.concatenate([k.p_cam for k in keyframes])
-        sigma = np.concatenate([k.sigma for k in keyframes])
-        off = misfit(expected, seen, sigma)
-        order = np.lexsort((off, rows))
-        count = np.bincount(rows, minlength=len(ids))
-        middle = (np.cumsum(count) - count) + count // 2
-        median = off[order][np.minimum(middle, len(order) - 1)]
-        return median, ids[(count >= 2) & (median > self.config.suspect_sigmas)]
 
 
 def _is_covariance(covariance: np.ndarray | None) -> bool:
@@ -263,8 +245,7 @@ def _solve(
     first, newest = min(keyframes), max(keyframes)
     graph, values, ordering = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Ordering()
     if config.prior:
-        sigmas = np.repeat([config.prior_sigma_rad, config.prior_sigma_m], 3)
-        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.full(6, _PRIOR_SIGMA))
         graph.add(gtsam.PriorFactorPose3(_x(first), gtsam.Pose3(anchor), noise))
     # Keypoints first: each is eliminated on its own, which leaves a small system of poses.
     for i in sorted(points) if config.observations else ():
@@ -281,9 +262,9 @@ def _solve(
                 keyframe.factors = _observations(key, keyframe, config)
             graph.push_back(keyframe.factors)
     params = gtsam.LevenbergMarquardtParams()
-    params.setlambdaInitial(config.damping)
+    params.setlambdaInitial(_LAMBDA)
     params.setMaxIterations(config.iterations)
-    params.setRelativeErrorTol(config.relative_tolerance)
+    params.setRelativeErrorTol(_RELATIVE_TOLERANCE)
     params.setOrdering(ordering)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
     error_before, solved = optimiser.error(), optimiser.optimize()

@@ -1,7 +1,7 @@
 """Keyframes of one object's graph as plain values: what they saw, how they are linked, how two become one.
 
-A graph over ever more keyframes costs ever more. :func:`condense` keeps their number bounded without
-throwing observations away: of two keyframes that look at the object from nearly the same side, one
+A graph over ever more keyframes costs ever more. :func:`merge_keyframes` keeps their number bounded without
+throwing observations away: of two keyframes with nearly the same view, one
 takes over what the other saw.
 """
 
@@ -17,6 +17,8 @@ from p2p_lib.core import se3
 # Noise of an observation moved to another keyframe, in its own: the relative pose by which it moves
 # adds to it. Measured: without, the covariance after much merging is too sure by half.
 _MOVED_SIGMA = 1.25
+# Observations off by more standard deviations are left out when keyframes merge: later, a mean hides them.
+_LARGEST_MISFIT = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,22 +78,22 @@ def misfit(expected: np.ndarray, seen: np.ndarray, sigma: np.ndarray) -> np.ndar
     return np.hypot(angle / sigma[:, 0], range_m / sigma[:, 1])
 
 
-def condense(keyframes: dict[int, Keyframe], points: dict[int, np.ndarray], most: int, largest_misfit: float) -> None:
+def merge_keyframes(keyframes: dict[int, Keyframe], points: dict[int, np.ndarray], most: int) -> None:
     """Merges keyframes, in place, until ``most`` remain (0: no bound), those with the most similar views first.
 
     The first keyframe, which holds the gauge, and the newest are never given up. ``points`` are the
-    solved positions. Of keyframes that merge, observations off by more than ``largest_misfit`` standard
-    deviations are dropped, so that a point may be left without any.
+    solved positions. Observations of merging keyframes that do not fit them are dropped, so that a point may be left
+    without any.
     """
     while most and max(most, 2) < len(keyframes):
         keys = sorted(keyframes)
         R = np.array([keyframes[key].T_obj_cam[:3, :3] for key in keys])
-        # tr(R_host^T R_gone) grows as the angle between the two falls.
-        likeness = np.einsum("hij,gij->hg", R, R[1:-1])
-        gone = np.arange(likeness.shape[1])
-        likeness[gone + 1, gone] = -np.inf
-        host, gone = np.unravel_index(np.argmax(likeness), likeness.shape)
-        _merge(keyframes[keys[host]], keyframes[keys[gone + 1]], points, largest_misfit)
+        # tr(R_kept^T R_gone) grows as the angle between the two falls.
+        similarity = np.einsum("kij,gij->kg", R, R[1:-1])
+        gone = np.arange(similarity.shape[1])
+        similarity[gone + 1, gone] = -np.inf
+        kept, gone = np.unravel_index(np.argmax(similarity), similarity.shape)
+        _merge(keyframes[keys[kept]], keyframes[keys[gone + 1]], points)
         remove(keyframes, keys[gone + 1])
 
 
@@ -113,24 +115,24 @@ def remove(keyframes: dict[int, Keyframe], key: int) -> None:
         )
 
 
-def _merge(host: Keyframe, gone: Keyframe, points: dict[int, np.ndarray], largest_misfit: float) -> None:
-    """Adds the observations of ``gone`` to ``host``; where both saw a point, their weighted mean remains.
+def _merge(kept: Keyframe, gone: Keyframe, points: dict[int, np.ndarray]) -> None:
+    """Adds the observations of ``gone`` to ``kept``; where both saw a point, their weighted mean remains.
 
     A mean cannot be told from its misfits later, so those of both are left out now.
     """
-    moved, moved_sigma = gone.seen_from(host.T_obj_cam)
+    moved, moved_sigma = gone.seen_from(kept.T_obj_cam)
     moved_sigma *= _MOVED_SIGMA
-    ids = np.concatenate([host.ids, gone.ids])
-    p_cam, sigma = np.concatenate([host.p_cam, moved]), np.concatenate([host.sigma, moved_sigma])
+    ids = np.concatenate([kept.ids, gone.ids])
+    p_cam, sigma = np.concatenate([kept.p_cam, moved]), np.concatenate([kept.sigma, moved_sigma])
     if not len(ids):
         return
     p_obj = np.array([points[i] for i in ids.tolist()])
-    stays = misfit(se3.transform(se3.inverse(host.T_obj_cam), p_obj), p_cam, sigma) <= largest_misfit
+    stays = misfit(se3.transform(se3.inverse(kept.T_obj_cam), p_obj), p_cam, sigma) <= _LARGEST_MISFIT
     merged, row = np.unique(ids[stays], return_inverse=True)
     information = sigma[stays] ** -2
     total = _sums(row, information)
     mean = _sums(row, p_cam[stays] * information[:, 1:]) / total[:, 1:]
-    host.replace_observations(merged, mean, total**-0.5)
+    kept.replace_observations(merged, mean, total**-0.5)
 
 
 def _sums(row: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -25,17 +25,15 @@ def extract(volume: TsdfVolume, min_weight: float = 1.0, min_component: float = 
     import trimesh
 
     vertices, faces = _marching_cubes(volume, min_weight)
-    if len(faces) == 0:
-        return trimesh.Trimesh()
-    faces = faces[_large_components(vertices, faces, min_component)]
-    used, faces = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[used], faces.reshape(-1, 3)
-    return trimesh.Trimesh(
-        volume.origin_m + volume.voxel_m * vertices,
-        faces,
-        vertex_colors=_colours(volume, vertices),
-        process=False,
-    )
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if len(faces):
+        component = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(faces))
+        area = np.bincount(component, mesh.area_faces)
+        mesh.update_faces((area >= min_component * area.max())[component])
+        mesh.remove_unreferenced_vertices()
+        mesh.visual.vertex_colors = _colours(volume, mesh.vertices)
+        mesh.vertices = volume.origin_m + volume.voxel_m * mesh.vertices
+    return mesh
 
 
 def save(mesh: trimesh.Trimesh, path: str | Path) -> Path:
@@ -79,20 +77,6 @@ def _cells(observed: np.ndarray) -> np.ndarray:
         a[axis], b[axis] = slice(None, -1), slice(1, None)
         observed = observed[tuple(a)] & observed[tuple(b)]
     return observed
-
-
-def _large_components(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> np.ndarray:
-    """Which faces belong to components with at least ``min_share`` of the largest one's area."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    n = len(vertices)
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(n, n))
-    label = connected_components(graph, directed=False)[1][faces[:, 0]]
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    area = np.bincount(label, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
-    return (area >= min_share * area.max())[label]
 
 
 def _colours(volume: TsdfVolume, vertices: np.ndarray) -> np.ndarray:

@@ -29,7 +29,9 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
-from p2p_lib.method.object_tracker import TrackedObject
+from p2p_lib.method.object_model import NO_IDS, Requests
+from p2p_lib.method.object_tracker import ObjectTracker
+from p2p_lib.method.observation import Observation
 
 #: Object to (H, W) bool; None where nobody knows.
 Masks = dict[str, np.ndarray | None]
@@ -52,11 +54,9 @@ class Point2Pose:
         self._rng = np.random.default_rng(self.config.seed)
         self.tracker = make_tracker(tracker, self.config.tracking, self._rng)
         self.detector = make_detector(detector, self.config.sampling, self._rng)
-        if isinstance(segmenter, str):
-            rng = np.random.default_rng([self.config.seed, 1])
-            segmenter = make_segmenter(segmenter, camera, self.config.segmentation, rng)
-        self.segmenter = segmenter
-        self.objects: dict[str, TrackedObject] = {}
+        rng = np.random.default_rng([self.config.seed, 1])
+        self.segmenter = make_segmenter(segmenter, camera, self.config.segmentation, rng)
+        self.objects: dict[str, ObjectTracker] = {}
         self.masks: Masks = {}
         self.tracks = NOTHING_TRACKED
         self.stopwatch = Stopwatch()
@@ -89,8 +89,8 @@ class Point2Pose:
             check_apart(name, clicks, self._first_clicks)
             self._first_clicks[name] = clicks
             self._clicked.add(name)
-        self.objects[name] = TrackedObject(
-            name, self.camera, self.config, self.tracker, self.detector, self._rng.spawn(1)[0], self.stopwatch
+        self.objects[name] = ObjectTracker(
+            name, self.camera, self.config, self.detector, self._rng.spawn(1)[0], self.stopwatch
         )
 
     def remove_object(self, name: str) -> None:
@@ -135,11 +135,40 @@ class Point2Pose:
         if len(self._waiting) <= self.tracker.latency_frames:
             return {}
         frame, masks, clicks = self._waiting.popleft()
-        self.tracks = tracks
-        self.masks = masks | self._segment(frame, tracks, clicks)
-        # An object added since then is not in that frame's masks yet.
-        objects = {name: obj for name, obj in self.objects.items() if name in masks}
-        return {name: obj.step(frame, self.masks[name], tracks) for name, obj in objects.items()}
+        self.tracks, self.masks = tracks, masks | self._segment(frame, tracks, clicks)
+        # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
+        objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
+        seen = {name: obj.observe(frame, self.masks[name], tracks) for name, obj in objects.items()}
+        self._apply({name: obj.misplaced(seen[name]) for name, obj in objects.items()})
+        seen |= self._redetect(seen)
+        steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
+        self._apply({name: step.requests for name, step in steps.items()})
+        return {name: steps[name].estimate for name in self.objects if name in steps}
+
+    def _redetect(self, seen: Mapping[str, Observation]) -> dict[str, Observation]:
+        """Guided re-detection: the tracker looks for points where their objects expect them; what is seen then."""
+        if self.tracker.latency_frames:
+            return {}
+        expected = {name: self.objects[name].expected_px(obs) for name, obs in seen.items()}
+        with self.stopwatch("tracking"):
+            for name, uv_px in expected.items():
+                found = None if uv_px is None else self.tracker.suggest(self.objects[name].map.ids, uv_px)
+                self.tracks = self.tracks if found is None else found
+        sought = [name for name, uv_px in expected.items() if uv_px is not None]
+        return {name: self.objects[name].observe(seen[name].frame, seen[name].mask, self.tracks) for name in sought}
+
+    def _apply(self, requests: Mapping[str, Requests]) -> None:
+        """The one place where the shared tracker is changed, after all objects have been looked at."""
+        rejected = np.concatenate([NO_IDS, *(request.reject for request in requests.values())])
+        if len(rejected):
+            self.tracker.reject(rejected)
+        for name, request in requests.items():
+            dropped = request.drop
+            if len(request.keys):
+                unused = self.objects[name].map.assign(request.keys, self.tracker.add(request.add_px))
+                dropped = np.concatenate([dropped, unused])
+            if len(dropped):
+                self.tracker.drop(dropped)
 
     def _given(self, frame: Frame, masks: Mapping[str, np.ndarray] | None) -> Masks:
         """Every object's checked mask in this frame; None for one of which nobody knows (yet)."""
@@ -170,7 +199,8 @@ class Point2Pose:
             return {}
         with self.stopwatch("segmentation"):
             hints = {name: self.objects[name].hint(frame, tracks) for name in self.segmenter.names}
-            labels = self.segmenter.segment(frame, clicks, hints)
+            self._apply({name: requests for name, (_, requests) in hints.items()})
+            labels = self.segmenter.segment(frame, clicks, {name: hint for name, (hint, _) in hints.items()})
             return {name: labels == label for label, name in enumerate(self.segmenter.names, 1)}
 
     def _track(self, frame: Frame, masks: dict[str, np.ndarray | None]) -> Tracks:

@@ -2,7 +2,7 @@
 
 Minimises, over D in SE(3), the Huber loss of the surface's signed distance at the measured points,
 ``sum rho_H(Phi(T^-1 D^-1 p)^2)``, with ``T <- D T``. The increment is parameterised on the right,
-``D = T exp(xi) T^-1``, which makes ``D T = T exp(xi)``: the same pose, in the house's tangent.
+``D = T exp(xi) T^-1``, which makes ``D T = T exp(xi)``: the same pose, in our tangent.
 
 Ours beyond the paper: directions that the shape leaves free are not moved by it, keypoint residuals
 can join (texture holds what shape leaves free), and the result says how well each direction is known.
@@ -13,25 +13,30 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import RefinementConfig
-from p2p_lib.core.depth import off_edges
+from p2p_lib.method import observability
 
 #: Fewer points on the observed surface than this determine nothing.
 MIN_POINTS = 10
-#: Damping is raised or lowered by this factor as steps fail or succeed.
-_DAMPING_FACTOR = 5.0
+#: Levenberg-Marquardt: the initial damping, and the factor by which it rises or falls as steps fail or succeed. The
+#: release's, as are the two bounds of a step.
+_DAMPING, _DAMPING_FACTOR = 1e-4, 5.0
+_MAX_STEP_M, _MAX_STEP_RAD = 0.02, 0.2
+#: A smaller gain, in squared standard deviations, ends the iterations.
+_TOLERANCE = 0.2
+#: Residuals beyond so many median absolute deviations are left out (the release's).
+_MAD_TRIM = 2.5
+#: Depth errors of neighbours are correlated: together, the points are worth so many independent ones.
+_INDEPENDENT_POINTS = 100
+#: Step of the numeric gradient (the release's).
+_GRADIENT_VOXELS = 0.5
 #: No map is exact to less than this share of its voxels, however little the points scatter.
 _SIGMA_FLOOR_VOXELS = 0.25
 _MAD_TO_SIGMA = 1.4826
-#: The map's noise is independent this many voxels apart.
-_PAIR_VOXELS = 3.0
-#: A strength must exceed this many standard deviations of what noise alone makes of it.
-_CLEAR_OF_NOISE = 3.0
 
 
 class Surface(Protocol):
@@ -39,6 +44,10 @@ class Surface(Protocol):
 
     tau_m: float
     voxel_m: float
+
+    def corners_m(self) -> np.ndarray:
+        """(8, 3) corners that bound it in the object frame."""
+        ...
 
     def query(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance in metres and validity at points of the object frame."""
@@ -68,10 +77,10 @@ class Refinement:
     inliers      share of the given points that lie on observed surface and were not trimmed
     iterations   Levenberg-Marquardt steps tried
     converged    whether it stopped because the step had become small
-    strengths    (6,): how firmly the shape holds each of :attr:`directions`, as the mean squared change of the
+    eigenvalues  (6,): how well the shape determines each of :attr:`directions`, the mean squared change of the
                  points' distance per squared displacement; a plane has three at 0, a can one
     directions   (6, 6) rows: unit tangents about the cloud's centre, rotation scaled by the cloud's radius
-    free_turns   (K, 6) right tangents of T_cam_obj, a radian each: how it may turn without leaving the surface
+    free_rotations  (K, 6) right tangents of T_cam_obj, a radian each: how it may turn without leaving the surface
     reason       why the pose was left alone, or what was held; empty otherwise
     """
 
@@ -81,9 +90,9 @@ class Refinement:
     inliers: float = 0.0
     iterations: int = 0
     converged: bool = False
-    strengths: np.ndarray | None = None
+    eigenvalues: np.ndarray | None = None
     directions: np.ndarray | None = None
-    free_turns: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    free_rotations: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     reason: str = ""
 
     @property
@@ -100,17 +109,14 @@ class _Linear:
     derivatives of their distances. H and g are means over them; rotations are scaled by the cloud's radius, so that
     everything is in metres.
 
-    strengths (6,) and directions (6, 6), columns, say how firmly the shape holds the pose: H per unit of
-    squared gradient, without the noise of the gradients. A noisy plane's normals wobble, and H takes the
-    wobble for shape; the products of two neighbours' Jacobians, whose noise is independent, do not. What
-    is left may still be chance: a strength that does not stand clear of it is 0.
+    eigenvalues (6,) and directions (6, 6), columns, are those of :func:`p2p_lib.method.observability.eigen`.
     """
 
     T: np.ndarray
     distance_m: np.ndarray
     H: np.ndarray
     g: np.ndarray
-    strengths: np.ndarray
+    eigenvalues: np.ndarray
     directions: np.ndarray
     cut_m: float
     rows: np.ndarray
@@ -141,7 +147,7 @@ def refine(
     if not np.isfinite(T_cam_obj).all():
         return Refinement(T_cam_obj, reason="the pose to refine is not finite")
     p_cam = _usable(p_cam, config.max_points)
-    keypoints = _usable_keypoints(keypoints, config.keypoint_weight)
+    keypoints = _usable_keypoints(keypoints, config)
     if len(p_cam) < MIN_POINTS:
         return Refinement(T_cam_obj, reason=f"{len(p_cam)} depth points, {MIN_POINTS} are needed")
     problem = _Problem.about(T_cam_obj, p_cam, volume, config, keypoints)
@@ -168,29 +174,28 @@ class _Problem:
             return None
         centre = p_obj[valid].mean(0)
         radius = float(np.sqrt(((p_obj[valid] - centre) ** 2).sum(-1).mean()))
-        pairs = _neighbours(p_cam, _PAIR_VOXELS * volume.voxel_m)
+        pairs = observability.neighbours(p_cam, observability.PAIR_VOXELS * volume.voxel_m)
         return cls(p_cam, volume, config, keypoints, centre, max(radius, 1e-4), pairs)
 
     def solve(self, T: np.ndarray) -> Refinement:
-        config = self.config
-        damping, converged, tries = config.damping, False, 0
+        damping, converged, tries = _DAMPING, False, 0
         # Wide at first: far from the solution, the few points that hold a direction look like outliers.
         at = self.surface(T, self.volume.tau_m / 2)
-        while tries < config.iterations and at is not None and not converged:
+        while tries < self.config.iterations and at is not None and not converged:
             tries += 1
             step = self.clipped(self.step(*self.joint(at), damping))
             nearby = at if np.linalg.norm(step) < self.volume.voxel_m else None
             new = self.surface(self.moved(at.T, step), self.volume.tau_m / 2 ** (tries + 1), nearby)
             gain = self.cost(at, at) - self.cost(new, at) if new is not None else -np.inf
-            converged = abs(gain) < config.tolerance
+            converged = abs(gain) < _TOLERANCE
             if gain > 0:
                 at, damping = new, damping / _DAMPING_FACTOR
             else:
                 damping = max(damping, 1e-4) * _DAMPING_FACTOR**2
         if at is None:
             return Refinement(T, iterations=tries, reason="the cloud lies beyond the surface's truncation")
-        strengths, directions = self.shape(at.rows, at.J)
-        return self.result(replace(at, strengths=strengths, directions=directions), tries, converged)
+        eigenvalues, directions = self.eigen(at.rows, at.J)
+        return self.result(replace(at, eigenvalues=eigenvalues, directions=directions), tries, converged)
 
     # -- the two kinds of residual -----------------------------------------------------------------
 
@@ -201,7 +206,7 @@ class _Problem:
         is taken from ``beside``, a pose nearby, where there is one: it hardly changes.
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
-        value, gradient, valid = self.volume.query_with_gradient(p_obj, self.config.gradient_voxels)
+        value, gradient, valid = self.volume.query_with_gradient(p_obj, _GRADIENT_VOXELS)
         distance = np.where(valid, value, np.inf)
         # Beyond the truncation the distance is not known and its gradient is 0.
         near = np.flatnonzero(np.abs(distance) < 0.98 * self.volume.tau_m)
@@ -210,32 +215,21 @@ class _Problem:
         middle = _median(value[near])
         scatter = _MAD_TO_SIGMA * _median(np.abs(value[near] - middle))
         sigma = max(scatter, _SIGMA_FLOOR_VOXELS * self.volume.voxel_m)
-        cut = max(abs(middle) + self.config.mad_trim * sigma, self.config.huber_m, widest_m)
+        cut = max(abs(middle) + _MAD_TRIM * sigma, self.config.huber_m, widest_m)
         used = near[np.abs(value[near]) <= cut]
         r = value[used]
         J = surface_jacobian((p_obj[used] - self.centre) / self.radius, gradient[used])
         Jw = J * np.minimum(1.0, self.config.huber_m / np.maximum(np.abs(r), 1e-12))[:, None]
         n, rms = len(used), float(np.sqrt((r * r).mean()))
-        held = (beside.strengths, beside.directions) if beside else self.shape(used, J)
+        held = (beside.eigenvalues, beside.directions) if beside else self.eigen(used, J)
         return _Linear(T, distance, Jw.T @ J / n, Jw.T @ r / n, *held, cut, used, J, rms, sigma)
 
-    def shape(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Strengths (6,) ascending and directions (6, 6) columns, as :class:`_Linear` has them."""
-        H = J.T @ J / len(J)
+    def eigen(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues (6,) ascending and eigenvectors (6, 6), columns, of what the shape determines."""
         row = np.full(len(self.p_cam), -1)
         row[used] = np.arange(len(used))
-        a, b = row[self.pairs].T
-        both = (a >= 0) & (b >= 0)
-        count = int(both.sum())
-        steepness = max(np.trace(H[3:, 3:]), 1e-12)
-        if count < max(MIN_POINTS, len(used) // 4):
-            strength, direction = np.linalg.eigh(H)  # the points lie too far apart for pairs
-            return strength / steepness, direction
-        S = J[a[both]].T @ J[b[both]] / count
-        strength, direction = np.linalg.eigh((S + S.T) / 2)
-        wobble = np.einsum("ik,ij,jk->k", direction, H, direction) - strength
-        clear = strength > _CLEAR_OF_NOISE * np.abs(wobble) / np.sqrt(count)
-        return np.where(clear, np.maximum(strength, 0.0), 0.0) / steepness, direction
+        pairs = row[self.pairs]
+        return observability.eigen(J, pairs[(pairs >= 0).all(1)])
 
     def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of T^-1 p_cam - p_obj in standard deviations, same variables."""
@@ -243,27 +237,32 @@ class _Problem:
         q = se3.transform(se3.inverse(T), k.p_cam)
         J = np.concatenate([se3.hat(q - self.centre) / self.radius, np.broadcast_to(-np.eye(3), (len(q), 3, 3))], -1)
         r = q - k.p_obj
-        scale = self.config.keypoint_weight * _huber_weight(np.linalg.norm(r, axis=-1) / k.sigma_m) / k.sigma_m**2
+        scale = _huber_weight(np.linalg.norm(r, axis=-1) / k.sigma_m) / k.sigma_m**2
         return np.einsum("mia,m,mib->ab", J, scale, J), np.einsum("mia,m,mi->a", J, scale, r)
 
     # -- solving -------------------------------------------------------------------------------
 
     def joint(self, at: _Linear) -> tuple[np.ndarray, np.ndarray]:
         """Information and gradient: the surface's in the directions it determines, the keypoints' in all."""
-        P, worth = self.determined(at), self.worth(at)
-        H, g = worth * P @ at.H @ P, worth * P @ at.g
+        P, information = self.determined(at), self.effective_information(at)
+        H, g = information * P @ at.H @ P, information * P @ at.g
         if self.keypoints is not None:
             H_k, g_k = self.keypoint_system(at.T)
             H, g = H + H_k, g + g_k
         return H, g
 
-    def worth(self, at: _Linear) -> float:
+    def effective_information(self, at: _Linear) -> float:
         """Independent observations per squared metre: depth errors of neighbours are correlated."""
-        return min(at.used, self.config.independent_points) / at.sigma_m**2
+        return min(at.used, _INDEPENDENT_POINTS) / at.sigma_m**2
+
+    @property
+    def floor(self) -> float:
+        """The eigenvalue from which on a direction counts as determined by the shape; the paper moves all."""
+        return self.config.min_eigenvalue if self.config.residuals == "surface_and_keypoints" else 0.0
 
     def determined(self, at: _Linear) -> np.ndarray:
         """Projection onto the directions that the shape holds."""
-        held = at.directions[:, at.strengths >= self.config.min_strength]
+        held = at.directions[:, at.eigenvalues >= self.floor]
         return held @ held.T
 
     def step(self, H: np.ndarray, g: np.ndarray, damping: float) -> np.ndarray:
@@ -275,7 +274,7 @@ class _Problem:
 
     def clipped(self, step: np.ndarray) -> np.ndarray:
         turn, shift = np.linalg.norm(step[:3]) / self.radius, np.linalg.norm(step[3:])
-        largest = max(turn / self.config.max_step_rad, shift / self.config.max_step_m, 1.0)
+        largest = max(turn / _MAX_STEP_RAD, shift / _MAX_STEP_M, 1.0)
         return step / largest
 
     def moved(self, T: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -290,22 +289,22 @@ class _Problem:
         Trimmed points and those off the observed surface cost what the trimming distance does.
         """
         r, d = np.minimum(np.abs(new.distance_m), at.cut_m), self.config.huber_m
-        total = self.worth(at) / at.used * np.where(r < d, r * r, 2 * d * r - d * d).sum()
+        total = self.effective_information(at) / at.used * np.where(r < d, r * r, 2 * d * r - d * d).sum()
         if self.keypoints is not None:
             k = self.keypoints
             e = np.linalg.norm(se3.transform(se3.inverse(new.T), k.p_cam) - k.p_obj, axis=-1) / k.sigma_m
-            total += self.config.keypoint_weight * np.where(e < _HUBER, e * e, 2 * _HUBER * e - _HUBER**2).sum()
+            total += np.where(e < _HUBER, e * e, 2 * _HUBER * e - _HUBER**2).sum()
         return float(total)
 
     def result(self, at: _Linear, tries: int, converged: bool) -> Refinement:
         """The pose reached, its covariance moved from the cloud's centre to the object's origin."""
         H, _ = self.joint(at)
         # What nothing determines is known to within the largest step.
-        free = np.repeat([self.config.max_step_rad * self.radius, self.config.max_step_m], 3) ** -2.0
+        free = np.repeat([_MAX_STEP_RAD * self.radius, _MAX_STEP_M], 3) ** -2.0
         metres = np.repeat([1 / self.radius, 1.0], 3)
         to_origin = se3.adjoint(se3.from_rt(np.eye(3), self.centre)) * metres
         covariance = to_origin @ np.linalg.inv(H + np.diag(free)) @ to_origin.T
-        loose = at.directions[:, at.strengths < self.config.min_strength]
+        loose = at.directions[:, at.eigenvalues < self.floor]
         return Refinement(
             at.T,
             (covariance + covariance.T) / 2,
@@ -313,24 +312,11 @@ class _Problem:
             at.used / len(self.p_cam),
             tries,
             converged,
-            at.strengths,
+            at.eigenvalues,
             at.directions.T,
-            _turns_of(loose).T @ to_origin.T * self.radius,
+            observability.rotations_in(loose).T @ to_origin.T * self.radius,
             f"the shape leaves {loose.shape[1]} of 6 directions free" if loose.size else "",
         )
-
-
-#: A unit tangent about the cloud's centre turns, rather than shifts, if this much of it is rotation.
-_MOSTLY = 0.5
-
-
-def _turns_of(loose: np.ndarray) -> np.ndarray:
-    """(6, T) the turns among the span of orthonormal tangents (6, K), each with a unit of rotation."""
-    if not loose.size:
-        return np.zeros((6, 0))
-    _, size, mix = np.linalg.svd(loose[:3])
-    size, mix = size[size > _MOSTLY], mix[: len(size)][size > _MOSTLY]
-    return loose @ mix.T / size
 
 
 #: Huber threshold of keypoint residuals in standard deviations.
@@ -339,23 +325,6 @@ _HUBER = 1.345
 
 def _huber_weight(e: np.ndarray) -> np.ndarray:
     return np.minimum(1.0, _HUBER / np.maximum(e, 1e-12))
-
-
-def _neighbours(p_cam: np.ndarray, distance_m: float) -> np.ndarray:
-    """(P, 2) rows of points about ``distance_m`` apart, each point with one to its right and one below it."""
-    pairs = []
-    for along, across in ((0, 1), (1, 0)):
-        strip = np.floor(p_cam[:, across] / (distance_m / 2))
-        # Within a strip the keys run along it; strips lie farther apart than any pair.
-        key = strip * (np.ptp(p_cam[:, along]) + 4 * distance_m) + p_cam[:, along]
-        order = np.argsort(key)
-        nearest = np.searchsorted(key[order], key + distance_m)
-        first = np.flatnonzero(nearest < len(key))
-        pairs.append(np.stack([first, order[nearest[first]]], -1))
-    first, second = np.concatenate(pairs).T
-    apart = np.linalg.norm(p_cam[first] - p_cam[second], axis=-1)
-    near = (apart > distance_m / 2) & (apart < 2 * distance_m)
-    return np.stack([first[near], second[near]], -1)
 
 
 def _median(x: np.ndarray) -> float:
@@ -372,54 +341,22 @@ def surface_jacobian(q: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x, -a, -b, -c], -1)
 
 
-def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
+def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H, N) absolute TSDF value in metres of the points p_cam (N, 3) under poses (H, 4, 4).
 
     Its mean over the points is the paper's measure for choosing a hypothesis. A point that falls where nothing was
-    observed counts ``unseen`` times the truncation distance, so that no pose wins by turning away from the surface.
+    observed counts the truncation distance, so that no pose wins by turning away from the surface.
     Points that are not finite are left out.
     """
     T_cam_obj = np.asarray(T_cam_obj, float).reshape(-1, 4, 4)
     value, valid = volume.query(se3.transform(se3.inverse(T_cam_obj), _usable(p_cam, len(p_cam))))
-    return np.where(valid, np.abs(value), unseen * volume.tau_m)
+    return np.where(valid, np.abs(value), volume.tau_m)
 
 
-def surface_score(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray, unseen: float = 1.0) -> np.ndarray:
+def surface_score(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H,) mean of :func:`surface_distances`; infinite without any finite point."""
-    distance_m = surface_distances(volume, p_cam, T_cam_obj, unseen)
+    distance_m = surface_distances(volume, p_cam, T_cam_obj)
     return distance_m.mean(1) if distance_m.size else np.full(len(distance_m), np.inf)
-
-
-def sample_cloud(
-    depth_m: np.ndarray,
-    mask: np.ndarray,
-    camera: Camera,
-    max_points: int,
-    *,
-    margin_px: int = 2,
-    depth_edge_m: float = 0.02,
-) -> np.ndarray:
-    """(N, 3) measured points of a masked depth picture in the camera frame, N <= max_points.
-
-    Leaves out a border of ``margin_px`` inside the mask, and pixels whose 3x3 neighbourhood holds an
-    invalid depth or a step beyond ``depth_edge_m``: both mix two surfaces. Deterministic, spread over
-    the whole mask. Empty where nothing is left.
-    """
-    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if len(rows) == 0 or max_points < 1:
-        return np.zeros((0, 3))
-    top, left = max(rows[0] - 1, 0), max(cols[0] - 1, 0)
-    cut = np.s_[top : rows[-1] + 2, left : cols[-1] + 2]
-    inside, depth = np.ascontiguousarray(mask[cut]).astype(np.uint8), np.ascontiguousarray(depth_m[cut], np.float32)
-    kernel = np.ones((2 * margin_px + 1,) * 2, np.uint8)
-    inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-    v, u = np.nonzero((inside > 0) & off_edges(depth, depth_edge_m))
-    # A lattice of pixels, then an even thinning of what is left over.
-    stride = max(1, int(np.sqrt(len(u) / max_points)))
-    on = np.flatnonzero((u % stride == 0) & (v % stride == 0))
-    on = on[np.linspace(0, len(on) - 1, min(len(on), max_points)).astype(int)]
-    return camera.unproject(np.stack([u[on] + left, v[on] + top], -1), depth[v[on], u[on]].astype(float))
 
 
 def _usable(p_cam: np.ndarray, max_points: int) -> np.ndarray:
@@ -430,8 +367,8 @@ def _usable(p_cam: np.ndarray, max_points: int) -> np.ndarray:
     return p_cam[np.linspace(0, len(p_cam) - 1, max_points).astype(int)]
 
 
-def _usable_keypoints(keypoints: Keypoints | None, weight: float) -> Keypoints | None:
-    if keypoints is None or weight == 0:
+def _usable_keypoints(keypoints: Keypoints | None, config: RefinementConfig) -> Keypoints | None:
+    if keypoints is None or config.residuals != "surface_and_keypoints":
         return None
     finite = np.isfinite(keypoints.p_obj).all(-1) & np.isfinite(keypoints.p_cam).all(-1)
     ok = finite & (keypoints.sigma_m > 0) & np.isfinite(keypoints.sigma_m)
@@ -442,15 +379,13 @@ def _usable_keypoints(keypoints: Keypoints | None, weight: float) -> Keypoints |
 _STRIDE = 2
 
 
-def surface_distance(
-    surface: Surface, corners_obj: np.ndarray, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray
-) -> np.ndarray:
-    """(H, W) float32 of :class:`Hint`, from every second pixel where the surface can be seen.
+def surface_distance(volume: Surface, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray) -> np.ndarray:
+    """(H, W) float32 signed distance of each measured pixel to the surface under a pose, in metres.
 
-    corners_obj (8, 3) bound the surface in the object frame.
+    Positive in front of it; NaN where it is not known. Every second pixel is asked, where the surface can be seen.
     """
     distance = np.full(depth_m.shape, np.nan, np.float32)
-    uv = camera.project(se3.transform(T_cam_obj, corners_obj))
+    uv = camera.project(se3.transform(T_cam_obj, volume.corners_m()))
     if not np.isfinite(uv).all():
         return distance
     size = np.array(depth_m.shape[::-1])
@@ -458,7 +393,7 @@ def surface_distance(
     v, u = np.mgrid[top:bottom:_STRIDE, left:right:_STRIDE]
     z = depth_m[v, u]
     p_obj = se3.transform(se3.inverse(T_cam_obj), camera.unproject(np.stack([u, v], -1), z).reshape(-1, 3))
-    value, known = surface.query(p_obj)
+    value, known = volume.query(p_obj)
     found = np.where(known & (z.ravel() > 0), value, np.nan).reshape(z.shape)
     coarse = np.repeat(np.repeat(found, _STRIDE, 0), _STRIDE, 1)
     distance[top:bottom, left:right] = coarse[: bottom - top, : right - left]

@@ -1,33 +1,28 @@
 """Frame-to-map registration: from 3D correspondences to several candidate poses (paper: "Frame-to-Map Registration").
 
-:func:`generate` runs sequential RANSAC + SVD; which of its hypotheses is right is told by the dense
-surface, which is measured elsewhere and weighed here, by :func:`select`. :func:`covariance` says how
-well the correspondences determine each direction of the chosen pose.
+:func:`register` runs sequential RANSAC + SVD; which of its hypotheses is right is told by the dense
+surface (:mod:`p2p_lib.method.selection`). :func:`covariance` says how well the correspondences determine each
+direction of the chosen pose.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from p2p_lib.core import se3
+from p2p_lib.core import robust, se3
 from p2p_lib.core.config import RegistrationConfig
-from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.robust import fit_rigid_inertia
 
 # A set of points determines the turn about its long axis when noise of a third of the inlier
 # threshold turns it by less than this; below, the set counts as collinear.
 _DETERMINED_RAD = 0.35
-# Weight (m^2) that holds a refit at its prior's rotation where the points say nothing (a line's
-# roll). Points spread over a centimetre outweigh it a thousandfold.
-_PRIOR_INERTIA_M2 = 1e-6
 # What is known of a pose before any point is seen: keeps covariances finite.
 _UNKNOWN_RAD, _UNKNOWN_M = np.pi, 1.0
-_REFITS = 5
-# RANSAC draws this many samples at once, and stops when the chance that no sample so far was free of
-# outliers, taking the best consensus for the truth, is below this.
-_BATCH, _MISSED = 100, 1e-3
+#: An inlier's residual is at most this many standard deviations of the point's noise, where that is known.
+_INLIER_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,17 +46,7 @@ class Hypothesis:
         return int(self.inliers.sum())
 
 
-def fit_rigid(p_obj: np.ndarray, p_cam: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """The T_cam_obj (..., 4, 4) that minimises sum of w |p_cam - T p_obj|^2 (paper: eq. corres_svd).
-
-    p_obj, p_cam (..., N, 3) finite, weights (..., N) at least 0. Always a proper rotation: never a
-    reflection. Where the points leave directions free (collinear, coincident, fewer than three) the
-    rotation is one of the many that fit.
-    """
-    return _fit(p_obj, p_cam, weights)[0]
-
-
-def generate(
+def register(
     p_obj: np.ndarray,
     p_cam: np.ndarray,
     config: RegistrationConfig,
@@ -72,25 +57,22 @@ def generate(
 ) -> list[Hypothesis]:
     """The hypotheses that correspondences p_obj, p_cam (N, 3) support, the largest consensus first.
 
-    Sequential RANSAC: the transformation with the most inliers, its consensus set removed, and again
-    on the rest. With ``config.motion_priors`` each pose in ``priors`` ({"last pose": T_cam_obj, ...})
-    competes too, refit on the points that agree with it. With ``config.multi_hypothesis`` off, one
-    hypothesis: SVD on all, outliers removed by the fixed threshold, second SVD.
+    ``config.method`` is "sequential_ransac", the paper's: the transformation with the most inliers, its consensus set
+    removed, and again on the rest; or "svd", its ablation: one fit to all, outliers removed by the fixed threshold,
+    a second fit. Rows that are not finite are ignored. Too few or collinear points: an empty list.
 
-    sigma_m (N,) is the noise of each p_cam, :func:`depth_noise_m` where None; it sets the thresholds and the
-    weights when ``config.inlier_sigmas`` is above 0. Rows that are not finite are ignored. Too few
-    or collinear points: an empty list.
+    sigma_m  (N,) noise of each p_cam: the threshold grows with it and fits are weighted. None: one threshold for all
+    priors   name to T_cam_obj (4, 4): poses that compete too, refit on the points that agree with them
     """
     matches, usable = _finite_matches(p_obj, p_cam, sigma_m, config)
     if len(matches.p_obj) < max(3, config.min_inliers):
         return []
-    if config.multi_hypothesis:
-        found = _sequential(matches, config, rng)
-        found += _from_priors(matches, priors or {}, config) if config.motion_priors else []
-    else:
+    if config.method == "svd":
         found = _svd_twice(matches, config)
+    else:
+        found = _sequential(matches, config, rng) + _from_priors(matches, priors or {}, config)
     distinct = _without_duplicates(found, matches, config)[: config.max_hypotheses]
-    return [_spread(hypothesis, usable) for hypothesis in distinct]
+    return [_in_all_rows(hypothesis, usable) for hypothesis in distinct]
 
 
 def refit(
@@ -103,60 +85,7 @@ def refit(
 ) -> list[Hypothesis]:
     """The hypothesis that grows from a given pose, refit on the correspondences that agree with it; or none."""
     matches, usable = _finite_matches(p_obj, p_cam, sigma_m, config)
-    return [_spread(hypothesis, usable) for hypothesis in _from_priors(matches, {origin: T_cam_obj}, config)]
-
-
-def competing(hypotheses: Sequence[Hypothesis], config: RegistrationConfig) -> list[Hypothesis]:
-    """Those with enough support to be judged by the surface, in the same order."""
-    most = max((h.support for h in hypotheses), default=0)
-    return [h for h in hypotheses if h.support >= min(config.min_support, config.min_support_share * most)]
-
-
-def motion_odds(
-    T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray], config: RegistrationConfig
-) -> np.ndarray | None:
-    """(H,) by how much the support of poses counts less for being off the nearest of the priors; None without any.
-
-    1 on a prior, 1/2 at ``odds_deg`` or ``odds_m`` from it: heavy tails, for objects may be pushed at any time.
-    """
-    if not len(priors) or not len(T_cam_obj) or not (config.odds_deg and config.odds_m):
-        return None
-    off = se3.inverse(np.stack(priors))[:, None] @ np.stack(T_cam_obj)[None]
-    turned = np.degrees(se3.angle_rad(off)) / config.odds_deg
-    moved = np.linalg.norm(np.stack(priors)[:, None, :3, 3] - np.stack(T_cam_obj)[None, :, :3, 3], axis=-1)
-    return 1 / (1 + (turned**2 + (moved / config.odds_m) ** 2).min(0))
-
-
-def select(
-    hypotheses: Sequence[Hypothesis],
-    distance_m: np.ndarray | None,
-    config: RegistrationConfig,
-    odds: np.ndarray | None = None,
-) -> tuple[Hypothesis | None, str]:
-    """The hypothesis to go on with, and why.
-
-    distance_m (H, N): how far each of the masked depth points lies from the surface under each pose (absolute
-    TSDF value in metres); None while there is no surface. The paper takes the least mean. Ours
-    (``surface_sigmas`` above 0): the best supported hypothesis stands unless another is nearer by more than chance
-    and ``surface_margin_m``; below that the surface cannot tell them apart. ``odds`` (H,) weigh the support.
-    """
-    if not hypotheses:
-        return None, "no hypothesis: too few correspondences agree"
-    support = np.array([h.support for h in hypotheses]) * (1 if odds is None else odds)
-    spread = np.array([h.residual_m[h.inliers].mean() if h.support else np.inf for h in hypotheses])
-    champion = int(np.lexsort((spread, -support))[0])
-    if len(hypotheses) == 1:
-        return hypotheses[0], "the only hypothesis"
-    if distance_m is None or not np.isfinite(distance_m).all(1).any() or not np.size(distance_m):
-        return hypotheses[champion], "most inliers, there is no surface yet"
-    scores = np.where(np.isfinite(distance_m).all(1), distance_m.mean(1), np.inf)
-    best = int(np.argmin(scores))
-    # The same points under both poses: what counts is the difference that each of them sees.
-    nearer = distance_m[champion] - distance_m[best]
-    chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
-    if scores[champion] - scores[best] > max(chance, config.surface_margin_m) or config.surface_sigmas == 0:
-        return hypotheses[best], f"nearest to the surface ({1e3 * scores[best]:.2f} mm)"
-    return hypotheses[champion], "most inliers, the surface does not tell the hypotheses apart"
+    return [_in_all_rows(hypothesis, usable) for hypothesis in _from_priors(matches, {origin: T_cam_obj}, config)]
 
 
 def covariance(hypothesis: Hypothesis, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray | float) -> np.ndarray:
@@ -191,16 +120,17 @@ class _Matches:
     weight: np.ndarray
 
     @classmethod
-    def of(cls, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray, config: RegistrationConfig) -> _Matches:
-        if config.inlier_sigmas > 0 and len(p_obj):
-            limit = np.maximum(config.inlier_m, config.inlier_sigmas * sigma_m)
-            return cls(p_obj, p_cam, limit, (np.median(sigma_m) / sigma_m) ** 2)
-        return cls(p_obj, p_cam, np.full(len(p_obj), config.inlier_m), np.ones(len(p_obj)))
+    def of(
+        cls, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray | None, config: RegistrationConfig
+    ) -> _Matches:
+        if sigma_m is None or not len(p_obj):
+            return cls(p_obj, p_cam, np.full(len(p_obj), config.inlier_m), np.ones(len(p_obj)))
+        limit = np.maximum(config.inlier_m, _INLIER_SIGMAS * sigma_m)
+        return cls(p_obj, p_cam, limit, (np.median(sigma_m) / sigma_m) ** 2)
 
     def residual_m(self, T_cam_obj: np.ndarray) -> np.ndarray:
         """(..., n) of poses (..., 4, 4)."""
-        error = se3.transform(T_cam_obj, self.p_obj) - self.p_cam
-        return np.sqrt(np.einsum("...i,...i->...", error, error))
+        return robust.residual_m(T_cam_obj, self.p_obj, self.p_cam)
 
 
 def _finite_matches(
@@ -208,30 +138,12 @@ def _finite_matches(
 ) -> tuple[_Matches, np.ndarray]:
     """The rows that are finite, and (N,) bool which those are."""
     p_obj, p_cam = np.asarray(p_obj, float).reshape(-1, 3), np.asarray(p_cam, float).reshape(-1, 3)
-    sigma_m = depth_noise_m(p_cam[:, 2]) if sigma_m is None else np.asarray(sigma_m, float)
-    usable = np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1) & np.isfinite(sigma_m) & (sigma_m > 0)
-    return _Matches.of(p_obj[usable], p_cam[usable], sigma_m[usable], config), usable
-
-
-def _fit(
-    p_obj: np.ndarray, p_cam: np.ndarray, weights: np.ndarray | None = None, R_prior: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """The best T_cam_obj (..., 4, 4) and the inertia (...,) in m^2 of the points about their long axis."""
-    p_obj, p_cam = np.asarray(p_obj, float), np.asarray(p_cam, float)
-    w = np.ones(p_obj.shape[:-1]) if weights is None else np.asarray(weights, float)
-    total = np.maximum(w.sum(-1), np.finfo(float).tiny)[..., None]
-    mean_obj = np.einsum("...n,...ni->...i", w, p_obj) / total
-    mean_cam = np.einsum("...n,...ni->...i", w, p_cam) / total
-    centred = (p_cam - mean_cam[..., None, :]) * w[..., None]
-    H = np.swapaxes(centred, -1, -2) @ (p_obj - mean_obj[..., None, :])
-    if R_prior is not None:
-        H = H + _PRIOR_INERTIA_M2 * R_prior
-    U, s, Vt = np.linalg.svd(H)
-    proper = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    U[..., 2] *= proper[..., None]
-    R = U @ Vt
-    t = mean_cam - np.einsum("...ij,...j->...i", R, mean_obj)
-    return se3.from_rt(R, t), s[..., 1] + proper * s[..., 2]
+    usable = np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1)
+    if sigma_m is not None:
+        sigma_m = np.asarray(sigma_m, float)
+        usable &= np.isfinite(sigma_m) & (sigma_m > 0)
+        sigma_m = sigma_m[usable]
+    return _Matches.of(p_obj[usable], p_cam[usable], sigma_m, config), usable
 
 
 def _determined(inertia_m2: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
@@ -244,7 +156,8 @@ def _sequential(matches: _Matches, config: RegistrationConfig, rng: np.random.Ge
     for _ in range(config.max_hypotheses):
         if pool.sum() < max(config.sample_size, config.min_inliers):
             break
-        T = _ransac(matches, np.flatnonzero(pool), config, rng)
+        drawn = matches.p_obj[pool], matches.p_cam[pool], matches.limit_m[pool]
+        T = robust.ransac(*drawn, config.sample_size, config.iterations, rng)
         refit = None if T is None else _refit(T, matches, pool, f"ransac {len(found) + 1}", config)
         if refit is None:
             break
@@ -255,51 +168,6 @@ def _sequential(matches: _Matches, config: RegistrationConfig, rng: np.random.Ge
     return found
 
 
-def _ransac(
-    matches: _Matches, pool: np.ndarray, config: RegistrationConfig, rng: np.random.Generator
-) -> np.ndarray | None:
-    """The T_cam_obj with the most inliers in ``pool`` (indices); None without any.
-
-    Samples come in batches until a better consensus is unlikely to have been missed.
-    """
-    best, best_score, missed = None, -np.inf, 1.0
-    for drawn in range(0, config.iterations, _BATCH):
-        size = min(_BATCH, config.iterations - drawn)
-        T, score = _best_of_batch(matches, pool, size, config.sample_size, rng)
-        if score > best_score:
-            best, best_score = T, score
-            share = np.ceil(score) / len(pool)
-            missed = 1 - share**config.sample_size
-        if missed ** (drawn + size) < _MISSED:
-            break
-    return best
-
-
-def _best_of_batch(
-    matches: _Matches, pool: np.ndarray, size: int, sample_size: int, rng: np.random.Generator
-) -> tuple[np.ndarray | None, float]:
-    """The best pose of ``size`` samples and its inliers, less a share of one for how loosely they fit."""
-    order = rng.random((size, len(pool)), np.float32)
-    sample = pool[np.argpartition(order, sample_size - 1, axis=1)[:, :sample_size]]
-    sample = sample[_lengths_agree(matches, sample)]
-    if not len(sample):
-        return None, -np.inf
-    T, _ = _fit(matches.p_obj[sample], matches.p_cam[sample])
-    relative = matches.residual_m(T)[:, pool] / matches.limit_m[pool]
-    agrees = relative <= 1
-    score = agrees.sum(1) - np.sum(np.where(agrees, relative, 0), 1) / (len(pool) + 1)
-    best = np.argmax(score)
-    return T[best], float(score[best])
-
-
-def _lengths_agree(matches: _Matches, sample: np.ndarray) -> np.ndarray:
-    """Which samples (S, k) keep the distances between successive points: no rigid motion fits the others."""
-    after = np.roll(sample, 1, axis=1)
-    length_obj = np.linalg.norm(matches.p_obj[sample] - matches.p_obj[after], axis=-1)
-    length_cam = np.linalg.norm(matches.p_cam[sample] - matches.p_cam[after], axis=-1)
-    return (np.abs(length_obj - length_cam) <= matches.limit_m[sample] + matches.limit_m[after]).all(1)
-
-
 def _refit(
     T: np.ndarray,
     matches: _Matches,
@@ -308,24 +176,13 @@ def _refit(
     config: RegistrationConfig,
     R_prior: np.ndarray | None = None,
 ) -> tuple[Hypothesis, bool] | None:
-    """Refits on the inliers until they stay the same; None if too few remain. And: do they determine the turn?
-
-    Fitting and choosing inliers in turn lowers the truncated cost, sum of w min(r, limit)^2, at each step.
-    """
-    inliers = pool & (matches.residual_m(T) <= matches.limit_m)
-    for _ in range(_REFITS):
-        if inliers.sum() < config.min_inliers:
-            return None
-        fitted = inliers
-        T, inertia = _fit(matches.p_obj[fitted], matches.p_cam[fitted], matches.weight[fitted], R_prior)
-        residual = matches.residual_m(T)
-        inliers = pool & (residual <= matches.limit_m)
-        if np.array_equal(inliers, fitted):
-            break
-    if inliers.sum() < config.min_inliers:
+    """The hypothesis refit on its inliers in ``pool`` (N,) bool, None without enough; do they determine its turn?"""
+    m = matches
+    fit = robust.refit(T, m.p_obj, m.p_cam, m.limit_m, m.weight, config.min_inliers, pool, R_prior)
+    if fit is None:
         return None
-    hypothesis = Hypothesis(T, inliers, residual, origin)
-    return hypothesis, bool(_determined(inertia, np.median(matches.limit_m[inliers])))
+    hypothesis = Hypothesis(fit.T_a_b, fit.inliers, fit.residual_m, origin)
+    return hypothesis, bool(_determined(fit.inertia_m2, np.median(m.limit_m[fit.inliers])))
 
 
 def _from_priors(matches: _Matches, priors: Mapping[str, np.ndarray], config: RegistrationConfig) -> list[Hypothesis]:
@@ -336,11 +193,11 @@ def _from_priors(matches: _Matches, priors: Mapping[str, np.ndarray], config: Re
 
 
 def _svd_twice(matches: _Matches, config: RegistrationConfig) -> list[Hypothesis]:
-    T, _ = _fit(matches.p_obj, matches.p_cam)
+    T, _ = fit_rigid_inertia(matches.p_obj, matches.p_cam)
     kept = matches.residual_m(T) <= matches.limit_m
     if kept.sum() < config.min_inliers:
         return []
-    T, inertia = _fit(matches.p_obj[kept], matches.p_cam[kept])
+    T, inertia = fit_rigid_inertia(matches.p_obj[kept], matches.p_cam[kept])
     if not _determined(inertia, matches.limit_m.mean()):
         return []
     residual = matches.residual_m(T)
@@ -356,7 +213,7 @@ def _without_duplicates(found: list[Hypothesis], matches: _Matches, config: Regi
     return [h for k, h in enumerate(found) if apart[k, :k].all()]
 
 
-def _spread(hypothesis: Hypothesis, usable: np.ndarray) -> Hypothesis:
+def _in_all_rows(hypothesis: Hypothesis, usable: np.ndarray) -> Hypothesis:
     """The hypothesis with its rows put back among those that were not finite."""
     inliers, residual = np.zeros(len(usable), bool), np.full(len(usable), np.inf)
     inliers[usable], residual[usable] = hypothesis.inliers, hypothesis.residual_m

@@ -17,6 +17,9 @@ from p2p_lib.core.depth import off_edges
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Frame
 
+#: Points keep this distance to the mask's border (the release's).
+_EDGE_MARGIN_PX = 2
+
 
 @dataclass(frozen=True, eq=False)
 class Terms:
@@ -80,8 +83,8 @@ def distance_px(uv_px: np.ndarray, others_px: np.ndarray) -> np.ndarray:
     return np.linalg.norm(uv_px[:, None] - others_px[None], axis=-1).min(1)
 
 
-def usable_region(frame: Frame, mask: np.ndarray, config: SamplingConfig, edge_m: float) -> np.ndarray:
+def usable_region(frame: Frame, mask: np.ndarray, edge_m: float) -> np.ndarray:
     """(H, W) bool: where points can be lifted: in the mask, off its border, measured, off depth edges of ``edge_m``."""
-    size = 2 * config.edge_margin_px + 1
+    size = 2 * _EDGE_MARGIN_PX + 1
     inner = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0)
     return (inner > 0) & off_edges(frame.depth_m, edge_m)

@@ -30,6 +30,8 @@ BLOCK = 8
 #: Voxels handled at once while fusing. On a CPU few enough for the temporaries to stay in its cache, and for
 #: torch not to share them among threads: on two busy cores, its threads wait for each other far longer than they work.
 _SLAB = {"cpu": 1 << 15, "cuda": 1 << 22}
+#: Room around new surface when the grid grows.
+_PADDING_M = 0.02
 #: Depth pixels looked at to decide where the object is.
 _REGION_POINTS = 4000
 #: A jump in sorted depth that separates the object from whatever else the mask caught.
@@ -329,7 +331,7 @@ class TsdfVolume:
         if not self.grows:
             return
         region = self._region(view)
-        pad = max(self.config.padding_m, self.tau_m)
+        pad = max(_PADDING_M, self.tau_m)
         want_lo = np.floor((region[0] - pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
         want_hi = np.ceil((region[1] + pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
         old_lo, old_hi = self.lo, self.lo + self.shape

@@ -2,7 +2,7 @@
 
 Causal, frame by frame: a memory of the object's last frames and of the one with the clicks conditions the mask in
 the next. Code and weights: Apache-2.0. Each object has an inference session of its own, so that it can come late and
-go; the picture's features, which are most of the work, are computed once for all of them.
+go; the image's features, which are most of the work, are computed once for all of them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from p2p_lib.core import packages
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import check_clicks, check_depth
+from p2p_lib.core.clicks import checked_clicks
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.raster import to_raster
@@ -25,7 +25,7 @@ from p2p_lib.datasets import checkpoints
 if TYPE_CHECKING:
     import torch
 
-#: What the publisher's picture processor, which needs torchvision, scales colours by: ImageNet's mean and deviation.
+#: What the publisher's image processor, which needs torchvision, scales colours by: ImageNet's mean and deviation.
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _OBJECT = 1  # the id of a session's only object
 _ABSENT = -1024.0  # the logit of pixels of an object that is not to be seen, as the network itself has it
@@ -46,7 +46,7 @@ def load(
 
 
 class Sam2Segmenter:
-    """Streams pictures through a ``Sam2VideoModel``. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
+    """Streams images through a ``Sam2VideoModel``. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
 
     It looks at colour alone: hints are not used, and unmeasured pixels are labelled too.
     """
@@ -77,11 +77,8 @@ class Sam2Segmenter:
         """One frame in, one label image out; where two objects claim a pixel the likelier one has it."""
         import torch
 
-        new = {name: check_clicks(name, at, self._camera) for name, at in (clicks or {}).items()}
-        for name, at in new.items():
-            check_depth(name, at, frame)
-        for name, at in new.items():
-            self._sessions[name] = self._session(at)
+        new = checked_clicks(clicks or {}, self._camera, frame)
+        self._sessions |= {name: self._session(at) for name, at in new.items()}
         with torch.inference_mode():
             labels = self._labels(frame) if self._sessions else np.zeros(frame.shape, np.int32)
         self._at += 1
@@ -129,12 +126,12 @@ class Sam2Segmenter:
         """(1, 3, S, S) as the network wants it."""
         import torch
 
-        picture = torch.from_numpy(rgb).to(self._device).permute(2, 0, 1)[None].float() / 255
-        picture = torch.nn.functional.interpolate(
-            picture, (self._size, self._size), mode="bilinear", align_corners=False, antialias=True
+        image = torch.from_numpy(rgb).to(self._device).permute(2, 0, 1)[None].float() / 255
+        image = torch.nn.functional.interpolate(
+            image, (self._size, self._size), mode="bilinear", align_corners=False, antialias=True
         )
         mean, deviation = (torch.tensor(v, device=self._device).view(1, 3, 1, 1) for v in (MEAN, DEVIATION))
-        return (picture - mean) / deviation
+        return (image - mean) / deviation
 
     def _trim(self, session: Any) -> None:
         """Let go of what is not read any more: by itself a session grows by megabytes a frame."""

@@ -1,378 +1,218 @@
-"""Looks at a sequence of one's own before anything is tracked and names what is wrong: what ``p2p check`` prints.
+"""Notebook 10: what went in and what came out, what good masks are, how to tell without any truth that it works.
 
-What goes wrong with own data is known: depth in another unit, depth that was not registered to colour, the camera
-matrix of another resolution, times in milliseconds, masks that hold the table too, objects without anything to track.
+A reconstructed surface is drawn at the estimated pose. Where the camera measured something behind it, the object cannot
+be: a wrong pose, or a surface that bulges. What lies in front of it hides it and says nothing.
 """
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from enum import StrEnum
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
+import trimesh
+from matplotlib.figure import Figure
+from pandas import DataFrame, Series
 
-from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, make_detector, make_segmenter
+from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput, P2PError
-from p2p_lib.core.types import Frame
+from p2p_lib.core.types import Frame, Status
+from p2p_lib.datasets.alignment import background_share, rim
+from p2p_lib.datasets.models import MESHES, find_models
 from p2p_lib.datasets.prompts import Prompt
-from p2p_lib.datasets.sequence import Sequence, open_sequence
-from p2p_lib.method.sampling import choose, usable_region
-from p2p_lib.studies.depth_colour import misfit
-from p2p_lib.studies.mask_rim import background_share
-from p2p_lib.synthetic.faults import spoil
+from p2p_lib.datasets.runs import Run
+from p2p_lib.datasets.sequence import Sequence as Recording
+from p2p_lib.figures import overlay, style
+from p2p_lib.figures.mesh_view import draw_mesh
+from p2p_lib.figures.overlay import Box
+from p2p_lib.figures.playback import Playback
+from p2p_lib.figures.plots import panels
+from p2p_lib.figures.scenes import Scene
+from p2p_lib.synthetic.render import render
+from p2p_lib.synthetic.shapes import Mesh, load_mesh
 
-#: Frames that are looked at, evenly spread.
-FRAMES = 12
-#: Of the picture's width: an offset between depth and colour that does not matter, and a principal point off centre.
-OFFSET_SHARE, CENTRE_SHARE = 0.01, 0.1
-#: How much better depth must fit elsewhere to be called not registered: 1.05 at most on good sequences looked at.
-GAIN = 1.2
-#: Whatever is recorded in front of a depth camera is this far away, in metres.
-NEAREST_M, FARTHEST_M = 0.05, 20.0
-#: Horizontal and vertical angles of view of any RGB-D camera, in degrees.
-VIEW_DEG = (20.0, 130.0)
-#: Frames per second that cameras have, and a gap as a multiple of the usual interval.
-RATES_HZ, GAP = (0.5, 500.0), 10.0
-#: Share of pictures that may equal the next one.
-REPEATED_SHARE = 0.3
-#: Share of a mask's rim that may lie on the background: 0.4 at most on good sequences looked at.
-RIM_SHARE = 0.5
-#: Shares of a mask, and of the picture, that should have a depth.
-MEASURED_SHARE = 0.5
-#: What an object seldom is: so much of the picture, so deep (of its distance). Objects looked at: at most 0.07, 0.23.
-LARGE_SHARE, DEEP_SHARE = 0.12, 0.25
-#: Share of depth at its largest value from which on it was cut off there.
-CLIPPED_SHARE = 0.1
+#: As near to the surface is on it; so much before it is something else that hides it.
+ON_M, BEFORE_M = 0.005, 0.01
 
 
-class Level(StrEnum):
-    """How bad a finding is: fine, worth a look, or to be mended before anything else."""
+def surface_fit(
+    sequence: Recording,
+    run: Run,
+    meshes: Mapping[str, Mesh],
+    rows: Iterable[int],
+    T_obj_wrong: np.ndarray = se3.IDENTITY,
+) -> dict[str, Series]:
+    """Per object, at these rows with a pose: the fraction of its unhidden surface on which depth was measured.
 
-    OK = "ok"
-    LOOK = "look"
-    WRONG = "WRONG"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that was looked at: its name, how it is, what was measured, and what to do about it."""
-
-    name: str
-    level: Level
-    text: str
-    fix: str = ""
-
-
-def check_folder(
-    sequence: str | Path | Sequence,
-    *,
-    prompts: Iterable[Prompt] = (),
-    format: str | None = None,
-    depth_scale: float | None = None,
-    config: Config | None = None,
-) -> list[Finding]:
-    """What is right and wrong with a sequence, in the order in which it should be mended.
-
-    prompts  clicks, for a sequence without masks: the embedded segmenter makes its first ones
-    config   whose limits count (default: the preset ``default``)
-
-    Files that cannot be read are findings too; nothing is raised for the data's sake.
+    meshes       object to its reconstructed surface (:func:`p2p_lib.figures.mesh_view.as_body`)
+    T_obj_wrong  (4, 4) by which all poses are put off on purpose, to see what a wrong pose would look like
     """
-    config = config or preset()
-    try:
-        if isinstance(sequence, str | Path):
-            sequence = open_sequence(sequence, format, depth_scale)
-        chosen = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist()
-        frames = [sequence.frame(i) for i in chosen]
-        masks = [sequence.masks(i) or {} for i in chosen]
-        firsts = dict(_clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config))
-    except P2PError as error:
-        return [_unreadable(error)]
-    size = f"{len(sequence)} pictures of {sequence.camera.width}x{sequence.camera.height}"
-    findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at")]
-    findings += [_camera(sequence.camera), _times(sequence), _repeated(frames, sequence)]
-    findings += [_depth(frames), _registered(frames)]
-    if any(finding.name == "depth" and finding.level is Level.WRONG for finding in findings):
-        return findings  # nothing that follows would mean anything
-    if not firsts:
-        return [*findings, _no_masks(sequence, any(masks), config)]
-    if beyond := _all_beyond(firsts, config):
-        return [*findings, beyond]  # what follows would only be its consequences
-    for name, (frame, mask) in firsts.items():
-        if mask.sum() < config.pipeline.min_mask_px:
-            findings.append(_nothing_there(name, frame, mask, config))
-            continue
-        pairs = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
-        findings.append(_range(name, frame, mask, config))
-        findings += [_rim(name, [(frame, mask), *pairs], config), _points(name, frame, mask, config)]
-    return findings
+    found: dict[str, dict[int, float]] = {name: {} for name in meshes}
+    for row in rows:
+        frame = sequence.frame(int(next(iter(run.objects.values())).frame_index[row]))
+        for name, body in meshes.items():
+            obj = run.objects[name]
+            if obj.has_pose[row]:
+                T_obj_cam = se3.inverse(obj.T_cam_obj[row] @ T_obj_wrong)
+                drawn_m = render([(body, se3.IDENTITY)], sequence.camera, T_obj_cam).depth_m
+                behind_m = (frame.depth_m - drawn_m)[(drawn_m > 0) & (frame.depth_m > 0)]
+                unhidden_m = behind_m[behind_m > -BEFORE_M]
+                found[name][row] = (np.abs(unhidden_m) < ON_M).mean() if len(unhidden_m) else np.nan
+    return {name: Series(fits, dtype=float) for name, fits in found.items()}
 
 
-def check_spoilt(folder: str | Path, fault: str, **options: Any) -> list[Finding]:
-    """What :func:`check_folder` finds in a copy of a folder with a fault of :mod:`p2p_lib.synthetic.faults` put in."""
-    with tempfile.TemporaryDirectory() as home:
-        copy = shutil.copytree(folder, Path(home) / Path(folder).name)
-        return check_folder(spoil(copy, fault), **options)
+def errors_against(source: Recording, frames: Iterable[int], run: Run) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Object to its rotation (n,) in degrees and translation (n,) in mm off a truth that the run did not know.
+
+    frames  those of ``source`` that the run's were. The object frame is aligned at the first row with a pose; NaN where
+    there is no pose.
+    """
+    errors, frames = {}, np.array(list(frames))
+    for name, obj in run.objects.items():
+        T_cam_model = source.truth[name].T_cam_model[frames[obj.frame_index]]
+        first = int(np.argmax(obj.has_pose))
+        T_obj_model = se3.inverse(obj.T_cam_obj[first]) @ T_cam_model[first]
+        errors[name] = se3.error_deg_mm(obj.T_cam_obj @ T_obj_model, T_cam_model)
+    return errors
 
 
-def as_lines(findings: Iterable[Finding]) -> str:
-    """The findings for people, each remedy under what it mends."""
-    findings = list(findings)
-    width = max(len(finding.name) for finding in findings)
-    lines = []
-    for finding in findings:
-        lines.append(f"{finding.level:7}{finding.name:{width}}  {finding.text}")
-        lines += [f"{'':7}{'':{width}}  -> {finding.fix}"] if finding.fix else []
-    wrong, look = ([f.name for f in findings if f.level is level] for level in (Level.WRONG, Level.LOOK))
-    last = (
-        f"To look at before tracking: {', '.join(look)}" if look else "Nothing is wrong with it as far as can be seen."
+def tight_box(mesh: trimesh.Trimesh) -> Box:
+    """The smallest box around a surface, along its own axes."""
+    T_box_obj, size_m = trimesh.bounds.oriented_bounds(mesh)
+    return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
+
+
+def edges_mm(mesh: trimesh.Trimesh, beyond: float = 0.005, rounds: int = 2) -> np.ndarray:
+    """(3,) edges of the box around a surface, longest first, without its fringes.
+
+    Twice, the outermost fraction ``beyond`` of the vertices is cut off at each side, along the box's axes.
+    """
+    p_obj = np.asarray(mesh.vertices)
+    for _ in range(rounds):
+        T_box_obj, _ = trimesh.bounds.oriented_bounds(p_obj)
+        p_box = se3.transform(se3.orthonormalised(T_box_obj), p_obj)
+        low, high = np.quantile(p_box, [beyond, 1 - beyond], axis=0)
+        p_obj = p_obj[((p_box >= low) & (p_box <= high)).all(1)]
+    return np.sort(1e3 * trimesh.bounds.oriented_bounds(p_obj)[1])[::-1]
+
+
+def true_edges_mm(sequence: Recording) -> dict[str, np.ndarray]:
+    """Per object with a model, (3,) edges of the box around it, longest first."""
+    meshes = {name: load_mesh(file) for name, file in find_models(sequence, MESHES).items()}
+    return {k: np.sort(1e3 * trimesh.bounds.oriented_bounds(m.vertices)[1])[::-1] for k, m in meshes.items()}
+
+
+def edges_table(edges: Mapping[str, np.ndarray], ruler: Mapping[str, np.ndarray]) -> DataFrame:
+    """A row per edge: the reconstructed surface's beside the ruler's."""
+    return DataFrame(
+        {"object": name, "edge": edge, "surface [mm]": round(float(found)), "ruler [mm]": round(float(true))}
+        for name in edges
+        for edge, found, true in zip(("longest", "middle", "shortest"), edges[name], ruler[name], strict=True)
     )
-    lines.append(f"To mend first: {', '.join(wrong)}" if wrong else last)
-    return "\n".join(lines)
 
 
-def _unreadable(error: P2PError) -> Finding:
-    if isinstance(error, BadInput):
-        return Finding("files", Level.WRONG, f"{error.name}: got {error.got}, expected {error.expected}", error.fix)
-    return Finding("files", Level.WRONG, str(error))
+def findings_table(findings: Mapping[str, Sequence[Any]]) -> DataFrame:
+    """What ``p2p check`` says about folders: a row per finding (:mod:`p2p_lib.apps.check`) that is not fine."""
+    return DataFrame(
+        {
+            "what was done to the folder": label,
+            "where": f.name,
+            "says": str(f.level),
+            "found": f.text.replace("`", ""),
+            "what to do": f.fix.replace("`", ""),
+        }
+        for label, found in findings.items()
+        for f in found
+        if f.level != "ok"
+    )
 
 
-def _camera(camera: Camera) -> Finding:
-    """Whether K belongs to pictures of this size: its principal point is their middle, nearly."""
-    size, centre = np.array([camera.width, camera.height]), np.array([camera.cx, camera.cy]) + 0.5
-    view_deg = np.degrees(2 * np.arctan(size / 2 / [camera.fx, camera.fy]))
-    text = f"sees {view_deg[0]:.0f} x {view_deg[1]:.0f} degrees, centre at ({camera.cx:.0f}, {camera.cy:.0f})"
-    if (np.abs(centre / size - 0.5) > CENTRE_SHARE).any():
-        of = "x".join(f"{round(2 * c, -1):.0f}" for c in centre)
-        text = f"K has its centre at ({camera.cx:.0f}, {camera.cy:.0f}): that of pictures of about {of}"
-        factors = size / (2 * centre)
-        fix = f"Take K at {camera.width}x{camera.height}"
-        if abs(factors[0] / factors[1] - 1) < 0.1:
-            fix += f": for pictures scaled as a whole, its first two rows times {factors.mean():.3g}"
-        return Finding("camera", Level.WRONG, text, f"{fix}.")
-    if (view_deg < VIEW_DEG[0]).any() or (view_deg > VIEW_DEG[1]).any():
-        fix = "fx and fy are in pixels, at the size that the pictures have here."
-        return Finding("camera", Level.WRONG, f"{text}: no RGB-D camera does", fix)
-    return Finding("camera", Level.OK, text)
+def story(playback: Playback, prompts: Sequence[Prompt], rows: Sequence[int], width_px: int = 430) -> np.ndarray:
+    """Clicks, poses and surfaces on one sheet: the clicked image, the run at some rows, each object reconstructed."""
+    boxes = {name: tight_box(mesh) for name, mesh in playback.meshes.items()}
+    scene = Scene(playback.sequence, playback.run, boxes=boxes, truth=False)
+    region_px = scene.region()
+    clicked = clicked_image(playback.sequence.frame(prompts[0].frame), prompts, playback.colours)
+    clicked, camera = overlay.zoomed(clicked, playback.sequence.camera, region_px, width_px)
+    images = [overlay.draw_caption(clicked, "clicks")]
+    images += [scene.draw(row, region_px, width_px, trail=60) for row in rows]
+    for name, mesh in playback.meshes.items():
+        images.append(overlay.draw_caption(mesh_portrait(mesh, camera.width, camera.height), f"{name}: surface"))
+    return overlay.montage(images, columns=3)
 
 
-def _times(sequence: Sequence) -> Finding:
-    """Whether the times are seconds, and without holes."""
-    steps_s = np.diff(sequence.times_s)
-    if not len(steps_s):
-        return Finding("times", Level.LOOK, "a single picture", "Tracking needs a video.")
-    usual_s, widest = float(np.median(steps_s)), int(steps_s.argmax())
-    text = f"{1 / usual_s:.3g} pictures per second, {sequence.times_s[-1] - sequence.times_s[0]:.1f} s"
-    if not RATES_HZ[0] <= 1 / usual_s <= RATES_HZ[1]:
-        unit = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
-        guess = next((f" These look like {n}." for k, n in unit.items() if 1 <= k / usual_s <= RATES_HZ[1]), "")
-        text = f"{usual_s:.3g} s between pictures: {1 / usual_s:.3g} per second"
-        return Finding("times", Level.WRONG, text, f"times.txt holds seconds, one a line.{guess}")
-    if steps_s[widest] > GAP * usual_s:
-        text += f", but {steps_s[widest]:.2g} s between frames {widest} and {widest + 1}"
-        fix = "Pictures are missing there: what moved meanwhile has to be found again."
-        return Finding("times", Level.LOOK, text, fix)
-    return Finding("times", Level.OK, text)
-
-
-def _repeated(frames: list[Frame], sequence: Sequence) -> Finding:
-    """Whether pictures are copies of the one before: a recorder that was faster than its camera."""
-    pairs = [(f, sequence.frame(f.index + 1)) for f in frames if f.index + 1 < len(sequence)]
-    copies = [a.index for a, b in pairs if np.array_equal(a.rgb, b.rgb)]
-    frozen = [a.index for a, b in pairs if a.depth_m.any() and np.array_equal(a.depth_m, b.depth_m)]
-    if max(len(copies), len(frozen)) > REPEATED_SHARE * len(pairs):
-        what, of = ("colour", copies) if len(copies) >= len(frozen) else ("depth", frozen)
-        text = f"{len(of)} of {len(pairs)} {what} pictures equal the next one, that of frame {of[0]} for one"
-        return Finding("motion", Level.LOOK, text, "Record each picture once, with the time at which it was taken.")
-    return Finding("motion", Level.OK, "every picture looked at differs from the next")
-
-
-def _depth(frames: list[Frame]) -> Finding:
-    """Whether depth is in metres once the scale is applied."""
-    known = [frame.depth_m[frame.depth_m > 0] for frame in frames]
-    share = float(np.mean([len(d) / f.depth_m.size for d, f in zip(known, frames)]))
-    if not share:
-        return Finding("depth", Level.WRONG, "no measurement anywhere", "Look at the files in depth/: all are 0.")
-    every_m = np.concatenate(known)
-    median_m = float(np.median(every_m))
-    text = f"{median_m:.3g} m in the middle, {100 * share:.0f} % of the pixels measured"
-    if not NEAREST_M <= median_m <= FARTHEST_M:
-        clipped = float((every_m == every_m.max()).mean())
-        if median_m > FARTHEST_M and clipped > CLIPPED_SHARE:
-            text = f"{text}; {100 * clipped:.0f} % of them are cut off at {every_m.max():.3g} m, the most that fits"
-            fix = "No scale brings back what was cut off: export the depth again, as 16-bit millimetres."
-            return Finding("depth", Level.WRONG, text, fix)
-        factor = _factor(median_m)
-        guess = f" A scale {factor:g} times the present one would make it {median_m * factor:.2g} m." if factor else ""
-        fix = f"Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1).{guess}"
-        return Finding("depth", Level.WRONG, f"{text}: the unit is another", fix)
-    if share < MEASURED_SHARE / 2:
-        fix = "Keep the sensor's least distance, and out of the sun; glass, mirrors and black things have no depth."
-        return Finding("depth", Level.LOOK, text, fix)
-    return Finding("depth", Level.OK, text)
-
-
-def _factor(median_m: float) -> float | None:
-    """The power of ten that brings a depth to where things stand before a camera; None where none does."""
-    return next((10.0**k for k in (-3, 3, -4, 4, -1, 1) if 0.15 <= median_m * 10.0**k <= 5), None)
-
-
-def _registered(frames: list[Frame]) -> Finding:
-    """Whether depth was registered to the colour camera."""
-    name, width = "registration", frames[0].shape[1]
-    found = misfit(frames, OFFSET_SHARE * width)
-    if found is None:
-        return Finding(name, Level.OK, "too few edges in depth and colour to tell whether they agree")
-    if found.gain <= GAIN:
-        return Finding(name, Level.OK, "edges of depth lie on edges of colour")
-    where = f"shifted by ({round(found.du_px):+d}, {round(found.dv_px):+d}) px"
-    size = f"{found.scale:.2f} times as large and " if abs(found.scale - 1) > 0.03 else ""
-    fix = "Register depth to colour when recording (`align` in the camera's software; p2p data convert-bag does)."
-    text = f"depth lies beside colour: {size}{where}, its edges would fit {found.gain:.1f} times as well"
-    return Finding(name, Level.WRONG, text, fix)
-
-
-def _no_masks(sequence: Sequence, drawn: bool, config: Config) -> Finding:
-    """Nothing to begin with: no masks at all, or masks that hold no object."""
-    fix = f"Make clicks with p2p click and give them with --prompts, or put masks into {sequence.path}/masks."
-    if not drawn:
-        return Finding("masks", Level.LOOK, "none", fix)
-    text = f"none that shows an object: no object has {config.pipeline.min_mask_px} pixels in any picture"
-    return Finding("masks", Level.WRONG, text, fix)
-
-
-def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
-    """A click at which the segmenter found no object to speak of."""
-    count, needed = int(mask.sum()), config.pipeline.min_mask_px
-    what = f"only {count} pixels were segmented" if count else "nothing was segmented"
-    text = f"{what} at the clicks on it in frame {frame.index}; {needed} pixels are needed"
-    return Finding(f"{name}: mask", Level.WRONG, text, "Click elsewhere, in the middle of the object: p2p click.")
-
-
-def _distance_m(frame: Frame, mask: np.ndarray) -> float:
-    """Median depth of what is measured of a mask; NaN where nothing is, or too little of it."""
-    depth_m = frame.depth_m[mask]
-    measured = depth_m[depth_m > 0]
-    enough = len(measured) and len(measured) >= MEASURED_SHARE * len(depth_m)
-    return float(np.median(measured)) if enough else float("nan")
-
-
-def _all_beyond(firsts: dict[str, tuple[Frame, np.ndarray]], config: Config) -> Finding | None:
-    """The one finding of objects that are all too far away, or all too near: most likely depth is in another unit."""
-    limits, away_m = config.depth, {name: _distance_m(*first) for name, first in firsts.items()}
-    distances = np.array(list(away_m.values()))
-    far = bool((distances > limits.max_m).all())
-    if not far and not (distances < limits.min_m).all():
-        return None
-    (first, (frame, mask)), *others = firsts.items()
-    text = f"{away_m[first]:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
-    text += f" ({', '.join(f'{name} {away_m[name]:.2f} m' for name, _ in others)})" if others else ""
-    return Finding(f"{first}: depth", Level.WRONG, *_beyond(text, distances, config))
-
-
-def _beyond(text: str, distances: np.ndarray, config: Config) -> tuple[str, str]:
-    """What is said of distances on one side of those that count, and what to do: the unit first, then the limit."""
-    limits, far = config.depth, bool(distances.max() > config.depth.max_m)
-    factor = _factor(float(np.median(distances)))
-    guess = f": {factor:g} times the present one would make it {distances[0] * factor:.2f} m" if factor else ""
-    wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
-    fix = f"If it was not, the depth scale is wrong (--depth-scale{guess}); if it was, --set depth.{wider}."
-    return f"{text}, but {limits.min_m:g} to {limits.max_m:g} m count", fix
-
-
-def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
-    """Whether an object is where depth counts, and measured."""
-    limits, depth_m = config.depth, frame.depth_m[mask]
-    share = float((depth_m > 0).mean())
-    if share < MEASURED_SHARE:
-        fix = "Dark, shiny and transparent things have none; change the light or the distance, or spray it matt."
-        text = f"only {100 * share:.0f} % of its pixels in frame {frame.index} have a depth"
-        return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
-    median_m = float(np.median(depth_m[depth_m > 0]))
-    text = f"{median_m:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
-    if not limits.min_m <= median_m <= limits.max_m:
-        return Finding(f"{name}: depth", Level.WRONG, *_beyond(text, np.array([median_m]), config))
-    return Finding(f"{name}: depth", Level.OK, text)
-
-
-def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Finding:
-    """Whether an object's masks hold background; the first of them also whether it is background altogether."""
-    first = seen[0]
-    seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.pipeline.min_mask_px]
-    shares = np.array([background_share(mask, frame.depth_m) for frame, mask in seen])
-    if np.isnan(shares).all():
-        return Finding(f"{name}: mask", Level.OK, "no depth along its rim to judge it by")
-    typical = float(np.nanmedian(shares))
-    text = f"{100 * typical:.0f} % of its rim lies on the background (median of {len(shares)} masks)"
-    if typical > RIM_SHARE:
-        worst = seen[int(np.nanargmax(shares))][0].index
-        fix = f"Draw it to the object's edge or a little inside; frame {worst} is the worst."
-        return Finding(f"{name}: mask", Level.WRONG, text, fix)
-    large, deep_m, away_m = _extent(*first)
-    if large > LARGE_SHARE or deep_m > DEEP_SHARE * away_m:
-        text = f"it covers {100 * large:.0f} % of the picture, over {deep_m:.2f} m of depth; {text}"
-        fix = "Is it the object, or the table or wall? If it is not, click in its middle, or draw it tighter."
-        return Finding(f"{name}: mask", Level.LOOK, text, fix)
-    return Finding(f"{name}: mask", Level.OK, text)
-
-
-def _extent(frame: Frame, mask: np.ndarray) -> tuple[float, float, float]:
-    """A mask's share of the picture, the depth that it reaches over without its outermost pixels, its distance (m)."""
-    depth_m = frame.depth_m[mask & (frame.depth_m > 0)]
-    near_m, away_m, far_m = np.percentile(depth_m, [2, 50, 98]) if len(depth_m) else (0.0, 0.0, 0.0)
-    return float(mask.mean()), float(far_m - near_m), float(away_m)
-
-
-def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
-    """Whether an object has anything to track: points that can be lifted, with a contrast of their own."""
-    detector = make_detector(DEFAULT_DETECTOR, config.sampling, np.random.default_rng(config.seed))
-    found = detector.detect(frame, usable_region(frame, mask, config.sampling, config.depth.edge_m))
-    taken = choose(found, np.zeros((0, 2)), config.sampling.max_visible, config.sampling)
-    u, v = np.rint(found.uv_px[taken]).astype(int).T
-    contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]
-    count, needed = int((contrast >= config.tracking.bare_contrast).sum()), config.pipeline.recover_min_inliers
-    text = f"places to track in frame {frame.index}: {count}"
-    if count < needed:
-        fix = "Come nearer, light it better, or begin with a textured side: then its surface alone carries the pose."
-        return Finding(f"{name}: points", Level.WRONG, f"{text}; {needed} are needed to find it again", fix)
-    return Finding(f"{name}: points", Level.OK, text)
-
-
-def _contrast(rgb: np.ndarray, side_px: int) -> np.ndarray:
-    """(H, W) standard deviation of brightness around each pixel, in grey levels."""
-    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    mean, square = cv2.blur(gray, (side_px, side_px)), cv2.blur(gray * gray, (side_px, side_px))
-    return np.sqrt(np.maximum(square - mean * mean, 0))
-
-
-def _first_masks(sequence: Sequence, config: Config) -> Iterator[tuple[str, tuple[Frame, np.ndarray]]]:
-    """Each object's first mask that is large enough to start from, with its frame."""
-    waiting = set(sequence.objects)
-    for i in range(len(sequence)):
-        masks = sequence.masks(i)
-        if masks is None or not waiting:
-            return
-        for name in sorted(waiting & masks.keys()):
-            if masks[name].sum() >= config.pipeline.min_mask_px:
-                waiting.discard(name)
-                yield name, (sequence.frame(i), masks[name])
-
-
-def _clicked(
-    sequence: Sequence, prompts: Iterable[Prompt], config: Config
-) -> Iterator[tuple[str, tuple[Frame, np.ndarray]]]:
-    """Each clicked object's first mask, as the embedded segmenter cuts it out."""
+def clicked_image(frame: Frame, prompts: Sequence[Prompt], colours: Mapping[str, str]) -> np.ndarray:
+    """An image with the clicks in it."""
+    image = frame.rgb
     for prompt in prompts:
-        if prompt.frame >= len(sequence):
-            raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", f"below {len(sequence)}")
-        rng, frame = np.random.default_rng(config.seed), sequence.frame(prompt.frame)
-        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
-        yield prompt.name, (frame, segmenter.segment(frame, {prompt.name: prompt.points_px}) > 0)
+        image = overlay.draw_points(image, prompt.points_px, colours[prompt.name], radius_px=7)
+        for radius_px in (15, 16, 17):
+            image = overlay.draw_points(image, prompt.points_px, colours[prompt.name], radius_px, filled=False)
+    return image
+
+
+def mesh_portrait(mesh: trimesh.Trimesh, width_px: int, height_px: int, turn_deg: float = 25.0) -> np.ndarray:
+    """A surface from slightly above, filling the image; ``turn_deg`` about the vertical, 0 as it was first seen."""
+    centre = Box.around(mesh.vertices).T_obj_box[:3, 3]
+    radius_m = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+    focal_px = 1.4 * min(height_px, width_px)
+    camera = Camera(focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, width_px, height_px)
+    tilt, turn = se3.exp(np.radians([[25, 0, 0, 0, 0, 0], [0, turn_deg, 0, 0, 0, 0]]))
+    away, centred = se3.from_rt(np.eye(3), [0, 0, 3.2 * radius_m]), se3.from_rt(np.eye(3), -centre)
+    return draw_mesh(mesh, camera, away @ tilt @ turn @ centred)
+
+
+def mesh_portraits(meshes: Mapping[str, trimesh.Trimesh], turns_deg: Sequence[float] = (-70, 0, 70, 180)) -> np.ndarray:
+    """Every surface from several sides, a row each."""
+    sides = [
+        overlay.draw_caption(mesh_portrait(mesh, 300, 260, turn), f"{name}, {turn:+g} deg")
+        for name, mesh in meshes.items()
+        for turn in turns_deg
+    ]
+    return overlay.montage(sides, columns=len(turns_deg))
+
+
+def mask_image(frame: Frame, mask: np.ndarray, title: str, width_px: int = 430) -> np.ndarray:
+    """A mask around its object: its rim on the object is blue, on the background vermillion."""
+    on_rim, behind = rim(mask, frame.depth_m)
+    image = overlay.draw_mask(frame.rgb, mask, style.NEUTRAL[1], width_px=1, fill=0.15)
+    for pixels, colour in ((on_rim & ~behind, style.OBJECTS[0]), (on_rim & behind, style.STATUS[Status.LOST][0])):
+        image[cv2.dilate(pixels.astype(np.uint8), np.ones((2, 2))) > 0] = style.rgb(colour)
+    camera = Camera(1, 1, 0, 0, mask.shape[1], mask.shape[0])
+    image, _ = overlay.zoomed(image, camera, overlay.region_around(mask, camera, (30, 30)), width_px)
+    share = background_share(mask, frame.depth_m)
+    return overlay.draw_caption(image, f"{title}: {100 * share:.0f} % of the rim on the background")
+
+
+def masks_image(frame: Frame, masks: Mapping[str, np.ndarray], width_px: int = 420) -> np.ndarray:
+    """Several masks of one object side by side, by their titles (see :func:`mask_image`)."""
+    images = [mask_image(frame, mask, title, width_px) for title, mask in masks.items()]
+    height_px = min(image.shape[0] for image in images)
+    return overlay.montage([image[:height_px] for image in images], columns=len(images))
+
+
+def widened(mask: np.ndarray, by_px: int) -> np.ndarray:
+    """A mask (H, W) bool drawn too wide."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by_px + 1,) * 2, np.uint8)) > 0
+
+
+@style.styled
+def fit_plot(playback: Playback, fits: Mapping[str, Mapping[str, Series]]) -> Figure:
+    """The fraction of each surface on which depth was measured, over time; the confidence below.
+
+    fits  label to the objects' fits (:func:`surface_fit`); the first is drawn full, the others dashed
+    """
+    figure, axes = panels(2, (8.0, 4.2), [2, 1])
+    for k, (label, objects) in enumerate(fits.items()):
+        line = {"linestyle": (0, (3 + k, 2)) if k else "-", "marker": "."}
+        for name, fit in objects.items():
+            times_s, colour = playback.times_s[fit.index], playback.colours[name]
+            axes[0].plot(times_s, 100 * fit, color=colour, label=f"{name}, {label}", **line)
+    for name, obj in playback.run.objects.items():
+        axes[1].plot(playback.times_s, np.where(obj.has_pose, obj.confidence, np.nan), color=playback.colours[name])
+    axes[0].set(ylabel="depth on the surface [%]", ylim=(0, 102))
+    axes[0].legend(loc="lower left", ncols=len(fits))
+    axes[0].set_title(f"Does the surface lie where depth was measured? {playback.run.info['sequence']}")
+    axes[1].set(ylabel="confidence", ylim=(0, 1.05), xlabel="time [s]")
+    return figure

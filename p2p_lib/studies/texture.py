@@ -1,32 +1,121 @@
-"""How much texture an object shows, how well its points are tracked, and how right its pose is.
+"""Notebook 08: how much texture an object shows, how well its points are tracked, and how right its pose is.
 
 The paper's analysis of texture: the mean magnitude of the Sobel gradient in the object's mask stands for visible
 texture; the error of the 2D tracks is the distance of the tracker's answers from the object's keypoints projected
 with true poses, of those that it calls visible and that are; the pose is judged by the area under the ADD curve.
 All three per sequence, or per window of frames.
+
+Studies (:class:`ObjectTexture`) and their measures are drawn by label, which is the contrast of a print or the name
+of a real object; contrasts in the order given, dark to bright.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from collections.abc import Sequence as Rows
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 
 import cv2
+import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+from pandas import DataFrame, concat
+from scipy import stats
 
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.interfaces import PointTracker
+from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.datasets import ycbmultitrack
-from p2p_lib.datasets.sequence import Sequence, open_sequence
+from p2p_lib.datasets.sequence import Sequence as Video
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import Evaluation
-from p2p_lib.evaluation.true_tracks import TrueScene
-from p2p_lib.studies.recorded_tracker import KeypointTracks, RecordedTracker
+from p2p_lib.evaluation.true_tracks import NO_POINTS, SurfacePoints, TrueScene
+from p2p_lib.figures import overlay, style
+from p2p_lib.figures.plots import logarithmic, panels
+from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic import scenario_dir
 
 #: The mask's outermost pixels are left out: their gradient is that of the outline, not of what is printed.
 MARGIN_PX = 3
+#: Tracks this far off or farther are drawn in the brightest colour.
+FAR_PX = 8.0
+#: What the labels of the synthetic studies are.
+LEGEND = "contrast of the print, synthetic"
+_WIDTH_IN = 8.0
+_TEXTURE = "mean Sobel gradient in the mask [grey levels / px]"
+_TRACK, _ADD = "median 2D track error [px]", "ADD AUC [%]"
+
+
+class RecordedTracker:
+    """A 2D tracker that passes everything on to another one and keeps what it was asked and what it answered.
+
+    In the place of a tracker it changes nothing; afterwards it knows the track of every keypoint that the method
+    ever followed, beside the true surface point behind the pixel at which it began.
+    """
+
+    def __init__(self, tracker: PointTracker):
+        self._tracker = tracker
+        self._frames: list[int] = []
+        self._queries: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self._answers: list[tuple[int, Tracks]] = []
+
+    def __getattr__(self, name: str):
+        return getattr(self._tracker, name)
+
+    def start(self, frame: Frame, *args, **kwargs) -> None:
+        """Begin a stream, and a new record."""
+        self._frames, self._queries, self._answers = [frame.index], [], []
+        self._tracker.start(frame, *args, **kwargs)
+
+    def add(self, uv_px: np.ndarray) -> np.ndarray:
+        """New queries in the newest frame that was answered."""
+        ids = self._tracker.add(uv_px)
+        self._queries.append((self._newest(), ids, np.asarray(uv_px, float).reshape(-1, 2)))
+        return ids
+
+    def track(self, frame: Frame, *args, **kwargs) -> Tracks:
+        """The tracker's answer, written down with the frame that it is of."""
+        self._frames.append(frame.index)
+        tracks = self._tracker.track(frame, *args, **kwargs)
+        self._answers.append((self._newest(), tracks))
+        return tracks
+
+    def _newest(self) -> int:
+        """Index of the frame that the newest answer is of."""
+        return self._frames[max(len(self._frames) - 1 - self._tracker.latency_frames, 0)]
+
+    def keypoints(self, scene: TrueScene) -> dict[str, DataFrame]:
+        """Per object whose mask a keypoint began in: ``frame``, ``u_px``, ``v_px`` and ``error_px`` of its track.
+
+        A row where the tracker calls the keypoint visible and its surface point is truly in sight; the error is the
+        distance from where the true pose puts that point.
+        """
+        ids, points = self._began(scene)
+        found = []
+        for index, tracks in self._answers:
+            tracks = tracks.select(tracks.ids[tracks.visible])
+            mine = points.select(np.searchsorted(ids, tracks.ids))
+            sight = scene.see(scene.sequence.frame(index), mine)
+            error_px = np.linalg.norm(tracks.uv_px - sight.uv_px, axis=1)
+            columns = {"frame": index, "u_px": tracks.uv_px[:, 0], "v_px": tracks.uv_px[:, 1], "error_px": error_px}
+            rows = DataFrame(columns | {"owner": mine.object}, index=range(len(tracks)))
+            found.append(rows[sight.visible])
+        rows = concat(found, ignore_index=True)
+        return {name: rows[rows.owner == k].drop(columns="owner") for k, name in enumerate(scene.objects)}
+
+    def _began(self, scene: TrueScene) -> tuple[np.ndarray, SurfacePoints]:
+        """The ids of all queries, increasing, and the surface points behind their pixels; NaN where none is met."""
+        ids, points = [np.zeros(0, np.int64)], NO_POINTS
+        for index, new_ids, uv_px in self._queries:
+            frame = scene.sequence.frame(index)
+            ids.append(new_ids)
+            points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
+        ids = np.concatenate(ids)
+        return np.sort(ids), points.select(np.argsort(ids))
 
 
 @dataclass(frozen=True)
@@ -54,48 +143,44 @@ class Measure:
 
 @dataclass(frozen=True, eq=False)
 class ObjectTexture:
-    """One object of a run, over its m scored frames.
+    """One object of a run, over its scored frames.
 
-    frame_index    (m,) of the sequence
-    texture        (m,) mean Sobel gradient magnitude in the mask; NaN where the mask is too thin
-    add_m, adds_m  (m,) metres; infinite where there was no pose
-    tracks         of its keypoints, in all frames
+    frames  a row each: ``frame`` of the sequence; ``texture``, the mean Sobel gradient magnitude in the mask, NaN where
+            it is too thin; ``add_m`` and ``adds_m``, infinite where there was no pose
+    tracks  of its keypoints, in all frames, as :meth:`RecordedTracker.keypoints` gives them
     """
 
     sequence: str
     object: str
-    frame_index: np.ndarray
-    texture: np.ndarray
-    add_m: np.ndarray
-    adds_m: np.ndarray
-    tracks: KeypointTracks
+    frames: DataFrame
+    tracks: DataFrame
 
     def measure(self, start: int = 0, stop: int | None = None) -> Measure:
         """Over the frames [start, stop); :class:`MissingData` where none of them is scored."""
-        stop = int(self.frame_index[-1]) + 1 if stop is None else stop
-        at = (self.frame_index >= start) & (self.frame_index < stop)
-        if not at.any():
+        stop = int(self.frames.frame.max()) + 1 if stop is None else stop
+        rows = self.frames[self.frames.frame.between(start, stop, inclusive="left")]
+        if not len(rows):
             raise MissingData(f"{self.object} of {self.sequence}", f"no scored frame from {start} to {stop}")
-        error_px = self.tracks.error_px[np.isin(self.tracks.frame, self.frame_index[at])]
+        error_px = self.tracks.error_px[self.tracks.frame.isin(rows.frame)]
         return Measure(
             self.sequence,
             self.object,
             start,
             stop,
-            int(at.sum()),
-            float(np.nanmean(self.texture[at])),
-            float(np.median(error_px)) if len(error_px) else float("nan"),
-            len(error_px) / int(at.sum()),
-            metrics.auc_exact(self.add_m[at]),
-            metrics.auc_exact(self.adds_m[at]),
+            frames=len(rows),
+            texture=float(rows.texture.mean()),
+            track_px=float(error_px.median()),
+            tracks=len(error_px) / len(rows),
+            add_auc=metrics.auc_exact(rows.add_m.to_numpy()),
+            adds_auc=metrics.auc_exact(rows.adds_m.to_numpy()),
         )
 
     def windows(self, size: int = 15) -> list[Measure]:
         """One measure per window of ``size`` frames; those with fewer than half of them scored are left out."""
-        first, last = int(self.frame_index[0]), int(self.frame_index[-1])
-        starts = np.arange(first, last + 1, size)
-        scored = ((self.frame_index >= starts[:, None]) & (self.frame_index < starts[:, None] + size)).sum(1)
-        return [self.measure(start, start + size) for start in starts[2 * scored >= size].tolist()]
+        first = int(self.frames.frame.min())
+        scored = ((self.frames.frame - first) // size).value_counts().sort_index()
+        starts = [first + size * int(k) for k in scored.index[2 * scored >= size]]
+        return [self.measure(start, start + size) for start in starts]
 
 
 def sobel_magnitude(rgb: np.ndarray) -> np.ndarray:
@@ -112,15 +197,15 @@ def visible_texture(rgb: np.ndarray, mask: np.ndarray, margin_px: int = MARGIN_P
     return float(sobel_magnitude(rgb)[inner].mean()) if inner.any() else float("nan")
 
 
-def fading_label(contrast: float, frames: int, seed: int = 0) -> Sequence:
+def fading_label(contrast: float, frames: int, seed: int = 0) -> Video:
     """``synthetic/fading_label`` at a contrast of its print: for one seed all else is the same."""
     folder = scenario_dir("fading_label", seed, contrast=float(contrast), frames=frames)
     return ycbmultitrack.load(folder, f"synthetic/fading_label {seed}, contrast {contrast:g}", None, None)
 
 
-def present(names: Iterable[str], left_out: str = "") -> dict[str, Sequence | str]:
+def present(names: Iterable[str], left_out: str = "") -> dict[str, Video | str]:
     """The sequences of these names or folders, or the reason why there is none: ``left_out`` for all, or missing."""
-    found: dict[str, Sequence | str] = {}
+    found: dict[str, Video | str] = {}
     for name in names:
         try:
             found[name] = left_out or open_sequence(name)
@@ -130,28 +215,24 @@ def present(names: Iterable[str], left_out: str = "") -> dict[str, Sequence | st
 
 
 def study(
-    sequence: Sequence,
+    sequence: Video,
     evaluation: Evaluation,
     recorded: RecordedTracker,
     models: Mapping[str, str | Path] | None = None,
 ) -> dict[str, ObjectTexture]:
-    """Texture, tracks and pose of each object that a run of the pipeline with a recorded tracker was scored on.
+    """Texture, tracks and pose of each object that a run of the method with a recorded tracker was scored on.
 
     models  object to mesh, besides those that lie with the sequence; the others' surface is the measured depth
     """
-    tracks = recorded.keypoints(TrueScene.of(sequence, models))
-    texture: dict[str, list[float]] = {name: [] for name in evaluation.objects}
-    for i in sorted({int(i) for score in evaluation.objects.values() for i in score.frame_index}):
-        rgb, masks = sequence.frame(i).rgb, sequence.masks(i) or {}
-        for name, score in evaluation.objects.items():
-            if i in score.frame_index:
-                texture[name].append(visible_texture(rgb, masks[name]) if name in masks else float("nan"))
-    return {
-        name: ObjectTexture(
-            sequence.name, name, score.frame_index, np.array(texture[name]), score.add_m, score.adds_m, tracks[name]
-        )
-        for name, score in evaluation.objects.items()
-    }
+    tracks, studies = recorded.keypoints(TrueScene.of(sequence, models)), {}
+    for name, score in evaluation.objects.items():
+        texture = []
+        for i in score.frame_index.tolist():
+            mask = (sequence.masks(i) or {}).get(name)
+            texture.append(np.nan if mask is None else visible_texture(sequence.frame(i).rgb, mask))
+        columns = {"frame": score.frame_index, "texture": texture, "add_m": score.add_m, "adds_m": score.adds_m}
+        studies[name] = ObjectTexture(sequence.name, name, DataFrame(columns), tracks[name])
+    return studies
 
 
 @dataclass(frozen=True)
@@ -164,9 +245,12 @@ class RankCorrelation:
     pairs: int
     groups: int
 
+    def __str__(self) -> str:
+        return f"{self.rho:+.2f} [{self.low:+.2f}, {self.high:+.2f}]"
+
 
 def rank_correlation(
-    x: np.ndarray, y: np.ndarray, groups: Rows | None = None, seed: int = 0, resamples: int = 2000
+    x: np.ndarray, y: np.ndarray, groups: Sequence | None = None, seed: int = 0, resamples: int = 2000
 ) -> RankCorrelation:
     """Spearman's rank correlation of x (n,) and y (n,) with a bootstrap confidence interval (percentiles).
 
@@ -175,8 +259,6 @@ def rank_correlation(
 
     Raises :class:`BadInput` for fewer than three groups.
     """
-    from scipy import stats
-
     x, y = np.asarray(x, float), np.asarray(y, float)
     group = np.arange(len(x)) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]
     keep = np.isfinite(x) & np.isfinite(y)
@@ -188,20 +270,166 @@ def rank_correlation(
 
     def rho(drawn: np.ndarray) -> float:
         rows = np.concatenate([members[k] for k in drawn])
-        ranks = stats.rankdata(x[rows]), stats.rankdata(y[rows])
         # A draw of one value alone has no order: no correlation.
-        return float(np.corrcoef(*ranks)[0, 1]) if min(np.ptp(r) for r in ranks) > 0 else 0.0
+        return float(stats.spearmanr(x[rows], y[rows]).statistic) if np.ptp(x[rows]) and np.ptp(y[rows]) else 0.0
 
     rng = np.random.default_rng(seed)
     method = {"n_resamples": resamples, "vectorized": False, "method": "percentile", "rng": rng}
-    drawn = stats.bootstrap((np.arange(count),), rho, **method)
-    interval = drawn.confidence_interval
+    interval = stats.bootstrap((np.arange(count),), rho, **method).confidence_interval
     return RankCorrelation(rho(np.arange(count)), float(interval.low), float(interval.high), len(x), count)
 
 
-def correlate(windows: Rows[Measure], seed: int = 0) -> tuple[RankCorrelation, RankCorrelation]:
+def correlate(windows: Sequence[Measure], seed: int = 0) -> tuple[RankCorrelation, RankCorrelation]:
     """Texture with track error, and texture with ADD AUC, over windows; those of one object belong together."""
-    groups = [f"{w.sequence}: {w.object}" for w in windows]
-    shown = np.array([w.texture for w in windows])
-    track_px, add_auc = (np.array([getattr(w, key) for w in windows]) for key in ("track_px", "add_auc"))
-    return rank_correlation(shown, track_px, groups, seed), rank_correlation(shown, add_auc, groups, seed)
+    table = DataFrame(windows)
+    groups = (table.sequence + ": " + table.object).to_list()
+    return tuple(rank_correlation(table.texture, table[key], groups, seed) for key in ("track_px", "add_auc"))
+
+
+def correlation_table(windows: Mapping[str, Sequence[Measure]], seed: int = 0) -> DataFrame:
+    """A row per label: Spearman's rho of texture with track error and with ADD AUC, and its 95 % interval.
+
+    A dash where the windows are of fewer than three objects or sequences.
+    """
+    rows = []
+    for label, many in windows.items():
+        objects = len({(w.sequence, w.object) for w in many})
+        track, add = map(str, correlate(many, seed)) if objects > 2 else (None, None)
+        row = {"": label, "windows": len(many), "sequences or objects": objects}
+        rows.append(row | {"texture and track error": track, "texture and ADD AUC": add})
+    return DataFrame(rows)
+
+
+def measure_table(measures: Mapping[str, Measure | str], head: str = LEGEND) -> DataFrame:
+    """A row per label: what it shows, how it was tracked, how right its pose was; or dashes and the reason."""
+    rows = [
+        {head: label, "why not": m}
+        if isinstance(m, str)
+        else {
+            head: label,
+            "scored frames": m.frames,
+            "Sobel [grey levels/px]": round(m.texture, 2),
+            "median track error [px]": round(m.track_px, 2),
+            "tracks per frame": round(m.tracks, 1),
+            _ADD: round(m.add_auc, 1),
+            "ADD-S AUC [%]": round(m.adds_auc, 1),
+            "why not": "",
+        }
+        for label, m in measures.items()
+    ]
+    table = DataFrame(rows)
+    reasons = table.pop("why not")
+    return table.assign(**{"why not": reasons}) if reasons.any() else table
+
+
+def draw_tracks(
+    scene: Scene, study: ObjectTexture, index: int, region_px: tuple[int, int, int, int], width_px: int = 260
+) -> np.ndarray:
+    """Frame ``index``, cut to a region: true box white and dashed, estimate in colour, a dot per keypoint in sight.
+
+    Dots are where the tracker has the keypoints, coloured by how far that is from the truth: dark blue is right,
+    yellow is off by :data:`FAR_PX` or more.
+    """
+    image = scene.draw(scene.row(index), region_px, width_px, axes=False, trail=0)
+    camera = scene.sequence.camera
+    _, seen_by = overlay.zoomed(scene.sequence.frame(index).rgb, camera, region_px, width_px)
+    here = study.tracks[study.tracks.frame == index]
+    uv_px = overlay.zoomed_px(here[["u_px", "v_px"]].to_numpy(), camera, seen_by)
+    return overlay.draw_points(image, uv_px, overlay.value_colours(here.error_px, 0, FAR_PX), 3)
+
+
+@style.styled
+def texture_story(images: Mapping[str, np.ndarray], measures: Mapping[str, Sequence[Measure]], title: str) -> Figure:
+    """The page's one figure: images side by side, and below them track error and ADD against visible texture."""
+    high = _WIDTH_IN / len(images) * max(image.shape[0] / image.shape[1] for image in images.values())
+    figure = Figure((_WIDTH_IN, high + 3.3), layout="constrained")
+    top, bottom = figure.subfigures(2, 1, height_ratios=[high + 0.45, 2.85])
+    for axis, (label, image) in zip(np.atleast_1d(top.subplots(1, len(images))), images.items()):
+        axis.imshow(image)
+        axis.set_title(label, fontsize=9)
+        axis.set_axis_off()
+    axes = bottom.subplots(1, 2)
+    _against_texture(axes, measures, 55, _colours(len(measures)))
+    bottom.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=9, fontsize=8, title=LEGEND)
+    top.suptitle(title, x=0.01, ha="left", fontsize=9)
+    return figure
+
+
+@style.styled
+def windows_against_texture(
+    windows: Mapping[str, Sequence[Measure]],
+    correlations: Sequence[RankCorrelation] = (),
+    synthetic: Sequence[Measure] = (),
+) -> Figure:
+    """Every window of every study; above the panels the rank correlations with track error and with ADD AUC.
+
+    synthetic  windows that are drawn in grey behind those of real objects
+    """
+    figure, axes = panels(2, (_WIDTH_IN, 3.4), side_by_side=True)
+    if synthetic:
+        _against_texture(axes, {"synthetic": synthetic} | dict(windows), 16, [style.NEUTRAL[1], *style.OBJECTS])
+    else:
+        _against_texture(axes, windows, 16, _colours(len(windows)))
+    for axis, found in zip(axes, correlations):
+        axis.set_title(f"Spearman {found.rho:+.2f}, 95 % [{found.low:+.2f}, {found.high:+.2f}], n = {found.pairs}")
+    entries, title = axes[0].get_legend_handles_labels(), None if synthetic else LEGEND
+    figure.legend(*entries, loc="outside lower center", ncols=3 if synthetic else 9, fontsize=8, title=title)
+    return figure
+
+
+@style.styled
+def same_frames(windows: Mapping[str, Sequence[Measure]]) -> Figure:
+    """One line per window of frames, through all contrasts: what differs along it is the contrast and nothing else.
+
+    Where a label has windows of several sequences, those of the first are drawn.
+    """
+    figure, axes = panels(2, (_WIDTH_IN, 3.3), side_by_side=True)
+    spans = sorted({(w.start, w.stop) for many in windows.values() for w in many})
+    for span, colour in zip(spans, matplotlib.colormaps["viridis"](np.linspace(0, 0.9, len(spans)))):
+        line = [next((w for w in many if (w.start, w.stop) == span), None) for many in windows.values()]
+        for axis, key in zip(axes, ("track_px", "add_auc")):
+            values = [getattr(w, key, np.nan) for w in line]
+            axis.plot(values, "o-", ms=3.5, color=colour, label=f"frames {span[0]} to {span[1] - 1}")
+    for axis, label in zip(axes, (_TRACK, _ADD)):
+        axis.set_xticks(range(len(windows)), windows)
+        axis.set(xlabel=LEGEND, ylabel=label)
+    logarithmic(axes[0].yaxis)
+    axes[1].set_ylim(0, 102)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
+    return figure
+
+
+@style.styled
+def track_errors(studies: Mapping[str, ObjectTexture]) -> Figure:
+    """The fraction of a study's tracks that lie within so many pixels of the truth."""
+    figure, (axis,) = panels(1, (_WIDTH_IN, 3.0))
+    for (label, study), colour in zip(studies.items(), _colours(len(studies))):
+        error_px = study.tracks.error_px
+        axis.ecdf(error_px, color=colour, label=f"{label} ({len(error_px)} answers)")
+    logarithmic(axis.xaxis)
+    axis.set(xlim=(0.05, 200), ylim=(0, 1.01), xlabel="distance from the true place [px]", ylabel="tracks within")
+    axis.yaxis.set_major_formatter(PercentFormatter(1))
+    axis.legend(loc="upper left", title=LEGEND)
+    return figure
+
+
+def _against_texture(
+    axes: Sequence[Axes], measures: Mapping[str, Sequence[Measure]], size: float, colours: Iterable
+) -> None:
+    """Track error and ADD AUC over texture, a colour per label."""
+    for (label, many), colour in zip(measures.items(), cycle(colours)):
+        for axis, key in zip(axes, ("track_px", "add_auc")):
+            x, y = ([getattr(m, name) for m in many] for name in ("texture", key))
+            axis.scatter(x, y, size, color=[colour], edgecolors="#333333", linewidths=0.5, label=label)
+    for axis, label in zip(axes, (_TRACK, _ADD)):
+        axis.set(xlabel=_TEXTURE, ylabel=label)
+        logarithmic(axis.xaxis)
+        low, high = axis.get_xlim()
+        axis.set_xticks([t for t in (0.5, 1, 2, 5, 10, 20) if low <= t <= high])
+    logarithmic(axes[0].yaxis)
+    axes[1].set_ylim(0, 102)
+
+
+def _colours(count: int) -> np.ndarray:
+    """(count, 4) dark to bright, but not so bright that a line is lost on white."""
+    return matplotlib.colormaps["cividis"](np.linspace(0, 0.85, max(count, 2)))[:count]

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from p2p_lib.core.errors import BadInput
-from p2p_lib.synthetic import shapes
-from p2p_lib.synthetic.crockery import mug as mug_mesh
+from p2p_lib.synthetic import shapes, solids
 from p2p_lib.synthetic.environment import living_room
-from p2p_lib.synthetic.motion import look_at, turn, wander
+from p2p_lib.synthetic.motion import standing, turned, wander
 from p2p_lib.synthetic.render import Light
-from p2p_lib.synthetic.scene import VGA, Body, Scenario, room
+from p2p_lib.synthetic.scene import VGA, Body, Scenario, check, room
 
-_EYE = np.array([0.0, -0.44, 0.30])
 _CENTRE = np.array([0.0, 0.0, 0.11])
 
 
@@ -24,18 +21,16 @@ def mug(seed: int, frames: int = 240, reflectance: float = 0.05, windows: int = 
     right, only the surface can tell. ``reflectance`` is the glaze's at normal incidence (0 = matt);
     more ``windows`` (0 to 4) and fewer ``marks`` make it harder.
     """
-    if frames < 2 or not 0 <= reflectance <= 1 or not 0 <= windows <= 4 or marks < 0:
-        got = f"frames {frames}, reflectance {reflectance}, windows {windows}, marks {marks}"
-        raise BadInput("mug", got, "at least 2 frames, reflectance from 0 to 1, 0 to 4 windows, marks from 0")
+    limits = {"reflectance": (reflectance, 0, 1), "windows": (windows, 0, 4), "marks": (marks, 0, np.inf)}
+    check("mug", frames=(frames, 2, np.inf), **limits)
     rng = np.random.default_rng([seed, 1])
-    mesh = mug_mesh(rng, 0.044 * rng.uniform(0.95, 1.05), 0.105 * rng.uniform(0.95, 1.05), reflectance, marks)
+    mesh = solids.mug(rng, 0.044 * rng.uniform(0.95, 1.05), 0.105 * rng.uniform(0.95, 1.05), reflectance, marks)
     # The handle swings by 2 x 70 degrees: from before the body, on one side of it, to just behind the outline.
     swing = np.radians(70) * np.sin(2 * np.pi * (np.arange(frames) / 230 + rng.choice([0, 0.5])))
     yaw = np.radians(-90 + rng.choice([-45, 45]) + rng.uniform(-8, 8)) + swing
-    T = wander(rng, frames, 0.02, 2.0, 150) @ turn(np.array([0, 0, 1.0]), yaw)
-    T[:, :3, 3] += _CENTRE
+    T = turned(wander(rng, frames, 0.02, 2.0, 150), yaw, _CENTRE)
     light = Light(environment=living_room(rng, windows))
-    return _on_the_table(rng, frames, Body("mug", mesh, T), light, np.array([0.0, -0.44, 0.20]))
+    return _on_the_table(rng, Body("mug", mesh, T), (0.0, -0.44, 0.20), light)
 
 
 def weak_texture(seed: int, frames: int = 240, contrast: float = 0.05) -> Scenario:
@@ -43,16 +38,13 @@ def weak_texture(seed: int, frames: int = 240, contrast: float = 0.05) -> Scenar
 
     Few points, and poor ones; but no two directions of the shape are alike. ``contrast`` is that of the print.
     """
-    if frames < 2 or not 0 <= contrast <= 1:
-        got = f"frames {frames}, contrast {contrast}"
-        raise BadInput("weak_texture", got, "at least 2 frames, contrast from 0 to 1")
+    check("weak_texture", frames=(frames, 2, np.inf), contrast=(contrast, 0, 1))
     rng = np.random.default_rng([seed, 1])
     mesh = shapes.block(rng, 0.055, 0.10, contrast)
     # Seen from above: the slanted top and two or three sides.
     yaw = np.radians(75) * np.sin(2 * np.pi * np.arange(frames) / 260 + rng.uniform(0, 2 * np.pi))
-    T = wander(rng, frames, 0.04, 15.0, 180) @ turn(np.array([0, 0, 1.0]), yaw)
-    T[:, :3, 3] += _CENTRE
-    return _on_the_table(rng, frames, Body("block", mesh, T), eye=np.array([0.0, -0.36, 0.42]))
+    T = turned(wander(rng, frames, 0.04, 15.0, 180), yaw, _CENTRE)
+    return _on_the_table(rng, Body("block", mesh, T), (0.0, -0.36, 0.42))
 
 
 def fading_label(seed: int, frames: int = 180, contrast: float = 1.0) -> Scenario:
@@ -60,36 +52,31 @@ def fading_label(seed: int, frames: int = 180, contrast: float = 1.0) -> Scenari
 
     Sequences of one seed differ in nothing but the contrast: shape, path and the noise of the sensor are the same.
     """
-    if frames < 2 or not 0 <= contrast <= 1:
-        got = f"frames {frames}, contrast {contrast}"
-        raise BadInput("fading_label", got, "at least 2 frames, contrast from 0 to 1")
+    check("fading_label", frames=(frames, 2, np.inf), contrast=(contrast, 0, 1))
     rng = np.random.default_rng([seed, 1])
     mesh = shapes.can(rng, 0.045 * rng.uniform(0.95, 1.05), 0.12 * rng.uniform(0.95, 1.05), contrast)
     yaw = np.radians(65) * np.sin(2 * np.pi * np.arange(frames) / 180 + rng.uniform(0, 2 * np.pi))
-    T = wander(rng, frames, 0.03, 15.0, 150) @ turn(np.array([0, 0, 1.0]), yaw)
-    T[:, :3, 3] += _CENTRE
-    return _on_the_table(rng, frames, Body("tin", mesh, T), eye=np.array([0.0, -0.40, 0.34]))
+    T = turned(wander(rng, frames, 0.03, 15.0, 150), yaw, _CENTRE)
+    return _on_the_table(rng, Body("tin", mesh, T), (0.0, -0.40, 0.34))
 
 
 def long_turning(seed: int, frames: int = 660) -> Scenario:
     """A tin that turns three times around while it sways: its axis changes, and views come back again and again.
 
     Only the print tells how far it has turned. Errors add up from keyframe to keyframe unless the views that come
-    back are tied to those before.
+    back are tied to those before. At least 300 frames: it turns by about two degrees a frame.
     """
-    if frames < 300:
-        raise BadInput("long_turning", f"frames {frames}", "at least 300: it turns by about two degrees a frame")
+    check("long_turning", frames=(frames, 300, np.inf))
     rng = np.random.default_rng([seed, 1])
     mesh = shapes.can(rng, 0.045 * rng.uniform(0.94, 1.06), 0.12 * rng.uniform(0.94, 1.06))
     yaw = np.radians(1.65) * np.arange(frames) * rng.choice([-1, 1]) + rng.uniform(0, 2 * np.pi)
-    T = wander(rng, frames, 0.03, 28.0, 260) @ turn(np.array([0, 0, 1.0]), yaw)
-    T[:, :3, 3] += _CENTRE
-    return _on_the_table(rng, frames, Body("tin", mesh, T), eye=np.array([0.0, -0.85, 0.50]))
+    T = turned(wander(rng, frames, 0.03, 28.0, 260), yaw, _CENTRE)
+    return _on_the_table(rng, Body("tin", mesh, T), (0.0, -0.85, 0.50))
 
 
 def _on_the_table(
-    rng: np.random.Generator, frames: int, body: Body, light: Light | None = None, eye: np.ndarray = _EYE
+    rng: np.random.Generator, body: Body, eye: tuple[float, float, float], light: Light | None = None
 ) -> Scenario:
     """One body before a camera that stands still."""
-    T_world_cam = np.broadcast_to(look_at(eye, _CENTRE), (frames, 4, 4))
+    T_world_cam = standing(np.array(eye), _CENTRE, len(body.T_world_model))
     return Scenario(VGA, T_world_cam, (body,), room(rng), light or Light())

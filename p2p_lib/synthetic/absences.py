@@ -1,4 +1,4 @@
-"""Absence and return: hidden by a hand, out of the picture, look-alikes, a late object, a camera that moves.
+"""Absence and return: hidden by a hand or a board, out of the image, look-alikes, a late object, a moving camera.
 
 In each, an object that is away moves by more than 10 cm and turns by more than 30 degrees, and comes back showing
 a side that was seen before. Times are frames of 30 a second.
@@ -13,83 +13,123 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.synthetic import shapes
-from p2p_lib.synthetic.body_parts import hand
-from p2p_lib.synthetic.motion import eased, look_at, path, varied
-from p2p_lib.synthetic.scene import VGA, Body, Scenario, room
+from p2p_lib.synthetic.motion import eased, look_at, path, standing, through, varied
+from p2p_lib.synthetic.scene import VGA, Body, Scenario, check, room
 from p2p_lib.synthetic.shapes import Mesh
+from p2p_lib.synthetic.solids import hand
 
 _EYE, _TARGET = np.array([0.0, -0.62, 0.42]), np.array([0.0, 0.03, 0.12])
-_HAND_SHARE = 0.42  # of the way from the camera to what it hides: there a hand covers 20 cm
+_FRAMES = 300
+#: How far along the line from the camera to what it hides: there a hand covers 20 cm, a board more.
+_HAND_SHARE, _BOARD_SHARE = 0.42, 0.62
+#: Where an object stands on the table, x and y in metres.
+Place = tuple[float, float]
+#: A body, and from which frame to which a hand hides it, if ever.
+Placed = tuple[Body, tuple[int, int] | None]
+
+#: Of ``crossing``: frame, x, y, z (metres, model centre in the world), yaw, pitch, roll (degrees).
+_CROSSING_CARTON = [
+    (0, -0.17, -0.01, 0.130, -30, 4, -3),
+    (45, -0.08, -0.09, 0.135, 32, -6, 5),
+    (85, 0.07, -0.07, 0.130, 85, 5, 4),
+    (120, 0.17, 0.00, 0.150, 126, 8, -6),
+    (160, 0.20, 0.06, 0.165, 138, -4, -8),
+    (205, 0.05, 0.01, 0.135, 184, -6, 6),
+    (262, -0.06, 0.06, 0.140, 248, 4, 4),
+    (299, -0.16, 0.02, 0.130, 300, -4, -4),
+]
+_CROSSING_TIN = [
+    (0, 0.16, 0.04, 0.120, 0, -8, 6),
+    (45, 0.09, 0.09, 0.150, 56, 6, -8),
+    (85, -0.06, 0.08, 0.135, 112, 10, 4),
+    (116, -0.16, 0.05, 0.130, 150, -6, 8),
+    (156, -0.02, -0.03, 0.120, 106, 4, -4),
+    (200, -0.12, -0.06, 0.115, 60, -8, 6),
+    (250, -0.03, -0.12, 0.120, -10, 6, 8),
+    (299, 0.15, -0.05, 0.130, -80, -6, -6),
+]
+_EXIT = [
+    (0, 0.05, 0.0, 0.16, -40, 4, -3),
+    (50, -0.05, 0.03, 0.18, 40, -4, 4),
+    (105, -0.14, 0.06, 0.22, -12, 3, -3),
+    (135, -0.66, 0.06, 0.22, -14, 0, 0),
+    (165, -0.66, -0.06, 0.09, 30, 0, 0),
+    (195, -0.12, -0.06, 0.09, 28, 3, 3),
+    (245, 0.05, 0.0, 0.14, -25, -4, -3),
+    (299, -0.02, 0.03, 0.16, 35, 4, 4),
+]
+
+
+def crossing(seed: int, frames: int = _FRAMES, contrast: float = 1.0) -> Scenario:
+    """A carton and a tin that pass in front of each other twice and are hidden once each.
+
+    In between, a board sweeps over first the tin, then the carton, and hides each completely while it
+    moves by at least 10 cm and turns by at least 30 degrees: the tin back to where it was seen before, the
+    carton on. Both turn by more than 90 degrees in all. ``frames`` stretches time, ``contrast`` fades the labels.
+    """
+    check("crossing", frames=(frames, 2, np.inf), contrast=(contrast, 0, 1))
+    rng = np.random.default_rng([seed, 1])
+    carton = shapes.box(rng, tuple(np.array([0.10, 0.055, 0.15]) * rng.uniform(0.94, 1.06, 3)), contrast)
+    tin = shapes.can(rng, 0.04 * rng.uniform(0.95, 1.05), 0.115 * rng.uniform(0.95, 1.05), contrast)
+    board = shapes.slab(rng, (0.16, 0.012, 0.20))
+    mirrored = -1.0 if rng.uniform() < 0.5 else 1.0
+    # The carton's wide panel is what shows before and after it is hidden.
+    yaw_carton, yaw_tin = rng.choice([20, 200]) + rng.uniform(-20, 20), rng.uniform(-180, 180)
+    T_carton = path(varied(rng, _CROSSING_CARTON, yaw_carton, mirrored), frames)
+    T_tin = path(varied(rng, _CROSSING_TIN, yaw_tin, mirrored), frames)
+    T_board = _board_path(frames, [(T_tin, 119, 153), (T_carton, 162, 200)], mirrored)
+    bodies = (Body("box", carton, T_carton), Body("can", tin, T_tin), Body("board", board, T_board, labelled=False))
+    return Scenario(VGA, standing(_EYE, _TARGET, frames), bodies, room(rng))
 
 
 def occlusion(seed: int) -> Scenario:
     """A carton that a hand hides completely for about a second and a half; a tin beside it stays in view."""
     rng = np.random.default_rng([seed, 1])
-    carton = Body("box", _carton(rng), _stay(rng, (-0.12, 0.0), (0.06, 0.05), (120, 165)))
-    tin = Body("can", _tin(rng), _stay(rng, (0.24, 0.05), (0.24, 0.05)))
-    return _scene(rng, (carton, tin), _standing(300), [(carton, 120, 165)])
+    return _scene(rng, _carton_and_tin(rng))
 
 
 def exit_reentry(seed: int) -> Scenario:
-    """A carton that leaves the picture at one side and comes back 15 cm lower and nearer, turned."""
+    """A carton that leaves the image at one side and comes back 15 cm lower and nearer, turned."""
     rng = np.random.default_rng([seed, 1])
-    side = rng.choice([-1.0, 1.0])
-    keys = [
-        (0, 0.05, 0.0, 0.16, -40, 4, -3),
-        (50, -0.05, 0.03, 0.18, 40, -4, 4),
-        (105, -0.14, 0.06, 0.22, -12, 3, -3),
-        (135, -0.66, 0.06, 0.22, -14, 0, 0),
-        (165, -0.66, -0.06, 0.09, 30, 0, 0),
-        (195, -0.12, -0.06, 0.09, 28, 3, 3),
-        (245, 0.05, 0.0, 0.14, -25, -4, -3),
-        (299, -0.02, 0.03, 0.16, 35, 4, 4),
-    ]
-    keys = varied(rng, keys, 0.0, side)
-    return _scene(rng, (Body("box", _carton(rng), path(keys, 300)),), _standing(300), [])
+    keys = varied(rng, _EXIT, mirrored=rng.choice([-1.0, 1.0]))
+    return _scene(rng, [(Body("box", _carton(rng), path(keys, _FRAMES)), None)])
 
 
 def look_alikes(seed: int) -> Scenario:
     """Two cartons with one label; only the mark on their fronts differs. A hand hides one, then the other."""
     rng = np.random.default_rng([seed, 1])
     mesh = _carton(rng)
-    left = Body(
-        "left", _marked(mesh, (200, 40, 40), round_mark=True), _stay(rng, (-0.20, 0.0), (-0.08, 0.05), (90, 130))
-    )
-    right = Body(
-        "right", _marked(mesh, (30, 60, 190), round_mark=False), _stay(rng, (0.12, 0.03), (0.23, 0.0), (185, 225))
-    )
-    return _scene(rng, (left, right), _standing(300), [(left, 90, 130), (right, 185, 225)])
+    red, blue = _marked(mesh, (200, 40, 40), round_mark=True), _marked(mesh, (30, 60, 190), round_mark=False)
+    left = _placed(rng, "left", red, (-0.20, 0.0), (-0.08, 0.05), (90, 130))
+    right = _placed(rng, "right", blue, (0.12, 0.03), (0.23, 0.0), (185, 225))
+    return _scene(rng, [left, right])
 
 
 def late_object(seed: int) -> Scenario:
     """A carton is there from the start; a tin comes in at frame 60, and is hidden later on."""
     rng = np.random.default_rng([seed, 1])
-    carton = Body("box", _carton(rng), _stay(rng, (-0.20, 0.02), (-0.20, 0.02)))
+    carton = _placed(rng, "box", _carton(rng), (-0.20, 0.02))
     T = _stay(rng, (0.08, 0.0), (0.22, 0.05), (190, 230))
-    coming = np.clip((np.arange(300) - 60) / 35, 0, 1)
-    T[:, 0, 3] += eased(0.62 * (1 - coming), 4)
-    tin = Body("can", _tin(rng), T)
-    return _scene(rng, (carton, tin), _standing(300), [(tin, 190, 230)])
+    T[:, 0, 3] += eased(0.62 * (1 - np.clip((np.arange(_FRAMES) - 60) / 35, 0, 1)), 4)
+    return _scene(rng, [carton, (Body("can", _tin(rng), T), (190, 230))])
 
 
 def three_objects(seed: int) -> Scenario:
     """A carton, a tin and a block, hidden by a hand one after the other."""
     rng = np.random.default_rng([seed, 1])
-    carton = Body("box", _carton(rng), _stay(rng, (-0.27, 0.02), (-0.18, 0.10), (95, 127)))
-    tin = Body("can", _tin(rng), _stay(rng, (-0.03, -0.02), (0.05, 0.07), (157, 189)))
-    block = Body("block", shapes.block(rng, 0.05, 0.11), _stay(rng, (0.27, 0.02), (0.18, 0.10), (219, 251)))
-    hidden = [(carton, 95, 127), (tin, 157, 189), (block, 219, 251)]
-    return _scene(rng, (carton, tin, block), _standing(300), hidden)
+    carton = _placed(rng, "box", _carton(rng), (-0.27, 0.02), (-0.18, 0.10), (95, 127))
+    tin = _placed(rng, "can", _tin(rng), (-0.03, -0.02), (0.05, 0.07), (157, 189))
+    block = _placed(rng, "block", shapes.block(rng, 0.05, 0.11), (0.27, 0.02), (0.18, 0.10), (219, 251))
+    return _scene(rng, [carton, tin, block])
 
 
 def moving_camera(seed: int) -> Scenario:
     """As ``occlusion``, seen by a camera that a hand carries about."""
     rng = np.random.default_rng([seed, 1])
-    carton = Body("box", _carton(rng), _stay(rng, (-0.12, 0.0), (0.06, 0.05), (120, 165)))
-    tin = Body("can", _tin(rng), _stay(rng, (0.24, 0.05), (0.24, 0.05)))
-    time = np.arange(300)[:, None] / rng.uniform(170, 230, 3) + rng.uniform(0, 1, 3)
+    placed = _carton_and_tin(rng)
+    time = np.arange(_FRAMES)[:, None] / rng.uniform(170, 230, 3) + rng.uniform(0, 1, 3)
     eyes = _EYE + np.array([0.16, 0.05, 0.06]) * np.sin(2 * np.pi * time)
-    return _scene(rng, (carton, tin), np.stack([look_at(eye, _TARGET) for eye in eyes]), [(carton, 120, 165)])
+    return _scene(rng, placed, np.stack([look_at(eye, _TARGET) for eye in eyes]))
 
 
 def _carton(rng: np.random.Generator) -> Mesh:
@@ -103,23 +143,34 @@ def _tin(rng: np.random.Generator) -> Mesh:
 def _marked(mesh: Mesh, ink: tuple[int, int, int], round_mark: bool) -> Mesh:
     """A carton with one mark on its front, whose print is the texture's upper left (see ``shapes.box``)."""
     texture = mesh.texture.copy()
-    across, size = int(0.10 * shapes.TEXELS_PER_M), int(0.02 * shapes.TEXELS_PER_M)
-    at = int(0.72 * across), int(0.40 * 0.14 * shapes.TEXELS_PER_M)
-    cv2.circle(texture, at, int(1.3 * size), (245, 245, 240), -1, cv2.LINE_AA)
+    size = int(0.02 * shapes.TEXELS_PER_M)
+    x, y = int(0.72 * int(0.10 * shapes.TEXELS_PER_M)), int(0.40 * 0.14 * shapes.TEXELS_PER_M)
+    cv2.circle(texture, (x, y), int(1.3 * size), (245, 245, 240), -1, cv2.LINE_AA)
     if round_mark:
-        cv2.circle(texture, at, size, ink, -1, cv2.LINE_AA)
+        cv2.circle(texture, (x, y), size, ink, -1, cv2.LINE_AA)
     else:
-        cv2.rectangle(texture, (at[0] - size, at[1] - size // 3), (at[0] + size, at[1] + size // 3), ink, -1)
+        cv2.rectangle(texture, (x - size, y - size // 3), (x + size, y + size // 3), ink, -1)
     return replace(mesh, texture=texture)
 
 
-def _standing(frames: int) -> np.ndarray:
-    return np.broadcast_to(look_at(_EYE, _TARGET), (frames, 4, 4))
+def _carton_and_tin(rng: np.random.Generator) -> list[Placed]:
+    carton = _placed(rng, "box", _carton(rng), (-0.12, 0.0), (0.06, 0.05), (120, 165))
+    return [carton, _placed(rng, "can", _tin(rng), (0.24, 0.05))]
 
 
-def _stay(
-    rng: np.random.Generator, here: tuple[float, float], there: tuple[float, float], away: tuple[int, int] = (120, 160)
-) -> np.ndarray:
+def _placed(
+    rng: np.random.Generator,
+    name: str,
+    mesh: Mesh,
+    here: Place,
+    there: Place | None = None,
+    hidden: tuple[int, int] | None = None,
+) -> Placed:
+    """A body about one place, and, after a hand has hidden it for the frames ``hidden``, about another."""
+    return Body(name, mesh, _stay(rng, here, there or here, hidden or (120, 160))), hidden
+
+
+def _stay(rng: np.random.Generator, here: Place, there: Place, away: tuple[int, int]) -> np.ndarray:
     """Poses (300, 4, 4) about ``here``, and about ``there`` from the frames ``away`` on.
 
     It shows its front and sways by 40 degrees to both sides before it goes: it returns within what was seen.
@@ -135,32 +186,50 @@ def _stay(
         ((b + 299) / 2 + 5, u, v, 0.13, -28, -4, -3),
         (299, u, v, 0.14, 32, 4, 4),
     ]
-    varying = varied(rng, keys, 0.0, 1.0)
+    varying = varied(rng, keys)
     varying[3, 1:] = varying[2, 1:] + rng.uniform(-0.002, 0.002, 6)
-    return path(varying, 300)
+    return path(varying, _FRAMES)
 
 
-def _scene(rng: np.random.Generator, bodies: tuple, T_world_cam: np.ndarray, hidden: list[tuple]) -> Scenario:
-    """The bodies in a room, and a hand that rises from below to hide each (body, from frame, to frame) in turn."""
+def _scene(rng: np.random.Generator, placed: list[Placed], T_world_cam: np.ndarray | None = None) -> Scenario:
+    """The bodies in a room, and a hand that rises from below to hide each in its time; the camera stands still."""
+    T_world_cam = standing(_EYE, _TARGET, _FRAMES) if T_world_cam is None else T_world_cam
+    bodies = [body for body, _ in placed]
+    hidden = [(body.T_world_model, *frames) for body, frames in placed if frames]
     if hidden:
-        T_cam_hand = _hand_path(T_world_cam, hidden)
-        bodies = (*bodies, Body("hand", hand(rng), T_world_cam @ T_cam_hand, labelled=False))
-    return Scenario(VGA, T_world_cam, bodies, room(rng))
+        T_world_hand = T_world_cam @ _hand_path(T_world_cam, hidden)
+        bodies.append(Body("hand", hand(rng), T_world_hand, labelled=False))
+    return Scenario(VGA, T_world_cam, tuple(bodies), room(rng))
 
 
-def _hand_path(T_world_cam: np.ndarray, hidden: list[tuple]) -> np.ndarray:
+def _hand_path(T_world_cam: np.ndarray, hidden: list[tuple[np.ndarray, int, int]]) -> np.ndarray:
     """T_cam_hand (T, 4, 4): fingers up, flat to the camera, on the line of sight while it hides something."""
-    from scipy.interpolate import PchipInterpolator
-
     frames, below = len(T_world_cam), np.array([0.0, 0.42, 0.0])
     keys, points = [], []
-    for body, start, stop in hidden:
-        p_cam = se3.transform(se3.inverse(T_world_cam), body.T_world_model[:, :3, 3][:, None])[:, 0]
+    for T_world_model, start, stop in hidden:
+        p_cam = (se3.inverse(T_world_cam) @ T_world_model)[:, :3, 3]
         at = np.linspace(start, stop, 12).round().astype(int)
         keys += [start - 14, *at, stop + 14]
         over = _HAND_SHARE * p_cam[at]
         points += [over[0] + below, *over, over[-1] + below]
     keys, points = [-1.0, *keys, float(frames)], [points[0], *points, points[-1]]
-    T = np.tile(se3.from_rt(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros(3)), (frames, 1, 1))
-    T[:, :3, 3] = eased(PchipInterpolator(keys, np.array(points))(np.arange(frames)), 1.5)
-    return T
+    at = through(keys, np.array(points), np.arange(frames), 1.5)
+    return se3.from_rt(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), at)
+
+
+def _board_path(frames: int, hidden: list[tuple[np.ndarray, int, int]], mirrored: float) -> np.ndarray:
+    """T_world_board (T, 4, 4): in from the side, on the line of sight to one object after the other, and out.
+
+    ``hidden`` are (T_world_model, from, to) with frames counted in 300.
+    """
+    scale = (frames - 1) / 299
+    side = np.array([-mirrored * 0.42, -0.2, 0.25])
+    keys, points = [0.0, hidden[0][1] - 10], [side, side]
+    for T_world_model, start, stop in hidden:
+        at = np.linspace(start, stop, 6)
+        keys += [*at]
+        points += [_EYE + _BOARD_SHARE * (T_world_model[round(t * scale), :3, 3] - _EYE) for t in at]
+    keys += [keys[-1] + 10, 299.0]
+    points += [side * [-1, 1, 1]] * 2
+    at = through(keys, np.array(points), np.linspace(0, 299, frames), scale)
+    return se3.from_rt(se3.exp(np.array([-0.4, 0, 0, 0, 0, 0.0]))[:3, :3], at)

@@ -1,4 +1,4 @@
-"""What a glossy surface mirrors: a picture of the room all around, far away, with lights brighter than white."""
+"""What a glossy surface mirrors: an image of the room all around, far away, with lights brighter than white."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from p2p_lib.synthetic import texture
 from p2p_lib.synthetic.labels import smooth_noise
 
 
@@ -25,20 +26,15 @@ class Environment:
 
     @cached_property
     def mipmap(self) -> list[np.ndarray]:
-        """The picture, each next level averaged to half the size."""
-        levels = [self.radiance]
-        while min(levels[-1].shape[:2]) > 1:
-            h, w = levels[-1].shape[:2]
-            levels.append(cv2.resize(levels[-1], (w // 2, h // 2), interpolation=cv2.INTER_AREA))
-        return levels
+        """The map at every size, see :func:`p2p_lib.synthetic.texture.mipmap`."""
+        return texture.mipmap(self.radiance)
 
-    def lookup(self, direction: np.ndarray, spread_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where unit directions (N, 3) meet the picture, uv (N, 2), and the level for a cone of that width (N,)."""
+    def seen(self, direction: np.ndarray, spread_rad: np.ndarray) -> np.ndarray:
+        """Light (N, 3) from unit directions (N, 3), averaged over cones of that width (N,)."""
         azimuth = np.arctan2(direction[:, 1], direction[:, 0])
         elevation = np.arcsin(np.clip(direction[:, 2], -1, 1))
-        texel_rad = np.pi / len(self.radiance)
         uv = np.stack([azimuth / (2 * np.pi) + 0.5, elevation / np.pi + 0.5], 1)
-        return uv, np.log2(np.maximum(spread_rad / texel_rad, 1e-6))
+        return texture.lookup(self.mipmap, uv, spread_rad / (np.pi / len(self.radiance)))
 
 
 def fresnel(reflectance: float, cosine: np.ndarray) -> np.ndarray:

@@ -23,126 +23,87 @@ def spoil(folder: str | Path, fault: str) -> Path:
     return Path(folder)
 
 
-def _depth_unit(folder: Path) -> None:
-    """Depth in millimetres that is taken for metres."""
-    (folder / "depth_scale.txt").write_text("1\n")
+def _images(pattern: str, change: Callable[[np.ndarray, list[np.ndarray]], np.ndarray]) -> Callable[[Path], None]:
+    """Rewrites the images that fit a pattern, each as a function of itself and of its frame's masks."""
+
+    def spoil(folder: Path) -> None:
+        for path in folder.glob(pattern):
+            masks = [_read(mask) for mask in (folder / "masks").glob(f"*/{path.name}")]
+            cv2.imwrite(str(path), change(_read(path), masks))
+
+    return spoil
 
 
-def _depth_in_metres(folder: Path) -> None:
-    """Depth stored as metres where millimetres are expected."""
+def _numbers(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    """Rewrites a text file of numbers as a function of them."""
+    return lambda folder: np.savetxt(folder / name, change(np.loadtxt(folder / name)), fmt="%.6f")
+
+
+def _read(path: Path) -> np.ndarray:
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+def _in_metres(folder: Path) -> None:
     for path in (folder / "depth").iterdir():
-        metres = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32) / 1000
-        cv2.imwrite(str(path.with_suffix(".tif")), metres)
+        cv2.imwrite(str(path.with_suffix(".tif")), _read(path).astype(np.float32) / 1000)
         path.unlink()
 
 
-def _not_registered(folder: Path) -> None:
-    """Depth as a D435's depth camera sees it: a wider view, and 15 mm beside the colour camera."""
-    for path in (folder / "depth").iterdir():
-        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        h, w = depth.shape
-        seen = np.array([[0.75, 0, 0.125 * w + 12], [0, 0.75, 0.125 * h]])
-        cv2.imwrite(str(path), cv2.warpAffine(depth, seen, (w, h), flags=cv2.INTER_NEAREST))
-
-
-def _shifted(folder: Path) -> None:
-    """Depth and colour of one size and view, 18 px apart."""
-    for path in (folder / "depth").iterdir():
-        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        cv2.imwrite(str(path), np.roll(depth, 18, axis=1))
-
-
-def _other_resolution(folder: Path) -> None:
-    """The camera matrix of pictures twice as large."""
-    K = np.loadtxt(folder / "cam_K.txt")
-    K[:2] *= 2
-    np.savetxt(folder / "cam_K.txt", K)
-
-
-def _other_aspect(folder: Path) -> None:
-    """The camera matrix of 1280x720, where the pictures are narrower."""
-    K = np.loadtxt(folder / "cam_K.txt")
-    K[0, 2], K[1, 2] = 639.5, 359.5
-    np.savetxt(folder / "cam_K.txt", K)
-
-
-def _milliseconds(folder: Path) -> None:
-    """Times in milliseconds."""
-    np.savetxt(folder / "times.txt", np.loadtxt(folder / "times.txt") * 1000, fmt="%.3f")
-
-
-def _backwards(folder: Path) -> None:
-    """Times that jump back half-way, as those of two recordings put together."""
-    times_s = np.loadtxt(folder / "times.txt")
-    times_s[len(times_s) // 2 :] -= times_s[len(times_s) // 2]
-    np.savetxt(folder / "times.txt", times_s, fmt="%.6f")
-
-
-def _gap(folder: Path) -> None:
-    """Three seconds in which nothing was recorded."""
-    times_s = np.loadtxt(folder / "times.txt")
-    times_s[len(times_s) // 2 :] += 3
-    np.savetxt(folder / "times.txt", times_s, fmt="%.6f")
-
-
 def _repeated(folder: Path) -> None:
-    """Every picture twice: a recorder that was faster than its camera."""
     for kind in ("rgb", "depth"):
         files = sorted((folder / kind).iterdir())
         for a, b in zip(files[::2], files[1::2]):
             b.write_bytes(a.read_bytes())
 
 
-def _bare(folder: Path) -> None:
-    """Objects of one plain colour, with the noise of a camera."""
-    rng = np.random.default_rng(0)
-    for path in (folder / "rgb").iterdir():
-        image = cv2.imread(str(path))
-        for mask_file in (folder / "masks").glob(f"*/{path.name}"):
-            mask = cv2.imread(str(mask_file), cv2.IMREAD_UNCHANGED)
-            wide = cv2.dilate(mask, np.ones((9, 9))) > 0
-            if mask.any():
-                plain = np.median(image[mask > 0], 0) + rng.normal(0, 2.5, (int(wide.sum()), 3))
-                image[wide] = np.clip(plain, 0, 255)
-        cv2.imwrite(str(path), image)
+def _wider(depth: np.ndarray, _: list[np.ndarray]) -> np.ndarray:
+    h, w = depth.shape
+    seen = np.array([[0.75, 0, 0.125 * w + 12], [0, 0.75, 0.125 * h]])
+    return cv2.warpAffine(depth, seen, (w, h), flags=cv2.INTER_NEAREST)
 
 
-def _wide_masks(folder: Path) -> None:
-    """Masks drawn 6 px too wide."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13))
-    for path in (folder / "masks").glob("*/*.png"):
-        cv2.imwrite(str(path), cv2.dilate(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), disc))
+def _plain(image: np.ndarray, masks: list[np.ndarray]) -> np.ndarray:
+    rng = np.random.default_rng(int(image.sum()))  # noise that differs from frame to frame
+    for mask in filter(np.any, masks):
+        wide = cv2.dilate(mask, np.ones((9, 9))) > 0
+        colour = np.median(image[mask > 0], 0) + rng.normal(0, 2.5, (int(wide.sum()), 3))
+        image[wide] = np.clip(colour, 0, 255)
+    return image
 
 
-def _far(folder: Path) -> None:
-    """Depth in tenths of a millimetre that is taken for millimetres: everything ten times as far away."""
-    for path in (folder / "depth").iterdir():
-        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED) * np.uint16(10))
-
-
-def _no_depth(folder: Path) -> None:
-    """Objects that the depth camera does not see: dark, shiny, transparent."""
-    for path in (folder / "depth").iterdir():
-        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        for mask_file in (folder / "masks").glob(f"*/{path.name}"):
-            depth[cv2.imread(str(mask_file), cv2.IMREAD_UNCHANGED) > 0] = 0
-        cv2.imwrite(str(path), depth)
+def _hidden(depth: np.ndarray, masks: list[np.ndarray]) -> np.ndarray:
+    return np.where(np.any(masks, axis=0), 0, depth).astype(depth.dtype)
 
 
 #: Fault to what puts it into a folder.
 FAULTS: dict[str, Callable[[Path], None]] = {
-    "depth unit": _depth_unit,
-    "depth in metres": _depth_in_metres,
-    "ten times as far": _far,
-    "depth not registered": _not_registered,
-    "depth shifted": _shifted,
-    "K of another resolution": _other_resolution,
-    "K of another aspect": _other_aspect,
-    "times in milliseconds": _milliseconds,
-    "times jump back": _backwards,
-    "a gap": _gap,
+    # Depth in millimetres that is taken for metres.
+    "depth unit": lambda folder: (folder / "depth_scale.txt").write_text("1\n"),
+    # Depth stored as metres where millimetres are expected.
+    "depth in metres": _in_metres,
+    # Depth in tenths of a millimetre that is taken for millimetres.
+    "ten times as far": _images("depth/*", lambda depth, _: depth * np.uint16(10)),
+    # Depth as a D435's depth camera sees it: a wider view, and 15 mm beside the colour camera.
+    "depth not registered": _images("depth/*", _wider),
+    # Depth and colour of one size and view, 18 px apart.
+    "depth shifted": _images("depth/*", lambda depth, _: np.roll(depth, 18, axis=1)),
+    # The camera matrix of images twice as large.
+    "K of another resolution": _numbers("cam_K.txt", lambda K: K * [[2], [2], [1]]),
+    # The camera matrix of 1280x720, where the images are narrower.
+    "K of another aspect": _numbers("cam_K.txt", lambda K: [[K[0, 0], 0, 639.5], [0, K[1, 1], 359.5], K[2]]),
+    "times in milliseconds": _numbers("times.txt", lambda s: s * 1000),
+    # As those of two recordings put together.
+    "times jump back": _numbers("times.txt", lambda s: np.r_[s[: len(s) // 2], s[len(s) // 2 :] - s[len(s) // 2]]),
+    # Three seconds in which nothing was recorded.
+    "a gap": _numbers("times.txt", lambda s: s + 3 * (np.arange(len(s)) >= len(s) // 2)),
+    # Every frame twice: a recorder that was faster than its camera.
     "pictures twice": _repeated,
-    "no texture": _bare,
-    "wide masks": _wide_masks,
-    "no depth on the objects": _no_depth,
+    # Objects of one plain colour, with the noise of a camera.
+    "no texture": _images("rgb/*", _plain),
+    # Masks drawn 6 px too wide.
+    "wide masks": _images(
+        "masks/*/*.png", lambda mask, _: cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13)))
+    ),
+    # Objects that the depth camera does not see: dark, shiny, transparent.
+    "no depth on the objects": _images("depth/*", _hidden),
 }

@@ -1,4 +1,4 @@
-"""Writes a scenario as a YCBMultiTrack folder, with exact poses, masks and 2D tracks; cached by its configuration."""
+"""Writes a scenario as a YCBMultiTrack folder, with exact poses and masks; cached by its configuration."""
 
 from __future__ import annotations
 
@@ -11,24 +11,27 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
+from tqdm import tqdm
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import cache_dir
+from p2p_lib.datasets.bop_writer import write_models, write_scene
+from p2p_lib.datasets.sequence import SYNTHETIC, open_sequence, unknown_scenario
 from p2p_lib.synthetic.noise import NOISE, Sensor, kept_frames, measured_colour, measured_depth, measured_mask
-from p2p_lib.synthetic.render import Picture, render
+from p2p_lib.synthetic.render import Rendering
 from p2p_lib.synthetic.scenarios import SCENARIOS
 from p2p_lib.synthetic.scene import FPS, Body, Scenario
 from p2p_lib.synthetic.shapes import Mesh
 
-_TRACKS_PER_OBJECT = 256
 _MODEL_POINTS = 6000
+_PER_OBJECT = ("masks", "annotated_poses", "is_mask_visible", "is_obj_in_image_labels", "models")
 _DONE = "scenario.json"
 
 
@@ -55,16 +58,24 @@ def scenario_dir(name: str, seed: int = 0, **overrides: object) -> Path:
 
 def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, title: str = "rendering") -> None:
     """Renders a scenario into ``folder``, which is made: colour, depth, and the truth per labelled body."""
-    truth = [_Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
-    for name in ("rgb", "depth", *(f"{kind}/{t.body.name}" for kind in _PER_OBJECT for t in truth)):
+    labelled = {k: body for k, body in enumerate(scenario.bodies, 1) if body.labelled}
+    for name in ("rgb", "depth", *(f"{kind}/{body.name}" for kind in _PER_OBJECT for body in labelled.values())):
         (folder / name).mkdir(parents=True, exist_ok=True)
     still = bool((scenario.T_world_cam == scenario.T_world_cam[0]).all())
-    room = _room(scenario, 0) if still else None
-    work = partial(_write_frame, folder, scenario, sensor, seed, truth, room)
+    work = partial(_write_frame, folder, scenario, sensor, seed, scenario.empty(0) if still else None)
     with ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0)))) as pool:
         frames = kept_frames(scenario.frames, sensor, np.random.default_rng([seed, 5]))
-        rows = list(_progress(pool.map(work, frames.tolist()), len(frames), title))
-    _write_truth(folder, scenario, truth, frames, rows)
+        done = pool.map(work, frames.tolist())
+        # On a terminal only, and only when it takes longer than a moment.
+        shown = {"unit": "frame", "delay": 2.0, "leave": False, "disable": None}
+        visible = list(tqdm(done, title, len(frames), **shown))
+    np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
+    np.savetxt(folder / "times.txt", frames / FPS, fmt="%.6f")
+    for k, body in labelled.items():
+        _write_truth(folder, scenario, body, frames, np.array([k in labels for labels in visible]))
+        points, _ = body.mesh.sample(_MODEL_POINTS, np.random.default_rng(k))
+        np.savetxt(folder / f"models/{body.name}/points.xyz", points, fmt="%.6f")
+        _write_obj(folder / f"models/{body.name}", body.mesh)
 
 
 def write_sequence(
@@ -82,23 +93,16 @@ def write_sequence(
     if noise not in NOISE:
         raise BadInput("noise", repr(noise), "one of " + ", ".join(NOISE))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise BadInput(str(out), "there is something already", "a new or empty folder")
+        raise BadInput(str(out), "has files in it", "a new or empty folder")
     own, _ = _settings(name, seed, {"models": str(models)} if models else {})
     scenario = SCENARIOS[name](seed, **own)
     write_scenario(out, scenario, NOISE[noise], seed, f"rendering {name}")
     made = {"name": name, "seed": seed, "noise": noise, "sensor": asdict(NOISE[noise]), "objects": scenario.objects}
     (out / _DONE).write_text(json.dumps(made | {"generator": generator_version()}, indent=1, sort_keys=True) + "\n")
     if bop:
-        _write_bop(out)
+        ids = write_scene(out / "bop/test/000001", open_sequence(out, format="ycbmultitrack"))
+        write_models(out / "bop/models", {k: out / f"models/{name}/textured.obj" for name, k in ids.items()})
     return out
-
-
-def _write_bop(folder: Path) -> None:
-    from p2p_lib.datasets.bop_writer import write_models, write_scene
-    from p2p_lib.datasets.sequence import open_sequence
-
-    ids = write_scene(folder / "bop/test/000001", open_sequence(folder, format="ycbmultitrack"))
-    write_models(folder / "bop/models", {k: folder / f"models/{name}/textured.obj" for name, k in ids.items()})
 
 
 def generator_version() -> str:
@@ -108,152 +112,79 @@ def generator_version() -> str:
 
 
 def photograph(
-    scenario: Scenario, sensor: Sensor, seed: int, t: int, room: Picture | None = None
-) -> tuple[np.ndarray, np.ndarray, Picture]:
-    """Frame ``t`` as the sensor delivers it: rgb (H, W, 3) uint8, depth_m (H, W), and the exact picture.
+    scenario: Scenario, sensor: Sensor, seed: int, t: int, room: Rendering | None = None
+) -> tuple[np.ndarray, np.ndarray, Rendering]:
+    """Frame ``t`` as the sensor delivers it: rgb (H, W, 3) uint8, depth_m (H, W), and the exact image.
 
     ``room`` is the empty scene at this frame's camera pose, where the caller already has it.
     """
     rng = np.random.default_rng([seed, 2, t])
-    exact = _exact(scenario, float(t), room)
+    exact = scenario.rendered(t, room)
     rgb = exact.rgb
     if sensor.shutter_share > 0:
         times = t + sensor.shutter_share * (np.arange(sensor.blur_samples) + 0.5) / sensor.blur_samples
-        rgb = np.mean([_exact(scenario, s, room).rgb for s in np.minimum(times, scenario.frames - 1)], 0)
+        rgb = np.mean([scenario.rendered(s, room).rgb for s in np.minimum(times, scenario.frames - 1)], 0)
     phase = np.random.default_rng([seed, 3]).uniform(0, 2 * np.pi)
     gain = 1 + sensor.exposure * np.sin(2 * np.pi * t / (4 * FPS) + phase)
     depth_m = measured_depth(exact, scenario.camera, sensor, rng)
     return measured_colour(rgb, sensor, gain, rng), depth_m, exact
 
 
-def _exact(scenario: Scenario, t: float, room: Picture | None) -> Picture:
-    bodies = [(body.mesh, _at(body.T_world_model, t)) for body in scenario.bodies]
-    room = room or _room(scenario, t)
-    return render(bodies, scenario.camera, _at(scenario.T_world_cam, t), scenario.light, room)
-
-
-def _room(scenario: Scenario, t: float) -> Picture:
-    """The scene without its bodies; nothing in it carries a label."""
-    walls = [(mesh, se3.IDENTITY) for mesh in scenario.room]
-    return render(walls, scenario.camera, _at(scenario.T_world_cam, t), scenario.light)
-
-
-def _at(T: np.ndarray, t: float) -> np.ndarray:
-    """The pose at a fractional frame."""
-    k = int(t)
-    return T[k] if t == k else se3.interpolate(T[k], T[k + 1], t - k)
-
-
-@dataclass(frozen=True, eq=False)
-class _Truth:
-    """A labelled body: its label and the surface points whose tracks are written."""
-
-    label: int
-    body: Body
-    p_model: np.ndarray
-    normals: np.ndarray
-
-    @classmethod
-    def of(cls, label: int, body: Body, seed: int) -> _Truth:
-        return cls(label, body, *body.mesh.sample(_TRACKS_PER_OBJECT, np.random.default_rng([seed, 4, label])))
-
-    def tracks(self, scenario: Scenario, t: int, exact: Picture) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (P, 2) and visibility (P,) of the points at frame t, by the exact depth."""
-        camera = scenario.camera
-        T_cam_model = se3.inverse(scenario.T_world_cam[t]) @ self.body.T_world_model[t]
-        p_cam = se3.transform(T_cam_model, self.p_model)
-        uv = camera.project(p_cam)
-        inside = camera.inside(uv)
-        u, v = np.where(inside, uv.T, 0).round().astype(int)
-        away = np.linalg.norm(p_cam, axis=1)
-        cosine = -np.einsum("pc,pc->p", self.normals @ T_cam_model[:3, :3].T, p_cam) / away
-        # The depth is that of the pixel's centre, up to 0.71 px away: a slanted surface differs by its slope.
-        slope = np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, 1e-3)
-        tolerance = 0.0005 + 0.75 * p_cam[:, 2] / camera.fx * slope
-        agrees = np.abs(exact.depth_m[v, u] - p_cam[:, 2]) < tolerance
-        return uv, inside & (cosine > 0.05) & (exact.label[v, u] == self.label) & agrees
-
-
-_PER_OBJECT = ("masks", "annotated_poses", "is_mask_visible", "is_obj_in_image_labels", "models")
-
-
 def _write_frame(
-    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, truth: list[_Truth], room: Picture | None, t: int
-) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Renders and writes frame t; returns visible pixels, track pixels and track visibility per object."""
+    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, room: Rendering | None, t: int
+) -> set[int]:
+    """Renders and writes frame t; returns the labels that are visible in it."""
     rgb, depth_m, exact = photograph(scenario, sensor, seed, t, room)
     _save(folder / f"rgb/{t:06d}.jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
     depth_mm = np.minimum(np.round(depth_m * 1000), 65534).astype(np.uint16)
     _save(folder / f"depth/{t:06d}.png", depth_mm, [cv2.IMWRITE_PNG_COMPRESSION, 2])
-    rows = []
-    for one in truth:
-        visible = exact.label == one.label
-        mask = measured_mask(visible, sensor, np.random.default_rng([seed, 6, t, one.label]))
-        where = folder / f"masks/{one.body.name}/{t:06d}.png"
-        _save(where, mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_COMPRESSION, 2])
-        rows.append((int(np.count_nonzero(visible)), *one.tracks(scenario, t, exact)))
-    return rows
+    for k, body in enumerate(scenario.bodies, 1):
+        if body.labelled:
+            mask = measured_mask(exact.label == k, sensor, np.random.default_rng([seed, 6, t, k]))
+            where = folder / f"masks/{body.name}/{t:06d}.png"
+            _save(where, mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_COMPRESSION, 2])
+    return set(np.unique(exact.label).tolist())
 
 
-def _save(path: Path, picture: np.ndarray, options: list[int]) -> None:
-    if not cv2.imwrite(str(path), picture, options):
+def _save(path: Path, image: np.ndarray, options: list[int]) -> None:
+    if not cv2.imwrite(str(path), image, options):
         raise OSError(f"{path} could not be written: is the disk full?")
 
 
-def _write_truth(folder: Path, scenario: Scenario, truth: list[_Truth], frames: np.ndarray, rows: list) -> None:
-    """Camera, times, poses, labels, models and tracks: everything that is not a picture."""
-    np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
-    np.savetxt(folder / "times.txt", frames / FPS, fmt="%.6f")
-    T_cam_world = se3.inverse(scenario.T_world_cam[frames])
-    for k, one in enumerate(truth):
-        name = one.body.name
-        T_cam_model = T_cam_world @ one.body.T_world_model[frames]
-        for t, T in zip(frames, T_cam_model, strict=True):
-            np.savetxt(folder / f"annotated_poses/{name}/{t:06d}.txt", T, fmt="%.9f")
-        uv = scenario.camera.project(se3.transform(T_cam_model, one.body.mesh.vertices))
-        in_image = scenario.camera.inside(uv).any(1)
-        np.save(folder / f"is_obj_in_image_labels/{name}/is_obj_in_image.npy", in_image)
-        np.save(folder / f"is_mask_visible/{name}/is_mask_visible.npy", np.array([row[k][0] > 0 for row in rows]))
-        points, _ = one.body.mesh.sample(_MODEL_POINTS, np.random.default_rng(one.label))
-        np.savetxt(folder / f"models/{name}/points.xyz", points, fmt="%.6f")
-        _write_obj(folder / f"models/{name}", one.body.mesh)
-    np.savez_compressed(
-        folder / "tracks.npz",
-        objects=np.array([one.body.name for one in truth]),
-        object_index=np.repeat(np.arange(len(truth)), _TRACKS_PER_OBJECT),
-        p_model=np.concatenate([one.p_model for one in truth]),
-        uv_px=np.stack([np.concatenate([r[1] for r in row]) for row in rows]).astype(np.float32),
-        visible=np.stack([np.concatenate([r[2] for r in row]) for row in rows]),
-    )
+def _write_truth(folder: Path, scenario: Scenario, body: Body, frames: np.ndarray, visible: np.ndarray) -> None:
+    """A body's pose and labels at every frame written."""
+    T_cam_model = se3.inverse(scenario.T_world_cam[frames]) @ body.T_world_model[frames]
+    for t, T in zip(frames, T_cam_model, strict=True):
+        np.savetxt(folder / f"annotated_poses/{body.name}/{t:06d}.txt", T, fmt="%.9f")
+    uv = scenario.camera.project(se3.transform(T_cam_model, body.mesh.vertices))
+    in_image = scenario.camera.inside(uv).any(1)
+    np.save(folder / f"is_obj_in_image_labels/{body.name}/is_obj_in_image.npy", in_image)
+    np.save(folder / f"is_mask_visible/{body.name}/is_mask_visible.npy", visible)
 
 
 def _write_obj(folder: Path, mesh: Mesh) -> None:
     """``textured.obj`` with its material and texture."""
-    _save(folder / "texture_map.png", mesh.texture[..., ::-1], [])
-    (folder / "textured.mtl").write_text("newmtl label\nKd 1 1 1\nmap_Kd texture_map.png\n")
-    corner = np.arange(mesh.faces.size).reshape(-1, 3) + 1
-    lines = ["mtllib textured.mtl", "usemtl label"]
-    lines += ["v {:.6f} {:.6f} {:.6f}".format(*p) for p in mesh.vertices]
-    lines += ["vt {:.6f} {:.6f}".format(*p) for p in mesh.uv.reshape(-1, 2)]
-    lines += [
-        "f {}/{} {}/{} {}/{}".format(*np.stack([f, c], 1).ravel()) for f, c in zip(mesh.faces + 1, corner, strict=True)
-    ]
-    (folder / "textured.obj").write_text("\n".join(lines) + "\n")
+    import trimesh
+    from PIL import Image
+
+    corners = np.arange(mesh.faces.size)
+    material = trimesh.visual.material.SimpleMaterial(Image.fromarray(mesh.texture), name="texture_map")
+    visual = trimesh.visual.TextureVisuals(mesh.uv.reshape(-1, 2), material)
+    loose = trimesh.Trimesh(mesh.vertices[mesh.faces.ravel()], corners.reshape(-1, 3), visual=visual, process=False)
+    loose.export(folder / "textured.obj", digits=6)
 
 
 def _settings(name: str, seed: int, overrides: dict) -> tuple[dict, Sensor]:
     """The scenario's own parameters and the sensor; unknown names and keys are refused."""
-    if name not in SCENARIOS:
-        known = ", ".join(f"synthetic/{n}" for n in sorted(SCENARIOS))
-        raise BadInput("synthetic sequence", repr(name), f"one of {known}")
+    if unknown := unknown_scenario(name, SCENARIOS):
+        raise unknown
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise BadInput(f"synthetic/{name} seed", repr(seed), "a whole number, 0 or above")
+        raise BadInput(f"{SYNTHETIC}{name} seed", repr(seed), "a whole number, 0 or above")
     taken = list(inspect.signature(SCENARIOS[name]).parameters.values())[1:]
     own = {p.name: p.default for p in taken if p.kind is not p.KEYWORD_ONLY}
     known = [*own, *(f.name for f in fields(Sensor))]
-    for key in overrides:
-        if key not in known:
-            raise BadInput(f"synthetic/{name} parameter", repr(key), "one of " + ", ".join(known))
+    for key in overrides.keys() - known:
+        raise BadInput(f"{SYNTHETIC}{name} parameter", repr(key), "one of " + ", ".join(known))
     sensor = Sensor(**{k: v for k, v in overrides.items() if k not in own})
     return own | {k: v for k, v in overrides.items() if k in own}, sensor
 
@@ -276,10 +207,3 @@ def _alone(folder: Path) -> Iterator[Path]:
             yield unfinished
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def _progress(items: Iterator, total: int, title: str) -> Iterator:
-    """A progress bar, shown on a terminal only and only when the work takes longer than a moment."""
-    from tqdm import tqdm
-
-    return tqdm(items, total=total, desc=title, unit="frame", delay=2.0, leave=False, disable=None)

@@ -1,4 +1,4 @@
-"""Printed matter, made up: package labels, wood, cardboard. Everything is drawn on uint8 pictures from an rng."""
+"""Printed matter, made up: package labels, wood, cardboard. Everything is drawn on uint8 images from an rng."""
 
 from __future__ import annotations
 

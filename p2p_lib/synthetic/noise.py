@@ -1,67 +1,50 @@
-"""What a real RGB-D camera does to a perfect picture (active stereo, as a RealSense D435)."""
+"""What a real RGB-D camera does to a perfect image (active stereo, as a RealSense D435)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.synthetic.render import Picture
+from p2p_lib.synthetic.render import Rendering
+
+
+def _effect(size: float, meaning: str, high: float = np.inf) -> Any:
+    """A field of :class:`Sensor`, from 0 to ``high``."""
+    return field(default=size, metadata={"meaning": meaning, "high": high})
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """Sensor model; 0 switches an effect off. The defaults are about those of a RealSense D435 at 640x480.
+    """Sensor model; 0 switches an effect off. The defaults are about those of a RealSense D435 at 640x480."""
 
-    axial_per_m       standard deviation of the depth noise at 1 m, in m; grows with the range squared
-    correlation_px    the noise is even over about this radius (stereo matches windows, not pixels)
-    disparity_step_px stereo quantises disparity to this; the depth step grows with the range squared
-    baseline_m        distance of the two imagers: what only one of them sees has no depth
-    lateral_px        standard deviation of the raggedness of depth edges
-    edge_m            a depth step larger than this is an edge; pixels beside it lose depth with edge_loss
-    edge_loss         probability
-    grazing_deg       incidence at which half of the depth is lost
-    psf_px            blur of lens and demosaicing (standard deviation)
-    read_levels       colour noise in the dark, standard deviation in grey levels
-    shot_levels       colour noise at full brightness, added in variance
-    exposure          largest relative change of brightness over time (slow)
-    shutter_share     share of the frame time that the shutter is open: motion blur
-    blur_samples      pictures averaged for it
-    mask_px           standard deviation of the displacement of the masks' outlines, which wobble smoothly
-    mask_loss         probability that an object's mask is missing in a frame
-    drop              probability that a frame is missing (never the first)
-    """
-
-    axial_per_m: float = 0.004
-    correlation_px: float = 1.5
-    disparity_step_px: float = 1 / 32
-    baseline_m: float = 0.05
-    lateral_px: float = 0.6
-    edge_m: float = 0.02
-    edge_loss: float = 0.5
-    grazing_deg: float = 80.0
-    psf_px: float = 0.6
-    read_levels: float = 1.5
-    shot_levels: float = 2.5
-    exposure: float = 0.04
-    shutter_share: float = 0.0
-    blur_samples: int = 6
-    mask_px: float = 0.0
-    mask_loss: float = 0.0
-    drop: float = 0.0
+    axial_per_m: float = _effect(0.004, "standard deviation of depth at 1 m, in m; grows with the range squared")
+    correlation_px: float = _effect(1.5, "depth noise is even over this radius: stereo matches windows, not pixels")
+    disparity_step_px: float = _effect(1 / 32, "disparity is quantised to this: depth steps grow with range squared")
+    baseline_m: float = _effect(0.05, "distance of the two imagers: what only one of them sees has no depth")
+    lateral_px: float = _effect(0.6, "standard deviation of the raggedness of depth edges")
+    edge_m: float = _effect(0.02, "a larger step in depth is an edge")
+    edge_loss: float = _effect(0.5, "probability that a pixel beside an edge has no depth", 1)
+    grazing_deg: float = _effect(80.0, "incidence at which half of the depth is lost", 90)
+    psf_px: float = _effect(0.6, "standard deviation of the blur of lens and demosaicing")
+    read_levels: float = _effect(1.5, "standard deviation of colour noise in the dark, in grey levels")
+    shot_levels: float = _effect(2.5, "that at full brightness, added in variance")
+    exposure: float = _effect(0.04, "largest relative change of brightness over time, which is slow", 0.9)
+    shutter_share: float = _effect(0.0, "share of the frame time that the shutter is open: motion blur", 1)
+    blur_samples: int = _effect(6, "images averaged for it, at least 1")
+    mask_px: float = _effect(0.0, "standard deviation of the displacement of mask outlines, which wobble smoothly")
+    mask_loss: float = _effect(0.0, "probability that an object's mask is missing in a frame", 1)
+    drop: float = _effect(0.0, "probability that a frame is missing; the first never is", 1)
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            value = getattr(self, f.name)
-            shares = dict.fromkeys(("edge_loss", "shutter_share", "mask_loss", "drop"), 1)
-            high = (shares | {"exposure": 0.9, "grazing_deg": 90}).get(f.name, np.inf)
-            if not np.isfinite(value) or not 0 <= value <= high:
-                raise BadInput(f"sensor {f.name}", value, f"a number from 0 to {high}")
-        if self.blur_samples < 1:
-            raise BadInput("sensor blur_samples", self.blur_samples, "at least 1")
+            value, low, high = getattr(self, f.name), int(f.name == "blur_samples"), f.metadata["high"]
+            if not np.isfinite(value) or not low <= value <= high:
+                raise BadInput(f"sensor {f.name}", value, f"a number from {low} to {high}: {f.metadata['meaning']}")
 
 
 #: Exact depth and clean colour.
@@ -77,9 +60,9 @@ NOISE = {
 }
 
 
-def measured_depth(picture: Picture, camera: Camera, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+def measured_depth(image: Rendering, camera: Camera, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
     """Depth (H, W) float64 in metres as the sensor reports it; 0 = no measurement."""
-    exact = picture.depth_m
+    exact = image.depth_m
     H, W = exact.shape
     hole = exact <= 0
     if sensor.baseline_m:
@@ -87,7 +70,7 @@ def measured_depth(picture: Picture, camera: Camera, sensor: Sensor, rng: np.ran
     if sensor.edge_loss:
         hole |= _edges(exact, sensor.edge_m) & (rng.random((H, W), np.float32) < sensor.edge_loss)
     if sensor.grazing_deg:
-        incidence = np.degrees(np.arccos(np.clip(picture.cos_incidence, 0, 1)))
+        incidence = np.degrees(np.arccos(np.clip(image.cos_incidence, 0, 1)))
         lost = np.clip((incidence - sensor.grazing_deg) / 10 + 0.5, 0, 1)
         hole |= rng.random((H, W), np.float32) < lost
     depth = _ragged(exact, sensor, rng) if sensor.lateral_px else exact
@@ -101,7 +84,7 @@ def measured_depth(picture: Picture, camera: Camera, sensor: Sensor, rng: np.ran
 
 
 def measured_colour(rgb: np.ndarray, sensor: Sensor, gain: float, rng: np.random.Generator) -> np.ndarray:
-    """Colour (H, W, 3) uint8 of a rendered (H, W, 3) float32 picture at a relative exposure ``gain``."""
+    """Colour (H, W, 3) uint8 of a rendered (H, W, 3) float32 image at a relative exposure ``gain``."""
     rgb = rgb * np.float32(gain)
     if sensor.psf_px:
         rgb = cv2.GaussianBlur(rgb, (0, 0), sensor.psf_px)

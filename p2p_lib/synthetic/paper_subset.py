@@ -14,10 +14,10 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import MissingData
 from p2p_lib.synthetic import shapes
-from p2p_lib.synthetic.motion import look_at, turn, wander
-from p2p_lib.synthetic.scene import Body, Scenario, room
+from p2p_lib.synthetic.motion import standing, turned, wander
+from p2p_lib.synthetic.scene import Body, Scenario, check, room
 from p2p_lib.synthetic.shapes import Mesh
 
 FRAMES = 541  # five times this is 2,705
@@ -58,8 +58,7 @@ def paper_sequence(seed: int, frames: int = FRAMES, models: str = "", *, parts: 
     ``models`` is a folder of YCB models (``<name>/textured.obj``, metres); without it printed stand-ins are used, and
     the scenario's ``objects`` say so.
     """
-    if frames < 2:
-        raise BadInput("frames", frames, "at least 2")
+    check("frames", frames=(frames, 2, np.inf))
     rng = np.random.default_rng([seed, 1])
     # Two objects keep clear of each other: one stays within 4 cm of the middle, the other goes around it.
     reach = {"circular": 0.21, "linear": 0.04} if len(parts) > 1 else {"circular": 0.10, "linear": 0.08}
@@ -69,8 +68,7 @@ def paper_sequence(seed: int, frames: int = FRAMES, models: str = "", *, parts: 
         T = {"circular": _circular, "linear": _linear}[part.motion](rng, frames, reach[part.motion])
         middle = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
         bodies.append(Body(part.model, mesh, T @ se3.from_rt(np.eye(3), -middle)))
-    eye = np.array([0.0, -0.52, 0.34])
-    T_world_cam = np.broadcast_to(look_at(eye, np.array([0.0, 0.02, 0.14])), (frames, 4, 4))
+    T_world_cam = standing(np.array([0.0, -0.52, 0.34]), np.array([0.0, 0.02, 0.14]), frames)
     kind = "YCB models" if models else "procedural stand-ins of about the YCB models' sizes"
     return Scenario(CAMERA, T_world_cam, tuple(bodies), room(rng), objects=kind)
 
@@ -87,18 +85,17 @@ def _mesh(rng: np.random.Generator, model: str, models: str) -> Mesh:
 
 def _circular(rng: np.random.Generator, frames: int, radius_m: float) -> np.ndarray:
     """Twice around a circle that lies flat, turning by a full turn on the way."""
-    share = np.arange(frames)[:, None] / (frames - 1)
+    share = np.arange(frames) / (frames - 1)
     angle = 2 * np.pi * (2 * share + rng.uniform()) * rng.choice([-1, 1])
-    T = wander(rng, frames, 0.01, 8.0, 200) @ turn(np.array([0, 0, 1.0]), 2 * np.pi * (share[:, 0] + rng.uniform()))
-    T[:, :3, 3] += np.concatenate([radius_m * np.cos(angle), radius_m * np.sin(angle), 0.16 + 0 * angle], 1)
-    return T
+    centre = np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), np.full(frames, 0.16)], 1)
+    sway = wander(rng, frames, 0.01, 8.0, 200)
+    return turned(sway, 2 * np.pi * (share + rng.uniform()), centre)
 
 
 def _linear(rng: np.random.Generator, frames: int, reach_m: float) -> np.ndarray:
     """To and fro along a line, turning by 200 degrees on the way."""
     share = np.arange(frames) / (frames - 1)
     yaw = np.radians(200) * share * rng.choice([-1, 1]) + rng.uniform(0, 2 * np.pi)
-    T = wander(rng, frames, 0.01, 8.0, 200) @ turn(np.array([0, 0, 1.0]), yaw)
-    T[:, 0, 3] += reach_m * np.sin(2 * np.pi * (2 * share + rng.uniform()))
-    T[:, 1:3, 3] += [0.02, 0.14]
-    return T
+    sway = wander(rng, frames, 0.01, 8.0, 200)
+    aside = reach_m * np.sin(2 * np.pi * (2 * share + rng.uniform()))
+    return turned(sway, yaw, np.stack([aside, np.full(frames, 0.02), np.full(frames, 0.14)], 1))

@@ -6,14 +6,13 @@ from collections.abc import Callable
 from functools import partial
 
 from p2p_lib.synthetic import ablations, absences, paper_subset
-from p2p_lib.synthetic.crossing import crossing
 from p2p_lib.synthetic.scene import Scenario
 
 #: Each takes the seed first and its own keyword parameters.
 SCENARIOS: dict[str, Callable[..., Scenario]] = {
     make.__name__: make
     for make in (
-        crossing,
+        absences.crossing,
         ablations.mug,
         ablations.weak_texture,
         ablations.fading_label,

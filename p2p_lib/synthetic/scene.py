@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
 from p2p_lib.synthetic import labels, shapes
-from p2p_lib.synthetic.render import Light
+from p2p_lib.synthetic.render import Light, Rendering, render
 from p2p_lib.synthetic.shapes import Mesh
 
 FPS = 30.0
@@ -42,13 +44,34 @@ class Scenario:
         """Number of frames."""
         return len(self.T_world_cam)
 
+    def rendered(self, t: float, room: Rendering | None = None) -> Rendering:
+        """The scene at a frame, or between two; ``room`` is :meth:`empty` there, where the caller has it already."""
+        bodies = [(body.mesh, _at(body.T_world_model, t)) for body in self.bodies]
+        return render(bodies, self.camera, _at(self.T_world_cam, t), self.light, room or self.empty(t))
+
+    def empty(self, t: float) -> Rendering:
+        """The scene without its bodies; nothing in it carries a label."""
+        walls = [(mesh, se3.IDENTITY) for mesh in self.room]
+        return render(walls, self.camera, _at(self.T_world_cam, t), self.light)
+
+
+def _at(T: np.ndarray, t: float) -> np.ndarray:
+    """The pose at a fractional frame."""
+    k = int(t)
+    return T[k] if t == k else se3.interpolate(T[k], T[k + 1], t - k)
+
+
+def check(scenario: str, **limits: tuple[float, float, float]) -> None:
+    """Raises :class:`BadInput` where a parameter of a scenario, (value, least, most), is beyond its limits."""
+    if not all(low <= value <= high for value, low, high in limits.values()):
+        got = ", ".join(f"{name} {value}" for name, (value, _, _) in limits.items())
+        raise BadInput(
+            scenario, got, ", ".join(f"{name} from {low} to {high}" for name, (_, low, high) in limits.items())
+        )
+
 
 def room(rng: np.random.Generator) -> tuple[Mesh, ...]:
     """A table top and the wall behind it."""
-    table = shapes.plane(
-        labels.wood(rng, 1536, 1024), [[-0.9, -0.6, 0], [0.9, -0.6, 0], [0.9, 0.45, 0], [-0.9, 0.45, 0]]
-    )
-    wall = shapes.plane(
-        labels.plaster(rng, 1024, 512), [[-1.6, 0.9, -0.6], [1.6, 0.9, -0.6], [1.6, 0.9, 1.2], [-1.6, 0.9, 1.2]]
-    )
-    return table, wall
+    table = [[-0.9, -0.6, 0], [0.9, -0.6, 0], [0.9, 0.45, 0], [-0.9, 0.45, 0]]
+    wall = [[-1.6, 0.9, -0.6], [1.6, 0.9, -0.6], [1.6, 0.9, 1.2], [-1.6, 0.9, 1.2]]
+    return shapes.plane(labels.wood(rng, 1536, 1024), table), shapes.plane(labels.plaster(rng, 1024, 512), wall)

@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.synthetic import labels
+from p2p_lib.core.raycasting import ray_scene
+from p2p_lib.synthetic import labels, texture
 
-#: Print resolution of the procedural labels; at 0.5 m and 615 px focal length the picture has 1.2 px/mm.
+#: Print resolution of the procedural labels; at 0.5 m and 615 px focal length the image has 1.2 px/mm.
 TEXELS_PER_M = 3000.0
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A rigid surface with a picture on it. Faces are counter-clockwise seen from outside.
+    """A rigid surface with an image on it. Faces are counter-clockwise seen from outside.
 
     vertices     (V, 3) float64, metres, model frame
     faces        (F, 3) int
     uv           (F, 3, 2) texture coordinates per face corner, (0, 0) = bottom left of the texture
     texture      (H, W, 3) uint8, RGB
     normals      (F, 3, 3) unit normals per face corner for shading; None = those of the flat faces
-    closed       faces seen from behind are not drawn
     reflectance  (F,) share of light mirrored at normal incidence (glaze 0.05); None = matt all over
     """
 
@@ -34,7 +35,6 @@ class Mesh:
     uv: np.ndarray
     texture: np.ndarray
     normals: np.ndarray | None = None
-    closed: bool = True
     reflectance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -46,6 +46,8 @@ class Mesh:
             raise BadInput("mesh texture", f"{self.texture.shape} {self.texture.dtype}", "(H, W, 3) uint8")
         if self.normals is None:
             object.__setattr__(self, "normals", np.repeat(self.face_normals[:, None], 3, 1))
+        if self.reflectance is None:
+            object.__setattr__(self, "reflectance", np.zeros(F))
 
     @cached_property
     def face_normals(self) -> np.ndarray:
@@ -61,13 +63,13 @@ class Mesh:
 
     @cached_property
     def mipmap(self) -> list[np.ndarray]:
-        """The texture, each next level averaged to half the size, down to one texel: (h, w, 3) float32."""
-        levels = [self.texture.astype(np.float32)]
-        while max(levels[-1].shape[:2]) > 1:
-            h, w = levels[-1].shape[:2]
-            half = (max(1, w // 2), max(1, h // 2))
-            levels.append(cv2.resize(levels[-1], half, interpolation=cv2.INTER_AREA))
-        return levels
+        """The texture at every size, see :func:`p2p_lib.synthetic.texture.mipmap`."""
+        return texture.mipmap(self.texture)
+
+    @cached_property
+    def ray_scene(self) -> Any:
+        """The mesh for :mod:`p2p_lib.core.raycasting`."""
+        return ray_scene(self.vertices, self.faces)
 
     def sample(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draws n points (n, 3) and normals (n, 3) on the surface, even in area, in model coordinates."""
@@ -80,49 +82,82 @@ class Mesh:
         return np.einsum("nk,nkc->nc", weights, self.vertices[self.faces[face]]), self.face_normals[face]
 
 
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Loose triangles with an image of their own, from which :func:`assembled` makes a mesh.
+
+    corners  (F, 3, 3) metres
+    uv       (F, 3, 2) on the patch's image, (0, 0) = bottom left
+    normals  (F, 3, 3)
+    image    (H, W, 3) uint8
+    """
+
+    corners: np.ndarray
+    uv: np.ndarray
+    normals: np.ndarray
+    image: np.ndarray
+
+
+def assembled(patches: Sequence[Patch], rows: Sequence[Sequence[int]] = ((0,),), ground: int = 128) -> Mesh:
+    """One mesh of patches: corners at one place become one vertex, the images parts of one texture.
+
+    rows    which patches' images stand side by side in each row of the texture, from the top
+    ground  grey level of the texture where there is none
+    """
+    sizes = [patch.image.shape[1::-1] for patch in patches]
+    heights = [max(sizes[k][1] for k in row) for row in rows]
+    W, H = max(sum(sizes[k][0] for k in row) for row in rows), sum(heights)
+    page = np.full((H, W, 3), ground, np.uint8)
+    uv: list[np.ndarray] = [np.zeros(0)] * len(patches)
+    for row, top in zip(rows, np.cumsum([0, *heights]), strict=False):
+        left = 0
+        for k in row:
+            w, h = sizes[k]
+            page[top : top + h, left : left + w] = patches[k].image
+            uv[k] = (patches[k].uv * [w, h] + [left, H - top - h]) / [W, H]
+            left += w
+    flat = np.concatenate([patch.corners for patch in patches]).reshape(-1, 3)
+    _, first, index = np.unique(np.round(flat, 9), axis=0, return_index=True, return_inverse=True)
+    normals = np.concatenate([patch.normals for patch in patches])
+    return Mesh(flat[first], index.reshape(-1, 3), np.concatenate(uv), page, normals)
+
+
 def box(rng: np.random.Generator, size_m: tuple[float, float, float], contrast: float = 1.0) -> Mesh:
     """A carton of size (x, y, z), centred, with six printed panels; the front faces -y, the top +z."""
     x, y, z = (max(8, round(s * TEXELS_PER_M)) for s in size_m)
     sides = [labels.label(rng, w, z, contrast, front) for w, front in ((x, True), (y, False), (x, True), (y, False))]
     ends = [labels.label(rng, x, y, contrast, front) for front in (True, False)]
-    return _carton(size_m, sides, ends)
+    return _six_sided(size_m, sides + ends)
 
 
 def slab(rng: np.random.Generator, size_m: tuple[float, float, float]) -> Mesh:
     """A plain board of size (x, y, z), centred: an occluder."""
     x, y, z = (max(8, round(s * TEXELS_PER_M / 3)) for s in size_m)
-    sides = [labels.cardboard(rng, w, z) for w in (x, y, x, y)]
-    return _carton(size_m, sides, [labels.cardboard(rng, x, y) for _ in range(2)])
+    return _six_sided(
+        size_m, [labels.cardboard(rng, w, h) for w, h in ((x, z), (y, z), (x, z), (y, z), (x, y), (x, y))]
+    )
 
 
 def can(rng: np.random.Generator, radius_m: float, height_m: float, contrast: float = 1.0, segments: int = 72) -> Mesh:
     """A tin around the z axis, centred, with a label wrapped around it and two lids."""
-    around, tall = round(2 * np.pi * radius_m * TEXELS_PER_M), round(height_m * TEXELS_PER_M)
-    disc = round(2 * radius_m * TEXELS_PER_M)
-    texture = np.zeros((tall + disc, max(around, 2 * disc), 3), np.uint8)
-    texture[:tall, :around] = labels.wrapped_label(rng, around, tall, contrast)
-    for k in range(2):
-        texture[tall:, k * disc : (k + 1) * disc] = labels.lid(rng, disc, contrast)
-    H, W = texture.shape[:2]
-
-    rows = max(2, round(height_m / 0.01))
-    across, up = np.linspace(0, 1, segments + 1), np.linspace(0, 1, rows + 1)
-    side = grid(across, up)
-    angle = 2 * np.pi * side[..., 0]
+    around, tall, disc = (round(s * TEXELS_PER_M) for s in (2 * np.pi * radius_m, height_m, 2 * radius_m))
+    across, up = np.linspace(0, 1, segments + 1), np.linspace(0, 1, max(2, round(height_m / 0.01)) + 1)
+    cells = grid(across, up)
+    angle = 2 * np.pi * cells[..., 0]
     out = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
-    points = out * radius_m + (side[..., 1:] - 0.5) * [0, 0, height_m]
-    parts = [(points, side * [around / W, tall / H] + [0, disc / H], out)]
-    rim = np.stack([across[:-1], across[1:]], -1) * 2 * np.pi
-    fan = np.stack([np.zeros_like(rim[:, :1].repeat(2, 1)), np.stack([np.cos(rim[:, 0]), np.sin(rim[:, 0])], -1)], 1)
-    fan = np.concatenate([fan, np.stack([np.cos(rim[:, 1]), np.sin(rim[:, 1])], -1)[:, None]], 1)
-    for k, sign in enumerate((1, -1)):
+    corners = out * radius_m + (cells[..., 1:] - 0.5) * [0, 0, height_m]
+    patches = [Patch(corners, cells, out, labels.wrapped_label(rng, around, tall, contrast))]
+    rim = np.stack([np.cos(2 * np.pi * across), np.sin(2 * np.pi * across)], -1)
+    fan = np.stack([np.zeros_like(rim[1:]), rim[:-1], rim[1:]], 1)
+    for sign in (1, -1):
         flat = fan if sign > 0 else fan[:, ::-1]
-        p = np.concatenate([flat * radius_m, np.full((segments, 3, 1), sign * height_m / 2)], -1)
+        corners = np.concatenate([flat * radius_m, np.full((segments, 3, 1), sign * height_m / 2)], -1)
         # Just inside the disc's edge, so that filtering does not mix in what lies outside.
-        uv = ((flat * [sign, 1] * 0.98 / 2 + 0.5) * disc + [k * disc, 0]) / [W, H]
-        parts.append((p, uv, np.broadcast_to([0.0, 0, sign], p.shape)))
-    corners, uv, normals = (np.concatenate(a) for a in zip(*parts, strict=True))
-    return welded(corners, uv, texture, normals)
+        uv = flat * [sign, 1] * 0.98 / 2 + 0.5
+        patches.append(
+            Patch(corners, uv, np.broadcast_to([0.0, 0, sign], corners.shape), labels.lid(rng, disc, contrast))
+        )
+    return assembled(patches, [[0], [1, 2]], ground=0)
 
 
 def block(rng: np.random.Generator, radius_m: float, height_m: float, contrast: float = 1.0) -> Mesh:
@@ -136,15 +171,28 @@ def block(rng: np.random.Generator, radius_m: float, height_m: float, contrast: 
     slant = np.r_[rng.uniform(0.2, 0.35) * np.array([np.cos(angle[0] + 1), np.sin(angle[0] + 1)]), 1]
     share = (height_m - foot @ slant) / ((apex - foot) @ slant)
     top = foot + share[:, None] * (apex - foot)
-    around = [np.stack([foot[k], foot[k - 4], top[k - 4], top[k]]) for k in range(5)]
-    return _flat_faced([*around, top, foot[::-1]], [0, 0, -height_m / 2], rng, contrast)
+    sides = [np.stack([foot[k], foot[k - 4], top[k - 4], top[k]]) for k in range(5)]
+    patches = []
+    for k, corners in enumerate([*sides, top, foot[::-1]]):
+        right = (corners[1] - corners[0]) / np.linalg.norm(corners[1] - corners[0])
+        out = np.cross(right, corners[2] - corners[1])
+        out /= np.linalg.norm(out)
+        flat = (corners - corners[0]) @ np.stack([right, np.cross(out, right)], 1)
+        flat -= flat.min(0)
+        w, h = np.maximum(8, np.round(flat.max(0) * TEXELS_PER_M)).astype(int)
+        fan = np.stack([[0, i, i + 1] for i in range(1, len(corners) - 1)])
+        placed, normals = corners[fan] - [0, 0, height_m / 2], np.broadcast_to(out, (len(fan), 3, 3))
+        patches.append(
+            Patch(placed, flat[fan] / flat.max(0), normals, labels.label(rng, w, h, contrast, front=k % 2 == 0))
+        )
+    return assembled(patches, [[k] for k in reversed(range(len(patches)))])
 
 
-def plane(texture: np.ndarray, corners_m: np.ndarray) -> Mesh:
-    """A flat picture: corners (4, 3) bottom left, bottom right, top right, top left of the texture."""
+def plane(image: np.ndarray, corners_m: np.ndarray) -> Mesh:
+    """A flat image: corners (4, 3) at its bottom left, bottom right, top right, top left."""
     uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    return Mesh(np.asarray(corners_m, float), faces, uv[faces], texture, closed=False)
+    return Mesh(np.asarray(corners_m, float), faces, uv[faces], image)
 
 
 def load_mesh(path: str | Path) -> Mesh:
@@ -159,7 +207,7 @@ def load_mesh(path: str | Path) -> Mesh:
     material = getattr(m.visual, "material", None)
     image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
     if uv is None or image is None:
-        raise BadInput(f"mesh {path}", "no texture", "a mesh with texture coordinates and a picture")
+        raise BadInput(f"mesh {path}", "no texture", "a mesh with texture coordinates and an image")
     faces = np.asarray(m.faces)
     normals = np.asarray(m.vertex_normals)[faces]
     return Mesh(np.asarray(m.vertices, float), faces, np.asarray(uv)[faces], np.array(image.convert("RGB")), normals)
@@ -167,62 +215,21 @@ def load_mesh(path: str | Path) -> Mesh:
 
 def grid(across: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Two counter-clockwise triangles per cell of a grid in the plane: (2 * cells, 3, 2)."""
-    a0, u0 = np.meshgrid(across[:-1], up[:-1])
-    a1, u1 = np.meshgrid(across[1:], up[1:])
-    p00, p10, p11, p01 = (np.stack([a.ravel(), u.ravel()], -1) for a, u in ((a0, u0), (a1, u0), (a1, u1), (a0, u1)))
-    return np.concatenate([np.stack([p00, p10, p11], 1), np.stack([p00, p11, p01], 1)])
+    nodes = np.stack(np.meshgrid(across, up), -1)
+    low_left, low_right, top_right, top_left = (
+        corner.reshape(-1, 2) for corner in (nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, 1:], nodes[1:, :-1])
+    )
+    return np.concatenate([np.stack([low_left, low_right, top_right], 1), np.stack([low_left, top_right, top_left], 1)])
 
 
-def _carton(size_m: tuple, sides: list[np.ndarray], ends: list[np.ndarray]) -> Mesh:
-    """Panels -y, +x, +y, -x and top, bottom around a box; faces of about 1 cm, so that vertices cover the surface."""
-    top_row, low_row = np.hstack(sides), np.hstack(ends)
-    H, W = len(top_row) + len(low_row), max(top_row.shape[1], low_row.shape[1])
-    texture = np.full((H, W, 3), 128, np.uint8)
-    texture[: len(top_row), : top_row.shape[1]] = top_row
-    texture[len(top_row) :, : low_row.shape[1]] = low_row
+def _six_sided(size_m: tuple[float, float, float], panels: list[np.ndarray]) -> Mesh:
+    """A box of panels -y, +x, +y, -x, top, bottom; faces of about 1 cm, so that vertices cover the surface."""
     x, y, z = np.eye(3)
-    frames = [(x, z), (y, z), (-x, z), (-y, z), (x, y), (-x, y)]
-    size, left, parts = np.asarray(size_m, float), 0, []
-    for k, ((right, up), panel) in enumerate(zip(frames, sides + ends, strict=True)):
+    size, patches = np.asarray(size_m, float), []
+    for (right, up), panel in zip([(x, z), (y, z), (-x, z), (-y, z), (x, y), (-x, y)], panels, strict=True):
         out = np.cross(right, up)
-        w, h = np.abs(right) @ size, np.abs(up) @ size
+        w, h, deep = (np.abs(axis) @ size for axis in (right, up, out))
         cells = grid(*(np.linspace(0, 1, max(1, round(s / 0.01)) + 1) for s in (w, h)))
-        p = (cells[..., :1] - 0.5) * w * right + (cells[..., 1:] - 0.5) * h * up + out * (np.abs(out) @ size) / 2
-        left = 0 if k == 4 else left
-        bottom = 0 if k >= 4 else len(low_row)
-        uv = (cells * panel.shape[1::-1] + [left, bottom]) / [W, H]
-        left += panel.shape[1]
-        parts.append((p, uv, np.broadcast_to(out, p.shape)))
-    corners, uv, normals = (np.concatenate(a) for a in zip(*parts, strict=True))
-    return welded(corners, uv, texture, normals)
-
-
-def _flat_faced(faces: list[np.ndarray], shift: list[float], rng: np.random.Generator, contrast: float) -> Mesh:
-    """A solid of flat convex faces (corners (K, 3) counter-clockwise), each with a label of its own."""
-    panels, parts = [], []
-    for corners in faces:
-        right = (corners[1] - corners[0]) / np.linalg.norm(corners[1] - corners[0])
-        out = np.cross(right, corners[2] - corners[1])
-        out /= np.linalg.norm(out)
-        flat = (corners - corners[0]) @ np.stack([right, np.cross(out, right)], 1)
-        flat -= flat.min(0)
-        w, h = np.maximum(8, np.round(flat.max(0) * TEXELS_PER_M)).astype(int)
-        panels.append(labels.label(rng, w, h, contrast, front=len(panels) % 2 == 0))
-        fan = np.stack([[0, k, k + 1] for k in range(1, len(corners) - 1)])
-        parts.append((corners[fan] + shift, flat[fan] / flat.max(0), np.broadcast_to(out, (len(fan), 3, 3))))
-    bottom = np.cumsum([0, *(len(p) for p in panels)])
-    texture = np.full((bottom[-1], max(p.shape[1] for p in panels), 3), 128, np.uint8)
-    H, W = texture.shape[:2]
-    uvs = []
-    for panel, low, (_, uv, _) in zip(panels, bottom, parts, strict=False):
-        texture[H - low - len(panel) : H - low, : panel.shape[1]] = panel
-        uvs.append((uv * panel.shape[1::-1] + [0, low]) / [W, H])
-    corners, normals = (np.concatenate([p[k] for p in parts]) for k in (0, 2))
-    return welded(corners, np.concatenate(uvs), texture, normals)
-
-
-def welded(corners: np.ndarray, uv: np.ndarray, texture: np.ndarray, normals: np.ndarray) -> Mesh:
-    """A mesh from loose triangles (F, 3, 3): corners at one place become one vertex."""
-    flat = corners.reshape(-1, 3)
-    _, first, index = np.unique(np.round(flat, 9), axis=0, return_index=True, return_inverse=True)
-    return Mesh(flat[first], index.reshape(-1, 3), uv, texture, np.array(normals))
+        corners = (cells[..., :1] - 0.5) * w * right + (cells[..., 1:] - 0.5) * h * up + out * deep / 2
+        patches.append(Patch(corners, cells, np.broadcast_to(out, corners.shape), panel))
+    return assembled(patches, [[0, 1, 2, 3], [4, 5]])

@@ -11,8 +11,8 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
-from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.trackers.ids import PointIds
 
 _FLOW = {"winSize": (21, 21), "maxLevel": 3}
 _FORWARD_BACKWARD_PX = 1.0
@@ -25,37 +25,28 @@ class LkTracker:
     latency_frames = 0
 
     def __init__(self, config: TrackingConfig, rng: np.random.Generator | None = None):
-        self._gray: np.ndarray | None = None
-        self._clear()
+        self._ids = PointIds()
 
-    def _clear(self) -> None:
-        self._next_id = 0
-        self._ids = np.zeros(0, np.int64)
+    def start(self, frame: Frame, camera: Camera | None = None) -> None:
+        """Begin a stream at this frame."""
+        self._ids.start()
+        self._gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         self._uv = np.zeros((0, 2), np.float32)
         self._visible = np.zeros(0, bool)
         self._uncertainty = np.zeros(0)
 
-    def start(self, frame: Frame, camera: Camera | None = None) -> None:
-        """Begin a stream at this frame."""
-        self._clear()
-        self._gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids."""
-        if self._gray is None:
-            raise BadInput("tracker", "queries before a frame", "start(frame) first")
         uv = np.asarray(uv_px, np.float32).reshape(-1, 2)
-        ids = np.arange(self._next_id, self._next_id + len(uv))
-        self._next_id += len(uv)
-        self._ids, self._uv = np.concatenate([self._ids, ids]), np.concatenate([self._uv, uv])
+        ids = self._ids.add(len(uv))
+        self._uv = np.concatenate([self._uv, uv])
         self._visible = np.concatenate([self._visible, np.ones(len(uv), bool)])
         self._uncertainty = np.concatenate([self._uncertainty, np.zeros(len(uv))])
         return ids
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame."""
-        if self._gray is None:
-            raise BadInput("tracker", "a frame to track before any start", "start(frame) first")
+        self._ids.check_started()
         previous, self._gray = self._gray, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         at = np.flatnonzero(self._visible)
         if len(at):
@@ -69,17 +60,16 @@ class LkTracker:
             self._uv[at], self._visible[at] = there, ok
             self._uncertainty[at] = np.where(ok, 0.5 * error_px / _FORWARD_BACKWARD_PX, 1.0)
         uv = np.where(self._visible[:, None], self._uv, np.nan).astype(float)
-        return Tracks(self._ids.copy(), uv, self._visible.copy(), self._uncertainty.copy())
+        return Tracks(self._ids.live.copy(), uv, self._visible.copy(), self._uncertainty.copy())
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
-        keep = ~np.isin(self._ids, ids)
-        self._ids, self._uv = self._ids[keep], self._uv[keep]
-        self._visible, self._uncertainty = self._visible[keep], self._uncertainty[keep]
+        keep = self._ids.drop(ids)
+        self._uv, self._visible, self._uncertainty = self._uv[keep], self._visible[keep], self._uncertainty[keep]
 
     def reject(self, ids: np.ndarray) -> None:
         """Take these tracks for invisible."""
-        self._visible &= ~np.isin(self._ids, ids)
+        self._visible &= ~np.isin(self._ids.live, ids)
 
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Ignored: nothing brings an invisible point back."""

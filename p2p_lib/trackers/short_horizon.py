@@ -11,6 +11,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.trackers.ids import PointIds
 
 
 class ShortHorizon:
@@ -24,65 +25,61 @@ class ShortHorizon:
         self.name = f"{tracker.name}-sh({forget_after})"
         self.latency_frames = tracker.latency_frames
         self._tracker, self._forget_after = tracker, forget_after
-        self._clear()
-
-    def _clear(self) -> None:
-        self._ids = np.zeros(0, np.int64)
-        self._hidden_for = np.zeros(0, np.int64)
+        self._ids = PointIds()
 
     @property
-    def _gone(self) -> np.ndarray:
-        """(N,) bool: points that were forgotten."""
+    def _forgotten(self) -> np.ndarray:
+        """(N,) bool."""
         return self._hidden_for >= self._forget_after
+
+    @property
+    def _followed(self) -> np.ndarray:
+        """Ids of the points that are not forgotten."""
+        return self._ids.live[~self._forgotten]
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
-        self._clear()
+        self._ids.start()
+        self._hidden_for = np.zeros(0, np.int64)
         self._tracker.start(frame, camera)
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids."""
         ids = self._tracker.add(uv_px)
-        self._ids = np.concatenate([self._ids, ids])
+        self._ids.extend(ids)
         self._hidden_for = np.concatenate([self._hidden_for, np.full(len(ids), -self.latency_frames)])
         return ids
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow the points that are not forgotten; rows of all, sorted by id."""
-        live = np.flatnonzero(~self._gone)
-        told = self._tracker.track(frame, search, urgent).select(self._ids[live])
-        result = self._with_forgotten(told, live)
-        self._hidden_for[live] = np.where(told.visible, 0, self._hidden_for[live] + 1)
-        self._tracker.drop(self._ids[live][self._gone[live]])
-        return result
+        live = np.flatnonzero(~self._forgotten)
+        tracks = self._with_forgotten(self._tracker.track(frame, search, urgent))
+        self._hidden_for[live] = np.where(tracks.visible[live], 0, self._hidden_for[live] + 1)
+        self._tracker.drop(self._ids.live[live][self._forgotten[live]])
+        return tracks
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
-        self._tracker.drop(self._ids[np.isin(self._ids, ids) & ~self._gone])
-        keep = ~np.isin(self._ids, ids)
-        self._ids, self._hidden_for = self._ids[keep], self._hidden_for[keep]
+        self._tracker.drop(self._followed[np.isin(self._followed, ids)])
+        self._hidden_for = self._hidden_for[self._ids.drop(ids)]
 
     def reject(self, ids: np.ndarray) -> None:
-        """Handed on."""
-        self._tracker.reject(self._known(ids))
+        """Handed on, for the points that are not forgotten."""
+        self._tracker.reject(np.asarray(ids)[np.isin(ids, self._followed)])
 
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Handed on, for the points that are not forgotten."""
-        known = np.isin(ids, self._known(ids))
-        told = self._tracker.suggest(ids[known], uv_px[known])
-        if told is None:
+        known = np.isin(ids, self._followed)
+        tracks = self._tracker.suggest(ids[known], uv_px[known])
+        if tracks is None:
             return None
-        live = np.flatnonzero(~self._gone)
-        told = told.select(self._ids[live])
-        self._hidden_for[live[told.visible]] = 0
-        return self._with_forgotten(told, live)
+        tracks = self._with_forgotten(tracks)
+        self._hidden_for[tracks.visible] = 0
+        return tracks
 
-    def _with_forgotten(self, told: Tracks, live: np.ndarray) -> Tracks:
-        """The tracks of the ``live`` rows among those of all."""
-        n = len(self._ids)
-        uv, visible, uncertainty = np.full((n, 2), np.nan), np.zeros(n, bool), np.ones(n)
-        uv[live], visible[live], uncertainty[live] = told.uv_px, told.visible, told.uncertainty
-        return Tracks(self._ids.copy(), uv, visible, uncertainty)
-
-    def _known(self, ids: np.ndarray) -> np.ndarray:
-        return np.asarray(ids)[np.isin(ids, self._ids[~self._gone])]
+    def _with_forgotten(self, tracks: Tracks) -> Tracks:
+        """The tracks of the points that are not forgotten among those of all."""
+        live, tracks, everyone = ~self._forgotten, tracks.select(self._followed), self._ids.unseen()
+        everyone.uv_px[live], everyone.visible[live] = tracks.uv_px, tracks.visible
+        everyone.uncertainty[live] = tracks.uncertainty
+        return everyone

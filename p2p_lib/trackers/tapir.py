@@ -1,6 +1,6 @@
 """Online BootsTAPIR (Doersch et al., ACCV 2024), the paper's tracker, through the official package ``tapnet``.
 
-Causal, frame by frame. Every query is a feature that is compared with the whole picture, so a point is found
+Causal, frame by frame. Every query is a feature that is compared with the whole image, so a point is found
 again wherever it returns. Code and weights: Apache-2.0.
 """
 
@@ -13,16 +13,16 @@ import numpy as np
 from p2p_lib.core import packages
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
-from p2p_lib.core.errors import BadInput
 from p2p_lib.core.image import in_image
 from p2p_lib.core.raster import from_raster, square, to_raster
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.datasets import checkpoints
+from p2p_lib.trackers.ids import PointIds
 
 if TYPE_CHECKING:
     import torch
 
-#: Side of the square that pictures are scaled to, and the visibility threshold (the paper's, both).
+#: Side of the square that images are scaled to, and the visibility threshold (the paper's, both).
 SIZE_PX, VISIBLE = 480, 0.5
 # Queries whose cost volumes are held at once.
 _CHUNK = 64
@@ -43,7 +43,7 @@ def new_model() -> torch.nn.Module:
 
 
 class TapirTracker:
-    """Streams pictures through a TAPIR model. Implements :class:`p2p_lib.core.interfaces.PointTracker`.
+    """Streams images through a TAPIR model. Implements :class:`p2p_lib.core.interfaces.PointTracker`.
 
     Visible where (1 - occluded)(1 - expected to be far off) exceeds a half; the uncertainty is the second of these.
     """
@@ -53,31 +53,24 @@ class TapirTracker:
 
     def __init__(self, model: torch.nn.Module, device: str = "cpu", size_px: int = SIZE_PX):
         self._model, self._device, self._size = model.to(device).eval(), device, size_px
-        self._grids: Any = None  # features of the newest picture
-        self._clear()
-
-    def _clear(self) -> None:
-        self._next_id = 0
-        self._ids = np.zeros(0, np.int64)
-        self._features: Any = None  # of the queries
-        self._state: list[dict[str, torch.Tensor]] = []
+        self._ids = PointIds()
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
-        self._clear()
-        self._look(frame)
+        self._ids.start()
+        self._features: Any = None  # of the queries
+        self._state: list[dict[str, torch.Tensor]] = []
+        self._observe(frame)
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids. They begin with an empty memory."""
         import torch
 
-        if self._grids is None:
-            raise BadInput("tracker", "queries before a frame", "start(frame) first")
         uv = np.asarray(uv_px, float).reshape(-1, 2)
-        ids = np.arange(self._next_id, self._next_id + len(uv))
+        first = not len(self._ids.live)
+        ids = self._ids.add(len(uv))
         if not len(ids):
             return ids
-        self._next_id += len(uv)
         xy = to_raster(uv, self._shape, self._size)
         tyx = np.concatenate([np.zeros((len(uv), 1)), xy[:, ::-1]], 1).astype(np.float32)
         with torch.inference_mode():
@@ -89,25 +82,23 @@ class TapirTracker:
             )
             state = self._model.construct_initial_causal_state(len(uv), len(new.resolutions) - 1)
             state = [{key: value.to(self._device) for key, value in part.items()} for part in state]
-            if len(self._ids):
+            if not first:
                 new = self._each(self._features, lambda a, b: torch.cat([a, b], 1), new)
                 state = [
                     {key: torch.cat([old[key], part[key]], 1) for key in part}
                     for old, part in zip(self._state, state, strict=True)
                 ]
         self._features, self._state = new, state
-        self._ids = np.concatenate([self._ids, ids])
         return ids
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
-        """Follow all live queries into the next frame; it always searches the whole picture."""
+        """Follow all live queries into the next frame; it always searches the whole image."""
         import torch
 
-        if self._grids is None:
-            raise BadInput("tracker", "a frame to track before any start", "start(frame) first")
-        self._look(frame)
-        if not len(self._ids):
-            return Tracks(self._ids.copy(), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
+        self._ids.check_started()
+        self._observe(frame)
+        if not len(self._ids.live):
+            return self._ids.unseen()
         with torch.inference_mode():
             out = self._model.estimate_trajectories(
                 (self._size, self._size),
@@ -129,16 +120,15 @@ class TapirTracker:
             visible = (1 - torch.sigmoid(occluded)) * (1 - far) > VISIBLE
         uv = from_raster(xy.double().cpu().numpy(), self._shape, self._size)
         visible = visible.cpu().numpy() & in_image(uv, self._shape, -0.5)
-        return Tracks(self._ids.copy(), uv, visible, far.double().cpu().numpy())
+        return Tracks(self._ids.live.copy(), uv, visible, far.double().cpu().numpy())
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
         import torch
 
-        keep = ~np.isin(self._ids, ids)
+        keep = self._ids.drop(ids)
         if keep.all():
             return
-        self._ids = self._ids[keep]
         rows = torch.from_numpy(np.flatnonzero(keep)).to(self._device)
         self._features = self._each(self._features, lambda a: a[:, rows])
         self._state = [{key: value[:, rows] for key, value in part.items()} for part in self._state]
@@ -149,7 +139,7 @@ class TapirTracker:
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Ignored: every frame is searched anew."""
 
-    def _look(self, frame: Frame) -> None:
+    def _observe(self, frame: Frame) -> None:
         import torch
 
         self._shape = frame.shape

@@ -17,6 +17,7 @@ import pytest
 import p2p_lib
 from p2p_lib.apps import cli
 from p2p_lib.core.errors import MissingData, P2PError
+from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.method.pipeline import Point2Pose
 
@@ -24,7 +25,7 @@ FRAMES, W, H = 8, 160, 120
 K = np.array([[200.0, 0, 79.5], [0, 200, 59.5], [0, 0, 1]])
 DEPTH_M = 0.5
 #: Points alone: the rest of the method is tested elsewhere, and torch takes seconds to import.
-POINTS_ALONE = ["--set", "tsdf.enabled=false", "--set", "factor_graph.enabled=false", "--quiet"]
+POINTS_ALONE = ["--set", "method.surface=false", "--set", "method.graph=false", "--quiet"]
 
 
 def write_sequence(folder: Path, frames: int = FRAMES) -> Path:
@@ -139,6 +140,8 @@ def test_options_reach_the_run(sequence, tmp_path, capsys):
     loaded = load_run(tmp_path / "out")
     assert loaded.objects["object"].frame_index.tolist() == [2, 3, 4, 5]
     assert (loaded.info["preset"], loaded.info["seed"], loaded.info["masks"]) == ("paper", 3, "dataset:drawn")
+    asked = RunOptions(**loaded.info["options"])
+    assert (asked.start, asked.stop, asked.objects, asked.settings["sampling.points"]) == (2, 6, ["object"], "18")
     written = (tmp_path / "out" / "config.toml").read_text()
     assert "points = 18\n" in written and "streak = 2\n" in written and 'preset = "paper"' in written
     # What was written reproduces the configuration.
@@ -260,7 +263,7 @@ BAD_FILES = {
     "empty sequence": (no_pictures, ["rgb", "no files"]),
     "no depth folder": (lambda s: shutil.rmtree(s / "depth"), ["depth"]),
     "K of two rows": (lambda s: spoil(s / "cam_K.txt", b"600 0 320\n0 600 240\n"), ["cam_K.txt", "(2, 3)", "3x3"]),
-    "K of words": (lambda s: spoil(s / "cam_K.txt", b"fx fy cx\n"), ["cam_K.txt", "fx fy cx", "3x3"]),
+    "K of words": (lambda s: spoil(s / "cam_K.txt", b"fx fy cx\n"), ["cam_K.txt", "'fx'", "3x3"]),
     "K transposed": (lambda s: np.savetxt(s / "cam_K.txt", K.T), ["cam_K.txt", "fx 0 cx 0 fy cy 0 0 1"]),
     "no K": (lambda s: spoil(s / "cam_K.txt", None), ["cam_K.txt"]),
     "NaN pose": (
@@ -308,7 +311,10 @@ BAD_WORDS = {
     "no config": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/no.toml"], ["no.toml", "no such"]),
     "config is no TOML": (["run", "{seq}", "--out", "{out}", "--config", "{seq}/cam_K.txt"], ["cam_K.txt", "TOML"]),
     "config is a folder": (["run", "{seq}", "--out", "{out}", "--config", "{seq}"], ["slide", "TOML"]),
-    "unknown stage": (["run", "{seq}", "--out", "{out}", "--set", "foo.bar=1"], ["'foo.bar'", "pipeline, tracking"]),
+    "unknown stage": (
+        ["run", "{seq}", "--out", "{out}", "--set", "foo.bar=1"],
+        ["'foo.bar'", "stage.key", "lifecycle, "],
+    ),
     "unknown scenario": (["synth", "crosing", "--out", "{out}"], ["'crosing'", "Did you mean synthetic/crossing?"]),
     "click into a file": (["click", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt/x", "can be written"]),
     "click into a folder": (["click", "{seq}", "--out", "{seq}/rgb"], ["slide/rgb", "a folder"]),
@@ -421,6 +427,13 @@ def test_clicks_replace_masks(sequence, tmp_path, capsys):
     assert load_run(again).objects["object"].has_pose.all() and not (again / "masks").exists()
     assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--stop", "2") == 0
     assert not list((out / "masks").rglob("*.png"))
+
+
+def test_names_of_earlier_versions_go_on_working(sequence, tmp_path):
+    prompts = clicks(tmp_path, ("object", 0, ON_BOARD))
+    assert run(sequence, tmp_path / "out", *prompts, "--masks", "embedded", "--tracker", "embedded", "--stop", "2") == 0
+    info = load_run(tmp_path / "out").info
+    assert (info["masks"], info["tracker"]) == ("builtin", "builtin")
 
 
 def test_what_counts_is_the_datasets_own_visibility(sequence, tmp_path, capsys):

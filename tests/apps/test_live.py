@@ -17,14 +17,15 @@ from p2p_lib.apps import cli
 from p2p_lib.apps.live import json_line, track_live
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.options import RunOptions
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.prompts import Prompt, save_prompts
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.run import make_config, run
+from p2p_lib.run import run
 
 FRAMES = 20  # then the board jumps back
-SETTINGS = {"tsdf.enabled": "false", "factor_graph.enabled": "false"}
+SETTINGS = {"method.surface": "false", "method.graph": "false"}
 PROMPTS = (Prompt("board", 0, [[60, 50]]),)
 
 
@@ -125,7 +126,7 @@ def test_slow_processing_drops_frames_and_counts_them(folder):
         got.append(estimate)
         time.sleep(0.05)
 
-    count = track_live(FolderCamera(open_sequence(folder), 100), PROMPTS, slow, config=make_config(settings=SETTINGS))
+    count = track_live(FolderCamera(open_sequence(folder), 100), PROMPTS, slow, RunOptions(settings=SETTINGS))
     assert count.frames == len(got) and count.dropped > 0 and count.frames + count.dropped <= FRAMES
     assert [e.frame_index for e in got] == sorted({e.frame_index for e in got}) and got[0].frame_index == 0
     assert count.dropped == got[-1].frame_index + 1 - len(got), "what lies between two that were tracked"
@@ -142,7 +143,7 @@ def test_live_estimates_are_those_of_a_run(folder, tmp_path):
         camera.hand.put(sequence.frame(estimate.frame_index + 1) if estimate.frame_index + 1 < FRAMES else None)
 
     camera.hand.put(sequence.frame(0))
-    count = track_live(camera, PROMPTS, next_please, config=make_config(settings=SETTINGS))
+    count = track_live(camera, PROMPTS, next_please, RunOptions(settings=SETTINGS))
     assert (count.frames, count.dropped) == (FRAMES, 0)
     run(sequence, tmp_path / "run", settings=SETTINGS, prompts=PROMPTS, progress=False)
     wanted = np.load(tmp_path / "run" / "poses.npz")
@@ -156,7 +157,7 @@ def test_a_prompt_starts_its_object_in_its_frame(folder):
         FolderCamera(sequence, 200),
         [Prompt("late", 9, [[60 + 18, 50 + 9]])],
         lambda e: (got.append(e), time.sleep(0.03)),
-        config=make_config(settings=SETTINGS),
+        RunOptions(settings=SETTINGS),
     )
     assert got[0].frame_index == 9 and got[0].status is Status.TRACKED and count.frames < FRAMES
 
@@ -164,7 +165,7 @@ def test_a_prompt_starts_its_object_in_its_frame(folder):
 def test_a_prompt_of_a_frame_that_never_comes_is_refused(folder):
     camera = FolderCamera(open_sequence(folder), 500)
     with pytest.raises(BadInput, match="prompt of 'mug': got frame 99, which never came"):
-        track_live(camera, [Prompt("mug", 99, [[1, 1]])], print, config=make_config(settings=SETTINGS))
+        track_live(camera, [Prompt("mug", 99, [[1, 1]])], print, RunOptions(settings=SETTINGS))
 
 
 # --- the command -------------------------------------------------------------------------------

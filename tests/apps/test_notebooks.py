@@ -1,5 +1,6 @@
 """Every notebook of the suite is clean and runs in the quick profile; the runner refuses and reports as it should."""
 
+import ast
 import json
 import math
 import re
@@ -11,7 +12,6 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 from p2p_lib.apps.notebooks import (
     NotebookFailed,
-    check_notebook,
     list_notebooks,
     notebook_parameters,
     read_result,
@@ -20,9 +20,51 @@ from p2p_lib.apps.notebooks import (
 )
 from p2p_lib.core.errors import BadInput, MissingData
 
-SUITE = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
+SUITE = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
+MAX_CELL_LINES = 15
 PARAMETERS = "PROFILE = 'quick'\nSEED: int = 0\nSCALE = 1.0\nNAME = 'a'"
 RECORD = "from p2p_lib.apps.notebooks import record\nrecord(seed=SEED, scale=SCALE, profile=PROFILE)"
+
+
+def check_notebook(path: Path) -> list[str]:
+    """What is wrong with a notebook's source as it is kept in git; empty where nothing is."""
+    code = [cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code"]
+    problems = []
+    for number, cell in enumerate(code, 1):
+        found = ["has outputs (run nbstripout)"] if cell.outputs or cell.execution_count else []
+        problems += [f"code cell {number} {problem}" for problem in found + source_problems(cell.source)]
+    if sum("parameters" in tags(cell) for cell in code) != 1:
+        problems.append("needs exactly one cell tagged parameters")
+    else:
+        try:
+            problems += [] if "PROFILE" in notebook_parameters(path) else ["has no parameter PROFILE"]
+        except BadInput as error:
+            problems.append(str(error))
+    if not code or "checks" not in tags(code[-1]):
+        problems.append("needs a last code cell tagged checks")
+    return problems
+
+
+def source_problems(source: str) -> list[str]:
+    lines = len(source.splitlines())
+    problems = [f"has {lines} lines, more than {MAX_CELL_LINES}"] if lines > MAX_CELL_LINES else []
+    try:
+        nodes = list(ast.walk(ast.parse(source)))
+    except SyntaxError:
+        return [*problems, "is not plain Python (no shell, no magics)"]
+    if any(isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) for node in nodes):
+        problems.append("defines a function or class (it belongs in p2p_lib)")
+    modules = [name.name for node in nodes if isinstance(node, ast.Import) for name in node.names]
+    modules += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+    if {module.split(".")[0] for module in modules} & {"os", "subprocess"}:
+        problems.append("imports os or subprocess (the library has a function for it)")
+    texts = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    problems += [f"holds the absolute path {text!r}" for text in texts if re.match(r"(/|~/|[A-Za-z]:\\)\w", text)]
+    return problems
+
+
+def tags(cell) -> list[str]:
+    return cell.metadata.get("tags", [])
 
 
 def cell(source: str, tag: str = ""):
@@ -60,7 +102,7 @@ def test_notebook_runs_in_the_quick_profile(path, suite_out):
     (result,) = run_notebooks("quick", [path.stem], suite_out, say=lines.append)
     assert result.error == "" and result.checks, "the checks cell records the numbers that it asserted"
     assert result.executed.with_suffix(".html").stat().st_size > 10_000
-    assert 0 < sum(result.cell_seconds) <= result.seconds
+    assert result.seconds > 0
 
 
 def test_a_browser_shows_every_figure_of_the_gallery(suite_out, browser):
@@ -126,8 +168,8 @@ def test_what_a_notebook_recorded_is_read_back(run):
     result = read_result(run[1] / "notebooks" / "00_first.ipynb")
     assert result.checks == {"seed": 3, "scale": 2.0, "profile": "quick"}
     assert isinstance(result.checks["scale"], float)
-    assert result.title == "A story" and result.picture_png == PNG and result.error == ""
-    assert len(result.cell_seconds) == 5 and 0 < sum(result.cell_seconds) <= result.seconds
+    assert result.title == "A story" and result.image_png == PNG and result.error == ""
+    assert result.seconds > 0
 
 
 def test_notebooks_learn_their_folders(run):
@@ -256,7 +298,7 @@ def test_parameters_are_literals(tmp_path, source):
 def test_a_file_that_is_no_notebook_is_named(tmp_path):
     (tmp_path / "00_a.ipynb").write_text("PROFILE = 1")
     with pytest.raises(BadInput, match=r"00_a\.ipynb: got a file that is not JSON"):
-        check_notebook(tmp_path / "00_a.ipynb")
+        notebook_parameters(tmp_path / "00_a.ipynb")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, [1, 2], None])

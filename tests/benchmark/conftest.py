@@ -14,10 +14,10 @@ title = "A board that slides"
 [[method]]
 name = "Ours"
 paper = "Ours"
-settings = {{ "tsdf.enabled" = false, "factor_graph.enabled" = false }}
+settings = {{ "method.surface" = false, "method.graph" = false }}
 [[method]]
 name = "No multi-hypothesis"
-settings = {{ "tsdf.enabled" = false, "factor_graph.enabled" = false, "registration.multi_hypothesis" = false }}
+settings = {{ "method.surface" = false, "method.graph" = false, "registration.method" = "svd" }}
 [quick]
 seeds = [0]
 sequence = [{{ name = "{first}", column = "AP10" }}]

@@ -21,8 +21,9 @@ from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import jobs_of
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome, load_outcome, save_outcome
 from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation import metrics
-from p2p_lib.run import evaluate_run
+from p2p_lib.evaluation.protocol import evaluate
 
 
 def table(benchmark: Benchmark, name: str = "results") -> list[dict[str, str]]:
@@ -44,7 +45,7 @@ def test_every_run_of_the_plan_is_there_and_scored_as_p2p_eval_does(whole):
     for job, outcome in whole.results:
         run = whole.out / "runs" / outcome.key
         for align in ("first", "all"):
-            scores = evaluate_run(run, align=align).as_dict()["objects"]["object"]
+            scores = evaluate(load_run(run), align=align).as_dict()["objects"]["object"]
             mine = {"key": outcome.key, "failures": "zero", "align": align}
             for metric, key in (("ADD AUC", "add_auc"), ("ADD-S AUC", "adds_auc")):
                 assert number(rows, **mine, metric=metric, form="exact") == pytest.approx(scores[key], abs=1e-9)
@@ -116,7 +117,7 @@ def test_a_key_is_of_everything_that_decides_a_result(slides, plan, tmp_path, mo
     assert len(set(same)) == 2
     assert keys(**{"seeds = [0]": "seeds = [4]"})[0] != same[0]
     assert keys(**{'column = "AP10" }': "stop = 4 }"})[0] != same[0]
-    assert keys(**{'"factor_graph.enabled" = false': '"factor_graph.enabled" = true'})[0] != same[0]
+    assert keys(**{'"method.graph" = false': '"method.graph" = true'})[0] != same[0]
     copy = Path(shutil.copytree(slides[0], tmp_path / "copy"))
     assert keys(**{str(slides[0]): str(copy)}) == same, "nor do folders"
     pose = copy / "annotated_poses/0003.txt"
@@ -176,7 +177,7 @@ def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp
     done = run_benchmark(plan, tmp_path, "quick", progress=False, jobs=1)
     assert done.counts() == {"done": 1, "failed": 1, "not run": 0}
     (reason,) = (outcome.reason for _, outcome in done.results if outcome.status == "failed")
-    assert reason == "its process was ended by signal 9: out of memory?"
+    assert "its process was ended" in reason
     assert run_benchmark(plan, tmp_path, "quick", progress=False).counts()["failed"] == 1, "not without being told"
     assert run_benchmark(plan, tmp_path, "quick", progress=False, retry=True).counts()["done"] == 2
 

@@ -9,10 +9,10 @@ from p2p_lib.benchmark import plan_names, read_plan
 from p2p_lib.benchmark.jobs import jobs_of
 from p2p_lib.core.backends import DETECTORS, TRACKERS
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.manifests import manifest
 from p2p_lib.datasets.paper_reported import paper_reported
 from p2p_lib.evaluation.oracle import OracleTracker
-from p2p_lib.run import make_config
 from p2p_lib.synthetic import SCENARIOS
 
 PLANS = plan_names()
@@ -27,7 +27,7 @@ def test_every_table_of_the_paper_has_a_plan():
 @pytest.mark.parametrize("name", PLANS)
 def test_methods_fit_configuration_and_registry(name):
     for method in read_plan(name).method:
-        make_config(method.preset, settings=method.settings)
+        RunOptions(preset=method.preset, settings=method.settings).config()
         assert method.tracker in {*TRACKERS, OracleTracker.name}
         assert {method.detector} if isinstance(method.detector, str) else set(method.detector) <= set(DETECTORS)
 
@@ -86,7 +86,7 @@ def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):
     jobs = jobs_of(read_plan("ycbmultitrack_real"), "full")
     names = list(dict.fromkeys(job.sequence.name for job in jobs))
     assert names == ["ycbmultitrack_real/a_one", "ycbmultitrack_real/b_two"]
-    assert all("no files, expected colour pictures" in job.reason for job in jobs), "and what is wrong with it"
+    assert all("no files, expected colour" in job.reason for job in jobs), "and what is wrong with it"
 
 
 def test_a_detector_of_choice_is_the_first_that_is_there(monkeypatch):

@@ -8,7 +8,8 @@ import pytest
 
 from p2p_lib.apps import cli
 from p2p_lib.benchmark.rows import MEAN_OF_ONE, POOLED
-from p2p_lib.run import evaluate_run
+from p2p_lib.datasets.runs import load_run
+from p2p_lib.evaluation.protocol import evaluate
 
 
 @pytest.fixture
@@ -47,7 +48,7 @@ def test_a_surface_is_scored_against_what_was_seen(slides, tmp_path, printed, ca
     exact = {**dict.fromkeys(("form", "failures", "align")), "form": "exact", "failures": "zero", "align": "all"}
     (row,) = (r for r in rows if r["sequence"] == POOLED and r["metric"] == "ADD AUC" and exact.items() <= r.items())
     assert float(row["value"]) == pytest.approx(
-        evaluate_run(tmp_path / "run", align="all").as_dict()["mean"]["add_auc"]
+        evaluate(load_run(tmp_path / "run"), align="all").as_dict()["mean"]["add_auc"]
     )
 
 

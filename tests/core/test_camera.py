@@ -169,5 +169,5 @@ def test_bad_numbers_are_refused(change):
 
 @pytest.mark.parametrize("size", [(0, 480), (640, 0), (-1, -1)])
 def test_a_picture_has_pixels(size):
-    with pytest.raises(BadInput, match=f"camera: got {size[0]}x{size[1]}, expected a picture size"):
+    with pytest.raises(BadInput, match=f"camera: got {size[0]}x{size[1]}, expected an image size"):
         Camera(600, 600, 320, 240, *size)

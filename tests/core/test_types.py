@@ -42,7 +42,7 @@ def test_readings_that_are_none_become_zero(reading, dtype):
         (RGB[..., 0], DEPTH, 0.0, r"frame 7 colour: got \(4, 6\) uint8, expected \(H, W, 3\) uint8"),
         (RGB.astype(float), DEPTH, 0.0, r"frame 7 colour: got \(4, 6, 3\) float64"),
         (np.zeros((4, 6, 4), np.uint8), DEPTH, 0.0, r"frame 7 colour: got \(4, 6, 4\)"),
-        (RGB, DEPTH[:3], 0.0, "frame 7 depth: got 6x3, expected 6x4 as the colour picture. Register"),
+        (RGB, DEPTH[:3], 0.0, "frame 7 depth: got 6x3, expected 6x4 as the colour image. Register"),
         (RGB, DEPTH[..., None], 0.0, "frame 7 depth: got 1x6x4, expected 6x4"),
         (RGB, np.full((4, 6), 500, np.uint16), 0.0, "frame 7 depth: got uint16, expected metres as floats"),
         (RGB, DEPTH, np.nan, "frame 7 time_s: got nan"),

@@ -6,19 +6,25 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from p2p_lib.core import se3
-from p2p_lib.datasets.recording.tracks import PoseTrack
+from p2p_lib.datasets.recording import PoseLog
 
 
 @dataclass(frozen=True)
 class Recording:
     """camera: T_cam_obj at 30 Hz; mocap: T_world_body at 120 Hz; truth: T_world_body, without noise, camera's clock."""
 
-    camera: PoseTrack
-    mocap: PoseTrack
-    truth: PoseTrack
+    camera: PoseLog
+    mocap: PoseLog
+    truth: PoseLog
     T_cam_world: np.ndarray
     T_body_obj: np.ndarray
     offset_s: float
+
+
+def seen(times_s, T):
+    """A log without the samples in which the body was not seen."""
+    keep = np.isfinite(T).all((1, 2))
+    return PoseLog(times_s[keep], T[keep])
 
 
 def noise(rng, n, deg, mm):
@@ -36,7 +42,7 @@ def record(seed, offset_s, seconds=20.0, turn_rad=0.5, drift=False, axis=None):
         xi[:, :3] = xi[:, :1] * axis
     T = se3.exp(np.c_[xi[:, :3], np.zeros((len(t), 3))])
     T[:, :3, 3] = xi[:, 3:] + [0.3, 0.2, 1.0]
-    truth = PoseTrack(t, T)
+    truth = PoseLog(t, T)
     T_cam_world = se3.exp(rng.normal(size=6))
     T_body_obj = se3.exp(np.r_[rng.normal(size=3), rng.normal(0, 0.05, 3)])
     frames = 2 + np.arange(int(seconds * 30)) / 30
@@ -50,5 +56,5 @@ def record(seed, offset_s, seconds=20.0, turn_rad=0.5, drift=False, axis=None):
     samples = 0.5 + np.arange(int((seconds + 3) * 120)) / 120
     B = truth.at(samples) @ noise(rng, len(samples), 0.1, 0.3)
     B[int(len(B) * 0.40) : int(len(B) * 0.43)] = np.nan
-    camera = PoseTrack(frames + rng.normal(0, 0.0005, len(frames)), A)
-    return Recording(camera, PoseTrack(samples + offset_s, B), truth, T_cam_world, T_body_obj, offset_s)
+    camera = seen(frames + rng.normal(0, 0.0005, len(frames)), A)
+    return Recording(camera, seen(samples + offset_s, B), truth, T_cam_world, T_body_obj, offset_s)

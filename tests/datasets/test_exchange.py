@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.apps.cli import main
+from p2p_lib.apps.evaluate import evaluate_poses, export_run
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
@@ -15,7 +16,7 @@ from p2p_lib.datasets.export import FORMATS, export
 from p2p_lib.datasets.imported import read_poses
 from p2p_lib.datasets.runs import RunWriter, load_run
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.run import evaluate_poses, evaluate_run, export_run
+from p2p_lib.evaluation.protocol import evaluate
 
 W, H, N = 40, 30, 12
 STEMS = [str(1581120424100262102 + i * 33_000_000) for i in range(N)]  # nanoseconds, as YCBInEOAT names pictures
@@ -100,7 +101,7 @@ def test_every_form_keeps_every_pose_and_every_loss(table, scene, tmp_path, layo
         T_obj_frame = np.eye(4) if frame == "object" else se3.inverse(obj.T_cam_obj[first]) @ obj.T_cam_model[first]
         np.testing.assert_allclose(read[name][~lost], (obj.T_cam_obj @ T_obj_frame)[~lost], atol=3e-8)
     # The same poses get the same scores, whichever way they come.
-    ours = evaluate_run(tmp_path / "run").as_dict()
+    ours = evaluate(load_run(tmp_path / "run")).as_dict()
     theirs = evaluate_poses(tmp_path / "out", folder).as_dict()
     assert 60 < ours["mean"]["add_auc"] < 99 and ours["objects"].keys() == theirs["objects"].keys()
     for name, score in ours["objects"].items():
@@ -218,12 +219,12 @@ FAULTS = {
     ),
     "a quaternion too long": (
         {"can.txt": f"{STEMS[0][:10]}.1002 0 0 1 0 0 0 2\n"},
-        r"line 1: got .*quaternion",
+        r"pose 1: got .*quaternion",
     ),
-    "a word": ({"can.txt": "0 0 0 zero 0 0 0 1\n"}, r"can\.txt: line 1: got '0 0 0 zero"),
+    "a word": ({"can.txt": "0 0 0 zero 0 0 0 1\n"}, r"can\.txt: got unreadable numbers .*'zero'"),
     "another time": ({"can.txt": "0.5 0 0 1 0 0 0 1\n"}, r"can\.txt: got the time 0\.500000 s, expected times"),
     "not rigid": ({"can/0000.txt": "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"}, r"0000\.txt: got a matrix that is not"),
-    "another name": ({"can/frame.txt": IDENTITY}, r"frame\.txt: got the name frame, expected the name of a picture"),
+    "another name": ({"can/frame.txt": IDENTITY}, r"frame\.txt: got the name frame, expected the name of an image"),
     "a number too high": ({"can/0012.txt": IDENTITY}, r"0012\.txt: got the name 0012, .*frame number below 12"),
     "three rows": ({"can/0000.txt": "1 0 0 0\n0 1 0 0\n0 0 1 0\n"}, r"0000\.txt: got shape \(3, 4\)"),
     "whose are they": ({"0000.txt": IDENTITY}, r"theirs: got poses of one object, expected .* box, can"),

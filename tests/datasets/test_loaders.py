@@ -53,7 +53,7 @@ def cut(path):
 CASES = {
     "colour unreadable": (
         lambda f: (f / "rgb/0001.png").write_bytes(b"not a picture"),
-        r"rgb/0001\.png: got an unreadable file of 13 bytes, expected a colour picture",
+        r"rgb/0001\.png: got an unreadable file of 13 bytes, expected a colour image",
     ),
     "colour cut off": (lambda f: cut(f / "rgb/0002.png"), r"rgb/0002\.png: got an unreadable file of \d+ bytes"),
     "colour empty": (
@@ -70,11 +70,11 @@ CASES = {
     ),
     "colour of another size": (
         lambda f: png(f / "rgb/0002.png", np.zeros((H, W + 2, 3), np.uint8)),
-        r"rgb/0002\.png: got 42x30 pixels, expected 40x30 as the first picture",
+        r"rgb/0002\.png: got 42x30 pixels, expected 40x30 as the first image",
     ),
     "depth of another size": (
         lambda f: png(f / "depth/0001.png", np.zeros((H // 2, W // 2), np.uint16)),
-        r"depth/0001\.png: got 20x15 pixels, expected 40x30 as the colour picture\. Register",
+        r"depth/0001\.png: got 20x15 pixels, expected 40x30 as the colour image\. Register",
     ),
     "depth of eight bits": (
         lambda f: png(f / "depth/0001.png", np.zeros((H, W), np.uint8)),
@@ -86,7 +86,7 @@ CASES = {
     ),
     "no pictures": (
         lambda f: [p.unlink() for p in (f / "rgb").iterdir()],
-        r"rgb: got no files, expected colour pictures \(\.png",
+        r"rgb: got no files, expected colour images \(\.png",
     ),
     "no depth folder": (lambda f: shutil.rmtree(f / "depth"), r"depth: no such folder, expected depth images"),
     "no camera": (lambda f: (f / "cam_K.txt").unlink(), r"cam_K\.txt: no such file, expected a 3x3 camera matrix"),
@@ -101,11 +101,11 @@ CASES = {
     "camera empty": (lambda f: (f / "cam_K.txt").write_text(""), r"cam_K\.txt: got shape \(0,\), expected a 3x3"),
     "camera in words": (
         lambda f: (f / "cam_K.txt").write_text("fx 50\nfy 50\n"),
-        r"cam_K\.txt: got 'fx 50', expected a 3x3 camera matrix",
+        r"cam_K\.txt: got unreadable numbers .*'fx'.*, expected a 3x3 camera matrix",
     ),
     "camera ragged": (
         lambda f: (f / "cam_K.txt").write_text("50 0 20\n0 50\n0 0 1\n"),
-        r"cam_K\.txt: got rows of unequal length, expected a 3x3",
+        r"cam_K\.txt: got unreadable numbers .*row 2.*, expected a 3x3",
     ),
     "camera NaN": (
         lambda f: (f / "cam_K.txt").write_text("nan 0 20\n0 50 15\n0 0 1\n"),
@@ -184,7 +184,7 @@ def test_fault_names_the_file(sequence, case):
 def test_a_picture_that_vanishes_after_opening_is_named(sequence):
     s = open_sequence(sequence)
     (sequence / "rgb/0002.png").unlink()
-    with pytest.raises(MissingData, match=r"rgb/0002\.png: no such file, expected a colour picture"):
+    with pytest.raises(MissingData, match=r"rgb/0002\.png: no such file, expected a colour image"):
         s.frame(2)
 
 
@@ -219,7 +219,7 @@ def test_lossy_masks_are_refused(sequence):
 def test_colour_masks_without_labels_are_refused(sequence):
     rainbow = np.random.default_rng(0).integers(0, 255, (H, W, 3), np.uint8)
     png(sequence / "masks/can/0001.png", rainbow)
-    with pytest.raises(BadInput, match=r"masks/can/0001\.png: got a colour picture \(RGB\), expected one label"):
+    with pytest.raises(BadInput, match=r"masks/can/0001\.png: got a colour image \(RGB\), expected one label"):
         open_sequence(sequence).masks(1)
 
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.datasets.models import find_models, load_points, parse_models
+from p2p_lib.datasets.models import find_models, given_models, load_points
 
 POINTS = np.array([[0.01, 0.02, 0.03], [0.04, -0.05, 0.06], [0.01, 0.02, 0.03], [1e-3, 0, -0.1]])  # one twice
 
@@ -97,20 +97,17 @@ def test_bops_models_are_in_millimetres(tmp_path):
     np.testing.assert_allclose(load_points(tmp_path / "obj_000001.ply"), POINTS, atol=1e-8)
 
 
-def test_assignments(tmp_path):
+def test_models_that_are_given(tmp_path):
     file = tmp_path / "a=b.obj"
     file.write_text(obj_text(POINTS))
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "points.xyz").write_text("0 0 0\n")
-    models = parse_models([f"can={file}", f"box={tmp_path / 'folder'}"], ("box", "can"))
+    models = given_models({"can": file, "box": tmp_path / "folder"}, ("box", "can"))
     assert models == {"can": file, "box": tmp_path / "folder" / "points.xyz"}
     with pytest.raises(BadInput, match=r"model: got the name 'mug', expected one of the objects: box, can"):
-        parse_models([f"mug={file}"], ("box", "can"))
-    for wrong in ("can", "can=", f"={file}"):
-        with pytest.raises(BadInput, match="expected NAME=PATH"):
-            parse_models([wrong], ("box", "can"))
+        given_models({"mug": file}, ("box", "can"))
     with pytest.raises(MissingData, match=r"gone\.obj: no such model"):
-        parse_models([f"can={tmp_path / 'gone.obj'}"], ("box", "can"))
+        given_models({"can": tmp_path / "gone.obj"}, ("box", "can"))
 
 
 def test_shared_models(shared_data):

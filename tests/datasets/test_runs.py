@@ -17,7 +17,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import from_toml, preset
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame, PoseEstimate, Status
-from p2p_lib.datasets.runs import ROW, RunWriter, load_run, quaternion_xyzw
+from p2p_lib.datasets.runs import COLUMNS, RunWriter, load_run
 from p2p_lib.datasets.sequence import open_sequence
 
 W, H, N = 32, 24, 150
@@ -232,7 +232,7 @@ def test_no_archive_holds_a_pickle(table, tmp_path):
         with np.load(tmp_path / "run" / name, allow_pickle=False) as file:
             assert all(file[key].dtype != object for key in file.files)
     with np.load(tmp_path / "run" / "poses.npz", allow_pickle=False) as file:
-        assert {key.split("/")[1] for key in file.files} == {*ROW.names, "reason"}
+        assert {key.split("/")[1] for key in file.files} == set(COLUMNS)
 
 
 def test_faults_of_runs(table, tmp_path):
@@ -268,11 +268,3 @@ def test_a_nan_pose_file_is_named_before_anything_runs(table, tmp_path):
     finally:
         path.write_text(kept)
     assert not (tmp_path / "run").exists()
-
-
-def test_quaternions_against_scipy():
-    rng = np.random.default_rng(1)
-    rotations = Rotation.concatenate([Rotation.random(200, rng=rng), Rotation.from_rotvec([[0, 0, 0], [np.pi, 0, 0]])])
-    ours = quaternion_xyzw(se3.from_rt(rotations.as_matrix(), np.zeros(3)))
-    np.testing.assert_allclose(np.abs((ours * rotations.as_quat()).sum(1)), 1, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(ours, axis=1), 1, atol=1e-12)

@@ -7,8 +7,8 @@ import pytest
 from p2p_lib.core.backends import DETECTORS, make_detector
 from p2p_lib.core.config import SamplingConfig, preset
 from p2p_lib.core.types import Frame
-from p2p_lib.detectors.classical import SAMPLING_VARIANTS
 from p2p_lib.method.sampling import choose
+from p2p_lib.studies.sampling_study import CHOICES
 
 DEFAULT = SamplingConfig()
 EMBEDDED = pytest.mark.parametrize("name", ["corners", "uniform", "farthest", "orb"])
@@ -92,12 +92,12 @@ def test_orb_finds_the_corners_of_a_square():
 
 
 def test_the_variants_of_the_comparison_are_what_they_say():
-    for detector, settings in SAMPLING_VARIANTS.values():
+    for detector, settings in CHOICES.values():
         assert detector in DETECTORS
         preset().with_values(settings)
-    config = preset().with_values(SAMPLING_VARIANTS["detector only"][1]).sampling
+    config = preset().with_values(CHOICES["score alone"][1]).sampling
     found = detect("corners", disc(), config=config)
     assert choose(found, np.zeros((0, 2)), 30, config).tolist() == list(range(30))  # the best, wherever they are
-    config = preset().with_values(SAMPLING_VARIANTS["uniform"][1]).sampling
+    config = preset().with_values(CHOICES["uniform"][1]).sampling
     found = detect("uniform", disc(), config=config)
     assert choose(found, np.zeros((0, 2)), 30, config).tolist() == list(range(30))  # the first drawn

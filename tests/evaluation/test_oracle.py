@@ -97,7 +97,7 @@ def test_a_query_beside_the_objects_is_never_seen(scene, crossing):
 @pytest.mark.parametrize("outliers", [0.0, 0.3])
 def test_the_pipeline_takes_the_tracker_itself(crossing, scene, outliers):
     """Points alone: what comes after tracking must cope with three tracks in ten wrong."""
-    config = preset().with_values({"tsdf.enabled": False, "factor_graph.enabled": False})
+    config = preset().with_values({"method.surface": False, "method.graph": False})
     method = Point2Pose(crossing.camera, config, OracleTracker(scene, OracleConfig(noise_px=0.3, outliers=outliers)))
     for name in crossing.objects:
         method.add_object(name)

@@ -1,11 +1,21 @@
 """TAP-Vid's scores against hand counts and against the published formulae written out; re-detection by hand."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pandas.testing import assert_frame_equal
 
-from p2p_lib.evaluation.point_tracks import Outcome, after_query, outcomes, redetections, reliability, tapvid
+from p2p_lib.evaluation.point_tracks import (
+    Outcome,
+    after_query,
+    outcomes,
+    redetection_shares,
+    redetections,
+    reliability,
+    tapvid,
+)
 
 SHAPE = (480, 640)
 
@@ -155,11 +165,11 @@ def test_the_angle_is_to_the_nearest_view_it_was_seen_from():
     turn = np.zeros(120, int)
     turn[:12], turn[12:20], turn[20:60], turn[60:] = 0, 30, 70, 80  # at 70 it was hidden
     back = returns_of(seen, turn_deg=turn, query=10)
-    assert back.view_deg == pytest.approx([50])
-    assert back.as_dict()["returns_same_view"] == 0 and back.as_dict()["returns"] == 1
-    assert np.isnan(back.as_dict()["found_same_view"])
+    assert back.view_deg.tolist() == pytest.approx([50])
+    assert redetection_shares(back)["returns_same_view"] == 0 and redetection_shares(back)["returns"] == 1
+    assert np.isnan(redetection_shares(back)["found_same_view"])
     turn[19] = 50
-    assert returns_of(seen, turn_deg=turn, query=10).as_dict()["found_same_view"] == 1
+    assert redetection_shares(returns_of(seen, turn_deg=turn, query=10))["found_same_view"] == 1
 
 
 def test_many_points_are_the_single_ones():
@@ -174,14 +184,13 @@ def test_many_points_are_the_single_ones():
         redetections(*(x[:, k : k + 1] for x in (uv, truly, known, view, uv, said)), query[k : k + 1]) for k in range(N)
     ]
     all_ = redetections(uv, truly, known, view, uv, said, query)
-    assert all_.point.tolist() == [k for k in range(N) for _ in one[k].frame] and len(all_.point) > 10
-    for name in ("frame", "view_deg", "found", "share_found"):
-        np.testing.assert_array_equal(getattr(all_, name), np.concatenate([getattr(o, name) for o in one]))
+    assert len(all_) > 10
+    assert_frame_equal(all_, pd.concat([o.assign(point=k) for k, o in enumerate(one)], ignore_index=True))
 
 
 def test_no_returns_at_all():
-    assert returns_of(shown((0, 100))).as_dict()["returns"] == 0
-    assert returns_of(shown()).as_dict()["returns"] == 0
+    assert redetection_shares(returns_of(shown((0, 100))))["returns"] == 0
+    assert redetection_shares(returns_of(shown()))["returns"] == 0
 
 
 # --- outcomes and reliability ---------------------------------------------------------------------

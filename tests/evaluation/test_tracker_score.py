@@ -11,7 +11,7 @@ from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.types import Tracks
 from p2p_lib.datasets.models import MESHES, find_models
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.evaluation.tracker_score import run_tracker, score_tracker
+from p2p_lib.evaluation.tracker_score import TrackTask, run_tracker
 from p2p_lib.evaluation.true_tracks import TrueScene, draw_queries
 
 
@@ -86,7 +86,7 @@ def test_a_late_answer_belongs_to_an_earlier_frame(crossing, queries):
 
 def test_plain_lk_scores_as_lucas_kanade_does(crossing):
     """It follows well and finds nothing again."""
-    score = score_tracker(crossing, make_tracker("lk", TrackingConfig()), 1, count=48)
+    score = TrackTask.of(crossing, 1, count=48).score(make_tracker("lk", TrackingConfig()))
     plain = score.as_dict()
     assert 0.2 < plain["aj"] < plain["delta_avg"] < 0.6 and plain["jaccard"]["16_px"] > plain["jaccard"]["1_px"]
     assert plain["redetection"]["returns"] > 10 and plain["redetection"]["found"] == 0
@@ -108,7 +108,7 @@ def test_the_command_prints_one_json_object(capsys):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ("synthetic/crossing --tracker lkk", "tracker: got 'lkk', expected one of lk, embedded"),
+        ("synthetic/crossing --tracker lkk", "tracker: got 'lkk', expected one of builtin, lk"),
         ("synthetic/crossing --models tin=x.obj", "model: got the name 'tin', expected one of the objects: box, can"),
         ("synthetic/crossing --models can=nowhere.obj", "nowhere.obj: no such model"),
         ("nowhere", "nowhere: no such folder"),

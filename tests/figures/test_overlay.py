@@ -156,10 +156,10 @@ def test_values_go_from_dark_to_light():
 def test_near_is_lighter_than_far_and_unmeasured_is_white():
     depth = np.tile(np.linspace(0.4, 1.6, 64, dtype=np.float32), (8, 1))
     depth[:, 10] = 0
-    image = overlay.depth_picture(depth)
+    image = overlay.depth_image(depth)
     light = image[0] @ [0.2126, 0.7152, 0.0722]
     assert light[0] > light[30] > light[-1] and (image[:, 10] == 255).all()
-    assert (overlay.depth_picture(np.zeros((4, 5))) == 255).all()
+    assert (overlay.depth_image(np.zeros((4, 5))) == 255).all()
 
 
 @pytest.mark.parametrize("width_px", [200, 333, 900])
@@ -185,7 +185,7 @@ def test_zoom_out_of_the_picture_is_refused():
 
 def test_montage_puts_pictures_in_their_places():
     images = [np.full((20, 30, 3), k, np.uint8) for k in range(5)]
-    sheet = overlay.montage(images, columns=2, gap_px=4)
+    sheet = overlay.montage(images, columns=2)
     assert sheet.shape == (3 * 20 + 2 * 4, 2 * 30 + 4, 3)
     for k in range(5):
         top, left = k // 2 * 24, k % 2 * 34
@@ -221,8 +221,6 @@ def test_box_around_points():
     inner = se3.transform(se3.inverse(box.T_obj_box), se3.transform(T, points))
     assert np.allclose(np.abs(inner).max(0), box.size_m / 2, atol=1e-12)
     assert np.allclose(box.size_m, [0.4, 0.1, 0.05], rtol=0.01)
-    with_strays = np.concatenate([points, [[9.0, 9, 9], [np.nan, 0, 0]]])
-    assert np.allclose(Box.around(with_strays, keep=0.98).size_m, box.size_m, rtol=0.03)
-    assert np.allclose(box.moved(T).T_obj_box, T @ box.T_obj_box)
+    assert np.allclose(Box.around([*points, [np.nan, 0, 0]]).size_m, box.size_m), "what is not finite is left out"
     with pytest.raises(BadInput, match="no finite points"):
         Box.around(np.full((3, 3), np.nan))

@@ -121,7 +121,7 @@ def test_figures_are_nobodys_global_state(made):
 
 
 def test_score_table_has_the_numbers(made):
-    table = tables.score_table(made.evaluation).set_index("object")
+    table = made.evaluation.as_frame().set_index("object")
     plain = made.evaluation.as_dict()
     assert list(table.index) == [*plain["objects"], "mean"]
     assert table.loc["box", "ADD AUC [%]"] == pytest.approx(plain["objects"]["box"]["add_auc"], abs=0.005)

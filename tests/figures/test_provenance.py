@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.figures import plots, provenance, tables
+from p2p_lib.figures import plots, provenance
 from p2p_lib.figures.provenance import save_figure, save_table, save_video
 
 
@@ -33,7 +33,7 @@ def save_all(made):
     save_figure(plots.error_over_time(made.run, made.evaluation), "plot", sources=sources, parameters=parameters)
     save_figure(image(), "picture", sources=sources, parameters=parameters)
     save_video([image()] * 4, "film", fps=10, sources=sources)
-    save_table(tables.score_table(made.evaluation), "scores", sources=sources, parameters=parameters)
+    save_table(made.evaluation.as_frame(), "scores", sources=sources, parameters=parameters)
 
 
 @pytest.mark.filterwarnings("error::UserWarning")  # a layout that does not fit

@@ -139,8 +139,8 @@ def test_thinning_keeps_the_shape():
     ball.visual.vertex_colors = np.tile([10, 20, 30, 255], (len(ball.vertices), 1))
     thin = _thinned(ball)
     assert len(ball.faces) > 20_000 >= len(thin.faces) > 1000
-    np.testing.assert_allclose(np.linalg.norm(thin.vertices, axis=1), 0.1, atol=1e-6)
-    assert (thin.visual.vertex_colors == [10, 20, 30, 255]).all()
+    np.testing.assert_allclose(np.linalg.norm(thin.vertices, axis=1), 0.1, atol=1e-3)
+    assert (thin.visual.vertex_colors == [10, 20, 30, 255]).all(), "colours stay"
     assert thin.area == pytest.approx(ball.area, rel=0.02)
 
 

@@ -9,8 +9,9 @@ from scipy.optimize import least_squares
 from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig, preset
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.robust import fit_rigid
+from p2p_lib.method import factor_graph
 from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
-from p2p_lib.method.registration import fit_rigid
 
 pytest.importorskip("gtsam")
 
@@ -103,19 +104,21 @@ def added_at_once(world: Turntable, config: FactorGraphConfig, T: np.ndarray) ->
 # --- what it solves ----------------------------------------------------------------------------
 
 
-def test_exact_observations_give_exact_poses_and_points() -> None:
+def test_exact_observations_give_exact_poses_and_points(monkeypatch) -> None:
+    monkeypatch.setattr(factor_graph, "_RELATIVE_TOLERANCE", 1e-12)
     world = Turntable.made(0, 10, noise=0)
-    config = replace(ALL, between=False, iterations=50, relative_tolerance=1e-12)
+    config = replace(ALL, between=False, iterations=50)
     _, result = added_at_once(world, config, perturbed(world.T_cam_obj, 1))
     assert result.ok and result.error_after < 1e-6 * result.error_before
     np.testing.assert_allclose(result.T_cam_obj, world.T_cam_obj, atol=2e-5)
     np.testing.assert_allclose(result.p_obj, world.p_obj[result.point_ids], atol=2e-5)
 
 
-def test_agrees_with_scipy() -> None:
+def test_agrees_with_scipy(monkeypatch) -> None:
     """The minimum of the same loss (bearing angle and range in sigmas, Huber) found by another solver."""
+    monkeypatch.setattr(factor_graph, "_RELATIVE_TOLERANCE", 1e-14)
     world = Turntable.made(2, 3, step_deg=20, points=25)
-    config = replace(ALL, between=False, huber=1e6, iterations=60, relative_tolerance=1e-14)
+    config = replace(ALL, between=False, huber=1e6, iterations=60)
     _, result = added_at_once(world, config, world.T_cam_obj)
     ids, poses = result.point_ids, len(world.T_cam_obj)
 
@@ -166,7 +169,7 @@ def test_revisited_points_close_a_drifted_chain() -> None:
     assert errors(drifted, world.T_cam_obj)[0] > 5
     _, chain_only = added_at_once(world, replace(ALL, observations=False), drifted)
     np.testing.assert_allclose(chain_only.T_cam_obj, drifted, atol=1e-6)
-    _, result = added_at_once(world, replace(ALL, iterations=30, relative_tolerance=1e-6), drifted)
+    _, result = added_at_once(world, replace(ALL, iterations=30), drifted)
     assert errors(result.T_cam_obj, world.T_cam_obj)[0] < 1.5
 
 
@@ -186,19 +189,15 @@ def test_robust_to_gross_outliers() -> None:
     assert turn < 1.5 * clean[0] + 0.2 and shift < 1.5 * clean[1] + 2e-4
 
 
-def test_points_that_disagree_are_named() -> None:
-    """Two tracks that slide along the surface are told from 148 that do not."""
+def test_forgotten_points_leave_with_their_observations() -> None:
+    """Two tracks that slide along the surface are forgotten: the loss falls, and the rest goes on."""
     world = Turntable.made(8, 12, step_deg=5)
-    views = np.bincount(np.concatenate(world.seen), minlength=len(world.p_obj))
-    sliding = np.flatnonzero(views >= 8)[:2]
+    sliding = np.flatnonzero(np.bincount(np.concatenate(world.seen), minlength=len(world.p_obj)) >= 8)[:2]
     rng = np.random.default_rng(9)
     for ids, p_cam in zip(world.seen, world.p_cam, strict=True):
         rows = np.isin(ids, sliding)
         p_cam[rows] += 0.015 * rng.normal(size=(rows.sum(), 3))
     graph, result = added_at_once(world, DEFAULT, world.T_cam_obj)
-    np.testing.assert_array_equal(np.sort(result.suspects), sliding)
-    good = ~np.isin(result.point_ids, sliding)
-    assert np.median(result.residual_sigmas[good]) < 2
     graph.forget(sliding)
     again = graph.optimise()
     assert not np.isin(sliding, again.point_ids).any() and again.error_after < result.error_after
@@ -207,13 +206,14 @@ def test_points_that_disagree_are_named() -> None:
 # --- covariance --------------------------------------------------------------------------------
 
 
-def test_covariance_is_that_of_many_trials() -> None:
+def test_covariance_is_that_of_many_trials(monkeypatch) -> None:
     """Rotation first, right tangent of T_cam_obj: the same small problem with 150 draws of its noise.
 
     The keyframe looks from 0.6 m at an object that has turned by 40 degrees, so that the tangents of
     X and T, left and right, and either order of rotation and translation all differ by far.
     """
-    config = replace(ALL, huber=1e6, iterations=20, relative_tolerance=1e-9)
+    monkeypatch.setattr(factor_graph, "_RELATIVE_TOLERANCE", 1e-9)
+    config = replace(ALL, huber=1e6, iterations=20)
     off, covariance = [], []
     exact = Turntable.made(10, 3, step_deg=20, points=60, noise=0)
     for seed in range(150):
@@ -347,7 +347,7 @@ def test_nothing_and_next_to_nothing() -> None:
 def test_points_seen_once_stay_where_they_were_seen() -> None:
     world = Turntable.made(17, 1)
     _, result = added_at_once(world, DEFAULT, world.T_cam_obj)
-    assert result.ok and result.error_after < 1e-9 and len(result.suspects) == 0
+    assert result.ok and result.error_after < 1e-9
     seen = se3.transform(se3.inverse(world.T_cam_obj[0]), world.p_cam[0])
     np.testing.assert_allclose(result.p_obj, seen[np.argsort(world.seen[0])], atol=1e-6)
 
@@ -388,7 +388,7 @@ def test_a_point_that_merging_leaves_without_observation_is_let_go() -> None:
         world.seen[k] = np.append(world.seen[k], stray)
         world.p_cam[k] = np.vstack([world.p_cam[k], offset + world.T_cam_obj[k][:3, 3]])
     graph, before = added_at_once(world, replace(DEFAULT, max_keyframes=2), world.T_cam_obj)
-    assert stray in before.suspects
+    assert stray in before.point_ids
     after = graph.optimise()
     assert after.ok and len(after.keys) == 2 and stray not in after.point_ids
     assert errors(after.T_cam_obj, world.T_cam_obj[after.keys])[0] < 1.5

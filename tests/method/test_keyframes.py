@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
-from p2p_lib.method.keyframes import Keyframe, Link, condense, misfit, remove
+from p2p_lib.method.keyframes import Keyframe, Link, merge_keyframes, misfit, remove
 
 
 def cameras(angles_deg: list[float], distance_m: float = 0.6) -> np.ndarray:
@@ -75,7 +75,7 @@ def test_merging_averages_what_both_saw_and_keeps_what_one_saw() -> None:
     seen = [np.arange(0, 30), np.arange(10, 40), np.arange(40), np.arange(40)]
     keyframes = {k: keyframe(T[k], seen[k], noisy[k][seen[k]]) for k in range(4)}
     keyframes[1].p_cam[5] += 0.05  # point 15: a misfit must not enter the mean
-    condense(keyframes, points, 3, 4.0)
+    merge_keyframes(keyframes, points, 3)
     assert sorted(keyframes) == [0, 2, 3]  # 1 looks like 0, and the first stays
     host = keyframes[0]
     np.testing.assert_array_equal(host.ids, np.arange(40))
@@ -96,9 +96,9 @@ def test_no_bound_and_nothing_to_merge() -> None:
     T = cameras([0, 10, 20])
     keyframes = chain(T, np.tile(np.eye(6), (3, 1, 1)))
     for most in (0, 3, 5):
-        condense(keyframes, {}, most, 4.0)
+        merge_keyframes(keyframes, {}, most)
         assert sorted(keyframes) == [0, 1, 2]
-    condense(keyframes, {}, 1, 4.0)
+    merge_keyframes(keyframes, {}, 1)
     assert sorted(keyframes) == [0, 2]  # the first and the newest always stay
 
 

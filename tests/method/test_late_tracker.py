@@ -15,7 +15,7 @@ from p2p_lib.run import run
 
 FRAMES = range(0, 60, 4)
 # A late tracker cannot look again in a frame that is past: on time, it must not either.
-CONFIG = preset().with_values({"tsdf.enabled": False, "factor_graph.enabled": False, "pipeline.seek_inliers": 0})
+CONFIG = preset().with_values({"method.surface": False, "method.graph": False, "method.redetection": False})
 
 
 class Late:
@@ -95,7 +95,7 @@ def test_a_stream_shorter_than_the_delay_is_finished_too(crossing, on_time):
 
 
 def test_a_run_writes_each_estimate_to_its_frame(crossing, tmp_path):
-    settings = {"tsdf.enabled": False, "factor_graph.enabled": False}
+    settings = {"method.surface": False, "method.graph": False}
     for late in (0, 5):
         run(crossing, tmp_path / str(late), settings=settings, tracker=Late(late), stop=12, progress=False)
     one, other = (load_run(tmp_path / str(late)) for late in (0, 5))

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from p2p_lib.core import se3
 from p2p_lib.core.config import RefinementConfig, TsdfConfig, preset
 from p2p_lib.method import refinement
-from p2p_lib.method.refinement import Keypoints, refine, sample_cloud, surface_jacobian, surface_score
+from p2p_lib.method.observation import sample_cloud
+from p2p_lib.method.refinement import Keypoints, refine, surface_jacobian, surface_score
 from p2p_lib.method.tsdf import TsdfVolume
 
 CONFIG = RefinementConfig()
@@ -134,10 +135,11 @@ def test_recovers_a_perturbed_pose_on_a_fused_surface(lump, name):
             assert found.refined and found.inliers > 0.7 and found.rms_m < 0.002
 
 
-def test_recovers_a_perturbed_pose_exactly_on_an_exact_surface():
+def test_recovers_a_perturbed_pose_exactly_on_an_exact_surface(monkeypatch):
+    monkeypatch.setattr(refinement, "_TOLERANCE", 1e-9)
     rng = np.random.default_rng(1)
     p_cam = cloud_of(LUMP, VIEW)
-    exact = RefinementConfig(tolerance=1e-9, iterations=40)
+    exact = RefinementConfig(iterations=40)
     for _ in range(5):
         found = refine(VIEW @ perturbation(rng, 4, 5), p_cam, Exact(LUMP), exact)
         turned, moved = error(found.T_cam_obj, VIEW)
@@ -181,10 +183,12 @@ def test_more_iterations_never_make_the_objective_worse(lump):
     assert np.all(np.diff(scores) < 2e-4)
 
 
-def test_steps_are_clipped(lump):
+def test_steps_are_clipped(lump, monkeypatch):
+    monkeypatch.setattr(refinement, "_MAX_STEP_M", 1e-4)
+    monkeypatch.setattr(refinement, "_MAX_STEP_RAD", 1e-3)
     p_cam = cloud_of(LUMP, VIEW)
     start = VIEW @ se3.exp([0.1, 0, 0, 0.008, 0, 0])
-    config = RefinementConfig(iterations=1, max_step_m=1e-4, max_step_rad=1e-3)
+    config = RefinementConfig(iterations=1)
     found = refine(start, p_cam, lump, config)
     e = se3.log(se3.inverse(start) @ found.T_cam_obj)
     assert 0 < np.linalg.norm(e[:3]) <= 1.01e-3
@@ -222,10 +226,10 @@ def test_a_can_is_not_spun_by_its_surface_but_by_its_keypoints(noise_free):
 
     alone = refine(start, p_cam, volume, CONFIG)
     assert alone.refined and "1 of 6" in alone.reason
-    assert alone.strengths[0] < CONFIG.min_strength < alone.strengths[1]
+    assert alone.eigenvalues[0] < CONFIG.min_eigenvalue < alone.eigenvalues[1]
     # A radian about the can's own axis, not about the cloud's centre.
-    assert alone.free_turns.shape == (1, 6)
-    np.testing.assert_allclose(np.abs(alone.free_turns[0]), [0, 0, 1, 0, 0, 0], atol=0.06)
+    assert alone.free_rotations.shape == (1, 6)
+    np.testing.assert_allclose(np.abs(alone.free_rotations[0]), [0, 0, 1, 0, 0, 0], atol=0.06)
     assert abs(spin_deg(alone.T_cam_obj, T) - 6) < 0.7
     assert np.degrees(np.sqrt(alone.covariance[2, 2])) > 3  # and it says that it does not know
 
@@ -258,8 +262,8 @@ def test_a_plane_fixes_three_directions_and_leaves_three():
     start = T @ se3.exp([0.03, -0.02, 0.05, 0.004, -0.003, 0.003])
     found = refine(start, p_cam, volume, CONFIG)
     assert "3 of 6" in found.reason
-    assert found.free_turns.shape == (1, 6)  # the two others are shifts
-    np.testing.assert_allclose(np.abs(found.free_turns[0, :3]), [0, 0, 1], atol=0.03)
+    assert found.free_rotations.shape == (1, 6)  # the two others are shifts
+    np.testing.assert_allclose(np.abs(found.free_rotations[0, :3]), [0, 0, 1], atol=0.03)
     left = se3.log(se3.inverse(T) @ found.T_cam_obj)
     assert np.degrees(np.abs(left[:2])).max() < 0.7 and abs(left[5]) < 0.001  # tilt and height are mended
     assert abs(left[2] - 0.05) < 0.006  # the turn within the plane is not touched
@@ -268,16 +272,16 @@ def test_a_plane_fixes_three_directions_and_leaves_three():
 
 def test_without_the_refusal_noise_moves_the_free_direction():
     """The refusal is not idle: the same can, with every direction allowed, is spun by its noise."""
-    spun = {0.0: [], CONFIG.min_strength: []}
+    spun = {0.0: [], CONFIG.min_eigenvalue: []}
     for seed in range(4):
         rng = np.random.default_rng(seed)
         volume = fused(CAN, [look_from((1, 0, 0.5))], rng)
         T = look_from((1, 0, 0.5)) @ se3.exp([0, 0, np.radians(20), 0, 0, 0])
         start, p_cam = T @ se3.exp([0, 0, np.radians(6), 0, 0, 0]), cloud_of(CAN, T, rng)
-        for min_strength, turned in spun.items():
-            found = refine(start, p_cam, volume, RefinementConfig(min_strength=min_strength))
+        for min_eigenvalue, turned in spun.items():
+            found = refine(start, p_cam, volume, RefinementConfig(min_eigenvalue=min_eigenvalue))
             turned.append(abs(spin_deg(found.T_cam_obj, T) - 6))
-    assert max(spun[CONFIG.min_strength]) < 0.4
+    assert max(spun[CONFIG.min_eigenvalue]) < 0.4
     assert np.median(spun[0.0]) > 0.5 and max(spun[0.0]) > 1.5
 
 

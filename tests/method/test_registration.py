@@ -12,11 +12,21 @@ from scipy.spatial.transform import Rotation
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.robust import fit_rigid
 from p2p_lib.method import registration
-from p2p_lib.method.registration import Hypothesis, competing, fit_rigid, generate, select
+from p2p_lib.method.registration import Hypothesis, register
+from p2p_lib.method.selection import select
 
 DEFAULT, PAPER = preset("default").registration, preset("paper").registration
+SELECTION = preset("default").selection, preset("paper").selection
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=["default", "paper"])
+
+
+def generate(p_obj, p_cam, config, rng, *, sigma_m=None, priors=None) -> list[Hypothesis]:
+    """As the presets ask for hypotheses: ``default`` with the noise of the sensor, ``paper`` with one threshold."""
+    if sigma_m is None and config.sample_size == DEFAULT.sample_size:
+        sigma_m = depth_noise_m(np.reshape(p_cam, (-1, 3))[:, 2])
+    return register(p_obj, p_cam, config, rng, sigma_m=sigma_m, priors=priors)
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
@@ -191,10 +201,6 @@ def test_a_prior_saves_the_true_pose_when_chance_misses_it() -> None:
         mine = [h for h in hypotheses if h.origin == "last pose"]
         assert len(mine) == 1 and mine[0].inliers[:6].all()
         assert error_deg_m(mine[0].T_cam_obj, T)[0] < error_deg_m(last, T)[0]
-        assert not any(
-            h.origin == "last pose"
-            for h in generate(p_obj, p_cam, PAPER, np.random.default_rng(seed), priors={"last pose": last})
-        )
 
 
 def test_a_prior_that_says_the_same_is_not_repeated() -> None:
@@ -274,73 +280,23 @@ def test_mug_ours_is_right_and_a_single_hypothesis_fails(config) -> None:
     for seed in range(40):
         mug = Mug(seed)
         hypotheses = generate(mug.p_obj, mug.p_cam, config, np.random.default_rng(seed))
-        chosen, reason = select(hypotheses, mug.distances_m(hypotheses), config)
+        rule = SELECTION[config is PAPER]
+        row, reason = select(hypotheses, mug.distances_m(hypotheses), rule)
+        chosen = hypotheses[row]
         assert "surface" in reason and chosen.inliers[80:].sum() >= 12 and not chosen.inliers[:80].any()
         ours.append(error_deg_m(chosen.T_cam_obj, mug.truth)[0])
         cov = registration.covariance(chosen, mug.p_obj, mug.p_cam, 0.001)
         off = se3.log(se3.inverse(mug.truth) @ chosen.T_cam_obj)
         nees.append(off @ np.linalg.solve(cov, off))
-        first, reason = select(hypotheses, None, config)
+        row, reason = select(hypotheses, None, rule)
         assert reason == "most inliers, there is no surface yet"
-        most_inliers.append(error_deg_m(first.T_cam_obj, mug.truth)[0])
-        single = generate(mug.p_obj, mug.p_cam, replace(config, multi_hypothesis=False), np.random.default_rng(seed))
+        most_inliers.append(error_deg_m(hypotheses[row].T_cam_obj, mug.truth)[0])
+        single = generate(mug.p_obj, mug.p_cam, replace(config, method="svd"), np.random.default_rng(seed))
         assert [h.origin for h in single] == ["svd"]
         svd.append(error_deg_m(single[0].T_cam_obj, mug.truth)[0])
     assert np.mean(np.array(ours) < 3.0) >= 0.9 and np.sqrt(np.mean(np.square(ours))) < 2.0
     assert 4.5 < np.mean(nees) < 8  # 6 degrees of freedom
     assert min(most_inliers) > 15 and min(svd) > 10
-
-
-# --- selection ---------------------------------------------------------------------------------
-
-
-def made(support: int, n: int = 100) -> Hypothesis:
-    return Hypothesis(se3.exp(np.full(6, support * 1e-3)), np.arange(n) < support, np.full(n, 0.001), str(support))
-
-
-def test_paper_takes_the_minimum_score() -> None:
-    hypotheses = [made(80), made(6), made(12)]
-    assert competing(hypotheses, PAPER) == hypotheses
-    chosen, reason = select(hypotheses, np.array([0.0020, 0.00199, np.nan])[:, None], PAPER)
-    assert chosen.origin == "6" and "surface" in reason
-
-
-def test_only_the_supported_compete() -> None:
-    """With 8 inliers, or a quarter of the best supported's."""
-    assert [h.support for h in competing([made(n) for n in (80, 7, 12, 8)], DEFAULT)] == [80, 12, 8]
-    assert [h.support for h in competing([made(n) for n in (20, 5, 4)], DEFAULT)] == [20, 5]
-    assert competing([], DEFAULT) == []
-
-
-def test_ours_goes_by_the_surface_only_beyond_chance() -> None:
-    """Points whose preference is even but for a shift of the mean: the shift counts in its standard errors."""
-    hypotheses, rng = [made(80), made(12)], np.random.default_rng(0)
-    noise = rng.normal(0, 1e-3, 400)
-    noise = (noise - noise.mean()) / noise.std() * 1e-3
-    for sigmas, gap, wins in ((2.0, 2.5, True), (2.0, 1.5, False), (4.0, 2.5, False)):
-        config = replace(DEFAULT, surface_sigmas=sigmas, surface_margin_m=0.0)
-        nearer = noise + gap * 1e-3 / np.sqrt(400)
-        chosen, reason = select(hypotheses, np.stack([0.01 + nearer, np.full(400, 0.01)]), config)
-        assert chosen.origin == ("12" if wins else "80") and ("nearest" in reason) == wins
-
-
-@pytest.mark.parametrize(("gap_m", "wins"), [(0.9e-4, False), (1.1e-4, True)])
-def test_ours_needs_a_margin_in_metres_too(gap_m: float, wins: bool) -> None:
-    config = replace(DEFAULT, surface_margin_m=1e-4)
-    distance_m = np.tile([[0.002], [0.002 - gap_m]], 50)  # certain, but is it enough?
-    assert select([made(80), made(12)], distance_m, config)[0].origin == ("12" if wins else "80")
-
-
-def test_nothing_to_select_from() -> None:
-    chosen, reason = select([], None, DEFAULT)
-    assert chosen is None and "too few" in reason
-
-
-def test_unusable_scores_fall_back_on_inliers() -> None:
-    assert select([made(10), made(20)], np.full((2, 3), np.nan), DEFAULT)[0].origin == "20"
-    assert select([made(10), made(20)], np.array([[np.nan], [0.002]]), PAPER)[0].origin == "20"
-    for config in (DEFAULT, PAPER):
-        assert select([made(10), made(20)], np.array([[0.002], [np.nan]]), config)[0].origin == "10"
 
 
 # --- bad input ---------------------------------------------------------------------------------
@@ -349,7 +305,7 @@ def test_unusable_scores_fall_back_on_inliers() -> None:
 @BOTH
 @pytest.mark.parametrize("multi", [True, False])
 def test_degenerate_sets_give_nothing(config, multi: bool) -> None:
-    config = replace(config, multi_hypothesis=multi)
+    config = config if multi else replace(config, method="svd")
     rng = np.random.default_rng(11)
     T = random_pose(rng)
     line = np.linspace(-0.1, 0.1, 40)[:, None] * np.array([[0.6, 0.8, 0.0]])
@@ -457,22 +413,6 @@ def test_covariance_says_which_direction_is_free() -> None:
     assert sigma[[0, 2]].max() < 0.02 and sigma[3:].max() < 0.001
 
 
-def test_support_counts_less_for_what_is_off_the_motion() -> None:
-    """1 on a prior, 1/2 at the configured turn or move from the nearest, and so a jump loses to a third as many."""
-    turn = [se3.exp(np.array([np.radians(deg), 0, 0, 0, 0, 0])) for deg in (0, DEFAULT.odds_deg, 20)]
-    move = se3.exp(np.array([0, 0, 0, DEFAULT.odds_m, 0, 0]))
-    T = random_pose(np.random.default_rng(3))
-    poses = [T @ turn[0], T @ turn[1], T @ turn[2], T @ move, T @ turn[2] @ turn[1]]
-    priors = [T, T @ turn[2]]
-    odds = registration.motion_odds(poses, priors, DEFAULT)
-    np.testing.assert_allclose(odds, [1, 0.5, 1, 0.5, 0.5], atol=1e-6)
-    assert registration.motion_odds(poses, [], DEFAULT) is None
-    assert registration.motion_odds(poses, priors, PAPER) is None
-    same = np.zeros((2, 50))
-    assert select([made(30), made(12)], same, DEFAULT)[0].origin == "30"
-    assert select([made(30), made(12)], same, DEFAULT, np.array([0.1, 1.0]))[0].origin == "12"
-
-
 def test_refit_grows_from_a_pose_what_agrees_with_it() -> None:
     rng = np.random.default_rng(11)
     p_obj, T, wrong = box_points(rng, 60), random_pose(rng), random_pose(rng)
@@ -480,7 +420,7 @@ def test_refit_grows_from_a_pose_what_agrees_with_it() -> None:
     p_cam += 0.0005 * rng.normal(size=(60, 3))
     p_cam[50] = np.nan
     near = T @ se3.exp(np.array([0.01, 0, 0, 0, 0.001, 0]))
-    (found,) = registration.refit(near, "surface", p_obj, p_cam, DEFAULT)
+    (found,) = registration.refit(near, "surface", p_obj, p_cam, DEFAULT, depth_noise_m(p_cam[:, 2]))
     assert found.origin == "surface" and found.support == 14 and not found.inliers[:45].any()
     assert error_deg_m(found.T_cam_obj, T)[0] < 0.5
-    assert registration.refit(random_pose(rng), "surface", p_obj, p_cam, DEFAULT) == []
+    assert registration.refit(random_pose(rng), "surface", p_obj, p_cam, DEFAULT, depth_noise_m(p_cam[:, 2])) == []

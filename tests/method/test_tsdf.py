@@ -334,7 +334,7 @@ def test_the_cap_holds_whatever_is_asked_for():
     assert volume.query(np.array([[0.0, 0.0, 0.39]]))[1].all()
 
 
-# -- carving, bad input, device ------------------------------------------------------------------------
+# -- carving, bad input ------------------------------------------------------------------------
 
 
 def test_carving_clears_what_the_background_is_seen_through():
@@ -403,14 +403,6 @@ def test_wrong_arguments_are_named(change, words):
 def test_a_fixed_grid_beyond_the_cap_is_refused():
     with pytest.raises(BadInput, match="at most 1000 voxels"):
         TsdfVolume(TsdfConfig(max_voxels=1000), origin_m=np.zeros(3), shape=(20, 20, 20))
-
-
-def test_cuda_gives_the_same_volume():
-    torch = pytest.importorskip("torch")
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
-    poses = around(3)
-    same_state(fused(LUMP, poses), fused(LUMP, poses, device="cuda"), atol=1e-4)
 
 
 def test_a_voxel_behind_the_camera_is_never_touched():

@@ -1,302 +1,127 @@
-"""p2p check: each fault, put into a good folder, is named with what mends it; good folders raise no alarm."""
+"""Clicks where they are, rims in the right colour, meshes that fill their image; the surface against measured depth."""
 
-import json
-import re
-import shutil
+from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
+import trimesh
 
-from p2p_lib.apps import cli
+from p2p_lib.apps.check import Finding, Level
+from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput
-from p2p_lib.core.types import Frame
-from p2p_lib.datasets import folder as own
-from p2p_lib.datasets.prompts import Prompt, load_prompts
-from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.studies.depth_colour import misfit
-from p2p_lib.studies.mask_rim import background_share
-from p2p_lib.studies.own_data import Level, as_lines, check_folder, check_spoilt
-from p2p_lib.synthetic.faults import FAULTS, spoil
+from p2p_lib.core.types import Frame, Status
+from p2p_lib.datasets.prompts import Prompt, prompts_in
+from p2p_lib.figures import style
+from p2p_lib.studies import own_data
+from p2p_lib.studies.own_data import errors_against, surface_fit
+from p2p_lib.studies.turntable import carton
+from p2p_lib.synthetic.render import render
 
-#: What must be found: the level, a part of what is said, and a part of the remedy.
-EXPECTED = {
-    "depth unit": ("depth", Level.WRONG, r"^\d{3} m in the middle", r"--depth-scale .* 0\.001 times the present"),
-    "depth in metres": ("depth", Level.WRONG, r"^0\.000\d+ m in the middle", r"--depth-scale .* 1000 times"),
-    "ten times as far": ("box: depth", Level.WRONG, r"6\.\d+ m away.*0\.1 to 2\.5 m count", "the depth scale is wrong"),
-    "depth not registered": ("registration", Level.WRONG, r"0\.7\d times as large", "Register depth to colour"),
-    "depth shifted": ("registration", Level.WRONG, r"shifted by \(\+1[6-9]|\(\+20, [+-]0\) px", "Register depth"),
-    "K of another resolution": ("camera", Level.WRONG, r"pictures of about 128\dx96\d", r"first two rows times 0\.5\."),
-    "K of another aspect": ("camera", Level.WRONG, "pictures of about 1280x720", r"Take K at 640x480\.$"),
-    "times in milliseconds": ("times", Level.WRONG, "s between pictures", "These look like milliseconds"),
-    "times jump back": ("files", Level.WRONG, r"times\.txt: got 0\.000000 s at frame 3", ""),
-    "a gap": ("times", Level.LOOK, "but 3.* s between frames 2 and 3", "found again"),
-    "pictures twice": ("motion", Level.LOOK, "pictures equal the next one", "each picture once"),
-    "no texture": ("box: points", Level.WRONG, r"frame 0: [0-7];", "textured side"),
-    "wide masks": ("can: mask", Level.WRONG, r"\d\d+ % of its rim", "a little inside"),
-    "no depth on the objects": ("box: depth", Level.WRONG, "only 0 % of its pixels", "shiny"),
-}
+V, U = np.mgrid[:120, :160]
+DISC = np.hypot(U - 80, V - 60) <= 30
+FRAME = Frame(0, 0.0, np.full((120, 160, 3), 128, np.uint8), np.where(DISC, 0.6, 1.0).astype(np.float32))
+
+
+def has(image, colour, at_least=1):
+    return (image == style.rgb(colour)).all(-1).sum() >= at_least
+
+
+def test_clicks_are_drawn_where_they_are():
+    image = own_data.clicked_image(FRAME, [Prompt("mug", 0, [[40, 50]])], {"mug": style.OBJECTS[0]})
+    v, u = np.nonzero((image == style.rgb(style.OBJECTS[0])).all(-1))
+    assert abs(u.mean() - 40) < 0.5 and abs(v.mean() - 50) < 0.5
+
+
+def test_a_rim_on_the_background_is_vermillion():
+    lost = style.STATUS[Status.LOST][0]
+    good, bad = (
+        own_data.mask_image(FRAME, DISC, "good"),
+        own_data.mask_image(FRAME, own_data.widened(DISC, 8), "bad"),
+    )
+    near = [np.abs(image.astype(int) - style.rgb(lost)).sum(-1).min() for image in (good, bad)]
+    assert near[0] > 60 > near[1]
+    sheet = own_data.masks_image(FRAME, {"a": DISC, "b": own_data.widened(DISC, 8)}, width_px=200)
+    assert sheet.shape[1] == 404
+
+
+def test_a_click_is_where_one_would_click():
+    (prompt,) = prompts_in({"disc": DISC, "hidden": np.zeros_like(DISC)}, frame=3)
+    assert prompt.name == "disc" and prompt.frame == 3
+    assert np.hypot(*(prompt.points_px[0] - [80, 60])) < 2
+
+
+def test_portraits_show_the_surface_from_its_sides():
+    body = trimesh.creation.box((0.05, 0.2, 0.1))
+    front = np.array([200, 30, 30, 255], np.uint8)
+    body.visual.vertex_colors = np.tile(front, (len(body.vertices), 1))
+    portrait = own_data.mesh_portrait(body, 200, 150)
+    covered = (portrait < 250).any(-1)
+    assert 0.05 < covered.mean() < 0.7 and not covered[[0, -1]].any() and not covered[:, [0, -1]].any()
+    assert own_data.mesh_portraits({"a": body, "b": body}, (0, 90)).shape[:2] == (524, 604)
+    np.testing.assert_allclose(np.sort(own_data.tight_box(body).size_m), [0.05, 0.1, 0.2], atol=1e-6)
+
+
+def test_the_table_of_findings_holds_what_is_not_fine():
+    findings = [Finding("files", Level.OK, "all"), Finding("camera", Level.WRONG, "K is off", "Take another.")]
+    table = own_data.findings_table({"K of another": findings, "fine": findings[:1]})
+    assert table.to_numpy().tolist() == [["K of another", "camera", "WRONG", "K is off", "Take another."]]
+
+
+CAMERA = Camera(300, 300, 159.5, 119.5, 320, 240)
+N = 4
+
+
+class Estimates(SimpleNamespace):
+    def __len__(self):
+        return N
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory):
-    """Some early frames of an embedded sequence, as if it had been recorded by the user."""
-    frames = range(0, 48, 8)
-    return own.write(open_sequence("synthetic/crossing"), tmp_path_factory.mktemp("own") / "good", frames)
+def made():
+    """A carton that moves before a wall; in the last frame a board hides its left half, in the second it is lost."""
+    body = carton(0).mesh
+    T = se3.exp(np.c_[np.linspace(0, 0.4, N), np.zeros(N), np.full(N, 0.5), np.zeros((N, 3))])
+    T[:, :3, 3] = np.c_[np.linspace(-0.05, 0.05, N), np.zeros(N), np.full(N, 0.6)]
+    frames = []
+    for k in range(N):
+        depth = render([(body, se3.IDENTITY)], CAMERA, se3.inverse(T[k])).depth_m
+        depth = np.where(depth > 0, depth, 1.5).astype(np.float32)
+        if k == N - 1:
+            depth[:, : int(CAMERA.project(T[k, :3, 3])[0])] = 0.3
+        frames.append(Frame(k, k / 30, np.zeros((240, 320, 3), np.uint8), depth))
+    T_cam_obj = T.copy()
+    T_cam_obj[1] = np.nan
+    has = np.arange(N) != 1
+    obj = Estimates(T_cam_obj=T_cam_obj, has_pose=has, frame_index=np.arange(N))
+    sequence = SimpleNamespace(camera=CAMERA, frame=frames.__getitem__, truth={"box": SimpleNamespace(T_cam_model=T)})
+    return sequence, SimpleNamespace(objects={"box": obj}), {"box": body}
 
 
-def found(folder, name, **options):
-    return next(f for f in check_folder(folder, **options) if f.name == name)
+def test_at_the_true_pose_all_of_it_is_on_the_surface(made):
+    sequence, run, bodies = made
+    fit = surface_fit(sequence, run, bodies, range(N))["box"]
+    assert fit.index.tolist() == [0, 2, 3], "no pose, no say"
+    assert (fit > 0.99).all(), "what hides it says nothing"
 
 
-def alarms(findings):
-    return [f for f in findings if f.level is not Level.OK]
-
-
-def test_a_good_folder_raises_no_alarm(good):
-    findings = check_folder(good)
-    assert alarms(findings) == []
-    names = ["files", "camera", "times", "motion", "depth", "registration"]
-    assert [f.name for f in findings] == names + [
-        f"{o}: {w}" for o in ("box", "can") for w in ("depth", "mask", "points")
+def test_a_wrong_pose_shows_and_the_more_the_farther(made):
+    sequence, run, bodies = made
+    shares = [
+        surface_fit(sequence, run, bodies, [0], se3.exp(np.radians([0, deg, 0, 0, 0, 0])))["box"][0]
+        for deg in (0, 5, 10, 20)
     ]
-
-
-def test_every_fault_is_expected_to_be_found():
-    assert EXPECTED.keys() == FAULTS.keys()
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_is_named_with_its_remedy(good, tmp_path, fault):
-    name, level, text, fix = EXPECTED[fault]
-    folder = spoil(shutil.copytree(good, tmp_path / "spoilt"), fault)
-    finding = found(folder, name)
-    assert finding.level is level
-    assert re.search(text, finding.text), finding.text
-    assert re.search(fix, finding.fix), finding.fix
-
-
-def test_an_embedded_sequence_raises_no_alarm():
-    assert alarms(check_folder("synthetic/crossing")) == []
-
-
-@pytest.mark.parametrize("name", ["ycbineoat/mustard0_first400", "real_multi/redkitchen_table"])
-def test_real_sequences_raise_no_alarm(shared_data, name):
-    findings = check_folder(shared_data / name)
-    # mustard0 really has holes: its pictures carry the time at which they were taken.
-    assert [(f.name, f.text) for f in alarms(findings) if f.name != "times"] == []
-    assert found(shared_data / name, "times").level is not Level.WRONG
-
-
-@pytest.mark.parametrize("name", ["mustard0_first400", "redkitchen_table"])
-def test_real_sequences_with_clicks_raise_no_alarm(shared_data, name):
-    where = next(p for p in shared_data.glob(f"*/{name}"))
-    prompts = load_prompts(shared_data / "prompts" / f"{name}.json")
-    findings = check_folder(where, prompts=prompts)
-    assert [(f.name, f.text) for f in alarms(findings) if f.level is Level.WRONG] == []
-    assert {f"{p.name}: points" for p in prompts} <= {f.name for f in findings}
-
-
-def test_real_depth_that_was_moved_is_found(shared_data, tmp_path):
-    folder = own.write(open_sequence(shared_data / "real_multi/redkitchen_table"), tmp_path / "own", range(0, 200, 20))
-    assert found(folder, "registration").level is Level.OK
-    assert found(spoil(folder, "depth not registered"), "registration").level is Level.WRONG
-
-
-# --- the two measures, against what is known -------------------------------------------------------
-
-
-def scene(du=0, dv=0, scale=1.0):
-    """Dark discs before a bright, textured wall; depth moved and scaled about the picture's centre."""
-    rng, frames = np.random.default_rng(1), []
-    v, u = np.mgrid[:240, :320]
-    for k in range(4):
-        spots = np.c_[rng.uniform(60, 260, 6), rng.uniform(50, 190, 6), rng.uniform(10, 22, 6)]
-
-        def near(u, v, spots=spots):
-            return ((u[..., None] - spots[:, 0]) ** 2 + (v[..., None] - spots[:, 1]) ** 2 < spots[:, 2] ** 2).any(-1)
-
-        rgb = np.where(near(u, v)[..., None], 60, 180) + rng.integers(-20, 20, (240, 320, 3))
-        back_u, back_v = (u - du - 159.5) / scale + 159.5, (v - dv - 119.5) / scale + 119.5
-        depth = np.where(near(back_u, back_v), 0.6, 1.2).astype(np.float32)
-        frames.append(Frame(k, k / 30, rgb.astype(np.uint8), depth))
-    return frames
-
-
-@pytest.mark.parametrize(("du", "dv", "scale"), [(12, 0, 1), (0, -9, 1), (-8, 6, 1), (0, 0, 0.81), (5, 0, 1.23)])
-def test_misfit_says_how_depth_lies(du, dv, scale):
-    fit = misfit(scene(du, dv, scale), tolerance_px=3)
-    assert fit.gain > 1.3
-    assert fit.scale == pytest.approx(scale, rel=0.04)
-    assert (fit.du_px, fit.dv_px) == (pytest.approx(du, abs=2), pytest.approx(dv, abs=2))
-
-
-def test_misfit_of_registered_depth_is_none():
-    assert misfit(scene(), 3).gain < 1.05
-    assert misfit(scene(2, 1), 3).gain < 1.05, "within the tolerance"
-
-
-def test_without_edges_nothing_is_claimed():
-    flat = [Frame(0, 0.0, f.rgb, np.full((240, 320), 1, np.float32)) for f in scene()]
-    assert misfit(flat, 3) is None
-    plain = [Frame(0, 0.0, np.full_like(f.rgb, 128), f.depth_m) for f in scene()]
-    assert misfit(plain, 3) is None
-
-
-def test_background_share_of_a_disc():
-    """A disc of radius 40 before a wall: none of it is wall; a mask 8 px wider has all of its rim there."""
-    v, u = np.mgrid[:200, :200]
-    radius = np.hypot(u - 100, v - 100)
-    depth = np.where(radius <= 40, 0.6, 1.0).astype(np.float32)
-    assert background_share(radius <= 40, depth) == 0
-    assert background_share(radius <= 48, depth) == 1
-    assert background_share((radius <= 48) & (u >= 100) | (radius <= 40), depth) == pytest.approx(0.55, abs=0.1)
-    lying = np.where(radius <= 40, 0.6, 0.61).astype(np.float32)
-    assert background_share(radius <= 48, lying) == 0, "a table right under it cannot be told from it"
-    assert np.isnan(background_share(radius <= 40, np.zeros_like(depth)))
-
-
-# --- the command -------------------------------------------------------------------------------
-
-
-def test_check_prints_findings_and_says_by_its_exit_code(good, tmp_path, capsys):
-    assert cli.main(["check", str(good)]) == 0
-    assert capsys.readouterr().out.endswith("Nothing is wrong with it as far as can be seen.\n")
-    folder = spoil(shutil.copytree(good, tmp_path / "spoilt"), "K of another resolution")
-    assert cli.main(["check", str(folder)]) == 2
-    out, err = capsys.readouterr()
-    assert "WRONG  camera" in out and "  -> Take K at 640x480" in out and err == ""
-    assert out.endswith("To mend first: camera\n")
-
-
-def test_what_cannot_be_read_is_a_finding(good, tmp_path, capsys):
-    folder = shutil.copytree(good, tmp_path / "spoilt")
-    (folder / "depth" / "000003.png").unlink()
-    assert cli.main(["check", str(folder)]) == 2
-    out, err = capsys.readouterr()
-    assert "WRONG  files" in out and "000003.png is missing" in out and err == ""
-    assert cli.main(["check", str(tmp_path / "nowhere"), "--json"]) == 2
-    (listed,) = json.loads(capsys.readouterr().out)
-    assert listed["name"] == "files" and listed["level"] == "WRONG" and "no such folder" in listed["text"]
-
-
-def test_without_masks_it_asks_for_clicks(good, tmp_path):
-    folder = shutil.copytree(good, tmp_path / "bare")
-    shutil.rmtree(folder / "masks")
-    (asked,) = alarms(check_folder(folder))
-    assert asked.name == "masks" and asked.level is Level.LOOK and "--prompts" in asked.fix
-    assert as_lines(check_folder(folder)).endswith("To look at before tracking: masks")
-
-
-def test_empty_masks_are_wrong(good, tmp_path):
-    folder = shutil.copytree(good, tmp_path / "empty")
-    for path in (folder / "masks").rglob("*.png"):
-        cv2.imwrite(str(path), np.zeros((480, 640), np.uint8))
-    (wrong,) = alarms(check_folder(folder))
-    assert (wrong.name, wrong.level) == ("masks", Level.WRONG) and "p2p click" in wrong.fix
-
-
-def click(u, v):
-    return {"prompts": [Prompt("box", 0, np.array([[u, v]], float))]}
-
-
-def test_a_click_on_the_background_is_worth_a_look(good):
-    finding = found(good, "box: mask", **click(230, 240))
-    assert finding.level is Level.LOOK and re.match(r"it covers 2\d % of the picture, over 0\.4", finding.text)
-    assert "table or wall" in finding.fix
-
-
-def test_a_click_that_segments_nothing_is_said_once(good, recwarn):
-    (wrong,) = alarms(check_folder(good, **click(5, 5)))
-    assert (wrong.name, wrong.level) == ("box: mask", Level.WRONG) and wrong.text.startswith("nothing was segmented")
-    assert "Click elsewhere" in wrong.fix and not len(recwarn)
-
-
-def scaled_depth(folder, factor):
-    for path in (folder / "depth").iterdir():
-        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) * float(factor)
-        cv2.imwrite(str(path), np.clip(np.rint(depth), 0, 65535).astype(np.uint16))
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("factor", "limit", "scale"), [(0.1, "depth.min_m=0.03", "10 times"), (10, "depth.max_m=1", "0.1 times")]
-)
-def test_objects_all_out_of_range_are_one_finding(good, tmp_path, factor, limit, scale):
-    (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)))
-    assert wrong.name == "box: depth" and "(can " in wrong.text
-    assert limit in wrong.fix and scale in wrong.fix
-
-
-def test_depth_that_was_cut_off_must_be_exported_again(good, tmp_path):
-    (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), 1000)))
-    assert wrong.name == "depth" and "cut off at 65.5 m" in wrong.text and "export the depth again" in wrong.fix
-
-
-def test_what_is_missing_is_named(good, tmp_path):
-    folder = shutil.copytree(good, tmp_path / "less")
-    (folder / "masks/box/000000.png").unlink()
-    (wrong,) = check_folder(folder)
-    assert "000000.png is missing. One mask alone" in wrong.fix
-    shutil.rmtree(folder / "rgb")
-    (wrong,) = check_folder(folder)
-    assert wrong.fix.startswith("rgb/ is missing")
-
-
-def test_lines_align_and_remedies_follow_what_they_mend(good):
-    lines = as_lines(check_folder(good)).splitlines()
-    assert all(re.match(r"ok     \S", line) for line in lines[:-1])
-
-
-# --- a folder of one's own, written ----------------------------------------------------------------
-
-
-def test_a_written_folder_reads_back(good):
-    source, read = open_sequence("synthetic/crossing"), open_sequence(good)
-    assert read.format == "folder" and len(read) == 6 and read.truth == {}
-    assert read.objects == source.objects and read.camera == source.camera
-    np.testing.assert_allclose(read.times_s, source.times_s[:48:8] - source.times_s[0], atol=1e-6)
-    for i in (0, 5):
-        a, b = source.frame(8 * i), read.frame(i)
-        np.testing.assert_array_equal(a.rgb, b.rgb)
-        np.testing.assert_allclose(a.depth_m, b.depth_m, atol=5.1e-4)
-        for name, mask in source.masks(8 * i).items():
-            np.testing.assert_array_equal(mask, read.masks(i)[name])
-
-
-def test_a_folder_is_not_written_over(good):
-    with pytest.raises(BadInput, match="not empty"):
-        own.write(open_sequence(good), good)
-
-
-def test_a_folder_of_ours_may_be_written_anew(good, tmp_path):
-    source, out = open_sequence(good), tmp_path / "again"
-    own.write(source, out, range(6))
-    (out / "notes.txt").write_text("mine")
-    assert len(open_sequence(own.write(source, out, range(2), masks=(), overwrite=True))) == 2
-    assert not (out / "masks").exists() and (out / "notes.txt").read_text() == "mine"
-
-
-def test_a_folder_with_the_first_masks_alone(good, tmp_path):
-    read = open_sequence(own.write(open_sequence(good), tmp_path / "first", range(6), masks=(0,)))
-    assert read.masks(0).keys() == {"box", "can"} and read.masks(1) is None
-    assert open_sequence(own.write(open_sequence(good), tmp_path / "none", range(6), masks=())).masks(0) is None
-
-
-def test_a_wrong_unit_is_told_once(good):
-    """Nothing can be said of objects that are a thousand times too far away, and nothing is."""
-    assert [f.name for f in alarms(check_spoilt(good, "depth unit"))] == ["depth"]
-    assert sorted(p.name for p in good.iterdir()) == ["cam_K.txt", "depth", "masks", "rgb", "times.txt"], "a copy was"
-
-
-def test_unknown_faults_are_refused(good):
-    with pytest.raises(BadInput, match="one of depth unit"):
-        spoil(good, "gremlins")
-
-
-def test_camera_of_a_telescope_is_no_camera():
-    from p2p_lib.studies.own_data import _camera
-
-    assert _camera(Camera(600, 600, 320, 240, 640, 480)).level is Level.OK
-    assert _camera(Camera(6000, 6000, 320, 240, 640, 480)).level is Level.WRONG
+    assert (np.diff(shares) < -0.05).all()
+
+
+def test_errors_against_a_truth_that_was_not_known(made):
+    sequence, run, _ = made
+    T_obj_model, T = se3.exp(np.array([0.1, 0.2, 0, 0.01, 0, 0])), run.objects["box"].T_cam_obj
+    drift = np.repeat(np.eye(4)[None], N, 0)
+    drift[3] = se3.exp(np.radians([0, 4.0, 0, 0, 0, 0]))
+    drift[2, 0, 3] = 0.007
+    off = Estimates(has_pose=run.objects["box"].has_pose, frame_index=np.arange(N))
+    off.T_cam_obj = T @ drift @ se3.inverse(T_obj_model)
+    deg, mm = errors_against(sequence, range(N), SimpleNamespace(objects={"box": off}))["box"]
+    np.testing.assert_allclose(deg[[0, 2, 3]], [0, 0, 4], atol=1e-6)
+    np.testing.assert_allclose(mm[[0, 2, 3]], [0, 7, 0], atol=1e-6)
+    assert np.isnan(deg[1]) and np.isnan(mm[1])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pandas import DataFrame
 from scipy import stats
 
 from p2p_lib import Point2Pose, preset
@@ -14,7 +15,7 @@ from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.run import run
 from p2p_lib.studies import texture
-from p2p_lib.studies.recorded_tracker import KeypointTracks, RecordedTracker
+from p2p_lib.studies.texture import RecordedTracker
 
 FRAMES = 14
 
@@ -87,7 +88,7 @@ def test_tracks_with_known_noise_have_the_error_of_that_noise(video):
     followed(video, record)
     tracks = record.keypoints(scene)["tin"]
     assert len(tracks.frame) > 200 and set(np.unique(tracks.frame)) == set(range(1, FRAMES))
-    # The distance of a Gaussian in the plane is Rayleigh's; noise at the rim now and then falls off the picture's tin.
+    # The distance of a Gaussian in the plane is Rayleigh's; noise at the rim now and then falls off the image's tin.
     assert np.median(tracks.error_px) == pytest.approx(0.8 * np.sqrt(2 * np.log(2)), rel=0.1)
 
 
@@ -144,10 +145,10 @@ def made(frame_index, error_px, add_m):
     """A study whose tracks are one per frame and error."""
     n, k = len(frame_index), len(error_px)
     uv = np.tile(np.array(error_px, float), n)
-    tracks = KeypointTracks(np.repeat(frame_index, k), np.tile(np.arange(k), n), np.stack([uv, 0 * uv], 1),
-                            np.zeros((n * k, 2)))  # fmt: skip
+    tracks = DataFrame({"frame": np.repeat(frame_index, k), "u_px": uv, "v_px": 0 * uv, "error_px": uv})
     add_m = np.asarray(add_m, float)
-    return texture.ObjectTexture("s", "o", np.asarray(frame_index), np.arange(n, dtype=float), add_m, add_m / 2, tracks)
+    frames = DataFrame({"frame": frame_index, "texture": np.arange(float(n)), "add_m": add_m, "adds_m": add_m / 2})
+    return texture.ObjectTexture("s", "o", frames, tracks)
 
 
 def test_a_measure_is_of_its_own_frames():

@@ -7,8 +7,8 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
-from p2p_lib.method.refinement import sample_cloud
-from p2p_lib.studies import basin, turntable
+from p2p_lib.method.observation import sample_cloud
+from p2p_lib.studies import refinement, turntable
 from p2p_lib.synthetic.noise import PERFECT
 from p2p_lib.synthetic.scene import VGA
 
@@ -41,8 +41,8 @@ def test_ring_looks_at_the_middle():
 def test_perturbations_and_errors_are_of_the_same_size():
     T = turntable.ring(1)[0]
     for degrees, millimetres in ((3, 0), (0, 7), (12, 20)):
-        off = basin.perturbed(T, degrees, millimetres, np.random.default_rng(1))
-        turned, moved = basin.pose_error(off, T)
+        off = refinement.perturbed(T, degrees, millimetres, np.random.default_rng(1))
+        turned, moved = se3.error_deg_mm(off, T)
         assert turned == pytest.approx(degrees, abs=1e-5)
         assert moved == pytest.approx(millimetres, rel=0.02, abs=1e-9)
 
@@ -52,11 +52,11 @@ def test_near_starts_come_back_and_far_ones_do_not_and_a_tin_keeps_its_spin():
     volume = turntable.fuse(turntable.photograph(body, poses, 3), CONFIG.tsdf)
     shot = turntable.photograph(body, poses[2:3], 4)[0]
     cloud = sample_cloud(shot.depth_m, shot.mask, VGA, 700)
-    errors = basin.basin_of_convergence(volume, cloud, poses[2], CONFIG.refinement, [0.5], [3, 40], 3)
+    errors = refinement.basin_of_convergence(volume, cloud, poses[2], CONFIG.refinement, [0.5], [3, 40], 3)
     assert errors.shape == (1, 2, 3, 2) and errors[0, 0, :, 1].max() < 2 < errors[0, 1, :, 1].max()
-    left = basin.spin_errors(volume, [cloud], poses[2], 6.0, CONFIG.refinement)
+    left = refinement.spin_errors(volume, [cloud], poses[2], 6.0, CONFIG.refinement)
     assert left[0] == pytest.approx(6, abs=0.7)
     points, normals = body.mesh.sample(2000, np.random.default_rng(0))
-    label = basin.label_points(points, normals, poses[2], 40, 0.0005, np.random.default_rng(0))
-    mended = basin.spin_errors(volume, [cloud], poses[2], 6.0, replace(CONFIG.refinement, iterations=15), [label])
+    label = refinement.label_points(points, normals, poses[2], 40, 0.0005, np.random.default_rng(0))
+    mended = refinement.spin_errors(volume, [cloud], poses[2], 6.0, replace(CONFIG.refinement, iterations=15), [label])
     assert abs(mended[0]) < 1

@@ -10,6 +10,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 from p2p_lib.synthetic import SCENARIOS, generate
 from p2p_lib.synthetic.noise import Sensor
+from p2p_lib.synthetic.render import render
 
 SEEDS = (1, 2, 3)
 
@@ -24,7 +25,7 @@ def T_cam_model(scenario):
 
 
 def photographs(scenario, seed, frames):
-    room = generate.render([], scenario.camera, scenario.T_world_cam[0])  # only the object matters here
+    room = render([], scenario.camera, scenario.T_world_cam[0])  # only the object matters here
     return [generate.photograph(scenario, Sensor(), seed, t, room) for t in frames]
 
 

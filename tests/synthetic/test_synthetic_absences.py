@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from surface_points import watch
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.synthetic import SCENARIOS, generate
+from p2p_lib.synthetic import SCENARIOS
 
 SMALL = Camera(615 / 4, 615 / 4, 79.5, 59.5, 160, 120)
 STEP = 2  # every second frame is looked at
@@ -24,23 +25,6 @@ AWAY = {
 
 def turn_deg(R_a, R_b):
     return np.degrees(np.arccos(np.clip((np.einsum("...ij,...ij->...", R_a, R_b) - 1) / 2, -1, 1)))
-
-
-def watch(scenario, seed):
-    """Per object: poses (T, 4, 4) in the camera, visible pixels (T,), visible surface points (T, 256)."""
-    truth = [generate._Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
-    blank = generate.render([], SMALL, scenario.T_world_cam[0])
-    frames = range(0, scenario.frames, STEP)
-    px, seen = np.zeros((len(truth), len(frames)), int), np.zeros((len(truth), len(frames), 256), bool)
-    for i, t in enumerate(frames):
-        exact = generate._exact(scenario, float(t), blank)
-        for k, one in enumerate(truth):
-            px[k, i] = np.count_nonzero(exact.label == one.label)
-            seen[k, i] = one.tracks(scenario, t, exact)[1]
-    T_cam_world = se3.inverse(scenario.T_world_cam)
-    return {
-        one.body.name: ((T_cam_world @ one.body.T_world_model)[::STEP], px[k], seen[k]) for k, one in enumerate(truth)
-    }
 
 
 def absences(px):
@@ -67,9 +51,12 @@ def check_return(name, T, px, seen):
 @pytest.mark.parametrize("name", AWAY)
 def test_objects_go_away_and_come_back_known(name, seed=1):
     scenario = replace(SCENARIOS[name](seed), camera=SMALL)
-    seen = watch(scenario, seed)
-    gone = {o: check_return(o, *seen[o]) for o in AWAY[name]}
-    for o, (T, px, _) in seen.items():
+    T_cam_world = se3.inverse(scenario.T_world_cam)
+    T_cam_model = {body.name: (T_cam_world @ body.T_world_model)[::STEP] for body in scenario.bodies}
+    seen = watch(scenario, range(0, scenario.frames, STEP))
+    gone = {o: check_return(o, T_cam_model[o], *seen[o]) for o in AWAY[name]}
+    for o, (px, _) in seen.items():
+        T = T_cam_model[o]
         assert turn_deg(T[1:, :3, :3], T[:-1, :3, :3]).max() < 4 * STEP, o
         if o not in AWAY[name]:
             assert px.min() > 0.5 * np.median(px), o  # the others stay in view
@@ -96,7 +83,7 @@ def test_the_mark_shows_when_a_look_alike_is_back():
         assert np.einsum("tc,tc->t", front_cam, towards).min() > 0.4
 
 
-def test_the_late_object_is_out_of_the_picture_at_first():
+def test_the_late_object_is_out_of_the_image_at_first():
     scenario = replace(SCENARIOS["late_object"](1), camera=SMALL)
     T = se3.inverse(scenario.T_world_cam) @ scenario.bodies[1].T_world_model
     uv = SMALL.project(se3.transform(T, scenario.bodies[1].mesh.vertices))

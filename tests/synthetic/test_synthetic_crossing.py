@@ -8,12 +8,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from surface_points import see, watch
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.synthetic import SCENARIOS, generate, scenario_dir
 from p2p_lib.synthetic.noise import PERFECT, Sensor
+from p2p_lib.synthetic.render import render
 
 OBJECTS = ("box", "can")
 FRAMES = 300
@@ -38,8 +40,9 @@ def poses(folder):
 
 
 @pytest.fixture(scope="module")
-def tracks(folder):
-    return dict(np.load(folder / "tracks.npz"))
+def points():
+    """Object to points and normals on its true surface."""
+    return {b.name: b.mesh.sample(256, np.random.default_rng(1)) for b in SCENARIOS["crossing"](0).bodies}
 
 
 def image(folder, kind, t):
@@ -100,37 +103,40 @@ def test_masks_are_where_the_poses_put_the_objects(folder, camera, poses):
     assert not any((image(folder, "masks/box", t) & image(folder, "masks/can", t)).any() for t in range(0, FRAMES, 5))
 
 
-def test_tracks_lie_on_the_measured_surface(folder, camera, poses, tracks):
+def shown(folder, camera, poses, points, o, t):
+    """Pixels (P, 2) and visibility (P,) of the points in the written image, whose depth is that of a noisy sensor."""
+    return see(
+        camera, poses[o][t], points[o], image(folder, "depth", t) / 1000, image(folder, f"masks/{o}", t) > 0, 0.008
+    )
+
+
+def test_the_surface_is_where_depth_was_measured(folder, camera, poses, points):
     in_front = []
     for t in range(0, FRAMES, 17):
         depth = image(folder, "depth", t) / 1000
-        for k, o in enumerate(tracks["objects"]):
-            mine = tracks["object_index"] == k
-            p_cam = se3.transform(poses[o][t], tracks["p_model"][mine])
-            uv, visible = tracks["uv_px"][t, mine], tracks["visible"][t, mine]
-            np.testing.assert_allclose(camera.project(p_cam), uv, atol=1e-3)
+        for o in OBJECTS:
+            z = se3.transform(poses[o][t], points[o][0])[:, 2]
+            uv, visible = shown(folder, camera, poses, points, o, t)
             u, v = uv.round().astype(int).T
-            measured = depth[v, u]
-            near = visible & (measured > 0)
-            assert (image(folder, f"masks/{o}", t)[v, u] > 0)[visible].all()
-            if near.sum() > 20:
-                error = measured[near] - p_cam[near, 2]
+            error = depth[v, u][visible] - z[visible]
+            if len(error) > 20:
                 assert abs(np.median(error)) < 1e-3 and np.quantile(np.abs(error), 0.9) < 0.006, (o, t)
             # Away from the outline, a point that does not show has something measured in front of it.
             mask = image(folder, f"masks/{o}", t)
             inner, outer = cv2.erode(mask, np.ones((5, 5))), cv2.dilate(mask, np.ones((5, 5)))
-            hidden = ~visible & (measured > 0) & ((inner[v, u] > 0) | (outer[v, u] == 0))
-            in_front += (measured[hidden] < p_cam[hidden, 2] + 0.008).tolist()
+            hidden = ~visible & (depth[v, u] > 0) & ((inner[v, u] > 0) | (outer[v, u] == 0))
+            in_front += (depth[v, u][hidden] < z[hidden] + 0.008).tolist()
     assert len(in_front) > 3000 and np.mean(in_front) > 0.995
 
 
-def test_pictures_move_as_the_tracks_say(folder, tracks):
-    # Lucas-Kanade on the written pictures is the oracle: what shows on the surface moves with the truth.
+def test_images_move_as_the_poses_say(folder, camera, poses, points):
+    # Lucas-Kanade on the written images is the oracle: what shows on the surface moves with the truth.
     errors = []
     for t in (5, 60, 100, 215, 250, 290):
         before, after = (cv2.cvtColor(image(folder, "rgb", s), cv2.COLOR_BGR2GRAY) for s in (t, t + 1))
-        both = tracks["visible"][t] & tracks["visible"][t + 1]
-        start, truth = tracks["uv_px"][t, both], tracks["uv_px"][t + 1, both]
+        at = [[shown(folder, camera, poses, points, o, s) for s in (t, t + 1)] for o in OBJECTS]
+        both = np.concatenate([a[1] & b[1] for a, b in at])
+        start, truth = (np.concatenate([pair[k][0] for pair in at])[both].astype(np.float32) for k in range(2))
         found, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None, winSize=(15, 15), maxLevel=2)
         back, _, _ = cv2.calcOpticalFlowPyrLK(after, before, found, None, winSize=(15, 15), maxLevel=2)
         u, v = start.round().astype(int).T
@@ -162,7 +168,7 @@ def events(visible_px):
     return [(a, b) for a, b in zip(starts, stops) if b - a > 10]
 
 
-def check_promises(o, T_cam_model, visible_px, visible_tracks, full_px):
+def check_promises(o, T_cam_model, visible_px, visible_points, full_px):
     """The bars of the scenario for one object."""
     assert turn_deg(T_cam_model[0, :3, :3], T_cam_model[:, :3, :3]).max() > 90, o
     assert turn_deg(T_cam_model[1:, :3, :3], T_cam_model[:-1, :3, :3]).max() < 4, o
@@ -173,41 +179,35 @@ def check_promises(o, T_cam_model, visible_px, visible_tracks, full_px):
     assert 30 <= b - a <= 60
     assert np.linalg.norm(T_cam_model[b - 1, :3, 3] - T_cam_model[a, :3, 3]) > 0.10, o
     assert turn_deg(T_cam_model[a, :3, :3], T_cam_model[b - 1, :3, :3]) > 30, o
-    shown = visible_tracks[b + 3]
-    assert shown.sum() > 20
-    assert (visible_tracks[:a].any(0) & shown).sum() > 0.4 * shown.sum(), o
+    back = visible_points[b + 3]
+    assert back.sum() > 20
+    assert (visible_points[:a].any(0) & back).sum() > 0.4 * back.sum(), o
     assert visible_px[b + 3] > 0.8 * visible_px[b + 12], o  # uncovered at once
     assert visible_px[b + 3 : b + 10].min() > 0.02 * full_px
 
 
 @pytest.mark.parametrize("o", OBJECTS)
-def test_hidden_and_back_on_the_written_sequence(folder, poses, tracks, o):
+def test_hidden_and_back_on_the_written_sequence(folder, camera, poses, points, o):
     px = np.array([np.count_nonzero(image(folder, f"masks/{o}", t)) for t in range(FRAMES)])
-    mine = tracks["object_index"] == list(tracks["objects"]).index(o)
-    check_promises(o, poses[o], px, tracks["visible"][:, mine], 640 * 480 * 0.5)
+    visible = np.array([shown(folder, camera, poses, points, o, t)[1] for t in range(FRAMES)])
+    check_promises(o, poses[o], px, visible, 640 * 480 * 0.5)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_every_seed_keeps_the_promises(seed):
     small = Camera(615 / 4, 615 / 4, 79.5, 59.5, 160, 120)
     scenario = replace(SCENARIOS["crossing"](seed), camera=small)
-    truth = [generate._Truth.of(k, body, seed) for k, body in enumerate(scenario.bodies, 1) if body.labelled]
-    room = generate._room(scenario, 0)
-    px, seen = np.zeros((2, FRAMES), int), np.zeros((2, FRAMES, 256), bool)
-    for t in range(FRAMES):
-        exact = generate._exact(scenario, t, room)
-        for k, one in enumerate(truth):
-            px[k, t] = np.count_nonzero(exact.label == one.label)
-            seen[k, t] = one.tracks(scenario, t, exact)[1]
-    for k, one in enumerate(truth):
-        T_cam_model = se3.inverse(scenario.T_world_cam) @ one.body.T_world_model
-        check_promises(one.body.name, T_cam_model, px[k], seen[k], 160 * 120 * 0.5)
+    seen = watch(scenario, range(FRAMES))
+    px = [seen[o][0] for o in OBJECTS]
+    for body in scenario.bodies[:2]:
+        T_cam_model = se3.inverse(scenario.T_world_cam) @ body.T_world_model
+        check_promises(body.name, T_cam_model, *seen[body.name], 160 * 120 * 0.5)
     # They pass in front of each other, the box first: each loses a part of its picture to the other, never all.
     for k, frames in ((1, range(40, 110, 4)), (0, range(215, FRAMES, 4))):
         shares = []
         for t in frames:
             one = scenario.bodies[k]
-            alone = generate.render([(one.mesh, one.T_world_model[t])], small, scenario.T_world_cam[t])
+            alone = render([(one.mesh, one.T_world_model[t])], small, scenario.T_world_cam[t])
             shares.append(px[k, t] / np.count_nonzero(alone.label))
         assert 0.2 < min(shares) < 0.85 and max(shares) > 0.95, (one.name, shares)
 
@@ -216,7 +216,7 @@ def tree(folder):
     return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
-def test_same_seed_same_bytes_other_seed_other_pictures(tmp_path, monkeypatch):
+def test_same_seed_same_bytes_other_seed_other_images(tmp_path, monkeypatch):
     made = []
     for k, seed in enumerate((4, 4, 5)):
         monkeypatch.setenv("P2P_CACHE", str(tmp_path / str(k)))

@@ -1,11 +1,13 @@
 """What glossy surfaces mirror: against reflections worked out by hand, and what a turning mug shows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.synthetic import crockery, shapes
+from p2p_lib.synthetic import shapes, solids
 from p2p_lib.synthetic.environment import Environment, fresnel, living_room
 from p2p_lib.synthetic.render import Light, render
 
@@ -25,15 +27,8 @@ def ball(reflectance, radius_m=0.06):
     """A black ball; its rings are fine enough for flat faces to lie within 0.1 mm of the sphere."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, 73)
     profile = radius_m * np.stack([np.cos(angle).clip(0), np.sin(angle)], 1)
-    mesh = crockery.revolved(profile, np.zeros((8, 8, 3), np.uint8), segments=144)
-    return shapes.Mesh(
-        mesh.vertices,
-        mesh.faces,
-        mesh.uv,
-        mesh.texture,
-        mesh.normals,
-        reflectance=np.full(len(mesh.faces), reflectance),
-    )
+    mesh = shapes.assembled([solids.revolved(profile, np.zeros((8, 8, 3), np.uint8), segments=144)])
+    return replace(mesh, reflectance=np.full(len(mesh.faces), reflectance))
 
 
 def test_schlick_at_both_ends():
@@ -74,7 +69,7 @@ def test_nothing_is_mirrored_without_a_room_or_by_matt_surfaces():
 
 @pytest.fixture(scope="module")
 def mug():
-    return crockery.mug(np.random.default_rng(3), 0.044, 0.105, reflectance=0.05, marks=5)
+    return solids.mug(np.random.default_rng(3), 0.044, 0.105, reflectance=0.05, marks=5)
 
 
 def test_mug_is_closed_and_wound_outwards(mug):
@@ -92,7 +87,7 @@ def test_mug_is_closed_and_wound_outwards(mug):
 
 
 def test_the_body_hides_that_it_turns_and_the_handle_does_not(mug):
-    bare = crockery.mug(np.random.default_rng(3), 0.044, 0.105, reflectance=0.05, marks=0)
+    bare = solids.mug(np.random.default_rng(3), 0.044, 0.105, reflectance=0.05, marks=0)
     light = Light(environment=living_room(np.random.default_rng(1), windows=4))
     upright = se3.exp(np.array([-np.pi / 2, 0, 0, 0, 0, 0]))  # z of the world is up in the picture
     eye = upright @ se3.from_rt(np.eye(3), [0, 0, -0.4])

@@ -6,7 +6,7 @@ import pytest
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.synthetic.noise import PERFECT, Sensor, measured_colour, measured_depth
-from p2p_lib.synthetic.render import Picture
+from p2p_lib.synthetic.render import Rendering
 
 CAMERA = Camera(615.0, 615.0, 319.5, 239.5, 640, 480)
 
@@ -15,7 +15,7 @@ def picture(depth_m, cosine=1.0):
     depth_m = np.asarray(depth_m, float)
     shape = depth_m.shape
     rgb = np.zeros((*shape, 3), np.float32)
-    return Picture(rgb, depth_m, np.zeros(shape, np.uint8), np.full(shape, cosine, np.float32))
+    return Rendering(rgb, depth_m, np.zeros(shape, np.uint8), np.full(shape, cosine, np.float32))
 
 
 def only(**values):

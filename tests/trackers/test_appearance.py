@@ -38,7 +38,7 @@ def test_finds_an_affine_warp_whatever_the_light(gain, offset):
     good = error_px < 0.2
     np.testing.assert_allclose(np.median(seen.A[good], 0), A, atol=0.01)
     assert np.median(seen.ncc) > 0.99
-    np.testing.assert_allclose(np.median(seen.stronger), gain, rtol=0.1)
+    np.testing.assert_allclose(np.median(seen.contrast_ratio), gain, rtol=0.1)
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (4.0, 0.0), (-2.0, 3.0)])

@@ -48,8 +48,8 @@ def test_finds_corners_again_where_the_surface_is_known(A):
     image, M = picture(), seen_under(A)
     uv, before = described(image, np.eye(2))
     uv_after, after = described(cv2.warpAffine(image, M, SHAPE[::-1]), A)
-    pairs = features.match(before, after, uv_after, 4.0, 0.8, 1)
-    error_px = np.linalg.norm(uv_after[pairs.found] - (uv @ M[:, :2].T + M[:, 2])[pairs.wanted], axis=1)
+    wanted, found = features.match(before, after, uv_after, 4.0, 0.8)
+    error_px = np.linalg.norm(uv_after[found] - (uv @ M[:, :2].T + M[:, 2])[wanted], axis=1)
     assert len(error_px) > 15 and (error_px < 4).mean() > 0.8
 
 
@@ -61,16 +61,16 @@ def test_a_slant_that_is_not_known_costs_most_of_them():
 
     def right(known: np.ndarray) -> int:
         uv_after, after = described(slanted, known)
-        pairs = features.match(before, after, uv_after, 4.0, 0.8, 1)
-        there = (uv @ M[:, :2].T + M[:, 2])[pairs.wanted]
-        return int((np.linalg.norm(uv_after[pairs.found] - there, axis=1) < 4).sum())
+        wanted, found = features.match(before, after, uv_after, 4.0, 0.8)
+        there = (uv @ M[:, :2].T + M[:, 2])[wanted]
+        return int((np.linalg.norm(uv_after[found] - there, axis=1) < 4).sum())
 
     assert right(A) > 2 * right(np.eye(2))
 
 
 def test_another_picture_matches_nothing():
     (_, one), (uv, other) = described(picture(0), np.eye(2)), described(picture(1), np.eye(2))
-    assert len(features.match(one, other, uv, 4.0, 0.8, 1).wanted) < 0.06 * len(one)
+    assert len(features.match(one, other, uv, 4.0, 0.8)[0]) < 0.06 * len(one)
 
 
 def test_two_places_that_look_alike_are_both_named():
@@ -81,20 +81,19 @@ def test_two_places_that_look_alike_are_both_named():
     uv, found = described(twice, np.eye(2))
     uv_left, left = described(card, np.eye(2), 60)
     left = left[(np.abs(uv_left - [60, 50]) < [40, 30]).all(1)]
-    both = features.match(left, found, uv, 4.0, 0.8, 2)
-    named = [uv[both.found[both.wanted == i]] for i in range(len(left))]
+    wanted, place = features.match(left, found, uv, 4.0, 0.8)
+    named = [uv[place[wanted == i]] for i in range(len(left))]
     twins = [len(at) == 2 and (np.abs(np.abs(at[0] - at[1]) - [160, 100]) < 3).all() for at in named]
     assert len(left) > 5 and np.mean(twins) > 0.6
 
 
-def test_the_rival_is_the_next_place_not_the_same_corner_twice():
+def test_a_match_is_nearer_than_the_third_place():
     wanted = np.eye(4, dtype=np.float32)[:1]
-    near, nearer, far = (np.float32([np.cos(a), np.sin(a), 0, 0]) for a in (0.30, 0.28, 0.9))
-    found, uv = np.stack([near, nearer, far]), np.array([[10.0, 10], [12, 10], [50, 50]])
-    (pair,) = features.match(wanted, found, uv, 4.0, 0.8, 1).found
-    assert pair == 1, "the corner found twice is its own place: it does not rival itself"
-    assert not len(features.match(wanted, found, uv, 1.0, 0.8, 1).wanted), "apart, they rival each other"
-    assert list(features.match(wanted, found, uv, 1.0, 0.8, 2).found) == [1, 0], "where two are asked for, both count"
+    at = [np.float32([np.cos(a), np.sin(a), 0, 0]) for a in (0.30, 0.28, 0.32, 0.9)]
+    uv = np.array([[10.0, 10], [12, 10], [50, 50], [90, 90]])
+    places = features.match(wanted, np.stack(at), uv, 4.0, 0.8)[1]
+    assert list(places) == [1, 2], "the two corners at one place are one place"
+    assert not len(features.match(wanted, np.stack(at[:3]), uv[:3], 1.0, 0.8)[0]), "three places that look alike"
 
 
 def test_stays_in_the_region():

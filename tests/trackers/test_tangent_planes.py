@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, projection, surface_at, tangent_steps
+from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, planes_at, projection, tangent_steps
 
 CAMERA = Camera(580, 600, 159, 121, 320, 240)
 NORMAL, OFFSET = np.array([0.5, -0.3, 1.0]) / np.linalg.norm([0.5, -0.3, 1.0]), 0.6
@@ -19,7 +19,7 @@ def slanted(noise_m: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize("step_px", [1, 2])
 def test_finds_a_plane(step_px):
-    surface = surface_at(slanted(), CAMERA, UV, step_px)
+    surface = planes_at(slanted(), CAMERA, UV, step_px)
     np.testing.assert_allclose(CAMERA.project(surface.p_cam), UV, atol=1e-6)
     # Depth is linear in the pixel only nearly, and a ridge holds the slope back.
     np.testing.assert_allclose(surface.p_cam @ NORMAL, OFFSET, atol=2e-4)
@@ -31,19 +31,19 @@ def test_finds_a_plane(step_px):
 def test_noise_and_holes_cost_little():
     depth = slanted(0.001)
     depth[78:83, 98:102] = 0
-    surface = surface_at(depth, CAMERA, UV)
+    surface = planes_at(depth, CAMERA, UV)
     assert np.isfinite(surface.p_cam).all() and np.abs(surface.p_cam @ NORMAL - OFFSET).max() < 0.002
-    assert not np.isfinite(surface_at(np.zeros_like(depth), CAMERA, UV).p_cam).any()
+    assert not np.isfinite(planes_at(np.zeros_like(depth), CAMERA, UV).p_cam).any()
 
 
 def test_the_surface_behind_a_step_is_another():
     depth = np.where(np.arange(320) < 160, 0.5, 0.7) * np.ones((240, 1))
-    surface = surface_at(depth, CAMERA, np.array([[158.0, 100.0], [162.0, 100.0]]))
+    surface = planes_at(depth, CAMERA, np.array([[158.0, 100.0], [162.0, 100.0]]))
     np.testing.assert_allclose(surface.p_cam[:, 2], [0.5, 0.7], atol=1e-3)
 
 
 def test_steps_on_the_tangent_plane_are_square():
-    surface = surface_at(slanted(), CAMERA, UV)
+    surface = planes_at(slanted(), CAMERA, UV)
     steps = tangent_steps(surface, CAMERA, 0.002)
     for at, step in zip(surface.p_cam, steps, strict=True):
         moved = np.stack([_on_plane(CAMERA.project(at) + step[:, axis]) - at for axis in (0, 1)])

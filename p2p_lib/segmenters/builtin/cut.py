@@ -12,9 +12,13 @@ from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import evidence, histogram
-from p2p_lib.segmenters.builtin.patch import Patch, connected, grown, plane_heights
+from p2p_lib.segmenters.builtin.patch import Patch, connected, dilated, plane_heights
 
-#: Less of a body than this on the patch's border is an accident.
+#: Weight of a pixel's certain evidence beside a tie to a like neighbour.
+_EVIDENCE = 0.06
+#: Measured points this near to the reconstructed surface are on it, and twice as far before it are not.
+_ON_SURFACE_M = 0.008
+#: Less of a component than this on the patch's border is an accident.
 _AT_THE_BORDER = 0.02
 #: Height in standard deviations of depth at which something stands out of its support.
 _STANDS_OUT = 2.0
@@ -25,17 +29,19 @@ _PLANE_SLACK_M = 0.003
 def by_geometry(
     patch: Patch, seeds: np.ndarray, plane: np.ndarray | None, config: SegmentationConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """An object hangs together in depth and is not what it stands on.
+    """An object is connected in depth and is not what it stands on.
 
     seeds (h, w) bool lie on the object, ``plane`` is what may support it. Returns the evidence (h, w) and the
-    body (h, w) bool: what hangs together with the seeds, where that looks like one object; else nothing.
+    component (h, w) bool: what is connected with the seeds, where that looks like one object; else nothing.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
     at = seeds & measured
     if not at.any():
         return log_odds, nothing
-    log_odds[measured & (np.abs(patch.depth_m - np.median(patch.depth_m[at])) > config.reach_m)] -= config.contradiction
+    log_odds[measured & (np.abs(patch.depth_m - np.median(patch.depth_m[at])) > config.reach_m)] -= (
+        config.geometry_weight
+    )
     free = patch.smooth
     if plane is not None:
         height, sigma_m = plane_heights(patch, plane), float(np.median(patch.sigma_m[at]))
@@ -46,12 +52,12 @@ def by_geometry(
             low = height < min(above_m / 2, (_STANDS_OUT + 0.5) * sigma_m + _PLANE_SLACK_M)
             log_odds[measured & low] -= config.geometry_weight
             free = free & ~low
-    body = connected(free, seeds)
-    log_odds[measured & ~grown(body, 1)] -= config.geometry_weight
-    if body[patch.border()].mean() > _AT_THE_BORDER:
-        return log_odds, nothing  # it goes on beyond the patch: more than one object hangs together
-    log_odds[body] += config.geometry_weight
-    return log_odds, body
+    component = connected(free, seeds)
+    log_odds[measured & ~dilated(component, 1)] -= config.geometry_weight
+    if component[patch.border()].mean() > _AT_THE_BORDER:
+        return log_odds, nothing  # it goes on beyond the patch: more than one object is connected
+    log_odds[component] += config.geometry_weight
+    return log_odds, component
 
 
 def by_colour(patch: Patch, own: np.ndarray, outside: np.ndarray, config: SegmentationConfig) -> np.ndarray:
@@ -64,33 +70,32 @@ def by_surface(patch: Patch, hint: Hint, config: SegmentationConfig) -> np.ndarr
     if hint.distance_m is None:
         return np.zeros(patch.shape, np.float32)
     distance_m = patch.nearest(hint.distance_m)
-    on, before = np.abs(distance_m) < config.surface_m, distance_m > 2 * config.surface_m
+    on, before = np.abs(distance_m) < _ON_SURFACE_M, distance_m > 2 * _ON_SURFACE_M
     return config.surface_weight * (on.astype(np.float32) - before)
 
 
 def cut(
     patch: Patch,
     log_odds: np.ndarray,
-    config: SegmentationConfig,
     *,
     start: np.ndarray | None = None,
-    sure: np.ndarray | None = None,
-    barred: np.ndarray | None = None,
+    seeds: np.ndarray | None = None,
+    background: np.ndarray | None = None,
 ) -> np.ndarray:
-    """(h, w) probability of the object, by a random walk; ``sure`` and ``barred`` (h, w) bool are given."""
+    """(h, w) probability of the object, by a random walk; ``seeds`` and ``background`` (h, w) bool are certain."""
     target = (log_odds > 0).astype(np.float32)
-    strength = (config.evidence_strength * np.tanh(np.abs(log_odds) / 2)).astype(np.float32)
-    for given, value in ((sure, 1), (barred, 0)):
+    strength = (_EVIDENCE * np.tanh(np.abs(log_odds) / 2)).astype(np.float32)
+    for given, value in ((seeds, 1), (background, 0)):
         if given is not None:
             target[given], strength[given] = value, 1
     start = 0.25 + 0.5 * target if start is None else start
-    return random_walk.walk(target, strength, patch.ties, start, config.iterations)
+    return random_walk.walk(target, strength, patch.edge_weights, start)
 
 
-def carried(was: np.ndarray, before: Patch, patch: Patch) -> tuple[np.ndarray, np.ndarray]:
-    """A share (h, w) of the patch before and its depth, carried along by the optical flow to this patch."""
+def warped(was: np.ndarray, before: Patch, patch: Patch) -> tuple[np.ndarray, np.ndarray]:
+    """A mask (h, w) of the patch before, in [0, 1], and its depth, warped by the optical flow to this patch."""
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(patch.gray, before.gray, None)
     v, u = np.mgrid[: patch.shape[0], : patch.shape[1]]
     at = flow + np.stack([u, v], -1).astype(np.float32)
-    share = cv2.remap(was.astype(np.float32), at, None, cv2.INTER_LINEAR, borderValue=0)
-    return share, cv2.remap(before.depth_m, at, None, cv2.INTER_NEAREST, borderValue=0)
+    mask = cv2.remap(was.astype(np.float32), at, None, cv2.INTER_LINEAR, borderValue=0)
+    return mask, cv2.remap(before.depth_m, at, None, cv2.INTER_NEAREST, borderValue=0)

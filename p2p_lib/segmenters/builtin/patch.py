@@ -1,4 +1,4 @@
-"""A rectangle of an RGB-D picture on a small grid, on which segmentation is cheap; and its geometry."""
+"""A rectangle of an RGB-D image on a small grid, on which segmentation is cheap, and its geometry."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SUPPORTS = 0.2
 
 @dataclass(frozen=True)
 class Box:
-    """Columns [left, right) and rows [top, bottom) of a picture."""
+    """Columns [left, right) and rows [top, bottom) of an image."""
 
     left: int
     top: int
@@ -37,12 +37,12 @@ class Box:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """To index a picture with."""
+        """To index an image with."""
         return np.s_[self.top : self.bottom, self.left : self.right]
 
 
 def around(centre: np.ndarray, half: np.ndarray, shape: tuple[int, int]) -> Box:
-    """The box of ``half`` (x, y) to each side of a centre (x, y), cut to the picture; never empty."""
+    """The box of ``half`` (x, y) to each side of a centre (x, y), cut to the image; never empty."""
     size = np.array(shape[::-1])
     low = np.clip(np.floor(centre - half).astype(int), 0, size - 2)
     high = np.clip(np.ceil(centre + half).astype(int) + 1, low + 2, size)
@@ -98,23 +98,23 @@ class Patch:
         return smooth
 
     @cached_property
-    def ties(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of neighbours, see :func:`p2p_lib.segmenters.builtin.random_walk.ties`."""
+    def edge_weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of neighbours, see :func:`p2p_lib.segmenters.builtin.random_walk.edge_weights`."""
         lab = cv2.cvtColor(self.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
-        return random_walk.ties(lab, self.depth_m, self.step_m)
+        return random_walk.edge_weights(lab, self.depth_m, self.step_m)
 
     @property
     def shape(self) -> tuple[int, int]:
         """(h, w) of the grid."""
         return self.depth_m.shape
 
-    def down(self, picture: np.ndarray) -> np.ndarray:
-        """A float picture (H, W), averaged onto the grid."""
-        return cv2.resize(picture[self.box.slices], self.shape[::-1], interpolation=cv2.INTER_AREA)
+    def down(self, image: np.ndarray) -> np.ndarray:
+        """A float image (H, W), averaged onto the grid."""
+        return cv2.resize(image[self.box.slices], self.shape[::-1], interpolation=cv2.INTER_AREA)
 
-    def nearest(self, picture: np.ndarray) -> np.ndarray:
-        """A picture (H, W) on the grid, each pixel that of its nearest."""
-        return cv2.resize(picture[self.box.slices], self.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    def nearest(self, image: np.ndarray) -> np.ndarray:
+        """An image (H, W) on the grid, each pixel that of its nearest."""
+        return cv2.resize(image[self.box.slices], self.shape[::-1], interpolation=cv2.INTER_NEAREST)
 
     def up(self, values: np.ndarray) -> np.ndarray:
         """Values (h, w) of the grid at the pixels of the box."""
@@ -122,17 +122,17 @@ class Patch:
         return cv2.resize(values.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
 
     def grid(self, uv_px: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of the picture as nearest columns and rows of the grid; those outside it are left out."""
+        """Pixels (N, 2) of the image as nearest columns and rows of the grid; those outside it are left out."""
         (h, w), size = self.shape, np.array(self.box.shape[::-1])
         at = (np.asarray(uv_px, float) - [self.box.left, self.box.top] + 0.5) * (np.array([w, h]) / size) - 0.5
         at = np.rint(at).astype(int)
         return at[((at >= 0) & (at < [w, h])).all(1)]
 
     def dots(self, uv_px: np.ndarray, radius: int) -> np.ndarray:
-        """(h, w) bool: squares around pixels of the picture."""
+        """(h, w) bool: squares around pixels of the image."""
         at, dots = self.grid(uv_px), np.zeros(self.shape, bool)
         dots[at[:, 1], at[:, 0]] = True
-        return grown(dots, radius)
+        return dilated(dots, radius)
 
     def border(self) -> np.ndarray:
         """(h, w) bool: the outermost pixels."""
@@ -148,7 +148,7 @@ class Patch:
         return (u - self.camera.cx) / self.camera.fx, (v - self.camera.cy) / self.camera.fy
 
 
-def grown(region: np.ndarray, radius: int) -> np.ndarray:
+def dilated(region: np.ndarray, radius: int) -> np.ndarray:
     """A region (h, w) bool with ``radius`` pixels around it."""
     return cv2.dilate(region.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
 

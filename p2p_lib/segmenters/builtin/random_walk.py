@@ -1,26 +1,26 @@
-"""Cutting a picture in two: a random walker with priors (Grady 2005) on a small RGB-D grid.
+"""Cutting an image in two: a random walker with priors (Grady 2005) on a small RGB-D grid.
 
-Every pixel pulls towards object or background by its own evidence and is tied to its neighbours, the
-less the more colour and depth change between them. The answer is the probability that a walker who
-starts at the pixel and prefers strong ties ends at the object: the minimum of a quadratic energy.
+Every pixel is pulled towards object or background by its own evidence and tied to its neighbours, less
+where colour and depth change between them. The answer is the probability that a walker who
+starts at the pixel and prefers large edge weights ends at the object: the minimum of a quadratic energy.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Weight of a tie across the strongest edge: no pixel is ever quite alone.
+#: Edge weight across the strongest contrast: no pixel is ever quite alone.
 _LOOSE = 1e-4
-#: A tie between a measured and an unmeasured pixel: depth is missing mostly beside silhouettes.
+#: Factor of the edge weight between a measured and an unmeasured pixel: depth is missing mostly beside silhouettes.
 _INTO_THE_UNMEASURED = 0.05
-#: The walk ends when the preconditioned residual falls below this.
-_SETTLED = 1e-6
+#: Conjugate gradients end when the residual falls below this, or after so many steps.
+_SETTLED, _STEPS = 2e-3, 40
 
 
-def ties(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def edge_weights(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weights in (0, 1] of neighbours along a row (H, W-1) and along a column (H-1, W).
 
-    colour (H, W, C) float, its contrast is judged by the picture's own mean; depth_m (H, W), 0 = not measured;
+    colour (H, W, C) float, its contrast is judged by the image's own mean; depth_m (H, W), 0 = not measured;
     step_m (H, W): a depth step of this size is an edge.
     """
     across = colour[:, 1:] - colour[:, :-1], colour[1:] - colour[:-1]
@@ -39,41 +39,27 @@ def ties(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[n
 def walk(
     target: np.ndarray,
     strength: np.ndarray,
-    ties: tuple[np.ndarray, np.ndarray],
+    weights: tuple[np.ndarray, np.ndarray],
     start: np.ndarray,
-    iterations: int,
+    steps: int = _STEPS,
 ) -> np.ndarray:
-    """(H, W) float32 in [0, 1]: the x that minimises sum strength (x - target)^2 + sum ties (x_i - x_j)^2.
+    """(H, W) float32 in [0, 1]: the x that minimises sum strength (x - target)^2 + sum weights (x_i - x_j)^2.
 
     target, strength (H, W) float32, the latter at least 0; ``start`` is where the conjugate gradients begin.
     """
-    across, down = ties
-    degree = strength.copy()
-    degree[:, :-1] += across
-    degree[:, 1:] += across
-    degree[:-1] += down
-    degree[1:] += down
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import cg
 
-    def apply(x: np.ndarray) -> np.ndarray:
-        y = degree * x
-        y[:, :-1] -= across * x[:, 1:]
-        y[:, 1:] -= across * x[:, :-1]
-        y[:-1] -= down * x[1:]
-        y[1:] -= down * x[:-1]
-        return y
-
-    inverse = 1 / (degree + 1e-9)
-    x = start.astype(np.float32)
-    residual = strength * target - apply(x)
-    step = scaled = inverse * residual
-    size = float((residual * scaled).sum())
-    for _ in range(iterations):
-        if size < _SETTLED:
-            break
-        image = apply(step)
-        length = size / float((step * image).sum())
-        x, residual = x + length * step, residual - length * image
-        scaled = inverse * residual
-        size, before = float((residual * scaled).sum()), size
-        step = scaled + (size / before) * step
-    return np.clip(x, 0, 1)
+    columns = target.shape[1]
+    right, below = np.pad(weights[0], ((0, 0), (0, 1))).ravel()[:-1], weights[1].ravel()
+    degree = strength.ravel() + np.float32(1e-9)
+    degree[:-1] += right
+    degree[1:] += right
+    degree[:-columns] += below
+    degree[columns:] += below
+    laplacian = diags_array([degree, -right, -right, -below, -below], offsets=[0, 1, -1, columns, -columns])
+    evidence, first = (strength * target).ravel(), start.ravel().astype(np.float32)
+    x, _ = cg(
+        laplacian, evidence, first, rtol=0, atol=_SETTLED, maxiter=steps, M=diags_array([1 / degree], offsets=[0])
+    )
+    return np.clip(x.reshape(target.shape), 0, 1)

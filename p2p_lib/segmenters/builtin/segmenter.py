@@ -1,7 +1,7 @@
 """Which pixels belong to which object (input of the paper: "a segmentation mask of each object").
 
 A segmenter takes a few clicks on each object in some frame and labels every frame from there on, causally.
-The embedded one needs no weights: evidence of colour, depth and geometry, of where the object was a
+The built-in one needs no weights: evidence of colour, depth and geometry, of where the object was a
 frame ago and of what the rest of the pipeline knows, is weighed per pixel and cut along edges by a random
 walker (:mod:`p2p_lib.segmenters.builtin.random_walk`). It labels measured pixels alone: without depth nothing can be
 lifted, and depth is missing just where a silhouette is doubtful.
@@ -12,28 +12,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import check_clicks, check_depth, depths_at
+from p2p_lib.core.clicks import checked_clicks, depths_at
 from p2p_lib.core.config import SegmentationConfig
+from p2p_lib.core.image import bounds
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
-from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, carried, cut
-from p2p_lib.segmenters.builtin.patch import Box, Patch, around, connected, grown, support_plane
+from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
+from p2p_lib.segmenters.builtin.patch import Box, Patch, around, connected, dilated, support_plane
 
 #: Room around an object, besides a share of its size: small ones move by pixels too.
 _ROOM_PX = 6
-#: How fast the largest area and size shown are forgotten, per frame: half in about 140.
-_FADES = 0.995
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Where an object was: mask (rows, columns) bool of a box of the picture, and the depth (m) of its middle."""
+    """Where an object was: mask (rows, columns) bool of a box of the image, and the depth (m) of its middle."""
 
     box: Box
     mask: np.ndarray
@@ -46,13 +44,11 @@ class _Target:
 
     seen     in the newest frame; None while it is absent
     colours  (4096,) shares of the colours it has shown; None if it has not been seen yet
-    area_m2  how much of it showed at most, lately
-    size_m   (2,) its width and height, likewise
+    size_m   (2,) its largest width and height so far
     """
 
     seen: _Seen | None = None
     colours: np.ndarray | None = None
-    area_m2: float = 0.0
     size_m: np.ndarray | None = None
 
 
@@ -79,9 +75,7 @@ class BuiltinSegmenter:
         hints: Mapping[str, Hint] | None = None,
     ) -> np.ndarray:
         """One frame in, one label image out; where two objects claim a pixel the likelier one has it."""
-        new = {name: check_clicks(name, at, self.camera) for name, at in (clicks or {}).items()}
-        for name, at in new.items():
-            check_depth(name, at, frame)
+        new = checked_clicks(clicks or {}, self.camera, frame)
         found: dict[str, tuple[Box, np.ndarray] | None] = {}
         for name, target in self._targets.items():
             hint = (hints or {}).get(name) or Hint()
@@ -96,7 +90,7 @@ class BuiltinSegmenter:
         del self._targets[name]
 
     def _shared_out(self, frame: Frame, found: Mapping[str, tuple[Box, np.ndarray] | None]) -> np.ndarray:
-        """The label image of what was found of every object: its probability in a box of the picture."""
+        """The label image of what was found of every object: its probability in a box of the image."""
         labels, best = np.zeros(frame.shape, np.int32), np.full(frame.shape, 0.5, np.float32)
         for label, name in enumerate(self._targets, 1):
             if found[name] is not None:
@@ -105,49 +99,51 @@ class BuiltinSegmenter:
                 wins = (x > likeliest) & (frame.depth_m[box.slices] > 0)
                 part[wins], likeliest[wins] = label, x[wins]
         for label, (name, target) in enumerate(self._targets.items(), 1):
-            seen = self._seen(frame, found[name][0], labels, label) if found[name] is not None else None
-            self._targets[name] = self._remembering(frame, target, seen)
-            if seen is not None and self._targets[name].seen is None:
-                labels[seen.box.slices][seen.mask] = 0
+            mask = labels == label
+            seen = _seen(frame, mask) if mask.sum() >= self.config.min_px else None
+            self._targets[name] = self._updated(frame, target, seen)
+            if seen is None:
+                labels[mask] = 0
         self._previous = frame
         return labels
 
     def _start(self, frame: Frame, clicks: np.ndarray, others: np.ndarray) -> tuple[Box, np.ndarray]:
-        """From clicks, and those on other objects: in a wide box at low resolution, then twice in one that fits."""
+        """From clicks, and those on other objects: in a wide box at low resolution, then in one that fits."""
         cfg = self.config
         z_m = float(np.median(depths_at(clicks, frame)))
         box = around(clicks.mean(0), np.maximum(cfg.reach_m * self._focal_px / z_m, 2 * np.ptp(clicks, 0)), frame.shape)
-        patch, start = Patch.of(frame, box, self.camera, cfg), None
+        patch = Patch.of(frame, box, self.camera, cfg)
         plane = support_plane(patch, patch.depth_m > 0, self._rng)
-        for closer in (True, True, False):
-            seeds, barred = patch.dots(clicks, 1), patch.dots(others, 1) | patch.border()
-            by_depth, _ = by_geometry(patch, seeds, plane, cfg)
-            x = self._cut_and_learn(patch, by_depth, seeds, barred & ~seeds, start)
-            if closer:
-                box = self._fitting(patch, x > 0.5, frame)
-                whole = np.zeros(frame.shape, np.float32)
-                whole[patch.box.slices] = patch.up(x)
-                patch = Patch.of(frame, box, self.camera, cfg)
-                start = patch.down(whole)
-        return box, patch.up(x)
+        seeds = patch.dots(clicks, 1)
+        x = self._cut_out(patch, plane, seeds, others, dilated(seeds, 2), ~dilated(seeds, min(seeds.shape) // 6))
+        whole = np.zeros(frame.shape, np.float32)
+        whole[box.slices] = patch.up(x)
+        patch = Patch.of(frame, self._fitting(patch, x > 0.5, frame), self.camera, cfg)
+        was = patch.down(whole)
+        x = self._cut_out(patch, plane, patch.dots(clicks, 1), others, was > 0.5, was < 0.5, was)
+        return patch.box, patch.up(x)
 
-    def _cut_and_learn(
-        self, patch: Patch, by_depth: np.ndarray, seeds: np.ndarray, barred: np.ndarray, x: np.ndarray | None
+    def _cut_out(
+        self,
+        patch: Patch,
+        plane: np.ndarray | None,
+        seeds: np.ndarray,
+        others: np.ndarray,
+        inside: np.ndarray,
+        outside: np.ndarray,
+        start: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Cut, learn the colours of both sides, and again; what does not hang together with the seeds is let go."""
-        inside, outside = grown(seeds, 2), ~grown(seeds, min(seeds.shape) // 6)
-        for _ in range(self.config.start_rounds):
-            if x is not None:
-                inside, outside = x > 0.5, x < 0.5
-            colour = by_colour(patch, histogram(patch.codes[inside]), outside, self.config)
-            x = cut(patch, by_depth + colour, self.config, start=x, sure=seeds, barred=barred)
-        return _only(x, seeds)
+        """(h, w) probability of what is connected with the seeds; colours are those ``inside`` and ``outside``."""
+        background = (patch.dots(others, 1) | patch.border()) & ~seeds
+        by_depth, _ = by_geometry(patch, seeds, plane, self.config)
+        colour = by_colour(patch, histogram(patch.codes[inside]), outside, self.config)
+        return _only(cut(patch, by_depth + colour, start=start, seeds=seeds, background=background), seeds)
 
     def _fitting(self, patch: Patch, inside: np.ndarray, frame: Frame) -> Box:
         """A box with room around what is ``inside`` a patch."""
-        rows, cols = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
+        rows, columns = bounds(inside)
         scale = np.array(patch.box.shape[::-1]) / patch.shape[::-1]
-        low, high = np.array([cols[0], rows[0]]) * scale, np.array([cols[-1] + 1, rows[-1] + 1]) * scale
+        low, high = np.array([columns.start, rows.start]) * scale, np.array([columns.stop, rows.stop]) * scale
         half = (high - low) / 2 * (1 + 2 * self.config.margin) + _ROOM_PX
         return around((low + high) / 2 + [patch.box.left, patch.box.top], half, frame.shape)
 
@@ -158,18 +154,18 @@ class BuiltinSegmenter:
         patch, before = (Patch.of(f, box, self.camera, cfg) for f in (frame, self._previous))
         mask = np.zeros(frame.shape, np.float32)
         mask[seen.box.slices] = seen.mask
-        prior, z_before = carried(before.down(mask), before, patch)
+        prior, z_before = warped(before.down(mask), before, patch)
         measured = (patch.depth_m > 0) & (z_before > 0)
         jumped = measured & (prior > 0.5) & (np.abs(patch.depth_m - z_before) > patch.step_m)
         core = (prior > 0.8) & ~jumped
         plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
-        log_odds, body = by_geometry(patch, core, plane, cfg)
-        stays = cfg.prior_weight * (2 * cv2.GaussianBlur(prior, (0, 0), 1.5) - 1)
-        # Parts that come into view hang together with those that were seen before.
-        log_odds += np.where(body, np.maximum(stays, 0), stays)
-        log_odds[jumped] -= cfg.contradiction
-        log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~body, cfg) + by_surface(patch, hint, cfg)
-        return box, patch.up(_only(cut(patch, log_odds, cfg, start=prior), core))
+        log_odds, component = by_geometry(patch, core, plane, cfg)
+        stays = cfg.prior_weight * (2 * prior - 1)
+        # Parts that come into view are connected with those that were seen before.
+        log_odds += np.where(component, np.maximum(stays, 0), stays)
+        log_odds[jumped] -= cfg.geometry_weight
+        log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
+        return box, patch.up(_only(cut(patch, log_odds, start=prior), core))
 
     def _find(self, frame: Frame, target: _Target, hint: Hint) -> tuple[Box, np.ndarray] | None:
         """Where enough of its points have come back."""
@@ -182,11 +178,12 @@ class BuiltinSegmenter:
         box = around((low + high) / 2, half, frame.shape)
         patch = Patch.of(frame, box, self.camera, cfg)
         seeds, surface = patch.dots(hint.uv_px, 1) & (patch.depth_m > 0), by_surface(patch, hint, cfg)
-        outside = ~grown(seeds | (surface > 0), 3)
+        outside = ~dilated(seeds | (surface > 0), 3)
         plane = support_plane(patch, (patch.depth_m > 0) & outside, self._rng)
-        log_odds, body = by_geometry(patch, seeds, plane, cfg)
-        colour = by_colour(patch, target.colours, outside & ~body, cfg)
-        x = _only(cut(patch, log_odds + surface + colour, cfg, sure=seeds, barred=patch.border() & ~seeds), seeds)
+        log_odds, component = by_geometry(patch, seeds, plane, cfg)
+        colour = by_colour(patch, target.colours, outside & ~component, cfg)
+        background = patch.border() & ~seeds
+        x = _only(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
         own_colours = colour[x > 0.5]
         return (box, patch.up(x)) if len(own_colours) and own_colours.mean() > 0 else None
 
@@ -198,30 +195,23 @@ class BuiltinSegmenter:
         centre = np.array([seen.box.left, seen.box.top]) + extent / 2
         return around(centre, half * (1 + self.config.margin) + _ROOM_PX, shape)
 
-    def _seen(self, frame: Frame, box: Box, labels: np.ndarray, label: int) -> _Seen | None:
-        mask = labels[box.slices] == label
-        rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        if not len(rows):
-            return None
-        fit = Box(box.left + cols[0], box.top + rows[0], box.left + cols[-1] + 1, box.top + rows[-1] + 1)
-        mask = labels[fit.slices] == label
-        return _Seen(fit, mask, float(np.median(frame.depth_m[fit.slices][mask])))
-
-    def _remembering(self, frame: Frame, target: _Target, seen: _Seen | None) -> _Target:
-        """What is known of an object after a frame; too little of it to be sure counts as nothing."""
-        cfg = self.config
+    def _updated(self, frame: Frame, target: _Target, seen: _Seen | None) -> _Target:
+        """What is known of an object after a frame."""
         if seen is None:
             return replace(target, seen=None)
-        pixel_m = seen.z_m / self._focal_px
-        area_m2, size_m = float(seen.mask.sum() * pixel_m.prod()), np.array(seen.mask.shape[::-1]) * pixel_m
-        if seen.mask.sum() < cfg.min_px or area_m2 < cfg.min_share * target.area_m2:
-            return replace(target, seen=None)
+        size_m = np.array(seen.mask.shape[::-1]) * seen.z_m / self._focal_px
         colours = histogram(colour_codes(frame.rgb[seen.box.slices][seen.mask]))
         if target.colours is None:
-            return _Target(seen, colours, area_m2, size_m)
-        colours = (1 - cfg.colour_rate) * target.colours + cfg.colour_rate * colours
-        area_m2, size_m = max(area_m2, _FADES * target.area_m2), np.maximum(size_m, _FADES * target.size_m)
-        return _Target(seen, colours, area_m2, size_m)
+            return _Target(seen, colours, size_m)
+        rate = self.config.colour_rate
+        return _Target(seen, (1 - rate) * target.colours + rate * colours, np.maximum(size_m, target.size_m))
+
+
+def _seen(frame: Frame, mask: np.ndarray) -> _Seen:
+    """Where a mask (H, W) lies in a frame."""
+    rows, columns = bounds(mask)
+    box = Box(columns.start, rows.start, columns.stop, rows.stop)
+    return _Seen(box, mask[rows, columns], float(np.median(frame.depth_m[mask])))
 
 
 def _only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:

@@ -1,9 +1,8 @@
-"""How a point looks: patches that are found again to a fraction of a pixel under an affine change of view.
+"""Appearance of points: patches that are found again with subpixel accuracy under an affine change of view.
 
 A patch is aligned by the inverse compositional algorithm (Baker and Matthews, "Lucas-Kanade 20 years
 on", IJCV 2004) with a window weight and invariance to gain, offset and slope of the light; all points
-in one batch. What does not change from frame to frame, the pseudo-inverse of its steepest descent
-images, is computed once when the patch is taken.
+in one batch. The pseudo-inverse of its steepest descent images is computed once, when the patch is taken.
 """
 
 from __future__ import annotations
@@ -20,11 +19,13 @@ _Y, _X = (a.ravel().astype(np.float32) for a in np.mgrid[-RADIUS : RADIUS + 1, -
 _GRID = np.stack([_X, _Y])  # (2, P)
 _WEIGHT = np.exp(-0.5 * (_X**2 + _Y**2) / WINDOW_PX**2).astype(np.float32)
 _ROOT = np.sqrt(_WEIGHT / _WEIGHT.sum())
-# A round body's shading stays where it is in the picture while its print moves on.
+# Shading of a round object stays in place in the image while its texture moves: patches are invariant to slopes.
 _RAMPS = np.stack([_X, _Y]) * _ROOT
 _RAMPS /= np.linalg.norm(_RAMPS, axis=1, keepdims=True)
-#: Independent samples that a patch is worth: neighbouring pixels share their noise.
+#: Effective number of independent samples in a patch: neighbouring pixels share their noise.
 _SAMPLES = 10.0
+#: Ratio of areas beyond which an alignment has diverged.
+_MAX_AREA_CHANGE = 5.0
 #: Damping of an affine and of a translational step, in units of the normalised patch.
 _DAMP = np.diag(np.float32([1e-4] * 2 + [0.05] * 4))
 
@@ -35,15 +36,13 @@ class Patches:
 
     pixels    (N, P) weighted, zero mean, unit length
     solver    (N, 6, P) takes a difference of pixels to the step [translation px, affine]
-    spread    (N, 2, 2) covariance of the translation per unit of the residual's variance, px^2
-    mean      (N,) of the grey values
-    contrast  (N,) their standard deviation
+    unit_cov  (N, 2, 2) covariance of the translation per unit of the residual's variance, px^2
+    contrast  (N,) standard deviation of the grey values
     """
 
     pixels: np.ndarray
     solver: np.ndarray
-    spread: np.ndarray
-    mean: np.ndarray
+    unit_cov: np.ndarray
     contrast: np.ndarray
 
     def __len__(self) -> int:
@@ -58,9 +57,9 @@ class Patches:
 
     @classmethod
     def empty(cls, shape: tuple[int, ...]) -> Patches:
-        """Room for patches, ``shape`` of them."""
+        """Zeros for patches, ``shape`` of them."""
         p = _SIDE**2
-        return cls(*(np.zeros(shape + tail, np.float32) for tail in ((p,), (6, p), (2, 2), (), ())))
+        return cls(*(np.zeros(shape + tail, np.float32) for tail in ((p,), (6, p), (2, 2), ())))
 
 
 def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:
@@ -70,7 +69,7 @@ def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:
     raw = _sample(image, uv_px.astype(np.float32), np.stack([x, y])).reshape(n, side, side)
     gx = 0.5 * (raw[:, 1:-1, 2:] - raw[:, 1:-1, :-2]).reshape(n, _SIDE**2)
     gy = 0.5 * (raw[:, 2:, 1:-1] - raw[:, :-2, 1:-1]).reshape(n, _SIDE**2)
-    pixels, mean, norm = _normalised(raw[:, 1:-1, 1:-1].reshape(n, _SIDE**2))
+    pixels, norm = _normalised(raw[:, 1:-1, 1:-1].reshape(n, _SIDE**2))
     J = np.stack([gx, gy, gx * _X, gx * _Y, gy * _X, gy * _Y], 1) * (_ROOT / norm[:, None, None])
     # What a change of offset, slope or gain explains is not evidence of motion.
     J -= (J @ _ROOT)[..., None] * _ROOT
@@ -78,52 +77,50 @@ def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:
     J -= (J @ pixels[..., None]) * pixels[:, None]
     H = J @ J.transpose(0, 2, 1)
     inverse = np.linalg.inv(H + _DAMP)
-    return Patches(pixels, inverse @ J, inverse[:, :2, :2], mean, norm)
+    return Patches(pixels, inverse @ J, inverse[:, :2, :2], norm)
 
 
 @dataclass(eq=False)
 class Alignment:
     """Where patches were found.
 
-    uv_px     (N, 2), A (N, 2, 2): the patch's offset x lies at uv + A x
-    ncc       (N,) weighted normalised cross correlation, -1 to 1; -1 where the search left the picture
-    cov_px2   (N, 2, 2) covariance of the place: long along an edge
-    lighter   (N,) change of the mean grey value
-    stronger  (N,) ratio of the contrasts
+    uv_px           (N, 2), A (N, 2, 2): the patch's offset x lies at uv + A x
+    ncc             (N,) weighted normalised cross correlation, -1 to 1; -1 where the alignment diverged
+    cov_px2         (N, 2, 2) covariance of uv_px: long along an edge
+    contrast_ratio  (N,) of the image to the patch
     """
 
     uv_px: np.ndarray
     A: np.ndarray
     ncc: np.ndarray
     cov_px2: np.ndarray
-    lighter: np.ndarray
-    stronger: np.ndarray
+    contrast_ratio: np.ndarray
 
 
-def align(image: np.ndarray, patches: Patches, uv_px: np.ndarray, A: np.ndarray, iterations: int) -> Alignment:
+def align(image: np.ndarray, patches: Patches, uv_px: np.ndarray, A: np.ndarray, iterations: int = 4) -> Alignment:
     """Find each patch near uv_px (N, 2), seen under about A (N, 2, 2), in a float32 grey image."""
     uv, A = uv_px.astype(np.float32), A.astype(np.float32)
     height, width = image.shape
-    start, eye = uv.copy(), np.eye(2, dtype=np.float32)
+    start, identity = uv.copy(), np.eye(2, dtype=np.float32)
     for _ in range(iterations):
-        seen, *_ = _normalised(_sample(image, uv, A @ _GRID))
+        seen, _ = _normalised(_sample(image, uv, A @ _GRID))
         step = (patches.solver @ (seen - patches.pixels)[..., None])[..., 0]
-        # A step is trusted as far as the linearisation reaches: some pixels, some tenths of scale.
+        # The linearisation holds for a few pixels and a few tenths of scale.
         shift = np.linalg.norm(step[:, :2], axis=1, keepdims=True)
         step[:, :2] *= np.minimum(1, 3 / np.maximum(shift, 1e-6))
         D = np.clip(step[:, 2:], -0.25, 0.25).reshape(-1, 2, 2)
-        A = A @ _inverse(eye + D)
+        A = A @ _inverse(identity + D)
         uv = uv - (A @ step[:, :2, None])[..., 0]
-    pixels, mean, contrast = _normalised(_sample(image, uv, A @ _GRID))
+    pixels, contrast = _normalised(_sample(image, uv, A @ _GRID))
     ncc = np.einsum("np,np->n", pixels, patches.pixels)
     inside = (uv >= 0).all(1) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1)
-    stretch = np.abs(np.linalg.det(A))
-    sane = inside & np.isfinite(A).all((1, 2)) & (stretch > 0.05) & (stretch < 20)
-    uv, A = np.where(sane[:, None], uv, start), np.where(sane[:, None, None], A, eye)
-    ncc = np.where(sane, ncc, -1.0)
+    area = np.abs(np.linalg.det(A))
+    found = inside & np.isfinite(A).all((1, 2)) & (area > 1 / _MAX_AREA_CHANGE) & (area < _MAX_AREA_CHANGE)
+    uv, A = np.where(found[:, None], uv, start), np.where(found[:, None, None], A, identity)
+    ncc = np.where(found, ncc, -1.0)
     variance = 2 * np.maximum(1 - ncc, 0.01) / _SAMPLES
-    cov = A @ (variance[:, None, None] * patches.spread) @ A.transpose(0, 2, 1)
-    return Alignment(uv, A, ncc, cov, mean - patches.mean, contrast / patches.contrast)
+    cov = A @ (variance[:, None, None] * patches.unit_cov) @ A.transpose(0, 2, 1)
+    return Alignment(uv, A, ncc, cov, contrast / patches.contrast)
 
 
 def _sample(image: np.ndarray, uv: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -135,17 +132,17 @@ def _sample(image: np.ndarray, uv: np.ndarray, offsets: np.ndarray) -> np.ndarra
     return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted, without mean and slope, unit length; and the weighted mean and standard deviation (N,) before."""
+def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted, without mean and slope, unit length; and the standard deviation (N,) before."""
     mean = raw @ (_ROOT**2)
     centred = (raw - mean[:, None]) * _ROOT
     centred -= (centred @ _RAMPS.T) @ _RAMPS
     norm = np.sqrt(np.maximum(np.einsum("np,np->n", centred, centred), 1.0))
-    return centred / norm[:, None], mean, norm
+    return centred / norm[:, None], norm
 
 
 def _inverse(A: np.ndarray) -> np.ndarray:
-    """Inverses of (N, 2, 2), by hand: LAPACK calls cost more than the batch."""
+    """Inverses of (N, 2, 2), in closed form: LAPACK's overhead exceeds the work."""
     det = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
     det = np.where(np.abs(det) < 1e-6, 1e-6, det)
     out = np.empty_like(A)

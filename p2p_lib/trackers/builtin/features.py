@@ -1,26 +1,28 @@
-"""Corners with descriptors of the surface they lie on, to find bodies again anywhere in the picture.
+"""Corners and their descriptors on the surface, for guided and global re-detection.
 
 The descriptor is of the family of SIFT: half-rectified gradients in eight directions, pooled in 4 x 4
-cells turned to the corner's dominant direction. It is not taken in the picture but on the surface's
-tangent plane, in millimetres (as the viewpoint invariant patches of Wu et al., CVPR 2008): the depth
-picture takes scale and slant out. All corners are described in one batch of matrix products.
+cells turned to the corner's dominant direction. It is sampled on the surface's tangent plane, in
+millimetres (as the viewpoint invariant patches of Wu et al., CVPR 2008), so that the depth image
+removes scale and slant. All corners are described in one batch of matrix products.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 _DIRECTIONS, _CELLS, _SAMPLES = 8, 4, 16
 SIZE = _DIRECTIONS * _CELLS**2
-_TURNS = [(np.float32(np.cos(a)), np.float32(np.sin(a))) for a in 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS]
+_ANGLES = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+_DIRECTION_VECTORS = [(np.float32(np.cos(a)), np.float32(np.sin(a))) for a in _ANGLES]
 _AXIS = np.arange(_SAMPLES) - (_SAMPLES - 1) / 2
 _GRID = np.stack(np.meshgrid(_AXIS, _AXIS)).reshape(2, -1).astype(np.float32)
 _RADIUS = _AXIS[-1]
-_MARGIN = 14
-#: Half a picture of 640 x 480.
+#: Places that a landmark may match.
+_PLACES = 2
+#: Room around a region in which gradients are computed.
+_MARGIN_PX = 14
+#: Half an image of 640 x 480.
 _LARGE_PX = 150_000
 
 
@@ -38,16 +40,21 @@ _POOL, _ROUND = _pooling()
 
 
 def detect(gray: np.ndarray, region: np.ndarray | None, limit: int) -> np.ndarray:
-    """The strongest corners (M, 2) of a uint8 picture, at most ``limit``, inside ``region`` (H, W) bool if given.
+    """The strongest corners (M, 2) of a uint8 image, at most ``limit``, inside ``region`` (H, W) bool if given.
 
-    In more than :data:`_LARGE_PX` pixels on half the resolution: a fraction of the time.
+    Regions of more than :data:`_LARGE_PX` pixels are searched at half the resolution, for speed.
     """
     x0, y0, x1, y1 = 0, 0, gray.shape[1], gray.shape[0]
     if region is not None:
         x, y, w, h = cv2.boundingRect(region.view(np.uint8))
         if not w:
             return np.zeros((0, 2), np.float32)
-        x0, y0, x1, y1 = max(0, x - _MARGIN), max(0, y - _MARGIN), min(x1, x + w + _MARGIN), min(y1, y + h + _MARGIN)
+        x0, y0, x1, y1 = (
+            max(0, x - _MARGIN_PX),
+            max(0, y - _MARGIN_PX),
+            min(x1, x + w + _MARGIN_PX),
+            min(y1, y + h + _MARGIN_PX),
+        )
     part, step = gray[y0:y1, x0:x1], 1 + ((x1 - x0) * (y1 - y0) > _LARGE_PX)
     # pyrDown keeps every other pixel where it is.
     level = cv2.pyrDown(part) if step == 2 else part
@@ -59,9 +66,9 @@ def detect(gray: np.ndarray, region: np.ndarray | None, limit: int) -> np.ndarra
 
 
 def describe(gray: np.ndarray, uv_px: np.ndarray, step_px: np.ndarray) -> np.ndarray:
-    """Descriptors (M, SIZE) float32, unit length, of what surrounds uv_px in a uint8 picture.
+    """Descriptors (M, SIZE) float32, unit length, of the surroundings of uv_px in a uint8 image.
 
-    step_px  (M, 2, 2): columns are the steps of the sampling grid, in pixels; they say how the surface lies
+    step_px  (M, 2, 2): columns are the steps of the sampling grid on the surface, in pixels
     """
     if not len(uv_px):
         return np.zeros((0, SIZE), np.float32)
@@ -71,11 +78,11 @@ def describe(gray: np.ndarray, uv_px: np.ndarray, step_px: np.ndarray) -> np.nda
     maps = [cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))]
     uv, M = (uv_px - [x0, y0]).astype(np.float32), step_px.astype(np.float32)
     gx, gy = _gradients(maps, uv, M)
-    angle = _dominant(np.stack([np.maximum(c * gx + s * gy, 0) @ _ROUND for c, s in _TURNS], 1))
+    angle = _dominant(np.stack([np.maximum(c * gx + s * gy, 0) @ _ROUND for c, s in _DIRECTION_VECTORS], 1))
     c, s = np.cos(angle), np.sin(angle)
     gx, gy = _gradients(maps, uv, M @ np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2).astype(np.float32))
-    raw = np.concatenate([np.maximum(c * gx + s * gy, 0) @ _POOL for c, s in _TURNS], 1)
-    # Hellinger's root tames strong edges.
+    raw = np.concatenate([np.maximum(c * gx + s * gy, 0) @ _POOL for c, s in _DIRECTION_VECTORS], 1)
+    # The square root (Hellinger kernel) keeps strong edges from dominating.
     return np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-6))
 
 
@@ -96,29 +103,21 @@ def _dominant(histogram: np.ndarray) -> np.ndarray:
     return 2 * np.pi * (peak + shift) / _DIRECTIONS
 
 
-@dataclass(frozen=True, eq=False)
-class Matches:
-    """Pairs of a landmark (row of those wanted) and a place in the picture (row of those found)."""
-
-    wanted: np.ndarray
-    found: np.ndarray
-
-
 def match(
-    wanted: np.ndarray, found: np.ndarray, uv_px: np.ndarray, rival_px: float, ratio: float, count: int
-) -> Matches:
-    """Pair descriptors wanted (Q, SIZE) with the ``count`` nearest places found (M, SIZE) at uv_px (M, 2).
+    wanted: np.ndarray, found: np.ndarray, uv_px: np.ndarray, same_px: float, ratio: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of descriptors wanted (Q, SIZE) and of places found (M, SIZE) at uv_px (M, 2) that match.
 
-    A pair counts if it is nearer than ``ratio`` times the rival: the nearest of all other places. What lies
-    within ``rival_px`` is one place. Two places serve where two objects look alike.
+    A wanted one may match its two nearest places, for two objects may look alike. Each counts if it is nearer than
+    ``ratio`` times the next best place beyond those two. Corners within ``same_px`` are one place.
     """
-    likeness = wanted @ found.T
-    rows, best, away = np.arange(len(wanted)), [], []
-    same = np.abs(uv_px[:, None] - uv_px[None]).max(-1) <= rival_px
-    for _ in range(count + 1):
-        best.append(likeness.argmax(1))
-        away.append(likeness[rows, best[-1]])
-        likeness[same[best[-1]]] = -1
-    distance = np.sqrt(np.maximum(2 - 2 * np.stack(away, 1), 0))
-    which, rank = np.nonzero(distance[:, :count] < ratio * distance[:, count:])
-    return Matches(which, np.stack(best, 1)[which, rank])
+    similarity = wanted @ found.T
+    rows, best, similarities = np.arange(len(wanted)), [], []
+    same = np.abs(uv_px[:, None] - uv_px[None]).max(-1) <= same_px
+    for _ in range(_PLACES + 1):
+        best.append(similarity.argmax(1))
+        similarities.append(similarity[rows, best[-1]])
+        similarity[same[best[-1]]] = -1
+    distance = np.sqrt(np.maximum(2 - 2 * np.stack(similarities, 1), 0))
+    which, rank = np.nonzero(distance[:, :_PLACES] < ratio * distance[:, _PLACES:])
+    return which, np.stack(best, 1)[which, rank]

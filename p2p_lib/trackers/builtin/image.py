@@ -1,4 +1,4 @@
-"""What the embedded tracker needs of a frame, prepared once."""
+"""What the tracker needs of a frame, computed once."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.image import in_image, in_mask, nearest_px
 from p2p_lib.core.types import Frame
 
+#: Pyramid levels of Lucas-Kanade above full resolution: with a window of 13 px it follows jumps of about 50 px.
+_LEVELS = 3
+
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """One frame. Places uv_px (N, 2) may lie outside of it, or be NaN.
+class Image:
+    """One frame. Pixels uv_px (N, 2) may lie outside of it, or be NaN.
 
     gray     (H, W) uint8; fine and coarse: the same and half as large, float32
     chroma   (H/4, W/4, 2) float32, CIELAB a and b
@@ -29,7 +32,7 @@ class Picture:
     camera: Camera
 
     @classmethod
-    def of(cls, frame: Frame, camera: Camera) -> Picture:
+    def of(cls, frame: Frame, camera: Camera) -> Image:
         """Of a frame taken by this camera."""
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         quarter = cv2.resize(frame.rgb, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
@@ -38,7 +41,7 @@ class Picture:
         return cls(gray, fine, coarse, chroma, frame.depth_m, camera)
 
     def chroma_at(self, uv_px: np.ndarray) -> np.ndarray:
-        """(N, 2) around places."""
+        """(N, 2) around pixels."""
         if not len(uv_px):
             return np.zeros((0, 2), np.float32)
         x, y = (np.ascontiguousarray((uv_px[:, i] + 0.5) / 4 - 0.5, np.float32)[:, None] for i in (0, 1))
@@ -50,24 +53,24 @@ class Picture:
         return self.depth_m[v, u].astype(float)
 
     def inside(self, uv_px: np.ndarray, region: np.ndarray | None = None) -> np.ndarray:
-        """(N,) bool: places in the picture, and in the region (H, W) if there is one."""
+        """(N,) bool: pixels in the image, and in the region (H, W) if there is one."""
         inside = in_image(uv_px, self.gray.shape)
         return inside if region is None else inside & in_mask(uv_px, region)
 
 
-def flow(before: Picture, after: Picture, uv_px: np.ndarray, window_px: int, levels: int) -> tuple[np.ndarray, ...]:
-    """Lucas-Kanade from places (N, 2) float32: where they went, and whether (N,) they were found.
+def flow(before: Image, after: Image, uv_px: np.ndarray, window_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lucas-Kanade from pixels (N, 2) float32: where they went, and whether (N,) they were found.
 
-    Only the part of the pictures around the places is looked at.
+    Only the part of the images around the pixels is read.
     """
     h, w = before.gray.shape
-    reach = window_px << levels
+    reach = window_px << _LEVELS
     x0, y0 = np.maximum(np.floor(uv_px.min(0)).astype(int) - reach, 0)
     x1, y1 = np.minimum(np.ceil(uv_px.max(0)).astype(int) + reach, [w, h])
     if min(x1 - x0, y1 - y0) < reach:
         x0, y0, x1, y1 = 0, 0, w, h
-    part, corner = np.s_[y0:y1, x0:x1], np.float32([x0, y0])
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
-        before.gray[part], after.gray[part], uv_px - corner, None, winSize=(window_px, window_px), maxLevel=levels
+    part, origin = np.s_[y0:y1, x0:x1], np.float32([x0, y0])
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        before.gray[part], after.gray[part], uv_px - origin, None, winSize=(window_px, window_px), maxLevel=_LEVELS
     )
-    return there + corner, found[:, 0] > 0
+    return moved + origin, found[:, 0] > 0

@@ -1,4 +1,4 @@
-"""The measured surface around pixels, as planes: what a depth picture says of points and of how they lie."""
+"""Tangent planes: the measured surface around pixels, from the depth image, and its projection."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depth_noise_m
 
 #: Half the window in which the surface around a pixel is taken for a plane, in steps.
-_PLANE = 3
-#: Readings that are farther from the nearest one, then from the plane, are of another surface; per step.
-_REACH_M, _OFF_M = 0.015, 0.006
-#: Fewer readings are no plane.
-_READINGS = 8
+_HALF_WINDOW = 3
+#: Readings farther from the pixel's own depth, then from the plane, belong to another surface (m per step).
+_REACH_M, _OFF_PLANE_M = 0.015, 0.006
+#: Fewer readings do not make a plane.
+_MIN_READINGS = 8
 
 
-def usual_camera(width: int, height: int) -> Camera:
-    """A camera with the field of view that most depth cameras have about, for pictures of an unknown one."""
+def assumed_camera(width: int, height: int) -> Camera:
+    """A camera with the field of view of common depth cameras, for streams whose camera is not given."""
     return Camera(0.95 * width, 0.95 * width, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """Measured surface at N pixels, as planes.
+class TangentPlanes:
+    """The measured surface at N pixels.
 
     p_cam    (N, 3) NaN where there is no trustworthy depth
     per_px   (N, 3, 2) displacement on the plane per pixel
@@ -35,27 +35,27 @@ class Surface:
     per_px: np.ndarray
     sigma_m: np.ndarray
 
-    def select(self, rows: np.ndarray) -> Surface:
+    def select(self, rows: np.ndarray) -> TangentPlanes:
         """The pixels at these rows or under this mask."""
-        return Surface(self.p_cam[rows], self.per_px[rows], self.sigma_m[rows])
+        return TangentPlanes(self.p_cam[rows], self.per_px[rows], self.sigma_m[rows])
 
 
-def surface_at(depth_m: np.ndarray, camera: Camera, uv_px: np.ndarray, step_px: int = 1) -> Surface:
-    """The surface behind pixels (N, 2): planes through the readings around each that hang together with it.
+def planes_at(depth_m: np.ndarray, camera: Camera, uv_px: np.ndarray, step_px: int = 1) -> TangentPlanes:
+    """The planes behind pixels (N, 2): least squares through the readings around each that lie on its surface.
 
     step_px  between the 7 x 7 readings
     """
     uv = np.asarray(uv_px, float)
     px = np.rint(uv).astype(int)
-    dy, dx = (step_px * a.ravel() for a in np.mgrid[-_PLANE : _PLANE + 1, -_PLANE : _PLANE + 1])
+    dy, dx = (step_px * a.ravel() for a in np.mgrid[-_HALF_WINDOW : _HALF_WINDOW + 1, -_HALF_WINDOW : _HALF_WINDOW + 1])
     h, w = depth_m.shape
     x, y = px[:, :1] + dx, px[:, 1:] + dy
     inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
     z = np.where(inside, depth_m[np.clip(y, 0, h - 1), np.clip(x, 0, w - 1)], 0).astype(float)
-    # Of the pixel itself, else of the nearest that has one.
+    # Depth of the pixel itself, else of the nearest one that has any.
     nearest = np.argsort(dx**2 + dy**2, kind="stable")[:21]
     z0 = z[np.arange(len(uv)), nearest[(z[:, nearest] > 0).argmax(1)]]
-    # The plane at the pixel itself: moments about it.
+    # Moments about the pixel itself: the plane's first parameter is the depth there.
     basis = np.stack([np.ones_like(x, float), x - uv[:, :1], y - uv[:, 1:]], -1)
     off, limit, plane = z - z0[:, None], _REACH_M * step_px, np.zeros((len(uv), 3))
     for _ in range(2):
@@ -63,17 +63,17 @@ def surface_at(depth_m: np.ndarray, camera: Camera, uv_px: np.ndarray, step_px: 
         weighted = basis * use[..., None]
         normal = weighted.transpose(0, 2, 1) @ basis + np.diag([1e-3, 3.0, 3.0])
         plane = np.linalg.solve(normal, (weighted * (z - z0[:, None])[..., None]).sum(1)[..., None])[..., 0]
-        off, limit = z - z0[:, None] - (basis * plane[:, None]).sum(-1), _OFF_M
+        off, limit = z - z0[:, None] - (basis * plane[:, None]).sum(-1), _OFF_PLANE_M
     count = use.sum(1)
-    known = (z0 > 0) & (count >= _READINGS)
+    known = (z0 > 0) & (count >= _MIN_READINGS)
     at_m = np.where(known, z0 + plane[:, 0], np.nan)
     spread = np.sqrt((use * off**2).sum(1) / np.maximum(count, 1))
     rays = np.column_stack([(uv[:, 0] - camera.cx) / camera.fx, (uv[:, 1] - camera.cy) / camera.fy, np.ones(len(uv))])
     across = np.zeros((len(uv), 3, 2))
     across[:, 0, 0], across[:, 1, 1] = 1 / camera.fx, 1 / camera.fy
     per_px = across * at_m[:, None, None] + rays[:, :, None] * plane[:, None, 1:]
-    # Readings nearby share their noise; where the plane does not fit, it is not known where the point is.
-    return Surface(rays * at_m[:, None], per_px, np.hypot(0.7 * depth_noise_m(at_m), spread))
+    # Neighbouring readings share their noise; where the plane does not fit, the depth is uncertain by the misfit.
+    return TangentPlanes(rays * at_m[:, None], per_px, np.hypot(0.7 * depth_noise_m(at_m), spread))
 
 
 def projection(camera: Camera, p_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -86,14 +86,14 @@ def projection(camera: Camera, p_cam: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return uv, J
 
 
-def tangent_steps(surface: Surface, camera: Camera, step_m: float) -> np.ndarray:
-    """(N, 2, 2) pixels per step of a square grid on each surface's tangent plane, step_m apart."""
-    u = surface.per_px[..., 0]
+def tangent_steps(planes: TangentPlanes, camera: Camera, step_m: float) -> np.ndarray:
+    """(N, 2, 2) pixels per step of a square grid on each tangent plane, step_m apart."""
+    u = planes.per_px[..., 0]
     a = u / np.linalg.norm(u, axis=1, keepdims=True)
-    v = surface.per_px[..., 1]
+    v = planes.per_px[..., 1]
     b = v - (a * v).sum(1, keepdims=True) * a
     b /= np.linalg.norm(b, axis=1, keepdims=True)
-    return step_m * (projection(camera, surface.p_cam)[1] @ np.stack([a, b], -1))
+    return step_m * (projection(camera, planes.p_cam)[1] @ np.stack([a, b], -1))
 
 
 def lifted_cov(

@@ -1,4 +1,4 @@
-"""What the embedded tracker knows of its points: rows of arrays."""
+"""What the tracker knows of its points: arrays with one row per point."""
 
 from __future__ import annotations
 
@@ -13,62 +13,57 @@ _EYE = np.eye(2, dtype=np.float32)
 
 @dataclass(eq=False)
 class Points:
-    """N points with K appearances each, row by row. Offsets and warps are in pixels of the appearance's frame.
+    """N points with K templates each. Offsets and warps are in pixels of the template's image.
 
-    A warp C takes offsets in a point's first appearance to offsets in the newest frame, view[k] to
-    those in the frame of appearance k: C inv(view[k]) is how appearance k looks now.
+    A warp takes offsets in a point's first template to offsets in the newest image, template_warp[k] to
+    those in template k: warp inv(template_warp[k]) is how template k appears now.
     """
 
-    ids: np.ndarray  # (N,) int64, increasing
-    uv: np.ndarray  # (N, 2) newest known place
-    warp: np.ndarray  # (N, 2, 2) C
-    visible: np.ndarray  # (N,) bool
-    verified: np.ndarray  # (N,) bool: an appearance, or Lucas-Kanade for a while, says so, not its body alone
+    uv: np.ndarray  # (N, 2) newest known position
+    warp: np.ndarray  # (N, 2, 2)
     cov: np.ndarray  # (N, 2, 2) covariance of uv, px^2
-    depth_m: np.ndarray  # (N,) where it was last visible; 0 where not measured
+    visible: np.ndarray  # (N,) bool: what the caller is told
+    verified: np.ndarray  # (N,) bool: a template, or Lucas-Kanade for a while, says so, not the segment alone
     hidden_for: np.ndarray  # (N,) frames
-    ncc: np.ndarray  # (N,) correlation with the appearance last seen
-    coasting: np.ndarray  # (N,) frames since an appearance was last seen
-    count: np.ndarray  # (N,) appearances in use
-    view: np.ndarray  # (N, K, 2, 2)
-    view_cov: np.ndarray  # (N, K, 2, 2) of the point's place in the appearance
+    ncc: np.ndarray  # (N,) correlation with the template last recognised
+    coasting: np.ndarray  # (N,) frames since a template was last recognised
+    count: np.ndarray  # (N,) templates in use
+    template_warp: np.ndarray  # (N, K, 2, 2)
+    template_cov: np.ndarray  # (N, K, 2, 2) of the point's position in the template
     fine: Patches  # (N, K) at full resolution
     coarse: Patches  # (N, K) at half resolution
-    colour: np.ndarray  # (N, K, 2) chroma around the point
-    body: np.ndarray  # (N,) which rigid body it belongs to, -1 for none
-    loose: np.ndarray  # (N,) bool: left its body together with others in the newest frame, not far yet
-    p_body: np.ndarray  # (N, 3) place on it, metres
+    chroma: np.ndarray  # (N, K, 2) around the point
+    segment: np.ndarray  # (N,) which rigid motion segment it belongs to, -1 for none
+    leaving: np.ndarray  # (N,) bool: disagrees with its segment together with others, but is not far from it yet
+    p_seg: np.ndarray  # (N, 3) position on the segment, metres
     map_cov: np.ndarray  # (N, 3, 3) its covariance
-    tangent: np.ndarray  # (N, 3, 2) offset on the body per pixel of offset in the first appearance
+    tangent: np.ndarray  # (N, 3, 2) offset on the segment per pixel of offset in the first template
 
     def __len__(self) -> int:
-        return len(self.ids)
+        return len(self.uv)
 
     @classmethod
-    def new(cls, ids: np.ndarray, uv: np.ndarray, appearances: int) -> Points:
-        """Points without an appearance yet."""
-        n, k = len(ids), appearances
-        zero, warp = np.zeros(n, np.int64), np.tile(_EYE, (n, 1, 1))
+    def new(cls, uv_px: np.ndarray, templates: int) -> Points:
+        """Visible points at uv_px (N, 2) without a template yet, with room for so many."""
+        n, k = len(uv_px), templates
         return cls(
-            ids=ids,
-            uv=uv.astype(np.float32),
-            warp=warp,
+            uv=uv_px.astype(np.float32),
+            warp=np.tile(_EYE, (n, 1, 1)),
+            cov=np.zeros((n, 2, 2), np.float32),
             visible=np.ones(n, bool),
             verified=np.ones(n, bool),
-            cov=np.zeros((n, 2, 2), np.float32),
-            depth_m=np.zeros(n, np.float32),
-            hidden_for=zero,
+            hidden_for=np.zeros(n, np.int64),
             ncc=np.ones(n, np.float32),
-            coasting=zero.copy(),
-            count=zero.copy(),
-            view=np.tile(_EYE, (n, k, 1, 1)),
-            view_cov=np.zeros((n, k, 2, 2), np.float32),
+            coasting=np.zeros(n, np.int64),
+            count=np.zeros(n, np.int64),
+            template_warp=np.tile(_EYE, (n, k, 1, 1)),
+            template_cov=np.zeros((n, k, 2, 2), np.float32),
             fine=Patches.empty((n, k)),
             coarse=Patches.empty((n, k)),
-            colour=np.zeros((n, k, 2), np.float32),
-            body=np.full(n, -1),
-            loose=np.zeros(n, bool),
-            p_body=np.zeros((n, 3)),
+            chroma=np.zeros((n, k, 2), np.float32),
+            segment=np.full(n, -1),
+            leaving=np.zeros(n, bool),
+            p_seg=np.zeros((n, 3)),
             map_cov=np.zeros((n, 3, 3)),
             tangent=np.zeros((n, 3, 2)),
         )
@@ -85,17 +80,10 @@ class Points:
     def joined(self, other: Points) -> Points:
         """These points, then the others."""
         mine, theirs = ([getattr(p, f.name) for f in fields(self)] for p in (self, other))
-        return Points(*(_concatenate(a, b) for a, b in zip(mine, theirs, strict=True)))
-
-    def rows(self, ids: np.ndarray) -> np.ndarray:
-        """Row of each id, any shape; -1 where it is not held."""
-        if not len(self):
-            return np.full(np.shape(ids), -1)
-        at = np.minimum(np.searchsorted(self.ids, ids), len(self) - 1)
-        return np.where(self.ids[at] == ids, at, -1)
+        return Points(*(_concatenated(a, b) for a, b in zip(mine, theirs, strict=True)))
 
 
-def _concatenate(a: np.ndarray | Patches, b: np.ndarray | Patches) -> np.ndarray | Patches:
+def _concatenated(a: np.ndarray | Patches, b: np.ndarray | Patches) -> np.ndarray | Patches:
     if isinstance(a, Patches):
         return Patches(*(np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(Patches)))
     return np.concatenate([a, b])

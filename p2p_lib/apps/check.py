@@ -1,0 +1,378 @@
+"""What ``p2p check`` prints: what is wrong with a sequence of one's own, before anything is tracked.
+
+Known faults: depth in another unit or not registered to colour, the camera matrix of another resolution, times in
+milliseconds, masks that hold the table too, objects without anything to track.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, make_detector, make_segmenter
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import Config, preset
+from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.alignment import background_share, misfit
+from p2p_lib.datasets.prompts import Prompt
+from p2p_lib.datasets.sequence import Sequence, open_sequence
+from p2p_lib.method.sampling import choose, usable_region
+from p2p_lib.synthetic.faults import spoil
+
+#: Frames that are looked at, evenly spread.
+FRAMES = 12
+#: Of the image's width: an offset between depth and colour that does not matter, and a principal point off centre.
+OFFSET_SHARE, CENTRE_SHARE = 0.01, 0.1
+#: How much better depth must fit elsewhere to be called not registered: 1.05 at most on good sequences.
+GAIN = 1.2
+#: Ranges in metres of whatever is recorded in front of a depth camera.
+NEAREST_M, FARTHEST_M = 0.05, 20.0
+#: Horizontal and vertical angles of view of any RGB-D camera.
+VIEW_DEG = (20.0, 130.0)
+#: Frames per second that cameras have, and a gap as a multiple of the usual interval.
+RATES_HZ, GAP = (0.5, 500.0), 10.0
+#: Fraction of images that may equal the next one.
+REPEATED_SHARE = 0.3
+#: Fraction of a mask's rim that may lie on the background: 0.4 at most on good sequences.
+RIM_SHARE = 0.5
+#: Fraction of a mask that should have a depth; half of it of the whole image.
+MEASURED_SHARE = 0.5
+#: What an object seldom is: so much of the image, so deep (of its distance). Good sequences: at most 0.07, 0.23.
+LARGE_SHARE, DEEP_SHARE = 0.12, 0.25
+#: Fraction of depth at its largest value from which on it was cut off there.
+CLIPPED_SHARE = 0.1
+
+FirstMasks = dict[str, tuple[Frame, np.ndarray]]
+
+
+class Level(StrEnum):
+    """How bad a finding is: fine, worth a look, or to be mended before anything else."""
+
+    OK = "ok"
+    LOOK = "look"
+    WRONG = "WRONG"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at: its name, how it is, what was measured, and what to do about it."""
+
+    name: str
+    level: Level
+    text: str
+    fix: str = ""
+
+
+def check_folder(
+    sequence: str | Path | Sequence,
+    *,
+    prompts: Iterable[Prompt] = (),
+    format: str | None = None,
+    depth_scale: float | None = None,
+    config: Config | None = None,
+) -> list[Finding]:
+    """What is right and wrong with a sequence, in the order in which it should be mended.
+
+    prompts  clicks, for a sequence without masks: the built-in segmenter makes its first ones
+    config   whose limits count (default: the preset ``default``)
+
+    Files that cannot be read are findings too.
+    """
+    config = config or preset()
+    try:
+        if isinstance(sequence, str | Path):
+            sequence = open_sequence(sequence, format, depth_scale)
+        chosen = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist()
+        frames = [sequence.frame(i) for i in chosen]
+        masks = [sequence.masks(i) or {} for i in chosen]
+        firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
+    except P2PError as error:
+        return [_unreadable(error)]
+    size = f"{len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
+    depth = _depth(frames)
+    findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
+    findings += [_times(sequence), _repeated(frames, sequence), depth, _registered(frames)]
+    if depth.level is Level.WRONG:
+        return findings  # nothing that follows would mean anything
+    if not firsts:
+        return [*findings, _no_masks(sequence, any(masks), config)]
+    if beyond := _all_beyond(firsts, config):
+        return [*findings, beyond]  # what follows would only be its consequences
+    for name, (frame, mask) in firsts.items():
+        if mask.sum() < config.lifecycle.min_mask_px:
+            findings.append(_nothing_there(name, frame, mask, config))
+            continue
+        others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
+        findings.append(_range(name, frame, mask, config))
+        findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
+    return findings
+
+
+def check_spoilt(folder: str | Path, fault: str, **options: Any) -> list[Finding]:
+    """What :func:`check_folder` finds in a copy of a folder with a fault of :mod:`p2p_lib.synthetic.faults` put in."""
+    with tempfile.TemporaryDirectory() as home:
+        copy = shutil.copytree(folder, Path(home) / Path(folder).name)
+        return check_folder(spoil(copy, fault), **options)
+
+
+def as_lines(findings: Iterable[Finding]) -> str:
+    """The findings for people, each remedy under what it mends."""
+    findings = list(findings)
+    width = max(len(finding.name) for finding in findings)
+    lines = []
+    for finding in findings:
+        lines.append(f"{finding.level:7}{finding.name:{width}}  {finding.text}")
+        lines += [f"{'':7}{'':{width}}  -> {finding.fix}"] * bool(finding.fix)
+    wrong, look = (", ".join(f.name for f in findings if f.level is level) for level in (Level.WRONG, Level.LOOK))
+    if wrong:
+        return "\n".join([*lines, f"To mend first: {wrong}"])
+    nothing = "Nothing is wrong with it as far as can be seen."
+    return "\n".join([*lines, f"To look at before tracking: {look}" if look else nothing])
+
+
+def _unreadable(error: P2PError) -> Finding:
+    if isinstance(error, BadInput):
+        return Finding("files", Level.WRONG, f"{error.name}: got {error.got}, expected {error.expected}", error.fix)
+    return Finding("files", Level.WRONG, str(error))
+
+
+def _camera(camera: Camera) -> Finding:
+    """Whether K belongs to images of this size: its principal point is about their middle."""
+    size, centre = np.array([camera.width, camera.height]), np.array([camera.cx, camera.cy]) + 0.5
+    view_deg = np.degrees(2 * np.arctan(size / 2 / [camera.fx, camera.fy]))
+    text = f"sees {view_deg[0]:.0f} x {view_deg[1]:.0f} degrees, centre at ({camera.cx:.0f}, {camera.cy:.0f})"
+    if (np.abs(centre / size - 0.5) > CENTRE_SHARE).any():
+        of = "x".join(f"{round(2 * c, -1):.0f}" for c in centre)
+        text = f"K has its centre at ({camera.cx:.0f}, {camera.cy:.0f}): that of images of about {of}"
+        factors = size / (2 * centre)
+        fix = f"Take K at {camera.width}x{camera.height}"
+        if abs(factors[0] / factors[1] - 1) < 0.1:
+            fix += f": for images scaled as a whole, its first two rows times {factors.mean():.3g}"
+        return Finding("camera", Level.WRONG, text, f"{fix}.")
+    if (view_deg < VIEW_DEG[0]).any() or (view_deg > VIEW_DEG[1]).any():
+        fix = "fx and fy are in pixels, at the size that the images have here."
+        return Finding("camera", Level.WRONG, f"{text}: no RGB-D camera does", fix)
+    return Finding("camera", Level.OK, text)
+
+
+def _times(sequence: Sequence) -> Finding:
+    """Whether the times are seconds, and without holes."""
+    steps_s = np.diff(sequence.times_s)
+    if not len(steps_s):
+        return Finding("times", Level.LOOK, "a single image", "Tracking needs a video.")
+    usual_s, widest = float(np.median(steps_s)), int(steps_s.argmax())
+    text = f"{1 / usual_s:.3g} images per second, {sequence.times_s[-1] - sequence.times_s[0]:.1f} s"
+    if not RATES_HZ[0] <= 1 / usual_s <= RATES_HZ[1]:
+        unit = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+        guess = next((f" These look like {n}." for k, n in unit.items() if 1 <= k / usual_s <= RATES_HZ[1]), "")
+        text = f"{usual_s:.3g} s between images: {1 / usual_s:.3g} per second"
+        return Finding("times", Level.WRONG, text, f"times.txt holds seconds, one a line.{guess}")
+    if steps_s[widest] > GAP * usual_s:
+        text += f", but {steps_s[widest]:.2g} s between frames {widest} and {widest + 1}"
+        fix = "Images are missing there: what moved meanwhile has to be found again."
+        return Finding("times", Level.LOOK, text, fix)
+    return Finding("times", Level.OK, text)
+
+
+def _repeated(frames: list[Frame], sequence: Sequence) -> Finding:
+    """Whether images are copies of the one before: a recorder that was faster than its camera."""
+    pairs = [(f, sequence.frame(f.index + 1)) for f in frames if f.index + 1 < len(sequence)]
+    copies = [a.index for a, b in pairs if np.array_equal(a.rgb, b.rgb)]
+    frozen = [a.index for a, b in pairs if a.depth_m.any() and np.array_equal(a.depth_m, b.depth_m)]
+    if max(len(copies), len(frozen)) > REPEATED_SHARE * len(pairs):
+        what, of = ("colour", copies) if len(copies) >= len(frozen) else ("depth", frozen)
+        text = f"{len(of)} of {len(pairs)} {what} images equal the next one, that of frame {of[0]} for one"
+        return Finding("motion", Level.LOOK, text, "Record each image once, with the time at which it was taken.")
+    return Finding("motion", Level.OK, "every image looked at differs from the next")
+
+
+def _depth(frames: list[Frame]) -> Finding:
+    """Whether depth is in metres once the scale is applied."""
+    known = [frame.depth_m[frame.depth_m > 0] for frame in frames]
+    share = float(np.mean([len(d) / f.depth_m.size for d, f in zip(known, frames)]))
+    if not share:
+        return Finding("depth", Level.WRONG, "no measurement anywhere", "Look at the files in depth/: all are 0.")
+    every_m = np.concatenate(known)
+    median_m = float(np.median(every_m))
+    text = f"{median_m:.3g} m in the middle, {100 * share:.0f} % of the pixels measured"
+    if not NEAREST_M <= median_m <= FARTHEST_M:
+        clipped = float((every_m == every_m.max()).mean())
+        if median_m > FARTHEST_M and clipped > CLIPPED_SHARE:
+            text = f"{text}; {100 * clipped:.0f} % of them are cut off at {every_m.max():.3g} m, the most that fits"
+            fix = "No scale brings back what was cut off: export the depth again, as 16-bit millimetres."
+            return Finding("depth", Level.WRONG, text, fix)
+        factor = _factor(median_m)
+        guess = f" A scale {factor:g} times the present one would make it {median_m * factor:.2g} m." if factor else ""
+        fix = f"Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1).{guess}"
+        return Finding("depth", Level.WRONG, f"{text}: the unit is another", fix)
+    if share < MEASURED_SHARE / 2:
+        fix = "Keep the sensor's least distance, and out of the sun; glass, mirrors and black things have no depth."
+        return Finding("depth", Level.LOOK, text, fix)
+    return Finding("depth", Level.OK, text)
+
+
+def _factor(median_m: float) -> float | None:
+    """The power of ten that brings a depth to where things stand before a camera; None where none does."""
+    return next((10.0**k for k in (-3, 3, -4, 4, -1, 1) if 0.15 <= median_m * 10.0**k <= 5), None)
+
+
+def _registered(frames: list[Frame]) -> Finding:
+    """Whether depth was registered to the colour camera."""
+    name, width = "registration", frames[0].shape[1]
+    found = misfit(frames, OFFSET_SHARE * width)
+    if found is None:
+        return Finding(name, Level.OK, "too few edges in depth and colour to tell whether they agree")
+    if found.gain <= GAIN:
+        return Finding(name, Level.OK, "edges of depth lie on edges of colour")
+    where = f"shifted by ({round(found.du_px):+d}, {round(found.dv_px):+d}) px"
+    size = f"{found.scale:.2f} times as large and " if abs(found.scale - 1) > 0.03 else ""
+    fix = "Register depth to colour when recording (`align` in the camera's software; p2p data convert-bag does)."
+    text = f"depth lies beside colour: {size}{where}, its edges would fit {found.gain:.1f} times as well"
+    return Finding(name, Level.WRONG, text, fix)
+
+
+def _no_masks(sequence: Sequence, drawn: bool, config: Config) -> Finding:
+    """Nothing to begin with: no masks at all, or masks that hold no object."""
+    fix = f"Make clicks with p2p click and give them with --prompts, or put masks into {sequence.path}/masks."
+    if not drawn:
+        return Finding("masks", Level.LOOK, "none", fix)
+    text = f"none that shows an object: no object has {config.lifecycle.min_mask_px} pixels in any image"
+    return Finding("masks", Level.WRONG, text, fix)
+
+
+def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
+    """A click at which the segmenter found no object to speak of."""
+    count, needed = int(mask.sum()), config.lifecycle.min_mask_px
+    what = f"only {count} pixels were segmented" if count else "nothing was segmented"
+    text = f"{what} at the clicks on it in frame {frame.index}; {needed} pixels are needed"
+    return Finding(f"{name}: mask", Level.WRONG, text, "Click elsewhere, in the middle of the object: p2p click.")
+
+
+def _distance_m(frame: Frame, mask: np.ndarray) -> float:
+    """Median depth of what is measured of a mask; NaN where nothing is, or too little of it."""
+    depth_m = frame.depth_m[mask]
+    measured = depth_m[depth_m > 0]
+    enough = len(measured) and len(measured) >= MEASURED_SHARE * len(depth_m)
+    return float(np.median(measured)) if enough else float("nan")
+
+
+def _all_beyond(firsts: FirstMasks, config: Config) -> Finding | None:
+    """The one finding of objects that are all too far away, or all too near: most likely depth is in another unit."""
+    limits, away_m = config.depth, {name: _distance_m(*first) for name, first in firsts.items()}
+    distances = np.array(list(away_m.values()))
+    far = bool((distances > limits.max_m).all())
+    if not far and not (distances < limits.min_m).all():
+        return None
+    (first, (frame, mask)), *others = firsts.items()
+    text = f"{away_m[first]:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
+    text += f" ({', '.join(f'{name} {away_m[name]:.2f} m' for name, _ in others)})" if others else ""
+    return Finding(f"{first}: depth", Level.WRONG, *_beyond(text, distances, config))
+
+
+def _beyond(text: str, distances: np.ndarray, config: Config) -> tuple[str, str]:
+    """What is said of distances on one side of those that count, and what to do: the unit first, then the limit."""
+    limits, far = config.depth, bool(distances.max() > config.depth.max_m)
+    factor = _factor(float(np.median(distances)))
+    guess = f": {factor:g} times the present one would make it {distances[0] * factor:.2f} m" if factor else ""
+    wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
+    fix = f"If it was not, the depth scale is wrong (--depth-scale{guess}); if it was, --set depth.{wider}."
+    return f"{text}, but {limits.min_m:g} to {limits.max_m:g} m count", fix
+
+
+def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
+    """Whether an object is where depth counts, and measured."""
+    limits, depth_m = config.depth, frame.depth_m[mask]
+    share = float((depth_m > 0).mean())
+    if share < MEASURED_SHARE:
+        fix = "Dark, shiny and transparent things have none; change the light or the distance, or spray it matt."
+        text = f"only {100 * share:.0f} % of its pixels in frame {frame.index} have a depth"
+        return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
+    median_m = float(np.median(depth_m[depth_m > 0]))
+    text = f"{median_m:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
+    if not limits.min_m <= median_m <= limits.max_m:
+        return Finding(f"{name}: depth", Level.WRONG, *_beyond(text, np.array([median_m]), config))
+    return Finding(f"{name}: depth", Level.OK, text)
+
+
+def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Finding:
+    """Whether an object's masks hold background; the first of them also whether it is background altogether."""
+    first = seen[0]
+    seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.lifecycle.min_mask_px]
+    shares = np.array([background_share(mask, frame.depth_m) for frame, mask in seen])
+    if np.isnan(shares).all():
+        return Finding(f"{name}: mask", Level.OK, "no depth along its rim to judge it by")
+    typical = float(np.nanmedian(shares))
+    text = f"{100 * typical:.0f} % of its rim lies on the background (median of {len(shares)} masks)"
+    if typical > RIM_SHARE:
+        worst = seen[int(np.nanargmax(shares))][0].index
+        fix = f"Draw it to the object's edge or a little inside; frame {worst} is the worst."
+        return Finding(f"{name}: mask", Level.WRONG, text, fix)
+    large, deep_m, away_m = _extent(*first)
+    if large > LARGE_SHARE or deep_m > DEEP_SHARE * away_m:
+        text = f"it covers {100 * large:.0f} % of the image, over {deep_m:.2f} m of depth; {text}"
+        fix = "Is it the object, or the table or wall? If it is not, click in its middle, or draw it tighter."
+        return Finding(f"{name}: mask", Level.LOOK, text, fix)
+    return Finding(f"{name}: mask", Level.OK, text)
+
+
+def _extent(frame: Frame, mask: np.ndarray) -> tuple[float, float, float]:
+    """A mask's fraction of the image, the depth that it reaches over without its outermost pixels, its distance (m)."""
+    depth_m = frame.depth_m[mask & (frame.depth_m > 0)]
+    near_m, away_m, far_m = np.percentile(depth_m, [2, 50, 98]) if len(depth_m) else (0.0, 0.0, 0.0)
+    return float(mask.mean()), float(far_m - near_m), float(away_m)
+
+
+def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
+    """Whether an object has anything to track: points that can be lifted, with a contrast of their own."""
+    detector = make_detector(DEFAULT_DETECTOR, config.sampling, np.random.default_rng(config.seed))
+    found = detector.detect(frame, usable_region(frame, mask, config.depth.edge_m))
+    taken = choose(found, np.zeros((0, 2)), config.sampling.max_visible, config.sampling)
+    u, v = np.rint(found.uv_px[taken]).astype(int).T
+    contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]
+    count, needed = int((contrast >= config.tracking.textureless_contrast).sum()), config.lifecycle.return_inliers
+    text = f"places to track in frame {frame.index}: {count}"
+    if count < needed:
+        fix = "Come nearer, light it better, or begin with a textured side: then its surface alone carries the pose."
+        return Finding(f"{name}: points", Level.WRONG, f"{text}; {needed} are needed to find it again", fix)
+    return Finding(f"{name}: points", Level.OK, text)
+
+
+def _contrast(rgb: np.ndarray, side_px: int) -> np.ndarray:
+    """(H, W) standard deviation of brightness around each pixel, in grey levels."""
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    mean, square = cv2.blur(gray, (side_px, side_px)), cv2.blur(gray * gray, (side_px, side_px))
+    return np.sqrt(np.maximum(square - mean * mean, 0))
+
+
+def _first_masks(sequence: Sequence, config: Config) -> FirstMasks:
+    """Each object's first mask that is large enough to start from, with its frame."""
+    firsts: FirstMasks = {}
+    for i in range(len(sequence)):
+        masks = sequence.masks(i)
+        if masks is None or firsts.keys() >= set(sequence.objects):
+            break
+        for name in sorted(masks.keys() & set(sequence.objects) - firsts.keys()):
+            if masks[name].sum() >= config.lifecycle.min_mask_px:
+                firsts[name] = sequence.frame(i), masks[name]
+    return firsts
+
+
+def _clicked(sequence: Sequence, prompts: Iterable[Prompt], config: Config) -> FirstMasks:
+    """Each clicked object's first mask, as the built-in segmenter cuts it out."""
+    firsts: FirstMasks = {}
+    for prompt in prompts:
+        if prompt.frame >= len(sequence):
+            raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", f"below {len(sequence)}")
+        rng, frame = np.random.default_rng(config.seed), sequence.frame(prompt.frame)
+        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
+        firsts[prompt.name] = frame, segmenter.segment(frame, {prompt.name: prompt.points_px}) > 0
+    return firsts

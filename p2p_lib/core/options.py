@@ -1,0 +1,138 @@
+"""The options of a run, declared once: they serve ``p2p run``, Python, plans of benchmarks and ``run.json``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from p2p_lib.core import config as configuration
+from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, DEFAULT_TRACKER, DETECTORS, SEGMENTERS, TRACKERS
+from p2p_lib.core.config import Config
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.interfaces import PointTracker
+
+
+def pairs(option: str, form: str) -> Callable[[Iterable[str]], dict[str, str]]:
+    """A reader of ``["a=1", ...]``, as an option collects them, to ``{"a": "1", ...}``."""
+
+    def read(given: Iterable[str]) -> dict[str, str]:
+        found = {}
+        for item in given:
+            name, equals, value = item.partition("=")
+            if not (name and equals and value):
+                raise BadInput(option, repr(item), form)
+            found[name] = value
+        return found
+
+    return read
+
+
+def names(given: str | None) -> tuple[str, ...] | None:
+    """``"a,b"`` to ``("a", "b")``; None where nothing is named."""
+    return tuple(part for part in (given or "").split(",") if part) or None
+
+
+def _typed(help: str, *, flag: str = "", read: Callable[[Any], Any] | None = None, **how: Any) -> dict[str, Any]:
+    """How a field is typed: ``read`` makes its value of what ``argparse.add_argument(flag, **how)`` collects."""
+    return {"flag": flag, "read": read, "how": {"help": help, **how}}
+
+
+_PRESET = _typed("paper or default: parameters only, never backends")
+_CONFIG = _typed("TOML file with [stage] key = value", flag="--config", type=Path, metavar="FILE")
+_SET = _typed(
+    "change one parameter; repeatable",
+    flag="--set",
+    read=pairs("--set", "stage.key=value"),
+    action="append",
+    metavar="STAGE.KEY=VALUE",
+)
+_SEED = _typed("of every random choice (default 0)", type=int, metavar="N")
+_DEVICE = _typed("where surfaces are fused and refined: cpu (default), cuda or cuda:N")
+_TRACKER = _typed(f"2D point tracker: {', '.join(TRACKERS)} (default {DEFAULT_TRACKER})", metavar="NAME")
+_DETECTOR = _typed(f"source of new points: {', '.join(DETECTORS)} (default {DEFAULT_DETECTOR})", metavar="NAME")
+_MASKS = _typed(
+    f"dataset, dataset:FOLDER, {', '.join(SEGMENTERS)} (default: dataset; with --prompts {DEFAULT_SEGMENTER})",
+    metavar="SOURCE",
+)
+_PROMPTS = _typed("clicks on the objects (see p2p click)", type=Path, metavar="FILE")
+_SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")
+_FORMAT = _typed("layout: ho3d, bop, ycbmultitrack, ycbineoat, folder (default: recognised)")
+_DEPTH_SCALE = _typed("metres per raw depth unit (default 0.001)", type=float, metavar="M")
+_OBJECTS = _typed("track only these objects", read=names, metavar="A,B")
+_START = _typed("first frame", type=int, metavar="I")
+_STOP = _typed("one past the last frame", type=int, metavar="J")
+_MODELS = _typed(
+    "models for scoring",
+    read=pairs("--models", "NAME=PATH"),
+    nargs="+",
+    action="extend",
+    metavar="NAME=PATH",
+)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What one may ask of a run, beside the sequence and the folder of its results.
+
+    ``tracker`` may be a tracker itself, ``prompts`` a file or values, ``settings`` is ``{"stage.key": value}``,
+    ``models`` object to file. None leaves the choice to the configuration or to the sequence.
+    """
+
+    preset: str | None = field(default=None, metadata=_PRESET)
+    config_file: str | Path | None = field(default=None, metadata=_CONFIG)
+    settings: Mapping[str, Any] | None = field(default=None, metadata=_SET)
+    seed: int | None = field(default=None, metadata=_SEED)
+    device: str | None = field(default=None, metadata=_DEVICE)
+    tracker: str | PointTracker = field(default=DEFAULT_TRACKER, metadata=_TRACKER)
+    detector: str = field(default=DEFAULT_DETECTOR, metadata=_DETECTOR)
+    masks: str | None = field(default=None, metadata=_MASKS)
+    prompts: str | Path | Iterable[Any] | None = field(default=None, metadata=_PROMPTS)
+    save_masks: bool = field(default=False, metadata=_SAVE_MASKS)
+    format: str | None = field(default=None, metadata=_FORMAT)
+    depth_scale: float | None = field(default=None, metadata=_DEPTH_SCALE)
+    objects: Sequence[str] | None = field(default=None, metadata=_OBJECTS)
+    start: int = field(default=0, metadata=_START)
+    stop: int | None = field(default=None, metadata=_STOP)
+    models: Mapping[str, str | Path] | None = field(default=None, metadata=_MODELS)
+
+    @classmethod
+    def of_arguments(cls, arguments: argparse.Namespace) -> RunOptions:
+        """The options among a command's arguments; the others keep their defaults."""
+        given = {}
+        for option in fields(cls):
+            if hasattr(arguments, option.name):
+                value, read = getattr(arguments, option.name), option.metadata["read"]
+                given[option.name] = read(value) if read and value is not None else value
+        return cls(**given)
+
+    def config(self) -> Config:
+        """The parameters: preset, then file, then single settings, then device and seed."""
+        config = configuration.preset(self.preset or "default")
+        if self.config_file is not None:
+            config = configuration.from_toml(self.config_file, config if self.preset else None)
+        config = config.with_values(dict(self.settings or {}), source="--set")
+        chosen = {"device": self.device, "seed": self.seed}
+        return config.with_values({key: value for key, value in chosen.items() if value is not None})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values that make the same options again, for ``run.json``; prompts given as values are left out."""
+        given = {option.name: getattr(self, option.name) for option in fields(self)}
+        given["tracker"] = self.tracker if isinstance(self.tracker, str) else self.tracker.name
+        given["prompts"] = self.prompts if isinstance(self.prompts, str | Path) else None
+        return json.loads(json.dumps(given, default=str))
+
+
+def add_options(parser: argparse.ArgumentParser, *wanted: str, **helps: str) -> None:
+    """Make command-line arguments of the fields of :class:`RunOptions` that are wanted; none named: of all.
+
+    helps  further fields, with what they mean to this command where that is not what they mean to a run
+    """
+    for option in fields(RunOptions):
+        if option.name in (*wanted, *helps) or not (wanted or helps):
+            flag = option.metadata["flag"] or "--" + option.name.replace("_", "-")
+            how = {**option.metadata["how"], "dest": option.name, "default": option.default}
+            parser.add_argument(flag, **how | ({"help": helps[option.name]} if option.name in helps else {}))

@@ -1,0 +1,136 @@
+"""What an object has been through, as a value, and the gates that a pose has to pass to be believed.
+
+:class:`Lifecycle` never changes: each frame makes the next one. :data:`GATES` is the whole list of reasons for which
+a pose is refused. The paper refuses none; the gates are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.config import LifecycleConfig
+from p2p_lib.core.types import WITH_POSE, Status
+
+#: A return has to be confirmed for so many frames, and is marked as recovered meanwhile.
+CONFIRM_FRAMES = 5
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for the pose of a frame.
+
+    support        keypoints that agree with it
+    surface_share  share of the depth points that lie on the surface under it; None where no surface was asked
+    """
+
+    support: int
+    surface_share: float | None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a pose stands, with the status that it gives the object and the reason in words."""
+
+    accepted: bool
+    status: Status
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Lifecycle:
+    """The state of one object between two frames.
+
+    status          of the newest frame
+    T_cam_obj       newest pose, of whatever frame; None before the first
+    seen_s          its time
+    T_previous      pose of the frame before it; None after a gap
+    T_left          newest pose before the absence; an unconfirmed return falls back to it
+    confirming      frames for which a return still has to be confirmed
+    start_px        pixels of the newest mask before the first pose; None without a mask
+    """
+
+    status: Status = Status.INITIALISING
+    T_cam_obj: np.ndarray | None = None
+    seen_s: float = float("nan")
+    T_previous: np.ndarray | None = None
+    T_left: np.ndarray | None = None
+    confirming: int = 0
+    start_px: int | None = None
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the newest frame has a pose."""
+        return self.status in WITH_POSE
+
+    @property
+    def unconfirmed(self) -> bool:
+        """Whether a pose would be a return, or one of the frames that confirm a return."""
+        return not self.has_pose or self.confirming > 0
+
+    def motion_priors(self) -> dict[str, np.ndarray]:
+        """Where the object is if it stays or moves on evenly: origin to T_cam_obj; empty after a gap."""
+        if not self.has_pose or self.T_cam_obj is None:
+            return {}
+        priors = {"last pose": self.T_cam_obj}
+        if self.T_previous is not None:
+            priors["constant velocity"] = self.T_cam_obj @ se3.inverse(self.T_previous) @ self.T_cam_obj
+        return priors
+
+    def moved_from_last(self, T_cam_obj: np.ndarray) -> tuple[float, float] | None:
+        """Metres and degrees from the pose of the frame before to another (4, 4); None after a gap."""
+        if not self.has_pose:
+            return None
+        moved_m = np.linalg.norm(T_cam_obj[:3, 3] - self.T_cam_obj[:3, 3])
+        return float(moved_m), float(np.degrees(se3.angle_rad(se3.inverse(self.T_cam_obj) @ T_cam_obj)))
+
+    def judge(self, evidence: Evidence, gates: tuple[str, ...], config: LifecycleConfig) -> Verdict:
+        """The verdict on a pose: refused by the first of ``gates`` that refuses it, else accepted."""
+        for name in gates:
+            if reason := GATES[name](self, evidence, config):
+                return Verdict(False, Status.LOST, reason)
+        if evidence.support < config.return_inliers:
+            return Verdict(True, Status.DEGRADED, f"only {evidence.support} points agree")
+        confirming = not self.has_pose or self.confirming > 1
+        return Verdict(True, Status.RECOVERED if confirming else Status.TRACKED)
+
+    def with_pose(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:
+        """The state after a frame with an accepted pose."""
+        return replace(
+            self,
+            status=status,
+            T_cam_obj=T_cam_obj,
+            seen_s=time_s,
+            T_previous=self.T_cam_obj if self.has_pose else None,
+            T_left=self.T_left if self.has_pose else self.T_cam_obj,
+            confirming=max(self.confirming - 1, 0) if self.has_pose else CONFIRM_FRAMES,
+        )
+
+    def started(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:
+        """The state after the first pose."""
+        return replace(self, status=status, T_cam_obj=T_cam_obj, seen_s=time_s)
+
+    def without_pose(self, status: Status) -> Lifecycle:
+        """The state after a frame without a pose. A return that was not confirmed is taken back."""
+        taken_back = {"T_cam_obj": self.T_left, "confirming": 0} if self.confirming else {}
+        return replace(self, status=status, **taken_back)
+
+
+def _few_points_on_return(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+    few = life.unconfirmed and evidence.support < config.return_inliers
+    return f"only {evidence.support} points agree on a return" if few else ""
+
+
+def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+    nothing = not evidence.support and (evidence.surface_share or 0.0) < config.surface_only_share
+    return "too few points, and the surface does not fit either" if nothing else ""
+
+
+#: Every reason to refuse a pose, in the order in which they are asked: state, evidence and bounds to words, or "".
+GATES: dict[str, Callable[[Lifecycle, Evidence, LifecycleConfig], str]] = {
+    "return_inliers": _few_points_on_return,
+    "surface_only": _no_points_and_off_surface,
+}

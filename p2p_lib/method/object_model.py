@@ -1,0 +1,177 @@
+"""What is known of one object: its keypoint map, its surface, its graph, and the views of its keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.config import Config
+from p2p_lib.core.stopwatch import Stopwatch
+from p2p_lib.method.factor_graph import ObjectGraph
+from p2p_lib.method.keyframe_views import KeyframeViews
+from p2p_lib.method.keypoint_map import KeypointMap
+from p2p_lib.method.observation import Observation, Observer
+
+if TYPE_CHECKING:
+    from p2p_lib.method.tsdf import TsdfVolume
+
+NO_IDS = np.zeros(0, np.int64)
+#: A frame with a larger move or turn verifies no point (appendix, "Point Promotion Strategy").
+_STABLE_M, _STABLE_DEG = 0.01, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Requests:
+    """What an object asks of the tracker that all objects share, applied when every object has been looked at.
+
+    reject  (K,) ids of tracks that contradict the object's motion
+    drop    (L,) ids of points that the map has given up
+    add_px  (M, 2) pixels of new points in this frame, and keys (M,) of them in the map
+    """
+
+    reject: np.ndarray = field(default_factory=lambda: NO_IDS)
+    drop: np.ndarray = field(default_factory=lambda: NO_IDS)
+    add_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    keys: np.ndarray = field(default_factory=lambda: NO_IDS)
+
+
+@dataclass(frozen=True, eq=False)
+class NewPoints:
+    """Points to be added at a keyframe: uv_px (M, 2) and p_cam (M, 3)."""
+
+    uv_px: np.ndarray
+    p_cam: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+
+class ObjectModel:
+    """Keypoints, surface and graph of one object; rows of observations are rows of ``map``."""
+
+    def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch):
+        self.config = config
+        self.map = KeypointMap(config.keypoint_map)
+        self.surface = _volume(config) if config.method.surface else None
+        self.graph = ObjectGraph(config.factor_graph) if config.method.graph else None
+        self.views = KeyframeViews()
+        self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
+        self._observer, self._stopwatch = observer, stopwatch
+        self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
+        self._since_keyframe, self._next_key = 0, 0
+
+    @property
+    def empty(self) -> bool:
+        """Whether there has been no keyframe yet."""
+        return not len(self.views)
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether depth can be compared with a surface."""
+        return self.surface is not None and not self.surface.empty
+
+    def noise_m(self, p_cam: np.ndarray) -> np.ndarray | None:
+        """(N,) standard deviation of measured points by the sensor's model; None where one noise is assumed for all."""
+        return self._observer.noise_m(p_cam) if self.config.method.noise == "sensor" else None
+
+    def observe(
+        self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray, moved: tuple[float, float] | None
+    ) -> None:
+        """Take an accepted frame into the map: count the keypoints that agree (N,), verify the pending ones.
+
+        moved  metres and degrees since the frame before, None after a gap: "Pose Stability" of the appendix
+        """
+        stable = moved is not None and moved[0] < _STABLE_M and moved[1] < _STABLE_DEG
+        self.map.count(obs.seen & self.map.promoted, agrees)
+        self.map.observe(se3.transform(se3.inverse(T_cam_obj), obs.p_cam), obs.tracks.uncertainty, stable)
+        self._since_keyframe += 1
+
+    def keyframe_due(self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray) -> bool:
+        """The appendix's "Sampling Criteria": a new view of the object, or too few points left."""
+        cfg = self.config.keypoint_map
+        visible = int((obs.seen & (agrees | ~self.map.promoted)).sum())
+        starved = visible < cfg.keyframe_min_points and self._since_keyframe > cfg.cooldown
+        turned = np.degrees(self.views.turned_rad(T_cam_obj)) > cfg.keyframe_angle_deg
+        return obs.mask is not None and bool(turned or starved)
+
+    def insert_keyframe(
+        self,
+        obs: Observation,
+        T_cam_obj: np.ndarray,
+        new: NewPoints,
+        agrees: np.ndarray,
+        covariance: np.ndarray | None = None,
+        confidence: float = 1.0,
+    ) -> tuple[np.ndarray, Requests]:
+        """New points, a vertex of the graph, a view of the surface.
+
+        agrees      (N,) bool: points of the map whose observation the pose agrees with
+        covariance  (6, 6) of the pose relative to the map; None at the first keyframe
+        confidence  of the pose
+
+        Returns the pose as the graph corrects it, and what the tracker has to follow and to drop.
+        """
+        p_obj = se3.transform(se3.inverse(T_cam_obj), new.p_cam)
+        old_keys = self.map.keys[agrees]
+        keys = self._next_key + np.arange(len(new))
+        self._next_key += len(new)
+        self.map.add(keys, p_obj, promoted=self.empty, confidence=confidence)
+        vertex, registered = None, T_cam_obj
+        if self.graph is not None:
+            with self._stopwatch("graph"):
+                p_cam = np.concatenate([obs.p_cam[agrees], new.p_cam])
+                vertex, T_cam_obj = self._optimise(T_cam_obj, np.concatenate([old_keys, keys]), p_cam, covariance)
+        self.views.add(registered)
+        self._since_keyframe = 0
+        if self.surface is not None:
+            with self._stopwatch("fusion"):
+                measured, frame = self._observer.measured(obs), obs.frame
+                self.surface.integrate(frame.depth_m, frame.rgb, measured, self._observer.camera, T_cam_obj, key=vertex)
+        gone, drop = self.map.retire()
+        if self.graph is not None:
+            self.graph.forget(gone)
+        return T_cam_obj, Requests(drop=drop, add_px=new.uv_px, keys=keys)
+
+    def settle_surface(self) -> None:
+        """Re-integrate the keyframe that the graph has moved farthest: one a frame, so that no frame waits long."""
+        if self.surface is not None and self._corrected:
+            with self._stopwatch("fusion"):
+                if not self.surface.move(self._corrected, limit=1):
+                    self._corrected = {}
+
+    def _optimise(
+        self, T_cam_obj: np.ndarray, keys: np.ndarray, p_cam: np.ndarray, covariance: np.ndarray | None
+    ) -> tuple[int, np.ndarray]:
+        """Add a vertex to the graph, solve, and carry the result into map and surface; its key and its pose.
+
+        Only what the graph still holds can be moved later: images of keyframes that it has merged are let go.
+        """
+        sigma_m = self.noise_m(p_cam)
+        vertex = self.graph.add_keyframe(
+            T_cam_obj,
+            keys,
+            p_cam,
+            p_obj_init=se3.transform(se3.inverse(T_cam_obj), p_cam),
+            covariance=None if sigma_m is None else covariance,
+            sigma_m=sigma_m,
+        )
+        result = self.graph.optimise()
+        if self.surface is not None:
+            self.surface.keep_only(result.keys)
+        if not result.ok:
+            return vertex, T_cam_obj
+        self.map.move(result.point_ids, result.p_obj)
+        if result.covariance is not None:
+            self.covariance = result.covariance
+        self._corrected = dict(zip(result.keys.tolist(), result.T_cam_obj, strict=True))
+        return vertex, result.T_cam_obj[-1]
+
+
+def _volume(config: Config) -> TsdfVolume:
+    """An empty surface. torch, which holds it, takes seconds to import: only when there is to be one."""
+    from p2p_lib.method.tsdf import TsdfVolume
+
+    return TsdfVolume(config.tsdf, device=config.device)

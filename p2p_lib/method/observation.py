@@ -1,0 +1,121 @@
+"""What one frame shows of one object: its keypoints lifted to 3D and its dense cloud (paper: P_cur)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import DepthConfig
+from p2p_lib.core.depth import depth_noise_m, in_range, lift, off_edges
+from p2p_lib.core.image import in_mask
+from p2p_lib.core.types import Frame, Tracks
+
+#: Depth this near the mask's border mixes the object with what is behind it.
+_BORDER_PX = 2
+#: A larger step in the 3x3 neighbourhood of a pixel of the cloud is an edge, m.
+_CLOUD_EDGE_M = 0.02
+
+#: A keypoint farther from the depth measured at its pixel is hidden, m.
+_HIDDEN_M = 0.015
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One frame's share of one object; rows are those of its keypoint map.
+
+    mask     (H, W) bool; None where no mask is known
+    tracks   of the map's points
+    p_cam    (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
+    cloud    (M, 3) depth points in the mask, camera frame
+    """
+
+    frame: Frame
+    mask: np.ndarray | None
+    tracks: Tracks
+    p_cam: np.ndarray
+    cloud: np.ndarray
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(N,) bool: points with a 3D observation."""
+        return np.isfinite(self.p_cam[:, 0])
+
+    def outside_mask(self) -> np.ndarray:
+        """(N,) bool: visible tracks that lie outside the mask; none where no mask is known."""
+        if self.mask is None:
+            return np.zeros(len(self.tracks), bool)
+        return self.tracks.visible & ~in_mask(self.tracks.uv_px, self.mask)
+
+
+class Observer:
+    """Makes observations with one camera.
+
+    cloud_points  of the dense cloud at most; 0 makes none
+    """
+
+    def __init__(self, camera: Camera, config: DepthConfig, cloud_points: int):
+        self.camera, self.config, self.cloud_points = camera, config, cloud_points
+
+    def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
+        """The observation of an object whose points have these ``tracks``."""
+        p_cam, cloud = np.full((len(tracks), 3), np.nan), np.zeros((0, 3))
+        rows = np.flatnonzero(tracks.visible)
+        if mask is not None:
+            rows = rows[in_mask(tracks.uv_px[rows], mask)]
+            cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
+        p_cam[rows] = self.lift(frame, tracks.uv_px[rows])
+        return Observation(frame, mask, tracks, p_cam, cloud)
+
+    def lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
+        """(N, 3) points behind pixels (N, 2); NaN where there is no trustworthy depth."""
+        return lift(frame, uv_px, self.camera, self.config)
+
+    def noise_m(self, p_cam: np.ndarray) -> np.ndarray:
+        """(N,) standard deviation of measured points (N, 3)."""
+        return depth_noise_m(p_cam[:, 2], self.config)
+
+    def measured(self, observation: Observation) -> np.ndarray:
+        """(H, W) bool: pixels of the mask with a depth within range."""
+        return observation.mask & in_range(observation.frame.depth_m, self.config)
+
+    def expected_px(self, obs: Observation, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> np.ndarray:
+        """(N, 2) where points p_obj (N, 3) show under a pose.
+
+        NaN for those outside the mask, and for those that the measured depth contradicts: something hides them, the
+        object itself included.
+        """
+        p_cam = se3.transform(T_cam_obj, p_obj)
+        uv_px = self.camera.project(p_cam)
+        at = np.flatnonzero((p_cam[:, 2] > 0) & self.camera.inside(uv_px))
+        u, v = np.rint(uv_px[at]).astype(int).T
+        at = at[obs.mask[v, u] & (np.abs(obs.frame.depth_m[v, u] - p_cam[at, 2]) < _HIDDEN_M)]
+        expected = np.full_like(uv_px, np.nan)
+        expected[at] = uv_px[at]
+        return expected
+
+
+def sample_cloud(depth_m: np.ndarray, mask: np.ndarray, camera: Camera, max_points: int) -> np.ndarray:
+    """(N, 3) measured points of a masked depth image in the camera frame, N <= max_points.
+
+    Leaves out a border inside the mask, and pixels whose 3x3 neighbourhood holds an invalid depth or a step: both mix
+    two surfaces. Deterministic, spread over the whole mask. Empty where nothing is left.
+    """
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if len(rows) == 0 or max_points < 1:
+        return np.zeros((0, 3))
+    top, left = max(rows[0] - 1, 0), max(cols[0] - 1, 0)
+    cut = np.s_[top : rows[-1] + 2, left : cols[-1] + 2]
+    inside, depth = np.ascontiguousarray(mask[cut]).astype(np.uint8), np.ascontiguousarray(depth_m[cut], np.float32)
+    kernel = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
+    inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    v, u = np.nonzero((inside > 0) & off_edges(depth, _CLOUD_EDGE_M))
+    # A lattice of pixels, then an even thinning of what is left over.
+    stride = max(1, int(np.sqrt(len(u) / max_points)))
+    on = np.flatnonzero((u % stride == 0) & (v % stride == 0))
+    on = on[np.linspace(0, len(on) - 1, min(len(on), max_points)).astype(int)]
+    return camera.unproject(np.stack([u[on] + left, v[on] + top], -1), depth[v[on], u[on]].astype(float))

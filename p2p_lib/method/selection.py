@@ -1,0 +1,111 @@
+"""Which pose hypothesis to go on with (paper: "Multi-Hypothesis Pose Generation and Selection").
+
+The paper takes the hypothesis whose dense points lie nearest to the surface: :func:`nearest_to_surface`. Ours,
+:func:`best_supported`, keeps the one that most keypoints agree with unless the surface prefers another one
+significantly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.config import SelectionConfig
+from p2p_lib.method.registration import Hypothesis
+
+
+def motion_weight(
+    T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray], config: SelectionConfig
+) -> np.ndarray | None:
+    """(H,) by how much the support of poses counts less for being off the nearest of the priors; None without priors.
+
+    1 on a prior, 1/2 at ``motion_deg`` or ``motion_m`` from it: heavy tails, because objects may be pushed at any time.
+    """
+    if not len(priors) or not len(T_cam_obj):
+        return None
+    off = se3.inverse(np.stack(priors))[:, None] @ np.stack(T_cam_obj)[None]
+    turned = np.degrees(se3.angle_rad(off)) / config.motion_deg
+    moved = np.linalg.norm(np.stack(priors)[:, None, :3, 3] - np.stack(T_cam_obj)[None, :, :3, 3], axis=-1)
+    return 1 / (1 + (turned**2 + (moved / config.motion_m) ** 2).min(0))
+
+
+def nearest_to_surface(
+    hypotheses: Sequence[Hypothesis],
+    distance_m: np.ndarray | None,
+    config: SelectionConfig,
+    weight: np.ndarray | None = None,
+) -> tuple[int | None, str]:
+    """The hypothesis with the least mean distance to the surface, and why; see :func:`select`."""
+    best = _best(hypotheses, weight)
+    scores = _scores(distance_m)
+    if scores is None or best is None:
+        return best, _WHY[len(hypotheses) if len(hypotheses) < 2 else 2]
+    best = int(np.argmin(scores))
+    return best, f"nearest to the surface ({1e3 * scores[best]:.2f} mm)"
+
+
+def best_supported(
+    hypotheses: Sequence[Hypothesis],
+    distance_m: np.ndarray | None,
+    config: SelectionConfig,
+    weight: np.ndarray | None = None,
+) -> tuple[int | None, str]:
+    """The best supported hypothesis unless the surface prefers another, and why; see :func:`select`.
+
+    It does where the other one is nearer by more than ``surface_sigmas`` standard errors. The same points are
+    compared under both poses, so the difference of each counts.
+    """
+    best = _best(hypotheses, weight)
+    scores = _scores(distance_m)
+    if scores is None or best is None:
+        return best, _WHY[len(hypotheses) if len(hypotheses) < 2 else 2]
+    nearest = int(np.argmin(scores))
+    nearer = distance_m[best] - distance_m[nearest]
+    chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
+    if scores[best] - scores[nearest] > chance:
+        return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
+    return best, "most inliers, the surface does not tell the hypotheses apart"
+
+
+#: The rules by name.
+RULES: dict[str, Callable[..., tuple[int | None, str]]] = {
+    "surface": nearest_to_surface,
+    "support": best_supported,
+}
+
+
+def select(
+    hypotheses: Sequence[Hypothesis],
+    distance_m: np.ndarray | None,
+    config: SelectionConfig,
+    weight: np.ndarray | None = None,
+) -> tuple[int | None, str]:
+    """The row of the hypothesis to go on with, None without any, and why, by ``config.rule``.
+
+    distance_m  (H, N) how far each masked depth point lies from the surface under each pose (absolute TSDF value in
+                metres); None while there is no surface
+    weight      (H,) factors of the support
+    """
+    return RULES[config.rule](hypotheses, distance_m, config, weight)
+
+
+_WHY = ("no hypothesis: too few correspondences agree", "the only hypothesis", "most inliers, there is no surface yet")
+
+
+def _best(hypotheses: Sequence[Hypothesis], weight: np.ndarray | None) -> int | None:
+    """The hypothesis with most support, then with the least mean residual."""
+    if not hypotheses:
+        return None
+    support = np.array([h.support for h in hypotheses]) * (1 if weight is None else weight)
+    residual_m = np.array([h.residual_m[h.inliers].mean() if h.support else np.inf for h in hypotheses])
+    return int(np.lexsort((residual_m, -support))[0])
+
+
+def _scores(distance_m: np.ndarray | None) -> np.ndarray | None:
+    """(H,) mean distances, infinite where one is not finite; None where nothing can be compared."""
+    if distance_m is None or len(distance_m) < 2 or not distance_m.size:
+        return None
+    finite = np.isfinite(distance_m).all(1)
+    return np.where(finite, distance_m.mean(1), np.inf) if finite.any() else None

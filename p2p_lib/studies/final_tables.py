@@ -1,0 +1,575 @@
+"""Notebook 09 and ``p2p benchmark``: a benchmark's tables in the paper's arrangements, and the figures beside them.
+
+Ours are exact areas under the curve over 0 to 0.1 m, aligned at the first scored frame, frames without a pose counted
+as 0, mean over seeds ± their standard deviation; every other form is in the benchmark's ``results.csv``. Bold is the
+best among methods without a CAD model, of those that ran on the whole of what the paper ran on.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import trimesh
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.benchmark.jobs import Job
+from p2p_lib.benchmark.outcome import Outcome
+from p2p_lib.benchmark.plan import Method
+from p2p_lib.benchmark.rows import MEAN, POOLED, Row, shown_name
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import MissingData
+from p2p_lib.core.files import replace_text
+from p2p_lib.datasets import manifests
+from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
+from p2p_lib.datasets.models import MESHES, find_models
+from p2p_lib.datasets.paper_reported import FAIL, paper_reported
+from p2p_lib.datasets.paper_reported import Table as Reported
+from p2p_lib.datasets.runs import ObjectRun, Run
+from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.evaluation import metrics
+from p2p_lib.evaluation.protocol import Evaluation, evaluate
+from p2p_lib.figures import mesh_view, overlay, style
+from p2p_lib.figures.overlay import Label
+from p2p_lib.figures.plots import logarithmic, panels
+from p2p_lib.figures.scenes import Scene
+from p2p_lib.figures.tables import Cell, Table, emboldened, number
+from p2p_lib.synthetic.shapes import load_mesh
+
+#: The paper's metrics: what the benchmark calls them, their head, and whether more is better.
+METRICS = {
+    "adds_auc": ("ADD-S AUC", "ADD-S (%)", True),
+    "add_auc": ("ADD AUC", "ADD (%)", True),
+    "chamfer_cm": ("Chamfer distance", "CD (cm)", False),
+}
+_AREAS = ("adds_auc", "add_auc")
+_AREA_HEADS = [METRICS[key][1] for key in _AREAS]
+_HOW = "Ours: exact area under the curve, aligned at the first scored frame, frames without a pose count as 0"
+_REPORTED = "(reported): as the paper prints it, on its own files, masks and machine"
+_NOT_IN_PAPER = Cell(note="not in the paper")
+
+
+def paper_table(benchmark: Benchmark) -> Table:
+    """The table of a benchmark, arranged as its plan's ``kind`` says."""
+    return KINDS[benchmark.plan.kind](Numbers(benchmark))
+
+
+def write_table(benchmark: Benchmark) -> str:
+    """``table.md``, ``table.tex`` and ``table.csv`` into the benchmark's folder; gives the first."""
+    table = paper_table(benchmark)
+    for suffix, text in (("md", table.markdown()), ("tex", table.latex()), ("csv", table.csv())):
+        replace_text(benchmark.folder / f"table.{suffix}", text)
+    return table.markdown()
+
+
+class Numbers:
+    """The summary of a benchmark, looked up by what a cell is of: failures count as 0, aligned at the first frame."""
+
+    def __init__(self, benchmark: Benchmark):
+        self.benchmark, self.plan = benchmark, benchmark.plan
+        self.methods = benchmark.plan.methods(benchmark.profile)
+        self.seeds = benchmark.plan.scope(benchmark.profile).seeds
+        #: A few dozen frames are too few to call a method the best or the fastest.
+        self.judges = benchmark.profile != "quick"
+        self._rows = [
+            row
+            for row in benchmark.summary
+            if row["failures"] in ("zero", "-") and row["align"] in ("first", "-") and row.get("value") is not None
+        ]
+        self._at = {
+            (row["method"], row["metric"], row["form"], row["sequence"], row["object"]): row for row in self._rows
+        }
+
+    def row(self, method: str, metric: str, sequence: str, object: str = "", form: str = "exact") -> Row | None:
+        """The number over seeds; None where there is none."""
+        return self._at.get((method, metric, form, sequence, object))
+
+    def of_objects(self, method: str, metric: str) -> list[float]:
+        """A method's number for every object of every sequence."""
+        of = (method, metric, "exact")
+        return [
+            row["value"] for row in self._rows if (row["method"], row["metric"], row["form"]) == of and row["object"]
+        ]
+
+    def cell(self, method: str, metric: str, sequence: str, object: str = "", form: str = "exact") -> Cell:
+        """The number over seeds as a cell; where there is none it says why."""
+        row = self.row(method, metric, sequence, object, form)
+        return self.missing(method, sequence) if row is None else number(row["value"], row.get("std"))
+
+    def mean(self, method: Method, metric: str) -> Cell:
+        """The mean over sequences, and how many these are of; where nothing ran, the reason that the first gave."""
+        of = [(j, o) for j, o in self.benchmark.results if j.method.name == method.name and j.measure == "poses"]
+        planned = {shown_name(job) for job, _ in of}
+        ran = {shown_name(job) for job, outcome in of if outcome.status != "not run"}
+        if self.row(method.name, metric, MEAN) is None:
+            return self.missing(method.name, shown_name(of[0][0]))
+        note = f"{len(ran)} of {len(planned)} sequences" if len(ran) < len(planned) else ""
+        return replace(self.cell(method.name, metric, MEAN), note=note)
+
+    def missing(self, method: str, sequence: str) -> Cell:
+        """A dash, or ``fail``, with the reason that the run gave."""
+        for job, outcome in self.benchmark.results:
+            if job.method.name == method and shown_name(job) == sequence and outcome.status != "done":
+                return Cell(FAIL if outcome.status == "failed" else "-", note=outcome.reason.rstrip("."))
+        return self.not_planned()
+
+    def not_planned(self) -> Cell:
+        """A dash for what no run of the plan could give."""
+        return Cell(note="no run of the plan is of this" if self.judges else "the quick form runs bundled data alone")
+
+    def notes(self) -> list[str]:
+        """What is to be said of every number of ours, and of those that the paper reports."""
+        seeds = ", ".join(map(str, self.seeds))
+        spread = f"mean ± standard deviation over seeds {seeds}" if len(self.seeds) > 1 else f"seed {seeds} alone"
+        return [f"{_HOW}; {spread}", self.what_ran(), *([_REPORTED] if self.plan.paper else [])]
+
+    def what_ran(self) -> str:
+        """Trackers, detectors, masks, sequences, commit."""
+        done = [(job, o) for job, o in self.benchmark.results if o.status == "done" and job.measure == "poses"]
+        if not done:
+            return "Nothing was run"
+        ran = {key: [str(o.ran.get(key)) for _, o in done] for key in ("tracker", "detector", "masks")}
+        ran["sequences"] = [shown_name(job) for job, _ in done]
+        ran["commit"] = [str(o.ran.get("commit") or "unknown")[:7] for _, o in done]
+        return "Ran: " + "; ".join(f"{key} {', '.join(dict.fromkeys(values))}" for key, values in ran.items())
+
+
+# --- the paper's two arrangements of its datasets, with its columns and ours -----------------------
+
+
+@dataclass
+class _Line:
+    """One method's numbers of one metric.
+
+    cells       by column; others hold ``empty``
+    comparable  columns in which it ran on what the paper ran on, without a CAD model
+    """
+
+    setting: str
+    name: str
+    cells: dict[str, Cell]
+    comparable: set[str]
+    empty: Cell
+
+    def cell(self, column: str) -> Cell:
+        return self.cells.get(column, self.empty)
+
+
+def by_sequence(numbers: Numbers) -> Table:
+    """A column per sequence, metrics and methods below each other: the paper's tables on HO3D and YCBInEOAT."""
+    paper = paper_reported().table(numbers.plan.paper)
+    columns = [*_columns(paper), "Mean", *_own_columns(numbers, paper)]
+    rows, rules = [], []
+    for metric in _metrics(numbers, paper):
+        rules.append(len(rows))
+        for line in _lines(numbers, paper, metric):
+            about = [Cell(METRICS[metric][1]), Cell(line.setting), Cell(line.name)]
+            rows.append(about + [line.cell(column) for column in columns])
+    heads = ["Metric", "Setting", "Method", *columns]
+    return Table(numbers.plan.title, heads, rows, words=3, rules=rules[1:], notes=numbers.notes())
+
+
+def by_object(numbers: Numbers) -> Table:
+    """A row per object, methods beside each other: the paper's tables on YCBMultiTrack."""
+    paper = paper_reported().table(numbers.plan.paper)
+    found = {metric: _lines(numbers, paper, metric) for metric in _metrics(numbers, paper)}
+    lines = [line for group in found.values() for line in group]
+    labels = dict(zip(_columns(paper), ((c.sequence, c.object) for c in paper.columns), strict=True))
+    labels |= {column: (shown_name(job), name) for column, (job, name) in _own_columns(numbers, paper).items()}
+    labels |= {"Mean": ("Mean", "")}
+    rows, rules, last = [], [], ""
+    for column, (sequence, object) in labels.items():
+        if sequence != last and rows:
+            rules.append(len(rows))
+        about = [Cell(sequence if sequence != last else ""), Cell(object)]
+        rows.append(about + [line.cell(column) for line in lines])
+        last = sequence
+    groups = [("", 2), *((METRICS[metric][1], len(group)) for metric, group in found.items())]
+    heads = ["Category", "Object", *(line.name + ", CAD" * (line.setting == "CAD") for line in lines)]
+    return Table(numbers.plan.title, heads, rows, groups, words=2, rules=rules, notes=numbers.notes())
+
+
+def _columns(paper: Reported) -> list[str]:
+    return [f"{column.sequence} {column.object}".strip() for column in paper.columns]
+
+
+def _metrics(numbers: Numbers, paper: Reported) -> list[str]:
+    printed = {row.metric for row in paper.rows}
+    return [metric for metric in METRICS if metric in printed and (metric in _AREAS or numbers.plan.chamfer)]
+
+
+def _places(numbers: Numbers) -> dict[str, tuple[Job, str]]:
+    """Column to the first job and object that fill it; a job that did not run fills those that its plan gives it."""
+    places: dict[str, tuple[Job, str]] = {}
+    for job, outcome in numbers.benchmark.results:
+        names = list(outcome.objects) or list(job.sequence.columns) or job.sequence.objects or [""]
+        for name in names:
+            own = shown_name(job) + (f" {name}" if len(names) > 1 else "")
+            column = job.sequence.column_of(name) or own
+            # One that has run knows its objects, one that has not may not.
+            if column not in places or (name and not places[column][1]):
+                places[column] = job, name
+    return places
+
+
+def _own_columns(numbers: Numbers, paper: Reported) -> dict[str, tuple[Job, str]]:
+    """Columns of ours that the paper does not have."""
+    return {column: at for column, at in _places(numbers).items() if column not in _columns(paper)}
+
+
+def _lines(numbers: Numbers, paper: Reported, metric: str) -> list[_Line]:
+    """All methods of a metric, the reported ones first, with the best in bold."""
+    lines = [_reported_line(paper, row) for row in paper.rows if row.metric == metric]
+    for method in numbers.methods:
+        for form in ("exact",) if metric in _AREAS else ("BundleSDF", "release"):
+            lines.append(_our_line(numbers, paper, metric, form, method))
+    for column in (*_columns(paper), "Mean"):
+        compared = [line for line in lines if column in line.comparable]
+        best = emboldened([line.cell(column) for line in compared], METRICS[metric][2])
+        for line, cell in zip(compared, best, strict=True):
+            line.cells[column] = cell
+    return lines
+
+
+def _reported_line(paper: Reported, row: object) -> _Line:
+    columns = _columns(paper)
+    cells = [Cell(FAIL) if value == FAIL else number(float(value)) for value in row.values]
+    name = "Point2Pose" if row.method == "Ours" else row.method
+    comparable = set() if row.cad else {*columns, "Mean"}
+    cells = dict(zip(columns, cells, strict=True)) | {"Mean": number(row.mean)}
+    return _Line("CAD" if row.cad else "CAD-free", f"{name} (reported)", cells, comparable, _NOT_IN_PAPER)
+
+
+def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method: Method) -> _Line:
+    columns, cells, comparable = _columns(paper), {}, {"Mean"}
+    frames = {shown_name(j): o.ran.get("frames") for j, o in numbers.benchmark.results if j.method.name == method.name}
+    for column, (job, name) in _places(numbers).items():
+        cells[column] = numbers.cell(method.name, METRICS[metric][0], shown_name(job), name, form)
+        if column in columns:
+            part = _part(job, frames.get(shown_name(job)), paper.dataset)
+            comparable |= {column} if not part and cells[column].text != "-" else set()
+            cells[column] = replace(cells[column], note=cells[column].note or part)
+    cells["Mean"] = numbers.cell(method.name, METRICS[metric][0], MEAN, "", form)
+    whole = len(comparable & set(columns))
+    if whole < len(columns):
+        cells["Mean"] = Cell(note=f"{whole} of the table's {len(columns)} columns were run in whole")
+    name = method.name if metric in _AREAS else f"{method.name}, {form}'s form"
+    return _Line("CAD-free", name, cells, comparable, numbers.not_planned())
+
+
+def _part(job: Job, frames: int | None, dataset: str) -> str:
+    """What a run leaves out of the sequence that the paper's number is of, "" where nothing."""
+    if job.sequence.start or job.sequence.stop is not None:
+        return f"frames {job.sequence.start} to {job.sequence.stop} alone"
+    known = {entry.name: entry.frames for entry in manifests.manifest(dataset).sequences}
+    whole = known.get(job.sequence.name.rpartition("/")[2])
+    return f"{frames} of {whole} frames" if whole and frames and frames < whole else ""
+
+
+# --- methods against each other --------------------------------------------------------------------
+
+
+def by_method(numbers: Numbers) -> Table:
+    """A row per method, with the spread over sequences: the paper's ablations, and the comparison of trackers."""
+    ran = {job.method.name: job.method.detector for job, _ in numbers.benchmark.results}
+    lines = []
+    for method in numbers.methods:
+        chosen = "" if isinstance(method.detector, str) else f" ({ran[method.name]})"
+        lines.append([Cell(method.name + chosen), *_areas(numbers, method)])
+    heads, groups = ["Method"], [("", 1), ("Ours", 4)]
+    heads += [head for area in _AREA_HEADS for head in (area, "std over sequences")]
+    bold = [1, 3] if numbers.judges else []
+    if numbers.plan.tracks:
+        names = ("AJ", "delta_avg", "OA", "found again")
+        heads, groups = [*heads, *names], [*groups, ("2D tracks, fractions", len(names))]
+        for line, method in zip(lines, numbers.methods, strict=True):
+            line += [_track_score(numbers, method, name) for name in names]
+    if numbers.plan.paper:
+        bold += [len(heads), len(heads) + 1]
+        heads, groups = [*heads, *_AREA_HEADS], [*groups, ("reported", len(_AREAS))]
+        printed = {(r.method, r.metric): r.mean for r in paper_reported().table(numbers.plan.paper).rows}
+        for line, method in zip(lines, numbers.methods, strict=True):
+            values = [printed.get((method.paper, metric)) for metric in _AREAS]
+            line += [number(value) if value else _NOT_IN_PAPER for value in values]
+    for column in bold:
+        for line, cell in zip(lines, emboldened([line[column] for line in lines], True), strict=True):
+            line[column] = cell
+    return Table(numbers.plan.title, heads, lines, groups, notes=numbers.notes())
+
+
+def by_return(numbers: Numbers) -> Table:
+    """Long-range against short-horizon tracking: returns after complete occlusion, and what they do to the areas."""
+    paper, lines = paper_reported(), []
+    events = paper.statement("occlusion_events").value
+    for method in numbers.methods:
+        line = [Cell(method.name), _returns(numbers, method), *_areas(numbers, method)[::2]]
+        values = {s.key: s.value for s in paper.text if s.of == method.paper}
+        if "recovered_events" in values:
+            line.append(Cell(f"{values['recovered_events']:g}/{events:g}"))
+            line += [number(values[f"mustard_{metric}"]) for metric in _AREAS]
+        else:
+            line += [_NOT_IN_PAPER] * 3
+        lines.append(line)
+    within = f"recovered within {paper.statement('recovered_within').value:g} frames"
+    groups = [("", 1), ("Ours", 3), ("reported, YCBMultiTrack-Real", 3)]
+    notes = [*numbers.notes(), "Returns are counted over all sequences and seeds"]
+    return Table(numbers.plan.title, ["Method", *[within, *_AREA_HEADS] * 2], lines, groups, notes=notes)
+
+
+def by_rate(numbers: Numbers) -> Table:
+    """Frames per second and milliseconds a stage, by number of tracks, of objects, and resolution."""
+    found = _times(numbers, "method", "metric")
+    stages = dict.fromkeys(metric for _, metric in found if metric.startswith("stage "))
+    heads = {"rate": "rate (Hz)", "95th percentile": "95 % within (ms)"}
+    heads |= {stage: stage.removeprefix("stage ") + " (ms)" for stage in stages}
+    heads |= {"processor time, files included": "processor, files included (ms)"}
+    lines = [
+        [Cell(method.name), *(number(found.get((method.name, metric)), digits=1) for metric in heads)]
+        for method in numbers.methods
+    ]
+    reported = paper_reported().statement("rate").value
+    notes = [f"The paper reports {reported[0]:g} to {reported[1]:g} Hz, on its machine", numbers.what_ran()]
+    notes += ["Wall-clock on this machine under the load that it had; processor time does not depend on the load"]
+    return Table(numbers.plan.title, ["Setting", *heads.values()], lines, notes=notes)
+
+
+def by_run(numbers: Numbers) -> Table:
+    """A row per method and sequence, means over objects: both alignments, range over seeds, frames lost, rate."""
+    done: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
+    for job, outcome in numbers.benchmark.results:
+        done[job.method.name, shown_name(job)] += [outcome] if outcome.objects else []
+    hz = _times(numbers, "method", "sequence", of="rate")
+    lines = []
+    for at, outcomes in done.items():
+        cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 5
+        rate = [number(hz.get(at), digits=1)] if numbers.judges else []
+        lines.append([Cell(at[0]), Cell(at[1]), *cells, *rate])
+    heads = ["Method", "Sequence", *_AREA_HEADS, *_AREA_HEADS, "frames lost", *["rate (Hz)"] * numbers.judges]
+    groups = [("", 2), ("aligned at the first frame", 2), ("one constant over all", 2), ("", 1 + numbers.judges)]
+    over = f"Mean over objects and seeds {', '.join(map(str, numbers.seeds))}"
+    over += ", in brackets the lowest and the highest" * (len(numbers.seeds) > 1)
+    how = "Exact area under the curve, frames without a pose count as 0"
+    how += "; the rate is this machine's, under its load" * numbers.judges
+    return Table(numbers.plan.title, heads, lines, groups, words=2, notes=[over, how, numbers.what_ran()])
+
+
+#: Arrangements by the ``kind`` of a plan.
+KINDS: dict[str, Callable[[Numbers], Table]] = {
+    "sequences": by_sequence,
+    "objects": by_object,
+    "methods": by_method,
+    "returns": by_return,
+    "rates": by_rate,
+    "runs": by_run,
+}
+
+
+def _times(numbers: Numbers, *keys: str, of: str = "") -> dict[tuple[str, ...], float]:
+    """The mean of the times (of the metric ``of``) that have these columns in common."""
+    found: dict[tuple[str, ...], list[float]] = defaultdict(list)
+    for row in numbers.benchmark.times:
+        if row["metric"] == of or not of:
+            found[tuple(row[key] for key in keys)].append(row["value"])
+    return {at: float(np.mean(values)) for at, values in found.items()}
+
+
+def _areas(numbers: Numbers, method: Method) -> list[Cell]:
+    """Both areas with their standard deviations over sequences."""
+    cells = []
+    for name in ("ADD-S AUC", "ADD AUC"):
+        values = numbers.of_objects(method.name, name)
+        spread = number(float(np.std(values, ddof=1))) if len(values) > 1 else Cell(note="of fewer than two sequences")
+        cells += [numbers.mean(method, name), spread]
+    return cells
+
+
+def _track_score(numbers: Numbers, method: Method, score: str) -> Cell:
+    results = numbers.benchmark.results
+    of = [o for job, o in results if job.method.name == method.name and job.measure == "tracks"]
+    values = [outcome.tracks[score] for outcome in of if outcome.tracks]
+    if values:
+        return number(float(np.mean(values)), digits=3)
+    return Cell(note=of[0].reason.rstrip(".") if of else "scored in the full form alone")
+
+
+def _returns(numbers: Numbers, method: Method) -> Cell:
+    """Recovered of all returns, summed over seeds."""
+    forms = ("recovered within 30 frames", "all")
+    rows = [numbers.row(method.name, "returns", POOLED, form=form) for form in forms]
+    if None in rows:
+        return numbers.mean(method, "ADD AUC")
+    return Cell("/".join(str(round(row["value"] * len(row["seeds"].split()))) for row in rows))
+
+
+def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
+    """The areas under the curve and the frames lost of one method on one sequence with several seeds."""
+    cells = []
+    for align in ("first", "all"):
+        for key in ("adds_m", "add_m"):
+            areas = [np.mean([metrics.auc_exact(x.errors_m(align)[key]) for x in o.objects.values()]) for o in outcomes]
+            spread = f" ({min(areas):.1f} to {max(areas):.1f})" if len(areas) > 1 else ""
+            cells.append(Cell(f"{np.mean(areas):.1f}{spread}"))
+    lost = [sum(obj.lost for obj in o.objects.values()) for o in outcomes]
+    frames = sum(len(obj.first["add_m"]) for obj in outcomes[0].objects.values())
+    return [*cells, Cell(f"{min(lost)}{f' to {max(lost)}' * (max(lost) > min(lost))} of {frames}")]
+
+
+# --- figures ---------------------------------------------------------------------------------------
+
+_WIDTH_IN = 8.0
+#: Errors from a tenth of a millimetre to the ten centimetres at which a frame scores nothing.
+EDGES_MM = np.geomspace(0.1, 100, 31)
+#: Tracks so far off, or farther, have the brightest colour.
+FAR_PX = 4.0
+
+
+def scene_of(benchmark: Benchmark, method: str, sequence: str = "") -> tuple[Scene, Run, Sequence]:
+    """A method's first finished run on its video, ready to be drawn."""
+    run, video = benchmark.run(method, sequence), benchmark.video(method, sequence)
+    return Scene(video, run, evaluate(run)), run, video
+
+
+@style.styled
+def error_histograms(benchmark: Benchmark) -> Figure:
+    """ADD and ADD-S of all scored frames of each method, one line a method; what has no pose stands apart.
+
+    Aligned at the first scored frame. Fractions of the scored frames, over all sequences, objects and seeds.
+    """
+    figure, axes = panels(2, (_WIDTH_IN, 3.2), side_by_side=True)
+    for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S")), strict=True):
+        errors = defaultdict(list)
+        for job, outcome in benchmark.results:
+            errors[job.method.name] += [1e3 * obj.errors_m("first")[key] for obj in outcome.objects.values()]
+        for colour, name in zip(style.METHODS, filter(errors.get, benchmark.methods), strict=False):
+            errors_mm = np.concatenate(errors[name])
+            weights = np.full(len(errors_mm), 100 / len(errors_mm))
+            percent, _ = np.histogram(np.maximum(errors_mm, EDGES_MM[0]), EDGES_MM, weights=weights)
+            axis.stairs(percent, EDGES_MM, color=colour, label=f"{name} ({len(errors_mm)} frames)")
+            beyond = weights[errors_mm >= EDGES_MM[-1]].sum()
+            axis.plot(1.4 * EDGES_MM[-1], beyond, "x", color=colour, clip_on=False, markersize=5)
+        axis.axvline(EDGES_MM[-1], color=style.NEUTRAL[1], linewidth=0.8)
+        logarithmic(axis.xaxis)
+        axis.set(xlabel=f"{title} [mm]", xlim=(EDGES_MM[0], 2 * EDGES_MM[-1]), ylim=(0, None))
+        axis.set_title(f"{title}; cross: lost, or off by 10 cm or more")
+    axes[0].set_ylabel("frames [%]")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=2, fontsize=8)
+    return figure
+
+
+@style.styled
+def tracks_by_error(
+    benchmark: Benchmark, method: str, sequence: str = "", count: int = 3, width_px: int = 420
+) -> Figure:
+    """True boxes (white, dashed), estimated ones, and the 2D tracks of the keypoints coloured by their error.
+
+    The error is the distance in pixels from where the tracker saw a keypoint to the keypoint of the final map projected
+    with the true pose; points that the map has dropped since are not drawn.
+    """
+    scene, run, video = scene_of(benchmark, method, sequence)
+    evaluation, keypoints, region_px = evaluate(run), load_keypoints(run.path), scene.region()
+    images = []
+    for row in _well_seen(run, count):
+        image = scene.draw(row, region_px, width_px, axes=False, trail=0)
+        _, camera = overlay.zoomed(video.frame(0).rgb, video.camera, region_px, width_px)
+        for name, score in evaluation.objects.items():
+            uv_px, error_px = _track_errors(video.camera, run.objects[name], keypoints[name], score.T_obj_model, row)
+            colours = overlay.value_colours(error_px, 0, FAR_PX)
+            image = overlay.draw_points(image, overlay.zoomed_px(uv_px, video.camera, camera), colours, 2.5)
+        images.append(image)
+    high_in = _WIDTH_IN / count * images[0].shape[0] / images[0].shape[1]
+    figure, axes = panels(count, (_WIDTH_IN, high_in + 0.6), side_by_side=True)
+    for axis, image in zip(axes, images, strict=True):
+        axis.imshow(image)
+        axis.set_axis_off()
+    colours = ScalarMappable(Normalize(0, FAR_PX), "cividis")
+    bar = figure.colorbar(colours, ax=axes, location="bottom", aspect=60, pad=0.02, extend="max")
+    bar.set_label("2D track from its keypoint under the true pose [px]")
+    return figure
+
+
+def recovery_strip(benchmark: Benchmark, sequence: str = "", count: int = 4, width_px: int = 300) -> np.ndarray:
+    """Occlusion and recovery: a line for each method, the same moments below each other.
+
+    White and dashed is the truth, in colour the estimate; a method that has lost the object draws none.
+    """
+    scenes = {name: scene_of(benchmark, name, sequence)[0] for name in benchmark.methods}
+    first = next(iter(scenes.values()))
+    moments, region_px, images = first.moments(count), first.region(), []
+    for name, scene in scenes.items():
+        for row in moments:
+            image = scene.draw(row, region_px, width_px, axes=False, trail=0)
+            foot = (0, image.shape[0] - 2, 1, image.shape[0] - 1)
+            images.append(overlay.draw_labels(image, [Label(name, "#222222", foot)]))
+    return overlay.montage(images, columns=count)
+
+
+def reconstruction_sheet(benchmark: Benchmark, method: str, sequence: str = "", width_px: int = 300) -> np.ndarray:
+    """Each object's reconstruction beside its true surface, seen as in its first frame and from behind."""
+    run, video = benchmark.run(method, sequence), benchmark.video(method, sequence)
+    evaluation, images = evaluate(run), []
+    for name in evaluation.objects:
+        chamfer_cm = benchmark.chamfer_cm(method, sequence, name)
+        images += _beside_truth(run, video, evaluation, name, chamfer_cm, width_px)
+    if not images:
+        raise MissingData(str(run.path), "no reconstructed surface", "Run with the setting method.surface = true.")
+    return overlay.montage(images, columns=4)
+
+
+def _beside_truth(
+    run: Run, video: Sequence, evaluation: Evaluation, name: str, chamfer_cm: float | None, width_px: int
+) -> list[np.ndarray]:
+    file, model = run.path / "meshes" / f"{name}.ply", find_models(video, MESHES).get(name)
+    if not file.is_file() or model is None:
+        return []
+    surface = trimesh.load(file, process=False)
+    surface.apply_transform(se3.inverse(evaluation.objects[name].T_obj_model))
+    truth = load_mesh(model)
+    middle = (truth.vertices.max(0) + truth.vertices.min(0)) / 2
+    camera, front = _portrait(run, name, middle, float(np.ptp(truth.vertices, axis=0).max()), width_px)
+    turn = se3.exp(np.array([0, 0, np.pi, 0, 0, 0]))
+    behind = front @ se3.from_rt(np.eye(3), middle) @ turn @ se3.from_rt(np.eye(3), -middle)
+    kind = "synthetic" if video.name.startswith("synthetic") else "real"
+    distance = "" if chamfer_cm is None else f", CD {10 * chamfer_cm:.1f} mm"
+    shown: list[tuple[trimesh.Trimesh, np.ndarray, str]] = [
+        (truth, front, f"{name}, {kind}: truth"),
+        (surface, front, f"reconstructed{distance}"),
+        (truth, behind, "from behind: truth"),
+        (surface, behind, "reconstructed"),
+    ]
+    return [overlay.draw_caption(mesh_view.draw_mesh(mesh, camera, T), title, scale=0.4) for mesh, T, title in shown]
+
+
+def _portrait(run: Run, name: str, middle: np.ndarray, size_m: float, width_px: int) -> tuple[Camera, np.ndarray]:
+    """A camera that sees the whole object as the first scored frame did, with its middle in the middle."""
+    obj = run.objects[name]
+    T = obj.T_cam_model[np.flatnonzero(obj.has_truth)[0]].copy()
+    T[:3, 3] = np.array([0, 0, 4 * size_m]) - T[:3, :3] @ middle
+    focal_px = 3.1 * width_px
+    return Camera(focal_px, focal_px, (width_px - 1) / 2, (width_px - 1) / 2, width_px, width_px), T
+
+
+def _well_seen(run: Run, count: int) -> list[int]:
+    """Rows spread over the frames in which every object has a pose; the first has no tracks yet."""
+    seen = np.flatnonzero(np.logical_and.reduce([obj.has_pose & obj.has_truth for obj in run.objects.values()]))
+    seen = seen[seen > 0]
+    if not len(seen):
+        raise MissingData(str(run.path), "no frame in which every object has a pose")
+    return seen[np.linspace(0, len(seen) - 1, count).round().astype(int)].tolist()
+
+
+def _track_errors(
+    camera: Camera, obj: ObjectRun, keypoints: ObjectKeypoints, T_obj_model: np.ndarray, row: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K, 2) tracks of one object in a frame and (K,) their errors, of the points that its final map still holds."""
+    now = keypoints.at(int(obj.frame_index[row]))
+    _, seen, known = np.intersect1d(keypoints.track_id[now], keypoints.ids, return_indices=True)
+    uv_px = keypoints.uv_px[now].astype(float)[seen]
+    T_cam_obj = obj.T_cam_model[row] @ se3.inverse(T_obj_model)
+    true_px = camera.project(se3.transform(T_cam_obj, keypoints.p_obj[known]))
+    return uv_px, np.linalg.norm(uv_px - true_px, axis=1)

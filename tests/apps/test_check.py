@@ -1,0 +1,299 @@
+"""p2p check: each fault, put into a good folder, is named with what mends it; good folders raise no alarm."""
+
+import json
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.apps import check, cli
+from p2p_lib.apps.check import Level, as_lines, check_folder, check_spoilt
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets import folder as own
+from p2p_lib.datasets.alignment import background_share, misfit
+from p2p_lib.datasets.prompts import Prompt, load_prompts
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.synthetic.faults import FAULTS, spoil
+
+#: What must be found: the level, a part of what is said, and a part of the remedy.
+EXPECTED = {
+    "depth unit": ("depth", Level.WRONG, r"^\d{3} m in the middle", r"--depth-scale .* 0\.001 times the present"),
+    "depth in metres": ("depth", Level.WRONG, r"^0\.000\d+ m in the middle", r"--depth-scale .* 1000 times"),
+    "ten times as far": ("box: depth", Level.WRONG, r"6\.\d+ m away.*0\.1 to 2\.5 m count", "the depth scale is wrong"),
+    "depth not registered": ("registration", Level.WRONG, r"0\.7\d times as large", "Register depth to colour"),
+    "depth shifted": ("registration", Level.WRONG, r"shifted by \(\+1[6-9]|\(\+20, [+-]0\) px", "Register depth"),
+    "K of another resolution": ("camera", Level.WRONG, r"images of about 128\dx96\d", r"first two rows times 0\.5\."),
+    "K of another aspect": ("camera", Level.WRONG, "images of about 1280x720", r"Take K at 640x480\.$"),
+    "times in milliseconds": ("times", Level.WRONG, "s between images", "These look like milliseconds"),
+    "times jump back": ("files", Level.WRONG, r"times\.txt: got 0\.000000 s at frame 3", ""),
+    "a gap": ("times", Level.LOOK, "but 3.* s between frames 2 and 3", "found again"),
+    "pictures twice": ("motion", Level.LOOK, "images equal", "each image once"),
+    "no texture": ("box: points", Level.WRONG, r"frame 0: [0-7];", "textured side"),
+    "wide masks": ("can: mask", Level.WRONG, r"\d\d+ % of its rim", "a little inside"),
+    "no depth on the objects": ("box: depth", Level.WRONG, "only 0 % of its pixels", "shiny"),
+}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    """Some early frames of an embedded sequence, as if it had been recorded by the user."""
+    frames = range(0, 48, 8)
+    return own.write(open_sequence("synthetic/crossing"), tmp_path_factory.mktemp("own") / "good", frames)
+
+
+def found(folder, name, **options):
+    return next(f for f in check_folder(folder, **options) if f.name == name)
+
+
+def alarms(findings):
+    return [f for f in findings if f.level is not Level.OK]
+
+
+def test_a_good_folder_raises_no_alarm(good):
+    findings = check_folder(good)
+    assert alarms(findings) == []
+    names = ["files", "camera", "times", "motion", "depth", "registration"]
+    assert [f.name for f in findings] == names + [
+        f"{o}: {w}" for o in ("box", "can") for w in ("depth", "mask", "points")
+    ]
+
+
+def test_every_fault_is_expected_to_be_found():
+    assert EXPECTED.keys() == FAULTS.keys()
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_is_named_with_its_remedy(good, tmp_path, fault):
+    name, level, text, fix = EXPECTED[fault]
+    folder = spoil(shutil.copytree(good, tmp_path / "spoilt"), fault)
+    finding = found(folder, name)
+    assert finding.level is level
+    assert re.search(text, finding.text), finding.text
+    assert re.search(fix, finding.fix), finding.fix
+
+
+def test_an_embedded_sequence_raises_no_alarm():
+    assert alarms(check_folder("synthetic/crossing")) == []
+
+
+@pytest.mark.parametrize("name", ["ycbineoat/mustard0_first400", "real_multi/redkitchen_table"])
+def test_real_sequences_raise_no_alarm(shared_data, name):
+    findings = check_folder(shared_data / name)
+    # mustard0 really has holes: its pictures carry the time at which they were taken.
+    assert [(f.name, f.text) for f in alarms(findings) if f.name != "times"] == []
+    assert found(shared_data / name, "times").level is not Level.WRONG
+
+
+@pytest.mark.parametrize("name", ["mustard0_first400", "redkitchen_table"])
+def test_real_sequences_with_clicks_raise_no_alarm(shared_data, name):
+    where = next(p for p in shared_data.glob(f"*/{name}"))
+    prompts = load_prompts(shared_data / "prompts" / f"{name}.json")
+    findings = check_folder(where, prompts=prompts)
+    assert [(f.name, f.text) for f in alarms(findings) if f.level is Level.WRONG] == []
+    assert {f"{p.name}: points" for p in prompts} <= {f.name for f in findings}
+
+
+def test_real_depth_that_was_moved_is_found(shared_data, tmp_path):
+    folder = own.write(open_sequence(shared_data / "real_multi/redkitchen_table"), tmp_path / "own", range(0, 200, 20))
+    assert found(folder, "registration").level is Level.OK
+    assert found(spoil(folder, "depth not registered"), "registration").level is Level.WRONG
+
+
+# --- the two measures, against what is known -------------------------------------------------------
+
+
+def scene(du=0, dv=0, scale=1.0):
+    """Dark discs before a bright, textured wall; depth moved and scaled about the picture's centre."""
+    rng, frames = np.random.default_rng(1), []
+    v, u = np.mgrid[:240, :320]
+    for k in range(4):
+        spots = np.c_[rng.uniform(60, 260, 6), rng.uniform(50, 190, 6), rng.uniform(10, 22, 6)]
+
+        def near(u, v, spots=spots):
+            return ((u[..., None] - spots[:, 0]) ** 2 + (v[..., None] - spots[:, 1]) ** 2 < spots[:, 2] ** 2).any(-1)
+
+        rgb = np.where(near(u, v)[..., None], 60, 180) + rng.integers(-20, 20, (240, 320, 3))
+        back_u, back_v = (u - du - 159.5) / scale + 159.5, (v - dv - 119.5) / scale + 119.5
+        depth = np.where(near(back_u, back_v), 0.6, 1.2).astype(np.float32)
+        frames.append(Frame(k, k / 30, rgb.astype(np.uint8), depth))
+    return frames
+
+
+@pytest.mark.parametrize(("du", "dv", "scale"), [(12, 0, 1), (0, -9, 1), (-8, 6, 1), (0, 0, 0.81), (5, 0, 1.23)])
+def test_misfit_says_how_depth_lies(du, dv, scale):
+    fit = misfit(scene(du, dv, scale), tolerance_px=3)
+    assert fit.gain > 1.3
+    assert fit.scale == pytest.approx(scale, rel=0.04)
+    assert (fit.du_px, fit.dv_px) == (pytest.approx(du, abs=2), pytest.approx(dv, abs=2))
+
+
+def test_misfit_of_registered_depth_is_none():
+    assert misfit(scene(), 3).gain < 1.05
+    assert misfit(scene(2, 1), 3).gain < 1.05, "within the tolerance"
+
+
+def test_without_edges_nothing_is_claimed():
+    flat = [Frame(0, 0.0, f.rgb, np.full((240, 320), 1, np.float32)) for f in scene()]
+    assert misfit(flat, 3) is None
+    plain = [Frame(0, 0.0, np.full_like(f.rgb, 128), f.depth_m) for f in scene()]
+    assert misfit(plain, 3) is None
+
+
+def test_background_share_of_a_disc():
+    """A disc of radius 40 before a wall: none of it is wall; a mask 8 px wider has all of its rim there."""
+    v, u = np.mgrid[:200, :200]
+    radius = np.hypot(u - 100, v - 100)
+    depth = np.where(radius <= 40, 0.6, 1.0).astype(np.float32)
+    assert background_share(radius <= 40, depth) == 0
+    assert background_share(radius <= 48, depth) == 1
+    assert background_share((radius <= 48) & (u >= 100) | (radius <= 40), depth) == pytest.approx(0.55, abs=0.1)
+    lying = np.where(radius <= 40, 0.6, 0.61).astype(np.float32)
+    assert background_share(radius <= 48, lying) == 0, "a table right under it cannot be told from it"
+    assert np.isnan(background_share(radius <= 40, np.zeros_like(depth)))
+
+
+# --- the command -------------------------------------------------------------------------------
+
+
+def test_check_prints_findings_and_says_by_its_exit_code(good, tmp_path, capsys):
+    assert cli.main(["check", str(good)]) == 0
+    assert capsys.readouterr().out.endswith("Nothing is wrong with it as far as can be seen.\n")
+    folder = spoil(shutil.copytree(good, tmp_path / "spoilt"), "K of another resolution")
+    assert cli.main(["check", str(folder)]) == 2
+    out, err = capsys.readouterr()
+    assert "WRONG  camera" in out and "  -> Take K at 640x480" in out and err == ""
+    assert out.endswith("To mend first: camera\n")
+
+
+def test_what_cannot_be_read_is_a_finding(good, tmp_path, capsys):
+    folder = shutil.copytree(good, tmp_path / "spoilt")
+    (folder / "depth" / "000003.png").unlink()
+    assert cli.main(["check", str(folder)]) == 2
+    out, err = capsys.readouterr()
+    assert "WRONG  files" in out and "000003.png is missing" in out and err == ""
+    assert cli.main(["check", str(tmp_path / "nowhere"), "--json"]) == 2
+    (listed,) = json.loads(capsys.readouterr().out)
+    assert listed["name"] == "files" and listed["level"] == "WRONG" and "no such folder" in listed["text"]
+
+
+def test_without_masks_it_asks_for_clicks(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "bare")
+    shutil.rmtree(folder / "masks")
+    (asked,) = alarms(check_folder(folder))
+    assert asked.name == "masks" and asked.level is Level.LOOK and "--prompts" in asked.fix
+    assert as_lines(check_folder(folder)).endswith("To look at before tracking: masks")
+
+
+def test_empty_masks_are_wrong(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "empty")
+    for path in (folder / "masks").rglob("*.png"):
+        cv2.imwrite(str(path), np.zeros((480, 640), np.uint8))
+    (wrong,) = alarms(check_folder(folder))
+    assert (wrong.name, wrong.level) == ("masks", Level.WRONG) and "p2p click" in wrong.fix
+
+
+def click(u, v):
+    return {"prompts": [Prompt("box", 0, np.array([[u, v]], float))]}
+
+
+def test_a_click_on_the_background_is_worth_a_look(good):
+    finding = found(good, "box: mask", **click(230, 240))
+    assert finding.level is Level.LOOK and re.match(r"it covers 2\d % of the image, over 0\.4", finding.text)
+    assert "table or wall" in finding.fix
+
+
+def test_a_click_that_segments_nothing_is_said_once(good, recwarn):
+    (wrong,) = alarms(check_folder(good, **click(5, 5)))
+    assert (wrong.name, wrong.level) == ("box: mask", Level.WRONG) and wrong.text.startswith("nothing was segmented")
+    assert "Click elsewhere" in wrong.fix and not len(recwarn)
+
+
+def scaled_depth(folder, factor):
+    for path in (folder / "depth").iterdir():
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) * float(factor)
+        cv2.imwrite(str(path), np.clip(np.rint(depth), 0, 65535).astype(np.uint16))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("factor", "limit", "scale"), [(0.1, "depth.min_m=0.03", "10 times"), (10, "depth.max_m=1", "0.1 times")]
+)
+def test_objects_all_out_of_range_are_one_finding(good, tmp_path, factor, limit, scale):
+    (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)))
+    assert wrong.name == "box: depth" and "(can " in wrong.text
+    assert limit in wrong.fix and scale in wrong.fix
+
+
+def test_depth_that_was_cut_off_must_be_exported_again(good, tmp_path):
+    (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), 1000)))
+    assert wrong.name == "depth" and "cut off at 65.5 m" in wrong.text and "export the depth again" in wrong.fix
+
+
+def test_what_is_missing_is_named(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "less")
+    (folder / "masks/box/000000.png").unlink()
+    (wrong,) = check_folder(folder)
+    assert "000000.png is missing. One mask alone" in wrong.fix
+    shutil.rmtree(folder / "rgb")
+    (wrong,) = check_folder(folder)
+    assert wrong.fix.startswith("rgb/ is missing")
+
+
+def test_lines_align_and_remedies_follow_what_they_mend(good):
+    lines = as_lines(check_folder(good)).splitlines()
+    assert all(re.match(r"ok     \S", line) for line in lines[:-1])
+
+
+# --- a folder of one's own, written ----------------------------------------------------------------
+
+
+def test_a_written_folder_reads_back(good):
+    source, read = open_sequence("synthetic/crossing"), open_sequence(good)
+    assert read.format == "folder" and len(read) == 6 and read.truth == {}
+    assert read.objects == source.objects and read.camera == source.camera
+    np.testing.assert_allclose(read.times_s, source.times_s[:48:8] - source.times_s[0], atol=1e-6)
+    for i in (0, 5):
+        a, b = source.frame(8 * i), read.frame(i)
+        np.testing.assert_array_equal(a.rgb, b.rgb)
+        np.testing.assert_allclose(a.depth_m, b.depth_m, atol=5.1e-4)
+        for name, mask in source.masks(8 * i).items():
+            np.testing.assert_array_equal(mask, read.masks(i)[name])
+
+
+def test_a_folder_is_not_written_over(good):
+    with pytest.raises(BadInput, match="not empty"):
+        own.write(open_sequence(good), good)
+
+
+def test_a_folder_of_ours_may_be_written_anew(good, tmp_path):
+    source, out = open_sequence(good), tmp_path / "again"
+    own.write(source, out, range(6))
+    (out / "notes.txt").write_text("mine")
+    assert len(open_sequence(own.write(source, out, range(2), masks=(), overwrite=True))) == 2
+    assert not (out / "masks").exists() and (out / "notes.txt").read_text() == "mine"
+
+
+def test_a_folder_with_the_first_masks_alone(good, tmp_path):
+    read = open_sequence(own.write(open_sequence(good), tmp_path / "first", range(6), masks=(0,)))
+    assert read.masks(0).keys() == {"box", "can"} and read.masks(1) is None
+    assert open_sequence(own.write(open_sequence(good), tmp_path / "none", range(6), masks=())).masks(0) is None
+
+
+def test_a_wrong_unit_is_told_once(good):
+    """Nothing can be said of objects that are a thousand times too far away, and nothing is."""
+    assert [f.name for f in alarms(check_spoilt(good, "depth unit"))] == ["depth"]
+    assert sorted(p.name for p in good.iterdir()) == ["cam_K.txt", "depth", "masks", "rgb", "times.txt"], "a copy was"
+
+
+def test_unknown_faults_are_refused(good):
+    with pytest.raises(BadInput, match="one of depth unit"):
+        spoil(good, "gremlins")
+
+
+def test_camera_of_a_telescope_is_no_camera():
+    assert check._camera(Camera(600, 600, 320, 240, 640, 480)).level is Level.OK
+    assert check._camera(Camera(6000, 6000, 320, 240, 640, 480)).level is Level.WRONG

@@ -1,0 +1,74 @@
+"""Options of a run are declared once: every field is an argument of the command line and comes back from it."""
+
+import argparse
+from dataclasses import fields
+
+import pytest
+
+from p2p_lib.core.config import preset
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.options import RunOptions, add_options
+
+#: What is typed for each field, and what the field is then.
+TYPED = {
+    "preset": (["--preset", "paper"], "paper"),
+    "config_file": (["--config", "mine.toml"], "mine.toml"),
+    "settings": (
+        ["--set", "sampling.points=5", "--set", "tsdf.enabled=no"],
+        {"sampling.points": "5", "tsdf.enabled": "no"},
+    ),
+    "seed": (["--seed", "7"], 7),
+    "device": (["--device", "cuda:1"], "cuda:1"),
+    "tracker": (["--tracker", "lk"], "lk"),
+    "detector": (["--detector", "orb"], "orb"),
+    "masks": (["--masks", "dataset:drawn"], "dataset:drawn"),
+    "prompts": (["--prompts", "p.json"], "p.json"),
+    "save_masks": (["--save-masks"], True),
+    "format": (["--format", "bop"], "bop"),
+    "depth_scale": (["--depth-scale", "0.0001"], 0.0001),
+    "objects": (["--objects", "mug,can"], ["mug", "can"]),
+    "start": (["--start", "3"], 3),
+    "stop": (["--stop", "9"], 9),
+    "models": (["--models", "mug=a.ply", "can=b.ply"], {"mug": "a.ply", "can": "b.ply"}),
+}
+
+
+def parsed(*words: str, wanted: tuple[str, ...] = ()) -> RunOptions:
+    parser = argparse.ArgumentParser()
+    add_options(parser, *wanted)
+    return RunOptions.of_arguments(parser.parse_args(words))
+
+
+def test_every_field_has_its_argument():
+    assert set(TYPED) == {option.name for option in fields(RunOptions)}
+    assert parsed() == RunOptions()
+
+
+@pytest.mark.parametrize("name", TYPED)
+def test_what_is_typed_is_the_fields_value_and_comes_back_from_a_record(name):
+    words, value = TYPED[name]
+    options = parsed(*words)
+    assert options.as_dict() == RunOptions().as_dict() | {name: value}
+    assert RunOptions(**options.as_dict()).as_dict() == options.as_dict()
+
+
+def test_a_command_takes_some_of_them():
+    assert parsed("--seed", "2", wanted=("seed",)) == RunOptions(seed=2)
+    with pytest.raises(SystemExit):
+        parsed("--tracker", "lk", wanted=("seed",))
+
+
+@pytest.mark.parametrize("words", [["--set", "points"], ["--models", "mug="]])
+def test_what_is_no_pair_is_refused(words):
+    with pytest.raises(BadInput, match=rf"{words[0]}: got '{words[1]}'"):
+        parsed(*words)
+
+
+def test_later_wins_over_earlier_in_the_configuration(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text('preset = "paper"\nseed = 4\n[sampling]\npoints = 17\nr_min_px = 3.0\n')
+    options = RunOptions(config_file=file, settings={"sampling.points": "18"}, seed=5)
+    expected = preset("paper", seed=5).with_values({"sampling.points": 18, "sampling.r_min_px": 3.0})
+    assert options.config() == expected
+    assert RunOptions(preset="default", config_file=file).config().preset == "default"
+    assert RunOptions(config_file=file).config().seed == 4

@@ -1,0 +1,50 @@
+"""The fused volume on each device: near the exact surface, and on CUDA the same as on the CPU."""
+
+import numpy as np
+import pytest
+from analytic_scene import CAMERA, LUMP, around, render
+
+from p2p_lib.core.config import TsdfConfig
+from p2p_lib.method.tsdf import TsdfVolume
+
+CONFIG = TsdfConfig(voxel_m=0.004)
+
+
+def fused(device):
+    volume = TsdfVolume(CONFIG, device=device)
+    rgb = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width, 3), np.uint8)
+    for key, T_cam_obj in enumerate([*around(6), *around(6, height=-0.7)]):
+        depth_m, mask = render(LUMP, T_cam_obj)
+        depth_m = np.where(mask, depth_m, np.float32(1.0))  # the background carves
+        assert volume.integrate(depth_m, rgb, mask, CAMERA, T_cam_obj, key=key) > 0
+    return volume
+
+
+@pytest.fixture(params=["cpu", "cuda"])
+def volume(request):
+    torch = pytest.importorskip("torch")
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("torch finds no CUDA device")
+    made = fused(request.param)
+    assert made.device.type == request.param
+    return made
+
+
+def test_the_surface_lies_on_the_shape(volume):
+    vertices = volume.mesh().vertices
+    assert len(vertices) > 1000
+    assert np.abs(LUMP(vertices)).mean() < CONFIG.voxel_m / 2
+    value, valid = volume.query(vertices)
+    assert valid.mean() > 0.9 and np.abs(value[valid]).max() < 0.1 * CONFIG.voxel_m
+
+
+def test_every_device_agrees_with_the_cpu(volume):
+    cpu = fused("cpu")
+    assert volume.shape == cpu.shape
+    np.testing.assert_allclose(volume.weights(), cpu.weights(), atol=1e-5)
+    np.testing.assert_allclose(volume.values(), cpu.values(), atol=1e-5)
+    p_obj = cpu.mesh().vertices[::7] + np.random.default_rng(1).normal(0, 0.002, (len(cpu.mesh().vertices[::7]), 3))
+    for here, there in zip(volume.query_with_gradient(p_obj), cpu.query_with_gradient(p_obj), strict=True):
+        np.testing.assert_allclose(here, there, atol=1e-5)
+    np.testing.assert_array_equal(volume.mesh().faces, cpu.mesh().faces)
+    np.testing.assert_allclose(volume.mesh().vertices, cpu.mesh().vertices, atol=1e-5)

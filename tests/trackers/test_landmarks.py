@@ -1,0 +1,54 @@
+"""Landmarks of a segment: which corners are taken, how many, and the search that finds the segment by them."""
+
+import numpy as np
+import pytest
+
+from p2p_lib.core.config import TrackingConfig
+from p2p_lib.trackers.builtin.landmarks import Landmarks
+from tests.trackers.made_up import CAMERA, DEPTH_M, grid, image, shifted, started
+
+UV = grid((80, 180), (70, 170), 20)
+
+
+def test_found_again_elsewhere_by_its_landmarks():
+    now, moved = image(), shifted(60, -20)
+    p, segments = started(UV, now)
+    segments.add_landmarks(p, now)
+    (segment,) = segments.segments
+    assert len(segment.landmarks.p_seg) > 20
+    segment.hidden_for = 50
+    segments.search(moved, None)
+    assert segment.hidden_for == 1
+    np.testing.assert_allclose(segment.fit.T_cam_seg[:3, 3], np.array([60, -20, 0]) * DEPTH_M / CAMERA.fx, atol=0.003)
+
+
+def test_landmarks_are_added_for_new_sides_only():
+    now = image()
+    p, segments = started(UV, now)
+    for _ in range(3):
+        segments.add_landmarks(p, now)
+    assert len(segments.segments[0].landmarks.views) == 1
+    marks = Landmarks(views=np.array([[0, 0, -0.5]]))
+    side = np.array([np.sin(np.radians(20)), 0, -np.cos(np.radians(20))])
+    assert marks.taken_from(np.array([0, 0.01, -0.8]), 15) and not marks.taken_from(side, 15)
+
+
+def test_only_corners_on_the_segment_are_taken():
+    depth = np.full((240, 320), 0.8, np.float32)
+    depth[60:180, 70:125] = DEPTH_M
+    p, segments = started(UV[UV[:, 0] < 115], image(depth_m=depth))
+    segments.add_landmarks(p, image(depth_m=depth))
+    marks = segments.segments[0].landmarks
+    assert len(marks.p_seg) > 5 and np.abs(marks.p_seg[:, 2] - DEPTH_M).max() < 0.05
+
+
+@pytest.mark.parametrize("cap", [100, 2500])
+def test_no_more_landmarks_than_the_cap(cap):
+    now, cfg = image(), TrackingConfig(max_landmarks=cap)
+    p, segments = started(UV, now, cfg)
+    (segment,) = segments.segments
+    for _ in range(3):
+        segment.landmarks.views = np.zeros((0, 3))
+        segments.add_landmarks(p, now)
+    assert len(segment.landmarks.p_seg) == len(segment.landmarks.descriptors)
+    assert (len(segment.landmarks.p_seg) <= 100) == (cap == 100)

@@ -1,0 +1,123 @@
+"""Rigid motion segments on made-up points: start, fit, split, loss, rejection, and positions that improve."""
+
+import numpy as np
+
+from p2p_lib.core.config import TrackingConfig
+from p2p_lib.trackers.builtin import motion_segments
+from p2p_lib.trackers.builtin.landmarks import Corners
+from p2p_lib.trackers.builtin.tracked_points import Points
+from tests.trackers.made_up import CAMERA, DEPTH_M, grid, image, shifted, started
+
+PX_M = DEPTH_M / CAMERA.fx  # one pixel on the plane
+LEFT, RIGHT = grid((40, 80), (80, 140), 12), grid((200, 250), (80, 140), 12)
+
+
+def test_components_of_enough_points_start_a_segment_each():
+    few = grid((120, 140), (200, 220), 10)  # 4 points, 8 cm from all others
+    p, segments = started(np.vstack([LEFT, RIGHT, few]), image())
+    of = np.split(p.segment, [len(LEFT), len(LEFT) + len(RIGHT)])
+    assert [set(one) for one in of] == [{0}, {1}, {-1}]
+    assert len(segments.segments) == 2
+    np.testing.assert_allclose(CAMERA.project(p.p_seg[: len(LEFT)]), LEFT, atol=0.01)
+
+
+def test_new_points_join_the_segment_next_to_them_in_steps():
+    now = image()
+    p, segments = started(LEFT, now)
+    row = grid((90, 200), (110, 111), 18)  # 3 cm apart, the first of them near the segment
+    p = p.joined(Points.new(row, 5))
+    segments.assign(p, len(LEFT) + np.arange(len(row)), now)
+    assert set(p.segment) == {0} and len(segments.segments) == 1
+
+
+def test_the_pose_follows_the_points_and_refuses_those_that_disagree():
+    p, segments = started(LEFT, image())
+    p.uv += [5, 0]
+    p.uv[:4] += [0, 30]
+    segments.fit(p, shifted(5))
+    np.testing.assert_allclose(segments.segments[0].fit.T_cam_seg[:3, 3], [5 * PX_M, 0, 0], atol=1e-3)
+    assert not p.verified[:4].any() and p.verified[4:].all()
+
+
+def test_a_segment_is_lost_where_too_few_of_its_points_agree():
+    p, segments = started(RIGHT, image())
+    p.uv[5:] += np.random.default_rng(1).uniform(20, 60, (len(RIGHT) - 5, 2))
+    segments.fit(p, image())
+    assert len(RIGHT) > 20 and segments.segments[0].hidden_for == 1
+
+
+def test_points_that_leave_together_stay_verified_and_then_are_a_segment():
+    p, segments = started(np.vstack([LEFT, LEFT + np.array([48, 0])]), image())
+    assert len(segments.segments) == 1
+    part = slice(0, 10)
+    p.uv[part] += [0, 7]  # 1.2 cm: not far yet
+    segments.fit(p, image())
+    assert len(segments.segments) == 1 and p.leaving[part].all() and p.verified[part].all()
+    p.uv[part] += [0, 9]
+    segments.fit(p, image())
+    assert len(segments.segments) == 2 and set(p.segment[part]) == {1} and not p.leaving.any()
+
+
+def test_a_rejected_segment_is_not_searched_for_where_it_was(monkeypatch):
+    p, segments = started(LEFT, image())
+    segments.invalidate(p, np.ones(len(p), bool))
+    p.verified[:] = False
+    (segment,) = segments.segments
+    assert not segment.posed and segment.rejected_for > 0
+    segment.landmarks.p_seg = np.zeros((5, 3))
+    both = np.vstack([LEFT, RIGHT]).astype(float)
+    found = Corners(
+        both, CAMERA.unproject(both, np.full(len(both), DEPTH_M)), np.zeros((len(both), 2, 128), np.float32)
+    )
+    offered = []
+    monkeypatch.setattr(motion_segments, "corners", lambda *_: found)
+    monkeypatch.setattr(segment.landmarks, "match", lambda here, *_: offered.append(here) or (np.zeros((0, 3)),) * 3)
+    monkeypatch.setattr(segments, "_propose", lambda *_: None)
+    segments.search(image(), None)
+    np.testing.assert_array_equal(offered[0].uv_px, RIGHT)
+    for _ in range(TrackingConfig().reject_frames):
+        segments.fit(p, image())
+    segments.search(image(), None)
+    assert len(offered[1].uv_px) == len(both)
+
+
+def test_segments_that_are_followed_are_not_searched_for(monkeypatch):
+    _, segments = started(LEFT, image())
+    segments.segments[0].landmarks.p_seg = np.zeros((5, 3))
+    monkeypatch.setattr(motion_segments, "corners", lambda *_: (_ for _ in ()).throw(AssertionError("searched")))
+    segments.search(image(), None)
+
+
+def test_a_pose_is_proposed_by_enough_corners_only():
+    p, segments = started(LEFT, image())
+    (segment,) = segments.segments
+    segment.hidden_for = 9
+    p_cam = p.p_seg + np.array([0.05, 0, 0])
+    segments._propose(segment, p.p_seg[:4], p_cam[:4], np.arange(4))
+    assert segment.hidden_for == 9
+    # Eight pairs, but of four corners.
+    segments._propose(segment, p.p_seg[:8], p_cam[:8], np.arange(8) // 2)
+    assert segment.hidden_for == 9
+    segments._propose(segment, p.p_seg[:8], p_cam[:8], np.arange(8))
+    assert segment.hidden_for == 1
+    np.testing.assert_allclose(segment.fit.T_cam_seg[:3, 3], [0.05, 0, 0], atol=1e-6)
+
+
+def test_positions_improve_with_observations_that_count_a_quarter_each():
+    now = image()
+    p, segments = started(LEFT, now)
+    p.p_seg += [0, 0, 0.004]
+    p.map_cov[:] = 0.005**2 * np.eye(3)
+    for _ in range(8):
+        segments.update_positions(p, np.arange(len(p)), now)
+    assert np.abs(p.p_seg[:, 2] - DEPTH_M).max() < 0.001
+    one = (1.5 * (0.001 + 0.0025 * DEPTH_M**2)) ** 2  # variance of one observation's depth, by hand
+    np.testing.assert_allclose(p.map_cov[:, 2, 2], 1 / (1 / 0.005**2 + 8 / (4 * one)), rtol=0.05)
+
+
+def test_depth_of_another_surface_teaches_nothing():
+    p, segments = started(LEFT, image())
+    p.map_cov[:] = 0.005**2 * np.eye(3)
+    before = p.p_seg.copy()
+    segments.update_positions(p, np.arange(len(p)), image(depth_m=DEPTH_M - 0.05))
+    np.testing.assert_array_equal(p.p_seg, before)
