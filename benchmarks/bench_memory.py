@@ -45,7 +45,7 @@ def held(method: Point2Pose) -> str:
     """What each object keeps: points / graph keyframes / views / pictures / million voxels."""
     words = []
     for name, obj in method.objects.items():
-        voxels = np.prod(obj.surface.shape) / 1e6
+        voxels = np.prod(obj.model.surface.shape) / 1e6
         counts = (len(obj.map), len(obj.model.graph.keys), len(obj.model.views), len(obj.model.surface.keys))
         words.append(f"{name} {'/'.join(map(str, counts))}/{voxels:.2f}")
     return "  ".join(words)

@@ -1,6 +1,6 @@
-"""Cost of the embedded tracker per frame: ``python benchmarks/bench_tracker.py [SEQUENCE] [--frames N]``.
+"""Cost of the built-in tracker per frame: ``python benchmarks/bench_tracker.py [SEQUENCE] [--frames N]``.
 
-256 points on the objects, 640x480, new queries and searches for lost bodies included. In every frame
+256 points on the objects, 640x480, new queries and searches for lost segments included. In every frame
 plain Lucas-Kanade follows the same points first: how long that takes says how busy the machine is. CPU
 milliseconds of all threads; the bars are 20 ms in the mean and 40 ms at the 95th percentile.
 """
@@ -46,8 +46,8 @@ def main() -> None:
     for tracker, ms in zip(trackers, cost.T, strict=True):
         middle, late = np.percentile(ms, [50, 95])
         print(f"{tracker.name:9} mean {ms.mean():5.1f} ms   median {middle:5.1f}   p95 {late:5.1f}")
-    lk_ms, embedded_ms = cost.mean(0)
-    print(f"ratio of the means {embedded_ms / lk_ms:.1f}; {len(queries)} points, {len(frames)} frames")
+    lk_ms, builtin_ms = cost.mean(0)
+    print(f"ratio of the means {builtin_ms / lk_ms:.1f}; {len(queries)} points, {len(frames)} frames")
 
 
 if __name__ == "__main__":

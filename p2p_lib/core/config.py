@@ -432,7 +432,24 @@ def from_toml(path: str | Path, base: Config | None = None) -> Config:
     return base.with_values(values, source=str(path))
 
 
+#: Keys of version 0.1 that scripts may hold, and what says the same now.
+_RENAMED = {
+    "tsdf.enabled=false": "method.surface=false",
+    "factor_graph.enabled=false": "method.graph=false",
+    "refinement.enabled=false": "refinement.residuals=none",
+    "registration.multi_hypothesis=false": "registration.method=svd",
+    "registration.motion_priors=false": "method.motion=false",
+    "pipeline.object_frame": "method.object_frame",
+    "pipeline.min_mask_px": "lifecycle.min_mask_px",
+    "pipeline.depth_min_m": "depth.min_m",
+    "pipeline.depth_max_m": "depth.max_m",
+}
+
+
 def _unknown(what: str, key: str, known: Any) -> BadInput:
+    for old, new in _RENAMED.items():
+        if old.partition("=")[0] == key:
+            return BadInput(what, repr(key), "a key of this version", f"Instead of {old} say {new}.")
     stage, _, name = str(key).partition(".")
     if name and stage in _STAGES:
         known = [f.name for f in fields(getattr(Config, stage))]

@@ -1,7 +1,7 @@
 """The one way to render a table: a pandas DataFrame as text for a terminal, as Markdown, or as HTML.
 
-Numbers stand to the right and words to the left, a missing value is a dash, the index is left out. Columns whose
-cells are typeset already hold words to the eye of pandas: ``words`` says how many columns at the left really do.
+Numbers stand to the right and words to the left, a missing value is a dash, the index is left out. Where numbers are
+text already, with their spread or in bold, ``words`` says how many columns at the left hold words.
 """
 
 from __future__ import annotations

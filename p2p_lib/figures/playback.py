@@ -11,7 +11,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import P2PError
-from p2p_lib.core.types import WITH_POSE, Frame
+from p2p_lib.core.types import WITH_POSE, Frame, Status
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.masks import read_labels
 from p2p_lib.datasets.runs import Run, load_run
@@ -81,6 +81,12 @@ class Playback:
     def has_pose(self, name: str) -> np.ndarray:
         """(n,) bool: rows with a pose of that very frame."""
         return np.isin(self.run.objects[name].status, [str(s) for s in WITH_POSE])
+
+    def path(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """(k, 3) positions of the object at rows with a pose, and (k, 3) uint8 colours of its status then."""
+        obj, has = self.run.objects[name], self.has_pose(name)
+        fills = [style.rgb(style.STATUS[Status(status)][0]) for status in obj.status[has]]
+        return obj.T_cam_obj[has, :3, 3], np.array(fills, np.uint8).reshape(-1, 3)
 
     def keyframes(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Rows (K,) that added a keyframe, and its T_obj_cam (K, 4, 4) as estimated then."""

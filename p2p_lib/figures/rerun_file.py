@@ -89,11 +89,9 @@ def _log_constants(rr: Any, stream: Any, playback: Playback) -> None:
         for plot in ("error", "confidence"):
             stream.log([plot, name], rr.SeriesLines(colors=colour, names=name), static=True)
         stream.log(["status", name], rr.StateConfiguration(values=statuses, colors=fills), static=True)
-        obj, has = playback.run.objects[name], playback.has_pose(name)
-        status_fill = np.array([style.rgb(style.STATUS[Status(s)][0]) for s in obj.status[has]], np.uint8)
-        if has.any():
-            path = rr.Points3D(obj.T_cam_obj[has, :3, 3], colors=status_fill, radii=_POINT_M)
-            stream.log(["paths", name], path, static=True)
+        positions, colours = playback.path(name)
+        if len(positions):
+            stream.log(["paths", name], rr.Points3D(positions, colors=colours, radii=_POINT_M), static=True)
 
 
 def _log_images(rr: Any, stream: Any, playback: Playback, i: int) -> None:

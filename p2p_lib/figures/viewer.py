@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.native import load_open3d
-from p2p_lib.core.types import Status
 from p2p_lib.datasets.runs import quaternion_xyzw
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
@@ -149,17 +148,10 @@ class _Scene:
             for row, q, T in zip(rows, wxyz, T_obj_cam, strict=True)
         ]
         nodes["keyframe_rows"] = rows
-        self._add_path(name)
+        positions, colours = playback.path(name)
+        if len(positions):
+            scene.add_point_cloud(f"/paths/{name}", positions, colours, point_size=_POINT_M, precision="float32")
         return nodes
-
-    def _add_path(self, name: str) -> None:
-        """Where the object was at every frame, in the colour of its status then."""
-        obj, has = self._playback.run.objects[name], self._playback.has_pose(name)
-        if has.any():
-            fill = np.array([style.rgb(style.STATUS[Status(s)][0]) for s in obj.status[has]], np.uint8)
-            self._scene.add_point_cloud(
-                f"/paths/{name}", obj.T_cam_obj[has, :3, 3], fill, point_size=_POINT_M, precision="float32"
-            )
 
     def show(self, i: int, renew: bool) -> None:
         """Change the scene to row i; ``renew``: its points, image and bright keypoints too."""

@@ -90,14 +90,20 @@ class Point2Pose:
             self._first_clicks[name] = clicks
             self._clicked.add(name)
         self.objects[name] = ObjectTracker(
-            name, self.camera, self.config, self.detector, self._rng.spawn(1)[0], self.stopwatch
+            name,
+            self.camera,
+            self.config,
+            self.detector,
+            np.random.default_rng([self.config.seed, *name.encode()]),
+            self.stopwatch,
         )
 
     def remove_object(self, name: str) -> None:
         """Stop following an object; its points are dropped from the tracker."""
         if name not in self.objects:
             raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        self.tracker.drop(self.objects.pop(name).map.ids)
+        if len(ids := self.objects.pop(name).map.ids):
+            self.tracker.drop(ids)
         self._first_masks.pop(name, None)
         self._first_clicks.pop(name, None)
         self._clicked.discard(name)

@@ -77,13 +77,10 @@ class Numbers:
         self.seeds = benchmark.plan.scope(benchmark.profile).seeds
         #: A few dozen frames are too few to call a method the best or the fastest.
         self.judges = benchmark.profile != "quick"
-        self._rows = [
-            row
+        self._at = {
+            (row["method"], row["metric"], row["form"], row["sequence"], row["object"]): row
             for row in benchmark.summary
             if row["failures"] in ("zero", "-") and row["align"] in ("first", "-") and row.get("value") is not None
-        ]
-        self._at = {
-            (row["method"], row["metric"], row["form"], row["sequence"], row["object"]): row for row in self._rows
         }
 
     def row(self, method: str, metric: str, sequence: str, object: str = "", form: str = "exact") -> Row | None:
@@ -93,9 +90,7 @@ class Numbers:
     def of_objects(self, method: str, metric: str) -> list[float]:
         """A method's number for every object of every sequence."""
         of = (method, metric, "exact")
-        return [
-            row["value"] for row in self._rows if (row["method"], row["metric"], row["form"]) == of and row["object"]
-        ]
+        return [row["value"] for (*about, _, object), row in self._at.items() if tuple(about) == of and object]
 
     def cell(self, method: str, metric: str, sequence: str, object: str = "", form: str = "exact") -> Cell:
         """The number over seeds as a cell; where there is none it says why."""

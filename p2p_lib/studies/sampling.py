@@ -20,7 +20,7 @@ from p2p_lib.core.backends import make_detector, make_tracker
 from p2p_lib.core.config import Config, SamplingConfig, preset
 from p2p_lib.core.depth import depth_noise_m, lift
 from p2p_lib.core.image import nearest_px
-from p2p_lib.core.interfaces import Candidates
+from p2p_lib.core.interfaces import Candidates, PointTracker
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.evaluation.true_tracks import TrueScene
@@ -87,10 +87,10 @@ class Situation:
         return self.video.camera.unproject(np.stack([u, v], 1)[some].astype(float), self.frame.depth_m[v, u][some])
 
 
-def greedy_terms(candidates: Candidates, chosen: np.ndarray, stored_px: np.ndarray, config: SamplingConfig) -> Terms:
+def greedy_terms(candidates: Candidates, chosen: np.ndarray, config: SamplingConfig) -> Terms:
     """The terms (K,) of each choice at the moment it was taken."""
-    before = [np.concatenate([stored_px, candidates.uv_px[chosen[:k]]]) for k in range(len(chosen))]
-    d = [distance_px(candidates.uv_px[[i]], points)[0] for i, points in zip(chosen, before, strict=True)]
+    uv_px = candidates.uv_px[chosen]
+    d = [distance_px(uv_px[[k]], uv_px[:k])[0] for k in range(len(chosen))]
     return terms(candidates.score[chosen], np.array(d), config)
 
 
@@ -135,31 +135,25 @@ def compare_choices(
             sampling, candidates = at.config.with_values(dict(settings)).sampling, at.candidates(detector, seed)
             uv_px = candidates.uv_px[choose(candidates, _NOTHING, sampling.points, sampling)]
             turn_deg, error_m = conditioning(at.lift(uv_px), at.surface(), at.config)
+            follower = make_tracker(tracker, at.config.tracking, np.random.default_rng(seed))
+            kept = _still_tracked(at, uv_px, scene, frames, follower) if scene else np.nan
             row = {
                 "choice": label,
                 "uv_px": uv_px,
                 "covered [%]": 100 * coverage(at.mask, uv_px, at.config.sampling.r_ideal_px),
                 "worst turn [°]": turn_deg,
                 "pose error [mm]": 1e3 * error_m,
-                "still tracked [%]": 100 * _still_tracked(at, uv_px, scene, frames, tracker, seed),
+                "still tracked [%]": 100 * kept,
             }
             rows.append(row)
     return DataFrame(rows)
 
 
 def _still_tracked(
-    at: Situation,
-    uv_px: np.ndarray,
-    scene: TrueScene | None,
-    frames: Sequence[tuple[Frame, np.ndarray | None]],
-    tracker: str,
-    seed: int,
+    at: Situation, uv_px: np.ndarray, scene: TrueScene, frames: Sequence[tuple], follower: PointTracker
 ) -> float:
     """Share of the points truly in sight in the last frame that the tracker has within 2 px; NaN if none is."""
-    if scene is None:
-        return np.nan
     points = scene.lift(at.frame, np.full(len(uv_px), scene.objects.index(at.name)), uv_px)
-    follower = make_tracker(tracker, at.config.tracking, np.random.default_rng(seed))
     follower.start(at.frame)
     follower.add(uv_px)
     for frame, mask in frames:
@@ -305,7 +299,7 @@ def greedy_plot(situation: Situation, candidates: Candidates) -> tuple[Figure, T
     """
     config = situation.config.sampling
     chosen = choose(candidates, _NOTHING, len(candidates.score), config)
-    parts = greedy_terms(candidates, chosen, _NOTHING, config)
+    parts = greedy_terms(candidates, chosen, config)
     k, zero = np.arange(1, len(chosen) + 1), np.zeros(len(chosen))
     layers = ((zero, parts.trackability), (parts.trackability, parts.trackability + parts.spread))
     figure, (axis,) = panels(1, (_WIDTH_IN, 3.0))

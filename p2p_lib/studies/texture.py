@@ -12,7 +12,7 @@ of a real object; contrasts in the order given, dark to bright.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import cycle
 from pathlib import Path
 
@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
-from pandas import DataFrame, concat
+from pandas import DataFrame, Series, concat
 from scipy import stats
 
 from p2p_lib.core.errors import BadInput, MissingData
@@ -48,6 +48,15 @@ LEGEND = "contrast of the print, synthetic"
 _WIDTH_IN = 8.0
 _TEXTURE = "mean Sobel gradient in the mask [grey levels / px]"
 _TRACK, _ADD = "median 2D track error [px]", "ADD AUC [%]"
+#: Columns of the table of measures.
+_HEADS = {
+    "frames": "scored frames",
+    "texture": "Sobel [grey levels/px]",
+    "track_px": "median track error [px]",
+    "tracks": "tracks per frame",
+    "add_auc": _ADD,
+    "adds_auc": "ADD-S AUC [%]",
+}
 
 
 class RecordedTracker:
@@ -302,23 +311,10 @@ def correlation_table(windows: Mapping[str, Sequence[Measure]], seed: int = 0) -
 
 def measure_table(measures: Mapping[str, Measure | str], head: str = LEGEND) -> DataFrame:
     """A row per label: what it shows, how it was tracked, how right its pose was; or dashes and the reason."""
-    rows = [
-        {head: label, "why not": m}
-        if isinstance(m, str)
-        else {
-            head: label,
-            "scored frames": m.frames,
-            "Sobel [grey levels/px]": round(m.texture, 2),
-            "median track error [px]": round(m.track_px, 2),
-            "tracks per frame": round(m.tracks, 1),
-            _ADD: round(m.add_auc, 1),
-            "ADD-S AUC [%]": round(m.adds_auc, 1),
-            "why not": "",
-        }
-        for label, m in measures.items()
-    ]
-    table = DataFrame(rows)
-    reasons = table.pop("why not")
+    table = DataFrame([{"why not": m} if isinstance(m, str) else asdict(m) for m in measures.values()])
+    reasons = table.get("why not", Series("", table.index)).fillna("")
+    table = table.reindex(columns=_HEADS).round(2).rename(columns=_HEADS)
+    table.insert(0, head, list(measures))
     return table.assign(**{"why not": reasons}) if reasons.any() else table
 
 

@@ -1,7 +1,7 @@
 """CoTracker3 online (Karaev et al., ICCV 2025), through torch.hub. Code and weights: CC BY-NC, not for commercial use.
 
-The model looks at windows of 16 pictures, 8 of them new, so an answer comes up to 7 frames late. A rollout
-begins with 8 copies of its first picture, so that the first window is full after 8 real ones.
+The model looks at windows of 16 images, 8 of them new, so an answer comes up to 7 frames late. A rollout
+begins with 8 copies of its first image, so that the first window is full after 8 real ones.
 """
 
 from __future__ import annotations
@@ -53,19 +53,19 @@ class CoTrackerModel:
         self.window, self.fresh = self.model.window_len, predictor.step
         self.latency_frames = self.fresh - 1
 
-    def begin(self, pictures: list[np.ndarray], uv_px: np.ndarray) -> CoTrackerRollout:
-        """A rollout with queries in the first picture."""
-        return CoTrackerRollout(self, pictures, uv_px)
+    def begin(self, images: list[np.ndarray], uv_px: np.ndarray) -> CoTrackerRollout:
+        """A rollout with queries in the first image."""
+        return CoTrackerRollout(self, images, uv_px)
 
     def resized(self, rgb: np.ndarray) -> torch.Tensor:
         """(3, h, w) float32 in [0, 255]; the corners' pixel centres stay in the corners."""
         import torch
 
-        picture = torch.from_numpy(rgb).to(self.device).permute(2, 0, 1)[None].float()
-        return torch.nn.functional.interpolate(picture, self.size, mode="bilinear", align_corners=True)[0]
+        image = torch.from_numpy(rgb).to(self.device).permute(2, 0, 1)[None].float()
+        return torch.nn.functional.interpolate(image, self.size, mode="bilinear", align_corners=True)[0]
 
     def scale(self, shape: tuple[int, int]) -> np.ndarray:
-        """(2,) x, y: the model's pixels per pixel of a picture of shape (H, W)."""
+        """(2,) x, y: the model's pixels per pixel of a image of shape (H, W)."""
         h, w = self.size
         return np.array([(w - 1) / (shape[1] - 1), (h - 1) / (shape[0] - 1)])
 
@@ -73,18 +73,18 @@ class CoTrackerModel:
 class CoTrackerRollout:
     """The model's sliding window with a fixed set of queries. It keeps its state in the model: swapped in and out."""
 
-    def __init__(self, of: CoTrackerModel, pictures: list[np.ndarray], uv_px: np.ndarray):
+    def __init__(self, of: CoTrackerModel, images: list[np.ndarray], uv_px: np.ndarray):
         import torch
 
-        self._of, self._scale = of, of.scale(pictures[0].shape[:2])
+        self._of, self._scale = of, of.scale(images[0].shape[:2])
         queries = np.concatenate([np.zeros((len(uv_px), 1)), uv_px * self._scale], 1).astype(np.float32)
         self._queries = torch.from_numpy(queries).to(of.device)[None]
-        still = of.resized(pictures[0])
-        self._pictures = deque([still] * of.fresh, maxlen=of.window)
-        self._taken = 0  # real pictures so far
+        still = of.resized(images[0])
+        self._images = deque([still] * of.fresh, maxlen=of.window)
+        self._taken = 0  # real images so far
         self._state: dict | None = None
         self._told: tuple[np.ndarray, ...] = ()  # of the frames since the still, as far as the windows reach
-        for rgb in pictures:
+        for rgb in images:
             self._take(rgb)
 
     def step(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,13 +98,13 @@ class CoTrackerRollout:
         return xy / self._scale, visible * sure > _VISIBLE, 1 - sure
 
     def _take(self, rgb: np.ndarray) -> None:
-        self._pictures.append(self._of.resized(rgb))
+        self._images.append(self._of.resized(rgb))
         self._taken += 1
         if self._taken % self._of.fresh == 0:
             self._run_window()
 
     def _run_window(self) -> None:
-        """One window over the newest pictures; of what the model predicts the window's part is kept."""
+        """One window over the newest images; of what the model predicts the window's part is kept."""
         import torch
 
         model, window = self._of.model, self._of.window
@@ -112,7 +112,7 @@ class CoTrackerRollout:
             model.init_video_online_processing()
             if self._state is not None:
                 vars(model).update(self._state)
-            video = torch.stack(list(self._pictures))[None]
+            video = torch.stack(list(self._images))[None]
             told = model(video=video, queries=self._queries, iters=_ITERATIONS, is_online=True)[:3]
         self._state = {key: value for key, value in vars(model).items() if key.startswith("online_")}
         self._told = tuple(part[0, -window:].double().cpu().numpy() for part in told)

@@ -18,7 +18,7 @@ from p2p_lib.trackers.rollouts import RolloutTracker
 if TYPE_CHECKING:
     import torch
 
-#: Side of the square that pictures are scaled to; coordinates have one bin per pixel of it.
+#: Side of the square that images are scaled to; coordinates have one bin per pixel of it.
 SIZE_PX = 256
 # The uncertainty is the probability that the model puts farther off than this, in pixels of its raster.
 _NEAR_PX = 8
@@ -49,9 +49,9 @@ class TapNextModel:
     def __init__(self, model: torch.nn.Module, device: str = "cpu"):
         self.model, self.device = model.to(device).eval(), device
 
-    def begin(self, pictures: list[np.ndarray], uv_px: np.ndarray) -> TapNextRollout:
-        """A rollout with queries in the newest picture."""
-        return TapNextRollout(self, pictures[0], uv_px)
+    def begin(self, images: list[np.ndarray], uv_px: np.ndarray) -> TapNextRollout:
+        """A rollout with queries in the newest image."""
+        return TapNextRollout(self, images[0], uv_px)
 
 
 class TapNextRollout:
@@ -66,7 +66,7 @@ class TapNextRollout:
         self._state = self._forward(rgb, query_points=torch.from_numpy(tyx).to(of.device)[None])[-1]
 
     def step(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions (Q, 2) in pixels, visible (Q,), uncertainty (Q,) in the next picture."""
+        """Positions (Q, 2) in pixels, visible (Q,), uncertainty (Q,) in the next image."""
         yx, logits, visible, self._state = self._forward(rgb, state=self._state)
         yx, logits = yx[0, 0].double(), logits[0, 0].double()
         sure = _mass_near(yx[:, 0], logits[:, :SIZE_PX]) * _mass_near(yx[:, 1], logits[:, SIZE_PX:])

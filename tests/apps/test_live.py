@@ -11,7 +11,6 @@ from urllib.request import Request, urlopen
 import cv2
 import numpy as np
 import pytest
-from test_cli import POINTS_ALONE, H, K, W, write_sequence
 
 from p2p_lib.apps import cli
 from p2p_lib.apps.live import json_line, track_live
@@ -23,6 +22,7 @@ from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.prompts import Prompt, save_prompts
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.run import run
+from tests.apps.test_cli import POINTS_ALONE, H, K, W, write_sequence
 
 FRAMES = 20  # then the board jumps back
 SETTINGS = {"method.surface": "false", "method.graph": "false"}

@@ -14,8 +14,8 @@ TYPED = {
     "preset": (["--preset", "paper"], "paper"),
     "config_file": (["--config", "mine.toml"], "mine.toml"),
     "settings": (
-        ["--set", "sampling.points=5", "--set", "tsdf.enabled=no"],
-        {"sampling.points": "5", "tsdf.enabled": "no"},
+        ["--set", "sampling.points=5", "--set", "method.surface=no"],
+        {"sampling.points": "5", "method.surface": "no"},
     ),
     "seed": (["--seed", "7"], 7),
     "device": (["--device", "cuda:1"], "cuda:1"),

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from recordings import noise, record, seen
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.apps.cli import main
@@ -12,6 +11,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets.recording import PoseLog, calibrate, read_log
 from p2p_lib.datasets.sequence import open_sequence
+from tests.datasets.recordings import noise, record, seen
 
 CAMERA = Camera(614.4, 615.1, 323.5, 239.1, 640, 480)
 

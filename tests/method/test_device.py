@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from analytic_scene import CAMERA, LUMP, around, render
 
 from p2p_lib.core.config import TsdfConfig
 from p2p_lib.method.tsdf import TsdfVolume
+from tests.method.analytic_scene import CAMERA, LUMP, around, render
 
 CONFIG = TsdfConfig(voxel_m=0.004)
 

@@ -15,9 +15,10 @@ from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
 
 pytest.importorskip("gtsam")
 
-DEFAULT, PAPER = preset("default").factor_graph, preset("paper").factor_graph
-ALL = replace(DEFAULT, max_keyframes=0)
 SIGMA_RAD, SIGMA_M = 0.0015, 0.003
+DEFAULT = replace(preset("default").factor_graph, range_sigma_m=SIGMA_M)
+PAPER = preset("paper").factor_graph
+ALL = replace(DEFAULT, max_keyframes=0)
 
 
 @dataclass

@@ -372,6 +372,12 @@ def test_the_future_changes_nothing(hidden_run, stop):
     assert_same(hidden_run[:stop], track(film(board=True)[:stop], config=preset()))
 
 
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_the_order_of_the_objects_means_nothing(name):
+    runs = [track(film(board=True)[: HIDDEN.stop + 2], names, preset(name)) for names in (TRUTH, list(TRUTH)[::-1])]
+    assert_same(*runs)
+
+
 def test_input_is_left_as_it_was():
     before = [(f.rgb.copy(), f.depth_m.copy(), {n: m.copy() for n, m in masks.items()}) for f, masks in film()[:8]]
     track(film()[:8], config=preset())

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from analytic_scene import CAMERA, LUMP, around, box, can, look_from, render
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,6 +11,7 @@ from p2p_lib.method import refinement
 from p2p_lib.method.observation import sample_cloud
 from p2p_lib.method.refinement import Keypoints, refine, surface_jacobian, surface_score
 from p2p_lib.method.tsdf import TsdfVolume
+from tests.method.analytic_scene import CAMERA, LUMP, around, box, can, look_from, render
 
 CONFIG = RefinementConfig()
 WHITE = np.full((CAMERA.height, CAMERA.width, 3), 255, np.uint8)

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from analytic_scene import CAMERA, LUMP, around, ball, box, look_from, render
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
@@ -12,6 +11,7 @@ from p2p_lib.core.config import TsdfConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.method import mesh as meshes
 from p2p_lib.method.tsdf import BLOCK, TsdfVolume
+from tests.method.analytic_scene import CAMERA, LUMP, around, ball, box, look_from, render
 
 CONFIG = TsdfConfig(voxel_m=0.004)
 WHITE = np.full((CAMERA.height, CAMERA.width, 3), 255, np.uint8)

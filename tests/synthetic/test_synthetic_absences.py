@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_points import watch
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.synthetic import SCENARIOS
+from tests.synthetic.surface_points import watch
 
 SMALL = Camera(615 / 4, 615 / 4, 79.5, 59.5, 160, 120)
 STEP = 2  # every second frame is looked at

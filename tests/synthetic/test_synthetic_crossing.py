@@ -8,7 +8,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from surface_points import see, watch
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
@@ -16,6 +15,7 @@ from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.synthetic import SCENARIOS, generate, scenario_dir
 from p2p_lib.synthetic.noise import PERFECT, Sensor
 from p2p_lib.synthetic.render import render
+from tests.synthetic.surface_points import see, watch
 
 OBJECTS = ("box", "can")
 FRAMES = 300
@@ -202,13 +202,13 @@ def test_every_seed_keeps_the_promises(seed):
     for body in scenario.bodies[:2]:
         T_cam_model = se3.inverse(scenario.T_world_cam) @ body.T_world_model
         check_promises(body.name, T_cam_model, *seen[body.name], 160 * 120 * 0.5)
-    # They pass in front of each other, the box first: each loses a part of its picture to the other, never all.
+    # They pass in front of each other, the box first: each is hidden in part by the other, never all.
     for k, frames in ((1, range(40, 110, 4)), (0, range(215, FRAMES, 4))):
         shares = []
         for t in frames:
             one = scenario.bodies[k]
             alone = render([(one.mesh, one.T_world_model[t])], small, scenario.T_world_cam[t])
-            shares.append(px[k, t] / np.count_nonzero(alone.label))
+            shares.append(px[k][t] / np.count_nonzero(alone.label))
         assert 0.2 < min(shares) < 0.85 and max(shares) > 0.95, (one.name, shares)
 
 

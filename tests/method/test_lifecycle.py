@@ -1,0 +1,102 @@
+"""What an object goes through, on made-up poses and evidence: no frame, no tracker, no image."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from p2p_lib.core import se3
+from p2p_lib.core.config import LifecycleConfig
+from p2p_lib.core.types import WITH_POSE, Status
+from p2p_lib.method.lifecycle import CONFIRM_FRAMES, GATES, Evidence, Lifecycle
+
+CFG = LifecycleConfig()
+ALL = tuple(GATES)
+GOOD = Evidence(support=30, surface_share=0.9)
+
+
+def pose(k: float) -> np.ndarray:
+    return se3.exp(np.array([0.02 * k, 0, 0.01 * k, 0.001 * k, 0, 0.6]))
+
+
+def lived(*steps: Evidence | Status) -> list[Lifecycle]:
+    """Started at pose 0, then judged with all gates, frame by frame; a status stands for a frame without a pose."""
+    lives = [Lifecycle().started(pose(0), 0.0, Status.TRACKED)]
+    for k, step in enumerate(steps, 1):
+        life = lives[-1]
+        if isinstance(step, Evidence):
+            verdict = life.judge(step, ALL, CFG)
+            life = life.with_pose(pose(k), k, verdict.status) if verdict.accepted else life.without_pose(verdict.status)
+        else:
+            life = life.without_pose(step)
+        lives.append(life)
+    return lives
+
+
+def test_it_is_a_value():
+    life = Lifecycle()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        life.status = Status.TRACKED
+    before = lived(GOOD)[-1]
+    before.judge(Evidence(0, None), ALL, CFG)
+    before.without_pose(Status.LOST)
+    assert before.has_pose and before.status is Status.TRACKED
+
+
+def test_priors_are_the_last_pose_and_even_motion():
+    lives = lived(GOOD, GOOD)
+    priors = lives[-1].motion_priors()
+    np.testing.assert_array_equal(priors["last pose"], pose(2))
+    # The step from the pose before, made once more on the right.
+    np.testing.assert_allclose(priors["constant velocity"], pose(2) @ np.linalg.inv(pose(1)) @ pose(2), atol=1e-12)
+    assert list(lives[0].motion_priors()) == ["last pose"]
+
+
+def test_a_gap_leaves_no_prior():
+    assert lived(GOOD, Status.OCCLUDED)[-1].motion_priors() == {}
+    back = lived(GOOD, Status.OCCLUDED, GOOD)[-1]
+    assert list(back.motion_priors()) == ["last pose"], "what moved during a gap says nothing of the speed"
+
+
+def test_moves_are_told_from_the_frame_before():
+    life = lived(GOOD)[-1]
+    moved_m, turned_deg = life.moved_from_last(pose(1) @ se3.exp(np.array([0, 0.1, 0, 0, 0, 0])))
+    assert moved_m == pytest.approx(0, abs=1e-9) and turned_deg == pytest.approx(np.degrees(0.1))
+    assert life.moved_from_last(se3.from_rt(pose(1)[:3, :3], pose(1)[:3, 3] + [0, 0.03, 0]))[0] == pytest.approx(0.03)
+    assert lived(Status.LOST)[-1].moved_from_last(pose(1)) is None
+
+
+def test_few_points_are_degraded_while_tracked_and_no_return():
+    few = Evidence(CFG.return_inliers - 1, 0.9)
+    assert lived(few)[-1].status is Status.DEGRADED
+    verdict = lived(Status.OCCLUDED)[-1].judge(few, ALL, CFG)
+    assert not verdict.accepted and verdict.status is Status.LOST and "agree on a return" in verdict.reason
+    assert lived(Status.OCCLUDED)[-1].judge(few, (), CFG).accepted, "the paper has no gates"
+    assert lived(Status.OCCLUDED)[-1].judge(GOOD, ALL, CFG).accepted
+
+
+@pytest.mark.parametrize(("share", "accepted"), [(0.61, True), (0.59, False), (None, False)])
+def test_without_points_the_surface_has_to_fit(share, accepted):
+    verdict = lived(GOOD)[-1].judge(Evidence(0, share), ALL, CFG)
+    assert verdict.accepted == accepted
+    assert verdict.status is (Status.DEGRADED if accepted else Status.LOST) and verdict.reason
+
+
+def test_a_return_is_recovered_until_it_is_confirmed():
+    lives = lived(Status.OCCLUDED, *[GOOD] * (CONFIRM_FRAMES + 2))
+    assert [life.status for life in lives[2:]] == [Status.RECOVERED] * CONFIRM_FRAMES + [Status.TRACKED] * 2
+    assert [life.unconfirmed for life in lives[1:]] == [True] * (CONFIRM_FRAMES + 1) + [False] * 2
+
+
+def test_a_return_that_is_not_confirmed_is_taken_back():
+    lives = lived(GOOD, Status.OCCLUDED, GOOD, GOOD, Evidence(3, 0.9))
+    assert [life.status in WITH_POSE for life in lives] == [True, True, False, True, True, False]
+    np.testing.assert_array_equal(lives[-1].T_cam_obj, pose(1))
+    confirmed = lived(GOOD, Status.OCCLUDED, *[GOOD] * (CONFIRM_FRAMES + 1), Status.LOST)[-1]
+    np.testing.assert_array_equal(confirmed.T_cam_obj, pose(CONFIRM_FRAMES + 3))
+
+
+def test_what_was_left_is_kept_through_the_frames_of_an_absence():
+    lives = lived(GOOD, GOOD, Status.LOST, Status.OCCLUDED, Status.LOST)
+    for life in lives[3:]:
+        np.testing.assert_array_equal(life.T_cam_obj, pose(2))
