@@ -1,4 +1,4 @@
-"""Errors of a fused surface against exact shapes: known offsets are measured, and images of meshes show them."""
+"""Errors of a fused surface against exact shapes: known offsets are measured, and pictures of meshes show them."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_what_no_camera_saw_is_not_asked_for():
     assert (np.abs(seen[:, 0] + 0.04) > 1e-6).all(), "the far side neither"
 
 
-def test_perfect_images_give_the_exact_surface_and_drift_spoils_it():
+def test_perfect_pictures_give_the_exact_surface_and_drift_spoils_it():
     shots = turntable.photograph(BODY, POSES, 0, PERFECT)
     errors = reconstruction.errors_by_keyframes(shots, (1, 4), BODY, TsdfConfig())
     assert errors[1].max() < 0.0015 and errors[0, 1] > 3 * errors[1, 1]

@@ -1,4 +1,4 @@
-"""Bodies on a turntable: images, exact distances and the experiments on refinement agree with each other."""
+"""Bodies on a turntable: pictures, exact distances and the experiments on refinement agree with each other."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ CONFIG = preset("default")
 
 
 @pytest.mark.parametrize("body", [turntable.carton(1), turntable.tin(1)], ids=lambda body: body.name)
-def test_perfect_images_lie_on_the_exact_surface(body):
+def test_perfect_pictures_lie_on_the_exact_surface(body):
     shots = turntable.photograph(body, turntable.ring(3), 0, PERFECT)
     for shot in shots:
         v, u = np.nonzero(shot.mask)
