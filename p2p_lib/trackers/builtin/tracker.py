@@ -99,7 +99,6 @@ class BuiltinTracker:
         if self._frames % cfg.update_every == 0:
             recognition.update_templates(p, now, cfg, self._frames // cfg.update_every)
             self._segments.assign(p, np.flatnonzero(p.verified & (p.segment < 0)), now)
-            self._segments.join(p)
             self._segments.add_landmarks(p, now)
         return self._tracks()
 
