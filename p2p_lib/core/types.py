@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from typing import TypeVar
 
@@ -131,7 +131,6 @@ class PoseEstimate:
     last_T_cam_obj: np.ndarray | None = None
     last_seen_s: float = float("nan")
     keyframe: bool = False
-    extra: dict = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         name = f"estimate of {self.object!r} at frame {self.frame_index}"
