@@ -20,7 +20,11 @@ def _effect(size: float, meaning: str, high: float = np.inf) -> Any:
 
 @dataclass(frozen=True)
 class Sensor:
-    """Sensor model; 0 switches an effect off. The defaults are about those of a RealSense D435 at 640x480."""
+    """Sensor model; 0 switches an effect off. The defaults are about those of a RealSense D435 at 640x480.
+
+    It makes errors; what the method assumes of them is :func:`p2p_lib.core.depth.depth_noise_m`, a model of its own, so
+    that no experiment is told what it is to find.
+    """
 
     axial_per_m: float = _effect(0.004, "standard deviation of depth at 1 m, in m; grows with the range squared")
     correlation_px: float = _effect(1.5, "depth noise is even over this radius: stereo matches windows, not pixels")

@@ -307,13 +307,15 @@ def test_distances_to_a_known_surface():
         def query(self, p):
             return np.linalg.norm(p, axis=-1) - 0.1, np.linalg.norm(p, axis=-1) < 0.15
 
+        def corners_m(self):
+            return np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+
     T_cam_obj = np.eye(4)
     T_cam_obj[:3, 3] = 0.05, -0.02, 0.6
     frame = picture(0, [])
     depth = np.full(frame.shape, 0.52, np.float32)
     depth[:, :20] = 0
-    corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
-    distance = surface_distance(Sphere(), corners, depth, CAMERA, T_cam_obj)
+    distance = surface_distance(Sphere(), depth, CAMERA, T_cam_obj)
     u, v = np.rint(CAMERA.project(T_cam_obj[:3, 3])).astype(int)
     assert distance[v, u] == pytest.approx(0.08 - 0.1, abs=1e-3)
     assert np.isnan(distance[:, :20]).all() and np.isnan(distance[0, 0])

@@ -77,10 +77,14 @@ class Landmarks:
         found = corners(now, _region_around(uv_px, now, cfg.segment_reach_m), cfg.corners)
         at = se3.transform(se3.inverse(T_cam_seg), found.p_cam)
         near = np.linalg.norm(at[:, None] - p_seg[None], axis=-1).min(1) < cfg.segment_reach_m
-        at = np.concatenate([self.p_seg, at[near]])
-        keep = np.sort(rng.permutation(len(at))[: cfg.max_landmarks])
-        self.p_seg, self.descriptors = at[keep], np.concatenate([self.descriptors, found.descriptors[near]])[keep]
+        self.extend(at[near], found.descriptors[near], cfg.max_landmarks, rng)
         self.views = np.vstack([self.views, camera_centre])
+
+    def extend(self, p_seg: np.ndarray, descriptors: np.ndarray, most: int, rng: np.random.Generator) -> None:
+        """Add these; beyond ``most`` in all, a random choice stays."""
+        p_seg, descriptors = np.concatenate([self.p_seg, p_seg]), np.concatenate([self.descriptors, descriptors])
+        keep = np.sort(rng.permutation(len(p_seg))[:most])
+        self.p_seg, self.descriptors = p_seg[keep], descriptors[keep]
 
     def match(
         self, found: Corners, ratio: float, rng: np.random.Generator

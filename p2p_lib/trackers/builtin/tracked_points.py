@@ -24,6 +24,7 @@ class Points:
     cov: np.ndarray  # (N, 2, 2) covariance of uv, px^2
     visible: np.ndarray  # (N,) bool: what the caller is told
     verified: np.ndarray  # (N,) bool: a template, or Lucas-Kanade for a while, says so, not the segment alone
+    depth_m: np.ndarray  # (N,) where it was last visible; 0 where not measured
     hidden_for: np.ndarray  # (N,) frames
     ncc: np.ndarray  # (N,) correlation with the template last recognised
     coasting: np.ndarray  # (N,) frames since a template was last recognised
@@ -52,6 +53,7 @@ class Points:
             cov=np.zeros((n, 2, 2), np.float32),
             visible=np.ones(n, bool),
             verified=np.ones(n, bool),
+            depth_m=np.zeros(n, np.float32),
             hidden_for=np.zeros(n, np.int64),
             ncc=np.ones(n, np.float32),
             coasting=np.zeros(n, np.int64),

@@ -80,6 +80,7 @@ class BuiltinTracker:
         self._find_predicted(None)
         if (self._segments.posed(p) & ~known).any():
             self._reconcile(None)
+            self._check_depth()
             p.hidden_for[p.visible] = 0
         return self._tracks()
 
@@ -95,10 +96,12 @@ class BuiltinTracker:
             self._segments.search(now, search)
         self._find_predicted(search)
         self._reconcile(search)
+        self._check_depth()
         p.hidden_for = np.where(p.visible, 0, p.hidden_for + 1)
         if self._frames % cfg.update_every == 0:
             recognition.update_templates(p, now, cfg, self._frames // cfg.update_every)
             self._segments.assign(p, np.flatnonzero(p.verified & (p.segment < 0)), now)
+            self._segments.join(p)
             self._segments.add_landmarks(p, now)
         return self._tracks()
 
@@ -148,3 +151,12 @@ class BuiltinTracker:
         p.warp[rows[~seen]] = predicted.warp[~seen]
         p.verified[rows] = seen & exposed
         p.visible[rows] = exposed & (seen | (predicted.sigma_px < cfg.max_predicted_sigma_px))
+
+    def _check_depth(self) -> None:
+        """A visible point whose depth jumps between frames has slid off its object, or something has come before it."""
+        p = self._points
+        z = self._now.depth_at(p.uv)
+        jumped = p.visible & (z > 0) & (p.depth_m > 0) & (np.abs(z - p.depth_m) > self.config.depth_jump_m)
+        p.visible[jumped] = False
+        # Depth is kept of visible points only: a hidden object moves anywhere.
+        p.depth_m = np.where(p.visible & (z > 0), z, np.where(p.visible, p.depth_m, 0)).astype(np.float32)
