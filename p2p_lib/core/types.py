@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -84,6 +84,18 @@ class Tracks:
 
 
 Arrays = TypeVar("Arrays")
+
+
+class Rows:
+    """What dataclasses have in common whose fields are arrays (or such dataclasses again) of one row per item."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def select(self, rows: np.ndarray) -> Self:
+        """The items at these rows or under this mask."""
+        columns = (getattr(self, f.name) for f in fields(self))
+        return type(self)(*(c.select(rows) if isinstance(c, Rows) else c[rows] for c in columns))
 
 
 def joined(parts: Sequence[Arrays], join: Callable[..., np.ndarray] = np.concatenate) -> Arrays:

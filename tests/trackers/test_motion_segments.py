@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.types import joined
 from p2p_lib.trackers.builtin import motion_segments
 from p2p_lib.trackers.builtin.landmarks import Corners
 from p2p_lib.trackers.builtin.tracked_points import Points
@@ -28,7 +29,7 @@ def test_new_points_join_the_segment_next_to_them_in_steps():
     now = image()
     p, segments = started(LEFT, now)
     row = grid((90, 200), (110, 111), 18)  # 3 cm apart, the first of them near the segment
-    p = p.joined(Points.new(row, 5))
+    p = joined([p, Points.new(row, 5)])
     segments.assign(p, len(LEFT) + np.arange(len(row)), now)
     assert set(p.segment) == {0} and len(segments.segments) == 1
 
@@ -61,8 +62,8 @@ def test_points_that_leave_together_stay_verified_and_then_are_a_segment():
     assert len(segments.segments) == 2 and set(p.segment[part]) == {1} and not p.leaving.any()
 
 
-@pytest.mark.parametrize(("drift_m", "joined"), [(0.0, True), (0.0038, False)])
-def test_segments_that_move_as_one_are_joined(drift_m, joined):
+@pytest.mark.parametrize(("drift_m", "merged"), [(0.0, True), (0.0038, False)])
+def test_segments_that_move_as_one_are_joined(drift_m, merged):
     p, segments = started(LEFT, image())
     half = np.arange(len(p)) % 2 == 1
     p.segment[half] = 1
@@ -74,8 +75,8 @@ def test_segments_that_move_as_one_are_joined(drift_m, joined):
             T[0, 3] += step_m
             segment.fit = replace(segment.fit, T_cam_seg=T)
         segments.join(p)
-    assert len(segments.segments) == (1 if joined else 2)
-    if joined:
+    assert len(segments.segments) == (1 if merged else 2)
+    if merged:
         np.testing.assert_allclose(p.p_seg, before, atol=1e-9)
 
 
