@@ -6,7 +6,6 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import OracleConfig
-from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.evaluation.true_tracks import NO_POINTS, TrueScene
 from p2p_lib.trackers.ids import PointIds
@@ -15,8 +14,8 @@ from p2p_lib.trackers.ids import PointIds
 _NOISE, _DROPOUT, _OUTLIER, _PLACE = range(4)
 
 
-class OracleTracker(PointTracker):
-    """True tracks of a sequence's own frames. It knows better than any rejection or suggestion.
+class OracleTracker:
+    """True tracks of a sequence's own frames. Implements :class:`p2p_lib.core.interfaces.PointTracker`.
 
     A query belongs to the object whose mask holds it, and lies on that object's true surface; one that lies on
     no object is never visible again. A visible point is reported with Gaussian noise; a chosen share is called
@@ -35,7 +34,7 @@ class OracleTracker(PointTracker):
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
         self._ids.start()
-        self._points, self._frame = NO_POINTS, frame
+        self._frame, self._points = frame, NO_POINTS
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids."""
@@ -50,10 +49,10 @@ class OracleTracker(PointTracker):
         self._ids.check_started()
         self._frame, cfg = frame, self.config
         sight = self._scene.see(frame, self._points)
-        visible = sight.visible & (self._uniform(_DROPOUT) >= cfg.dropout)
-        uv = sight.uv_px + cfg.noise_px * self._rng(_NOISE).standard_normal((self._ids.given, 2))[self._ids.live]
-        stray = self._uniform(_OUTLIER) < cfg.outliers
-        turn = 2 * np.pi * self._uniform(_PLACE)
+        visible = sight.visible & (self._drawn(_DROPOUT, "random") >= cfg.dropout)
+        uv = sight.uv_px + cfg.noise_px * self._drawn(_NOISE, "standard_normal", 2)
+        stray = self._drawn(_OUTLIER, "random") < cfg.outliers
+        turn = 2 * np.pi * self._drawn(_PLACE, "random")
         uv += np.where(stray, cfg.outlier_px, 0)[:, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
         visible &= self._scene.sequence.camera.inside(uv)
         return Tracks(self._ids.live.copy(), np.where(visible[:, None], uv, np.nan), visible, 1.0 - visible)
@@ -62,9 +61,13 @@ class OracleTracker(PointTracker):
         """Forget these queries for good."""
         self._points = self._points.select(self._ids.drop(ids))
 
-    def _rng(self, kind: int) -> np.random.Generator:
-        return np.random.default_rng([self._seed, self._frame.index, kind])
+    def reject(self, ids: np.ndarray) -> None:
+        """Ignored: it knows better."""
 
-    def _uniform(self, kind: int) -> np.ndarray:
-        """A number in [0, 1) for each live point."""
-        return self._rng(kind).random(self._ids.given)[self._ids.live]
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
+        """Ignored: it knows better."""
+
+    def _drawn(self, kind: int, distribution: str, *columns: int) -> np.ndarray:
+        """Numbers of a distribution of :class:`numpy.random.Generator`, a row for each live point."""
+        rng, live = np.random.default_rng([self._seed, self._frame.index, kind]), self._ids.live
+        return getattr(rng, distribution)((live.max(initial=-1) + 1, *columns))[live]

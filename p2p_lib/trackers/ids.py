@@ -11,33 +11,32 @@ from p2p_lib.core.types import Tracks
 class PointIds:
     """The live points of a stream, a row each.
 
-    live   (N,) int64, increasing
-    given  how many ids were given out so far; None before a stream has begun
+    live  (N,) int64, increasing
     """
 
     def __init__(self) -> None:
-        self.given: int | None = None
+        self._next: int | None = None
         self.live = np.zeros(0, np.int64)
 
     def start(self) -> None:
         """Begin a stream: no points, numbers from 0."""
-        self.given, self.live = 0, np.zeros(0, np.int64)
+        self._next, self.live = 0, np.zeros(0, np.int64)
 
     def check_started(self) -> None:
         """:class:`BadInput` before a stream has begun."""
-        if self.given is None:
+        if self._next is None:
             raise BadInput("tracker", "queries or a frame to track before any start", "start(frame) first")
 
     def add(self, count: int) -> np.ndarray:
         """Rows for new points at the end; returns their ids (count,)."""
         self.check_started()
-        ids = np.arange(self.given, self.given + count)
+        ids = np.arange(self._next, self._next + count)
         self.extend(ids)
         return ids
 
     def extend(self, ids: np.ndarray) -> None:
         """Rows at the end for points that another tracker has numbered, higher than all before."""
-        self.given = max([self.given or 0, *(ids[-1:] + 1)])
+        self._next = max([self._next or 0, *(ids[-1:] + 1)])
         self.live = np.concatenate([self.live, ids])
 
     def drop(self, ids: np.ndarray) -> np.ndarray:
