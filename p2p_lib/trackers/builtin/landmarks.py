@@ -10,6 +10,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.image import nearest_px
+from p2p_lib.core.types import Rows
 from p2p_lib.trackers.builtin import features
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.tangent_planes import planes_at, tangent_steps
@@ -23,16 +24,12 @@ _SEARCHED = 400
 
 
 @dataclass(frozen=True, eq=False)
-class Corners:
+class Corners(Rows):
     """Corners of an image where there is depth: uv_px (M, 2), p_cam (M, 3), descriptors (M, scales, SIZE)."""
 
     uv_px: np.ndarray
     p_cam: np.ndarray
     descriptors: np.ndarray
-
-    def select(self, rows: np.ndarray) -> Corners:
-        """The corners at these rows or under this mask."""
-        return Corners(self.uv_px[rows], self.p_cam[rows], self.descriptors[rows])
 
 
 def corners(now: Image, region: np.ndarray | None, limit: int) -> Corners:

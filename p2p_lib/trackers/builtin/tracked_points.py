@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
+from p2p_lib.core.types import Rows
 from p2p_lib.trackers.builtin.appearance import Patches
 
 _EYE = np.eye(2, dtype=np.float32)
 
 
 @dataclass(eq=False)
-class Points:
+class Points(Rows):
     """N points with K templates each. Offsets and warps are in pixels of the template's image.
 
     A warp takes offsets in a point's first template to offsets in the newest image, template_warp[k] to
@@ -38,9 +39,6 @@ class Points:
     p_seg: np.ndarray  # (N, 3) position on the segment, metres
     map_cov: np.ndarray  # (N, 3, 3) its covariance
     tangent: np.ndarray  # (N, 3, 2) offset on the segment per pixel of offset in the first template
-
-    def __len__(self) -> int:
-        return len(self.uv)
 
     @classmethod
     def new(cls, uv_px: np.ndarray, templates: int) -> Points:
@@ -72,18 +70,3 @@ class Points:
     def sigma_px(self) -> np.ndarray:
         """(N,) standard deviation of uv."""
         return np.sqrt(np.trace(self.cov, axis1=1, axis2=2))
-
-    def select(self, rows: np.ndarray) -> Points:
-        """The points at these rows or under this mask."""
-        return Points(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def joined(self, other: Points) -> Points:
-        """These points, then the others."""
-        mine, theirs = ([getattr(p, f.name) for f in fields(self)] for p in (self, other))
-        return Points(*(_concatenated(a, b) for a, b in zip(mine, theirs, strict=True)))
-
-
-def _concatenated(a: np.ndarray | Patches, b: np.ndarray | Patches) -> np.ndarray | Patches:
-    if isinstance(a, Patches):
-        return Patches(*(np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(Patches)))
-    return np.concatenate([a, b])

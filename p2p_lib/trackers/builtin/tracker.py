@@ -6,7 +6,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
-from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.trackers.builtin import recognition
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.motion_segments import MotionSegments
@@ -48,7 +48,7 @@ class BuiltinTracker:
         uv = np.asarray(uv_px, np.float32).reshape(-1, 2)
         ids = self._ids.add(len(uv))
         new = len(self._points) + np.arange(len(uv))
-        self._points = self._points.joined(Points.new(uv, self.config.templates))
+        self._points = joined([self._points, Points.new(uv, self.config.templates)])
         recognition.store_templates(self._points, new, self._now, 0)
         self._segments.assign(self._points, new, self._now)
         return ids
