@@ -3,6 +3,7 @@
 import numpy as np
 
 from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.types import joined
 from p2p_lib.trackers.builtin import motion_segments
 from p2p_lib.trackers.builtin.landmarks import Corners
 from p2p_lib.trackers.builtin.tracked_points import Points
@@ -25,7 +26,7 @@ def test_new_points_join_the_segment_next_to_them_in_steps():
     now = image()
     p, segments = started(LEFT, now)
     row = grid((90, 200), (110, 111), 18)  # 3 cm apart, the first of them near the segment
-    p = p.joined(Points.new(row, 5))
+    p = joined([p, Points.new(row, 5)])
     segments.assign(p, len(LEFT) + np.arange(len(row)), now)
     assert set(p.segment) == {0} and len(segments.segments) == 1
 
