@@ -37,16 +37,16 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
     camera = camera_for(rgb[0], first["camMat"], f"{meta_files[0]}: camMat")
     files = ImageFiles(folder, rgb, depth, camera, images.frame_times(folder, rgb))
     beside = [_root(folder) / str(where) / images.full(folder).name for where in ([masks] if masks else MASKS)]
-    found, _ = files.masks(next((where for where in beside if where.is_dir()), masks), (), (OBJECT,))
+    found, _ = files.find_masks(next((where for where in beside if where.is_dir()), masks), (), (OBJECT,))
 
     def read_truth() -> dict[str, ObjectTruth]:
         poses = [read_pose(path, read_meta(path), camera) for path in meta_files]
         return {OBJECT: ObjectTruth(np.stack(poses), np.ones(len(poses), bool))}
 
     return ImageSequence(
+        **vars(files),
         name=name,
         format="ho3d",
-        files=files,
         objects=(OBJECT,),
         depth_scale=depth_scale or DEPTH_SCALE,
         read_depth=read_raw_depth,

@@ -33,7 +33,7 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
     files, objects = image_files(folder), _objects(folder)
     if not objects:
         raise BadInput(str(folder / "annotated_poses"), "no folders", "one folder of poses for each object")
-    chosen, own = files.masks(masks, [folder / "masks"], objects)
+    chosen, own = files.find_masks(masks, [folder / "masks"], objects)
 
     def read_truth() -> dict[str, ObjectTruth]:
         poses = {obj: images.read_poses(folder / "annotated_poses" / obj, files.rgb) for obj in objects}
@@ -41,9 +41,9 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
 
     roots = folder, images.full(folder).parent
     return ImageSequence(
+        **vars(files),
         name=name,
         format="ycbmultitrack",
-        files=files,
         objects=objects,
         depth_scale=depth_scale or images.DEPTH_SCALE,
         depth_invalid=DEPTH_INVALID,
