@@ -23,10 +23,10 @@ from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.types import Status
+from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets import images
 from p2p_lib.datasets.models import load_points
-from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run, tum_line
+from p2p_lib.datasets.runs import NO_POSE, ObjectRun, Run, tum_line
 from p2p_lib.datasets.sequence import Sequence
 
 FORMATS = ("tum", "poses", "bop")
@@ -125,39 +125,28 @@ def as_run(
     poses: Mapping[str, np.ndarray],
     sequence: Sequence,
     models: Mapping[str, Path],
-    method: str = "imported",
-    path: Path | None = None,
-    frames: range | None = None,
+    path: Path,
+    frames: range,
 ) -> Run:
-    """A :class:`~p2p_lib.datasets.runs.Run` of such poses over a sequence, or ``frames`` of it, ready to be evaluated.
+    """Such poses over some frames of a sequence as a run that is ready to be evaluated.
 
     models  object to model file; every object of the sequence is in the run: one without poses is lost throughout
+    path    of the poses
     """
-    at = np.arange(len(sequence)) if frames is None else np.array(frames)
-    n, nothing = len(at), np.full((len(sequence), 4, 4), np.nan)
-    visible = [sequence.visible_px(int(i)) for i in at]
+    visible_px = [sequence.visible_px(i) for i in frames]
     objects = {}
     for name in sequence.objects:
-        T_cam_obj, truth = poses.get(name, nothing)[at], sequence.truth.get(name)
-        has_pose = np.isfinite(T_cam_obj).all((1, 2))
-        objects[name] = ObjectRun(
-            frame_index=at,
-            time_s=np.asarray(sequence.times_s, float)[at],
-            status=np.where(has_pose, str(Status.TRACKED), str(Status.LOST)),
-            T_cam_obj=T_cam_obj,
-            confidence=has_pose.astype(float),
-            covariance=np.full((n, 6, 6), np.nan),
-            visible_points=np.zeros(n, int),
-            inliers=np.zeros(n, int),
-            keyframe=np.zeros(n, bool),
-            T_cam_model=truth.T_cam_model[at] if truth else nothing[at],
-            labelled=truth.labelled[at] if truth else np.zeros(n, bool),
-            visible_px=np.array([NO_MASKS if v is None else v.get(name, 0) for v in visible]),
-            reason=np.where(has_pose, "", "no pose given"),
-        )
-    info = {"sequence": sequence.name, "objects": list(sequence.objects), "tracker": method, "masks": None}
-    points = {name: load_points(file) for name, file in models.items()}
-    return Run(path or Path(method), info, objects, points, {})
+        T_cam_obj = poses.get(name, np.tile(NO_POSE, (len(sequence), 1, 1)))
+        estimates = [_estimate(name, i, sequence.times_s[i], T_cam_obj[i]) for i in frames]
+        objects[name] = ObjectRun.of(name, estimates, sequence, visible_px)
+    info = {"sequence": sequence.name, "objects": list(sequence.objects), "tracker": "imported", "masks": None}
+    return Run(path, info, objects, {name: load_points(file) for name, file in models.items()}, {})
+
+
+def _estimate(name: str, frame: int, time_s: float, T_cam_obj: np.ndarray) -> PoseEstimate:
+    if not np.isfinite(T_cam_obj).all():
+        return PoseEstimate(name, frame, time_s, Status.LOST, reason="no pose given")
+    return PoseEstimate(name, frame, time_s, Status.TRACKED, T_cam_obj, 1.0)
 
 
 def _only_object(path: Path, sequence: Sequence) -> str:
