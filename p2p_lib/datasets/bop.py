@@ -165,12 +165,12 @@ def write_scene(folder: str | Path, sequence: Sequence) -> dict[str, int]:
         images.save_png(folder / "depth" / f"{i:06d}.png", depth_mm.astype(np.uint16))
         truth = {name: sequence.truth[name].T_cam_model[i] for name in obj_ids if name in sequence.truth}
         truth = {name: T for name, T in truth.items() if np.isfinite(T).all()}
-        visible = {name: masks.get(name, np.zeros(frame.shape, bool)).astype(np.uint8) for name in truth}
-        for index, mask in enumerate(visible.values()):
-            images.save_png(folder / "mask_visib" / f"{i:06d}_{index:06d}.png", mask * np.uint8(255))
+        visible = [masks.get(name, np.zeros(frame.shape, bool)) for name in truth]
+        for index, mask in enumerate(visible):
+            images.save_png(folder / "mask_visib" / f"{i:06d}_{index:06d}.png", mask)
         scenes["scene_camera"][i] = camera
         scenes["scene_gt"][i] = [_pose_entry(obj_ids[name], T) for name, T in truth.items()]
-        scenes["scene_gt_info"][i] = [_info_entry(mask) for mask in visible.values()]
+        scenes["scene_gt_info"][i] = [_info_entry(mask) for mask in visible]
     for name, scene in scenes.items():
         rows = ",\n".join(f'  "{i}": {json.dumps(entry)}' for i, entry in scene.items())
         (folder / f"{name}.json").write_text("{\n" + rows + "\n}\n")
@@ -184,7 +184,7 @@ def _pose_entry(obj_id: int, T_cam_model: np.ndarray) -> dict[str, object]:
 
 def _info_entry(mask: np.ndarray) -> dict[str, object]:
     """Visible pixels, and x, y, width, height around them: -1 where there are none, as BOP writes it."""
-    box = list(cv2.boundingRect(mask)) if mask.any() else [-1] * 4
+    box = list(cv2.boundingRect(mask.astype(np.uint8))) if mask.any() else [-1] * 4
     return {"bbox_visib": box, "px_count_visib": int(mask.sum())}
 
 

@@ -64,7 +64,7 @@ def write(
         images.save_png(out / "rgb" / f"{number:06d}.png", frame.rgb)
         images.save_png(out / "depth" / f"{number:06d}.png", depth)
         for name, mask in (sequence.masks(i) or {}).items() if number in wanted else ():
-            images.save_png(out / "masks" / name / f"{number:06d}.png", mask.astype(np.uint8) * np.uint8(255))
+            images.save_png(out / "masks" / name / f"{number:06d}.png", mask)
     np.savetxt(out / "cam_K.txt", sequence.camera.K, fmt="%.9g")
     np.savetxt(out / "times.txt", sequence.times_s[frames] - sequence.times_s[frames[0]], fmt="%.6f")
     return out

@@ -18,7 +18,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -79,15 +79,9 @@ class ObjectRun:
                 raise BadInput(f"run: {column}", f"shape {got}", f"{expected}")
 
     @classmethod
-    def of(
-        cls,
-        name: str,
-        estimates: Iterable[PoseEstimate],
-        sequence: Sequence,
-        visible_px: Iterable[Mapping[str, int] | None],
-    ) -> ObjectRun:
-        """An object's estimates, one a frame, beside its truth and what the sequence said was visible there."""
-        estimates, truth = list(estimates), sequence.truth.get(name)
+    def of(cls, name: str, estimates: list[PoseEstimate], sequence: Sequence, visible_px: list) -> ObjectRun:
+        """An object's estimates, one a frame, beside its truth and the sequence's ``visible_px`` of these frames."""
+        truth = sequence.truth.get(name)
         same = ("frame_index", "time_s", "confidence", "visible_points", "inliers", "keyframe", "reason")
         columns = {key: np.array([getattr(e, key) for e in estimates]) for key in same}
         at = columns["frame_index"]
@@ -252,10 +246,9 @@ class RunWriter:
                 self._add_object(name)
         self._visible_px.append(self._sequence.visible_px(frame.index))
         for name, kept in self._estimates.items():
-            estimate = estimates.get(name) or _not_yet(name, frame.index, frame.time_s)
-            kept.append(estimate)
-            if estimate.T_cam_obj is not None:
-                _append(self._pose_file(name), tum_line(frame.time_s, estimate.T_cam_obj))
+            kept.append(estimates.get(name) or _not_yet(name, frame.index, frame.time_s))
+            if kept[-1].T_cam_obj is not None:
+                _append(self._pose_file(name), tum_line(frame.time_s, kept[-1].T_cam_obj))
         self._frames.append((frame.index, frame.time_s))
         self._add_timing(frame, total_ms, any(e.keyframe for e in estimates.values()), stages_ms or {})
         n = len(self._frames)
@@ -267,8 +260,8 @@ class RunWriter:
         """Keep the masks (H, W) bool that served at a frame; all False for an object of which nothing is known."""
         for name in self._estimates:
             mask = masks.get(name)
-            image = np.zeros(frame.shape, np.uint8) if mask is None else mask.astype(np.uint8) * np.uint8(255)
-            save_png(self.path / "masks" / name / f"{frame.index:06d}.png", image)
+            mask = np.zeros(frame.shape, bool) if mask is None else mask
+            save_png(self.path / "masks" / name / f"{frame.index:06d}.png", mask)
 
     def flush(self) -> None:
         """Make everything so far readable on disk."""
