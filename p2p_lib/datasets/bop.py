@@ -47,11 +47,8 @@ class _Info(BaseModel):
     px_count_visib: int = 1
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The scene in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`.
-
-    The depth scale is the scene's own unless another is given.
-    """
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The scene in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     rgb, depth = paired_images(folder)
     numbers = [_number(path) for path in rgb]
     camera, scale_mm = _camera(folder / "scene_camera.json", numbers, rgb[0])
@@ -67,10 +64,8 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
 
     return ImageSequence(
         **vars(files),
-        name=name,
-        format="bop",
         objects=objects or ("object",),
-        depth_scale=depth_scale or scale_mm * MM,
+        depth_scale=scale_mm * MM,
         mask_files=chosen,
         own_masks=own or chosen,
         read_truth=read_truth,
@@ -169,22 +164,20 @@ def write_scene(folder: str | Path, sequence: Sequence) -> dict[str, int]:
         for index, mask in enumerate(visible):
             images.save_png(folder / "mask_visib" / f"{i:06d}_{index:06d}.png", mask)
         scenes["scene_camera"][i] = camera
-        scenes["scene_gt"][i] = [_pose_entry(obj_ids[name], T) for name, T in truth.items()]
-        scenes["scene_gt_info"][i] = [_info_entry(mask) for mask in visible]
+        scenes["scene_gt"][i] = [
+            {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (T[:3, 3] / MM).tolist(), "obj_id": obj_ids[name]}
+            for name, T in truth.items()
+        ]
+        scenes["scene_gt_info"][i] = [_visibility(mask) for mask in visible]
     for name, scene in scenes.items():
         rows = ",\n".join(f'  "{i}": {json.dumps(entry)}' for i, entry in scene.items())
         (folder / f"{name}.json").write_text("{\n" + rows + "\n}\n")
     return obj_ids
 
 
-def _pose_entry(obj_id: int, T_cam_model: np.ndarray) -> dict[str, object]:
-    R, t_mm = T_cam_model[:3, :3], T_cam_model[:3, 3] * 1000
-    return {"cam_R_m2c": R.ravel().tolist(), "cam_t_m2c": t_mm.tolist(), "obj_id": obj_id}
-
-
-def _info_entry(mask: np.ndarray) -> dict[str, object]:
+def _visibility(mask: np.ndarray) -> dict[str, object]:
     """Visible pixels, and x, y, width, height around them: -1 where there are none, as BOP writes it."""
-    box = list(cv2.boundingRect(mask.astype(np.uint8))) if mask.any() else [-1] * 4
+    box = cv2.boundingRect(mask.astype(np.uint8)) if mask.any() else [-1] * 4
     return {"bbox_visib": box, "px_count_visib": int(mask.sum())}
 
 

@@ -20,17 +20,15 @@ from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import Sequence
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)
     found, _ = files.find_masks(masks, [] if masks else [folder / "masks"], first_frame_alone=True)
     objects = tuple(found.files) if found else ("object",)
     return ImageSequence(
         **vars(files),
-        name=name,
-        format="folder",
         objects=objects,
-        depth_scale=depth_scale or _depth_scale(folder / "depth_scale.txt"),
+        depth_scale=_depth_scale(folder / "depth_scale.txt"),
         mask_files=found,
         own_masks=found,
         model_places={obj: (folder / "models" / obj,) for obj in objects},

@@ -29,8 +29,8 @@ DEPTH_SCALE = 0.00012498664727900177  # metres per unit, from the dataset's own 
 T_CV_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     rgb, depth = paired_images(folder)
     meta_files = images.check_paired(images.list_files(folder / "meta", (".pkl",), "meta files"), rgb)
     first = read_meta(meta_files[0])
@@ -46,10 +46,8 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
 
     return ImageSequence(
         **vars(files),
-        name=name,
-        format="ho3d",
         objects=(OBJECT,),
-        depth_scale=depth_scale or DEPTH_SCALE,
+        depth_scale=DEPTH_SCALE,
         read_depth=read_raw_depth,
         mask_files=found,
         read_truth=read_truth,

@@ -85,10 +85,10 @@ class ImageSequence(ImageFiles):
     read_truth     called once, when truth is first asked for
     """
 
-    name: str
-    format: str
+    name: str = ""
+    format: str = ""
     objects: tuple[str, ...]
-    depth_scale: float
+    depth_scale: float = images.DEPTH_SCALE
     depth_invalid: int = 0
     read_depth: Callable[[Path], np.ndarray] = images.read_raw_depth
     mask_files: MaskFiles | None = None

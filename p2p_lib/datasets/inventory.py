@@ -232,15 +232,12 @@ def overview() -> str:
     root = paths.data_dir()
     rows = []
     for of in map(manifest, names()):
-        here = "?" if root is None else "yes" if _holds_files(folder_of(of)) else "no"
+        # A download that broke off leaves only hidden files.
+        files = [] if root is None else (p for p in folder_of(of).rglob("[!.]*") if p.is_file())
+        here = "?" if root is None else "yes" if any(files) else "no"
         rows.append((of.name, of.kind, here, of.access, of.title))
     table = as_text(DataFrame(rows, columns=["name", "kind", "here", "access", "what"]))
     return f"{table}\n" + (f"In {root}" if root else "$P2P_DATA is not set: it says in which folder datasets live.")
-
-
-def _holds_files(folder: Path) -> bool:
-    """Whether anything lies there; a download that broke off leaves only hidden files."""
-    return any(path.is_file() and not path.name.startswith(".") for path in folder.rglob("*"))
 
 
 def describe(of: Manifest) -> str:

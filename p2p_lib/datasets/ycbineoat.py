@@ -26,8 +26,8 @@ YCB_NAMES = {
 }
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)
     chosen, own = files.find_masks(masks, [folder / "gt_mask", folder / "masks"], (OBJECT,))
 
@@ -39,10 +39,7 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
 
     return ImageSequence(
         **vars(files),
-        name=name,
-        format="ycbineoat",
         objects=(OBJECT,),
-        depth_scale=depth_scale or images.DEPTH_SCALE,
         mask_files=chosen,
         own_masks=own,
         read_truth=read_truth,

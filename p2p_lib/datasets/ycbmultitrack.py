@@ -28,8 +28,8 @@ def _objects(folder: Path) -> tuple[str, ...]:
     return tuple(sorted(p.name for p in poses.iterdir() if p.is_dir())) if poses.is_dir() else ()
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files, objects = image_files(folder), _objects(folder)
     if not objects:
         raise BadInput(str(folder / "annotated_poses"), "no folders", "one folder of poses for each object")
@@ -42,10 +42,7 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
     roots = folder, images.full(folder).parent
     return ImageSequence(
         **vars(files),
-        name=name,
-        format="ycbmultitrack",
         objects=objects,
-        depth_scale=depth_scale or images.DEPTH_SCALE,
         depth_invalid=DEPTH_INVALID,
         mask_files=chosen,
         own_masks=own,
