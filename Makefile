@@ -8,7 +8,7 @@ export MKL_NUM_THREADS := $(THREADS)
 # ROS and others put packages of another Python there.
 unexport PYTHONPATH PYTHONHOME
 
-.PHONY: help setup reproduce test lab figures lock
+.PHONY: help setup reproduce test mutants lab figures lock
 help: ## this list
 	@grep -E '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
 
@@ -25,6 +25,9 @@ test: setup ## linter, then all tests, every notebook included
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
 	@.venv/bin/python -m pytest --durations=5
+
+mutants: setup ## switch every mechanism off in turn and see its test fail (minutes)
+	@.venv/bin/python tools/mutants.py
 
 lab: setup ## open JupyterLab on the notebooks
 	@P2P_FIGURES="$(CURDIR)/out/lab/figures" .venv/bin/jupyter lab $(if $(filter 0,$(shell id -u)),--allow-root) --log-level=WARN --notebook-dir=. notebooks/00_quickstart.ipynb

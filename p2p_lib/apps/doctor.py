@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 
 from p2p_lib.core import native
-from p2p_lib.core.packages import INSTALL, PIP, command, cotracker_folder, install_command
+from p2p_lib.core.packages import INSTALL, PIP, command, cotracker_folder
 from p2p_lib.core.paths import PROJECT, cache_dir, data_dir
 
 #: Distributions whose module has another name.
@@ -134,7 +134,7 @@ def _optional(name: str, module: str, serves: str, remedy: str) -> Check:
 def _cotracker() -> Check:
     there = cotracker_folder() is not None  # it comes through torch.hub, which keeps it under its own cache folder
     serves = "2D tracker cotracker3, CC BY-NC: not for commercial use" + ("" if there else "; not there")
-    return Check("cotracker", there, True, serves, install_command("co-tracker"))
+    return Check("cotracker", there, True, serves, command(INSTALL["co-tracker"]))
 
 
 def _data() -> Check:

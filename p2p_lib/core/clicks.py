@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.image import nearest_px
 from p2p_lib.core.types import Frame
 
 
@@ -38,14 +39,9 @@ def check_apart(name: str, clicks: np.ndarray, others: Mapping[str, np.ndarray])
 def depths_at(clicks: np.ndarray, frame: Frame, radius: int = 2) -> np.ndarray:
     """(N,) median depth around each click; NaN where nothing is measured."""
     d = np.arange(-radius, radius + 1)
-    px = np.rint(clicks).astype(int)
-    x = np.clip(px[:, 0, None, None] + d, 0, frame.shape[1] - 1)
-    y = np.clip(px[:, 1, None, None] + d[:, None], 0, frame.shape[0] - 1)
-    z = frame.depth_m[y, x].reshape(len(clicks), -1)
-    found = (z > 0).any(1)
-    result = np.full(len(clicks), np.nan)
-    result[found] = np.nanmedian(np.where(z[found] > 0, z[found], np.nan), 1)
-    return result
+    around = np.stack(np.meshgrid(d, d), -1).reshape(-1, 2)
+    u, v = nearest_px(np.rint(clicks)[:, None] + around, frame.shape)
+    return np.ma.median(np.ma.masked_equal(frame.depth_m[v, u], 0), axis=1).astype(float).filled(np.nan)
 
 
 def checked_clicks(clicks: Mapping[str, ArrayLike], camera: Camera, frame: Frame) -> dict[str, np.ndarray]:

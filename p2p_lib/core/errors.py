@@ -34,11 +34,7 @@ class MissingData(P2PError, FileNotFoundError):
 
     def __init__(self, name: str, expected: str, fix: str = ""):
         self.name, self.expected, self.fix = name, expected, fix
-        self._text = _sentence(f"{name}: {expected}", fix)
-        super().__init__(self._text)
-
-    def __str__(self) -> str:
-        return self._text
+        super().__init__(_sentence(f"{name}: {expected}", fix))
 
 
 class MissingBackend(P2PError, ImportError):
@@ -52,4 +48,5 @@ class MissingBackend(P2PError, ImportError):
 
 
 def _sentence(what: str, fix: str) -> str:
-    return " ".join(f"{what}. {fix}".split()) if fix else " ".join(what.split())
+    """One line, whatever line breaks the parts have."""
+    return " ".join((f"{what}. {fix}" if fix else what).split())

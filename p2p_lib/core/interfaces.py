@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.core.types import Frame, Rows, Tracks
 
 
 class PointTracker(Protocol):
@@ -57,15 +57,11 @@ class PointTracker(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class Candidates(Rows):
     """Points a detector offers: uv_px (N, 2) and score (N,) in [0, 1] (paper: p_k, s_k)."""
 
     uv_px: np.ndarray
     score: np.ndarray
-
-    def select(self, keep: np.ndarray) -> Candidates:
-        """The candidates at these indices or under this mask."""
-        return Candidates(self.uv_px[keep], self.score[keep])
 
 
 class Detector(Protocol):

@@ -27,11 +27,6 @@ INSTALL = {
 }
 
 
-def install_command(package: str) -> str:
-    """What to type to get a package of :data:`INSTALL`."""
-    return command(INSTALL[package])
-
-
 def command(template: str) -> str:
     """A template of :data:`INSTALL` for this very Python."""
     uv = shutil.which("uv", path=str(Path(sys.executable).parent)) or "uv"
@@ -48,7 +43,7 @@ def load(module: str, backend: str, package: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        fix = f"Run: {install_command(package)}"
+        fix = f"Run: {command(INSTALL[package])}"
         missing = f"the package {package} cannot be loaded ({' '.join(str(error).split())[:120]})"
         raise MissingBackend(backend, missing, fix) from error
 

@@ -21,14 +21,12 @@ def manifest_dir() -> Path:
 
 def cache_dir() -> Path:
     """Generated data that may be deleted at any time: ``$P2P_CACHE``, else the user's cache folder."""
-    if os.environ.get("P2P_CACHE"):
-        return Path(os.environ["P2P_CACHE"]).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "p2p"
+    return _given("P2P_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "p2p"
 
 
 def data_dir() -> Path | None:
     """The user's datasets: ``$P2P_DATA``, or None where it is not set."""
-    return Path(os.environ["P2P_DATA"]).expanduser() if os.environ.get("P2P_DATA") else None
+    return _given("P2P_DATA")
 
 
 def figure_dir() -> Path:

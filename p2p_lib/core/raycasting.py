@@ -22,8 +22,3 @@ def cast(scene: Any, eye: np.ndarray, rays: np.ndarray) -> dict[str, np.ndarray]
     lines = np.empty((len(rays), 6), np.float32)
     lines[:, :3], lines[:, 3:] = eye, rays
     return {key: value.numpy() for key, value in scene.cast_rays(load_open3d().core.Tensor(lines)).items()}
-
-
-def first_faces(scene: Any, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """(N,) index of the face that each ray meets first, -1 where none."""
-    return cast(scene, eye, rays)["primitive_ids"].astype(np.int32)

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 _HTML = "padding: 2px 5px; white-space: normal; font-size: 11px; text-align: "
 
 
-def as_text(table: DataFrame, header: bool = True) -> str:
-    """Lines for a terminal; without ``header`` the names of the columns are left out."""
+def as_text(table: DataFrame) -> str:
+    """Lines for a terminal."""
     left = _words(table)
-    rows = [list(map(str, table.columns))] * header + [[shown(value) for value in row] for row in _rows(table)]
+    rows = [[shown(value) for value in row] for row in [table.columns, *_rows(table)]]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [[f"{cell:{'<' if k in left else '>'}{widths[k]}}" for k, cell in enumerate(row)] for row in rows]
     return "\n".join("  ".join(line).rstrip() for line in lines)

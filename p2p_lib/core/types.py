@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -86,6 +86,18 @@ class Tracks:
 Arrays = TypeVar("Arrays")
 
 
+class Rows:
+    """What dataclasses have in common whose fields are arrays (or such dataclasses again) of one row per item."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def select(self, rows: np.ndarray) -> Self:
+        """The items at these rows or under this mask."""
+        columns = (getattr(self, f.name) for f in fields(self))
+        return type(self)(*(c.select(rows) if isinstance(c, Rows) else c[rows] for c in columns))
+
+
 def joined(parts: Sequence[Arrays], join: Callable[..., np.ndarray] = np.concatenate) -> Arrays:
     """Values of one dataclass that holds arrays (or such dataclasses again), one after the other."""
     columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(parts[0])}
@@ -131,7 +143,6 @@ class PoseEstimate:
     last_T_cam_obj: np.ndarray | None = None
     last_seen_s: float = float("nan")
     keyframe: bool = False
-    extra: dict = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         name = f"estimate of {self.object!r} at frame {self.frame_index}"

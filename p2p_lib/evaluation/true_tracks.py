@@ -20,7 +20,7 @@ from p2p_lib.core.depth import lift
 from p2p_lib.core.errors import MissingData
 from p2p_lib.core.image import in_mask, nearest_px
 from p2p_lib.core.raycasting import cast, ray_scene
-from p2p_lib.core.types import Frame, joined
+from p2p_lib.core.types import Frame, Rows, joined
 from p2p_lib.datasets.models import MESHES, find_models, given_models, load_mesh
 from p2p_lib.datasets.sequence import Sequence
 
@@ -35,19 +35,12 @@ _DEPTH, _BASE_PX = DepthConfig(min_m=0.1, max_m=5.0, edge_m=0.02), 2
 
 
 @dataclass(frozen=True, eq=False)
-class SurfacePoints:
+class SurfacePoints(Rows):
     """Points on true surfaces. object (N,) index; p_model (N, 3) metres; normal (N, 3), NaN where unknown."""
 
     object: np.ndarray
     p_model: np.ndarray
     normal: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.object)
-
-    def select(self, keep: np.ndarray) -> SurfacePoints:
-        """The points at these indices or under this mask."""
-        return SurfacePoints(self.object[keep], self.p_model[keep], self.normal[keep])
 
 
 NO_POINTS = SurfacePoints(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))

@@ -15,6 +15,9 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import SelectionConfig
 from p2p_lib.method.registration import Hypothesis
 
+#: A smaller difference of the mean distances tells nothing, however certain it is, m.
+_MARGIN_M = 2e-4
+
 
 def motion_weight(
     T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray], config: SelectionConfig
@@ -54,8 +57,8 @@ def best_supported(
 ) -> tuple[int | None, str]:
     """The best supported hypothesis unless the surface prefers another, and why; see :func:`select`.
 
-    It does where the other one is nearer by more than ``surface_sigmas`` standard errors. The same points are
-    compared under both poses, so the difference of each counts.
+    It does where the other one is nearer by more than ``surface_sigmas`` standard errors and a small margin. The same
+    points are compared under both poses, so the difference of each counts.
     """
     best = _best(hypotheses, weight)
     scores = _scores(distance_m)
@@ -64,7 +67,7 @@ def best_supported(
     nearest = int(np.argmin(scores))
     nearer = distance_m[best] - distance_m[nearest]
     chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
-    if scores[best] - scores[nearest] > chance:
+    if scores[best] - scores[nearest] > max(chance, _MARGIN_M):
         return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
     return best, "most inliers, the surface does not tell the hypotheses apart"
 

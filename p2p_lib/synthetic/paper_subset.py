@@ -6,7 +6,6 @@ Not the paper's files: the same objects, camera and kinds of motion, drawn anew.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import MissingData
 from p2p_lib.synthetic import shapes
 from p2p_lib.synthetic.motion import standing, turned, wander
 from p2p_lib.synthetic.scene import Body, Scenario, check, room
@@ -35,24 +33,17 @@ STAND_INS: dict[str, Callable[[np.random.Generator], Mesh]] = {
 }
 
 
-@dataclass(frozen=True)
-class Part:
-    """One object of a sequence and how it moves: ``circular`` (around the middle) or ``linear`` (to and fro)."""
-
-    model: str
-    motion: str
-
-
+#: Objects of each sequence and how they move: ``circular`` (around the middle) or ``linear`` (to and fro).
 SEQUENCES = {
-    "ycb_sugar_box": (Part("004_sugar_box", "linear"),),
-    "ycb_pitcher": (Part("019_pitcher_base", "circular"),),
-    "ycb_meat_sugar": (Part("010_potted_meat_can", "circular"), Part("004_sugar_box", "linear")),
-    "ycb_scissors_can": (Part("037_scissors", "circular"), Part("002_master_chef_can", "linear")),
-    "ycb_airplane_can": (Part("072-a_toy_airplane", "circular"), Part("005_tomato_soup_can", "linear")),
+    "ycb_sugar_box": {"004_sugar_box": "linear"},
+    "ycb_pitcher": {"019_pitcher_base": "circular"},
+    "ycb_meat_sugar": {"010_potted_meat_can": "circular", "004_sugar_box": "linear"},
+    "ycb_scissors_can": {"037_scissors": "circular", "002_master_chef_can": "linear"},
+    "ycb_airplane_can": {"072-a_toy_airplane": "circular", "005_tomato_soup_can": "linear"},
 }
 
 
-def paper_sequence(seed: int, frames: int = FRAMES, models: str = "", *, parts: tuple[Part, ...]) -> Scenario:
+def paper_sequence(seed: int, frames: int = FRAMES, models: str = "", *, parts: dict[str, str]) -> Scenario:
     """One of :data:`SEQUENCES`. The circling object passes before and behind the other one.
 
     ``models`` is a folder of YCB models (``<name>/textured.obj``, metres); without it printed stand-ins are used, and
@@ -63,24 +54,14 @@ def paper_sequence(seed: int, frames: int = FRAMES, models: str = "", *, parts: 
     # Two objects keep clear of each other: one stays within 4 cm of the middle, the other goes around it.
     reach = {"circular": 0.21, "linear": 0.04} if len(parts) > 1 else {"circular": 0.10, "linear": 0.08}
     bodies = []
-    for part in parts:
-        mesh = _mesh(rng, part.model, models)
-        T = {"circular": _circular, "linear": _linear}[part.motion](rng, frames, reach[part.motion])
+    for model, motion in parts.items():
+        mesh = shapes.load_mesh(Path(models) / model / "textured.obj") if models else STAND_INS[model](rng)
+        T = {"circular": _circular, "linear": _linear}[motion](rng, frames, reach[motion])
         middle = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
-        bodies.append(Body(part.model, mesh, T @ se3.from_rt(np.eye(3), -middle)))
+        bodies.append(Body(model, mesh, T @ se3.from_rt(np.eye(3), -middle)))
     T_world_cam = standing(np.array([0.0, -0.52, 0.34]), np.array([0.0, 0.02, 0.14]), frames)
     kind = "YCB models" if models else "procedural stand-ins of about the YCB models' sizes"
     return Scenario(CAMERA, T_world_cam, tuple(bodies), room(rng), objects=kind)
-
-
-def _mesh(rng: np.random.Generator, model: str, models: str) -> Mesh:
-    if not models:
-        return STAND_INS[model](rng)
-    path = Path(models).expanduser() / model / "textured.obj"
-    if not path.is_file():
-        fix = "Give the folder that holds the YCB models, one folder each; without --models stand-ins are used."
-        raise MissingData(f"model {path}", "no such file", fix)
-    return shapes.load_mesh(path)
 
 
 def _circular(rng: np.random.Generator, frames: int, radius_m: float) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.raycasting import first_faces
+from p2p_lib.core.raycasting import cast
 from p2p_lib.synthetic import texture
 from p2p_lib.synthetic.environment import Environment, fresnel
 from p2p_lib.synthetic.shapes import Mesh
@@ -113,8 +113,8 @@ def _hits(mesh: Mesh, T_cam_model: np.ndarray, camera: Camera) -> tuple[_Hits, n
     pixel = _pixels_around(p_cam, camera)
     T_model_cam = se3.inverse(T_cam_model)
     rays = camera.rays.reshape(-1, 3)[pixel].astype(float) @ T_model_cam[:3, :3].T
-    face = first_faces(mesh.ray_scene, T_model_cam[:3, 3], rays)
-    met = face >= 0
+    face = cast(mesh.ray_scene, T_model_cam[:3, 3], rays)["primitive_ids"].astype(np.int32)
+    met = face >= 0  # -1 where a ray meets nothing
     pixel, face = pixel[met], face[met]
     shows = np.bincount(face, minlength=len(mesh.faces)) > 0
     shown, row = np.flatnonzero(shows), (np.cumsum(shows) - 1)[face]

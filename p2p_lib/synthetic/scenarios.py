@@ -31,6 +31,6 @@ SCENARIOS |= {name: partial(paper_subset.paper_sequence, parts=parts) for name, 
 def describe(name: str) -> str:
     """What happens in a scenario, in one line."""
     if name in paper_subset.SEQUENCES:
-        parts = " and ".join(f"{part.model} ({part.motion})" for part in paper_subset.SEQUENCES[name])
+        parts = " and ".join(f"{model} ({motion})" for model, motion in paper_subset.SEQUENCES[name].items())
         return f"as in the paper's synthetic subset: {parts}, {paper_subset.FRAMES} frames."
     return SCENARIOS[name].__doc__.splitlines()[0]

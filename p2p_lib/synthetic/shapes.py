@@ -199,9 +199,9 @@ def load_mesh(path: str | Path) -> Mesh:
     """Any mesh with a texture that trimesh reads (metres), such as a YCB ``textured.obj``."""
     import trimesh
 
-    path = Path(path)
+    path = Path(path).expanduser()
     if not path.is_file():
-        raise MissingData(f"mesh {path}", "no such file")
+        raise MissingData(f"mesh {path}", "no such file", "YCB models lie in a folder each: NAME/textured.obj.")
     m = trimesh.load(path, process=False, force="mesh")
     uv = getattr(m.visual, "uv", None)
     material = getattr(m.visual, "material", None)

@@ -11,6 +11,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.trackers.ids import PointIds
 
@@ -18,8 +19,8 @@ _FLOW = {"winSize": (21, 21), "maxLevel": 3}
 _FORWARD_BACKWARD_PX = 1.0
 
 
-class LkTracker:
-    """The reference tracker. Implements :class:`p2p_lib.core.interfaces.PointTracker`."""
+class LkTracker(PointTracker):
+    """The reference tracker. It has no use for suggestions: nothing brings an invisible point back."""
 
     name = "lk"
     latency_frames = 0
@@ -70,6 +71,3 @@ class LkTracker:
     def reject(self, ids: np.ndarray) -> None:
         """Take these tracks for invisible."""
         self._visible &= ~np.isin(self._ids.live, ids)
-
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
-        """Ignored: nothing brings an invisible point back."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.image import in_image
+from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.trackers.ids import PointIds
 
@@ -36,8 +37,8 @@ class RolloutModel(Protocol):
         """A rollout with queries (Q, 2) in the first of the images; the others are those that came since."""
 
 
-class RolloutTracker:
-    """Implements :class:`p2p_lib.core.interfaces.PointTracker` over a :class:`RolloutModel`.
+class RolloutTracker(PointTracker):
+    """A tracker over a :class:`RolloutModel`, which takes neither rejections nor suggestions.
 
     A late model answers for the frame ``latency_frames`` ago, and queries are taken to be in that frame: the one
     that the caller is at. A rollout ends with its last point. Beyond :data:`MAX_ROLLOUTS` the one with the fewest
@@ -85,12 +86,6 @@ class RolloutTracker:
         self._open()
         self._visible = self._visible[self._ids.drop(ids)]
         self._rollouts = [(own, run) for own, run in self._rollouts if np.isin(own, self._ids.live).any()]
-
-    def reject(self, ids: np.ndarray) -> None:
-        """Ignored."""
-
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
-        """Ignored."""
 
     def _open(self) -> None:
         """A rollout for the queries added since the last image, if there are any."""

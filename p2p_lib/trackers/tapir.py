@@ -14,6 +14,7 @@ from p2p_lib.core import packages
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.image import in_image
+from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.raster import from_raster, square, to_raster
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.datasets import checkpoints
@@ -42,8 +43,8 @@ def new_model() -> torch.nn.Module:
     return module.TAPIR(pyramid_level=1, use_casual_conv=True)
 
 
-class TapirTracker:
-    """Streams images through a TAPIR model. Implements :class:`p2p_lib.core.interfaces.PointTracker`.
+class TapirTracker(PointTracker):
+    """Streams images through a TAPIR model, which searches every frame anew: rejections and suggestions are ignored.
 
     Visible where (1 - occluded)(1 - expected to be far off) exceeds a half; the uncertainty is the second of these.
     """
@@ -132,12 +133,6 @@ class TapirTracker:
         rows = torch.from_numpy(np.flatnonzero(keep)).to(self._device)
         self._features = self._each(self._features, lambda a: a[:, rows])
         self._state = [{key: value[:, rows] for key, value in part.items()} for part in self._state]
-
-    def reject(self, ids: np.ndarray) -> None:
-        """Ignored: every frame is searched anew."""
-
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
-        """Ignored: every frame is searched anew."""
 
     def _observe(self, frame: Frame) -> None:
         import torch

@@ -25,12 +25,18 @@ def test_the_paper_takes_the_least_mean_distance():
 @pytest.mark.parametrize(("sigmas", "gap", "wins"), [(2.0, 2.5, True), (2.0, 1.5, False), (4.0, 2.5, False)])
 def test_ours_goes_by_the_surface_only_beyond_chance(sigmas, gap, wins):
     """Points whose preference is even but for a shift of the mean: the shift counts in its standard errors."""
-    noise = np.random.default_rng(0).normal(0, 1e-3, 400)
-    noise = (noise - noise.mean()) / noise.std() * 1e-3
-    nearer = noise + gap * 1e-3 / np.sqrt(400)
+    noise = np.random.default_rng(0).normal(0, 1, 400)
+    noise = (noise - noise.mean()) / noise.std() * 5e-3
+    nearer = noise + gap * 5e-3 / np.sqrt(400)
     config = replace(DEFAULT, surface_sigmas=sigmas)
-    row, reason = select([made(80), made(12)], np.stack([0.01 + nearer, np.full(400, 0.01)]), config)
+    row, reason = select([made(80), made(12)], np.stack([0.05 + nearer, np.full(400, 0.05)]), config)
     assert row == int(wins) and ("nearest" in reason) == wins
+
+
+@pytest.mark.parametrize(("gap_m", "wins"), [(1.9e-4, False), (2.1e-4, True)])
+def test_ours_needs_a_margin_too(gap_m, wins):
+    distance_m = np.tile([[0.002], [0.002 - gap_m]], 50)  # certain, but is it enough?
+    assert select([made(80), made(12)], distance_m, DEFAULT)[0] == int(wins)
 
 
 @pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=["default", "paper"])

@@ -24,7 +24,7 @@ CLICKS = np.array([[80.0, 60], [70, 50]])
 
 needs_transformers = pytest.mark.skipif(
     importlib.util.find_spec("transformers") is None,
-    reason=f"transformers is not installed: {packages.install_command('transformers')}",
+    reason=f"transformers is not installed: {packages.command(packages.INSTALL['transformers'])}",
 )
 
 

@@ -1,9 +1,6 @@
 """Rigid motion segments on made-up points: start, fit, split, loss, rejection, and positions that improve."""
 
-from dataclasses import replace
-
 import numpy as np
-import pytest
 
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.trackers.builtin import motion_segments
@@ -59,31 +56,6 @@ def test_points_that_leave_together_stay_verified_and_then_are_a_segment():
     p.uv[part] += [0, 9]
     segments.fit(p, image())
     assert len(segments.segments) == 2 and set(p.segment[part]) == {1} and not p.leaving.any()
-
-
-@pytest.mark.parametrize(("drift_m", "joined"), [(0.0, True), (0.0038, False)])
-def test_segments_that_move_as_one_are_joined(drift_m, joined):
-    p, segments = started(LEFT, image())
-    half = np.arange(len(p)) % 2 == 1
-    p.segment[half] = 1
-    segments.segments.append(motion_segments.MotionSegment.at(np.eye(4), np.zeros((6, 6)), p.p_seg[half].mean(0)))
-    before = p.p_seg.copy()
-    for _ in range(5):
-        for segment, step_m in zip(segments.segments, (0.008, 0.008 + drift_m), strict=False):
-            T = segment.fit.T_cam_seg.copy()
-            T[0, 3] += step_m
-            segment.fit = replace(segment.fit, T_cam_seg=T)
-        segments.join(p)
-    assert len(segments.segments) == (1 if joined else 2)
-    if joined:
-        np.testing.assert_allclose(p.p_seg, before, atol=1e-9)
-
-
-def test_segments_that_do_not_move_are_not_joined():
-    p, segments = started(np.vstack([LEFT, RIGHT]), image())
-    for _ in range(8):
-        segments.join(p)
-    assert len(segments.segments) == 2
 
 
 def test_a_rejected_segment_is_not_searched_for_where_it_was(monkeypatch):

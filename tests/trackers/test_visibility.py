@@ -64,17 +64,6 @@ def test_points_behind_a_nearer_surface_are_invisible(tracker):
     np.testing.assert_array_equal(tracker._points.visible, UV[:, 0] >= 100)
 
 
-def test_a_point_whose_depth_jumps_is_invisible_once(tracker):
-    p = tracker._points
-    tracker._check_depth()
-    tracker._now = image(depth_m=DEPTH_M + 0.05)
-    tracker._check_depth()
-    assert not p.visible.any()
-    p.visible[:] = True
-    tracker._check_depth()
-    assert p.visible.all()
-
-
 def test_textureless_points_are_not_searched_for(tracker, monkeypatch):
     p, searched = tracker._points, []
     monkeypatch.setattr(builtin.recognition, "find", lambda p, at, *_: searched.append(at.tolist()))

@@ -7,7 +7,7 @@ from the poses of these segments. A frame goes through it in this order (:mod:`p
    of its templates decides. That removes drift, and a place of another appearance is refused. A point whose
    appearance changed coasts on Lucas-Kanade alone for a few frames.
 2. Fit (``motion_segments``, ``rigid_motion``): each segment's pose is fitted to its points; points that disagree are
-   not verified, many that leave together become a segment of their own, and segments that move as one are joined.
+   not verified, and many that leave together become a segment of their own.
 3. Search (``landmarks``, ``features``): a lost segment is searched for in the whole image by corners that were seen on
    it, described on its surface (``tangent_planes``); most matches that agree propose its pose.
 4. Find: points that were not followed are searched for where their segment predicts them.

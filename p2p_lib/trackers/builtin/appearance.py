@@ -12,6 +12,8 @@ from dataclasses import dataclass, fields
 import cv2
 import numpy as np
 
+from p2p_lib.core.types import Rows
+
 #: Half a patch's side in pixels, and the standard deviation of the window's weight.
 RADIUS, WINDOW_PX = 7, 5.0
 _SIDE = 2 * RADIUS + 1
@@ -31,7 +33,7 @@ _DAMP = np.diag(np.float32([1e-4] * 2 + [0.05] * 4))
 
 
 @dataclass(eq=False)
-class Patches:
+class Patches(Rows):
     """N patches, ready to be searched for.
 
     pixels    (N, P) weighted, zero mean, unit length
@@ -45,11 +47,8 @@ class Patches:
     unit_cov: np.ndarray
     contrast: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.pixels)
-
     def __getitem__(self, rows: np.ndarray) -> Patches:
-        return Patches(*(getattr(self, f.name)[rows] for f in fields(self)))
+        return self.select(rows)
 
     def __setitem__(self, rows: np.ndarray, other: Patches) -> None:
         for f in fields(self):

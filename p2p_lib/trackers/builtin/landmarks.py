@@ -10,6 +10,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.image import nearest_px
+from p2p_lib.core.types import Rows
 from p2p_lib.trackers.builtin import features
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.tangent_planes import planes_at, tangent_steps
@@ -23,16 +24,12 @@ _SEARCHED = 400
 
 
 @dataclass(frozen=True, eq=False)
-class Corners:
+class Corners(Rows):
     """Corners of an image where there is depth: uv_px (M, 2), p_cam (M, 3), descriptors (M, scales, SIZE)."""
 
     uv_px: np.ndarray
     p_cam: np.ndarray
     descriptors: np.ndarray
-
-    def select(self, rows: np.ndarray) -> Corners:
-        """The corners at these rows or under this mask."""
-        return Corners(self.uv_px[rows], self.p_cam[rows], self.descriptors[rows])
 
 
 def corners(now: Image, region: np.ndarray | None, limit: int) -> Corners:
@@ -77,14 +74,10 @@ class Landmarks:
         found = corners(now, _region_around(uv_px, now, cfg.segment_reach_m), cfg.corners)
         at = se3.transform(se3.inverse(T_cam_seg), found.p_cam)
         near = np.linalg.norm(at[:, None] - p_seg[None], axis=-1).min(1) < cfg.segment_reach_m
-        self.extend(at[near], found.descriptors[near], cfg.max_landmarks, rng)
+        at = np.concatenate([self.p_seg, at[near]])
+        keep = np.sort(rng.permutation(len(at))[: cfg.max_landmarks])
+        self.p_seg, self.descriptors = at[keep], np.concatenate([self.descriptors, found.descriptors[near]])[keep]
         self.views = np.vstack([self.views, camera_centre])
-
-    def extend(self, p_seg: np.ndarray, descriptors: np.ndarray, most: int, rng: np.random.Generator) -> None:
-        """Add these; beyond ``most`` in all, a random choice stays."""
-        p_seg, descriptors = np.concatenate([self.p_seg, p_seg]), np.concatenate([self.descriptors, descriptors])
-        keep = np.sort(rng.permutation(len(p_seg))[:most])
-        self.p_seg, self.descriptors = p_seg[keep], descriptors[keep]
 
     def match(
         self, found: Corners, ratio: float, rng: np.random.Generator

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import combinations
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -28,9 +27,6 @@ _MIN_AGREEING = 0.3
 _REPEATS = 4.0
 #: Error of a position (px) beside what alignment states: when a point is placed, when it is observed again.
 _PLACED_PX, _OBSERVED_PX = 0.2, 0.3
-#: Two segments that are one: updates over which they are compared, how far they may drift apart as a fraction of their
-#: motion, the fraction of the smaller one's points that must be near the larger one, and the error of the union (m).
-_JOIN_UPDATES, _JOIN_DRIFT, _JOIN_NEAR, _JOIN_SIGMA_M = 5, 0.3, 0.7, 0.001
 #: A neighbouring pixel's depth may be read: depth noise of an observation is larger than the sensor's by this.
 _DEPTH_NOISE = 1.5
 _EYE2, _EYE3 = np.eye(2), np.eye(3)
@@ -42,7 +38,6 @@ class MotionSegment:
 
     before        T_cam_seg of the frame before
     hidden_for    frames since the pose was known
-    history       T_cam_seg at the newest updates
     rejected      (M, 3) points in the camera's frame where it was found wrongly: a look-alike may be there
     rejected_for  frames for which it is not searched for around them
     """
@@ -50,7 +45,6 @@ class MotionSegment:
     fit: PoseFit
     before: np.ndarray
     hidden_for: int = 0
-    history: list[np.ndarray] = field(default_factory=list)
     rejected: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     rejected_for: int = 0
     landmarks: Landmarks = field(default_factory=Landmarks)
@@ -114,7 +108,7 @@ class MotionSegments:
             if (own & wrong).sum() > 0.5 * own.sum():
                 segment.rejected = se3.transform(segment.fit.T_cam_seg, p.p_seg[own & wrong])
                 segment.rejected_for = self.config.reject_frames
-                segment.hidden_for, segment.history = self.config.linger_frames + 1, []
+                segment.hidden_for = self.config.linger_frames + 1
 
     def fit(self, p: Points, now: Image, lost_only: bool = False) -> None:
         """Fit poses to the points that were followed or found; points that disagree are not verified."""
@@ -164,38 +158,6 @@ class MotionSegments:
         if not p.leaving[own[0]]:
             p.segment[own] = len(self.segments)
             self.segments.append(MotionSegment.at(T, _PROPOSED_COV, centre))
-
-    def join(self, p: Points) -> None:
-        """Join two segments that lie in one another and moved together for a while: one pair at a time."""
-        for segment in self.segments:
-            segment.history = [*segment.history, segment.fit.T_cam_seg][-_JOIN_UPDATES:] if segment.posed else []
-        size = np.bincount(p.segment[p.segment >= 0], minlength=len(self.segments))
-        known = [s for s in np.argsort(-size, kind="stable") if len(self.segments[s].history) == _JOIN_UPDATES]
-        for large, small in combinations(known, 2):
-            if self._are_one(p, large, small):
-                self._merge(p, large, small)
-                return
-
-    def _are_one(self, p: Points, large: int, small: int) -> bool:
-        one, other = self.segments[large], self.segments[small]
-        T_one_other = se3.inverse(one.history[-1]) @ other.history[-1]
-        moved_m = pose_distance_m(other.history[0], other.history[-1], other.fit.centre)
-        drift_m = pose_distance_m(one.history[0] @ T_one_other, other.history[0], other.fit.centre)
-        if moved_m < self.config.split_m or drift_m > _JOIN_DRIFT * moved_m:
-            return False
-        gap_m, _ = cKDTree(p.p_seg[p.segment == large]).query(se3.transform(T_one_other, p.p_seg[p.segment == small]))
-        return bool((gap_m < self.config.segment_reach_m).mean() >= _JOIN_NEAR)
-
-    def _merge(self, p: Points, large: int, small: int) -> None:
-        """Points and landmarks of the smaller segment become the larger one's."""
-        one, other = self.segments[large], self.segments[small]
-        T_one_other = se3.inverse(one.history[-1]) @ other.history[-1]
-        R, own = T_one_other[:3, :3], np.flatnonzero(p.segment == small)
-        p.segment[own], p.p_seg[own] = large, se3.transform(T_one_other, p.p_seg[own])
-        p.tangent[own], p.map_cov[own] = R @ p.tangent[own], R @ p.map_cov[own] @ R.T + _JOIN_SIGMA_M**2 * _EYE3
-        landmarks = se3.transform(T_one_other, other.landmarks.p_seg), other.landmarks.descriptors
-        one.landmarks.extend(*landmarks, self.config.max_landmarks, self._rng)
-        self.compact(p)
 
     def search(self, now: Image, region: np.ndarray | None) -> None:
         """Propose poses for lost segments by their landmarks, outside of the regions where they were rejected."""

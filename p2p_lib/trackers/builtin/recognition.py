@@ -16,8 +16,6 @@ from p2p_lib.trackers.builtin.tracked_points import Points
 _EYE = np.eye(2, dtype=np.float32)
 #: The correlation that a coasting point keeps, and the standard deviation that each frame of it adds (px).
 _COAST_NCC, _COAST_SIGMA_PX = 0.4, 0.7
-#: A point whose position is less certain (px) gets no new template: the error would stay in it.
-_UPDATE_SIGMA_PX = 1.5
 #: An older template is preferred to one that is less distorted by no more than this.
 _OLDER_DISTORTION = 0.1
 
@@ -109,7 +107,7 @@ def _same_appearance(
 
 def update_templates(p: Points, now: Image, cfg: TrackingConfig, turn: int) -> None:
     """Store a further template of points that no template resembles at the present scale and slant."""
-    at = np.flatnonzero(p.verified & p.visible & (p.coasting == 0) & (p.sigma_px < _UPDATE_SIGMA_PX))
+    at = np.flatnonzero(p.verified & p.visible & (p.coasting == 0))
     scales = np.linalg.svd(_warp_of(p, at, best_template(p, at)), compute_uv=False)
     changed = np.abs(np.log(scales)).max(1) > np.log(cfg.update_scale_change)
     store_templates(p, at[changed | (p.ncc[at] < cfg.update_ncc)], now, turn)

@@ -8,6 +8,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.types import Rows
 
 #: Half the window in which the surface around a pixel is taken for a plane, in steps.
 _HALF_WINDOW = 3
@@ -23,7 +24,7 @@ def assumed_camera(width: int, height: int) -> Camera:
 
 
 @dataclass(frozen=True, eq=False)
-class TangentPlanes:
+class TangentPlanes(Rows):
     """The measured surface at N pixels.
 
     p_cam    (N, 3) NaN where there is no trustworthy depth
@@ -34,10 +35,6 @@ class TangentPlanes:
     p_cam: np.ndarray
     per_px: np.ndarray
     sigma_m: np.ndarray
-
-    def select(self, rows: np.ndarray) -> TangentPlanes:
-        """The pixels at these rows or under this mask."""
-        return TangentPlanes(self.p_cam[rows], self.per_px[rows], self.sigma_m[rows])
 
 
 def planes_at(depth_m: np.ndarray, camera: Camera, uv_px: np.ndarray, step_px: int = 1) -> TangentPlanes:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
+from p2p_lib.core.types import Rows
 from p2p_lib.trackers.builtin.appearance import Patches
 
 _EYE = np.eye(2, dtype=np.float32)
 
 
 @dataclass(eq=False)
-class Points:
+class Points(Rows):
     """N points with K templates each. Offsets and warps are in pixels of the template's image.
 
     A warp takes offsets in a point's first template to offsets in the newest image, template_warp[k] to
@@ -24,7 +25,6 @@ class Points:
     cov: np.ndarray  # (N, 2, 2) covariance of uv, px^2
     visible: np.ndarray  # (N,) bool: what the caller is told
     verified: np.ndarray  # (N,) bool: a template, or Lucas-Kanade for a while, says so, not the segment alone
-    depth_m: np.ndarray  # (N,) where it was last visible; 0 where not measured
     hidden_for: np.ndarray  # (N,) frames
     ncc: np.ndarray  # (N,) correlation with the template last recognised
     coasting: np.ndarray  # (N,) frames since a template was last recognised
@@ -40,9 +40,6 @@ class Points:
     map_cov: np.ndarray  # (N, 3, 3) its covariance
     tangent: np.ndarray  # (N, 3, 2) offset on the segment per pixel of offset in the first template
 
-    def __len__(self) -> int:
-        return len(self.uv)
-
     @classmethod
     def new(cls, uv_px: np.ndarray, templates: int) -> Points:
         """Visible points at uv_px (N, 2) without a template yet, with room for so many."""
@@ -53,7 +50,6 @@ class Points:
             cov=np.zeros((n, 2, 2), np.float32),
             visible=np.ones(n, bool),
             verified=np.ones(n, bool),
-            depth_m=np.zeros(n, np.float32),
             hidden_for=np.zeros(n, np.int64),
             ncc=np.ones(n, np.float32),
             coasting=np.zeros(n, np.int64),
@@ -74,18 +70,3 @@ class Points:
     def sigma_px(self) -> np.ndarray:
         """(N,) standard deviation of uv."""
         return np.sqrt(np.trace(self.cov, axis1=1, axis2=2))
-
-    def select(self, rows: np.ndarray) -> Points:
-        """The points at these rows or under this mask."""
-        return Points(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def joined(self, other: Points) -> Points:
-        """These points, then the others."""
-        mine, theirs = ([getattr(p, f.name) for f in fields(self)] for p in (self, other))
-        return Points(*(_concatenated(a, b) for a, b in zip(mine, theirs, strict=True)))
-
-
-def _concatenated(a: np.ndarray | Patches, b: np.ndarray | Patches) -> np.ndarray | Patches:
-    if isinstance(a, Patches):
-        return Patches(*(np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(Patches)))
-    return np.concatenate([a, b])

@@ -6,7 +6,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
-from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.trackers.builtin import recognition
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.motion_segments import MotionSegments
@@ -48,7 +48,7 @@ class BuiltinTracker:
         uv = np.asarray(uv_px, np.float32).reshape(-1, 2)
         ids = self._ids.add(len(uv))
         new = len(self._points) + np.arange(len(uv))
-        self._points = self._points.joined(Points.new(uv, self.config.templates))
+        self._points = joined([self._points, Points.new(uv, self.config.templates)])
         recognition.store_templates(self._points, new, self._now, 0)
         self._segments.assign(self._points, new, self._now)
         return ids
@@ -80,7 +80,6 @@ class BuiltinTracker:
         self._find_predicted(None)
         if (self._segments.posed(p) & ~known).any():
             self._reconcile(None)
-            self._check_depth()
             p.hidden_for[p.visible] = 0
         return self._tracks()
 
@@ -96,12 +95,10 @@ class BuiltinTracker:
             self._segments.search(now, search)
         self._find_predicted(search)
         self._reconcile(search)
-        self._check_depth()
         p.hidden_for = np.where(p.visible, 0, p.hidden_for + 1)
         if self._frames % cfg.update_every == 0:
             recognition.update_templates(p, now, cfg, self._frames // cfg.update_every)
             self._segments.assign(p, np.flatnonzero(p.verified & (p.segment < 0)), now)
-            self._segments.join(p)
             self._segments.add_landmarks(p, now)
         return self._tracks()
 
@@ -151,12 +148,3 @@ class BuiltinTracker:
         p.warp[rows[~seen]] = predicted.warp[~seen]
         p.verified[rows] = seen & exposed
         p.visible[rows] = exposed & (seen | (predicted.sigma_px < cfg.max_predicted_sigma_px))
-
-    def _check_depth(self) -> None:
-        """A visible point whose depth jumps between frames has slid off its object, or something has come before it."""
-        p = self._points
-        z = self._now.depth_at(p.uv)
-        jumped = p.visible & (z > 0) & (p.depth_m > 0) & (np.abs(z - p.depth_m) > self.config.depth_jump_m)
-        p.visible[jumped] = False
-        # Depth is kept of visible points only: a hidden object moves anywhere.
-        p.depth_m = np.where(p.visible & (z > 0), z, np.where(p.visible, p.depth_m, 0)).astype(np.float32)
