@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.datasets.export import export
-from p2p_lib.datasets.imported import as_run, read_poses
+from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import Sequence, open_sequence
@@ -25,7 +24,7 @@ def evaluate_poses(
     start: int = 0,
     stop: int | None = None,
 ) -> Evaluation:
-    """Score any method's poses (:mod:`p2p_lib.datasets.imported`) by the rules of a run of ours over these frames."""
+    """Score any method's poses (:mod:`p2p_lib.datasets.exchange`) by the rules of a run of ours over these frames."""
     if isinstance(sequence, str | Path):
         sequence = open_sequence(sequence, format)
     known = find_models(sequence) | given_models(models or {}, sequence.objects)

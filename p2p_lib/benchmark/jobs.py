@@ -23,7 +23,7 @@ from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
-from p2p_lib.datasets import manifests, ycbmultitrack
+from p2p_lib.datasets import manifests
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.datasets.resized import Resized
@@ -116,7 +116,7 @@ def open_planned(job: Job) -> Sequence:
 
         scenario = planned.name.removeprefix(SYNTHETIC)
         folder = scenario_dir(scenario, job.sequence_seed, **_synthetic(planned, method)[0])
-        sequence = ycbmultitrack.load(folder, name=planned.name, depth_scale=None, masks=masks)
+        sequence = replace(open_sequence(folder, "ycbmultitrack", masks=masks), name=planned.name)
     else:
         sequence = open_sequence(planned.name, masks=masks)
     return Resized(sequence, method.scale) if method.scale != 1 else sequence

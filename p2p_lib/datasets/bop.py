@@ -1,4 +1,4 @@
-"""A scene in the BOP format: ``<split>/<scene>/`` of a BOP dataset.
+"""Scenes in the BOP format, ``<split>/<scene>/`` of a BOP dataset: read, and written from any sequence.
 
 ``rgb/000001.png``, ``depth/000001.png``, ``mask_visib/000001_000000.png`` (image, index in its list of objects),
 ``scene_camera.json``, ``scene_gt.json`` (millimetres, OpenCV axes), ``scene_gt_info.json``; models in
@@ -8,10 +8,13 @@ An object is called ``obj_000005``; a second one of the same kind in an image ``
 
 from __future__ import annotations
 
+import json
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
+import cv2
 import numpy as np
 from pydantic import BaseModel, Field
 
@@ -21,8 +24,9 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.masks import MaskFiles
+from p2p_lib.datasets.models import load_mesh, load_points
 from p2p_lib.datasets.schema import read_json
-from p2p_lib.datasets.sequence import ObjectTruth
+from p2p_lib.datasets.sequence import ObjectTruth, Sequence
 
 MM = 0.001
 Nine = Annotated[list[float], Field(min_length=9, max_length=9)]
@@ -43,11 +47,8 @@ class _Info(BaseModel):
     px_count_visib: int = 1
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The scene in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`.
-
-    The depth scale is the scene's own unless another is given.
-    """
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The scene in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     rgb, depth = paired_images(folder)
     numbers = [_number(path) for path in rgb]
     camera, scale_mm = _camera(folder / "scene_camera.json", numbers, rgb[0])
@@ -55,18 +56,16 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
     listed = _named(_lists(folder / "scene_gt.json", _Pose), numbers)
     objects = tuple(sorted({obj for at in listed for obj in at}))
     own = _visible_masks(folder, numbers, listed, objects, files.shape)
-    chosen = files.masks(masks, (), objects or None)[0] if masks else own
+    chosen = files.find_masks(masks, (), objects or None)[0] if masks else own
 
     def read_truth() -> dict[str, ObjectTruth]:
         info = _lists(folder / "scene_gt_info.json", _Info)
         return {obj: _truth(folder, obj, numbers, listed, info) for obj in objects}
 
     return ImageSequence(
-        name=name,
-        format="bop",
-        files=files,
+        **vars(files),
         objects=objects or ("object",),
-        depth_scale=depth_scale or scale_mm * MM,
+        depth_scale=scale_mm * MM,
         mask_files=chosen,
         own_masks=own or chosen,
         read_truth=read_truth,
@@ -140,3 +139,71 @@ def _truth(folder: Path, obj: str, numbers: list[int], listed, info: dict[int, l
 def _model_places(folder: Path, obj: str) -> tuple[Path, ...]:
     root, kind = images.full(folder).parent.parent, "_".join(obj.split("_")[:2])
     return (folder / "models" / obj, *(root / models / f"{kind}.ply" for models in ("models_eval", "models")))
+
+
+def write_scene(folder: str | Path, sequence: Sequence) -> dict[str, int]:
+    """Write a sequence as the BOP scene ``folder``, which is ``<dataset>/<split>/<scene>``; depth in millimetres.
+
+    An object is listed in the images in which it has truth. Returns the objects' numbers: 1, 2, ... in their order.
+    """
+    folder = Path(folder)
+    obj_ids = {name: k for k, name in enumerate(sequence.objects, 1)}
+    camera = {"cam_K": sequence.camera.K.ravel().tolist(), "depth_scale": 1.0}
+    scenes: dict[str, dict[int, object]] = {"scene_camera": {}, "scene_gt": {}, "scene_gt_info": {}}
+    (folder / "mask_visib").mkdir(parents=True, exist_ok=True)
+    for i in range(len(sequence)):
+        frame, masks = sequence.frame(i), sequence.masks(i) or {}
+        depth_mm = np.rint(frame.depth_m.astype(float) * 1000)
+        if depth_mm.max(initial=0) > 65535:
+            raise BadInput(f"frame {i} depth", f"{frame.depth_m.max():.2f} m", "at most 65.53 m")
+        images.save_png(folder / "rgb" / f"{i:06d}.png", frame.rgb)
+        images.save_png(folder / "depth" / f"{i:06d}.png", depth_mm.astype(np.uint16))
+        truth = {name: sequence.truth[name].T_cam_model[i] for name in obj_ids if name in sequence.truth}
+        truth = {name: T for name, T in truth.items() if np.isfinite(T).all()}
+        visible = [masks.get(name, np.zeros(frame.shape, bool)) for name in truth]
+        for index, mask in enumerate(visible):
+            images.save_png(folder / "mask_visib" / f"{i:06d}_{index:06d}.png", mask)
+        scenes["scene_camera"][i] = camera
+        scenes["scene_gt"][i] = [
+            {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (T[:3, 3] / MM).tolist(), "obj_id": obj_ids[name]}
+            for name, T in truth.items()
+        ]
+        scenes["scene_gt_info"][i] = [_visibility(mask) for mask in visible]
+    for name, scene in scenes.items():
+        rows = ",\n".join(f'  "{i}": {json.dumps(entry)}' for i, entry in scene.items())
+        (folder / f"{name}.json").write_text("{\n" + rows + "\n}\n")
+    return obj_ids
+
+
+def _visibility(mask: np.ndarray) -> dict[str, object]:
+    """Visible pixels, and x, y, width, height around them: -1 where there are none, as BOP writes it."""
+    box = cv2.boundingRect(mask.astype(np.uint8)) if mask.any() else [-1] * 4
+    return {"bbox_visib": box, "px_count_visib": int(mask.sum())}
+
+
+def write_models(folder: str | Path, models: Mapping[int, str | Path]) -> None:
+    """Write ``models/`` of a BOP dataset: ``obj_000001.ply`` in millimetres and ``models_info.json``.
+
+    models  BOP's number to a model file (see :func:`~p2p_lib.datasets.models.load_points`)
+    """
+    import trimesh
+    from scipy.spatial import ConvexHull
+    from scipy.spatial.distance import pdist
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    info = {}
+    for number, path in sorted(models.items()):
+        points_mm = load_points(path) * 1000
+        if Path(path).suffix.lower() == ".xyz":
+            shape = trimesh.PointCloud(points_mm)
+        else:
+            vertices, faces = load_mesh(path)
+            shape = trimesh.Trimesh(vertices * 1000, faces, process=False)
+        (folder / f"obj_{number:06d}.ply").write_bytes(shape.export(file_type="ply"))
+        # The two points farthest apart are corners of the hull.
+        corners = points_mm[ConvexHull(points_mm, qhull_options="QJ").vertices]
+        info[str(number)] = {"diameter": float(pdist(corners).max())}
+        info[str(number)] |= {f"min_{axis}": float(x) for axis, x in zip("xyz", points_mm.min(0))}
+        info[str(number)] |= {f"size_{axis}": float(x) for axis, x in zip("xyz", np.ptp(points_mm, axis=0))}
+    (folder / "models_info.json").write_text(json.dumps(info, indent=1) + "\n")

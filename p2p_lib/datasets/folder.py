@@ -20,17 +20,15 @@ from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import Sequence
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)
-    found, _ = files.masks(masks, [] if masks else [folder / "masks"], first_frame_alone=True)
-    objects = found.objects if found else ("object",)
+    found, _ = files.find_masks(masks, [] if masks else [folder / "masks"], first_frame_alone=True)
+    objects = tuple(found.files) if found else ("object",)
     return ImageSequence(
-        name=name,
-        format="folder",
-        files=files,
+        **vars(files),
         objects=objects,
-        depth_scale=depth_scale or _depth_scale(folder / "depth_scale.txt"),
+        depth_scale=_depth_scale(folder / "depth_scale.txt"),
         mask_files=found,
         own_masks=found,
         model_places={obj: (folder / "models" / obj,) for obj in objects},
@@ -64,7 +62,7 @@ def write(
         images.save_png(out / "rgb" / f"{number:06d}.png", frame.rgb)
         images.save_png(out / "depth" / f"{number:06d}.png", depth)
         for name, mask in (sequence.masks(i) or {}).items() if number in wanted else ():
-            images.save_png(out / "masks" / name / f"{number:06d}.png", mask.astype(np.uint8) * np.uint8(255))
+            images.save_png(out / "masks" / name / f"{number:06d}.png", mask)
     np.savetxt(out / "cam_K.txt", sequence.camera.K, fmt="%.9g")
     np.savetxt(out / "times.txt", sequence.times_s[frames] - sequence.times_s[frames[0]], fmt="%.6f")
     return out

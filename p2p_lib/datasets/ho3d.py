@@ -29,26 +29,25 @@ DEPTH_SCALE = 0.00012498664727900177  # metres per unit, from the dataset's own 
 T_CV_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     rgb, depth = paired_images(folder)
     meta_files = images.check_paired(images.list_files(folder / "meta", (".pkl",), "meta files"), rgb)
     first = read_meta(meta_files[0])
     camera = camera_for(rgb[0], first["camMat"], f"{meta_files[0]}: camMat")
     files = ImageFiles(folder, rgb, depth, camera, images.frame_times(folder, rgb))
-    beside = [_root(folder) / str(where) / images.full(folder).name for where in ([masks] if masks else MASKS)]
-    found, _ = files.masks(next((where for where in beside if where.is_dir()), masks), (), (OBJECT,))
+    at = images.full(folder)
+    beside = [at.parents[1] / str(where) / at.name for where in ([masks] if masks else MASKS)]
+    found, _ = files.find_masks(next((where for where in beside if where.is_dir()), masks), (), (OBJECT,))
 
     def read_truth() -> dict[str, ObjectTruth]:
         poses = [read_pose(path, read_meta(path), camera) for path in meta_files]
         return {OBJECT: ObjectTruth(np.stack(poses), np.ones(len(poses), bool))}
 
     return ImageSequence(
-        name=name,
-        format="ho3d",
-        files=files,
+        **vars(files),
         objects=(OBJECT,),
-        depth_scale=depth_scale or DEPTH_SCALE,
+        depth_scale=DEPTH_SCALE,
         read_depth=read_raw_depth,
         mask_files=found,
         read_truth=read_truth,
@@ -90,15 +89,10 @@ def read_raw_depth(path: Path) -> np.ndarray:
     return bgr[..., 2].astype(np.uint16) + (bgr[..., 1].astype(np.uint16) << 8)
 
 
-def _root(folder: Path) -> Path:
-    """``HO3D_v3``, two folders above the sequence."""
-    return images.full(folder).parent.parent
-
-
 def _models(folder: Path, meta: dict) -> tuple[Path, ...]:
     """Where the model lies: BundleSDF scores with all vertices of ``textured_simple.obj``."""
     own, known = folder / "models" / OBJECT, meta.get("objName")
     if not isinstance(known, str) or not re.fullmatch(r"[\w-]+", known):
         return (own,)
-    beside = _root(folder) / "models" / known
+    beside = images.full(folder).parents[1] / "models" / known
     return own, beside / "textured_simple.obj", beside

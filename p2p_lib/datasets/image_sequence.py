@@ -21,7 +21,7 @@ from p2p_lib.datasets.sequence import ObjectTruth
 class ImageFiles:
     """What every layout has: a folder with one ``rgb/`` and one ``depth/`` image a frame, a camera, times (N,)."""
 
-    folder: Path
+    path: Path
     rgb: tuple[Path, ...]
     depth: tuple[Path, ...]
     camera: Camera
@@ -32,7 +32,7 @@ class ImageFiles:
         """(height, width) in pixels."""
         return self.camera.height, self.camera.width
 
-    def masks(
+    def find_masks(
         self,
         asked: str | Path | None,
         places: Iterable[Path],
@@ -50,7 +50,7 @@ class ImageFiles:
         own = next((find(where) for where in places if where.is_dir()), None)
         if asked is None:
             return own, own
-        inside = self.folder / asked
+        inside = self.path / asked
         chosen = find(inside if inside.is_dir() else Path(asked).expanduser())
         return chosen, own or chosen
 
@@ -75,22 +75,20 @@ def image_files(folder: Path) -> ImageFiles:
     return ImageFiles(folder, rgb, depth, camera, images.frame_times(folder, rgb))
 
 
-@dataclass(frozen=True, eq=False)
-class ImageSequence:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImageSequence(ImageFiles):
     """A :class:`~p2p_lib.datasets.sequence.Sequence` of image files.
 
     depth_invalid  raw depth value that means "no measurement" besides 0
     read_depth     reads a depth file: (H, W) in the file's unit, of which depth_scale is metres
     mask_files     what :meth:`masks` gives; ``own_masks`` the dataset's own, which scoring counts
     read_truth     called once, when truth is first asked for
-    model_places   object to the files and folders where its model may lie, best first
     """
 
-    name: str
-    format: str
-    files: ImageFiles
+    name: str = ""
+    format: str = ""
     objects: tuple[str, ...]
-    depth_scale: float
+    depth_scale: float = images.DEPTH_SCALE
     depth_invalid: int = 0
     read_depth: Callable[[Path], np.ndarray] = images.read_raw_depth
     mask_files: MaskFiles | None = None
@@ -99,22 +97,7 @@ class ImageSequence:
     model_places: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.files.rgb)
-
-    @property
-    def path(self) -> Path:
-        """The folder."""
-        return self.files.folder
-
-    @property
-    def camera(self) -> Camera:
-        """The colour camera's, which depth is registered to."""
-        return self.files.camera
-
-    @property
-    def times_s(self) -> np.ndarray:
-        """(N,) seconds, increasing."""
-        return self.files.times_s
+        return len(self.rgb)
 
     @cached_property
     def truth(self) -> dict[str, ObjectTruth]:
@@ -124,15 +107,15 @@ class ImageSequence:
     @property
     def frame_names(self) -> tuple[str, ...]:
         """What each frame's image is called, without its ending."""
-        return tuple(path.stem for path in self.files.rgb)
+        return tuple(path.stem for path in self.rgb)
 
     def frame(self, i: int) -> Frame:
         """The i-th frame."""
         self._check_index(i)
-        rgb = images.read_rgb(self.files.rgb[i])
-        images.check_size(self.files.rgb[i], rgb, self.files.shape, "the first image")
-        raw, fix = self.read_depth(self.files.depth[i]), "Register the depth to the colour camera first."
-        images.check_size(self.files.depth[i], raw, self.files.shape, fix=fix)
+        rgb = images.read_rgb(self.rgb[i])
+        images.check_size(self.rgb[i], rgb, self.shape, "the first image")
+        raw, fix = self.read_depth(self.depth[i]), "Register the depth to the colour camera first."
+        images.check_size(self.depth[i], raw, self.shape, fix=fix)
         depth_m = raw.astype(np.float32) * np.float32(self.depth_scale)
         depth_m[raw == self.depth_invalid] = 0
         return Frame(i, float(self.times_s[i]), rgb, depth_m)

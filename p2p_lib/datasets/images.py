@@ -20,9 +20,6 @@ DEFAULT_HZ = 30.0
 NOT_RIGID = 0.01
 
 
-# --- files and their order -------------------------------------------------------------------------
-
-
 def full(folder: Path) -> Path:
     """The folder's whole path, with links left as they are: datasets are often put together of links."""
     return Path(os.path.abspath(folder))
@@ -75,9 +72,6 @@ def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
     return times_s
 
 
-# --- numbers ---------------------------------------------------------------------------------------
-
-
 def read_numbers(path: Path, expected: str) -> np.ndarray:
     """(rows, columns) float64 of a text file of numbers between spaces or commas; ``expected`` says what they are."""
     lines = _read(path, expected).decode("utf-8", "replace").replace(",", " ").splitlines()
@@ -94,9 +88,6 @@ def read_poses(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
     files = check_paired(list_files(folder, (".txt",), "pose files"), rgb_files)
     T = [se3.check(str(p), read_numbers(p, "a 4x4 transformation in metres"), NOT_RIGID) for p in files]
     return se3.orthonormalised(np.stack(T))
-
-
-# --- images --------------------------------------------------------------------------------------
 
 
 def _read(path: Path, expected: str) -> bytes:
@@ -144,7 +135,8 @@ def check_size(
 
 
 def save_png(path: Path, image: np.ndarray) -> None:
-    """Write an image (H, W) or (H, W, 3), red first, and the folders above it."""
+    """Write an image (H, W, 3), red first, or (H, W), a mask as 0 and 255, and the folders above it."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    image = np.where(image, np.uint8(255), np.uint8(0)) if image.dtype == bool else image
     bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     path.write_bytes(cv2.imencode(".png", bgr)[1].tobytes())

@@ -7,20 +7,23 @@ Nothing is downloaded but by :func:`fetch`. What was fetched, or found in its pl
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
 from tqdm import tqdm
 
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
+from p2p_lib.core.files import replace_text
 from p2p_lib.core.progress import progress_bar
+from p2p_lib.core.tables import as_text
 from p2p_lib.datasets.archives import unpack
 from p2p_lib.datasets.download import download, sha256
 from p2p_lib.datasets.manifests import Manifest, RemoteFile, find_sequence, folder_of, manifest, names
+from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import open_sequence
 
 
@@ -33,19 +36,19 @@ class Check:
     text: str
 
 
+class _Recorded(BaseModel):
+    files: dict[str, dict[str, Any]]
+
+
 class _Record:
     """What ``.p2p-NAME.json`` of a manifest's folder says of its files: sha256, bytes, and which were unpacked."""
 
     def __init__(self, of: Manifest):
         self.folder = folder_of(of)
         self._path = self.folder / f".p2p-{of.name}.json"
-        try:
-            self._files: dict[str, dict[str, Any]] = json.loads(self._path.read_text())["files"]
-        except FileNotFoundError:
-            self._files = {}
-        except (ValueError, KeyError, TypeError) as error:
-            fix = "Delete it; files are then checked against the manifest alone."
-            raise BadInput(str(self._path), f"unreadable ({error})", "a record of what was fetched", fix) from None
+        self._files: dict[str, dict[str, Any]] = {}
+        if self._path.is_file():
+            self._files = read_json(self._path, _Recorded, "a record of what was fetched").files
 
     def sha256(self, file: RemoteFile) -> str | None:
         """The checksum that a file must have: the manifest's, else that of the first time."""
@@ -59,9 +62,7 @@ class _Record:
         """Write down what a file is like, and what came out of it."""
         known = {"sha256": digest, "bytes": (self.folder / file.path).stat().st_size}
         self._files[file.path] = known if unpacked is None else {**known, "unpacked": unpacked}
-        partial = self._path.with_name(self._path.name + ".partial")
-        partial.write_text(json.dumps({"files": self._files}, indent=1) + "\n")
-        os.replace(partial, self._path)
+        replace_text(self._path, json.dumps({"files": self._files}, indent=1) + "\n")
 
 
 # --- fetching --------------------------------------------------------------------------------------
@@ -226,20 +227,17 @@ def where(name: str) -> Path:
 
 def overview() -> str:
     """A table of all manifests: name, kind, whether it is here, how it is had, title."""
+    from pandas import DataFrame
+
     root = paths.data_dir()
-    rows = [("name", "kind", "here", "access", "what")]
+    rows = []
     for of in map(manifest, names()):
-        here = "?" if root is None else "yes" if _holds_files(folder_of(of)) else "no"
+        # A download that broke off leaves only hidden files.
+        files = [] if root is None else (p for p in folder_of(of).rglob("[!.]*") if p.is_file())
+        here = "?" if root is None else "yes" if any(files) else "no"
         rows.append((of.name, of.kind, here, of.access, of.title))
-    widths = [max(map(len, column)) for column in zip(*rows)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
-    lines.append(f"In {root}" if root else "$P2P_DATA is not set: it says in which folder datasets live.")
-    return "\n".join(lines)
-
-
-def _holds_files(folder: Path) -> bool:
-    """Whether anything lies there; a download that broke off leaves only hidden files."""
-    return any(path.is_file() and not path.name.startswith(".") for path in folder.rglob("*"))
+    table = as_text(DataFrame(rows, columns=["name", "kind", "here", "access", "what"]))
+    return f"{table}\n" + (f"In {root}" if root else "$P2P_DATA is not set: it says in which folder datasets live.")
 
 
 def describe(of: Manifest) -> str:

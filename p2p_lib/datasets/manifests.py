@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData
@@ -18,6 +18,15 @@ from p2p_lib.datasets.schema import Strict, read_json
 
 CHECKPOINTS = "checkpoints"
 
+
+def _inside(value: str) -> str:
+    path = PurePosixPath(value)
+    if path.is_absolute() or ".." in path.parts or "\\" in value or not value:
+        raise ValueError(f"{value!r} must be a relative path that stays inside")
+    return value
+
+
+Below = Annotated[str, AfterValidator(_inside)]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_]*$")]
 Text = Annotated[str, Field(min_length=1)]
 Url = Annotated[str, Field(pattern=r"^https?://[^\s/]+(/\S*)?$")]
@@ -34,17 +43,12 @@ class RemoteFile(Strict):
     unpack_to  an archive's contents go there, below the manifest's folder; None: it is no archive
     """
 
-    path: Text
+    path: Below
     url: Url | None
     bytes: Annotated[int, Field(gt=0)] | None
     sha256: Sha256 | None
     unknown: str = ""
-    unpack_to: str | None = None
-
-    @field_validator("path", "unpack_to")
-    @classmethod
-    def _inside(cls, value: str | None) -> str | None:
-        return value if value is None else _relative(value)
+    unpack_to: Below | None = None
 
     @model_validator(mode="after")
     def _reasons(self) -> RemoteFile:
@@ -90,21 +94,16 @@ class Manifest(Strict):
     page: Url
     access: Literal["open", "by hand"]
     how_to_get: Text
-    folder: Text
+    folder: Below
     files: list[RemoteFile]
     files_unknown: str = ""
     units: dict[str, str]
     layout: list[str]
     citation: Text
     format: str | None = None
-    sequences_in: str = "."
+    sequences_in: Below = "."
     sequences: list[SequenceEntry] = []
     used_by: str = ""
-
-    @field_validator("folder", "sequences_in")
-    @classmethod
-    def _inside(cls, value: str) -> str:
-        return _relative(value)
 
     @model_validator(mode="after")
     def _complete(self) -> Manifest:
@@ -180,10 +179,3 @@ def _files() -> list[Path]:
 
 def _kind(path: Path) -> str:
     return "checkpoint" if path.parent.name == CHECKPOINTS else "dataset"
-
-
-def _relative(value: str) -> str:
-    path = PurePosixPath(value)
-    if path.is_absolute() or ".." in path.parts or "\\" in value or not value:
-        raise ValueError(f"{value!r} must be a relative path that stays inside")
-    return value

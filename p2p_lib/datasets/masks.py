@@ -24,11 +24,6 @@ class MaskFiles:
     shape: tuple[int, int]
     _counts: dict[int, dict[str, int]] = field(default_factory=dict)
 
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Names, in the order of their labels or folders."""
-        return tuple(self.files)
-
     def read(self, i: int) -> dict[str, np.ndarray] | None:
         """Object to (H, W) bool at frame i; None where no object has a mask for it."""
         at_i = {name: files[i] for name, files in self.files.items() if i < len(files)}

@@ -58,23 +58,9 @@ class Table(Strict):
                 raise ValueError(f"{row.method} {row.metric}: {len(row.values)} values for {len(self.columns)} columns")
         return self
 
-    def row(self, method: str, metric: str) -> Row:
-        """The line of a method and metric."""
-        found = [row for row in self.rows if (row.method, row.metric) == (method, metric)]
-        if not found:
-            known = ", ".join(sorted({f"{row.method} {row.metric}" for row in self.rows}))
-            raise BadInput(self.label, f"{method} {metric}", f"one of {known}")
-        return found[0]
-
 
 class Statement(Strict):
-    """A number of the running text.
-
-    key         what it is, such as ``recovered_events``
-    where       the section it stands in
-    of          the method or setting
-    value       one number, or the two ends of a range; unit in words
-    """
+    """A number of the running text, or the two ends of a range: what it is, the section, of which method or setting."""
 
     key: Text
     where: Text

@@ -23,13 +23,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import load_arrays, replace_text, replacing
 from p2p_lib.core.types import Frame, PoseEstimate, Status
+from p2p_lib.datasets.images import save_png
 from p2p_lib.datasets.keypoint_log import FILE as KEYPOINTS
 from p2p_lib.datasets.models import load_points
 from p2p_lib.datasets.provenance import provenance
@@ -37,7 +37,7 @@ from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
 
 NO_MASKS = -1  # visible_px of sequences that come without masks
 NO_POSE = np.full((4, 4), np.nan)
-_NO_COVARIANCE = np.full((6, 6), np.nan)
+NO_COVARIANCE = np.full((6, 6), np.nan)
 
 
 # --- reading ---------------------------------------------------------------------------------------
@@ -77,6 +77,23 @@ class ObjectRun:
             got, expected = getattr(self, column).shape, (len(self), *of_a_frame.get(column, ()))
             if got != expected:
                 raise BadInput(f"run: {column}", f"shape {got}", f"{expected}")
+
+    @classmethod
+    def of(cls, name: str, estimates: list[PoseEstimate], sequence: Sequence, visible_px: list) -> ObjectRun:
+        """An object's estimates, one a frame, beside its truth and the sequence's ``visible_px`` of these frames."""
+        truth = sequence.truth.get(name)
+        same = ("frame_index", "time_s", "confidence", "visible_points", "inliers", "keyframe", "reason")
+        columns = {key: np.array([getattr(e, key) for e in estimates]) for key in same}
+        at = columns["frame_index"]
+        return cls(
+            **columns,
+            status=np.array([str(e.status) for e in estimates]),
+            T_cam_obj=np.array([NO_POSE if e.T_cam_obj is None else e.T_cam_obj for e in estimates]),
+            covariance=np.array([NO_COVARIANCE if e.covariance is None else e.covariance for e in estimates]),
+            T_cam_model=truth.T_cam_model[at] if truth else np.tile(NO_POSE, (len(at), 1, 1)),
+            labelled=truth.labelled[at] if truth else np.zeros(len(at), bool),
+            visible_px=np.array([NO_MASKS if seen is None else seen.get(name, 0) for seen in visible_px]),
+        )
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -175,9 +192,10 @@ class RunWriter:
         models: Mapping[str, Path] | None = None,
     ):
         self.path, self._sequence = Path(out), sequence
-        self._truth = sequence.truth
-        self._rows: dict[str, list[dict[str, Any]]] = {}  # of each object, a row for every frame so far
+        _ = sequence.truth  # what is wrong with it is said before anything is written
+        self._estimates: dict[str, list[PoseEstimate]] = {}  # of each object, one for every frame so far
         self._frames: list[tuple[int, float]] = []  # index and time of every frame so far
+        self._visible_px: list[Mapping[str, int] | None] = []
         self._timing_columns = ["frame_index", "time_s", "total_ms", "keyframe"]
         self._timings: list[dict[str, str]] = []
         self._flush_at = 1
@@ -196,7 +214,7 @@ class RunWriter:
             "sequence": sequence.name,
             "path": None if synthetic or sequence.path is None else str(sequence.path),
             "format": sequence.format,
-            "objects": list(self._rows),
+            "objects": list(self._estimates),
             "start": start,
             "stop": len(sequence) if stop is None else min(stop, len(sequence)),
             "tracker": tracker,
@@ -224,14 +242,13 @@ class RunWriter:
         stages_ms  parts of it by name; a stage may be absent from a frame
         """
         for name in estimates:
-            if name not in self._rows:
+            if name not in self._estimates:
                 self._add_object(name)
-        visible_px = self._sequence.visible_px(frame.index)
-        for name, rows in self._rows.items():
-            estimate = estimates.get(name) or _not_yet(name, frame.index, frame.time_s)
-            rows.append(self._row(estimate, visible_px.get(name, 0) if visible_px else NO_MASKS))
-            if estimate.T_cam_obj is not None:
-                _append(self._pose_file(name), tum_line(frame.time_s, estimate.T_cam_obj))
+        self._visible_px.append(self._sequence.visible_px(frame.index))
+        for name, kept in self._estimates.items():
+            kept.append(estimates.get(name) or _not_yet(name, frame.index, frame.time_s))
+            if kept[-1].T_cam_obj is not None:
+                _append(self._pose_file(name), tum_line(frame.time_s, kept[-1].T_cam_obj))
         self._frames.append((frame.index, frame.time_s))
         self._add_timing(frame, total_ms, any(e.keyframe for e in estimates.values()), stages_ms or {})
         n = len(self._frames)
@@ -241,23 +258,20 @@ class RunWriter:
 
     def add_masks(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> None:
         """Keep the masks (H, W) bool that served at a frame; all False for an object of which nothing is known."""
-        for name in self._rows:
+        for name in self._estimates:
             mask = masks.get(name)
-            image = np.zeros(frame.shape, np.uint8) if mask is None else mask.astype(np.uint8) * np.uint8(255)
-            path = self.path / "masks" / name / f"{frame.index:06d}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+            mask = np.zeros(frame.shape, bool) if mask is None else mask
+            save_png(self.path / "masks" / name / f"{frame.index:06d}.png", mask)
 
     def flush(self) -> None:
         """Make everything so far readable on disk."""
         if self._frames:
-            arrays = {
-                f"{name}/{column}": np.array([row[column] for row in rows])
-                for name, rows in self._rows.items()
-                for column in COLUMNS
-            }
+            arrays = {}
+            for name, estimates in self._estimates.items():
+                run = ObjectRun.of(name, estimates, self._sequence, self._visible_px)
+                arrays |= {f"{name}/{column}": getattr(run, column) for column in COLUMNS}
             _save_arrays(self.path / "poses.npz", arrays)
-        self.info |= {"frames": len(self._frames), "objects": list(self._rows)}
+        self.info |= {"frames": len(self._frames), "objects": list(self._estimates)}
         self._write_info()
 
     def __enter__(self) -> RunWriter:
@@ -272,20 +286,8 @@ class RunWriter:
     def _add_object(self, name: str) -> None:
         if not re.fullmatch(r"[\w][\w .+-]*", name):
             raise BadInput("object name", repr(name), "letters, digits, '_', '-', '.', '+' or spaces: it names a file")
-        self._rows[name] = [self._row(_not_yet(name, index, time_s), NO_MASKS) for index, time_s in self._frames]
+        self._estimates[name] = [_not_yet(name, index, time_s) for index, time_s in self._frames]
         self._pose_file(name).write_text("")
-
-    def _row(self, estimate: PoseEstimate, visible_px: int) -> dict[str, Any]:
-        """The columns of an object at one frame."""
-        truth, i = self._truth.get(estimate.object), estimate.frame_index
-        same = ("frame_index", "time_s", "confidence", "visible_points", "inliers", "keyframe", "reason")
-        row = {key: getattr(estimate, key) for key in same}
-        row |= {"status": str(estimate.status), "visible_px": visible_px}
-        row["T_cam_obj"] = NO_POSE if estimate.T_cam_obj is None else estimate.T_cam_obj
-        row["covariance"] = _NO_COVARIANCE if estimate.covariance is None else estimate.covariance
-        row["T_cam_model"] = truth.T_cam_model[i] if truth else NO_POSE
-        row["labelled"] = bool(truth.labelled[i]) if truth else False
-        return row
 
     def _add_timing(self, frame: Frame, total_ms: float, keyframe: bool, stages_ms: Mapping[str, float]) -> None:
         row = {"frame_index": str(frame.index), "time_s": f"{frame.time_s:.9f}", "total_ms": f"{total_ms:.4f}"}

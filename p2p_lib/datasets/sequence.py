@@ -1,13 +1,13 @@
 """RGB-D sequences: the protocol that every layout fulfils, and :func:`open_sequence`, which opens any of them.
 
-A layout is one module with ``load(folder, name, depth_scale, masks)``, and one line in :data:`FORMATS`.
+A layout is one module with ``load(folder, masks)``, and one line in :data:`FORMATS`.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -104,7 +104,7 @@ def open_sequence(
     other folder by its path below ``$P2P_DATA``.
 
     format       one of :data:`FORMATS`; by default the layout is recognised
-    depth_scale  metres per raw unit of the depth images (default 0.001: millimetres)
+    depth_scale  metres per raw unit of the depth images (default: the layout's, mostly 0.001 for millimetres)
     seed         of the generator, for ``synthetic/NAME``
     masks        another folder of masks (a name inside the sequence, or a path); by default the dataset's own
 
@@ -124,8 +124,9 @@ def open_sequence(
     else:
         folder, format = _find(path_or_name, format)
         name = os.path.basename(os.path.abspath(folder))
-    loader = import_module(f"p2p_lib.datasets.{format or recognise(folder)}")
-    return loader.load(folder, name=name, depth_scale=depth_scale, masks=masks)
+    format = format or recognise(folder)
+    read = import_module(f"p2p_lib.datasets.{format}").load(folder, masks)
+    return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale)
 
 
 def unknown_scenario(name: str, known: Iterable[str]) -> BadInput | None:

@@ -26,10 +26,10 @@ YCB_NAMES = {
 }
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)
-    chosen, own = files.masks(masks, [folder / "gt_mask", folder / "masks"], (OBJECT,))
+    chosen, own = files.find_masks(masks, [folder / "gt_mask", folder / "masks"], (OBJECT,))
 
     def read_truth() -> dict[str, ObjectTruth]:
         if not (folder / "annotated_poses").is_dir():
@@ -38,11 +38,8 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
         return {OBJECT: ObjectTruth(poses, np.ones(len(poses), bool))}
 
     return ImageSequence(
-        name=name,
-        format="ycbineoat",
-        files=files,
+        **vars(files),
         objects=(OBJECT,),
-        depth_scale=depth_scale or images.DEPTH_SCALE,
         mask_files=chosen,
         own_masks=own,
         read_truth=read_truth,

@@ -28,12 +28,12 @@ def _objects(folder: Path) -> tuple[str, ...]:
     return tuple(sorted(p.name for p in poses.iterdir() if p.is_dir())) if poses.is_dir() else ()
 
 
-def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path | None) -> ImageSequence:
-    """The sequence in this folder; arguments as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files, objects = image_files(folder), _objects(folder)
     if not objects:
         raise BadInput(str(folder / "annotated_poses"), "no folders", "one folder of poses for each object")
-    chosen, own = files.masks(masks, [folder / "masks"], objects)
+    chosen, own = files.find_masks(masks, [folder / "masks"], objects)
 
     def read_truth() -> dict[str, ObjectTruth]:
         poses = {obj: images.read_poses(folder / "annotated_poses" / obj, files.rgb) for obj in objects}
@@ -41,11 +41,8 @@ def load(folder: Path, name: str, depth_scale: float | None, masks: str | Path |
 
     roots = folder, images.full(folder).parent
     return ImageSequence(
-        name=name,
-        format="ycbmultitrack",
-        files=files,
+        **vars(files),
         objects=objects,
-        depth_scale=depth_scale or images.DEPTH_SCALE,
         depth_invalid=DEPTH_INVALID,
         mask_files=chosen,
         own_masks=own,

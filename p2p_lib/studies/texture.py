@@ -12,7 +12,7 @@ of a real object; contrasts in the order given, dark to bright.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import cycle
 from pathlib import Path
 
@@ -28,7 +28,6 @@ from scipy import stats
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.types import Frame, Tracks, joined
-from p2p_lib.datasets import ycbmultitrack
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation import metrics
@@ -209,7 +208,7 @@ def visible_texture(rgb: np.ndarray, mask: np.ndarray, margin_px: int = MARGIN_P
 def fading_label(contrast: float, frames: int, seed: int = 0) -> Video:
     """``synthetic/fading_label`` at a contrast of its print: for one seed all else is the same."""
     folder = scenario_dir("fading_label", seed, contrast=float(contrast), frames=frames)
-    return ycbmultitrack.load(folder, f"synthetic/fading_label {seed}, contrast {contrast:g}", None, None)
+    return replace(open_sequence(folder, "ycbmultitrack"), name=f"synthetic/fading_label {seed}, contrast {contrast:g}")
 
 
 def present(names: Iterable[str], left_out: str = "") -> dict[str, Video | str]:

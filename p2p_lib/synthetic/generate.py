@@ -22,7 +22,7 @@ from tqdm import tqdm
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import cache_dir
-from p2p_lib.datasets.bop_writer import write_models, write_scene
+from p2p_lib.datasets.bop import write_models, write_scene
 from p2p_lib.datasets.sequence import SYNTHETIC, open_sequence, unknown_scenario
 from p2p_lib.synthetic.noise import NOISE, Sensor, kept_frames, measured_colour, measured_depth, measured_mask
 from p2p_lib.synthetic.render import Rendering

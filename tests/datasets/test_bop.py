@@ -11,7 +11,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.bop_writer import write_models, write_scene
+from p2p_lib.datasets.bop import write_models, write_scene
 from p2p_lib.datasets.models import find_models, load_points
 from p2p_lib.datasets.sequence import ObjectTruth, open_sequence
 

@@ -11,9 +11,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import PoseEstimate, Status
-from p2p_lib.datasets.bop_writer import write_models, write_scene
-from p2p_lib.datasets.export import FORMATS, export
-from p2p_lib.datasets.imported import read_poses
+from p2p_lib.datasets.bop import write_models, write_scene
+from p2p_lib.datasets.exchange import FORMATS, export, read_poses
 from p2p_lib.datasets.runs import RunWriter, load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.protocol import evaluate

@@ -51,23 +51,28 @@ def test_means_that_leave_failures_out():
     ]
 
 
+def row(table, method, metric):
+    [found] = [row for row in table.rows if (row.method, row.metric) == (method, metric)]
+    return found
+
+
 def test_spot_checks_by_hand():
     paper = paper_reported()
     ho3d = paper.table(HO3D)
     assert [c.sequence for c in ho3d.columns] == [s.name for s in manifests.manifest("ho3d_v3").sequences]
     at = [c.sequence for c in ho3d.columns].index("AP12")
-    assert ho3d.row("Ours", "add_auc").values[at] == 46.64
-    assert ho3d.row("Ours", "chamfer_cm").values[at] == 2.97
-    assert ho3d.row("FoundationPose", "adds_auc").values[-1] == FAIL
+    assert row(ho3d, "Ours", "add_auc").values[at] == 46.64
+    assert row(ho3d, "Ours", "chamfer_cm").values[at] == 2.97
+    assert row(ho3d, "FoundationPose", "adds_auc").values[-1] == FAIL
     eoat = paper.table("tab:ycb_ineoat")
     assert {c.sequence for c in eoat.columns} == {s.paper for s in manifests.manifest("ycbineoat").sequences}
-    assert eoat.row("Ours", "adds_auc").values == [82.88, 93.90, 96.37, 92.50, 95.26, 95.65, 94.31, 87.60, 95.52]
+    assert row(eoat, "Ours", "adds_auc").values == [82.88, 93.90, 96.37, 92.50, 95.26, 95.65, 94.31, 87.60, 95.52]
     synthetic = paper.table("tab:ycbmultitrack_syn")
     assert [(r.mean) for r in synthetic.rows] == [98.39, 76.74, 88.67, 97.58, 63.05, 77.94]
     real = paper.table("tab:ycbmultitrack_real")
     assert len({c.sequence for c in real.columns}) == 11
-    assert paper.table("tab:ablation_mean_std").row("Proposed", "add_auc").mean == 82.76
-    sampling = paper.table("tab:keypoint_sampling_mean_std").row("Uniform Sampling", "adds_auc")
+    assert row(paper.table("tab:ablation_mean_std"), "Proposed", "add_auc").mean == 82.76
+    sampling = row(paper.table("tab:keypoint_sampling_mean_std"), "Uniform Sampling", "adds_auc")
     assert (sampling.mean, sampling.std) == (91.47, 5.92)
 
 

@@ -1,18 +1,20 @@
-"""Poses of any method, read so that they are scored by the same rules as a run of ours.
+"""Poses to and from other tools; any method's poses are scored by the same rules as a run of ours.
 
-What may be given (see :mod:`p2p_lib.datasets.export`, which writes all of them):
+``tum``    ``<object>.txt``: time_s tx ty tz qx qy qz qw, as evo and the TUM tools read it
+``poses``  ``annotated_poses/<object>/<frame>.txt``, 4x4 in metres, as the datasets keep their truth and BundleSDF its
+           results (``ob_in_cam``); a sequence of one unnamed object has ``annotated_poses/<frame>.txt``
+``bop``    one CSV of the BOP challenge: scene_id,im_id,obj_id,score,R,t,time with millimetres and seconds
 
-- a BOP challenge CSV: the best-scored estimate of an object in an image counts;
-- TUM trajectories: ``<object>.txt`` in a folder, or one file; times are matched to the sequence's;
-- 4x4 matrices, one file a frame: ``ob_in_cam/*.txt`` of BundleSDF, ``annotated_poses/``, or a folder of such, with
-  one folder per object where there are several. Files are named as the images, or by frame number from 0.
-
+:func:`export` writes frames by the names of the sequence's images and leaves out those without a pose.
+:func:`read_poses` takes all three: of a BOP file the best-scored estimate of an object in an image, a TUM file alone
+or in a folder, times matched to the sequence's, and folders of matrices named as the images or by frame number from 0.
 A frame for which there is nothing, or a matrix of zeros or NaN, is lost, and lost it is scored.
 """
 
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,14 +23,75 @@ from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.types import Status
+from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets import images
-from p2p_lib.datasets.export import BOP_HEADER, image_ids, obj_ids, scene_id
 from p2p_lib.datasets.models import load_points
-from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run
+from p2p_lib.datasets.runs import NO_POSE, ObjectRun, Run, tum_line
 from p2p_lib.datasets.sequence import Sequence
 
+FORMATS = ("tum", "poses", "bop")
+BOP_HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 MATRIX_FOLDERS = ("ob_in_cam", "annotated_poses")
+
+
+def export(
+    run: Run,
+    out: str | Path,
+    format: str,
+    T_obj_frame: Mapping[str, np.ndarray] | None = None,
+    sequence: Sequence | None = None,
+) -> list[Path]:
+    """Write a run's poses below the folder ``out``; returns the files, or the folders of files.
+
+    T_obj_frame  object to the constant (4, 4) from the frame wanted to the tracker's own, such as T_obj_model: what is
+                 written is T_cam_frame, of these objects alone. By default T_cam_obj of all
+    sequence     names the frames and BOP's scene and objects; without it frames are named by number
+
+    Raises :class:`BadInput` for an unknown format.
+    """
+    if format not in FORMATS:
+        raise BadInput("format", repr(format), "one of " + ", ".join(FORMATS))
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    frames = dict.fromkeys(run.objects, np.eye(4)) if T_obj_frame is None else T_obj_frame
+    poses = {name: run.objects[name].T_cam_obj @ T for name, T in frames.items()}
+    if format == "bop":
+        return [_write_bop(out, run, poses, sequence)]
+    written = []
+    for name, T in poses.items():
+        obj = run.objects[name]
+        has_pose = np.flatnonzero(obj.has_pose)
+        if format == "tum":
+            written.append(out / f"{name}.txt")
+            written[-1].write_text("".join(tum_line(obj.time_s[i], T[i]) for i in has_pose))
+        else:
+            written.append(out / "annotated_poses" / ("" if tuple(poses) == ("object",) else name))
+            written[-1].mkdir(parents=True, exist_ok=True)
+            for i in has_pose:
+                index = int(obj.frame_index[i])
+                stem = f"{index:07d}" if sequence is None else sequence.frame_names[index]
+                np.savetxt(written[-1] / f"{stem}.txt", T[i], fmt="%.12g")
+    return written
+
+
+def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: Sequence | None) -> Path:
+    numbers = _obj_ids(tuple(poses) if sequence is None else sequence.objects)
+    total_ms = run.timings.get("total_ms", np.empty(0))
+    lines = [BOP_HEADER]
+    for name, T in poses.items():
+        obj = run.objects[name]
+        images = _image_ids(sequence, obj.frame_index)
+        # BOP wants one time for all estimates of an image, -1 where it is unknown.
+        times_s = total_ms / 1000 if len(total_ms) == len(obj) else np.full(len(obj), -1.0)
+        for i in np.flatnonzero(obj.has_pose):
+            R, t_mm = (" ".join(f"{x:.12g}" for x in v) for v in (T[i, :3, :3].ravel(), T[i, :3, 3] * 1000))
+            head = f"{_scene_id(sequence)},{images[i]},{numbers[name]},{obj.confidence[i]:.6f}"
+            lines.append(f"{head},{R},{t_mm},{times_s[i]:.6f}")
+    # METHOD_DATASET-SPLIT.csv, as the BOP toolkit takes names apart.
+    dataset = re.sub(r"[^A-Za-z0-9]+", "", str(run.info.get("sequence", "run"))) or "run"
+    path = out / f"p2p_{dataset}-test.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
 
 
 def read_poses(path: str | Path, sequence: Sequence) -> dict[str, np.ndarray]:
@@ -62,39 +125,28 @@ def as_run(
     poses: Mapping[str, np.ndarray],
     sequence: Sequence,
     models: Mapping[str, Path],
-    method: str = "imported",
-    path: Path | None = None,
-    frames: range | None = None,
+    path: Path,
+    frames: range,
 ) -> Run:
-    """A :class:`~p2p_lib.datasets.runs.Run` of such poses over a sequence, or ``frames`` of it, ready to be evaluated.
+    """Such poses over some frames of a sequence as a run that is ready to be evaluated.
 
     models  object to model file; every object of the sequence is in the run: one without poses is lost throughout
+    path    of the poses
     """
-    at = np.arange(len(sequence)) if frames is None else np.array(frames)
-    n, nothing = len(at), np.full((len(sequence), 4, 4), np.nan)
-    visible = [sequence.visible_px(int(i)) for i in at]
+    visible_px = [sequence.visible_px(i) for i in frames]
     objects = {}
     for name in sequence.objects:
-        T_cam_obj, truth = poses.get(name, nothing)[at], sequence.truth.get(name)
-        has_pose = np.isfinite(T_cam_obj).all((1, 2))
-        objects[name] = ObjectRun(
-            frame_index=at,
-            time_s=np.asarray(sequence.times_s, float)[at],
-            status=np.where(has_pose, str(Status.TRACKED), str(Status.LOST)),
-            T_cam_obj=T_cam_obj,
-            confidence=has_pose.astype(float),
-            covariance=np.full((n, 6, 6), np.nan),
-            visible_points=np.zeros(n, int),
-            inliers=np.zeros(n, int),
-            keyframe=np.zeros(n, bool),
-            T_cam_model=truth.T_cam_model[at] if truth else nothing[at],
-            labelled=truth.labelled[at] if truth else np.zeros(n, bool),
-            visible_px=np.array([NO_MASKS if v is None else v.get(name, 0) for v in visible]),
-            reason=np.where(has_pose, "", "no pose given"),
-        )
-    info = {"sequence": sequence.name, "objects": list(sequence.objects), "tracker": method, "masks": None}
-    points = {name: load_points(file) for name, file in models.items()}
-    return Run(path or Path(method), info, objects, points, {})
+        T_cam_obj = poses.get(name, np.tile(NO_POSE, (len(sequence), 1, 1)))
+        estimates = [_estimate(name, i, sequence.times_s[i], T_cam_obj[i]) for i in frames]
+        objects[name] = ObjectRun.of(name, estimates, sequence, visible_px)
+    info = {"sequence": sequence.name, "objects": list(sequence.objects), "tracker": "imported", "masks": None}
+    return Run(path, info, objects, {name: load_points(file) for name, file in models.items()}, {})
+
+
+def _estimate(name: str, frame: int, time_s: float, T_cam_obj: np.ndarray) -> PoseEstimate:
+    if not np.isfinite(T_cam_obj).all():
+        return PoseEstimate(name, frame, time_s, Status.LOST, reason="no pose given")
+    return PoseEstimate(name, frame, time_s, Status.TRACKED, T_cam_obj, 1.0)
 
 
 def _only_object(path: Path, sequence: Sequence) -> str:
@@ -152,8 +204,8 @@ def _read_tum(path: Path, sequence: Sequence) -> np.ndarray:
 
 def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
     """Best-scored estimates. Of several instances of a kind only the first is filled: BOP does not tell them apart."""
-    frame_of = {int(k): i for i, k in enumerate(image_ids(sequence, np.arange(len(sequence))))}
-    name_of = {number: name for name, number in reversed(obj_ids(sequence.objects).items())}
+    frame_of = {int(k): i for i, k in enumerate(_image_ids(sequence, np.arange(len(sequence))))}
+    name_of = {number: name for name, number in reversed(_obj_ids(sequence.objects).items())}
     poses: dict[str, np.ndarray] = {}
     best: dict[tuple[str, int], float] = {}
     for number, row in enumerate(_bop_rows(path), 2):
@@ -165,7 +217,7 @@ def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
             T = se3.from_rt(R, t_mm * 0.001)
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise BadInput(where, f"unreadable ({error})", BOP_HEADER) from None
-        if scene != scene_id(sequence) or obj not in name_of:
+        if scene != _scene_id(sequence) or obj not in name_of:
             continue  # another scene's, or an object that this one does not have
         if image not in frame_of:
             raise BadInput(where, f"im_id {image}", "the number of an image of the sequence")
@@ -175,7 +227,7 @@ def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
             poses.setdefault(name, np.full((len(sequence), 4, 4), np.nan))
             poses[name][frame] = se3.orthonormalised(se3.check(where, T, images.NOT_RIGID))
     if not poses:
-        raise BadInput(str(path), f"nothing of scene {scene_id(sequence)}", f"poses of {', '.join(sequence.objects)}")
+        raise BadInput(str(path), f"nothing of scene {_scene_id(sequence)}", f"poses of {', '.join(sequence.objects)}")
     return poses
 
 
@@ -187,3 +239,22 @@ def _bop_rows(path: Path) -> list[dict[str, str]]:
         if list(rows.fieldnames or []) != BOP_HEADER.split(","):
             raise BadInput(str(path), f"the header {','.join(rows.fieldnames or [])[:80]!r}", BOP_HEADER)
         return list(rows)
+
+
+def _scene_id(sequence: Sequence | None) -> int:
+    """BOP's number of a scene: its folder's name where that is a number, else 1."""
+    name = sequence.path.name if sequence is not None and sequence.path is not None else ""
+    return int(name) if name.isdigit() else 1
+
+
+def _obj_ids(objects: tuple[str, ...]) -> dict[str, int]:
+    """BOP's number of each object: that of ``obj_000005``, else 1, 2, ... in the sequence's order."""
+    named = {name: re.fullmatch(r"obj_(\d{6})(_\d+)?", name) for name in objects}
+    return {name: int(found[1]) if found else k for k, (name, found) in enumerate(named.items(), 1)}
+
+
+def _image_ids(sequence: Sequence | None, frame_index: np.ndarray) -> np.ndarray:
+    """BOP's number of each frame: the image's in a BOP scene, else the frame's own."""
+    if sequence is None or sequence.format != "bop":
+        return frame_index
+    return np.array([int(sequence.frame_names[i]) for i in frame_index], int)
