@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.types import WITH_POSE, Status
+from p2p_lib.core.types import Status
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.confidence import pose_error
@@ -57,8 +57,7 @@ def status_intervals(status: np.ndarray) -> list[tuple[str, int, int]]:
 
 def gaps(obj: ObjectRun, at_least: int = 5) -> list[tuple[int, int]]:
     """Spans [start, stop) of at least so many frames without a pose, after the object was first seen."""
-    spans = status_intervals(np.isin(obj.status, [str(status) for status in WITH_POSE]))
-    return [(a, b) for with_pose, a, b in spans if with_pose == "False" and a > 0 and b - a >= at_least]
+    return [(a, b) for has, a, b in status_intervals(obj.has_pose) if has == "False" and a > 0 and b - a >= at_least]
 
 
 @style.styled
