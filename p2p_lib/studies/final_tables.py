@@ -16,6 +16,7 @@ import trimesh
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from pandas import DataFrame
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import Job
@@ -319,8 +320,9 @@ def by_return(numbers: Numbers) -> Table:
 
 def by_rate(numbers: Numbers) -> Table:
     """Frames per second and milliseconds a stage, by number of tracks, of objects, and resolution."""
-    found = _times(numbers, "method", "metric")
-    stages = dict.fromkeys(metric for _, metric in found if metric.startswith("stage "))
+    times = DataFrame(numbers.benchmark.times, columns=["method", "metric", "value"])
+    found = times.groupby(["method", "metric"], sort=False).value.mean()
+    stages = [metric for metric in times.metric.unique() if metric.startswith("stage ")]
     heads = {"rate": "rate (Hz)", "95th percentile": "95 % within (ms)"}
     heads |= {stage: stage.removeprefix("stage ") + " (ms)" for stage in stages}
     heads |= {"processor time, files included": "processor, files included (ms)"}
@@ -339,7 +341,8 @@ def by_run(numbers: Numbers) -> Table:
     done: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for job, outcome in numbers.benchmark.results:
         done[job.method.name, shown_name(job)] += [outcome] if outcome.objects else []
-    hz = _times(numbers, "method", "sequence", of="rate")
+    times = DataFrame(numbers.benchmark.times, columns=["method", "sequence", "metric", "value"])
+    hz = times[times.metric == "rate"].groupby(["method", "sequence"]).value.mean()
     lines = []
     for at, outcomes in done.items():
         cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 5
@@ -363,15 +366,6 @@ KINDS: dict[str, Callable[[Numbers], Table]] = {
     "rates": by_rate,
     "runs": by_run,
 }
-
-
-def _times(numbers: Numbers, *keys: str, of: str = "") -> dict[tuple[str, ...], float]:
-    """The mean of the times (of the metric ``of``) that have these columns in common."""
-    found: dict[tuple[str, ...], list[float]] = defaultdict(list)
-    for row in numbers.benchmark.times:
-        if row["metric"] == of or not of:
-            found[tuple(row[key] for key in keys)].append(row["value"])
-    return {at: float(np.mean(values)) for at, values in found.items()}
 
 
 def _areas(numbers: Numbers, method: Method) -> list[Cell]:
@@ -424,9 +418,9 @@ EDGES_MM = np.geomspace(0.1, 100, 31)
 FAR_PX = 4.0
 
 
-def scene_of(benchmark: Benchmark, method: str, sequence: str = "") -> tuple[Scene, Run, Sequence]:
+def scene_of(benchmark: Benchmark, method: str) -> tuple[Scene, Run, Sequence]:
     """A method's first finished run on its video, ready to be drawn."""
-    run, video = benchmark.run(method, sequence), benchmark.video(method, sequence)
+    run, video = benchmark.run(method), benchmark.video(method)
     return Scene(video, run, evaluate(run)), run, video
 
 
@@ -458,18 +452,20 @@ def error_histograms(benchmark: Benchmark) -> Figure:
 
 
 @style.styled
-def tracks_by_error(
-    benchmark: Benchmark, method: str, sequence: str = "", count: int = 3, width_px: int = 420
-) -> Figure:
+def tracks_by_error(benchmark: Benchmark, method: str, count: int = 3) -> Figure:
     """True boxes (white, dashed), estimated ones, and the 2D tracks of the keypoints coloured by their error.
 
     The error is the distance in pixels from where the tracker saw a keypoint to the keypoint of the final map projected
     with the true pose; points that the map has dropped since are not drawn.
     """
-    scene, run, video = scene_of(benchmark, method, sequence)
-    evaluation, keypoints, region_px = evaluate(run), load_keypoints(run.path), scene.region()
+    scene, run, video = scene_of(benchmark, method)
+    evaluation, keypoints, region_px, width_px = evaluate(run), load_keypoints(run.path), scene.region(), 420
+    seen = np.flatnonzero(np.logical_and.reduce([obj.has_pose & obj.has_truth for obj in run.objects.values()]))
+    seen = seen[seen > 0]  # the first has no tracks yet
+    if not len(seen):
+        raise MissingData(str(run.path), "no frame in which every object has a pose")
     images = []
-    for row in _well_seen(run, count):
+    for row in seen[np.linspace(0, len(seen) - 1, count).round().astype(int)].tolist():
         image = scene.draw(row, region_px, width_px, axes=False, trail=0)
         _, camera = overlay.zoomed(video.frame(0).rgb, video.camera, region_px, width_px)
         for name, score in evaluation.objects.items():
@@ -488,12 +484,12 @@ def tracks_by_error(
     return figure
 
 
-def recovery_strip(benchmark: Benchmark, sequence: str = "", count: int = 4, width_px: int = 300) -> np.ndarray:
+def recovery_strip(benchmark: Benchmark, count: int = 4, width_px: int = 300) -> np.ndarray:
     """Occlusion and recovery: a line for each method, the same moments below each other.
 
     White and dashed is the truth, in colour the estimate; a method that has lost the object draws none.
     """
-    scenes = {name: scene_of(benchmark, name, sequence)[0] for name in benchmark.methods}
+    scenes = {name: scene_of(benchmark, name)[0] for name in benchmark.methods}
     first = next(iter(scenes.values()))
     moments, region_px, images = first.moments(count), first.region(), []
     for name, scene in scenes.items():
@@ -504,20 +500,20 @@ def recovery_strip(benchmark: Benchmark, sequence: str = "", count: int = 4, wid
     return overlay.montage(images, columns=count)
 
 
-def reconstruction_sheet(benchmark: Benchmark, method: str, sequence: str = "", width_px: int = 300) -> np.ndarray:
+def reconstruction_sheet(benchmark: Benchmark, method: str) -> np.ndarray:
     """Each object's reconstruction beside its true surface, seen as in its first frame and from behind."""
-    run, video = benchmark.run(method, sequence), benchmark.video(method, sequence)
+    run, video = benchmark.run(method), benchmark.video(method)
     evaluation, images = evaluate(run), []
     for name in evaluation.objects:
-        chamfer_cm = benchmark.chamfer_cm(method, sequence, name)
-        images += _beside_truth(run, video, evaluation, name, chamfer_cm, width_px)
+        chamfer_cm = benchmark.chamfer_cm(method, "", name)
+        images += _beside_truth(run, video, evaluation, name, chamfer_cm)
     if not images:
         raise MissingData(str(run.path), "no reconstructed surface", "Run with the setting method.surface = true.")
     return overlay.montage(images, columns=4)
 
 
 def _beside_truth(
-    run: Run, video: Sequence, evaluation: Evaluation, name: str, chamfer_cm: float | None, width_px: int
+    run: Run, video: Sequence, evaluation: Evaluation, name: str, chamfer_cm: float | None
 ) -> list[np.ndarray]:
     file, model = run.path / "meshes" / f"{name}.ply", find_models(video, MESHES).get(name)
     if not file.is_file() or model is None:
@@ -526,7 +522,7 @@ def _beside_truth(
     surface.apply_transform(se3.inverse(evaluation.objects[name].T_obj_model))
     truth = load_mesh(model)
     middle = (truth.vertices.max(0) + truth.vertices.min(0)) / 2
-    camera, front = _portrait(run, name, middle, float(np.ptp(truth.vertices, axis=0).max()), width_px)
+    camera, front = _portrait(run, name, middle, float(np.ptp(truth.vertices, axis=0).max()))
     turn = se3.exp(np.array([0, 0, np.pi, 0, 0, 0]))
     behind = front @ se3.from_rt(np.eye(3), middle) @ turn @ se3.from_rt(np.eye(3), -middle)
     kind = "synthetic" if video.name.startswith("synthetic") else "real"
@@ -540,22 +536,12 @@ def _beside_truth(
     return [overlay.draw_caption(mesh_view.draw_mesh(mesh, camera, T), title, scale=0.4) for mesh, T, title in shown]
 
 
-def _portrait(run: Run, name: str, middle: np.ndarray, size_m: float, width_px: int) -> tuple[Camera, np.ndarray]:
+def _portrait(run: Run, name: str, middle: np.ndarray, size_m: float) -> tuple[Camera, np.ndarray]:
     """A camera that sees the whole object as the first scored frame did, with its middle in the middle."""
     obj = run.objects[name]
     T = obj.T_cam_model[np.flatnonzero(obj.has_truth)[0]].copy()
     T[:3, 3] = np.array([0, 0, 4 * size_m]) - T[:3, :3] @ middle
-    focal_px = 3.1 * width_px
-    return Camera(focal_px, focal_px, (width_px - 1) / 2, (width_px - 1) / 2, width_px, width_px), T
-
-
-def _well_seen(run: Run, count: int) -> list[int]:
-    """Rows spread over the frames in which every object has a pose; the first has no tracks yet."""
-    seen = np.flatnonzero(np.logical_and.reduce([obj.has_pose & obj.has_truth for obj in run.objects.values()]))
-    seen = seen[seen > 0]
-    if not len(seen):
-        raise MissingData(str(run.path), "no frame in which every object has a pose")
-    return seen[np.linspace(0, len(seen) - 1, count).round().astype(int)].tolist()
+    return Camera(930, 930, 149.5, 149.5, 300, 300), T
 
 
 def _track_errors(

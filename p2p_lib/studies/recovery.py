@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from p2p_lib.core import se3
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M, Judged, reliability, right_poses
 from p2p_lib.evaluation.point_tracks import Outcome
@@ -166,16 +165,12 @@ def recovery_counts(cases: Mapping[tuple[str, str], tuple[Run, Evaluation]]) -> 
     return DataFrame(rows)
 
 
-def around(scene: Scene, name: str, indices: Sequence[int], margin: float = 0.3) -> list[tuple[int, int, int, int]]:
-    """The rectangles (left, top, right, bottom), all of one size, of where an object truly is in each frame.
-
-    margin  as a fraction of the object's size
-    """
+def around(scene: Scene, name: str, indices: Sequence[int]) -> list[tuple[int, int, int, int]]:
+    """The rectangles (left, top, right, bottom), all of one size, of where an object truly is in each frame."""
     obj, camera = scene.run.objects[name], scene.sequence.camera
     box = Box.around(scene.run.points[name])
-    T_cam_box = obj.T_cam_model[[scene.row(i) for i in indices]] @ box.T_obj_box
-    uv = camera.project(se3.transform(T_cam_box, overlay.box_corners(box.size_m)))
+    uv = camera.project(box.corners(obj.T_cam_model[[scene.row(i) for i in indices]]))
     low, high = uv.min(1), uv.max(1)
-    size = np.minimum((1 + 2 * margin) * (high - low).max(0), [camera.width, camera.height]).astype(int)
+    size = np.minimum(1.6 * (high - low).max(0), [camera.width, camera.height]).astype(int)
     corner = np.clip((low + high - size) / 2, 0, np.array([camera.width, camera.height]) - size).astype(int)
     return [(int(x), int(y), int(x + size[0]), int(y + size[1])) for x, y in corner]
