@@ -83,16 +83,16 @@ def tight_box(mesh: trimesh.Trimesh) -> Box:
     return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
 
 
-def edges_mm(mesh: trimesh.Trimesh, beyond: float = 0.005, rounds: int = 2) -> np.ndarray:
+def edges_mm(mesh: trimesh.Trimesh) -> np.ndarray:
     """(3,) edges of the box around a surface, longest first, without its fringes.
 
-    Twice, the outermost fraction ``beyond`` of the vertices is cut off at each side, along the box's axes.
+    Twice, the outermost 0.5 % of the vertices are cut off at each side, along the box's axes.
     """
     p_obj = np.asarray(mesh.vertices)
-    for _ in range(rounds):
+    for _ in range(2):
         T_box_obj, _ = trimesh.bounds.oriented_bounds(p_obj)
         p_box = se3.transform(se3.orthonormalised(T_box_obj), p_obj)
-        low, high = np.quantile(p_box, [beyond, 1 - beyond], axis=0)
+        low, high = np.quantile(p_box, [0.005, 0.995], axis=0)
         p_obj = p_obj[((p_box >= low) & (p_box <= high)).all(1)]
     return np.sort(1e3 * trimesh.bounds.oriented_bounds(p_obj)[1])[::-1]
 

@@ -26,15 +26,10 @@ _RIGHT = f"{100 * MAX_M:.0f} cm and {MAX_DEG:.0f}°"
 
 
 @style.styled
-def return_strip(
-    scenes: Mapping[str, Scene], name: str, event: RecoveryEvent, after: Sequence[int] = (0, 1, 10)
-) -> Figure:
-    """A row of images per method: the object before, while and after it is hidden; cut to where it truly is.
-
-    Its status is below each image.
-    """
+def return_strip(scenes: Mapping[str, Scene], name: str, event: RecoveryEvent) -> Figure:
+    """A row of images per method: the object before, while and after it is hidden, with its status below each."""
     shown = {"last in sight": event.hidden_frame - 2, "hidden": (event.hidden_frame + event.return_frame) // 2}
-    shown |= {f"return + {k}" if k else "return": event.return_frame + k for k in after}
+    shown |= {f"return + {k}" if k else "return": event.return_frame + k for k in (0, 1, 10)}
     first = next(iter(scenes.values()))
     regions = around(first, name, list(shown.values()))
     (left, top, right, bottom), *_ = regions

@@ -163,13 +163,13 @@ def _still_tracked(
     return near[sight.visible].mean() if sight.visible.any() else np.nan
 
 
-def open_views(video: Video, count: int, frames_on: int, min_px: int = 2000) -> list[Situation]:
+def open_views(video: Video, count: int, frames_on: int) -> list[Situation]:
     """``count`` situations per object, spread over the frames in which it is well in sight for ``frames_on`` more."""
     looked = range(0, len(video) - frames_on, 5)
     sizes = {i: {name: int(mask.sum()) for name, mask in (video.masks(i) or {}).items()} for i in looked}
     found = []
     for name in video.truth:
-        clear = [i for i in looked if sizes[i].get(name, 0) >= min_px and sizes.get(i + frames_on, sizes[i])[name] > 0]
+        clear = [i for i in looked if sizes[i].get(name, 0) >= 2000 and sizes.get(i + frames_on, sizes[i])[name] > 0]
         rows = np.linspace(0, len(clear) - 1, min(count, len(clear))).astype(int)
         found += [Situation.of(video, name, clear[row]) for row in rows]
     return found
@@ -293,10 +293,7 @@ def term_maps(situation: Situation, candidates: Candidates, after: Sequence[int]
 
 @style.styled
 def greedy_plot(situation: Situation, candidates: Candidates) -> tuple[Figure, Terms]:
-    """What every choice was worth when taken, and the terms, if choosing went on until nothing is worth its cost.
-
-    The dotted line is K, after which the pipeline stops.
-    """
+    """What every choice was worth when taken, and the terms; the dotted line is K, after which the pipeline stops."""
     config = situation.config.sampling
     chosen = choose(candidates, _NOTHING, len(candidates.score), config)
     parts = greedy_terms(candidates, chosen, config)
@@ -387,12 +384,12 @@ def life_lines(history: MapHistory, video: Video) -> Figure:
     return figure
 
 
-def promotion_moments(history: MapHistory, count: int = 4) -> list[int]:
+def promotion_moments(history: MapHistory) -> list[int]:
     """Frames from the keyframe that brought most points which were promoted, until nine in ten of them were."""
     births, counts = np.unique(history.born[history.late], return_counts=True)
     start = int(births[counts.argmax()])
     end = int(np.quantile(history.promoted[history.late & (history.born == start)], 0.9))
-    return np.unique(np.linspace(start, max(end, start + count - 1), count).astype(int)).tolist()
+    return np.unique(np.linspace(start, max(end, start + 3), 4).astype(int)).tolist()
 
 
 def promotion_sheet(video: Video, history: MapHistory, frames: Sequence[int]) -> np.ndarray:

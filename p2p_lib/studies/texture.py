@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import cycle
-from pathlib import Path
 
 import cv2
 import matplotlib
@@ -33,7 +32,7 @@ from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import Evaluation
-from p2p_lib.evaluation.true_tracks import NO_POINTS, SurfacePoints, TrueScene
+from p2p_lib.evaluation.true_tracks import NO_POINTS, TrueScene
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.plots import logarithmic, panels
 from p2p_lib.figures.scenes import Scene
@@ -103,7 +102,13 @@ class RecordedTracker:
         A row where the tracker calls the keypoint visible and its surface point is truly in sight; the error is the
         distance from where the true pose puts that point.
         """
-        ids, points = self._began(scene)
+        ids, points = [np.zeros(0, np.int64)], NO_POINTS
+        for index, new_ids, uv_px in self._queries:
+            frame = scene.sequence.frame(index)
+            ids.append(new_ids)
+            points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
+        ids = np.concatenate(ids)
+        ids, points = np.sort(ids), points.select(np.argsort(ids))
         found = []
         for index, tracks in self._answers:
             tracks = tracks.select(tracks.ids[tracks.visible])
@@ -115,16 +120,6 @@ class RecordedTracker:
             found.append(rows[sight.visible])
         rows = concat(found, ignore_index=True)
         return {name: rows[rows.owner == k].drop(columns="owner") for k, name in enumerate(scene.objects)}
-
-    def _began(self, scene: TrueScene) -> tuple[np.ndarray, SurfacePoints]:
-        """The ids of all queries, increasing, and the surface points behind their pixels; NaN where none is met."""
-        ids, points = [np.zeros(0, np.int64)], NO_POINTS
-        for index, new_ids, uv_px in self._queries:
-            frame = scene.sequence.frame(index)
-            ids.append(new_ids)
-            points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
-        ids = np.concatenate(ids)
-        return np.sort(ids), points.select(np.argsort(ids))
 
 
 @dataclass(frozen=True)
@@ -199,9 +194,9 @@ def sobel_magnitude(rgb: np.ndarray) -> np.ndarray:
     return cv2.magnitude(across, down)
 
 
-def visible_texture(rgb: np.ndarray, mask: np.ndarray, margin_px: int = MARGIN_PX) -> float:
+def visible_texture(rgb: np.ndarray, mask: np.ndarray) -> float:
     """Mean Sobel gradient magnitude over a mask (H, W) without its rim; NaN where nothing of it is left."""
-    side = 2 * margin_px + 1
+    side = 2 * MARGIN_PX + 1
     inner = cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0) > 0
     return float(sobel_magnitude(rgb)[inner].mean()) if inner.any() else float("nan")
 
@@ -223,17 +218,9 @@ def present(names: Iterable[str], left_out: str = "") -> dict[str, Video | str]:
     return found
 
 
-def study(
-    sequence: Video,
-    evaluation: Evaluation,
-    recorded: RecordedTracker,
-    models: Mapping[str, str | Path] | None = None,
-) -> dict[str, ObjectTexture]:
-    """Texture, tracks and pose of each object that a run of the method with a recorded tracker was scored on.
-
-    models  object to mesh, besides those that lie with the sequence; the others' surface is the measured depth
-    """
-    tracks, studies = recorded.keypoints(TrueScene.of(sequence, models)), {}
+def study(sequence: Video, evaluation: Evaluation, recorded: RecordedTracker) -> dict[str, ObjectTexture]:
+    """Texture, tracks and pose of each object that a run of the method with a recorded tracker was scored on."""
+    tracks, studies = recorded.keypoints(TrueScene.of(sequence)), {}
     for name, score in evaluation.objects.items():
         texture = []
         for i in score.frame_index.tolist():
@@ -263,10 +250,9 @@ def rank_correlation(
 ) -> RankCorrelation:
     """Spearman's rank correlation of x (n,) and y (n,) with a bootstrap confidence interval (percentiles).
 
-    groups  (n,) which pairs belong together: windows of one sequence are not independent, so whole sequences are
-            drawn; by default every pair stands for itself. Pairs that are not finite are left out.
+    groups  (n,) which pairs belong together, as windows of one sequence do; by default each stands for itself
 
-    Raises :class:`BadInput` for fewer than three groups.
+    Pairs that are not finite are left out. Raises :class:`BadInput` for fewer than three groups.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     group = np.arange(len(x)) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]

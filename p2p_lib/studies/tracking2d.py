@@ -70,12 +70,12 @@ def score_outcomes(score: TrackerScore) -> np.ndarray:
     return outcomes(truth.uv_px, truth.visible, run.uv_px, run.visible, scored)
 
 
-def score_reliability(score: TrackerScore, bins: int = 10) -> Reliability:
+def score_reliability(score: TrackerScore) -> Reliability:
     """Reliability of the uncertainty over all predictions that are called visible of points that are."""
     truth, run = score.truth, score.run
     both = run.visible & truth.visible & truth.known & np.isfinite(run.uv_px[..., 0])
     error_px = np.linalg.norm(run.uv_px[both] - truth.uv_px[both], axis=-1)
-    return reliability(error_px, run.uncertainty[both], bins)
+    return reliability(error_px, run.uncertainty[both], 10)
 
 
 class TrackScene:
