@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from pandas import DataFrame
+from PIL import Image
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import paths
@@ -55,14 +56,19 @@ def save_figure(
     parameters  what decided how it was made: profile, seed, ...
     """
     target = _target(paths.figure_dir(), name)
+    png = target.with_name(f"{name}.png")
     if isinstance(figure, np.ndarray):
-        width_px = _write_image(figure, target)
-        suffixes, drawn_with = [".png"], []
+        if figure.ndim != 3 or figure.shape[2] != 3 or figure.dtype != np.uint8:
+            raise BadInput(f"figure {name}", f"{figure.shape} {figure.dtype}", "(H, W, 3) uint8, red first")
+        Image.fromarray(figure).save(png, optimize=True)
+        width_px, suffixes, drawn_with = figure.shape[1], [".png"], []
     else:
-        width_px = _write_plot(figure, target)
+        with style.applied():
+            figure.savefig(png, metadata={"Software": None})
+            figure.savefig(png.with_suffix(".pdf"), metadata={"CreationDate": None})
+            width_px = round(figure.get_figwidth() * figure.dpi)
         suffixes, drawn_with = [".png", ".pdf"], ["matplotlib"]
     _write_note(target, suffixes, sources, parameters, drawn_with)
-    png = target.with_name(f"{name}.png")
     shown = {"image/png": base64.b64encode(png.read_bytes()).decode(), "text/plain": f"<{name}.png>"}
     return Saved(png, (shown, {"image/png": {"width": min(width_px, _SHOWN_PX)}}))
 
@@ -182,23 +188,6 @@ def _target(folder: Path, name: str) -> Path:
     return folder / name
 
 
-def _write_plot(figure: Any, target: Path) -> int:
-    """PNG and PDF of a Matplotlib figure; the width in pixels at which it reads well on a screen."""
-    with style.applied():
-        figure.savefig(target.with_name(f"{target.name}.png"), metadata={"Software": None})
-        figure.savefig(target.with_name(f"{target.name}.pdf"), metadata={"CreationDate": None})
-        return round(figure.get_figwidth() * figure.dpi)
-
-
-def _write_image(image: np.ndarray, target: Path) -> int:
-    from PIL import Image
-
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise BadInput(f"figure {target.name}", f"{image.shape} {image.dtype}", "(H, W, 3) uint8, red first")
-    Image.fromarray(image).save(target.with_name(f"{target.name}.png"), optimize=True)
-    return image.shape[1]
-
-
 def _write_note(
     target: Path,
     suffixes: list[str],
@@ -212,19 +201,17 @@ def _write_note(
     made["versions"] |= {name: version(name) for name in drawn_with}
     files = {f"{target.name}{suffix}": _sha256(target.with_name(f"{target.name}{suffix}")) for suffix in suffixes}
     note = {
-        "parameters": {key: _plain(value) for key, value in (parameters or {}).items()},
+        "parameters": dict(parameters or {}),
         "sources": [describe(source) for source in sources],
         **made,
         "sha256": files,
     }
     path = target.with_name(f"{target.name}.json")
-    path.write_text(json.dumps(note, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(note, indent=1, ensure_ascii=False, default=_plain) + "\n", encoding="utf-8")
 
 
 def _plain(value: Any) -> Any:
-    """As JSON holds it; a path is named by its last part alone."""
-    if is_dataclass(value) and not isinstance(value, type):
+    """As JSON holds a dataclass, a path (by its last part alone) or an array."""
+    if is_dataclass(value):
         return asdict(value)
-    if isinstance(value, Path):
-        return value.name
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    return value.name if isinstance(value, Path) else value.tolist()

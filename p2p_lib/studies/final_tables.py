@@ -426,10 +426,7 @@ def scene_of(benchmark: Benchmark, method: str) -> tuple[Scene, Run, Sequence]:
 
 @style.styled
 def error_histograms(benchmark: Benchmark) -> Figure:
-    """ADD and ADD-S of all scored frames of each method, one line a method; what has no pose stands apart.
-
-    Aligned at the first scored frame. Fractions of the scored frames, over all sequences, objects and seeds.
-    """
+    """ADD and ADD-S of each method over all scored frames, aligned at the first; what has no pose stands apart."""
     figure, axes = panels(2, (_WIDTH_IN, 3.2), side_by_side=True)
     for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S")), strict=True):
         errors = defaultdict(list)
@@ -485,10 +482,7 @@ def tracks_by_error(benchmark: Benchmark, method: str, count: int = 3) -> Figure
 
 
 def recovery_strip(benchmark: Benchmark, count: int = 4, width_px: int = 300) -> np.ndarray:
-    """Occlusion and recovery: a line for each method, the same moments below each other.
-
-    White and dashed is the truth, in colour the estimate; a method that has lost the object draws none.
-    """
+    """Occlusion and recovery: a line for each method, the same moments below each other."""
     scenes = {name: scene_of(benchmark, name)[0] for name in benchmark.methods}
     first = next(iter(scenes.values()))
     moments, region_px, images = first.moments(count), first.region(), []
@@ -522,7 +516,10 @@ def _beside_truth(
     surface.apply_transform(se3.inverse(evaluation.objects[name].T_obj_model))
     truth = load_mesh(model)
     middle = (truth.vertices.max(0) + truth.vertices.min(0)) / 2
-    camera, front = _portrait(run, name, middle, float(np.ptp(truth.vertices, axis=0).max()))
+    # The first scored frame's view, with the object's middle in the middle and all of it in sight.
+    front = run.objects[name].T_cam_model[np.flatnonzero(run.objects[name].has_truth)[0]].copy()
+    front[:3, 3] = np.array([0, 0, 4 * np.ptp(truth.vertices, axis=0).max()]) - front[:3, :3] @ middle
+    camera = Camera(930, 930, 149.5, 149.5, 300, 300)
     turn = se3.exp(np.array([0, 0, np.pi, 0, 0, 0]))
     behind = front @ se3.from_rt(np.eye(3), middle) @ turn @ se3.from_rt(np.eye(3), -middle)
     kind = "synthetic" if video.name.startswith("synthetic") else "real"
@@ -534,14 +531,6 @@ def _beside_truth(
         (surface, behind, "reconstructed"),
     ]
     return [overlay.draw_caption(mesh_view.draw_mesh(mesh, camera, T), title, scale=0.4) for mesh, T, title in shown]
-
-
-def _portrait(run: Run, name: str, middle: np.ndarray, size_m: float) -> tuple[Camera, np.ndarray]:
-    """A camera that sees the whole object as the first scored frame did, with its middle in the middle."""
-    obj = run.objects[name]
-    T = obj.T_cam_model[np.flatnonzero(obj.has_truth)[0]].copy()
-    T[:3, 3] = np.array([0, 0, 4 * size_m]) - T[:3, :3] @ middle
-    return Camera(930, 930, 149.5, 149.5, 300, 300), T
 
 
 def _track_errors(

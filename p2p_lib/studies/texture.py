@@ -1,12 +1,8 @@
 """Notebook 08: how much texture an object shows, how well its points are tracked, and how right its pose is.
 
-The paper's analysis of texture: the mean magnitude of the Sobel gradient in the object's mask stands for visible
-texture; the error of the 2D tracks is the distance of the tracker's answers from the object's keypoints projected
-with true poses, of those that it calls visible and that are; the pose is judged by the area under the ADD curve.
-All three per sequence, or per window of frames.
-
-Studies (:class:`ObjectTexture`) and their measures are drawn by label, which is the contrast of a print or the name
-of a real object; contrasts in the order given, dark to bright.
+The paper's analysis of texture: the mean magnitude of the Sobel gradient in the mask; the distance of 2D tracks from
+the keypoints projected with true poses, where both call them visible; the area under the ADD curve. All three per
+sequence or window of frames, by label: the contrast of a print, or the name of a real object.
 """
 
 from __future__ import annotations
@@ -59,11 +55,7 @@ _HEADS = {
 
 
 class RecordedTracker:
-    """A 2D tracker that passes everything on to another one and keeps what it was asked and what it answered.
-
-    In the place of a tracker it changes nothing; afterwards it knows the track of every keypoint that the method
-    ever followed, beside the true surface point behind the pixel at which it began.
-    """
+    """A 2D tracker that passes everything on to another one and keeps what it was asked and what it answered."""
 
     def __init__(self, tracker: PointTracker):
         self._tracker = tracker
@@ -282,10 +274,7 @@ def correlate(windows: Sequence[Measure], seed: int = 0) -> tuple[RankCorrelatio
 
 
 def correlation_table(windows: Mapping[str, Sequence[Measure]], seed: int = 0) -> DataFrame:
-    """A row per label: Spearman's rho of texture with track error and with ADD AUC, and its 95 % interval.
-
-    A dash where the windows are of fewer than three objects or sequences.
-    """
+    """A row per label: texture's rho with track error and with ADD AUC; a dash for fewer than three objects."""
     rows = []
     for label, many in windows.items():
         objects = len({(w.sequence, w.object) for w in many})
@@ -307,10 +296,9 @@ def measure_table(measures: Mapping[str, Measure | str], head: str = LEGEND) -> 
 def draw_tracks(
     scene: Scene, study: ObjectTexture, index: int, region_px: tuple[int, int, int, int], width_px: int = 260
 ) -> np.ndarray:
-    """Frame ``index``, cut to a region: true box white and dashed, estimate in colour, a dot per keypoint in sight.
+    """Frame ``index``, cut to a region: true and estimated box, and a dot per keypoint in sight.
 
-    Dots are where the tracker has the keypoints, coloured by how far that is from the truth: dark blue is right,
-    yellow is off by :data:`FAR_PX` or more.
+    A dot's colour is how far the tracker is from the truth: dark blue is right, yellow :data:`FAR_PX` or more.
     """
     image = scene.draw(scene.row(index), region_px, width_px, axes=False, trail=0)
     camera = scene.sequence.camera
@@ -361,10 +349,7 @@ def windows_against_texture(
 
 @style.styled
 def same_frames(windows: Mapping[str, Sequence[Measure]]) -> Figure:
-    """One line per window of frames, through all contrasts: what differs along it is the contrast and nothing else.
-
-    Where a label has windows of several sequences, those of the first are drawn.
-    """
+    """One line per window of frames, through all contrasts; of several sequences the first is drawn."""
     figure, axes = panels(2, (_WIDTH_IN, 3.3), side_by_side=True)
     spans = sorted({(w.start, w.stop) for many in windows.values() for w in many})
     for span, colour in zip(spans, matplotlib.colormaps["viridis"](np.linspace(0, 0.9, len(spans)))):

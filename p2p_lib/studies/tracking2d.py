@@ -91,8 +91,7 @@ class TrackScene:
     def draw(self, index: int, width_px: int = 480, trail: int = 12) -> np.ndarray:
         """Frame ``index`` around the points: dots in the object's colour are right, vermillion rings are wrong.
 
-        Points that truth sees and the tracker does not are small dark dots at their true place. Lines are the
-        paths of the last ``trail`` frames, as far as the tracker was right in them.
+        Small dark dots are missed points at their true place, lines the right part of the last ``trail`` frames.
         """
         frame, camera, run = self.sequence.frame(index), self.sequence.camera, self.score.run
         image, seen_by = overlay.zoomed(frame.rgb, camera, self.region_px, width_px)
