@@ -38,7 +38,7 @@ from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
 from p2p_lib.figures import mesh_view, overlay, style
 from p2p_lib.figures.overlay import Label
-from p2p_lib.figures.plots import logarithmic, panels
+from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.figures.tables import Cell, Table, emboldened, number
 from p2p_lib.synthetic.shapes import load_mesh
@@ -78,7 +78,7 @@ class Numbers:
         self.seeds = benchmark.plan.scope(benchmark.profile).seeds
         #: A few dozen frames are too few to call a method the best or the fastest.
         self.judges = benchmark.profile != "quick"
-        self._at = {
+        self.by_cell = {
             (row["method"], row["metric"], row["form"], row["sequence"], row["object"]): row
             for row in benchmark.summary
             if row["failures"] in ("zero", "-") and row["align"] in ("first", "-") and row.get("value") is not None
@@ -86,12 +86,7 @@ class Numbers:
 
     def row(self, method: str, metric: str, sequence: str, object: str = "", form: str = "exact") -> Row | None:
         """The number over seeds; None where there is none."""
-        return self._at.get((method, metric, form, sequence, object))
-
-    def of_objects(self, method: str, metric: str) -> list[float]:
-        """A method's number for every object of every sequence."""
-        of = (method, metric, "exact")
-        return [row["value"] for (*about, _, object), row in self._at.items() if tuple(about) == of and object]
+        return self.by_cell.get((method, metric, form, sequence, object))
 
     def cell(self, method: str, metric: str, sequence: str, object: str = "", form: str = "exact") -> Cell:
         """The number over seeds as a cell; where there is none it says why."""
@@ -372,7 +367,8 @@ def _areas(numbers: Numbers, method: Method) -> list[Cell]:
     """Both areas with their standard deviations over sequences."""
     cells = []
     for name in ("ADD-S AUC", "ADD AUC"):
-        values = numbers.of_objects(method.name, name)
+        about = [method.name, name, "exact"]
+        values = [row["value"] for (*of, _, object), row in numbers.by_cell.items() if of == about and object]
         spread = number(float(np.std(values, ddof=1))) if len(values) > 1 else Cell(note="of fewer than two sequences")
         cells += [numbers.mean(method, name), spread]
     return cells
@@ -411,7 +407,6 @@ def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
 
 # --- figures ---------------------------------------------------------------------------------------
 
-_WIDTH_IN = 8.0
 #: Errors from a tenth of a millimetre to the ten centimetres at which a frame scores nothing.
 EDGES_MM = np.geomspace(0.1, 100, 31)
 #: Tracks so far off, or farther, have the brightest colour.
@@ -427,7 +422,7 @@ def scene_of(benchmark: Benchmark, method: str) -> tuple[Scene, Run, Sequence]:
 @style.styled
 def error_histograms(benchmark: Benchmark) -> Figure:
     """ADD and ADD-S of each method over all scored frames, aligned at the first; what has no pose stands apart."""
-    figure, axes = panels(2, (_WIDTH_IN, 3.2), side_by_side=True)
+    figure, axes = panels(2, (WIDTH_IN, 3.2), side_by_side=True)
     for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S")), strict=True):
         errors = defaultdict(list)
         for job, outcome in benchmark.results:
@@ -470,8 +465,8 @@ def tracks_by_error(benchmark: Benchmark, method: str, count: int = 3) -> Figure
             colours = overlay.value_colours(error_px, 0, FAR_PX)
             image = overlay.draw_points(image, overlay.zoomed_px(uv_px, video.camera, camera), colours, 2.5)
         images.append(image)
-    high_in = _WIDTH_IN / count * images[0].shape[0] / images[0].shape[1]
-    figure, axes = panels(count, (_WIDTH_IN, high_in + 0.6), side_by_side=True)
+    high_in = WIDTH_IN / count * images[0].shape[0] / images[0].shape[1]
+    figure, axes = panels(count, (WIDTH_IN, high_in + 0.6), side_by_side=True)
     for axis, image in zip(axes, images, strict=True):
         axis.imshow(image)
         axis.set_axis_off()

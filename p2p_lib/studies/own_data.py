@@ -27,7 +27,7 @@ from p2p_lib.figures import overlay, style
 from p2p_lib.figures.mesh_view import draw_mesh
 from p2p_lib.figures.overlay import Box
 from p2p_lib.figures.playback import Playback
-from p2p_lib.figures.plots import panels
+from p2p_lib.figures.plots import WIDTH_IN, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic.render import render
 from p2p_lib.synthetic.shapes import Mesh, load_mesh
@@ -203,7 +203,7 @@ def fit_plot(playback: Playback, fits: Mapping[str, Mapping[str, Series]]) -> Fi
 
     fits  label to the objects' fits (:func:`surface_fit`); the first is drawn full, the others dashed
     """
-    figure, axes = panels(2, (8.0, 4.2), [2, 1])
+    figure, axes = panels(2, (WIDTH_IN, 4.2), [2, 1])
     for k, (label, objects) in enumerate(fits.items()):
         line = {"linestyle": (0, (3 + k, 2)) if k else "-", "marker": "."}
         for name, fit in objects.items():

@@ -18,10 +18,9 @@ from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import MAX_ADDS_M, RecoveryEvent, recovered_within, recovery_events
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box
-from p2p_lib.figures.plots import draw_strip, logarithmic, panels
+from p2p_lib.figures.plots import WIDTH_IN, draw_strip, logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 
-_WIDTH_IN = 8.0
 _RIGHT = f"{100 * MAX_M:.0f} cm and {MAX_DEG:.0f}°"
 
 
@@ -33,8 +32,8 @@ def return_strip(scenes: Mapping[str, Scene], name: str, event: RecoveryEvent) -
     first = next(iter(scenes.values()))
     regions = around(first, name, list(shown.values()))
     (left, top, right, bottom), *_ = regions
-    high = _WIDTH_IN / len(shown) * (bottom - top) / (right - left)
-    figure = Figure((_WIDTH_IN, (0.96 * high + 0.1) * len(scenes) + 0.7), layout="constrained")
+    high = WIDTH_IN / len(shown) * (bottom - top) / (right - left)
+    figure = Figure((WIDTH_IN, (0.96 * high + 0.1) * len(scenes) + 0.7), layout="constrained")
     axes = figure.subplots(len(scenes), len(shown), squeeze=False)
     for row, (label, scene) in zip(axes, scenes.items()):
         for axis, index, region_px in zip(row, shown.values(), regions):
@@ -65,7 +64,7 @@ def around_return(
     scenes: Mapping[str, Scene], evaluations: Mapping[str, Evaluation], name: str, event: RecoveryEvent, span: int = 40
 ) -> Figure:
     """Frames about a return: pixels in sight; keypoints that agree on the pose; ADD-S; confidence."""
-    figure, axes = panels(4, (_WIDTH_IN, 6.2), [1, 1.6, 1.6, 1.2])
+    figure, axes = panels(4, (WIDTH_IN, 6.2), [1, 1.6, 1.6, 1.2])
     sight, agreeing, adds, confidence = axes
     first = next(iter(scenes.values()))
     at = np.isin(first.run.objects[name].frame_index, range(event.hidden_frame - 10, event.return_frame + span))
@@ -100,7 +99,7 @@ def around_return(
 def status_strips(scenes: Mapping[str, Scene]) -> Figure:
     """The status of each method's estimates at every moment, one block of lines per method."""
     lines = sum(len(scene.run.objects) for scene in scenes.values())
-    figure, axes = panels(len(scenes), (_WIDTH_IN, 1.1 + 0.5 * len(scenes) + 0.25 * lines))
+    figure, axes = panels(len(scenes), (WIDTH_IN, 1.1 + 0.5 * len(scenes) + 0.25 * lines))
     occurring = {str(s) for scene in scenes.values() for obj in scene.run.objects.values() for s in obj.status}
     for axis, (label, scene) in zip(axes, scenes.items()):
         draw_strip(axis, scene.run, occurring if axis is axes[-1] else ())
@@ -113,7 +112,7 @@ def status_strips(scenes: Mapping[str, Scene]) -> Figure:
 def confidence_over_time(run: Run, evaluation: Evaluation) -> Figure:
     """Each object's confidence; dots where the pose is right (2 cm, 5 degrees), crosses where it is wrong."""
     names = list(evaluation.objects)
-    figure, axes = panels(len(names), (_WIDTH_IN, 0.9 + 1.25 * len(names)))
+    figure, axes = panels(len(names), (WIDTH_IN, 0.9 + 1.25 * len(names)))
     for axis, name in zip(axes, names):
         obj, colour = run.objects[name], style.object_colours(run.objects)[name]
         right = right_poses(obj, evaluation.objects[name])
@@ -130,7 +129,7 @@ def confidence_over_time(run: Run, evaluation: Evaluation) -> Figure:
 @style.styled
 def reliability_plot(judged: Mapping[str, Judged]) -> Figure:
     """The fraction of right poses by stated confidence, and how many there are; the diagonal would be calibrated."""
-    figure, axes = panels(2, (_WIDTH_IN, 3.2), [1.2, 1], side_by_side=True)
+    figure, axes = panels(2, (WIDTH_IN, 3.2), [1.2, 1], side_by_side=True)
     axes[0].plot([0, 1], [0, 100], ":", color="#333333", lw=0.8)
     width = 0.8 / 10 / len(judged)
     for k, ((label, one), colour) in enumerate(zip(judged.items(), style.METHODS)):

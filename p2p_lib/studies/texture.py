@@ -30,7 +30,7 @@ from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.true_tracks import NO_POINTS, TrueScene
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.plots import logarithmic, panels
+from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic import scenario_dir
 
@@ -40,7 +40,6 @@ MARGIN_PX = 3
 FAR_PX = 8.0
 #: What the labels of the synthetic studies are.
 LEGEND = "contrast of the print, synthetic"
-_WIDTH_IN = 8.0
 _TEXTURE = "mean Sobel gradient in the mask [grey levels / px]"
 _TRACK, _ADD = "median 2D track error [px]", "ADD AUC [%]"
 #: Columns of the table of measures.
@@ -311,8 +310,8 @@ def draw_tracks(
 @style.styled
 def texture_story(images: Mapping[str, np.ndarray], measures: Mapping[str, Sequence[Measure]], title: str) -> Figure:
     """The page's one figure: images side by side, and below them track error and ADD against visible texture."""
-    high = _WIDTH_IN / len(images) * max(image.shape[0] / image.shape[1] for image in images.values())
-    figure = Figure((_WIDTH_IN, high + 3.3), layout="constrained")
+    high = WIDTH_IN / len(images) * max(image.shape[0] / image.shape[1] for image in images.values())
+    figure = Figure((WIDTH_IN, high + 3.3), layout="constrained")
     top, bottom = figure.subfigures(2, 1, height_ratios=[high + 0.45, 2.85])
     for axis, (label, image) in zip(np.atleast_1d(top.subplots(1, len(images))), images.items()):
         axis.imshow(image)
@@ -335,7 +334,7 @@ def windows_against_texture(
 
     synthetic  windows that are drawn in grey behind those of real objects
     """
-    figure, axes = panels(2, (_WIDTH_IN, 3.4), side_by_side=True)
+    figure, axes = panels(2, (WIDTH_IN, 3.4), side_by_side=True)
     if synthetic:
         _against_texture(axes, {"synthetic": synthetic} | dict(windows), 16, [style.NEUTRAL[1], *style.OBJECTS])
     else:
@@ -350,7 +349,7 @@ def windows_against_texture(
 @style.styled
 def same_frames(windows: Mapping[str, Sequence[Measure]]) -> Figure:
     """One line per window of frames, through all contrasts; of several sequences the first is drawn."""
-    figure, axes = panels(2, (_WIDTH_IN, 3.3), side_by_side=True)
+    figure, axes = panels(2, (WIDTH_IN, 3.3), side_by_side=True)
     spans = sorted({(w.start, w.stop) for many in windows.values() for w in many})
     for span, colour in zip(spans, matplotlib.colormaps["viridis"](np.linspace(0, 0.9, len(spans)))):
         line = [next((w for w in many if (w.start, w.stop) == span), None) for many in windows.values()]
@@ -369,7 +368,7 @@ def same_frames(windows: Mapping[str, Sequence[Measure]]) -> Figure:
 @style.styled
 def track_errors(studies: Mapping[str, ObjectTexture]) -> Figure:
     """The fraction of a study's tracks that lie within so many pixels of the truth."""
-    figure, (axis,) = panels(1, (_WIDTH_IN, 3.0))
+    figure, (axis,) = panels(1, (WIDTH_IN, 3.0))
     for (label, study), colour in zip(studies.items(), _colours(len(studies))):
         error_px = study.tracks.error_px
         axis.ecdf(error_px, color=colour, label=f"{label} ({len(error_px)} answers)")
