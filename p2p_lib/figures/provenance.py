@@ -148,7 +148,11 @@ def save_table(
 def describe(source: Any) -> dict[str, Any]:
     """What a note says of a source: its kind, what ran, and checksums where they are cheap."""
     if isinstance(source, Run):
-        return {"run": _run_id(source), **_what_ran(source.info), "poses_sha256": _sha256(source.path / "poses.npz")}
+        ran, config = _what_ran(source.info), source.path / "config.toml"
+        # All that decides a run's poses: its parameters and what ran on what.
+        text = json.dumps(ran, sort_keys=True) + (config.read_text() if config.is_file() else "")
+        name = hashlib.sha256(text.encode()).hexdigest()[:12]
+        return {"run": name, **ran, "poses_sha256": _sha256(source.path / "poses.npz")}
     if isinstance(source, Evaluation):
         return {"evaluation": _what_ran(source.info), "align": source.align}
     if isinstance(source, Benchmark):
@@ -167,13 +171,6 @@ def describe(source: Any) -> dict[str, Any]:
 
 def _what_ran(info: Mapping[str, Any]) -> dict[str, Any]:
     return {key: info.get(key) for key in _WHAT_RAN}
-
-
-def _run_id(run: Run) -> str:
-    """Twelve digits that stand for everything that decides a run's poses: its parameters and what ran on what."""
-    config = run.path / "config.toml"
-    text = json.dumps(_what_ran(run.info), sort_keys=True) + (config.read_text() if config.is_file() else "")
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _sha256(path: Path) -> str | None:

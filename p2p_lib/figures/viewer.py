@@ -158,7 +158,7 @@ class _Scene:
             x, y, z, w = quaternion_xyzw(T)
             nodes["frame"].wxyz, nodes["frame"].position = (w, x, y, z), T[:3, 3]
             nodes["label"].position = T[:3, 3] - [0, 1.5 * _AXES_M, 0]
-            if before is None or not nodes["label"].visible:
+            if not nodes["label"].visible:
                 nodes["label"].visible = True
         for k in np.flatnonzero(nodes["keyframe_rows"] == i):
             nodes["keyframes"][k].visible = True
