@@ -20,7 +20,7 @@ from p2p_lib.figures import style
 _SHIFT = 4  # OpenCV's fixed-point coordinates: sixteenths of a pixel
 _NEAR_M = 0.02  # lines are cut off here, in front of the camera
 _GAP_PX = 4  # between the images of a montage
-_FONT, _RIM = cv2.FONT_HERSHEY_SIMPLEX, "#101010"
+_FONT, _SCALE, _RIM = cv2.FONT_HERSHEY_SIMPLEX, 0.45, "#101010"
 
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 #: The 12 edges of a box as pairs of rows of :func:`box_corners`: those that differ in one coordinate.
@@ -41,6 +41,10 @@ class Box:
         se3.check("box", self.T_obj_box)
         if np.shape(self.size_m) != (3,) or not (np.asarray(self.size_m) >= 0).all():
             raise BadInput("box size_m", self.size_m, "three lengths in metres")
+
+    def corners(self, T_cam_obj: np.ndarray) -> np.ndarray:
+        """(..., 8, 3) its corners in the camera frame, at poses (..., 4, 4)."""
+        return se3.transform(T_cam_obj @ self.T_obj_box, box_corners(self.size_m))
 
     @classmethod
     def around(cls, points: np.ndarray, T_obj_points: np.ndarray = se3.IDENTITY) -> Box:
@@ -77,14 +81,12 @@ def draw_box(
     return _stroke(image, before, colour, width_px, rim=0 if dashed else 0.6)
 
 
-def draw_axes(
-    image: np.ndarray, camera: Camera, T_cam_obj: np.ndarray, length_m: float, width_px: int = 2
-) -> np.ndarray:
+def draw_axes(image: np.ndarray, camera: Camera, T_cam_obj: np.ndarray, length_m: float) -> np.ndarray:
     """A frame's x, y and z axes, the farthest first, in the colours of :data:`style.AXES`."""
     tips = se3.transform(T_cam_obj, np.eye(3) * length_m)
     for k in np.argsort(-tips[:, 2]):
         line = np.stack([T_cam_obj[:3, 3], tips[k]])[None]
-        image = _stroke(image, _segments(camera, line), style.AXES[k], width_px)
+        image = _stroke(image, _segments(camera, line), style.AXES[k], 2)
     return image
 
 
@@ -162,7 +164,7 @@ def depth_image(depth_m: np.ndarray) -> np.ndarray:
 
 def draw_trail(image: np.ndarray, uv_px: np.ndarray, colour: str, width_px: int = 2) -> np.ndarray:
     """A path (N, 2) through the image; NaN interrupts it."""
-    pairs = np.stack([uv_px[:-1], uv_px[1:]], 1) if len(uv_px) > 1 else np.zeros((0, 2, 2))
+    pairs = np.stack([uv_px[:-1], uv_px[1:]], 1)
     return _stroke(image, pairs[np.isfinite(pairs).all((1, 2))], colour, width_px, rim=0)
 
 
@@ -175,21 +177,21 @@ class Label:
     around_px: tuple[float, float, float, float]
 
 
-def draw_labels(image: np.ndarray, labels: Iterable[Label], scale: float = 0.45) -> np.ndarray:
+def draw_labels(image: np.ndarray, labels: Iterable[Label]) -> np.ndarray:
     """Labels beside their rectangles, so that none covers another: above, else below, right or left."""
     image, taken = image.copy(), []
     for label in labels:
-        (w, h), base = cv2.getTextSize(label.text, _FONT, scale, 1)
+        (w, h), base = cv2.getTextSize(label.text, _FONT, _SCALE, 1)
         w, h = w + 10, h + base + 4
         left, top = _free_place((w, h), label.around_px, taken, image.shape)
         taken.append((left, top, left + w, top + h))
         cv2.rectangle(image, (left, top), (left + w - 1, top + h - 1), style.rgb(label.colour), -1)
         at, colour = (left + 5, top + h - base - 1), style.rgb(style.ink(label.colour))
-        cv2.putText(image, label.text, at, _FONT, scale, colour, 1, cv2.LINE_AA)
+        cv2.putText(image, label.text, at, _FONT, _SCALE, colour, 1, cv2.LINE_AA)
     return image
 
 
-def draw_caption(image: np.ndarray, text: str, scale: float = 0.45) -> np.ndarray:
+def draw_caption(image: np.ndarray, text: str, scale: float = _SCALE) -> np.ndarray:
     """White words on a dark ground in the upper left corner."""
     image = image.copy()
     (w, h), base = cv2.getTextSize(text, _FONT, scale, 1)
@@ -286,11 +288,11 @@ def _rimmed(
     return image
 
 
-def _dashes(segments: np.ndarray, period_px: float = 10.0) -> np.ndarray:
-    """Segments (M, 2, 2) cut into dashes of half a period, beginning and ending with one."""
+def _dashes(segments: np.ndarray) -> np.ndarray:
+    """Segments (M, 2, 2) cut into dashes of 5 px and gaps as long, beginning and ending with a dash."""
     pieces = [np.zeros((0, 2, 2))]
     for a, b in segments:
-        n = 2 * min(round(float(np.linalg.norm(b - a)) / period_px), 500) + 1
+        n = 2 * min(round(float(np.linalg.norm(b - a)) / 10), 500) + 1
         s = np.linspace(0, 1, n + 1)[:, None]
         at = a + s * (b - a)
         pieces.append(np.stack([at[:-1:2], at[1::2]], 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import P2PError
-from p2p_lib.core.types import WITH_POSE, Frame, Status
+from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.masks import read_labels
 from p2p_lib.datasets.runs import Run, load_run
@@ -41,7 +42,11 @@ class Playback:
     def of(cls, run: Run | str | Path, sequence: Sequence | None = None) -> Playback:
         """Of a run's folder; the sequence is opened as the run says unless it is given."""
         run = run if isinstance(run, Run) else load_run(run)
-        return cls(run, sequence or _reopened(run), load_keypoints(run.path))
+        if sequence is None:
+            info = run.info
+            with contextlib.suppress(P2PError):
+                sequence = open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
+        return cls(run, sequence, load_keypoints(run.path))
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -78,20 +83,17 @@ class Playback:
         except P2PError:
             return None
 
-    def has_pose(self, name: str) -> np.ndarray:
-        """(n,) bool: rows with a pose of that very frame."""
-        return np.isin(self.run.objects[name].status, [str(s) for s in WITH_POSE])
-
     def path(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(k, 3) positions of the object at rows with a pose, and (k, 3) uint8 colours of its status then."""
-        obj, has = self.run.objects[name], self.has_pose(name)
+        obj = self.run.objects[name]
+        has = obj.has_pose
         fills = [style.rgb(style.STATUS[Status(status)][0]) for status in obj.status[has]]
         return obj.T_cam_obj[has, :3, 3], np.array(fills, np.uint8).reshape(-1, 3)
 
     def keyframes(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Rows (K,) that added a keyframe, and its T_obj_cam (K, 4, 4) as estimated then."""
         obj = self.run.objects[name]
-        rows = np.flatnonzero(obj.keyframe & self.has_pose(name))
+        rows = np.flatnonzero(obj.keyframe & obj.has_pose)
         return rows, se3.inverse(obj.T_cam_obj[rows])
 
     def frame(self, i: int) -> Frame | None:
@@ -129,11 +131,3 @@ class Playback:
             found = np.isfinite(score.add_m)
             errors[np.searchsorted(self.frame_index, score.frame_index[found])] = score.add_m[found]
         return errors
-
-
-def _reopened(run: Run) -> Sequence | None:
-    info = run.info
-    try:
-        return open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
-    except P2PError:
-        return None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.types import WITH_POSE, Status
+from p2p_lib.core.types import Status
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.confidence import pose_error
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-_WIDTH_IN = 8.0
+#: The width in inches of a figure that fills a page.
+WIDTH_IN = 8.0
 _ALIGNED = {"first": "aligned at the first scored frame", "all": "aligned by one constant over all frames"}
 _EDGE = {"edgecolor": "#333333", "linewidth": 0.3}
 
@@ -57,8 +58,7 @@ def status_intervals(status: np.ndarray) -> list[tuple[str, int, int]]:
 
 def gaps(obj: ObjectRun, at_least: int = 5) -> list[tuple[int, int]]:
     """Spans [start, stop) of at least so many frames without a pose, after the object was first seen."""
-    spans = status_intervals(np.isin(obj.status, [str(status) for status in WITH_POSE]))
-    return [(a, b) for with_pose, a, b in spans if with_pose == "False" and a > 0 and b - a >= at_least]
+    return [(a, b) for has, a, b in status_intervals(obj.has_pose) if has == "False" and a > 0 and b - a >= at_least]
 
 
 @style.styled
@@ -70,7 +70,7 @@ def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
     """
     names = [name for name in run.objects if name in evaluation.objects]
     colours = style.object_colours(run.objects)
-    figure, axes = panels(4, (_WIDTH_IN, 6.4), [3, 2, 2, 0.42 * len(run.objects)])
+    figure, axes = panels(4, (WIDTH_IN, 6.4), [3, 2, 2, 0.42 * len(run.objects)])
     for name in names:
         _draw_errors(axes, name, run.objects[name], evaluation.objects[name], colours[name])
     for axis, unit in zip(axes, ("ADD [mm]", "rotation [°]", "translation [mm]")):
@@ -86,7 +86,7 @@ def error_over_time(run: Run, evaluation: Evaluation) -> Figure:
 @style.styled
 def status_strip(run: Run) -> Figure:
     """One line per object: its status at every moment."""
-    figure, (axis,) = panels(1, (_WIDTH_IN, 1.0 + 0.32 * len(run.objects)))
+    figure, (axis,) = panels(1, (WIDTH_IN, 1.0 + 0.32 * len(run.objects)))
     draw_strip(axis, run)
     axis.set_title(f"Status over time, {run.info['sequence']}")
     return figure
@@ -95,7 +95,7 @@ def status_strip(run: Run) -> Figure:
 @style.styled
 def accuracy_threshold(evaluation: Evaluation, max_m: float = metrics.MAX_M) -> Figure:
     """The fraction of scored frames with an error below a threshold; its area is the AUC in the legend (exact form)."""
-    figure, axes = panels(2, (_WIDTH_IN, 2.9), side_by_side=True)
+    figure, axes = panels(2, (WIDTH_IN, 2.9), side_by_side=True)
     colours = style.object_colours(evaluation.info.get("objects") or evaluation.objects)
     for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S"))):
         for name, score in evaluation.objects.items():
@@ -127,7 +127,7 @@ def stage_timings(run: Run) -> Figure:
     # A stage that did not run took no time.
     ms = {name: np.nan_to_num(values) for name, values in run.timings.items() if name.endswith("_ms")}
     order = sorted(ms, key=lambda name: (name == "total_ms", -ms[name].mean()))
-    figure, (axis,) = panels(1, (_WIDTH_IN, 0.6 + 0.36 * len(order)))
+    figure, (axis,) = panels(1, (WIDTH_IN, 0.6 + 0.36 * len(order)))
     for k, (which, colour, label) in enumerate(zip((~key, key), style.NEUTRAL, ("other frames", "keyframes"))):
         if which.any():
             means = [ms[name][which].mean() for name in order]

@@ -13,11 +13,13 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pandas import DataFrame
+from PIL import Image
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import paths
@@ -26,11 +28,11 @@ from p2p_lib.core.tables import as_html, as_markdown
 from p2p_lib.datasets.provenance import provenance
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
-from p2p_lib.figures import film as video
 from p2p_lib.figures import style
 from p2p_lib.figures.tables import Table
 
 _WHAT_RAN = "sequence objects start stop frames tracker masks preset seed commit modified".split()
+_CRF = 23  # x264's constant quality: smaller is better and larger
 _SHOWN_PX = 900  # a notebook shows images at most this wide
 
 
@@ -54,14 +56,19 @@ def save_figure(
     parameters  what decided how it was made: profile, seed, ...
     """
     target = _target(paths.figure_dir(), name)
+    png = target.with_name(f"{name}.png")
     if isinstance(figure, np.ndarray):
-        width_px = _write_image(figure, target)
-        suffixes, drawn_with = [".png"], []
+        if figure.ndim != 3 or figure.shape[2] != 3 or figure.dtype != np.uint8:
+            raise BadInput(f"figure {name}", f"{figure.shape} {figure.dtype}", "(H, W, 3) uint8, red first")
+        Image.fromarray(figure).save(png, optimize=True)
+        width_px, suffixes, drawn_with = figure.shape[1], [".png"], []
     else:
-        width_px = _write_plot(figure, target)
+        with style.applied():
+            figure.savefig(png, metadata={"Software": None})
+            figure.savefig(png.with_suffix(".pdf"), metadata={"CreationDate": None})
+            width_px = round(figure.get_figwidth() * figure.dpi)
         suffixes, drawn_with = [".png", ".pdf"], ["matplotlib"]
     _write_note(target, suffixes, sources, parameters, drawn_with)
-    png = target.with_name(f"{name}.png")
     shown = {"image/png": base64.b64encode(png.read_bytes()).decode(), "text/plain": f"<{name}.png>"}
     return Saved(png, (shown, {"image/png": {"width": min(width_px, _SHOWN_PX)}}))
 
@@ -74,12 +81,51 @@ def save_video(
     sources: Iterable[Any] = (),
     parameters: Mapping[str, Any] | None = None,
 ) -> Saved:
-    """Write images as a film (see :func:`~p2p_lib.figures.film.write_video`) with its note; shown embedded."""
+    """Write images as a film (see :func:`write_video`) with its note; shown embedded."""
+    from IPython.display import Video
+
     target = _target(paths.figure_dir(), name)
-    path = video.write_video(images, target.with_name(f"{name}.mp4"), fps)
+    path = write_video(images, target.with_name(f"{name}.mp4"), fps)
     _write_note(target, [path.suffix], sources, {**(parameters or {}), "fps": fps}, ["av"])
-    shown = {"text/html": video.show_video(path)._repr_html_(), "text/plain": f"<{path.name}>"}
-    return Saved(path, (shown, {}))
+    # The whole film is inside the page, so that exported pages play it too.
+    page = Video(str(path), embed=True, html_attributes="controls autoplay loop muted playsinline")._repr_html_()
+    return Saved(path, ({"text/html": page, "text/plain": f"<{path.name}>"}, {}))
+
+
+def write_video(images: Iterable[np.ndarray], path: str | Path, fps: float = 30.0) -> Path:
+    """Write images (H, W, 3) uint8 of one size as H.264 in MP4; the path written.
+
+    The last row or column of an image of odd size is left out, as the pixel format requires.
+    """
+    import av
+
+    path, stream = Path(path), None
+    if path.suffix != ".mp4":
+        raise BadInput("video", path.name, "a name that ends in .mp4")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Without "bitexact" the file would name the builds that wrote it.
+    with av.open(str(path), "w", options={"movflags": "+faststart", "fflags": "+bitexact"}) as container:
+        for image in _checked(images):
+            if stream is None:
+                stream = container.add_stream("libx264", Fraction(fps).limit_denominator(1000))
+                stream.height, stream.width = image.shape[:2]
+                stream.pix_fmt = "yuv420p"
+                # How many threads encode changes the bytes, and x264's macroblock tree reads memory it never wrote.
+                stream.options = {"crf": str(_CRF), "preset": "medium", "threads": "2", "x264-params": "mbtree=0"}
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24")))
+        if stream is None:
+            raise BadInput("video", "no images", "at least one")
+        container.mux(stream.encode())
+    return path
+
+
+def _checked(images: Iterable[np.ndarray]) -> Iterable[np.ndarray]:
+    shape = None
+    for image in images:
+        shape = shape or image.shape
+        if image.shape != shape or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise BadInput("video", f"an image {image.shape} {image.dtype}", "(H, W, 3) uint8, all of one size")
+        yield image[: shape[0] // 2 * 2, : shape[1] // 2 * 2]
 
 
 def save_table(
@@ -102,7 +148,11 @@ def save_table(
 def describe(source: Any) -> dict[str, Any]:
     """What a note says of a source: its kind, what ran, and checksums where they are cheap."""
     if isinstance(source, Run):
-        return {"run": _run_id(source), **_what_ran(source.info), "poses_sha256": _sha256(source.path / "poses.npz")}
+        ran, config = _what_ran(source.info), source.path / "config.toml"
+        # All that decides a run's poses: its parameters and what ran on what.
+        text = json.dumps(ran, sort_keys=True) + (config.read_text() if config.is_file() else "")
+        name = hashlib.sha256(text.encode()).hexdigest()[:12]
+        return {"run": name, **ran, "poses_sha256": _sha256(source.path / "poses.npz")}
     if isinstance(source, Evaluation):
         return {"evaluation": _what_ran(source.info), "align": source.align}
     if isinstance(source, Benchmark):
@@ -123,13 +173,6 @@ def _what_ran(info: Mapping[str, Any]) -> dict[str, Any]:
     return {key: info.get(key) for key in _WHAT_RAN}
 
 
-def _run_id(run: Run) -> str:
-    """Twelve digits that stand for everything that decides a run's poses: its parameters and what ran on what."""
-    config = run.path / "config.toml"
-    text = json.dumps(_what_ran(run.info), sort_keys=True) + (config.read_text() if config.is_file() else "")
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
-
-
 def _sha256(path: Path) -> str | None:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
@@ -140,23 +183,6 @@ def _target(folder: Path, name: str) -> Path:
         raise BadInput("figure name", repr(name), "letters, digits, '_' and '-': it names files")
     folder.mkdir(parents=True, exist_ok=True)
     return folder / name
-
-
-def _write_plot(figure: Any, target: Path) -> int:
-    """PNG and PDF of a Matplotlib figure; the width in pixels at which it reads well on a screen."""
-    with style.applied():
-        figure.savefig(target.with_name(f"{target.name}.png"), metadata={"Software": None})
-        figure.savefig(target.with_name(f"{target.name}.pdf"), metadata={"CreationDate": None})
-        return round(figure.get_figwidth() * figure.dpi)
-
-
-def _write_image(image: np.ndarray, target: Path) -> int:
-    from PIL import Image
-
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise BadInput(f"figure {target.name}", f"{image.shape} {image.dtype}", "(H, W, 3) uint8, red first")
-    Image.fromarray(image).save(target.with_name(f"{target.name}.png"), optimize=True)
-    return image.shape[1]
 
 
 def _write_note(
@@ -172,19 +198,17 @@ def _write_note(
     made["versions"] |= {name: version(name) for name in drawn_with}
     files = {f"{target.name}{suffix}": _sha256(target.with_name(f"{target.name}{suffix}")) for suffix in suffixes}
     note = {
-        "parameters": {key: _plain(value) for key, value in (parameters or {}).items()},
+        "parameters": dict(parameters or {}),
         "sources": [describe(source) for source in sources],
         **made,
         "sha256": files,
     }
     path = target.with_name(f"{target.name}.json")
-    path.write_text(json.dumps(note, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(note, indent=1, ensure_ascii=False, default=_plain) + "\n", encoding="utf-8")
 
 
 def _plain(value: Any) -> Any:
-    """As JSON holds it; a path is named by its last part alone."""
-    if is_dataclass(value) and not isinstance(value, type):
+    """As JSON holds a dataclass, a path (by its last part alone) or an array."""
+    if is_dataclass(value):
         return asdict(value)
-    if isinstance(value, Path):
-        return value.name
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    return value.name if isinstance(value, Path) else value.tolist()

@@ -113,7 +113,8 @@ def _log_images(rr: Any, stream: Any, playback: Playback, i: int) -> None:
 
 def _log_object(rr: Any, stream: Any, playback: Playback, name: str, i: int) -> None:
     """One object at row i: where it is, what is known of it, how good that is."""
-    obj, has, colour = playback.run.objects[name], playback.has_pose(name), style.rgb(playback.colours[name])
+    obj, colour = playback.run.objects[name], style.rgb(playback.colours[name])
+    has = obj.has_pose
     if i == 0 or obj.status[i] != obj.status[i - 1]:
         stream.log(["status", name], rr.StateChange(state=str(obj.status[i])))
     stream.log(["confidence", name], rr.Scalars(float(obj.confidence[i])))

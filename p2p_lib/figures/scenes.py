@@ -36,7 +36,13 @@ class Scene:
     ):
         if sequence.name != run.info["sequence"]:
             raise BadInput("scene", f"a run of {run.info['sequence']!r}", f"one of {sequence.name!r}")
-        _check_same_data(sequence, run)
+        for name, obj in run.objects.items():
+            if name not in sequence.truth:
+                continue
+            T_cam_model = sequence.truth[name].T_cam_model[obj.frame_index]
+            if not np.allclose(T_cam_model, obj.T_cam_model, atol=1e-6, equal_nan=True):
+                # A synthetic sequence may have been generated anew since.
+                raise BadInput("scene", f"a run on another {sequence.name!r}", "the data it ran on", "Run it again.")
         self.sequence, self.run = sequence, run
         known = set(run.objects) <= set(sequence.objects)  # a folder without masks knows no names
         self.colours = style.object_colours(sequence.objects if known else run.objects)
@@ -54,7 +60,7 @@ class Scene:
     def row(self, index: int) -> int:
         """The row of the run that is of frame ``index`` of the sequence; :class:`BadInput` where there is none."""
         frames = next(iter(self.run.objects.values())).frame_index
-        (rows,) = np.nonzero(frames == index)
+        rows = np.flatnonzero(frames == index)
         if not len(rows):
             raise BadInput("frame", index, f"one of the run, {frames[0]} to {frames[-1]}")
         return int(rows[0])
@@ -70,8 +76,8 @@ class Scene:
     ) -> np.ndarray:
         """The run's ``row``-th frame, cut to a region and scaled to a width; ``words`` are names, statuses, the time.
 
-        Estimated boxes are in their object's colour, true ones white and dashed; an object that is hidden has only
-        its true box. ``trail`` is the number of earlier frames whose path is drawn.
+        Estimated boxes are in their object's colour, true ones white and dashed; ``trail`` is how many earlier frames
+        the path goes back.
         """
         first = next(iter(self.run.objects.values()))
         frame = self.sequence.frame(int(first.frame_index[row]))
@@ -111,27 +117,17 @@ class Scene:
 
     def region(self, margin: float = 0.08) -> tuple[int, int, int, int]:
         """The rectangle of the objects over the whole run, with a margin (a fraction of the image's width)."""
-        camera = self.sequence.camera
-        uv = [np.zeros((0, 2))]
+        camera, uv = self.sequence.camera, [np.zeros((0, 2))]
         for name, obj in self.run.objects.items():
-            for T_cam_box, box in self._placed(name, obj):
-                p_cam = se3.transform(T_cam_box, overlay.box_corners(box.size_m))
-                uv.append(camera.project(p_cam).reshape(-1, 2))
+            estimated = self._boxes.get(name), obj.T_cam_obj[obj.has_pose]
+            true = self._model_boxes.get(name), obj.T_cam_model[obj.has_truth]
+            uv += [camera.project(box.corners(T)).reshape(-1, 2) for box, T in (estimated, true) if box]
         uv = np.concatenate(uv)
         uv = uv[camera.inside(uv)]
         if not len(uv):
             return 0, 0, camera.width, camera.height
-        low, high = uv.min(0) - margin * camera.width, uv.max(0) + margin * camera.width
-        left, top = np.maximum(np.floor(low), 0).astype(int)
-        right, bottom = np.minimum(np.ceil(high), [camera.width, camera.height]).astype(int)
-        return int(left), int(top), int(right), int(bottom)
-
-    def _placed(self, name: str, obj: ObjectRun) -> Iterator[tuple[np.ndarray, Box]]:
-        """T_cam_box (k, 4, 4) of all estimated, then of all true boxes of an object."""
-        if box := self._boxes.get(name):
-            yield obj.T_cam_obj[obj.has_pose] @ box.T_obj_box, box
-        if box := self._model_boxes.get(name):
-            yield obj.T_cam_model[obj.has_truth] @ box.T_obj_box, box
+        margin_px = round(margin * camera.width)
+        return overlay.region_around(uv, camera, (margin_px, margin_px))
 
     def _draw_object(
         self, image: np.ndarray, camera: Camera, name: str, obj: ObjectRun, row: int, axes: bool, trail: int
@@ -158,8 +154,7 @@ class Scene:
             T_cam_obj = obj.T_cam_obj[before[-1]]
         else:
             return None
-        corners = se3.transform(box.T_obj_box, overlay.box_corners(box.size_m)) if box else np.zeros((1, 3))
-        uv = camera.project(se3.transform(T_cam_obj, corners))
+        uv = camera.project(box.corners(T_cam_obj) if box else T_cam_obj[None, :3, 3])
         if not np.isfinite(uv).all():
             return None
         return Label(f"{name}: {obj.status[row]}", self.colours[name], (*uv.min(0), *uv.max(0)))
@@ -172,11 +167,7 @@ def draw_live(
     masks: Mapping[str, np.ndarray] | None = None,
     title: str = "",
 ) -> np.ndarray:
-    """The tracker's own view of a frame: each object's mask, keypoints (pending ones as rings), axes and status.
-
-    The keypoints are those of the map, projected with the estimate: they sit where the map says, not where a
-    2D track is.
-    """
+    """The tracker's own view of a frame: masks, axes, statuses, and the map's keypoints (pending ones as rings)."""
     image, labels = frame.rgb, []
     colours = style.object_colours(method.objects)
     image = overlay.draw_masks(image, masks or {}, colours, fill=0.15)
@@ -191,13 +182,3 @@ def draw_live(
         low, high = np.nanmin(uv_px, 0), np.nanmax(uv_px, 0)
         labels.append(Label(f"{name}: {estimate.status}", colours[name], (*low, *high)))
     return overlay.draw_caption(overlay.draw_labels(image, labels), f"{title}  {frame.time_s:.2f} s".strip())
-
-
-def _check_same_data(sequence: Sequence, run: Run) -> None:
-    """The run's truth must be the sequence's: a synthetic one may have been generated anew since."""
-    for name, obj in run.objects.items():
-        truth = sequence.truth.get(name)
-        if truth is None or not len(obj):
-            continue
-        if not np.allclose(truth.T_cam_model[obj.frame_index], obj.T_cam_model, atol=1e-6, equal_nan=True):
-            raise BadInput("scene", f"a run on another {sequence.name!r}", "the data it ran on", "Run it again.")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pandas import DataFrame, MultiIndex
+from pandas import DataFrame, MultiIndex, Series, to_numeric
 
 from p2p_lib.core import se3
 from p2p_lib.core.tables import as_html, as_markdown
@@ -67,19 +67,11 @@ def emboldened(cells: Sequence[Cell], more_is_better: bool) -> list[Cell]:
 
     A number beats one that failed; a dash takes no part.
     """
-    values = [_printed(cell) for cell in cells]
-    known = [value for value in values if value is not None]
-    if not known or sum(cell.text != "-" for cell in cells) < 2:
+    values = to_numeric(Series([cell.text.partition(" ")[0] for cell in cells]), errors="coerce")
+    if values.isna().all() or sum(cell.text != "-" for cell in cells) < 2:
         return list(cells)
-    best = max(known) if more_is_better else min(known)
-    return [replace(cell, bold=value == best) for cell, value in zip(cells, values, strict=True)]
-
-
-def _printed(cell: Cell) -> float | None:
-    try:
-        return float(cell.text.partition(" ")[0])
-    except ValueError:
-        return None
+    best = float(values.max() if more_is_better else values.min())
+    return [replace(cell, bold=value == best) for cell, value in zip(cells, values.tolist(), strict=True)]
 
 
 _TEX = {"\\": r"\textbackslash{}", "±": r"$\pm$", "Δ": r"$\Delta$", "°": r"$^\circ$", "~": r"\textasciitilde{}"}
@@ -158,11 +150,9 @@ class Table:
     def csv(self) -> str:
         """Values alone, and a column that says why some are missing."""
         table = self._frame(_Language(lambda text: "" if text == "-" else text, "{}", ""), " ")
-        table["notes"] = [self._reasons(row, table.columns) for row in self.rows]
+        noted = [[f"{h}: {cell.note}" for h, cell in zip(table.columns, row) if cell.note] for row in self.rows]
+        table["notes"] = ["; ".join(dict.fromkeys(reasons)) for reasons in noted]
         return table.to_csv(index=False, lineterminator="\n")
-
-    def _reasons(self, row: Sequence[Cell], heads: Sequence[str]) -> str:
-        return "; ".join(dict.fromkeys(f"{head}: {cell.note}" for head, cell in zip(heads, row) if cell.note))
 
     def _frame(self, language: _Language, between: str = "") -> DataFrame:
         """The cells as a format writes them; groups are a level of their own, or stand before ``between`` and head."""

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import html
-from collections.abc import Iterator
-from dataclasses import dataclass
+import io
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from p2p_lib.datasets.runs import quaternion_xyzw
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
 from p2p_lib.figures.playback import Playback
+from p2p_lib.figures.provenance import Saved
 
 #: Moments at which points and image are renewed, points each time, and the image's width: a page of about 2 MB.
 MOMENTS, POINTS, IMAGE_PX = 30, 5000, 240
@@ -32,13 +32,15 @@ _CLOUD_POINT_M, _CAMERA_M = 0.006, 0.08
 _FACES = 20_000
 _LEGEND = """<div style="position:fixed;right:12px;top:12px;z-index:9;font:13px/1.5 system-ui,sans-serif;
 background:#fffc;padding:6px 10px;border-radius:4px;pointer-events:none">{title}<br>{objects}<br>{statuses}</div>"""
+_SWATCH = '<span style="background:{colour};border:1px solid #888;padding:0 6px"></span> {status} &nbsp;'
 
 
 def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS) -> str:
     """The whole page as HTML: it works offline, from a file, and inside another page."""
     from viser import ViserServer
 
-    with _silence():
+    # Viser prints when it starts and stops, even with verbose=False.
+    with contextlib.redirect_stdout(io.StringIO()):
         server = ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
             scene = _Scene(server, playback, points)
@@ -55,19 +57,6 @@ def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS)
     return page[:end] + _legend(playback) + page[end:]
 
 
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Viser prints when it starts and stops, even with verbose=False."""
-    import rich
-
-    console = rich.get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before
-
-
 def write_page(run: str | Path, out: str | Path | None = None, sequence: Sequence | None = None) -> Path:
     """Write the page of a run's folder (default: ``view.html`` in it); the path written."""
     playback = Playback.of(run, sequence)
@@ -77,22 +66,12 @@ def write_page(run: str | Path, out: str | Path | None = None, sequence: Sequenc
     return out
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A page inside a notebook, and inside the pages that notebooks are exported to."""
-
-    path: Path
-    height_px: int
-
-    def _repr_mimebundle_(self, include=None, exclude=None):
-        inside = html.escape(self.path.read_text(encoding="utf-8"), quote=True)
-        frame = f'<iframe srcdoc="{inside}" width="100%" height="{self.height_px}" style="border:0"></iframe>'
-        return {"text/html": frame, "text/plain": f"<{self.path.name}>"}
-
-
-def show_run(run: str | Path, sequence: Sequence | None = None, height_px: int = 560) -> Shown:
+def show_run(run: str | Path, sequence: Sequence | None = None) -> Saved:
     """The page of a run's folder, written there as ``view.html`` and shown by the cell that ends with it."""
-    return Shown(write_page(run, sequence=sequence), height_px)
+    path = write_page(run, sequence=sequence)
+    inside = html.escape(path.read_text(encoding="utf-8"), quote=True)
+    frame = f'<iframe srcdoc="{inside}" width="100%" height="560" style="border:0"></iframe>'
+    return Saved(path, ({"text/html": frame, "text/plain": f"<{path.name}>"}, {}))
 
 
 class _Scene:
@@ -101,7 +80,9 @@ class _Scene:
     def __init__(self, server: Any, playback: Playback, points: int):
         self._playback, self._points, self._scene = playback, points, server.scene
         server.scene.set_up_direction("-y")
-        middle = _middle(playback)
+        objects = playback.run.objects.values()
+        places = np.concatenate([obj.T_cam_obj[obj.has_pose, :3, 3] for obj in objects])
+        middle = np.median(places, 0) if len(places) else np.array([0.0, 0.0, 0.7])
         server.initial_camera.position = tuple(middle + middle[2] * np.array([0.35, -0.5, -1.0]))
         server.initial_camera.look_at = tuple(middle)
         self._camera = None
@@ -165,8 +146,9 @@ class _Scene:
             self._camera.image = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
 
     def _show_object(self, name: str, nodes: dict[str, Any], i: int, renew: bool) -> None:
-        obj, has = self._playback.run.objects[name], bool(self._playback.has_pose(name)[i])
-        before = bool(self._playback.has_pose(name)[i - 1]) if i else None
+        obj = self._playback.run.objects[name]
+        has = bool(obj.has_pose[i])
+        before = bool(obj.has_pose[i - 1]) if i else None
         if has != before:
             nodes["frame"].visible = has
         if i == 0 or obj.status[i] != obj.status[i - 1]:
@@ -176,7 +158,7 @@ class _Scene:
             x, y, z, w = quaternion_xyzw(T)
             nodes["frame"].wxyz, nodes["frame"].position = (w, x, y, z), T[:3, 3]
             nodes["label"].position = T[:3, 3] - [0, 1.5 * _AXES_M, 0]
-            if before is None or not nodes["label"].visible:
+            if not nodes["label"].visible:
                 nodes["label"].visible = True
         for k in np.flatnonzero(nodes["keyframe_rows"] == i):
             nodes["keyframes"][k].visible = True
@@ -185,12 +167,6 @@ class _Scene:
             seen = np.isin(points.ids, points.track_id[points.at(int(self._playback.frame_index[i]))])
             shades = np.array([style.rgb(style.NEUTRAL[1]), style.rgb(self._playback.colours[name])], np.uint8)
             nodes["keypoints"].colors = shades[seen.astype(int)]
-
-
-def _middle(playback: Playback) -> np.ndarray:
-    """(3,) about where the objects are, in camera coordinates."""
-    poses = np.concatenate([obj.T_cam_obj[obj.has_pose, :3, 3] for obj in playback.run.objects.values()])
-    return np.median(poses, 0) if len(poses) else np.array([0.0, 0.0, 0.7])
 
 
 def _thinned(mesh: Any) -> Any:
@@ -216,9 +192,5 @@ def _legend(playback: Playback) -> str:
     return _LEGEND.format(
         title=html.escape(title),
         objects=", ".join(f'<b style="color:{c}">{html.escape(name)}</b>' for name, c in playback.colours.items()),
-        statuses=" ".join(_swatch(style.STATUS[s][0], str(s)) for s in occurring),
+        statuses=" ".join(_SWATCH.format(colour=style.STATUS[s][0], status=s) for s in occurring),
     )
-
-
-def _swatch(colour: str, text: str) -> str:
-    return f'<span style="background:{colour};border:1px solid #888;padding:0 6px"></span> {html.escape(text)} &nbsp;'

@@ -198,11 +198,7 @@ _UNITS = ("rotation [°]", "translation [mm]")
 
 @style.styled
 def turn_from_above(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
-    """The object standing still and the virtual cameras X_m that moved around it, seen along its axis.
-
-    A panel per way: true cameras in black, estimated ones in colour, tied to their own truth; the map's points
-    where the way puts them.
-    """
+    """A panel per way, along the object's axis: true cameras X_m in black, estimated ones and the map in colour."""
     true_xz = 100 * se3.inverse(turn.T_cam_obj)[:, [0, 2], 3]
     figure, axes = panels(len(solved), (4.0 * len(solved), 4.4), side_by_side=True)
     for axis, (name, one) in zip(axes, solved.items(), strict=True):
@@ -222,10 +218,7 @@ def turn_from_above(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
 
 @style.styled
 def errors_by_way(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
-    """Rotation and translation error of every keyframe, one line per way; gaps are keyframes that were left out.
-
-    Means are over the keyframes that every way has.
-    """
+    """Rotation and translation error of every keyframe, one line per way; means are over keyframes that all have."""
     errors = {name: one.errors(turn) for name, one in solved.items()}
     common = np.isfinite(sum(errors.values())).all(0)
     over = "mean" if common.all() else f"mean of the {common.sum()} that all have"

@@ -16,6 +16,7 @@ import trimesh
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from pandas import DataFrame
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import Job
@@ -37,7 +38,7 @@ from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
 from p2p_lib.figures import mesh_view, overlay, style
 from p2p_lib.figures.overlay import Label
-from p2p_lib.figures.plots import logarithmic, panels
+from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.figures.tables import Cell, Table, emboldened, number
 from p2p_lib.synthetic.shapes import load_mesh
@@ -77,7 +78,7 @@ class Numbers:
         self.seeds = benchmark.plan.scope(benchmark.profile).seeds
         #: A few dozen frames are too few to call a method the best or the fastest.
         self.judges = benchmark.profile != "quick"
-        self._at = {
+        self.by_cell = {
             (row["method"], row["metric"], row["form"], row["sequence"], row["object"]): row
             for row in benchmark.summary
             if row["failures"] in ("zero", "-") and row["align"] in ("first", "-") and row.get("value") is not None
@@ -85,12 +86,7 @@ class Numbers:
 
     def row(self, method: str, metric: str, sequence: str, object: str = "", form: str = "exact") -> Row | None:
         """The number over seeds; None where there is none."""
-        return self._at.get((method, metric, form, sequence, object))
-
-    def of_objects(self, method: str, metric: str) -> list[float]:
-        """A method's number for every object of every sequence."""
-        of = (method, metric, "exact")
-        return [row["value"] for (*about, _, object), row in self._at.items() if tuple(about) == of and object]
+        return self.by_cell.get((method, metric, form, sequence, object))
 
     def cell(self, method: str, metric: str, sequence: str, object: str = "", form: str = "exact") -> Cell:
         """The number over seeds as a cell; where there is none it says why."""
@@ -319,8 +315,9 @@ def by_return(numbers: Numbers) -> Table:
 
 def by_rate(numbers: Numbers) -> Table:
     """Frames per second and milliseconds a stage, by number of tracks, of objects, and resolution."""
-    found = _times(numbers, "method", "metric")
-    stages = dict.fromkeys(metric for _, metric in found if metric.startswith("stage "))
+    times = DataFrame(numbers.benchmark.times, columns=["method", "metric", "value"])
+    found = times.groupby(["method", "metric"], sort=False).value.mean()
+    stages = [metric for metric in times.metric.unique() if metric.startswith("stage ")]
     heads = {"rate": "rate (Hz)", "95th percentile": "95 % within (ms)"}
     heads |= {stage: stage.removeprefix("stage ") + " (ms)" for stage in stages}
     heads |= {"processor time, files included": "processor, files included (ms)"}
@@ -339,7 +336,8 @@ def by_run(numbers: Numbers) -> Table:
     done: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for job, outcome in numbers.benchmark.results:
         done[job.method.name, shown_name(job)] += [outcome] if outcome.objects else []
-    hz = _times(numbers, "method", "sequence", of="rate")
+    times = DataFrame(numbers.benchmark.times, columns=["method", "sequence", "metric", "value"])
+    hz = times[times.metric == "rate"].groupby(["method", "sequence"]).value.mean()
     lines = []
     for at, outcomes in done.items():
         cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 5
@@ -365,20 +363,12 @@ KINDS: dict[str, Callable[[Numbers], Table]] = {
 }
 
 
-def _times(numbers: Numbers, *keys: str, of: str = "") -> dict[tuple[str, ...], float]:
-    """The mean of the times (of the metric ``of``) that have these columns in common."""
-    found: dict[tuple[str, ...], list[float]] = defaultdict(list)
-    for row in numbers.benchmark.times:
-        if row["metric"] == of or not of:
-            found[tuple(row[key] for key in keys)].append(row["value"])
-    return {at: float(np.mean(values)) for at, values in found.items()}
-
-
 def _areas(numbers: Numbers, method: Method) -> list[Cell]:
     """Both areas with their standard deviations over sequences."""
     cells = []
     for name in ("ADD-S AUC", "ADD AUC"):
-        values = numbers.of_objects(method.name, name)
+        about = [method.name, name, "exact"]
+        values = [row["value"] for (*of, _, object), row in numbers.by_cell.items() if of == about and object]
         spread = number(float(np.std(values, ddof=1))) if len(values) > 1 else Cell(note="of fewer than two sequences")
         cells += [numbers.mean(method, name), spread]
     return cells
@@ -417,26 +407,22 @@ def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
 
 # --- figures ---------------------------------------------------------------------------------------
 
-_WIDTH_IN = 8.0
 #: Errors from a tenth of a millimetre to the ten centimetres at which a frame scores nothing.
 EDGES_MM = np.geomspace(0.1, 100, 31)
 #: Tracks so far off, or farther, have the brightest colour.
 FAR_PX = 4.0
 
 
-def scene_of(benchmark: Benchmark, method: str, sequence: str = "") -> tuple[Scene, Run, Sequence]:
+def scene_of(benchmark: Benchmark, method: str) -> tuple[Scene, Run, Sequence]:
     """A method's first finished run on its video, ready to be drawn."""
-    run, video = benchmark.run(method, sequence), benchmark.video(method, sequence)
+    run, video = benchmark.run(method), benchmark.video(method)
     return Scene(video, run, evaluate(run)), run, video
 
 
 @style.styled
 def error_histograms(benchmark: Benchmark) -> Figure:
-    """ADD and ADD-S of all scored frames of each method, one line a method; what has no pose stands apart.
-
-    Aligned at the first scored frame. Fractions of the scored frames, over all sequences, objects and seeds.
-    """
-    figure, axes = panels(2, (_WIDTH_IN, 3.2), side_by_side=True)
+    """ADD and ADD-S of each method over all scored frames, aligned at the first; what has no pose stands apart."""
+    figure, axes = panels(2, (WIDTH_IN, 3.2), side_by_side=True)
     for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S")), strict=True):
         errors = defaultdict(list)
         for job, outcome in benchmark.results:
@@ -458,18 +444,20 @@ def error_histograms(benchmark: Benchmark) -> Figure:
 
 
 @style.styled
-def tracks_by_error(
-    benchmark: Benchmark, method: str, sequence: str = "", count: int = 3, width_px: int = 420
-) -> Figure:
+def tracks_by_error(benchmark: Benchmark, method: str, count: int = 3) -> Figure:
     """True boxes (white, dashed), estimated ones, and the 2D tracks of the keypoints coloured by their error.
 
     The error is the distance in pixels from where the tracker saw a keypoint to the keypoint of the final map projected
     with the true pose; points that the map has dropped since are not drawn.
     """
-    scene, run, video = scene_of(benchmark, method, sequence)
-    evaluation, keypoints, region_px = evaluate(run), load_keypoints(run.path), scene.region()
+    scene, run, video = scene_of(benchmark, method)
+    evaluation, keypoints, region_px, width_px = evaluate(run), load_keypoints(run.path), scene.region(), 420
+    seen = np.flatnonzero(np.logical_and.reduce([obj.has_pose & obj.has_truth for obj in run.objects.values()]))
+    seen = seen[seen > 0]  # the first has no tracks yet
+    if not len(seen):
+        raise MissingData(str(run.path), "no frame in which every object has a pose")
     images = []
-    for row in _well_seen(run, count):
+    for row in seen[np.linspace(0, len(seen) - 1, count).round().astype(int)].tolist():
         image = scene.draw(row, region_px, width_px, axes=False, trail=0)
         _, camera = overlay.zoomed(video.frame(0).rgb, video.camera, region_px, width_px)
         for name, score in evaluation.objects.items():
@@ -477,8 +465,8 @@ def tracks_by_error(
             colours = overlay.value_colours(error_px, 0, FAR_PX)
             image = overlay.draw_points(image, overlay.zoomed_px(uv_px, video.camera, camera), colours, 2.5)
         images.append(image)
-    high_in = _WIDTH_IN / count * images[0].shape[0] / images[0].shape[1]
-    figure, axes = panels(count, (_WIDTH_IN, high_in + 0.6), side_by_side=True)
+    high_in = WIDTH_IN / count * images[0].shape[0] / images[0].shape[1]
+    figure, axes = panels(count, (WIDTH_IN, high_in + 0.6), side_by_side=True)
     for axis, image in zip(axes, images, strict=True):
         axis.imshow(image)
         axis.set_axis_off()
@@ -488,12 +476,9 @@ def tracks_by_error(
     return figure
 
 
-def recovery_strip(benchmark: Benchmark, sequence: str = "", count: int = 4, width_px: int = 300) -> np.ndarray:
-    """Occlusion and recovery: a line for each method, the same moments below each other.
-
-    White and dashed is the truth, in colour the estimate; a method that has lost the object draws none.
-    """
-    scenes = {name: scene_of(benchmark, name, sequence)[0] for name in benchmark.methods}
+def recovery_strip(benchmark: Benchmark, count: int = 4, width_px: int = 300) -> np.ndarray:
+    """Occlusion and recovery: a line for each method, the same moments below each other."""
+    scenes = {name: scene_of(benchmark, name)[0] for name in benchmark.methods}
     first = next(iter(scenes.values()))
     moments, region_px, images = first.moments(count), first.region(), []
     for name, scene in scenes.items():
@@ -504,20 +489,20 @@ def recovery_strip(benchmark: Benchmark, sequence: str = "", count: int = 4, wid
     return overlay.montage(images, columns=count)
 
 
-def reconstruction_sheet(benchmark: Benchmark, method: str, sequence: str = "", width_px: int = 300) -> np.ndarray:
+def reconstruction_sheet(benchmark: Benchmark, method: str) -> np.ndarray:
     """Each object's reconstruction beside its true surface, seen as in its first frame and from behind."""
-    run, video = benchmark.run(method, sequence), benchmark.video(method, sequence)
+    run, video = benchmark.run(method), benchmark.video(method)
     evaluation, images = evaluate(run), []
     for name in evaluation.objects:
-        chamfer_cm = benchmark.chamfer_cm(method, sequence, name)
-        images += _beside_truth(run, video, evaluation, name, chamfer_cm, width_px)
+        chamfer_cm = benchmark.chamfer_cm(method, "", name)
+        images += _beside_truth(run, video, evaluation, name, chamfer_cm)
     if not images:
         raise MissingData(str(run.path), "no reconstructed surface", "Run with the setting method.surface = true.")
     return overlay.montage(images, columns=4)
 
 
 def _beside_truth(
-    run: Run, video: Sequence, evaluation: Evaluation, name: str, chamfer_cm: float | None, width_px: int
+    run: Run, video: Sequence, evaluation: Evaluation, name: str, chamfer_cm: float | None
 ) -> list[np.ndarray]:
     file, model = run.path / "meshes" / f"{name}.ply", find_models(video, MESHES).get(name)
     if not file.is_file() or model is None:
@@ -526,7 +511,10 @@ def _beside_truth(
     surface.apply_transform(se3.inverse(evaluation.objects[name].T_obj_model))
     truth = load_mesh(model)
     middle = (truth.vertices.max(0) + truth.vertices.min(0)) / 2
-    camera, front = _portrait(run, name, middle, float(np.ptp(truth.vertices, axis=0).max()), width_px)
+    # The first scored frame's view, with the object's middle in the middle and all of it in sight.
+    front = run.objects[name].T_cam_model[np.flatnonzero(run.objects[name].has_truth)[0]].copy()
+    front[:3, 3] = np.array([0, 0, 4 * np.ptp(truth.vertices, axis=0).max()]) - front[:3, :3] @ middle
+    camera = Camera(930, 930, 149.5, 149.5, 300, 300)
     turn = se3.exp(np.array([0, 0, np.pi, 0, 0, 0]))
     behind = front @ se3.from_rt(np.eye(3), middle) @ turn @ se3.from_rt(np.eye(3), -middle)
     kind = "synthetic" if video.name.startswith("synthetic") else "real"
@@ -538,24 +526,6 @@ def _beside_truth(
         (surface, behind, "reconstructed"),
     ]
     return [overlay.draw_caption(mesh_view.draw_mesh(mesh, camera, T), title, scale=0.4) for mesh, T, title in shown]
-
-
-def _portrait(run: Run, name: str, middle: np.ndarray, size_m: float, width_px: int) -> tuple[Camera, np.ndarray]:
-    """A camera that sees the whole object as the first scored frame did, with its middle in the middle."""
-    obj = run.objects[name]
-    T = obj.T_cam_model[np.flatnonzero(obj.has_truth)[0]].copy()
-    T[:3, 3] = np.array([0, 0, 4 * size_m]) - T[:3, :3] @ middle
-    focal_px = 3.1 * width_px
-    return Camera(focal_px, focal_px, (width_px - 1) / 2, (width_px - 1) / 2, width_px, width_px), T
-
-
-def _well_seen(run: Run, count: int) -> list[int]:
-    """Rows spread over the frames in which every object has a pose; the first has no tracks yet."""
-    seen = np.flatnonzero(np.logical_and.reduce([obj.has_pose & obj.has_truth for obj in run.objects.values()]))
-    seen = seen[seen > 0]
-    if not len(seen):
-        raise MissingData(str(run.path), "no frame in which every object has a pose")
-    return seen[np.linspace(0, len(seen) - 1, count).round().astype(int)].tolist()
 
 
 def _track_errors(

@@ -27,7 +27,7 @@ from p2p_lib.figures import overlay, style
 from p2p_lib.figures.mesh_view import draw_mesh
 from p2p_lib.figures.overlay import Box
 from p2p_lib.figures.playback import Playback
-from p2p_lib.figures.plots import panels
+from p2p_lib.figures.plots import WIDTH_IN, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic.render import render
 from p2p_lib.synthetic.shapes import Mesh, load_mesh
@@ -83,16 +83,16 @@ def tight_box(mesh: trimesh.Trimesh) -> Box:
     return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
 
 
-def edges_mm(mesh: trimesh.Trimesh, beyond: float = 0.005, rounds: int = 2) -> np.ndarray:
+def edges_mm(mesh: trimesh.Trimesh) -> np.ndarray:
     """(3,) edges of the box around a surface, longest first, without its fringes.
 
-    Twice, the outermost fraction ``beyond`` of the vertices is cut off at each side, along the box's axes.
+    Twice, the outermost 0.5 % of the vertices are cut off at each side, along the box's axes.
     """
     p_obj = np.asarray(mesh.vertices)
-    for _ in range(rounds):
+    for _ in range(2):
         T_box_obj, _ = trimesh.bounds.oriented_bounds(p_obj)
         p_box = se3.transform(se3.orthonormalised(T_box_obj), p_obj)
-        low, high = np.quantile(p_box, [beyond, 1 - beyond], axis=0)
+        low, high = np.quantile(p_box, [0.005, 0.995], axis=0)
         p_obj = p_obj[((p_box >= low) & (p_box <= high)).all(1)]
     return np.sort(1e3 * trimesh.bounds.oriented_bounds(p_obj)[1])[::-1]
 
@@ -203,7 +203,7 @@ def fit_plot(playback: Playback, fits: Mapping[str, Mapping[str, Series]]) -> Fi
 
     fits  label to the objects' fits (:func:`surface_fit`); the first is drawn full, the others dashed
     """
-    figure, axes = panels(2, (8.0, 4.2), [2, 1])
+    figure, axes = panels(2, (WIDTH_IN, 4.2), [2, 1])
     for k, (label, objects) in enumerate(fits.items()):
         line = {"linestyle": (0, (3 + k, 2)) if k else "-", "marker": "."}
         for name, fit in objects.items():

@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from p2p_lib.core import se3
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M, Judged, reliability, right_poses
 from p2p_lib.evaluation.point_tracks import Outcome
@@ -19,28 +18,22 @@ from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import MAX_ADDS_M, RecoveryEvent, recovered_within, recovery_events
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box
-from p2p_lib.figures.plots import draw_strip, logarithmic, panels
+from p2p_lib.figures.plots import WIDTH_IN, draw_strip, logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 
-_WIDTH_IN = 8.0
 _RIGHT = f"{100 * MAX_M:.0f} cm and {MAX_DEG:.0f}°"
 
 
 @style.styled
-def return_strip(
-    scenes: Mapping[str, Scene], name: str, event: RecoveryEvent, after: Sequence[int] = (0, 1, 10)
-) -> Figure:
-    """A row of images per method: the object before, while and after it is hidden; cut to where it truly is.
-
-    Its status is below each image.
-    """
+def return_strip(scenes: Mapping[str, Scene], name: str, event: RecoveryEvent) -> Figure:
+    """A row of images per method: the object before, while and after it is hidden, with its status below each."""
     shown = {"last in sight": event.hidden_frame - 2, "hidden": (event.hidden_frame + event.return_frame) // 2}
-    shown |= {f"return + {k}" if k else "return": event.return_frame + k for k in after}
+    shown |= {f"return + {k}" if k else "return": event.return_frame + k for k in (0, 1, 10)}
     first = next(iter(scenes.values()))
     regions = around(first, name, list(shown.values()))
     (left, top, right, bottom), *_ = regions
-    high = _WIDTH_IN / len(shown) * (bottom - top) / (right - left)
-    figure = Figure((_WIDTH_IN, (0.96 * high + 0.1) * len(scenes) + 0.7), layout="constrained")
+    high = WIDTH_IN / len(shown) * (bottom - top) / (right - left)
+    figure = Figure((WIDTH_IN, (0.96 * high + 0.1) * len(scenes) + 0.7), layout="constrained")
     axes = figure.subplots(len(scenes), len(shown), squeeze=False)
     for row, (label, scene) in zip(axes, scenes.items()):
         for axis, index, region_px in zip(row, shown.values(), regions):
@@ -71,7 +64,7 @@ def around_return(
     scenes: Mapping[str, Scene], evaluations: Mapping[str, Evaluation], name: str, event: RecoveryEvent, span: int = 40
 ) -> Figure:
     """Frames about a return: pixels in sight; keypoints that agree on the pose; ADD-S; confidence."""
-    figure, axes = panels(4, (_WIDTH_IN, 6.2), [1, 1.6, 1.6, 1.2])
+    figure, axes = panels(4, (WIDTH_IN, 6.2), [1, 1.6, 1.6, 1.2])
     sight, agreeing, adds, confidence = axes
     first = next(iter(scenes.values()))
     at = np.isin(first.run.objects[name].frame_index, range(event.hidden_frame - 10, event.return_frame + span))
@@ -106,7 +99,7 @@ def around_return(
 def status_strips(scenes: Mapping[str, Scene]) -> Figure:
     """The status of each method's estimates at every moment, one block of lines per method."""
     lines = sum(len(scene.run.objects) for scene in scenes.values())
-    figure, axes = panels(len(scenes), (_WIDTH_IN, 1.1 + 0.5 * len(scenes) + 0.25 * lines))
+    figure, axes = panels(len(scenes), (WIDTH_IN, 1.1 + 0.5 * len(scenes) + 0.25 * lines))
     occurring = {str(s) for scene in scenes.values() for obj in scene.run.objects.values() for s in obj.status}
     for axis, (label, scene) in zip(axes, scenes.items()):
         draw_strip(axis, scene.run, occurring if axis is axes[-1] else ())
@@ -119,7 +112,7 @@ def status_strips(scenes: Mapping[str, Scene]) -> Figure:
 def confidence_over_time(run: Run, evaluation: Evaluation) -> Figure:
     """Each object's confidence; dots where the pose is right (2 cm, 5 degrees), crosses where it is wrong."""
     names = list(evaluation.objects)
-    figure, axes = panels(len(names), (_WIDTH_IN, 0.9 + 1.25 * len(names)))
+    figure, axes = panels(len(names), (WIDTH_IN, 0.9 + 1.25 * len(names)))
     for axis, name in zip(axes, names):
         obj, colour = run.objects[name], style.object_colours(run.objects)[name]
         right = right_poses(obj, evaluation.objects[name])
@@ -136,7 +129,7 @@ def confidence_over_time(run: Run, evaluation: Evaluation) -> Figure:
 @style.styled
 def reliability_plot(judged: Mapping[str, Judged]) -> Figure:
     """The fraction of right poses by stated confidence, and how many there are; the diagonal would be calibrated."""
-    figure, axes = panels(2, (_WIDTH_IN, 3.2), [1.2, 1], side_by_side=True)
+    figure, axes = panels(2, (WIDTH_IN, 3.2), [1.2, 1], side_by_side=True)
     axes[0].plot([0, 1], [0, 100], ":", color="#333333", lw=0.8)
     width = 0.8 / 10 / len(judged)
     for k, ((label, one), colour) in enumerate(zip(judged.items(), style.METHODS)):
@@ -166,16 +159,12 @@ def recovery_counts(cases: Mapping[tuple[str, str], tuple[Run, Evaluation]]) -> 
     return DataFrame(rows)
 
 
-def around(scene: Scene, name: str, indices: Sequence[int], margin: float = 0.3) -> list[tuple[int, int, int, int]]:
-    """The rectangles (left, top, right, bottom), all of one size, of where an object truly is in each frame.
-
-    margin  as a fraction of the object's size
-    """
+def around(scene: Scene, name: str, indices: Sequence[int]) -> list[tuple[int, int, int, int]]:
+    """The rectangles (left, top, right, bottom), all of one size, of where an object truly is in each frame."""
     obj, camera = scene.run.objects[name], scene.sequence.camera
     box = Box.around(scene.run.points[name])
-    T_cam_box = obj.T_cam_model[[scene.row(i) for i in indices]] @ box.T_obj_box
-    uv = camera.project(se3.transform(T_cam_box, overlay.box_corners(box.size_m)))
+    uv = camera.project(box.corners(obj.T_cam_model[[scene.row(i) for i in indices]]))
     low, high = uv.min(1), uv.max(1)
-    size = np.minimum((1 + 2 * margin) * (high - low).max(0), [camera.width, camera.height]).astype(int)
+    size = np.minimum(1.6 * (high - low).max(0), [camera.width, camera.height]).astype(int)
     corner = np.clip((low + high - size) / 2, 0, np.array([camera.width, camera.height]) - size).astype(int)
     return [(int(x), int(y), int(x + size[0]), int(y + size[1])) for x, y in corner]

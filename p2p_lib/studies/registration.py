@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-import cv2
 import numpy as np
 from matplotlib.figure import Figure
 from pandas import DataFrame
@@ -33,11 +31,14 @@ from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.synthetic.ablations import mug
 from p2p_lib.synthetic.generate import photograph
 from p2p_lib.synthetic.noise import Sensor
+from p2p_lib.synthetic.render import render
 from p2p_lib.synthetic.scene import FPS, Scenario
 from p2p_lib.synthetic.shapes import Mesh
 
 #: The newest keyframe that the surface holds is this many frames old; keyframes are ten frames, or degrees, apart.
 _KEYFRAME_AGO, _KEYFRAME_EVERY, _POINTS = 6, 10, 90
+#: Between the image in which points are sampled and the one in which they are registered.
+_FRAMES = 16
 #: Tracks that follow the object (dots) and tracks that do not (crosses).
 _FOLLOWS, _STRAYS = "#F2F2F2", style.STATUS["lost"][0]
 #: Hypotheses by their order; light enough to be seen on a dark object.
@@ -84,16 +85,13 @@ class Moment:
         return se3.error_deg_mm(T_cam_obj, self.T_cam_obj)
 
 
-def mug_moment(config: Config, seed: int = 0, frames: int = 16, marks: int = 2) -> Moment:
-    """Points sampled on ``synthetic/mug`` and tracked over so many frames, while the handle comes into view.
-
-    ``marks`` is the number of small prints on the body that do turn with it.
-    """
-    scenario, rng = mug(seed, marks=marks), np.random.default_rng([seed, 7])
+def mug_moment(config: Config, seed: int = 0) -> Moment:
+    """Points sampled on ``synthetic/mug`` and tracked while the handle comes into view."""
+    scenario, rng = mug(seed, marks=2), np.random.default_rng([seed, 7])
     body, camera = scenario.bodies[0], scenario.camera
     poses = se3.inverse(scenario.T_world_cam) @ body.T_world_model
-    now = _handle_in_view(poses, frames)
-    before = now - frames
+    now = _handle_in_view(poses)
+    before = now - _FRAMES
     keyframes = range(now - _KEYFRAME_AGO, max(now - 100, 0), -_KEYFRAME_EVERY)
     shots = _shots(scenario, seed, {*keyframes, *range(before, now + 1)})
     surface = TsdfVolume(config.tsdf)
@@ -141,27 +139,26 @@ def ways_to_decide(moment: Moment, config: Config, seed: int = 0) -> dict[str, n
     }
 
 
-def mug_trials(config: Config, seeds: Iterable[int], **moment: Any) -> DataFrame:
+def mug_trials(config: Config, seeds: Iterable[int]) -> DataFrame:
     """A row per mug: how far it turned, the share of right tracks, and the rotation error of each way in degrees."""
     rows = []
     for seed in seeds:
-        one = mug_moment(config, seed, **moment)
+        one = mug_moment(config, seed)
         right = 100 * one.right[np.isfinite(one.off_m)].mean()
         errors = {f"{way} [°]": one.error(T)[0] for way, T in ways_to_decide(one, config, seed).items()}
         rows.append({"mug": seed, "turned [°]": one.turned_deg, "right tracks [%]": right, **errors})
     return DataFrame(rows)
 
 
-def _handle_in_view(poses: np.ndarray, frames: int) -> int:
+def _handle_in_view(poses: np.ndarray) -> int:
     """The frame, of those a whole history lies before, that ends the largest turn with the handle towards the camera.
 
-    poses (T, 4, 4) T_cam_obj; the handle points along the mug's x axis. Between half in front and sideways, it
-    stands clear of the body.
+    poses (T, 4, 4) T_cam_obj; the handle points along the mug's x axis
     """
     ends = np.arange(100, len(poses))
-    turned = se3.angle_rad(se3.inverse(poses[ends - frames]) @ poses[ends])
+    turned = se3.angle_rad(se3.inverse(poses[ends - _FRAMES]) @ poses[ends])
     towards = -poses[:, 2, 0]
-    shown = np.minimum(towards[ends], towards[ends - frames]) > 0.2
+    shown = np.minimum(towards[ends], towards[ends - _FRAMES]) > 0.2
     return int(ends[np.argmax(np.where(shown, turned, -1))])
 
 
@@ -256,8 +253,5 @@ def _outlined(moment: Moment, T_cam_obj: np.ndarray, colour: str, width_px: int)
     """The image around the mug with the silhouette of the true model at a pose, and the camera that sees it so."""
     region_px = overlay.region_around(moment.mask, moment.camera, (75, 30))
     image, camera = overlay.zoomed(moment.frame.rgb, moment.camera, region_px, width_px)
-    uv_px = camera.project(se3.transform(T_cam_obj, moment.mesh.vertices))[moment.mesh.faces]
-    mask = np.zeros(image.shape[:2], np.uint8)
-    for triangle in np.rint(uv_px * 16).astype(np.int32):
-        cv2.fillConvexPoly(mask, triangle, 1, shift=4)
-    return overlay.draw_mask(image, mask > 0, colour), camera
+    mask = render([(moment.mesh, se3.IDENTITY)], camera, se3.inverse(T_cam_obj)).label > 0
+    return overlay.draw_mask(image, mask, colour), camera

@@ -25,7 +25,7 @@ from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.plots import panels
+from p2p_lib.figures.plots import WIDTH_IN, panels
 from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.method.registration import Hypothesis, covariance
 from p2p_lib.method.sampling import Terms, choose, distance_px, terms, usable_region
@@ -42,7 +42,6 @@ CHOICES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 _DENSE = 400  # points of the visible surface that a pose's error is felt at
 _NOTHING = np.zeros((0, 2))
-_WIDTH_IN = 8.0
 _TERMS = (r"$\lambda\, s$", r"$(1-\lambda)\min(d/r_{ideal}, 1)$", r"$-\beta\,\rho(d)$", r"$J$")
 _TERM_COLOURS = ("#0072B2", "#56B4E9", "#D55E00")
 _RIM = [withStroke(linewidth=2.4, foreground="black")]
@@ -163,13 +162,13 @@ def _still_tracked(
     return near[sight.visible].mean() if sight.visible.any() else np.nan
 
 
-def open_views(video: Video, count: int, frames_on: int, min_px: int = 2000) -> list[Situation]:
+def open_views(video: Video, count: int, frames_on: int) -> list[Situation]:
     """``count`` situations per object, spread over the frames in which it is well in sight for ``frames_on`` more."""
     looked = range(0, len(video) - frames_on, 5)
     sizes = {i: {name: int(mask.sum()) for name, mask in (video.masks(i) or {}).items()} for i in looked}
     found = []
     for name in video.truth:
-        clear = [i for i in looked if sizes[i].get(name, 0) >= min_px and sizes.get(i + frames_on, sizes[i])[name] > 0]
+        clear = [i for i in looked if sizes[i].get(name, 0) >= 2000 and sizes.get(i + frames_on, sizes[i])[name] > 0]
         rows = np.linspace(0, len(clear) - 1, min(count, len(clear))).astype(int)
         found += [Situation.of(video, name, clear[row]) for row in rows]
     return found
@@ -197,14 +196,9 @@ class MapHistory:
     T_cam_obj: np.ndarray
 
     @property
-    def founding(self) -> np.ndarray:
-        """(N,) bool: points of the first frame, which define the map and are keypoints at once."""
-        return self.born == self.born.min(initial=0)
-
-    @property
     def late(self) -> np.ndarray:
-        """(N,) bool: points of later frames that were promoted."""
-        return ~self.founding & (self.promoted < len(self.keyframe))
+        """(N,) bool: points that were promoted, without those of the first frame, which are keypoints at once."""
+        return (self.born > 0) & (self.promoted < len(self.keyframe))
 
     @property
     def born_error_m(self) -> np.ndarray:
@@ -261,7 +255,7 @@ def term_maps(situation: Situation, candidates: Candidates, after: Sequence[int]
     extent = (left - 0.5, right - 0.5, bottom - 0.5, top - 0.5)
     height = 1.75 * (bottom - top) / (right - left)
     limits = [(0, config.score_weight), (0, 1 - config.score_weight), (-config.cluster_weight, 0), (-0.5, 1)]
-    figure = Figure((_WIDTH_IN, 0.9 + len(after) * (height + 0.25)), layout="constrained")
+    figure = Figure((WIDTH_IN, 0.9 + len(after) * (height + 0.25)), layout="constrained")
     axes = figure.subplots(len(after), 4, squeeze=False)
     for row, k in zip(axes, after, strict=True):
         taken, following = candidates.uv_px[chosen[:k]], candidates.uv_px[chosen[k : k + 1]]
@@ -293,16 +287,13 @@ def term_maps(situation: Situation, candidates: Candidates, after: Sequence[int]
 
 @style.styled
 def greedy_plot(situation: Situation, candidates: Candidates) -> tuple[Figure, Terms]:
-    """What every choice was worth when taken, and the terms, if choosing went on until nothing is worth its cost.
-
-    The dotted line is K, after which the pipeline stops.
-    """
+    """What every choice was worth when taken, and the terms; the dotted line is K, after which the pipeline stops."""
     config = situation.config.sampling
     chosen = choose(candidates, _NOTHING, len(candidates.score), config)
     parts = greedy_terms(candidates, chosen, config)
     k, zero = np.arange(1, len(chosen) + 1), np.zeros(len(chosen))
     layers = ((zero, parts.trackability), (parts.trackability, parts.trackability + parts.spread))
-    figure, (axis,) = panels(1, (_WIDTH_IN, 3.0))
+    figure, (axis,) = panels(1, (WIDTH_IN, 3.0))
     for (low, high), colour, label in zip((*layers, (parts.crowding, zero)), _TERM_COLOURS, _TERMS[:3], strict=True):
         axis.fill_between(k, low, high, step="mid", color=colour, lw=0, label=label)
     axis.plot(k, parts.total, color="black", lw=1.2, label=_TERMS[3])
@@ -333,7 +324,7 @@ def choice_plot(table: DataFrame) -> Figure:
     """The table as dots: more is better left and right, less in the middle."""
     senses = {"covered [%]": "more", "pose error [mm]": "less", "still tracked [%]": "more"}
     colours = [_TERM_COLOURS[0] if label == "J" else style.NEUTRAL[0] for label in table["choice"]]
-    figure, axes = panels(3, (_WIDTH_IN, 2.6), side_by_side=True)
+    figure, axes = panels(3, (WIDTH_IN, 2.6), side_by_side=True)
     for axis, (column, sense) in zip(axes, senses.items(), strict=True):
         axis.scatter(table[column], table.index, 40, colours, zorder=3)
         axis.axvline(table[column][0], color=_TERM_COLOURS[0], lw=0.8, ls=":")
@@ -350,7 +341,7 @@ def spacing_plot(situations: Sequence[Situation], r_ideal_px: Sequence[float]) -
     """Coverage and conditioning against r_ideal, means over situations; dotted: as configured."""
     ways = {f"{r:g}": ("corners", {"sampling.r_ideal_px": float(r)}) for r in r_ideal_px}
     table = choice_table(compare_choices(situations, ways, frames_on=0))
-    figure, axes = panels(2, (_WIDTH_IN, 2.5), side_by_side=True)
+    figure, axes = panels(2, (WIDTH_IN, 2.5), side_by_side=True)
     for axis, column in zip(axes, ("covered [%]", "pose error [mm]"), strict=True):
         axis.plot(r_ideal_px, table[column], "o-", color=style.NEUTRAL[0], markersize=4)
         axis.axvline(situations[0].config.sampling.r_ideal_px, color=style.NEUTRAL[0], lw=0.8, ls=":")
@@ -368,7 +359,7 @@ def life_lines(history: MapHistory, video: Video) -> Figure:
     born, gone = history.born[order], history.gone[order]
     keypoint, rows = np.minimum(history.promoted[order], gone), np.arange(len(order))
     pending = {"facecolor": style.STATUS[Status.INITIALISING][0], "edgecolor": "#333333", "linewidth": 0.3}
-    figure, (axis,) = panels(1, (_WIDTH_IN, 4.2))
+    figure, (axis,) = panels(1, (WIDTH_IN, 4.2))
     axis.barh(rows, keypoint - born, 1.0, born, **pending)
     axis.barh(rows, gone - keypoint, 1.0, keypoint, color=colour)
     axis.plot(gone[gone < total], rows[gone < total], "x", color=lost, markersize=3)
@@ -387,16 +378,16 @@ def life_lines(history: MapHistory, video: Video) -> Figure:
     return figure
 
 
-def promotion_moments(history: MapHistory, count: int = 4) -> list[int]:
+def promotion_moments(history: MapHistory) -> list[int]:
     """Frames from the keyframe that brought most points which were promoted, until nine in ten of them were."""
     births, counts = np.unique(history.born[history.late], return_counts=True)
     start = int(births[counts.argmax()])
     end = int(np.quantile(history.promoted[history.late & (history.born == start)], 0.9))
-    return np.unique(np.linspace(start, max(end, start + count - 1), count).astype(int)).tolist()
+    return np.unique(np.linspace(start, max(end, start + 3), 4).astype(int)).tolist()
 
 
 def promotion_sheet(video: Video, history: MapHistory, frames: Sequence[int]) -> np.ndarray:
-    """The part of the map that is in sight, on the video at a few frames: pending points are rings, keypoints dots."""
+    """The part of the map in sight at a few frames of the video: pending points are rings, keypoints dots."""
     colour = style.object_colours(video.objects)[history.name]
     box = overlay.region_around(np.any([video.masks(t)[history.name] for t in frames], axis=0), video.camera)
     images = []
@@ -419,7 +410,7 @@ def promotion_sheet(video: Video, history: MapHistory, frames: Sequence[int]) ->
 def error_plot(history: MapHistory) -> Figure:
     """How far points lay from the true surface point when they were born, and when they were promoted."""
     known = history.late & np.isfinite(history.promoted_error_m + history.born_error_m)
-    figure, (axis,) = panels(1, (_WIDTH_IN, 2.8))
+    figure, (axis,) = panels(1, (WIDTH_IN, 2.8))
     for errors_m, line, when in (
         (history.born_error_m, "--", "when born"),
         (history.promoted_error_m, "-", "when promoted"),

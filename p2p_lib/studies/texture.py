@@ -1,12 +1,8 @@
 """Notebook 08: how much texture an object shows, how well its points are tracked, and how right its pose is.
 
-The paper's analysis of texture: the mean magnitude of the Sobel gradient in the object's mask stands for visible
-texture; the error of the 2D tracks is the distance of the tracker's answers from the object's keypoints projected
-with true poses, of those that it calls visible and that are; the pose is judged by the area under the ADD curve.
-All three per sequence, or per window of frames.
-
-Studies (:class:`ObjectTexture`) and their measures are drawn by label, which is the contrast of a print or the name
-of a real object; contrasts in the order given, dark to bright.
+The paper's analysis of texture: the mean magnitude of the Sobel gradient in the mask; the distance of 2D tracks from
+the keypoints projected with true poses, where both call them visible; the area under the ADD curve. All three per
+sequence or window of frames, by label: the contrast of a print, or the name of a real object.
 """
 
 from __future__ import annotations
@@ -14,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import cycle
-from pathlib import Path
 
 import cv2
 import matplotlib
@@ -32,9 +27,9 @@ from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import Evaluation
-from p2p_lib.evaluation.true_tracks import NO_POINTS, SurfacePoints, TrueScene
+from p2p_lib.evaluation.true_tracks import NO_POINTS, TrueScene
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.plots import logarithmic, panels
+from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic import scenario_dir
 
@@ -44,7 +39,6 @@ MARGIN_PX = 3
 FAR_PX = 8.0
 #: What the labels of the synthetic studies are.
 LEGEND = "contrast of the print, synthetic"
-_WIDTH_IN = 8.0
 _TEXTURE = "mean Sobel gradient in the mask [grey levels / px]"
 _TRACK, _ADD = "median 2D track error [px]", "ADD AUC [%]"
 #: Columns of the table of measures.
@@ -59,11 +53,7 @@ _HEADS = {
 
 
 class RecordedTracker:
-    """A 2D tracker that passes everything on to another one and keeps what it was asked and what it answered.
-
-    In the place of a tracker it changes nothing; afterwards it knows the track of every keypoint that the method
-    ever followed, beside the true surface point behind the pixel at which it began.
-    """
+    """A 2D tracker that passes everything on to another one and keeps what it was asked and what it answered."""
 
     def __init__(self, tracker: PointTracker):
         self._tracker = tracker
@@ -102,7 +92,13 @@ class RecordedTracker:
         A row where the tracker calls the keypoint visible and its surface point is truly in sight; the error is the
         distance from where the true pose puts that point.
         """
-        ids, points = self._began(scene)
+        ids, points = [np.zeros(0, np.int64)], NO_POINTS
+        for index, new_ids, uv_px in self._queries:
+            frame = scene.sequence.frame(index)
+            ids.append(new_ids)
+            points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
+        ids = np.concatenate(ids)
+        ids, points = np.sort(ids), points.select(np.argsort(ids))
         found = []
         for index, tracks in self._answers:
             tracks = tracks.select(tracks.ids[tracks.visible])
@@ -114,16 +110,6 @@ class RecordedTracker:
             found.append(rows[sight.visible])
         rows = concat(found, ignore_index=True)
         return {name: rows[rows.owner == k].drop(columns="owner") for k, name in enumerate(scene.objects)}
-
-    def _began(self, scene: TrueScene) -> tuple[np.ndarray, SurfacePoints]:
-        """The ids of all queries, increasing, and the surface points behind their pixels; NaN where none is met."""
-        ids, points = [np.zeros(0, np.int64)], NO_POINTS
-        for index, new_ids, uv_px in self._queries:
-            frame = scene.sequence.frame(index)
-            ids.append(new_ids)
-            points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
-        ids = np.concatenate(ids)
-        return np.sort(ids), points.select(np.argsort(ids))
 
 
 @dataclass(frozen=True)
@@ -198,9 +184,9 @@ def sobel_magnitude(rgb: np.ndarray) -> np.ndarray:
     return cv2.magnitude(across, down)
 
 
-def visible_texture(rgb: np.ndarray, mask: np.ndarray, margin_px: int = MARGIN_PX) -> float:
+def visible_texture(rgb: np.ndarray, mask: np.ndarray) -> float:
     """Mean Sobel gradient magnitude over a mask (H, W) without its rim; NaN where nothing of it is left."""
-    side = 2 * margin_px + 1
+    side = 2 * MARGIN_PX + 1
     inner = cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0) > 0
     return float(sobel_magnitude(rgb)[inner].mean()) if inner.any() else float("nan")
 
@@ -222,17 +208,9 @@ def present(names: Iterable[str], left_out: str = "") -> dict[str, Video | str]:
     return found
 
 
-def study(
-    sequence: Video,
-    evaluation: Evaluation,
-    recorded: RecordedTracker,
-    models: Mapping[str, str | Path] | None = None,
-) -> dict[str, ObjectTexture]:
-    """Texture, tracks and pose of each object that a run of the method with a recorded tracker was scored on.
-
-    models  object to mesh, besides those that lie with the sequence; the others' surface is the measured depth
-    """
-    tracks, studies = recorded.keypoints(TrueScene.of(sequence, models)), {}
+def study(sequence: Video, evaluation: Evaluation, recorded: RecordedTracker) -> dict[str, ObjectTexture]:
+    """Texture, tracks and pose of each object that a run of the method with a recorded tracker was scored on."""
+    tracks, studies = recorded.keypoints(TrueScene.of(sequence)), {}
     for name, score in evaluation.objects.items():
         texture = []
         for i in score.frame_index.tolist():
@@ -262,10 +240,9 @@ def rank_correlation(
 ) -> RankCorrelation:
     """Spearman's rank correlation of x (n,) and y (n,) with a bootstrap confidence interval (percentiles).
 
-    groups  (n,) which pairs belong together: windows of one sequence are not independent, so whole sequences are
-            drawn; by default every pair stands for itself. Pairs that are not finite are left out.
+    groups  (n,) which pairs belong together, as windows of one sequence do; by default each stands for itself
 
-    Raises :class:`BadInput` for fewer than three groups.
+    Pairs that are not finite are left out. Raises :class:`BadInput` for fewer than three groups.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     group = np.arange(len(x)) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]
@@ -295,10 +272,7 @@ def correlate(windows: Sequence[Measure], seed: int = 0) -> tuple[RankCorrelatio
 
 
 def correlation_table(windows: Mapping[str, Sequence[Measure]], seed: int = 0) -> DataFrame:
-    """A row per label: Spearman's rho of texture with track error and with ADD AUC, and its 95 % interval.
-
-    A dash where the windows are of fewer than three objects or sequences.
-    """
+    """A row per label: texture's rho with track error and with ADD AUC; a dash for fewer than three objects."""
     rows = []
     for label, many in windows.items():
         objects = len({(w.sequence, w.object) for w in many})
@@ -320,10 +294,9 @@ def measure_table(measures: Mapping[str, Measure | str], head: str = LEGEND) -> 
 def draw_tracks(
     scene: Scene, study: ObjectTexture, index: int, region_px: tuple[int, int, int, int], width_px: int = 260
 ) -> np.ndarray:
-    """Frame ``index``, cut to a region: true box white and dashed, estimate in colour, a dot per keypoint in sight.
+    """Frame ``index``, cut to a region: true and estimated box, and a dot per keypoint in sight.
 
-    Dots are where the tracker has the keypoints, coloured by how far that is from the truth: dark blue is right,
-    yellow is off by :data:`FAR_PX` or more.
+    A dot's colour is how far the tracker is from the truth: dark blue is right, yellow :data:`FAR_PX` or more.
     """
     image = scene.draw(scene.row(index), region_px, width_px, axes=False, trail=0)
     camera = scene.sequence.camera
@@ -336,8 +309,8 @@ def draw_tracks(
 @style.styled
 def texture_story(images: Mapping[str, np.ndarray], measures: Mapping[str, Sequence[Measure]], title: str) -> Figure:
     """The page's one figure: images side by side, and below them track error and ADD against visible texture."""
-    high = _WIDTH_IN / len(images) * max(image.shape[0] / image.shape[1] for image in images.values())
-    figure = Figure((_WIDTH_IN, high + 3.3), layout="constrained")
+    high = WIDTH_IN / len(images) * max(image.shape[0] / image.shape[1] for image in images.values())
+    figure = Figure((WIDTH_IN, high + 3.3), layout="constrained")
     top, bottom = figure.subfigures(2, 1, height_ratios=[high + 0.45, 2.85])
     for axis, (label, image) in zip(np.atleast_1d(top.subplots(1, len(images))), images.items()):
         axis.imshow(image)
@@ -360,7 +333,7 @@ def windows_against_texture(
 
     synthetic  windows that are drawn in grey behind those of real objects
     """
-    figure, axes = panels(2, (_WIDTH_IN, 3.4), side_by_side=True)
+    figure, axes = panels(2, (WIDTH_IN, 3.4), side_by_side=True)
     if synthetic:
         _against_texture(axes, {"synthetic": synthetic} | dict(windows), 16, [style.NEUTRAL[1], *style.OBJECTS])
     else:
@@ -374,11 +347,8 @@ def windows_against_texture(
 
 @style.styled
 def same_frames(windows: Mapping[str, Sequence[Measure]]) -> Figure:
-    """One line per window of frames, through all contrasts: what differs along it is the contrast and nothing else.
-
-    Where a label has windows of several sequences, those of the first are drawn.
-    """
-    figure, axes = panels(2, (_WIDTH_IN, 3.3), side_by_side=True)
+    """One line per window of frames, through all contrasts; of several sequences the first is drawn."""
+    figure, axes = panels(2, (WIDTH_IN, 3.3), side_by_side=True)
     spans = sorted({(w.start, w.stop) for many in windows.values() for w in many})
     for span, colour in zip(spans, matplotlib.colormaps["viridis"](np.linspace(0, 0.9, len(spans)))):
         line = [next((w for w in many if (w.start, w.stop) == span), None) for many in windows.values()]
@@ -397,7 +367,7 @@ def same_frames(windows: Mapping[str, Sequence[Measure]]) -> Figure:
 @style.styled
 def track_errors(studies: Mapping[str, ObjectTexture]) -> Figure:
     """The fraction of a study's tracks that lie within so many pixels of the truth."""
-    figure, (axis,) = panels(1, (_WIDTH_IN, 3.0))
+    figure, (axis,) = panels(1, (WIDTH_IN, 3.0))
     for (label, study), colour in zip(studies.items(), _colours(len(studies))):
         error_px = study.tracks.error_px
         axis.ecdf(error_px, color=colour, label=f"{label} ({len(error_px)} answers)")

@@ -17,9 +17,8 @@ from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.point_tracks import FOUND_PX, Outcome, Reliability, after_query, outcomes, reliability
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.plots import logarithmic, panels, status_intervals
+from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels, status_intervals
 
-_WIDTH_IN = 8.0
 _OUTCOMES = {
     Outcome.RIGHT: f"found within {FOUND_PX:.0f} px",
     Outcome.MISSED: "visible, but called hidden",
@@ -70,12 +69,12 @@ def score_outcomes(score: TrackerScore) -> np.ndarray:
     return outcomes(truth.uv_px, truth.visible, run.uv_px, run.visible, scored)
 
 
-def score_reliability(score: TrackerScore, bins: int = 10) -> Reliability:
+def score_reliability(score: TrackerScore) -> Reliability:
     """Reliability of the uncertainty over all predictions that are called visible of points that are."""
     truth, run = score.truth, score.run
     both = run.visible & truth.visible & truth.known & np.isfinite(run.uv_px[..., 0])
     error_px = np.linalg.norm(run.uv_px[both] - truth.uv_px[both], axis=-1)
-    return reliability(error_px, run.uncertainty[both], bins)
+    return reliability(error_px, run.uncertainty[both], 10)
 
 
 class TrackScene:
@@ -91,8 +90,7 @@ class TrackScene:
     def draw(self, index: int, width_px: int = 480, trail: int = 12) -> np.ndarray:
         """Frame ``index`` around the points: dots in the object's colour are right, vermillion rings are wrong.
 
-        Points that truth sees and the tracker does not are small dark dots at their true place. Lines are the
-        paths of the last ``trail`` frames, as far as the tracker was right in them.
+        Small dark dots are missed points at their true place, lines the right part of the last ``trail`` frames.
         """
         frame, camera, run = self.sequence.frame(index), self.sequence.camera, self.score.run
         image, seen_by = overlay.zoomed(frame.rgb, camera, self.region_px, width_px)
@@ -141,7 +139,7 @@ class TrackScene:
 def found_over_time(scores: Mapping[str, TrackerScore | str], times_s: np.ndarray) -> Figure:
     """Share of the points in sight that each tracker has, over time; below it how many are in sight."""
     ran = {label: score for label, score in scores.items() if isinstance(score, TrackerScore)}
-    figure, (axis, below) = panels(2, (_WIDTH_IN, 3.8), [3, 1])
+    figure, (axis, below) = panels(2, (WIDTH_IN, 3.8), [3, 1])
     for colour, (label, score) in zip(style.METHODS, ran.items(), strict=False):
         came = score_outcomes(score)
         in_sight = ((came != Outcome.NOT_ASKED) & score.truth.visible).sum(1)
@@ -164,7 +162,7 @@ def outcome_bands(scores: Mapping[str, TrackerScore], times_s: np.ndarray) -> Fi
     Lines are sorted by object, then by query frame; a point has the same line in all panels.
     """
     colours = ListedColormap(["#F3F3F3", *(style.OUTCOMES[k] for k in sorted(style.OUTCOMES))])
-    figure, axes = panels(len(scores), (_WIDTH_IN, 1.0 + 1.7 * len(scores)))
+    figure, axes = panels(len(scores), (WIDTH_IN, 1.0 + 1.7 * len(scores)))
     for axis, (label, score) in zip(axes, scores.items(), strict=True):
         order = np.lexsort([score.queries.frame, score.queries.points.object])
         extent = (times_s[0], times_s[-1], len(order), 0)
@@ -187,7 +185,7 @@ def reliability_plot(rows: Mapping[str, Reliability], uncertain_px: Mapping[str,
     uncertain_px  trackers whose uncertainty states a standard deviation, and the one that they call 1/2
                   (``tracking.uncertain_px``): a dashed line shows what they state
     """
-    figure, axes = panels(len(rows), (_WIDTH_IN, 3.4), side_by_side=True)
+    figure, axes = panels(len(rows), (WIDTH_IN, 3.4), side_by_side=True)
     for axis, (label, row) in zip(axes, rows.items(), strict=True):
         # The colour that it has beside all the others.
         colour = style.METHODS[2 if label == "plain LK" else 0]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.figures import film as video
+from p2p_lib.core.errors import BadInput
+from p2p_lib.figures.provenance import save_video, write_video
 
 
 def images(count, height=120, width=160):
@@ -26,7 +26,7 @@ def decoded(path):
 
 @pytest.mark.parametrize("count", [1, 2, 23])
 def test_mp4_reads_back(tmp_path, count):
-    path = video.write_video(images(count), tmp_path / "film.mp4", fps=15)
+    path = write_video(images(count), tmp_path / "film.mp4", fps=15)
     frames, codec, pixels, rate = decoded(path)
     assert len(frames) == count and codec == "h264" and pixels == "yuv420p"
     assert rate == pytest.approx(15)
@@ -35,31 +35,30 @@ def test_mp4_reads_back(tmp_path, count):
 
 
 def test_odd_sizes_lose_a_row_and_a_column(tmp_path):
-    frames, *_ = decoded(video.write_video(images(3, 121, 159), tmp_path / "odd.mp4"))
+    frames, *_ = decoded(write_video(images(3, 121, 159), tmp_path / "odd.mp4"))
     assert frames[0].shape == (120, 158, 3)
 
 
 def test_same_images_same_bytes(tmp_path):
-    first = video.write_video(images(12), tmp_path / "a.mp4").read_bytes()
-    assert first == video.write_video(images(12), tmp_path / "b.mp4").read_bytes()
+    first = write_video(images(12), tmp_path / "a.mp4").read_bytes()
+    assert first == write_video(images(12), tmp_path / "b.mp4").read_bytes()
 
 
-def test_shown_films_are_embedded(tmp_path):
+def test_shown_films_are_embedded(tmp_path, monkeypatch):
     import base64
 
-    path = video.write_video(images(3), tmp_path / "film.mp4")
-    page = video.show_video(path)._repr_html_()
-    assert base64.b64encode(path.read_bytes()).decode() in page and "autoplay" in page
-    with pytest.raises(MissingData, match="no such film"):
-        video.show_video(tmp_path / "absent.mp4")
+    monkeypatch.setenv("P2P_FIGURES", str(tmp_path))
+    saved = save_video(images(3), "film")
+    page = saved._repr_mimebundle_()[0]["text/html"]
+    assert base64.b64encode(saved.path.read_bytes()).decode() in page and "autoplay" in page
 
 
 def test_what_is_no_film_is_refused(tmp_path):
     with pytest.raises(BadInput, match="no images"):
-        video.write_video([], tmp_path / "film.mp4")
+        write_video([], tmp_path / "film.mp4")
     with pytest.raises(BadInput, match=r"\.mp4"):
-        video.write_video(images(1), tmp_path / "film.avi")
+        write_video(images(1), tmp_path / "film.avi")
     with pytest.raises(BadInput, match="all of one size"):
-        video.write_video([*images(1), *images(1, 100, 100)], tmp_path / "film.mp4")
+        write_video([*images(1), *images(1, 100, 100)], tmp_path / "film.mp4")
     with pytest.raises(BadInput, match="uint8"):
-        video.write_video([np.zeros((8, 8, 3))], tmp_path / "film.mp4")
+        write_video([np.zeros((8, 8, 3))], tmp_path / "film.mp4")

@@ -14,7 +14,7 @@ from p2p_lib.datasets.prompts import Prompt, prompts_in
 from p2p_lib.figures import style
 from p2p_lib.studies import own_data
 from p2p_lib.studies.own_data import errors_against, surface_fit
-from p2p_lib.studies.turntable import carton
+from p2p_lib.studies.surface import carton
 from p2p_lib.synthetic.render import render
 
 V, U = np.mgrid[:120, :160]

@@ -97,9 +97,9 @@ def test_views_are_of_objects_in_sight(crossing):
 
 def test_the_life_of_a_map_follows_the_rules_of_promotion(crossing):
     history, cfg = follow_map(crossing, "box", 30), CONFIG.keypoint_map
-    late = ~history.founding
+    late = history.born > 0
     assert history.keyframe[0] and set(history.born) == set(np.flatnonzero(history.keyframe))
-    assert (history.promoted[history.founding] == 0).all()
+    assert (history.promoted[~late] == 0).all()
     waited = (history.promoted - history.born)[late & (history.promoted < 30)]
     assert len(waited) > 5 and waited.min() >= cfg.streak
     np.testing.assert_array_equal(np.isfinite(history.p_promoted[:, 0]), history.promoted < 30)
@@ -147,6 +147,6 @@ def test_lives_are_bars_of_the_right_length(history, crossing):
 
 
 def test_the_moments_of_promotion(history):
-    assert history.founding.tolist() == [True, True, False, False, False]
+    assert history.late.tolist() == [False, False, True, True, False]
     moments = sampling.promotion_moments(history)
     assert moments[0] == 4 and moments[-1] == 7 and len(moments) == 4
