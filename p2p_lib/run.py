@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 
 from p2p_lib.core.backends import ALIASES, DEFAULT_SEGMENTER, SEGMENTERS, make_tracker
-from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import check_apart, check_clicks
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.interfaces import PointTracker
@@ -22,7 +20,7 @@ from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, given_models
-from p2p_lib.datasets.prompts import Prompt, load_prompts
+from p2p_lib.datasets.prompts import Prompt, clicks_by_frame, load_prompts
 from p2p_lib.datasets.runs import Run, RunWriter, load_run
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, rate
@@ -169,7 +167,7 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
         sequence = sequences.open_sequence(sequence, options.format, options.depth_scale, config.seed, masks=folder)
     frames = frame_range(len(sequence), options.start, options.stop)
     objects = _chosen([p.name for p in prompts] if segmenter else sequence.objects, options.objects)
-    clicked = _by_frame([p for p in prompts if p.name in objects], frames, sequence.camera)
+    clicked = clicks_by_frame([p for p in prompts if p.name in objects], frames, sequence.camera)
     if not segmenter and all(sequence.masks(i) is None for i in frames):
         fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
         expected = "masks of the first image at least, or clicks"
@@ -200,19 +198,6 @@ def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> tuple[str, ..
     if not chosen:
         raise BadInput("objects", "none", "masks or prompts that show at least one", "Add masks/ or give --prompts.")
     return chosen
-
-
-def _by_frame(prompts: Sequence[Prompt], frames: range, camera: Camera) -> dict[int, dict[str, np.ndarray]]:
-    """Frame to the clicks in it by object."""
-    clicked: dict[int, dict[str, np.ndarray]] = {}
-    for prompt in prompts:
-        if prompt.frame not in frames:
-            got = f"frame {prompt.frame}"
-            raise BadInput(f"prompt of {prompt.name!r}", got, f"a frame of the run, {frames[0]} to {frames[-1]}")
-        clicks = check_clicks(prompt.name, prompt.points_px, camera)
-        check_apart(prompt.name, clicks, clicked.setdefault(prompt.frame, {}))
-        clicked[prompt.frame][prompt.name] = clicks
-    return clicked
 
 
 def _tracker(

@@ -320,12 +320,12 @@ def _notebooks(a: argparse.Namespace) -> None:
     _options("format", "depth_scale", seed="of a synthetic sequence (default 0)"),
 )
 def _click(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.click import check_writable, collect_clicks, wait_for_clicks
+    from p2p_lib.apps.click import Clicker, check_writable, wait_for_clicks
     from p2p_lib.datasets.sequence import open_sequence
 
     check_writable(a.out)
     sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed or 0)
-    page = collect_clicks(sequence, a.out, a.frame, a.port)
+    page = Clicker(sequence, a.out, a.frame, a.port)
     prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)
     print(f"{len(prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --out DIR")
 

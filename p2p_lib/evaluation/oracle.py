@@ -29,18 +29,12 @@ class OracleTracker:
     def __init__(self, scene: TrueScene, config: OracleConfig | None = None, seed: int = 0):
         self.config = config or OracleConfig()
         self._scene, self._seed = scene, seed
-        self._frame: Frame | None = None
-        self._clear()
-
-    def _clear(self) -> None:
-        self._next_id = 0
-        self._ids = np.zeros(0, np.int64)
-        self._points = NO_POINTS
+        self._frame: Frame | None = None  # the newest
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
-        self._clear()
-        self._frame = frame
+        self._frame, self._next_id = frame, 0
+        self._ids, self._points = np.zeros(0, np.int64), NO_POINTS
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids."""
