@@ -1,0 +1,217 @@
+"""What each mechanism of the method is worth: sequences with and without it.
+
+    python benchmarks/bench_mechanisms.py OUT SEQUENCE ... [--mechanisms A,B] [--clicks]
+
+A mechanism is an entry of ``mechanisms.toml``: one text of the library, and what it is replaced with to switch the
+mechanism off. Each run is a process of its own with a patched copy of the library. ``OUT/runs.jsonl`` keeps a line per
+run and no run is done twice; ``OUT/table.md`` and ``OUT/table.csv`` compare with the unchanged method. SEQUENCE is what
+``p2p run`` takes, with masks, truth and models; ``--clicks`` starts from one click per object instead of masks.
+
+Scores are means over the objects of a run, in percent, aligned at the first scored frame with a pose. A frame is
+confidently wrong where the confidence is above 0.5 and ADD or the error of translation above 5 cm. The Brier score is
+that of the confidence, where a pose within 2 cm and 5 degrees is right; the squared errors are those of rotation and
+of translation by the covariance, whose expectation is 3, as medians over the frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "tools"))
+from mutants import read_mechanisms, switch_off  # noqa: E402
+
+UNCHANGED = "unchanged"
+#: A claim, and an error that belies it.
+CONFIDENT, FAR_M = 0.5, 0.05
+RIGHT_M, RIGHT_DEG = 0.02, 5.0
+MIN_VISIBLE_PX = 300
+MODEL_POINTS = 2000
+SUMS = ["frames", "lost", "confidently_wrong"]
+MEANS = ["add", "adds", "brier", "rotation_error2", "translation_error2"]
+
+
+def track(sequence: str, clicks: bool, out: Path) -> None:
+    """Follow every object of a sequence with the library that is imported; its estimates go to the file ``out``."""
+    from p2p_lib import Point2Pose, open_sequence, preset
+
+    seq = open_sequence(sequence)
+    method, first = Point2Pose(seq.camera, preset("default")), seq.masks(0) or {}
+    for name in seq.objects:
+        if not clicks:
+            method.add_object(name)
+        elif name in first and first[name].any():
+            method.add_object(name, clicks=innermost_pixel(first[name]))
+    frame_ms, told = [], {name: [] for name in method.objects}
+    for t in range(len(seq)):
+        frame, masks = seq.frame(t), None if clicks else seq.masks(t)
+        start = time.process_time()
+        estimates = method.step(frame, masks)
+        frame_ms.append(1e3 * (time.process_time() - start))
+        for name, e in estimates.items():
+            nothing = np.full((4, 4), np.nan), 0.0, np.full((6, 6), np.nan)
+            told[name].append(nothing if e.T_cam_obj is None else (e.T_cam_obj, e.confidence, e.covariance))
+    arrays = {}
+    for name, frames in told.items():
+        keys = f"{name}/T_cam_obj", f"{name}/confidence", f"{name}/covariance"
+        arrays |= dict(zip(keys, map(np.array, zip(*frames, strict=True)), strict=True))
+    np.savez(out, frame_ms=frame_ms, **arrays)
+
+
+def innermost_pixel(mask: np.ndarray) -> np.ndarray:
+    """(1, 2) the pixel of a mask (H, W) that is farthest from its rim."""
+    import cv2
+
+    v, u = np.unravel_index(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5).argmax(), mask.shape)
+    return np.array([[u, v]], float)
+
+
+@lru_cache
+def known_truth(sequence: str) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Per object with truth and a model: T_cam_model (N, 4, 4), scored frames (N,) bool, points (V, 3) of its model."""
+    from p2p_lib import open_sequence
+    from p2p_lib.datasets.models import find_models, load_points
+
+    seq, known = open_sequence(sequence), {}
+    visible_px = [seq.visible_px(t) or {} for t in range(len(seq))]
+    for name, model in find_models(seq).items():
+        truth, px = seq.truth[name], np.array([at.get(name, 0) for at in visible_px])
+        scored = np.isfinite(truth.T_cam_model).all((1, 2)) & truth.labelled & (px >= MIN_VISIBLE_PX)
+        points = np.random.default_rng(0).permutation(load_points(model))[:MODEL_POINTS]
+        known[name] = truth.T_cam_model, scored, points
+    return known
+
+
+def score_object(
+    T_cam_obj: np.ndarray,
+    confidence: np.ndarray,
+    covariance: np.ndarray,
+    T_cam_model: np.ndarray,
+    points: np.ndarray,
+) -> dict[str, float]:
+    """The numbers of one object over its scored frames; poses (n, 4, 4) are NaN where there is none."""
+    from p2p_lib.core import se3
+    from p2p_lib.evaluation import metrics
+
+    posed = np.flatnonzero(np.isfinite(T_cam_obj).all((1, 2)))
+    if not len(posed):
+        return {"add": 0.0, "adds": 0.0, "frames": len(T_cam_obj), "lost": len(T_cam_obj), "confidently_wrong": 0}
+    T_obj_model = se3.inverse(T_cam_obj[posed[0]]) @ T_cam_model[posed[0]]
+    T_pred, T_true = T_cam_obj @ T_obj_model, T_cam_model @ se3.inverse(T_obj_model)
+    add_m = metrics.add_m(T_pred, T_cam_model, points)
+    apart_m = np.linalg.norm((T_pred - T_cam_model)[:, :3, 3], axis=1)
+    judged = posed[1:]  # the first is right by alignment
+    off = se3.log(se3.inverse(T_true[judged]) @ T_cam_obj[judged])  # right tangent of T_cam_obj, as the covariance
+    turned_deg = np.degrees(np.linalg.norm(off[:, :3], axis=1))
+    right = (turned_deg <= RIGHT_DEG) & (apart_m[judged] <= RIGHT_M)
+    error2 = [
+        np.einsum("ni,nij,nj->n", off[:, s], np.linalg.inv(covariance[judged][:, s, s]), off[:, s])
+        for s in (slice(0, 3), slice(3, 6))
+    ]
+    wrong = (add_m[posed] > FAR_M) | (apart_m[posed] > FAR_M)
+    return {
+        "add": metrics.auc_exact(add_m),
+        "adds": metrics.auc_exact(metrics.adds_m(T_pred, T_cam_model, points, workers=1)),
+        "brier": float(np.mean((confidence[judged] - right) ** 2)),
+        "rotation_error2": float(np.median(error2[0])),
+        "translation_error2": float(np.median(error2[1])),
+        "frames": len(T_cam_obj),
+        "lost": len(T_cam_obj) - len(posed),
+        "confidently_wrong": int((wrong & (confidence[posed] > CONFIDENT)).sum()),
+    }
+
+
+def score(sequence: str, tracked: Path) -> dict[str, float]:
+    """The numbers of one run: means and sums over its objects."""
+    run, rows = np.load(tracked), []
+    for name, (T_cam_model, scored, points) in known_truth(sequence).items():
+        if f"{name}/T_cam_obj" in run:
+            told = (run[f"{name}/{key}"][scored] for key in ("T_cam_obj", "confidence", "covariance"))
+            rows.append(score_object(*told, T_cam_model[scored], points))
+    table = pd.DataFrame(rows, columns=[*MEANS, *SUMS])
+    return table[MEANS].mean().to_dict() | table[SUMS].sum().to_dict() | {"frame_ms": float(run["frame_ms"].mean())}
+
+
+def run_once(mechanism: dict[str, str] | None, sequence: str, clicks: bool) -> dict[str, float | str]:
+    """A run without the mechanism, scored by the library as it is; ``failed`` says with which error it ended."""
+    with tempfile.TemporaryDirectory() as scratch:
+        shutil.copytree(ROOT / "p2p_lib", Path(scratch) / "p2p_lib")
+        if mechanism is not None:
+            switch_off(mechanism, Path(scratch))
+        out = Path(scratch) / "tracked.npz"
+        command = [sys.executable, __file__, "--track", sequence, str(out), *(["--clicks"] if clicks else [])]
+        done = subprocess.run(command, env=os.environ | {"PYTHONPATH": scratch}, capture_output=True, text=True)
+        if done.returncode:
+            return {"failed": done.stderr.strip().splitlines()[-1]}
+        return score(sequence, out)
+
+
+def compare(runs: pd.DataFrame) -> pd.DataFrame:
+    """Per mechanism what the method loses without it, over the sequences on which both ran."""
+    numbers = runs.set_index(["sequence", "mechanism"])[MEANS + SUMS].astype(float).unstack("mechanism")
+    whole, rows = numbers.xs(UNCHANGED, axis=1, level=1), []
+    for name in runs["mechanism"].drop_duplicates().drop(0):
+        gain = (whole - numbers.xs(name, axis=1, level=1)).dropna(subset=["add"])
+        if len(gain):
+            worst, best = gain["add"].idxmax(), gain["add"].idxmin()
+            row = {"mechanism": name, "sequences": len(gain), "ADD": gain["add"].mean(), "ADD-S": gain["adds"].mean()}
+            row |= {"most": f"{gain['add'][worst]:+.2f} {worst}", "least": f"{gain['add'][best]:+.2f} {best}"}
+            row |= {"lost": -gain["lost"].sum(), "confidently wrong": -gain["confidently_wrong"].sum()}
+            rows.append(
+                row | {"Brier": -gain["brier"].mean(), "unchanged": int((gain[["add", "adds"]] == 0).all(1).sum())}
+            )
+    return pd.DataFrame(rows).set_index("mechanism").sort_values("ADD", ascending=False) if rows else pd.DataFrame()
+
+
+def as_markdown(table: pd.DataFrame) -> str:
+    """A table for people."""
+    shown = table.reset_index().map(lambda cell: f"{cell:+.3f}" if isinstance(cell, float) else str(cell))
+    rows = [list(shown), ["---"] * shown.shape[1], *shown.to_numpy().tolist()]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("out", type=Path, metavar="OUT")
+    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    parser.add_argument("--mechanisms", default="", metavar="A,B", help="only these")
+    parser.add_argument("--clicks", action="store_true", help="from one click per object instead of masks")
+    asked = parser.parse_args()
+    asked.out.mkdir(parents=True, exist_ok=True)
+    log = asked.out / "runs.jsonl"
+    runs = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    done = {(run["mechanism"], run["sequence"]) for run in runs}
+    for mechanism in [None, *read_mechanisms([name for name in asked.mechanisms.split(",") if name])]:
+        for sequence in asked.sequences:
+            what = {
+                "mechanism": mechanism["name"] if mechanism else UNCHANGED,
+                "sequence": Path(sequence).name + (" clicks" if asked.clicks else ""),
+            }
+            if tuple(what.values()) in done:
+                continue
+            runs.append(what | run_once(mechanism, sequence, asked.clicks))
+            with log.open("a") as file:
+                file.write(json.dumps(runs[-1]) + "\n")
+            print(json.dumps(runs[-1]), flush=True)
+    table = compare(pd.DataFrame(runs))
+    table.to_csv(asked.out / "table.csv")
+    (asked.out / "table.md").write_text(as_markdown(table))
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--track":
+        track(sys.argv[2], "--clicks" in sys.argv, Path(sys.argv[3]))
+    else:
+        main()

@@ -1,0 +1,378 @@
+"""One object's step on exact depth of an analytic shape, with tracks made up by the test: each mechanism by itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from p2p_lib.core import se3
+from p2p_lib.core.config import preset
+from p2p_lib.core.interfaces import Candidates
+from p2p_lib.core.stopwatch import Stopwatch
+from p2p_lib.core.types import Frame, Status, Tracks
+from p2p_lib.method import refinement
+from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
+from tests.method.analytic_scene import CAMERA, LUMP, look_from, render
+
+START = look_from((1.0, 0.2, 0.5))
+NO_SURFACE = {"method__surface": False, "refinement__residuals": "none", "method__graph": False}
+
+
+def turned(deg: float, T: np.ndarray = START) -> np.ndarray:
+    """The pose turned about the object's z axis, and a little moved."""
+    return T @ se3.exp(np.array([0, 0, np.radians(deg), 0, 0, 0.0005 * deg]))
+
+
+class Grid:
+    """Offers the pixels of a lattice inside the mask."""
+
+    name = "grid"
+
+    def detect(self, frame, mask):
+        v, u = np.nonzero(mask)
+        on = (u % 7 == 0) & (v % 7 == 0)
+        return Candidates(np.stack([u[on], v[on]], -1).astype(float), np.linspace(1, 0.5, on.sum()))
+
+
+class Lump:
+    """The object before the camera, and a tracker that knows where its points are."""
+
+    def __init__(self, **settings):
+        config = preset().with_values({key.replace("__", "."): value for key, value in settings.items()})
+        rng = np.random.default_rng(0)
+        self.tracker = ObjectTracker("lump", CAMERA, config, Grid(), rng, Stopwatch())
+        self.p_model, self.steps, self.T_first = np.zeros((0, 3)), [], None
+
+    def tracks(self, T_cam_model: np.ndarray) -> Tracks:
+        """Perfect tracks of the map's points."""
+        ids = self.tracker.map.ids
+        p_cam = se3.transform(T_cam_model, self.p_model[ids])
+        uv = CAMERA.project(p_cam)
+        depth, mask = render(LUMP, T_cam_model)
+        u, v = np.clip(np.rint(uv), 0, [CAMERA.width - 1, CAMERA.height - 1]).astype(int).T
+        visible = mask[v, u] & (np.abs(depth[v, u] - p_cam[:, 2]) < 0.004)
+        return Tracks(ids, uv, visible, np.where(visible, 0.1, 1.0))
+
+    def observed(self, T_cam_model: np.ndarray, spoil=None, mask: np.ndarray | None = None):
+        depth, seen = render(LUMP, T_cam_model)
+        frame = Frame(len(self.steps), len(self.steps) / 30, np.zeros((*depth.shape, 3), np.uint8), depth)
+        tracks = self.tracks(T_cam_model)
+        return self.tracker.observe(frame, seen if mask is None else mask, tracks if spoil is None else spoil(tracks))
+
+    def see(self, T_cam_model: np.ndarray, spoil=None, mask: np.ndarray | None = None) -> ObjectStep:
+        """One frame at a true pose; ``spoil`` changes the tracks."""
+        obs = self.observed(T_cam_model, spoil, mask)
+        step = self.tracker.step(obs)
+        asked = step.requests
+        if len(asked.keys):
+            u, v = np.rint(asked.add_px).astype(int).T
+            p_cam = CAMERA.unproject(asked.add_px, obs.frame.depth_m[v, u].astype(float))
+            ids = len(self.p_model) + np.arange(len(u))
+            self.p_model = np.concatenate([self.p_model, se3.transform(se3.inverse(T_cam_model), p_cam)])
+            self.tracker.map.assign(asked.keys, ids)
+        if self.T_first is None:
+            self.T_first = (step.estimate.T_cam_obj, T_cam_model)
+        self.steps.append(step)
+        return step
+
+    def off(self, T_cam_model: np.ndarray) -> tuple[float, float]:
+        """Degrees and millimetres by which the newest pose is wrong."""
+        T_obj_model = se3.inverse(self.T_first[0]) @ self.T_first[1]
+        error = se3.inverse(T_cam_model) @ self.steps[-1].estimate.T_cam_obj @ T_obj_model
+        return np.degrees(se3.angle_rad(error)), 1e3 * np.linalg.norm(error[:3, 3])
+
+
+def begun(**settings) -> Lump:
+    lump = Lump(**settings)
+    assert lump.see(START).estimate.status is Status.TRACKED and len(lump.tracker.map) >= 25
+    return lump
+
+
+def hide(rows):
+    return lambda tracks: replace(tracks, visible=tracks.visible & ~rows(tracks))
+
+
+def moved_to(T_wrong, lump: Lump, rows, uncertainty: float = 0.1):
+    """These rows follow another rigid motion; their pixels stay on the object."""
+
+    def spoil(tracks: Tracks) -> Tracks:
+        at = rows(tracks)
+        uv = tracks.uv_px.copy()
+        uv[at] = CAMERA.project(se3.transform(T_wrong, lump.p_model[tracks.ids[at]]))
+        return replace(tracks, uv_px=uv, uncertainty=np.where(at, uncertainty, tracks.uncertainty))
+
+    return spoil
+
+
+def visible_first(n: int, last: bool = False):
+    """The first (or last) n of the visible rows."""
+
+    def rows(tracks: Tracks) -> np.ndarray:
+        at = np.flatnonzero(tracks.visible)
+        return np.isin(np.arange(len(tracks)), at[-n:] if last else at[:n])
+
+    return rows
+
+
+def settled(lump: Lump, degrees) -> Lump:
+    for deg in degrees:
+        lump.see(turned(deg))
+    return lump
+
+
+# --- following, and what it follows ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", [{}, {"method__surface": False, "method__graph": False}], ids=["all", "points"])
+def test_a_turning_object_is_followed(settings):
+    lump = settled(begun(**settings), range(2, 31, 2))
+    assert {step.estimate.status for step in lump.steps} == {Status.TRACKED}
+    turn_deg, off_mm = lump.off(turned(30))
+    assert turn_deg < 1 and off_mm < 1.5
+    assert sum(step.estimate.keyframe for step in lump.steps) >= 3
+
+
+def test_uncertain_tracks_have_no_say():
+    """Two thirds of the tracks follow another motion, and say that they are uncertain."""
+    lump = begun(**NO_SURFACE)
+    n = int(lump.tracks(turned(2)).visible.sum())
+    lump.see(turned(2), moved_to(turned(9), lump, visible_first(2 * n // 3), uncertainty=0.7))
+    assert lump.off(turned(2))[0] < 0.5
+
+
+def pending_and_promoted() -> tuple[Lump, np.ndarray]:
+    """A lump whose newest points are pending; (N,) bool which."""
+    lump = settled(begun(**NO_SURFACE, sampling__max_visible=200, sampling__points=60), [4, 8, 11])
+    pending = ~lump.tracker.map.promoted
+    assert pending.sum() > 15 and lump.tracker.map.promoted.sum() > 15
+    return lump, pending
+
+
+def test_pending_points_have_no_say_while_keypoints_suffice():
+    lump, pending = pending_and_promoted()
+    step = lump.see(turned(12), moved_to(turned(20), lump, lambda tracks: pending & tracks.visible))
+    assert lump.off(turned(12))[0] < 0.5
+    assert step.estimate.inliers <= (~pending).sum()
+
+
+def test_pending_points_help_where_few_keypoints_are_seen():
+    lump, pending = pending_and_promoted()
+    few = lambda tracks: ~pending & (np.cumsum(~pending & tracks.visible) > 6)  # noqa: E731
+    assert lump.see(turned(12), hide(few)).estimate.inliers > 12
+
+
+def test_where_keypoints_contradict_each_other_pending_points_and_the_surface_propose():
+    lump, pending = pending_and_promoted()
+    rng = np.random.default_rng(3)
+
+    def scattered(tracks: Tracks) -> Tracks:
+        at = ~pending & (np.cumsum(~pending & tracks.visible) > 6)
+        uv = tracks.uv_px + np.where(at[:, None], rng.uniform(-15, 15, tracks.uv_px.shape), 0)
+        return replace(tracks, uv_px=uv)
+
+    assert lump.see(turned(12), scattered).estimate.inliers > 12
+    full = settled(begun(), [2])
+    obs = full.observed(turned(4), moved_to(turned(-20), full, visible_first(14)))
+    use = obs.seen & full.tracker.map.promoted
+    assert 14 < 0.7 * use.sum(), "the largest consensus is a minority"
+    assert "surface" in {h.origin for h in full.tracker._register(obs)}
+
+
+def test_what_moved_evenly_is_expected_to_go_on():
+    """Without a surface, a smaller consensus on the motion so far outweighs a larger one that jumps."""
+    lump = settled(begun(**NO_SURFACE), [1, 2])
+    n = int(lump.tracks(turned(3)).visible.sum())
+    lump.see(turned(3), moved_to(turned(40), lump, visible_first(n // 2 + 2)))
+    assert lump.off(turned(3))[0] < 1
+
+
+def test_last_poses_compete_with_what_samples_find():
+    lump = settled(begun(**NO_SURFACE), [1, 2])
+    obs = lump.observed(turned(3))
+    empty = replace(lump.tracker.config.registration, iterations=1, sample_size=20)
+    lump.tracker.config = replace(lump.tracker.config, registration=empty)
+    spoilt = moved_to(turned(40), lump, visible_first(int(obs.seen.sum()) // 2))
+    origins = {h.origin for h in lump.tracker._register(lump.observed(turned(3), spoilt))}
+    assert origins & {"last pose", "constant velocity"}
+
+
+def test_the_surface_tracks_where_no_point_is_seen():
+    lump = settled(begun(), [2])
+    step = lump.see(turned(4), hide(lambda tracks: tracks.visible))
+    assert step.estimate.status is Status.DEGRADED and step.estimate.inliers == 0
+    assert lump.off(turned(4))[0] < 1 and lump.off(turned(4))[1] < 1
+
+
+def test_the_surface_overrules_more_points_that_agree_on_a_wrong_motion():
+    lump = settled(begun(), [2])
+    n = int(lump.tracks(turned(4)).visible.sum())
+    lump.see(turned(4), moved_to(turned(10), lump, visible_first(int(0.65 * n))))
+    assert lump.off(turned(4))[0] < 1.5
+
+
+@pytest.mark.parametrize(("rule", "before"), [("support", True), ("surface", False)])
+def test_ours_refines_before_it_selects_the_paper_after(rule, before, monkeypatch):
+    lump, refined = settled(begun(selection__rule=rule), [2]), []
+    inner = refinement.refine
+    monkeypatch.setattr(refinement, "refine", lambda *a, **k: refined.append(k["keypoints"]) or inner(*a, **k))
+    n = int(lump.tracks(turned(4)).visible.sum())
+    lump.see(turned(4), moved_to(turned(18), lump, visible_first(n // 2)))
+    assert (len(refined) > 1) == before
+    assert all(points is not None for points in refined), "with the keypoints that agree"
+
+
+# --- what is believed, kept and asked for ------------------------------------------------------
+
+
+def test_tracks_that_contradict_the_motion_are_rejected():
+    lump = settled(begun(), [2])
+    spoilt = moved_to(turned(18), lump, visible_first(8))
+    obs = lump.observed(turned(4), spoilt)
+    wrong = obs.tracks.ids[visible_first(8)(obs.tracks) & obs.seen]
+    step = lump.see(turned(4), spoilt)
+    assert set(step.requests.reject.tolist()) == set(wrong.tolist()) != set()
+
+
+def test_wrong_observations_stay_out_of_a_keyframe():
+    """At a keyframe the graph gets the keypoints that agree; a wrong one would bend it."""
+    lump = settled(begun(), [5])
+    tracks = lump.tracks(turned(12))
+    wrong = lump.tracker.map.keys[visible_first(4)(tracks)]
+    step = lump.see(turned(12), moved_to(turned(30), lump, visible_first(4)))
+    assert step.estimate.keyframe
+    assert not np.isin(wrong, lump.tracker.model.graph._keyframes[max(lump.tracker.model.graph.keys)].ids).any()
+
+
+def test_a_turn_asks_for_a_keyframe_and_few_points_do_after_a_while():
+    lump = begun()
+    assert not lump.see(turned(5)).estimate.keyframe and lump.see(turned(11)).estimate.keyframe
+    starved = begun()
+    few = hide(lambda tracks: np.cumsum(tracks.visible) > 15)
+    asked = [starved.see(turned(0.2 * k), few).estimate.keyframe for k in range(1, 9)]
+    wait = preset().keypoint_map.cooldown
+    assert asked[: wait + 1] == [False] * wait + [True]
+
+
+def test_no_keyframe_before_a_return_is_confirmed():
+    lump, nothing = settled(begun(), [2]), np.zeros((CAMERA.height, CAMERA.width), bool)
+    assert lump.see(turned(4), mask=nothing).estimate.status is Status.OCCLUDED
+    for _ in range(5):
+        step = lump.see(turned(16))
+        assert step.estimate.status is Status.RECOVERED and not step.estimate.keyframe
+    assert lump.see(turned(16)).estimate.keyframe
+
+
+def test_points_follow_what_the_graph_finds():
+    lump = settled(begun(), [5])
+    before = dict(zip(lump.tracker.map.keys.tolist(), lump.tracker.map.p_obj.copy()))
+    step = lump.see(
+        turned(12), lambda t: replace(t, uv_px=t.uv_px + np.random.default_rng(0).normal(0, 0.4, (len(t), 2)))
+    )
+    assert step.estimate.keyframe and lump.tracker.model._corrected
+    after = dict(zip(lump.tracker.map.keys.tolist(), lump.tracker.map.p_obj))
+    moved_mm = [1e3 * np.linalg.norm(after[k] - before[k]) for k in before if k in after]
+    assert 0.001 < np.median(moved_mm) < 2
+
+
+def test_the_surface_follows_what_the_graph_finds():
+    lump, moved = settled(begun(), [5, 12]), []
+    lump.tracker.model.surface.move = lambda poses, limit: moved.append((set(poses), limit)) or []
+    lump.see(turned(13))
+    assert moved and moved[0][0] == set(lump.tracker.model.graph.keys) and moved[0][1] == 1
+    assert not lump.tracker.model._corrected, "nothing is left to move"
+
+
+def test_a_frame_that_moved_far_verifies_no_point():
+    """Pending points are not promoted from frames between which the object moved by 3 degrees."""
+    slow, fast = (settled(begun(sampling__max_visible=200), [5, 11, *more]) for more in ((12, 13, 14), (14, 17, 20)))
+    assert slow.tracker.map.promoted.sum() > fast.tracker.map.promoted.sum()
+
+
+def test_no_more_points_than_are_missing_are_added():
+    lump = begun(sampling__max_visible=35)
+    step = lump.see(turned(12))
+    assert step.estimate.keyframe
+    assert len(step.requests.keys) == max(35 - step.estimate.visible_points, 0) > 0
+
+
+def test_points_that_a_doubtful_pose_placed_count_less():
+    one, other = settled(begun(), [2]), settled(begun(), [2])
+    other.tracker.map.confidence[:] = 0.1
+    assert one.see(turned(3)).estimate.confidence > other.see(turned(3)).estimate.confidence + 0.02
+
+
+# --- start, absence, and what others are told --------------------------------------------------
+
+
+def test_an_object_that_still_comes_into_view_is_not_started():
+    lump, (_, mask) = Lump(), render(LUMP, START)
+    columns = np.flatnonzero(mask.any(0))
+    sliver = mask & (np.arange(CAMERA.width) < columns[len(columns) // 2])
+    first = Lump()
+    first.tracker.life = replace(first.tracker.life, start_px=int(sliver.sum()))
+    assert first.see(START).estimate.reason == "still coming into view"
+    assert lump.see(START).estimate.status is Status.TRACKED
+    paper = Lump(method__gates="none")
+    paper.tracker.life = first.tracker.life
+    assert paper.see(START).estimate.status is Status.TRACKED
+
+
+def test_points_off_the_mask_are_no_observations_and_elsewhere_when_it_is_away():
+    lump = settled(begun(), [2])
+    _, mask = render(LUMP, turned(4))
+    left = mask & (np.arange(CAMERA.width) < np.median(np.flatnonzero(mask.any(0))))
+    obs = lump.observed(turned(4), mask=left)
+    u, v = np.rint(obs.tracks.uv_px[obs.seen]).astype(int).T
+    assert 0 < obs.seen.sum() < obs.tracks.visible.sum() and left[v, u].all()
+    assert not len(lump.tracker.misplaced(obs).reject)
+    lump.see(turned(4), mask=np.zeros_like(mask))
+    away = lump.observed(turned(4), mask=left)
+    assert (
+        set(lump.tracker.misplaced(away).reject.tolist()) == set(away.tracks.ids[away.outside_mask()].tolist()) != set()
+    )
+
+
+def test_an_object_is_awaited_from_when_its_mask_is_back():
+    lump, nothing = settled(begun(), [2]), np.zeros((CAMERA.height, CAMERA.width), bool)
+    full = ~nothing
+    assert not lump.tracker.awaited(full), "it is there"
+    lump.see(turned(3), mask=nothing)
+    assert lump.tracker.awaited(full) and not lump.tracker.awaited(nothing) and not lump.tracker.awaited(None)
+    sliver = nothing.copy()
+    sliver[:2, :40] = True
+    assert not lump.tracker.awaited(sliver) and lump.see(turned(3), mask=sliver).estimate.status is Status.OCCLUDED
+
+
+def test_few_points_say_where_the_others_show():
+    lump = settled(begun(), [2])
+    few, truth = hide(lambda tracks: np.cumsum(tracks.visible) > 8), lump.tracks(turned(4))
+    obs = lump.observed(turned(4), few)
+    expected = lump.tracker.expected_px(obs)
+    known = np.isfinite(expected[:, 0])
+    assert known.sum() > 15
+    assert np.abs(expected - truth.uv_px)[known].max() < 1.5
+    assert lump.tracker.expected_px(lump.observed(turned(4))) is None, "enough are seen"
+    covered = replace(obs, frame=replace(obs.frame, depth_m=obs.frame.depth_m - np.float32(0.05)))
+    assert not np.isfinite(lump.tracker.observer.expected_px(covered, START, lump.tracker.map.p_obj)).any()
+
+
+def test_a_hint_rejects_what_agrees_on_no_pose_only_while_it_is_away():
+    lump = settled(begun(), [2])
+    frame, wrong = lump.observed(turned(4)).frame, moved_to(turned(30), lump, visible_first(6))
+    there, requests = lump.tracker.hint(frame, wrong(lump.tracks(turned(4))))
+    assert len(there.uv_px) > 10 and there.distance_m is not None and not len(requests.reject)
+    lump.see(turned(3), mask=np.zeros((CAMERA.height, CAMERA.width), bool))
+    few = wrong(lump.tracks(turned(4)))
+    few = replace(few, visible=few.visible & (np.cumsum(few.visible) <= 12))
+    back, requests = lump.tracker.hint(frame, few)
+    assert not len(back.uv_px), "six points are no return"
+    assert set(requests.reject.tolist()) >= set(few.ids[visible_first(6)(few)].tolist())
+
+
+def test_questions_change_nothing():
+    lump, other = settled(begun(), [2]), settled(begun(), [2])
+    for _ in range(3):
+        obs = lump.observed(turned(4))
+        lump.tracker.misplaced(obs)
+        lump.tracker.awaited(obs.mask)
+    np.testing.assert_array_equal(lump.see(turned(4)).estimate.T_cam_obj, other.see(turned(4)).estimate.T_cam_obj)
