@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.true_tracks import SurfacePoints, TrueScene, draw_queries, true_tracks
+from p2p_lib.synthetic import SCENARIOS
+from tests.synthetic.surface_points import see
 
 EVERY = 15  # frames of crossing looked at
 
@@ -21,9 +24,24 @@ def crossing():
 
 @pytest.fixture(scope="module")
 def exact(crossing):
-    """The renderer's own tracks of random surface points."""
-    with np.load(crossing.path / "tracks.npz") as file:
-        return dict(file)
+    """Random points on the true surfaces and where exact geometry has them, in the frames looked at."""
+    scenario = SCENARIOS["crossing"](0)
+    bodies = {body.name: (k, body) for k, body in enumerate(scenario.bodies, 1)}
+    points = {name: bodies[name][1].mesh.sample(256, np.random.default_rng(0)) for name in crossing.truth}
+    uv_px = np.full((len(crossing), 256 * len(points), 2), np.nan)
+    visible = np.zeros(uv_px.shape[:2], bool)
+    for t in range(0, len(crossing), EVERY):
+        image = scenario.rendered(t, None)
+        for i, (name, at) in enumerate(points.items()):
+            label, body = bodies[name]
+            T_cam_model = se3.inverse(scenario.T_world_cam[t]) @ body.T_world_model[t]
+            rows = slice(256 * i, 256 * (i + 1))
+            uv_px[t, rows], visible[t, rows] = see(
+                crossing.camera, T_cam_model, at, image.depth_m, image.label == label
+            )
+    owner = np.repeat(np.arange(len(points)), 256)
+    p_model = np.concatenate([at[0] for at in points.values()])
+    return {"uv_px": uv_px, "visible": visible, "object_index": owner, "p_model": p_model}
 
 
 @pytest.fixture(scope="module")
