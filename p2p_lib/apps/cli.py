@@ -175,7 +175,7 @@ def _eval(a: argparse.Namespace) -> None:
 
         print(as_csv(run_rows(a.run, options.models), COLUMNS), end="")
     elif a.poses is not None:
-        from p2p_lib.apps.evaluate import evaluate_poses
+        from p2p_lib.run import evaluate_poses
 
         how = {"format": options.format, "start": options.start, "stop": options.stop}
         _show(evaluate_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how), a.json)
@@ -263,7 +263,7 @@ def _benchmark(a: argparse.Namespace) -> int:
     _arg("--frame", choices=("object", "model"), help="of the tracker, or by truth the model's (default for bop)"),
 )
 def _export(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.evaluate import export_run
+    from p2p_lib.run import export_run
 
     for path in export_run(a.run, a.format, a.out, a.frame):
         print(path)

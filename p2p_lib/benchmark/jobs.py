@@ -77,12 +77,8 @@ class Job:
             prompts = [Prompt(name, planned.start, at) for name, at in clicks.items()]
         objects = tuple(planned.objects) or (tuple(planned.clicks) if prompts else known)
         return RunOptions(
-            preset=method.preset,
-            settings=method.settings,
+            **method.model_dump(include={"preset", "settings", "tracker", "detector", "masks"}),
             seed=self.seed,
-            tracker=method.tracker,
-            detector=method.detector,
-            masks=method.masks,
             prompts=prompts,
             objects=objects[: method.count or None] or None,
             start=planned.start,
@@ -140,7 +136,7 @@ def _keyed(job: Job, known: dict[tuple, str]) -> Job:
             "library": library_version(),
             "measure": job.measure,
             "config": config.as_dict(),
-            "method": {k: getattr(method, k) for k in ("tracker", "detector", "masks", "scale", "count")},
+            "method": method.model_dump(include={"tracker", "detector", "masks", "scale", "count"}),
             "sequence": _fingerprint(job, known),
             "cut": [planned.start, planned.stop, planned.objects],
             "clicks": planned.clicks if uses_clicks(method) else {},

@@ -95,8 +95,8 @@ class TrackTask:
         """(T, N) bool: after the query, where truth says whether the point is visible."""
         return after_query(self.queries.frame, len(self.sequence)) & self.truth.known
 
-    def tracker(self, name: str, config: Config) -> PointTracker:
-        """The tracker of this name: ``oracle``, which knows the truth, or one of the known trackers."""
+    def tracker(self, name: str | PointTracker, config: Config) -> PointTracker:
+        """The tracker of this name: ``oracle``, which knows the truth, or a known one; or the one given."""
         known = OracleTracker(self.scene, config.oracle, self.seed) if name == OracleTracker.name else name
         return make_tracker(known, config.tracking, np.random.default_rng(self.seed))
 
