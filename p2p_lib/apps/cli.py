@@ -48,9 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 # --- how a command is declared -------------------------------------------------------------------
 
-_COMMANDS: list[Callable[[Any, Any], None]] = []  # each adds one command to the parsers of p2p and of p2p data
-
 Argument = Callable[[argparse.ArgumentParser], Any]
+_COMMANDS: list[tuple[str, str, tuple[Argument, ...], Callable]] = []  # name, help, arguments, what carries it out
 
 
 def _arg(*flags: str, **how: Any) -> Argument:
@@ -67,15 +66,7 @@ def _command(name: str, help: str, *arguments: Argument) -> Callable:
     """Declare a command ``p2p NAME``, carried out by the function below it; its value is the exit code, None for 0."""
 
     def declare(function: Callable[[argparse.Namespace], int | None]) -> Callable:
-        def add(commands: Any, data: Any) -> None:
-            group, word = (data, name.removeprefix("data ")) if name.startswith("data ") else (commands, name)
-            parser = group.add_parser(word, help=help, description=help[0].upper() + help[1:] + ".")
-            for argument in arguments:
-                argument(parser)
-            parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-            parser.set_defaults(command=function, parser=parser, name=name)
-
-        _COMMANDS.append(add)
+        _COMMANDS.append((name, help, arguments, function))
         return function
 
     return declare
@@ -477,8 +468,13 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
     data = commands.add_parser("data", help="datasets and checkpoints: what they are, where, whether whole")
     actions = data.add_subparsers(metavar="ACTION", required=True, parser_class=_Parser)
-    for add in _COMMANDS:
-        add(commands, actions)
+    for name, help, arguments, function in _COMMANDS:
+        group, word = (actions, name.removeprefix("data ")) if name.startswith("data ") else (commands, name)
+        command = group.add_parser(word, help=help, description=help[0].upper() + help[1:] + ".")
+        for argument in arguments:
+            argument(command)
+        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        command.set_defaults(command=function, parser=command, name=name)
     return parser
 
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import OracleConfig
-from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.evaluation.true_tracks import NO_POINTS, TrueScene
+from p2p_lib.trackers.ids import PointIds
 
 # What is drawn for a frame; each kind has a stream of its own, so that points added later change no earlier draw.
 _NOISE, _DROPOUT, _OUTLIER, _PLACE = range(4)
@@ -29,43 +29,37 @@ class OracleTracker:
     def __init__(self, scene: TrueScene, config: OracleConfig | None = None, seed: int = 0):
         self.config = config or OracleConfig()
         self._scene, self._seed = scene, seed
-        self._frame: Frame | None = None  # the newest
+        self._ids = PointIds()
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
-        self._frame, self._next_id = frame, 0
-        self._ids, self._points = np.zeros(0, np.int64), NO_POINTS
+        self._ids.start()
+        self._frame, self._points = frame, NO_POINTS
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids."""
-        if self._frame is None:
-            raise BadInput("tracker", "queries before a frame", "start(frame) first")
         uv = np.asarray(uv_px, float).reshape(-1, 2)
-        ids = np.arange(self._next_id, self._next_id + len(uv))
-        self._next_id += len(uv)
-        self._ids = np.concatenate([self._ids, ids])
+        ids = self._ids.add(len(uv))
         new = self._scene.lift(self._frame, self._scene.owners(self._frame, uv), uv)
         self._points = joined([self._points, new])
         return ids
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Where truth has the points in the next frame, spoiled as configured."""
-        if self._frame is None:
-            raise BadInput("tracker", "a frame to track before any start", "start(frame) first")
+        self._ids.check_started()
         self._frame, cfg = frame, self.config
         sight = self._scene.see(frame, self._points)
-        visible = sight.visible & (self._uniform(_DROPOUT) >= cfg.dropout)
-        uv = sight.uv_px + cfg.noise_px * self._rng(_NOISE).standard_normal((self._next_id, 2))[self._ids]
-        stray = self._uniform(_OUTLIER) < cfg.outliers
-        turn = 2 * np.pi * self._uniform(_PLACE)
+        visible = sight.visible & (self._drawn(_DROPOUT, "random") >= cfg.dropout)
+        uv = sight.uv_px + cfg.noise_px * self._drawn(_NOISE, "standard_normal", 2)
+        stray = self._drawn(_OUTLIER, "random") < cfg.outliers
+        turn = 2 * np.pi * self._drawn(_PLACE, "random")
         uv += np.where(stray, cfg.outlier_px, 0)[:, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
         visible &= self._scene.sequence.camera.inside(uv)
-        return Tracks(self._ids.copy(), np.where(visible[:, None], uv, np.nan), visible, 1.0 - visible)
+        return Tracks(self._ids.live.copy(), np.where(visible[:, None], uv, np.nan), visible, 1.0 - visible)
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
-        keep = ~np.isin(self._ids, ids)
-        self._ids, self._points = self._ids[keep], self._points.select(keep)
+        self._points = self._points.select(self._ids.drop(ids))
 
     def reject(self, ids: np.ndarray) -> None:
         """Ignored: it knows better."""
@@ -73,9 +67,7 @@ class OracleTracker:
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Ignored: it knows better."""
 
-    def _rng(self, kind: int) -> np.random.Generator:
-        return np.random.default_rng([self._seed, self._frame.index, kind])
-
-    def _uniform(self, kind: int) -> np.ndarray:
-        """A number in [0, 1) for each live point."""
-        return self._rng(kind).random(self._next_id)[self._ids]
+    def _drawn(self, kind: int, distribution: str, *columns: int) -> np.ndarray:
+        """Numbers of a distribution of :class:`numpy.random.Generator`, a row for each live point."""
+        rng, live = np.random.default_rng([self._seed, self._frame.index, kind]), self._ids.live
+        return getattr(rng, distribution)((live.max(initial=-1) + 1, *columns))[live]
