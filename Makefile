@@ -15,7 +15,7 @@ help: ## this list
 setup: ## set up .venv (about a minute the first time, instant when nothing has changed)
 	@$(PYTHON) tools/bootstrap.py
 
-reproduce: setup ## run every notebook on embedded data into out/quick (profile quick: CPU, no downloads)
+reproduce: setup ## run every notebook on bundled data into out/quick (profile quick: CPU, no downloads)
 	@.venv/bin/p2p notebooks --profile quick
 
 figures: setup ## run every notebook on the data and backends present (profile full) and fill figures/

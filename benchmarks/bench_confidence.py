@@ -2,7 +2,7 @@
 
     python benchmarks/bench_confidence.py [SEED ...]      (400 401 402 where none is given)
 
-Tracks synthetic sequences that are degraded (pale labels, coarse depth, blurred noisy pictures) until many poses are
+Tracks synthetic sequences that are degraded (pale labels, coarse depth, blurred noisy images) until many poses are
 wrong, and prints per sequence and pooled: the share of poses within 2 cm and 5 degrees, the expected calibration error
 and the AUROC of the confidence. Then, on sequences as they are, the normalised squared error of the poses' covariance,
 for rotation and for translation, whose expectation is 3. Seeds 310 to 314 were used to set the parameters.

@@ -1,9 +1,9 @@
 """Memory and time per frame over a long stream: ``python benchmarks/bench_memory.py [frames] [sequence]``.
 
-An embedded sequence is played forwards and backwards without a cut (10,000 frames of ``synthetic/crossing`` by
+A bundled sequence is played forwards and backwards without a cut (10,000 frames of ``synthetic/crossing`` by
 default: each object is hidden completely more than 60 times). Every 500 frames a line says what is held: resident
 memory, the milliseconds of CPU per frame (median over the last whole round of the sequence), and per object the
-keypoints, keyframes of the graph, remembered views, pictures kept for re-integration, and voxels.
+keypoints, keyframes of the graph, remembered views, images kept for re-integration, and voxels.
 
 The bars: resident memory at the end within 50 MB of that after frame 1,000, and the median time within 20 %.
 """
@@ -42,7 +42,7 @@ def resident_mb() -> float:
 
 
 def held(method: Point2Pose) -> str:
-    """What each object keeps: points / graph keyframes / views / pictures / million voxels."""
+    """What each object keeps: points / graph keyframes / views / images / million voxels."""
     words = []
     for name, obj in method.objects.items():
         voxels = np.prod(obj.model.surface.shape) / 1e6
@@ -59,7 +59,7 @@ def main(frames: int = 10_000, name: str = "synthetic/crossing") -> None:
     for known in sequence.objects:
         method.add_object(known)
     cpu_ms, settled, with_pose = np.zeros(frames), None, 0
-    print(f"{name}, {frames} frames; per object: points/graph/views/pictures/M voxels", flush=True)
+    print(f"{name}, {frames} frames; per object: points/graph/views/images/M voxels", flush=True)
     for i, (frame, masks) in enumerate(there_and_back(sequence, frames), 1):
         start = time.process_time()
         estimates = method.step(frame, masks)

@@ -1,4 +1,4 @@
-"""The house keeps its floors, each heavy library its one home, and nothing tells of the machine it was built on."""
+"""Packages keep their layers, heavy libraries are used in one place each, and nothing tells of the machine."""
 
 import ast
 import re
@@ -10,8 +10,8 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 PACKAGE = PROJECT / "p2p_lib"
-#: Ground to roof; the parts of one floor do not know each other.
-FLOORS = [
+#: Lowest first; the packages of one layer do not import each other.
+LAYERS = [
     {"core"},
     {"method", "datasets"},
     {"synthetic"},
@@ -35,7 +35,7 @@ LAZY = ("torch", "open3d", "matplotlib", "pandas", "scipy", "skimage", "papermil
 
 
 def part(module: str) -> str:
-    """The part of the house that a module of ours belongs to."""
+    """The package that a module of ours belongs to."""
     return module.split(".")[1]
 
 
@@ -46,7 +46,7 @@ def imports(path: Path) -> list[str]:
         if isinstance(node, ast.Import):
             found += [name.name for name in node.names]
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import; say from p2p_lib... so that the floor is plain"
+            assert node.level == 0, f"{path}: relative import; say from p2p_lib... so that the layer is plain"
             whole = {"p2p_lib"} >= {node.module}
             found += [f"{node.module}.{name.name}" for name in node.names] if whole else [node.module]
         elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) == "import_module":
@@ -65,18 +65,18 @@ def tracked_files() -> list[Path]:
     return [PROJECT / name for name in listed.stdout.split("\0") if name and (PROJECT / name).is_file()]
 
 
-def test_every_part_has_a_floor():
+def test_every_package_has_a_layer():
     parts = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in sources()}
-    assert parts <= set().union(*FLOORS), "give the new part its floor in FLOORS"
+    assert parts <= set().union(*LAYERS), "give the new package its layer in LAYERS"
 
 
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_point_down(path):
-    floor = {name: level for level, names in enumerate(FLOORS) for name in names}
+    layer = {name: level for level, names in enumerate(LAYERS) for name in names}
     mine = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
     for module in imports(path):
         if module.startswith("p2p_lib.") and module != "p2p_lib.__version__" and part(module) != mine:
-            assert floor[part(module)] < floor[mine], f"{mine} (floor {floor[mine]}) imports {module}"
+            assert layer[part(module)] < layer[mine], f"{mine} (layer {layer[mine]}) imports {module}"
 
 
 @pytest.mark.parametrize("library", HOMES)

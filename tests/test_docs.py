@@ -1,6 +1,8 @@
 """What the documents say is so: files exist, commands are known, the example runs, the right people are cited."""
 
 import argparse
+import ast
+import importlib
 import re
 import subprocess
 import tomllib
@@ -32,6 +34,41 @@ def test_files_that_are_named_exist(name):
     named = {word for word in named if not word.startswith("out/") and word not in ("utils.py", "DIR/")}
     assert len(named) > 15
     missing = {word for word in named if not any((PROJECT / place / word).exists() for place in PLACES)}
+    assert not missing
+
+
+PACKAGES = sorted(path.parent for path in (PROJECT / "p2p_lib").glob("*/__init__.py"))
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.name)
+def test_a_package_says_where_to_look_first(package):
+    page = ast.get_docstring(ast.parse((package / "__init__.py").read_text()))
+    first = re.findall(r":mod:`~?([\w.]+)`", page)
+    assert first or package.name == "studies", "the modules to look at first"
+    assert all(module_of(name) for name in first)
+    assert f"`p2p_lib/{package.name}/`" in read("CONTRIBUTING.md")
+
+
+def test_the_page_of_the_method_names_every_file_of_it():
+    folder = PROJECT / "p2p_lib" / "method"
+    page = ast.get_docstring(ast.parse((folder / "__init__.py").read_text()))
+    named = set(re.findall(r"``(\w+)``", page)) | set(re.findall(r"p2p_lib\.method\.(\w+)`", page))
+    assert named == {path.stem for path in folder.glob("*.py")} - {"__init__"}
+
+
+def module_of(name: str) -> Path | None:
+    """The file or folder of a module of ours; None where there is none."""
+    path = PROJECT / name.replace(".", "/")
+    return next((place for place in (path, path.with_suffix(".py")) if place.exists()), None)
+
+
+def test_what_docstrings_refer_to_exists():
+    missing = []
+    for path in (PROJECT / "p2p_lib").rglob("*.py"):
+        for name in re.findall(r":\w+:`~?(p2p_lib\.[\w.]+)`", path.read_text()):
+            module, _, thing = name.rpartition(".")
+            if module_of(name) is None and not hasattr(importlib.import_module(module), thing):
+                missing.append(f"{path.relative_to(PROJECT)}: {name}")
     assert not missing
 
 

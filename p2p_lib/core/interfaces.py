@@ -25,7 +25,7 @@ class PointTracker(Protocol):
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame, forgetting any earlier one.
 
-        camera  that took the pictures, if somebody knows; a tracker may use it to reason in 3D
+        camera  that took the images, if somebody knows; a tracker may use it to reason in 3D
         """
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ class PointTracker(Protocol):
         """Follow all live queries into the next frame; rows sorted by id.
 
         search  (H, W) bool says where the objects are known to be, if somebody knows; a tracker may
-                use it to spare itself work elsewhere. None means the whole picture
+                use it to spare itself work elsewhere. None means the whole image
         urgent  the caller waits for invisible points to come back: worth more work in this frame
         """
 

@@ -1,5 +1,17 @@
 """The paper's method, and nothing else: one file per box of its overview figure.
 
-Look first at :mod:`p2p_lib.method.pipeline` (all objects, one frame) and :mod:`p2p_lib.method.object_tracker` (one
-object's step). The 2D tracker, the detector of candidates and the segmenter are parts that it is given.
+Look first at :mod:`~p2p_lib.method.pipeline` (all objects, one frame) and :mod:`~p2p_lib.method.object_tracker` (one
+object's step), then at the parts of that step in its order:
+
+- observe: ``observation`` lifts the object's 2D points and takes its dense cloud;
+- register: ``registration`` gives pose hypotheses against the keypoints of ``keypoint_map``;
+- refine: ``refinement`` moves poses onto the surface of ``tsdf``; ``observability`` says which motions its shape
+  determines;
+- select: ``selection``;
+- judge: ``lifecycle`` holds an object's state and every gate;
+- extend: ``object_model`` holds map, surface (``tsdf``, ``mesh``) and graph (``factor_graph``, ``keyframes``,
+  ``keyframe_views``); ``sampling`` chooses new points; ``confidence`` says how well the pose is known.
+
+The 2D tracker, the detector of candidates and the segmenter are parts that it is given; what it asks of them is in
+:mod:`p2p_lib.core.interfaces`.
 """

@@ -71,7 +71,7 @@ class Point2Pose:
 
         mask    (H, W) bool: where it is in the next frame
         clicks  (N, 2) pixels on the object in the next frame: the segmenter finds its mask there and in
-                every frame to come. :class:`BadInput` for clicks outside the picture or on another object's
+                every frame to come. :class:`BadInput` for clicks outside the image or on another object's
                 click; ``step`` raises it for clicks where there is no depth
         With neither the object is started by the first mask that ``step`` gets for it.
         """
@@ -129,7 +129,7 @@ class Point2Pose:
         for _ in range(self.tracker.latency_frames if waiting else 0):
             with self.stopwatch.frame():
                 owed = len(self._waiting) == self.tracker.latency_frames
-                estimates = self._advance(*waiting[-1])  # the last picture again
+                estimates = self._advance(*waiting[-1])  # the last image again
             if owed:
                 yield estimates
         self._waiting.clear()

@@ -197,14 +197,14 @@ class TsdfVolume:
         weight: float = 1.0,
         key: int | None = None,
     ) -> int:
-        """Fuse one masked RGB-D picture; returns how many voxels it touched.
+        """Fuse one masked RGB-D image; returns how many voxels it touched.
 
         Projective update of the appendix: d(v) = D(pi(v)) - z(v) with depth sampled at the nearest
-        pixel; a voxel outside the picture or mask, at an invalid depth, or with d < -tau is left alone;
+        pixel; a voxel outside the image or mask, at an invalid depth, or with d < -tau is left alone;
         the others take min(1, d / tau) into their weighted mean.
 
         depth_m (H, W) metres, 0 or not finite = invalid; rgb (H, W, 3) uint8; mask (H, W) bool.
-        ``weight=-1`` takes an equal picture at an equal pose out again, exactly up to rounding as long as
+        ``weight=-1`` takes an equal image at an equal pose out again, exactly up to rounding as long as
         the grid has not grown since. With ``key`` the observation is kept and can be moved
         (:meth:`move`) or taken out (:meth:`remove`), whether or not the grid has grown.
         An empty mask or one without any valid depth touches nothing.
@@ -269,25 +269,25 @@ class TsdfVolume:
         want = (camera.height, camera.width)
         if depth_m.shape != want or mask.shape != want or np.shape(rgb) != (*want, 3):
             raise BadInput(
-                "tsdf picture",
+                "tsdf image",
                 f"depth {depth_m.shape}, mask {mask.shape}, rgb {np.shape(rgb)}",
                 f"{want} as the camera",
             )
         rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         if len(rows) == 0:
             return None
-        picture = (depth_m, rgb, mask, camera, T_cam_obj, weight)
-        view = self._cut(cols[0], rows[0], cols[-1] + 1, rows[-1] + 1, *picture)
+        image = (depth_m, rgb, mask, camera, T_cam_obj, weight)
+        view = self._cut(cols[0], rows[0], cols[-1] + 1, rows[-1] + 1, *image)
         if not view.inside.any():
             return None
         self._grow(view)
         if self.config.carve:
-            view = self._cut(*self._window(view), *picture)
+            view = self._cut(*self._window(view), *image)
         lo, hi = self._frustum_box(view)
         return replace(view, lo=lo, hi=hi)
 
     def _cut(self, left, top, right, bottom, depth_m, rgb, mask, camera, T_cam_obj, weight: float) -> _View:
-        """The view of these columns and rows of a picture."""
+        """The view of these columns and rows of a image."""
         cut = np.s_[top:bottom, left:right]
         depth, mask = np.asarray(depth_m[cut], np.float32), mask[cut]
         measured = (depth > 0) & (depth < np.inf)
@@ -400,10 +400,10 @@ class TsdfVolume:
         return touched
 
     def _project(self, view: _View, lo: np.ndarray, hi: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-        """Index into the view's cut picture and depth z in metres of every voxel in [lo, hi), flat.
+        """Index into the view's cut image and depth z in metres of every voxel in [lo, hi), flat.
 
         Pixel coordinates times depth are affine in the voxel's indices, so each is a sum of three rows.
-        Whatever falls outside the cut picture lands on its border, which holds no depth.
+        Whatever falls outside the cut image lands on its border, which holds no depth.
         """
         cam, (h, w) = view.camera, view.depth_m.shape
         K = np.array([[cam.fx, 0, cam.cx - view.corner[0] + 1], [0, cam.fy, cam.cy - view.corner[1] + 1], [0, 0, 1.0]])

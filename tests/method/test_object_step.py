@@ -181,8 +181,12 @@ def test_where_keypoints_contradict_each_other_pending_points_and_the_surface_pr
 def test_what_moved_evenly_is_expected_to_go_on():
     """Without a surface, a smaller consensus on the motion so far outweighs a larger one that jumps."""
     lump = settled(begun(**NO_SURFACE), [1, 2])
-    n = int(lump.tracks(turned(3)).visible.sum())
-    lump.see(turned(3), moved_to(turned(40), lump, visible_first(n // 2 + 2)))
+    obs = lump.observed(turned(3))
+    wrong = visible_first(int(0.65 * obs.seen.sum()))(obs.tracks) & obs.seen
+    jump = se3.transform(turned(33), lump.p_model[obs.tracks.ids])
+    obs = replace(obs, p_cam=np.where(wrong[:, None], jump, obs.p_cam))
+    assert wrong.sum() > (obs.seen & ~wrong).sum() > 5, "more agree on the jump"
+    lump.steps.append(lump.tracker.step(obs))
     assert lump.off(turned(3))[0] < 1
 
 
@@ -192,8 +196,8 @@ def test_last_poses_compete_with_what_samples_find():
     empty = replace(lump.tracker.config.registration, iterations=1, sample_size=20)
     lump.tracker.config = replace(lump.tracker.config, registration=empty)
     spoilt = moved_to(turned(40), lump, visible_first(int(obs.seen.sum()) // 2))
-    origins = {h.origin for h in lump.tracker._register(lump.observed(turned(3), spoilt))}
-    assert origins & {"last pose", "constant velocity"}
+    found = {h.origin: h.support for h in lump.tracker._register(lump.observed(turned(3), spoilt))}
+    assert max(found.get("last pose", 0), found.get("constant velocity", 0)) > 5
 
 
 def test_the_surface_tracks_where_no_point_is_seen():
@@ -217,8 +221,8 @@ def test_ours_refines_before_it_selects_the_paper_after(rule, before, monkeypatc
     monkeypatch.setattr(refinement, "refine", lambda *a, **k: refined.append(k["keypoints"]) or inner(*a, **k))
     n = int(lump.tracks(turned(4)).visible.sum())
     lump.see(turned(4), moved_to(turned(18), lump, visible_first(n // 2)))
-    assert (len(refined) > 1) == before
-    assert all(points is not None for points in refined), "with the keypoints that agree"
+    refined = [points for points in refined if points is not None]  # but for where the surface alone leads
+    assert (len(refined) > 1) == before and refined
 
 
 # --- what is believed, kept and asked for ------------------------------------------------------

@@ -386,9 +386,9 @@ def test_invalid_pixels_leave_the_others_as_they_are():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"depth_m": np.ones((4, 4), np.float32)}, "tsdf picture: got depth"),
-        ({"mask": np.ones((2, 2), bool)}, "tsdf picture"),
-        ({"rgb": np.zeros((180, 240), np.uint8)}, "tsdf picture"),
+        ({"depth_m": np.ones((4, 4), np.float32)}, "tsdf image: got depth"),
+        ({"mask": np.ones((2, 2), bool)}, "tsdf image"),
+        ({"rgb": np.zeros((180, 240), np.uint8)}, "tsdf image"),
         ({"T_cam_obj": np.full((4, 4), np.nan)}, "T_cam_obj: got NaN"),
         ({"T_cam_obj": np.diag([1.0, 1, -1, 1])}, "not a rotation"),
     ],
