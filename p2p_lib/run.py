@@ -1,4 +1,7 @@
-"""Track a whole sequence and keep the results: what ``p2p run`` and the notebooks call."""
+"""Track a whole sequence and keep the results: what ``p2p run`` and the notebooks call.
+
+Scores a 2D tracker by itself and any method's poses as well, and writes a run in the forms of other tools.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.core.backends import ALIASES, DEFAULT_SEGMENTER, SEGMENTERS, make_tracker
-from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import check_apart, check_clicks
+from p2p_lib.core.backends import ALIASES, DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets import sequence as sequences
+from p2p_lib.datasets.export import export
+from p2p_lib.datasets.imported import as_run, read_poses
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, given_models
-from p2p_lib.datasets.prompts import Prompt, load_prompts
+from p2p_lib.datasets.prompts import Prompt, clicks_by_frame, load_prompts
 from p2p_lib.datasets.runs import Run, RunWriter, load_run
 from p2p_lib.evaluation.oracle import OracleTracker
-from p2p_lib.evaluation.protocol import Evaluation, evaluate, rate
+from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.method.mesh import save as save_mesh
@@ -74,13 +76,11 @@ def run(
     """
     options = replace(options or RunOptions(), **changes)
     job = _prepare(sequence, options)
-    method = Point2Pose(
-        job.sequence.camera,
-        job.config,
-        _tracker(options.tracker, job.sequence, job.config, options.models),
-        options.detector,
-        job.segmenter or DEFAULT_SEGMENTER,
-    )
+    tracker = options.tracker
+    if tracker == OracleTracker.name:  # which has to know the sequence
+        tracker = OracleTracker(TrueScene.of(job.sequence, options.models), job.config.oracle, job.config.seed)
+    segmenter = job.segmenter or DEFAULT_SEGMENTER
+    method = Point2Pose(job.sequence.camera, job.config, tracker, options.detector, segmenter)
     for name in () if job.segmenter else job.objects:
         method.add_object(name)
     writer = _writer(job, options, method, out)
@@ -95,7 +95,8 @@ def run(
                 _log_keypoints(keypoints, frame, method)
                 times = method.stopwatch.last_ms
                 writer.add(frame, estimates, times["total"], {k: v for k, v in times.items() if k != "total"})
-                bar.set_postfix_str(_postfix(times["total"], estimates), refresh=False)
+                now = ", ".join(f"{name} {estimate.status}" for name, estimate in estimates.items())
+                bar.set_postfix_str(f"{1e3 / max(times['total'], 1e-3):.0f} Hz, {now}", refresh=False)
                 bar.update()
         except KeyboardInterrupt:
             writer.info["stopped_by"] = "KeyboardInterrupt"
@@ -122,17 +123,42 @@ def evaluate_tracker(
     config = options.config()
     if isinstance(sequence, str | Path):
         sequence = sequences.open_sequence(sequence, options.format, options.depth_scale)
-    chosen = _tracker(options.tracker, sequence, config, options.models)
-    tracker = make_tracker(chosen, config.tracking, np.random.default_rng(config.seed))
-    return TrackTask.of(sequence, config.seed, options.models, count).score(tracker, search)
+    task = TrackTask.of(sequence, config.seed, options.models, count)
+    return task.score(task.tracker(options.tracker, config), search)
 
 
-def frame_range(count: int, start: int, stop: int | None) -> range:
-    """The frames from ``start`` to ``stop`` of a sequence of ``count``; :class:`BadInput` where there are none."""
-    end = count if stop is None else min(stop, count)
-    if not 0 <= start < end:
-        raise BadInput("frames", f"start {start}, stop {stop}", f"0 <= start < stop within {count} frames")
-    return range(start, end)
+def evaluate_poses(
+    poses: str | Path,
+    sequence: str | Path | sequences.Sequence,
+    models: Mapping[str, str | Path] | None = None,
+    align: str = "first",
+    min_visible_px: int = 300,
+    format: str | None = None,
+    start: int = 0,
+    stop: int | None = None,
+) -> Evaluation:
+    """Score any method's poses (:mod:`p2p_lib.datasets.imported`) by the rules of a run of ours over these frames."""
+    if isinstance(sequence, str | Path):
+        sequence = sequences.open_sequence(sequence, format)
+    known = find_models(sequence) | given_models(models or {}, sequence.objects)
+    frames = _frame_range(len(sequence), start, stop)
+    run = as_run(read_poses(poses, sequence), sequence, known, path=Path(poses), frames=frames)
+    return evaluate(run, None, align, min_visible_px)
+
+
+def export_run(folder: str | Path, format: str, out: str | Path, frame: str | None = None) -> list[Path]:
+    """Write a run's poses in another tool's form; what ``p2p export`` does.
+
+    frame  "object": T_cam_obj, the tracker's own frame; "model": T_cam_model, by the truth of the first scored frame
+           as scoring fixes it. By default the model's for ``bop``, which knows no other, else the object's
+    """
+    if frame not in (None, "object", "model"):
+        raise BadInput("frame", repr(frame), "object or model")
+    run = load_run(folder)
+    in_model = (frame or ("model" if format == "bop" else "object")) == "model"
+    path = run.info.get("path")
+    sequence = sequences.open_sequence(path, run.info["format"]) if path and Path(path).is_dir() else None
+    return export(run, out, format, model_frames(run) if in_model else None, sequence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,14 +193,22 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     if isinstance(sequence, str | Path):
         folder = None if segmenter else masks.partition(":")[2] or None
         sequence = sequences.open_sequence(sequence, options.format, options.depth_scale, config.seed, masks=folder)
-    frames = frame_range(len(sequence), options.start, options.stop)
+    frames = _frame_range(len(sequence), options.start, options.stop)
     objects = _chosen([p.name for p in prompts] if segmenter else sequence.objects, options.objects)
-    clicked = _by_frame([p for p in prompts if p.name in objects], frames, sequence.camera)
+    clicked = clicks_by_frame([p for p in prompts if p.name in objects], frames, sequence.camera)
     if not segmenter and all(sequence.masks(i) is None for i in frames):
         fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
         expected = "masks of the first image at least, or clicks"
         raise BadInput("masks", f"none in frames {frames[0]} to {frames[-1]} of {sequence.name}", expected, fix)
     return _Job(source, config, sequence, frames, objects, masks, segmenter, prompts, clicked)
+
+
+def _frame_range(count: int, start: int, stop: int | None) -> range:
+    """The frames from ``start`` to ``stop`` of a sequence of ``count``; :class:`BadInput` where there are none."""
+    end = count if stop is None else min(stop, count)
+    if not 0 <= start < end:
+        raise BadInput("frames", f"start {start}, stop {stop}", f"0 <= start < stop within {count} frames")
+    return range(start, end)
 
 
 def _mask_source(masks: str | None, prompts: Sequence[Prompt]) -> str:
@@ -200,31 +234,6 @@ def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> tuple[str, ..
     if not chosen:
         raise BadInput("objects", "none", "masks or prompts that show at least one", "Add masks/ or give --prompts.")
     return chosen
-
-
-def _by_frame(prompts: Sequence[Prompt], frames: range, camera: Camera) -> dict[int, dict[str, np.ndarray]]:
-    """Frame to the clicks in it by object."""
-    clicked: dict[int, dict[str, np.ndarray]] = {}
-    for prompt in prompts:
-        if prompt.frame not in frames:
-            got = f"frame {prompt.frame}"
-            raise BadInput(f"prompt of {prompt.name!r}", got, f"a frame of the run, {frames[0]} to {frames[-1]}")
-        clicks = check_clicks(prompt.name, prompt.points_px, camera)
-        check_apart(prompt.name, clicks, clicked.setdefault(prompt.frame, {}))
-        clicked[prompt.frame][prompt.name] = clicks
-    return clicked
-
-
-def _tracker(
-    tracker: str | PointTracker,
-    sequence: sequences.Sequence,
-    config: Config,
-    models: Mapping[str, str | Path] | None,
-) -> str | PointTracker:
-    """What was asked for, but the tracker itself where it must know the sequence: ``oracle``."""
-    if tracker != OracleTracker.name:
-        return tracker
-    return OracleTracker(TrueScene.of(sequence, models), config.oracle, config.seed)
 
 
 def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path) -> RunWriter:
@@ -326,7 +335,3 @@ def _advice(run: Run, job: _Job) -> str:
         fix = "see what is wrong with the data"
     first = next(iter(reasons.values()))
     return f"{', '.join(reasons)} never had a pose ({first}); {fix}. Next: p2p check {job.source}"
-
-
-def _postfix(total_ms: float, estimates: Mapping[str, PoseEstimate]) -> str:
-    return f"{1e3 / max(total_ms, 1e-3):.0f} Hz, " + ", ".join(f"{name} {e.status}" for name, e in estimates.items())

@@ -23,7 +23,7 @@ from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.alignment import background_share, misfit
-from p2p_lib.datasets.prompts import Prompt
+from p2p_lib.datasets.prompts import Prompt, clicks_by_frame
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.method.sampling import choose, usable_region
 from p2p_lib.synthetic.faults import spoil
@@ -369,10 +369,10 @@ def _first_masks(sequence: Sequence, config: Config) -> FirstMasks:
 def _clicked(sequence: Sequence, prompts: Iterable[Prompt], config: Config) -> FirstMasks:
     """Each clicked object's first mask, as the built-in segmenter cuts it out."""
     firsts: FirstMasks = {}
-    for prompt in prompts:
-        if prompt.frame >= len(sequence):
-            raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", f"below {len(sequence)}")
-        rng, frame = np.random.default_rng(config.seed), sequence.frame(prompt.frame)
-        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
-        firsts[prompt.name] = frame, segmenter.segment(frame, {prompt.name: prompt.points_px}) > 0
+    for i, clicked in clicks_by_frame(prompts, range(len(sequence)), sequence.camera).items():
+        frame = sequence.frame(i)
+        for name, clicks in clicked.items():
+            rng = np.random.default_rng(config.seed)
+            segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
+            firsts[name] = frame, segmenter.segment(frame, {name: clicks}) > 0
     return firsts

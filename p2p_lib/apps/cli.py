@@ -48,9 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 # --- how a command is declared -------------------------------------------------------------------
 
-_COMMANDS: list[Callable[[Any, Any], None]] = []  # each adds one command to the parsers of p2p and of p2p data
-
 Argument = Callable[[argparse.ArgumentParser], Any]
+_COMMANDS: list[tuple[str, str, tuple[Argument, ...], Callable]] = []  # name, help, arguments, what carries it out
 
 
 def _arg(*flags: str, **how: Any) -> Argument:
@@ -67,15 +66,7 @@ def _command(name: str, help: str, *arguments: Argument) -> Callable:
     """Declare a command ``p2p NAME``, carried out by the function below it; its value is the exit code, None for 0."""
 
     def declare(function: Callable[[argparse.Namespace], int | None]) -> Callable:
-        def add(commands: Any, data: Any) -> None:
-            group, word = (data, name.removeprefix("data ")) if name.startswith("data ") else (commands, name)
-            parser = group.add_parser(word, help=help, description=help[0].upper() + help[1:] + ".")
-            for argument in arguments:
-                argument(parser)
-            parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-            parser.set_defaults(command=function, parser=parser, name=name)
-
-        _COMMANDS.append(add)
+        _COMMANDS.append((name, help, arguments, function))
         return function
 
     return declare
@@ -175,7 +166,7 @@ def _eval(a: argparse.Namespace) -> None:
 
         print(as_csv(run_rows(a.run, options.models), COLUMNS), end="")
     elif a.poses is not None:
-        from p2p_lib.apps.evaluate import evaluate_poses
+        from p2p_lib.run import evaluate_poses
 
         how = {"format": options.format, "start": options.start, "stop": options.stop}
         _show(evaluate_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how), a.json)
@@ -263,7 +254,7 @@ def _benchmark(a: argparse.Namespace) -> int:
     _arg("--frame", choices=("object", "model"), help="of the tracker, or by truth the model's (default for bop)"),
 )
 def _export(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.evaluate import export_run
+    from p2p_lib.run import export_run
 
     for path in export_run(a.run, a.format, a.out, a.frame):
         print(path)
@@ -320,12 +311,12 @@ def _notebooks(a: argparse.Namespace) -> None:
     _options("format", "depth_scale", seed="of a synthetic sequence (default 0)"),
 )
 def _click(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.click import check_writable, collect_clicks, wait_for_clicks
+    from p2p_lib.apps.click import Clicker, check_writable, wait_for_clicks
     from p2p_lib.datasets.sequence import open_sequence
 
     check_writable(a.out)
     sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed or 0)
-    page = collect_clicks(sequence, a.out, a.frame, a.port)
+    page = Clicker(sequence, a.out, a.frame, a.port)
     prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)
     print(f"{len(prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --out DIR")
 
@@ -477,8 +468,13 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
     data = commands.add_parser("data", help="datasets and checkpoints: what they are, where, whether whole")
     actions = data.add_subparsers(metavar="ACTION", required=True, parser_class=_Parser)
-    for add in _COMMANDS:
-        add(commands, actions)
+    for name, help, arguments, function in _COMMANDS:
+        group, word = (actions, name.removeprefix("data ")) if name.startswith("data ") else (commands, name)
+        command = group.add_parser(word, help=help, description=help[0].upper() + help[1:] + ".")
+        for argument in arguments:
+            argument(command)
+        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        command.set_defaults(command=function, parser=command, name=name)
     return parser
 
 

@@ -1,7 +1,7 @@
 """Clicks on objects, collected in the browser: what ``p2p click`` and notebooks call.
 
 A page of the standard library's web server, on this machine alone, shows the frames; clicks make prompts
-(:mod:`p2p_lib.datasets.prompts`). In a notebook the value of :func:`collect_clicks` shows the page by itself.
+(:mod:`p2p_lib.datasets.prompts`). In a notebook a :class:`Clicker` shows the page by itself.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from threading import Event, Thread
 from typing import Any
 
 import cv2
-import numpy as np
 
 from p2p_lib.core.browser import open_page
-from p2p_lib.core.clicks import check_apart, check_clicks, check_depth
+from p2p_lib.core.clicks import checked_clicks
 from p2p_lib.core.errors import BadInput, P2PError
-from p2p_lib.datasets.prompts import Prompt, load_prompts, parse_prompts, save_prompts
+from p2p_lib.datasets.prompts import Prompt, clicks_by_frame, load_prompts, parse_prompts, save_prompts
 from p2p_lib.datasets.sequence import Sequence
 
 HOST = "127.0.0.1"
@@ -91,25 +90,12 @@ class Clicker:
     def save(self, content: object) -> None:
         """Check prompts as the page sends them, and write the file; :class:`BadInput` says what does not fit."""
         prompts = parse_prompts(content)
-        taken: dict[int, dict[str, np.ndarray]] = {}
-        for prompt in prompts:
-            if prompt.frame >= len(self.sequence):
-                raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", f"below {len(self.sequence)}")
-            clicks = check_clicks(prompt.name, prompt.points_px, self.sequence.camera)
-            check_depth(prompt.name, clicks, self.sequence.frame(prompt.frame))
-            check_apart(prompt.name, clicks, taken.setdefault(prompt.frame, {}))
-            taken[prompt.frame][prompt.name] = clicks
+        clicked = clicks_by_frame(prompts, range(len(self.sequence)), self.sequence.camera)
+        for i, clicks in clicked.items():
+            checked_clicks(clicks, self.sequence.camera, self.sequence.frame(i))
         save_prompts(self.path, prompts)
         self.prompts = prompts
         self._saved.set()
-
-
-def collect_clicks(sequence: Sequence, path: str | Path, frame: int = 0, port: int = 0) -> Clicker:
-    """Serve the page and come back at once: show the value in a notebook, or open its ``url``; close it when done.
-
-    ``port`` 0 takes a free one.
-    """
-    return Clicker(sequence, path, frame, port)
 
 
 def check_writable(path: Path) -> None:

@@ -15,7 +15,7 @@ from time import monotonic
 
 import numpy as np
 
-from p2p_lib.apps.click import collect_clicks, wait_for_clicks
+from p2p_lib.apps.click import Clicker, wait_for_clicks
 from p2p_lib.core.backends import DEFAULT_SEGMENTER
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
@@ -99,7 +99,7 @@ def click_first(
     if image is None:
         raise BadInput(camera.name, "no image", "one to click on")
     with tempfile.TemporaryDirectory() as folder:
-        page = collect_clicks(Still(camera.name, camera.camera, image), Path(folder) / "prompts.json")
+        page = Clicker(Still(camera.name, camera.camera, image), Path(folder) / "prompts.json")
         return wait_for_clicks(page, say, open_browser), image
 
 

@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.paths import PROJECT
 from p2p_lib.figures import equations
@@ -286,14 +288,11 @@ def _fitting_parameters(path: Path, given: Mapping[str, Any]) -> dict[str, Value
             fix = f"Did you mean {near[0]}?" if near else "Pick the notebooks that have it with --only."
             raise BadInput(f"{path.stem} parameter", name, "one of " + ", ".join(known), fix)
         kind = type(known[name])
-        if isinstance(value, str) and kind is not str:
-            with suppress(ValueError, SyntaxError):  # refused just below
-                value = ast.literal_eval(value)
-        if kind is float and type(value) is int:
-            value = float(value)
-        if known[name] is not None and type(value) is not kind:
-            raise BadInput(f"{path.stem} parameter {name}", repr(value), f"{kind.__name__} like {known[name]!r}")
-        values[name] = value
+        try:
+            values[name] = TypeAdapter(kind).validate_python(value, strict=not isinstance(value, str))
+        except ValidationError:
+            expected = f"{kind.__name__} like {known[name]!r}"
+            raise BadInput(f"{path.stem} parameter {name}", repr(value), expected) from None
     return values
 
 

@@ -1,10 +1,10 @@
 """Benchmarks: methods on sequences with seeds as a plan says, run on many cores or machines, as tidy tables.
 
-``run_benchmark("ycbineoat", "out/benchmark")`` runs what is not on disk yet and gives the results of all of it.
+``run_benchmarks(["ycbineoat"], "out/benchmark")`` runs what is not on disk yet and gives the results of all of it.
 Look first at :mod:`p2p_lib.benchmark.plan` (what is to run) and :mod:`p2p_lib.benchmark.benchmark` (how it is run).
 """
 
-from p2p_lib.benchmark.benchmark import Benchmark, load_benchmark, load_or_run_quick, run_benchmark, run_benchmarks
+from p2p_lib.benchmark.benchmark import Benchmark, load_benchmark, load_or_run_quick, run_benchmarks
 from p2p_lib.benchmark.plan import Plan, plan_names, read_plan
 
 __all__ = [
@@ -14,6 +14,5 @@ __all__ = [
     "load_or_run_quick",
     "plan_names",
     "read_plan",
-    "run_benchmark",
     "run_benchmarks",
 ]

@@ -17,7 +17,6 @@ import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from p2p_lib.benchmark import rows
 from p2p_lib.benchmark.execution import execute
@@ -104,11 +103,6 @@ class Benchmark:
                 return job, outcome
         known = ", ".join(sorted({job.method.name for job, _ in done})) or "none"
         raise BadInput("benchmark run", f"{method} {sequence}".strip(), f"a method that ran: {known}")
-
-
-def run_benchmark(plan: str | Path | Plan, out: str | Path, profile: str = "full", **options: Any) -> Benchmark:
-    """One plan of :func:`run_benchmarks`."""
-    return run_benchmarks([plan], out, profile, **options)[0]
 
 
 def run_benchmarks(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
@@ -77,12 +78,8 @@ class Job:
             prompts = [Prompt(name, planned.start, at) for name, at in clicks.items()]
         objects = tuple(planned.objects) or (tuple(planned.clicks) if prompts else known)
         return RunOptions(
-            preset=method.preset,
-            settings=method.settings,
+            **method.model_dump(include={"preset", "settings", "tracker", "detector", "masks"}),
             seed=self.seed,
-            tracker=method.tracker,
-            detector=method.detector,
-            masks=method.masks,
             prompts=prompts,
             objects=objects[: method.count or None] or None,
             start=planned.start,
@@ -95,14 +92,15 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
     """Every run of a plan in its order: sequences, methods, seeds. What cannot run says why, and nothing runs yet."""
     scope = plan.scope(profile)
     measures = ("poses", "tracks") if plan.tracks and scope.tracks else ("poses",)
+    methods = [_with_detector(method) for method in plan.methods(profile)]
     known: dict[tuple, str] = {}  # of this call alone: files may change until the next
     jobs = []
     for planned in scope.sequence:
         for sequence, missing in _present(planned):
-            for method in (m for m in plan.methods(profile) if not m.only or planned.name in m.only):
+            for method in (m for m in methods if not m.only or planned.name in m.only):
                 for measure in measures:
                     for seed in scope.seeds:
-                        job = Job(_with_detector(method), sequence, seed, measure, plan.chamfer, reason=missing)
+                        job = Job(method, sequence, seed, measure, plan.chamfer, reason=missing)
                         jobs.append(job if missing else _keyed(job, known))
     return jobs
 
@@ -140,7 +138,7 @@ def _keyed(job: Job, known: dict[tuple, str]) -> Job:
             "library": library_version(),
             "measure": job.measure,
             "config": config.as_dict(),
-            "method": {k: getattr(method, k) for k in ("tracker", "detector", "masks", "scale", "count")},
+            "method": method.model_dump(include={"tracker", "detector", "masks", "scale", "count"}),
             "sequence": _fingerprint(job, known),
             "cut": [planned.start, planned.stop, planned.objects],
             "clicks": planned.clicks if uses_clicks(method) else {},
@@ -172,20 +170,14 @@ def _present(planned: PlannedSequence) -> Iterator[tuple[PlannedSequence, str]]:
         yield planned.model_copy(update={"name": f"{dataset}/{name}"}), ""
 
 
-@cache
-def _detector_there(name: str) -> bool:
-    try:
-        make_detector(name, SamplingConfig(), np.random.default_rng(0))
-    except MissingBackend:
-        return False
-    return True
-
-
 def _with_detector(method: Method) -> Method:
     """With the first of its detectors that is installed; the last one where none is, which then says what it needs."""
-    if isinstance(method.detector, str):
-        return method
-    chosen = next(filter(_detector_there, method.detector), method.detector[-1])
+    *others, chosen = [method.detector] if isinstance(method.detector, str) else method.detector
+    for name in others:
+        with suppress(MissingBackend):
+            make_detector(name, SamplingConfig(), np.random.default_rng(0))
+            chosen = name
+            break
     return method.model_copy(update={"detector": chosen})
 
 

@@ -1,22 +1,30 @@
-"""Tidy rows: one number each, with everything that one has to know to compare it with another."""
+"""Tidy rows: one number each, with everything that one has to know to compare it with another.
+
+A number says its form, how failures count, the alignment and the unit.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from p2p_lib.benchmark.jobs import Job
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome
 from p2p_lib.benchmark.plan import Plan
-from p2p_lib.evaluation import numbers
+from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.alignment import ALIGNMENTS
-from p2p_lib.evaluation.numbers import Number
-from p2p_lib.evaluation.recovery import WITHIN_FRAMES
+from p2p_lib.evaluation.recovery import recovered_within
 
+#: The errors of a frame, by what their area under the curve is called.
+AREAS = {"ADD-S AUC": "adds_m", "ADD AUC": "add_m"}
+#: The exact integral, and the right-hand sum of the field's tables.
+FORMS = {"exact": metrics.auc_exact, "VOC": metrics.auc_voc}
+#: A frame without a pose (in a mean also a run that failed) counts as 0, or is left out.
+FAILURES = ("zero", "left out")
 #: What the ``sequence`` of a row says where it is about several.
 MEAN, POOLED = "mean over sequences", "pooled over frames"
 #: What MEAN is called where all of it is of one sequence (:func:`p2p_lib.benchmark.scoring.run_rows`).
@@ -41,6 +49,61 @@ Row = dict[str, Any]
 Results = Sequence[tuple[Job, Outcome]]
 
 
+class Number(NamedTuple):
+    """One number.
+
+    metric    such as ``ADD AUC``; form, which of its definitions
+    failures  how frames without a pose count: one of :data:`FAILURES`, or a dash
+    align     how the object frame met the model frame (``first``, ``all``), or a dash
+    value     NaN where it does not exist (no frame left, no mesh)
+    """
+
+    metric: str
+    form: str
+    failures: str
+    align: str
+    unit: str
+    value: float
+
+
+def areas(errors_m: Mapping[str, np.ndarray], align: str) -> list[Number]:
+    """Both areas under the curve in both forms, failures as 0 and left out.
+
+    errors_m  ``adds_m`` and ``add_m``, (m,) each, infinite where there was no pose
+    """
+    numbers = []
+    for (metric, key), (form, area), failures in product(AREAS.items(), FORMS.items(), FAILURES):
+        kept = errors_m[key] if failures == "zero" else errors_m[key][np.isfinite(errors_m[key])]
+        numbers.append(Number(metric, form, failures, align, "%", area(kept)))
+    return numbers
+
+
+def chamfer(values_cm: Mapping[str, float]) -> list[Number]:
+    """The Chamfer distance in its forms."""
+    return [Number("Chamfer distance", form, "-", "first", "cm", cm) for form, cm in values_cm.items()]
+
+
+def returns(frames_to_recovery: Sequence[int | None]) -> list[Number]:
+    """How often an object returned from complete occlusion, and how often it was recovered within so many frames."""
+    recovered = recovered_within(frames_to_recovery)
+    counts = {"all": len(frames_to_recovery)} | {f"recovered within {n} frames": k for n, k in recovered.items()}
+    return [Number("returns", form, "-", "first", "events", count) for form, count in counts.items()]
+
+
+def mean(numbers: Iterable[Number], failed: int = 0) -> list[Number]:
+    """The mean of every kind of number, each object or sequence with equal weight.
+
+    ``failed`` more of them gave nothing: they count as 0 where failures do, and are left out elsewhere. Of Chamfer
+    distances and returns, which have no worst value, they are always left out.
+    """
+    by_kind = defaultdict(list)
+    for *kind, value in numbers:
+        by_kind[tuple(kind)] += [value] if np.isfinite(value) else []
+    for kind, values in by_kind.items():
+        values += [0.0] * failed if "zero" in kind else []
+    return [Number(*kind, float(np.mean(values)) if values else np.nan) for kind, values in by_kind.items()]
+
+
 def result_rows(plan: Plan, profile: str, results: Results) -> list[Row]:
     """Every number of a benchmark but those of time: each run's, then their mean and pool by method and seed."""
     rows: list[Row] = []
@@ -53,11 +116,11 @@ def result_rows(plan: Plan, profile: str, results: Results) -> list[Row]:
             about = {"object": ", ".join(job.sequence.objects), "column": job.sequence.column}
             rows.append(head | about | {"metric": outcome.status, "reason": outcome.reason})
         for metric, value in outcome.tracks.items():
-            rows.append(head | asdict(Number(f"2D {metric}", "-", "-", "-", "share", value)))
+            rows.append(head | Number(f"2D {metric}", "-", "-", "-", "share", value)._asdict())
         for name, obj in outcome.objects.items():
             about = {"object": name, "column": job.sequence.column_of(name)}
             about |= {"frames": len(obj.first["add_m"]), "lost": obj.lost}
-            rows += [head | about | asdict(number) for number in _numbers(obj)]
+            rows += [head | about | number._asdict() for number in _numbers(obj)]
             if obj.no_chamfer:
                 rows.append(head | about | {"metric": "Chamfer distance", "unit": "cm", "reason": obj.no_chamfer})
         for name, reason in outcome.left_out.items():
@@ -126,23 +189,22 @@ def _over_sequences(plan: Plan, profile: str, group: Results) -> list[Row]:
     head = _head(plan, profile, *(done or group)[0]) | {"object": "", "column": "", "key": ""}
     head |= {"frames": sum(len(o.first["add_m"]) for o in objects), "lost": sum(o.lost for o in objects)}
     head |= {"sequences": sum(bool(o.objects) for _, o in done) + len(fallen), "objects": len(objects) + failed}
-    mean, pool = head | {"sequence": MEAN}, head | {"sequence": POOLED}
+    over, pool = head | {"sequence": MEAN}, head | {"sequence": POOLED}
     if failed and objects:  # how many frames they had nobody knows
         pool["reason"] = f"{failed} failed: not in the pool"
-    rows = [mean | asdict(number) for number in numbers.mean([_numbers(o) for o in objects], failed)]
+    rows = [over | number._asdict() for number in mean([n for o in objects for n in _numbers(o)], failed)]
     if objects:
         for align in ALIGNMENTS:
             errors = [o.errors_m(align) for o in objects]
             pooled = {key: np.concatenate([e[key] for e in errors]) for key in errors[0]}
-            rows += [pool | asdict(number) for number in numbers.areas(pooled, align)]
-        events = [frames for o in objects for frames in o.returns]
-        rows += [pool | asdict(number) for number in numbers.returns(events, WITHIN_FRAMES, "first")]
+            rows += [pool | number._asdict() for number in areas(pooled, align)]
+        rows += [pool | number._asdict() for number in returns([frames for o in objects for frames in o.returns])]
     return rows
 
 
 def _numbers(obj: ObjectOutcome) -> list[Number]:
-    found = [number for align in ALIGNMENTS for number in numbers.areas(obj.errors_m(align), align)]
-    return [*found, *numbers.chamfer(obj.chamfer_cm, "first"), *numbers.returns(obj.returns, WITHIN_FRAMES, "first")]
+    found = [number for align in ALIGNMENTS for number in areas(obj.errors_m(align), align)]
+    return [*found, *chamfer(obj.chamfer_cm), *returns(obj.returns)]
 
 
 def _head(plan: Plan, profile: str, job: Job, outcome: Outcome) -> Row:

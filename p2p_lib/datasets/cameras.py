@@ -123,7 +123,7 @@ class Newest:
 
 @dataclass(frozen=True, eq=False)
 class Still:
-    """One frame of a camera as a sequence, to be clicked on (:func:`p2p_lib.apps.click.collect_clicks`)."""
+    """One frame of a camera as a sequence, to be clicked on (:class:`p2p_lib.apps.click.Clicker`)."""
 
     name: str
     camera: Camera

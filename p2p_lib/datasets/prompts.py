@@ -10,6 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.clicks import check_apart, check_clicks
 from p2p_lib.core.errors import BadInput, MissingData
 
 _FORM = '{"objects": [{"name": "mug", "frame": 0, "points": [[x, y], ...]}]}'
@@ -70,6 +72,22 @@ def parse_prompts(content: object) -> tuple[Prompt, ...]:
     if twice := [name for name in names if names.count(name) > 1]:
         raise BadInput("prompts", f"{twice[0]!r} twice", "one entry per object, with all its points")
     return tuple(prompts)
+
+
+def clicks_by_frame(prompts: Iterable[Prompt], frames: range, camera: Camera) -> dict[int, dict[str, np.ndarray]]:
+    """Frame to the clicks (N, 2) in it by object.
+
+    Raises :class:`BadInput` for a click in no frame, outside the image, or on two objects.
+    """
+    clicked: dict[int, dict[str, np.ndarray]] = {}
+    for prompt in prompts:
+        if prompt.frame not in frames:
+            expected = f"a frame from {frames[0]} to {frames[-1]}"
+            raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", expected)
+        clicks = check_clicks(prompt.name, prompt.points_px, camera)
+        check_apart(prompt.name, clicks, clicked.setdefault(prompt.frame, {}))
+        clicked[prompt.frame][prompt.name] = clicks
+    return clicked
 
 
 def prompts_in(masks: Mapping[str, np.ndarray], frame: int = 0) -> tuple[Prompt, ...]:

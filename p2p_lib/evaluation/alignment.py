@@ -32,8 +32,10 @@ def align_all(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray
     """
     Y = (se3.inverse(T_cam_obj) @ T_cam_model)[:, :3]
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
-    L = _square_root(homogeneous.T @ homogeneous / len(points))
-    best = _best_proposal(Y, L)
+    values, vectors = np.linalg.eigh(homogeneous.T @ homogeneous / len(points))
+    L = vectors * np.sqrt(np.maximum(values, 0))
+    tried = Y[np.unique(np.linspace(0, len(Y) - 1, 400).astype(int))]  # of long runs 400 evenly spread ones
+    best = tried[np.argmin([_cost(_distances(X, Y, L)) for X in tried])]
     distances = _distances(best, Y, L)
     for _ in range(200):
         # 1e-9 m: a frame that fits exactly would otherwise have an infinite weight.
@@ -55,11 +57,6 @@ def align_all(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray
 ALIGNMENTS = {"first": align_first, "all": align_all}
 
 
-def _square_root(M: np.ndarray) -> np.ndarray:
-    values, vectors = np.linalg.eigh(M)
-    return vectors * np.sqrt(np.maximum(values, 0))
-
-
 def _distances(X: np.ndarray, Y: np.ndarray, L: np.ndarray) -> np.ndarray:
     """Root mean square distance (..., m) in metres of the model's points under X (..., 3, 4) and under each Y."""
     return np.linalg.norm((X[..., None, :, :] - Y) @ L, axis=(-2, -1))
@@ -67,12 +64,6 @@ def _distances(X: np.ndarray, Y: np.ndarray, L: np.ndarray) -> np.ndarray:
 
 def _cost(distances: np.ndarray) -> np.ndarray:
     return np.minimum(distances, metrics.MAX_M).sum(-1)
-
-
-def _best_proposal(Y: np.ndarray, L: np.ndarray) -> np.ndarray:
-    """The frame whose constant suits the others best; of long runs 400 evenly spread ones are tried, the first too."""
-    tried = np.unique(np.linspace(0, len(Y) - 1, 400).astype(int))
-    return Y[tried[int(np.argmin([_cost(_distances(Y[t], Y, L)) for t in tried]))]]
 
 
 def _nearest_rigid(mean: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from p2p_lib.core import se3
 from p2p_lib.core.types import joined
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation.protocol import Evaluation, ObjectScore
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 MAX_M, MAX_DEG = 0.02, 5.0
 
@@ -34,7 +38,7 @@ class Judged:
     def calibration_error(self) -> float:
         """Expected calibration error: mean gap between confidence and share of right poses, by how many there are."""
         bins = reliability(self)
-        return float(np.average(np.abs(bins.right - bins.confidence), weights=bins.count)) if len(self) else np.nan
+        return float(np.average(np.abs(bins.right - bins.confidence), weights=bins.poses)) if len(self) else np.nan
 
     @property
     def auroc(self) -> float:
@@ -46,15 +50,6 @@ class Judged:
             return float("nan")
         ranks = rankdata(self.confidence)[self.right].sum()
         return float((ranks - n_right * (n_right + 1) / 2) / (n_right * n_wrong))
-
-
-@dataclass(frozen=True, eq=False)
-class Bins:
-    """Poses by confidence, empty bins left out: mean confidence, share of right ones, count; (b,) each."""
-
-    confidence: np.ndarray
-    right: np.ndarray
-    count: np.ndarray
 
 
 def pose_error(obj: ObjectRun, score: ObjectScore) -> tuple[np.ndarray, np.ndarray]:
@@ -87,10 +82,10 @@ def pooled(many: Iterable[Judged]) -> Judged:
     return joined([Judged(np.zeros(0), np.zeros(0, bool)), *many])
 
 
-def reliability(judged: Judged, bins: int = 10) -> Bins:
-    """Poses sorted into bins of equal width of their confidence."""
+def reliability(judged: Judged, bins: int = 10) -> DataFrame:
+    """A row per bin of equal width with any: mean ``confidence``, share that is ``right``, number of ``poses``."""
+    from pandas import DataFrame
+
     at = np.minimum((judged.confidence * bins).astype(int), bins - 1)
-    count = np.bincount(at, minlength=bins)
-    used = count > 0
-    confidence, right = (np.bincount(at, v, bins)[used] / count[used] for v in (judged.confidence, judged.right))
-    return Bins(confidence, right, count[used])
+    groups = DataFrame({"confidence": judged.confidence, "right": judged.right}).groupby(at)
+    return groups.mean().assign(poses=groups.size())

@@ -15,7 +15,7 @@ from p2p_lib.core import tables
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets.masks import read_labels
 from p2p_lib.datasets.runs import Run
-from p2p_lib.datasets.sequence import Sequence, open_sequence
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 
 if TYPE_CHECKING:
@@ -72,16 +72,16 @@ def agreement(found: np.ndarray, truth: np.ndarray, min_visible_px: int = MIN_VI
     return float((found & truth).sum() / (found | truth).sum()) if true_px >= min_visible_px else np.nan, np.nan
 
 
-def evaluate_masks(run: Run, sequence: Sequence | None = None, min_visible_px: int = MIN_VISIBLE_PX) -> MaskEvaluation:
+def evaluate_masks(run: Run, min_visible_px: int = MIN_VISIBLE_PX) -> MaskEvaluation:
     """Score the masks that a run kept (``p2p run --save-masks``) against the dataset's own.
 
-    The sequence is opened anew, as the run says, unless it is given. An object without a true mask in a frame is
+    The sequence is opened anew, as the run says. An object without a true mask in a frame is
     absent there; frames without any are left out. Raises :class:`MissingData` where either side has no masks.
     """
     from pandas import DataFrame
 
     info = run.info
-    sequence = sequence or open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
+    sequence = open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
     kept = {path for name in run.objects for path in (run.path / "masks" / name).glob("*.png")}
     if not kept:
         raise MissingData(str(run.path / "masks"), "the run kept no masks", "Run it again with --save-masks.")

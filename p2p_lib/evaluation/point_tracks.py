@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,21 +26,6 @@ MIN_ABSENT_FRAMES, FOUND_PX, FOUND_WITHIN_FRAMES = 30, 8.0, 5
 SAME_VIEW_DEG = 40.0
 
 
-@dataclass(frozen=True)
-class TapVid:
-    """The TAP-Vid scores, shares in [0, 1]; NaN where nothing could be scored.
-
-    jaccard, within  one for each of :data:`THRESHOLDS_PX`; ``aj`` and ``delta_avg`` are their means
-    oa               share of scored frames whose visibility is right
-    """
-
-    aj: float
-    delta_avg: float
-    oa: float
-    jaccard: tuple[float, ...]
-    within: tuple[float, ...]
-
-
 def after_query(query_frame: np.ndarray, frames: int) -> np.ndarray:
     """(T, N) bool: the frames after each point's query, which the query-first protocol scores."""
     return np.arange(frames)[:, None] > query_frame[None]
@@ -53,30 +38,30 @@ def tapvid(
     visible: np.ndarray,
     scored: np.ndarray,
     shape: tuple[int, int],
-) -> TapVid:
+) -> dict[str, Any]:
     """TAP-Vid scores over the ``scored`` (T, N) frames; positions in pixels of an image of ``shape`` (H, W).
 
-    A predicted position that is NaN is wrong at every threshold.
+    Shares in [0, 1], NaN where nothing could be scored: ``jaccard`` and ``within`` for each of :data:`THRESHOLDS_PX`
+    (``"1_px"``), their means ``aj`` and ``delta_avg``, and ``oa`` of frames whose visibility is right. A predicted
+    position that is NaN is wrong at every threshold.
     """
     off = (uv_px - uv_true) * (RASTER_PX / np.array(shape[::-1], float))
     off_sq = np.where(np.isfinite(off).all(-1), (off**2).sum(-1), np.inf)[scored]
     truly, said = visible_true[scored], visible[scored]
-    if not truly.size:
-        nothing = (np.nan,) * len(THRESHOLDS_PX)
-        return TapVid(np.nan, np.nan, np.nan, nothing, nothing)
     near = off_sq < np.square(THRESHOLDS_PX, dtype=float)[:, None]
     hits = (near & truly & said).sum(1)
     false = (said & ~(near & truly)).sum(1)
     with np.errstate(invalid="ignore"):
         within = (near & truly).sum(1) / truly.sum()
         jaccard = hits / (truly.sum() + false)
-    return TapVid(
-        float(jaccard.mean()),
-        float(within.mean()),
-        float((truly == said).mean()),
-        tuple(map(float, jaccard)),
-        tuple(map(float, within)),
-    )
+    names = [f"{px}_px" for px in THRESHOLDS_PX]
+    return {
+        "aj": float(jaccard.mean()),
+        "delta_avg": float(within.mean()),
+        "oa": float((truly == said).mean()) if truly.size else float("nan"),
+        "jaccard": dict(zip(names, jaccard.tolist(), strict=True)),
+        "within": dict(zip(names, within.tolist(), strict=True)),
+    }
 
 
 class Outcome(IntEnum):

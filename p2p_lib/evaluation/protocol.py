@@ -162,17 +162,20 @@ def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) ->
     )
 
 
-def model_frames(run: Run, min_visible_px: int = MIN_VISIBLE_PX) -> dict[str, np.ndarray]:
+def model_frames(run: Run) -> dict[str, np.ndarray]:
     """Object to T_obj_model (4, 4) by :func:`align_first`, for those with a pose in a scored frame.
 
     Raises :class:`MissingData` where there is none of these.
     """
-    usable = {name: scored_frames(obj, min_visible_px) & obj.has_pose for name, obj in run.objects.items()}
-    if not any(at.any() for at in usable.values()):
+    frames = {}
+    for name, obj in run.objects.items():
+        at = scored_frames(obj) & obj.has_pose
+        if at.any():
+            frames[name] = align_first(obj.T_cam_obj[at], obj.T_cam_model[at])
+    if not frames:
         fix = "Take the tracker's own object frame."
         raise MissingData(str(run.path), "no scored frame with truth and a pose, so no model frame", fix)
-    found = {name: run.objects[name] for name, at in usable.items() if at.any()}
-    return {n: align_first(o.T_cam_obj[usable[n]], o.T_cam_model[usable[n]]) for n, o in found.items()}
+    return frames
 
 
 def rate(timings: Mapping[str, np.ndarray]) -> tuple[float | None, float | None]:

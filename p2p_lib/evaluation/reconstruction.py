@@ -36,9 +36,7 @@ _ICP_STEPS = 30
 _AGREES_M, _VIEWS = 0.007, 40
 
 
-def chamfer_cm(
-    mesh: trimesh.Trimesh, T_model_obj: np.ndarray, reference: np.ndarray, seed: int = 0
-) -> dict[str, float]:
+def chamfer_cm(mesh: trimesh.Trimesh, T_model_obj: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """All forms in centimetres.
 
     mesh         in the object frame; T_model_obj (4, 4) takes it to the model's
@@ -53,7 +51,7 @@ def chamfer_cm(
     mesh = _cleaned(mesh, T_model_obj, truth)
     if mesh is None:
         return {}
-    samples, _ = trimesh.sample.sample_surface(mesh, SAMPLES, seed=seed)
+    samples, _ = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
     as_aligned = (cKDTree(reference).query(samples)[0].mean() + cKDTree(samples).query(reference)[0].mean()) / 2
     samples = se3.transform(_icp(thinned(samples), truth), samples)
     tree = cKDTree(truth)
@@ -72,9 +70,7 @@ def thinned(points: np.ndarray, grid_m: float = GRID_M) -> np.ndarray:
     return sums / count[:, None]
 
 
-def seen_surface(
-    sequence: Sequence, name: str, model: Path | np.ndarray, frames: np.ndarray, seed: int = 0
-) -> tuple[np.ndarray, str]:
+def seen_surface(sequence: Sequence, name: str, model: Path | np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, str]:
     """The part of an object's true surface that these frames show, (M, 3) in the model frame, and where it is from.
 
     ``visible_mesh.ply`` of the sequence where it is there (BundleSDF's download of HO3D has it); else the points of
@@ -85,8 +81,8 @@ def seen_surface(
     """
     given = sequence.path / "visible_mesh.ply" if sequence.path else None
     if given and given.is_file():
-        return _sampled(given, seed), "visible_mesh.ply"
-    points = _sampled(model, seed) if isinstance(model, Path) else model
+        return _sampled(given), "visible_mesh.ply"
+    points = _sampled(model) if isinstance(model, Path) else model
     seen = np.zeros(len(points), bool)
     for k in np.unique(frames[np.linspace(0, len(frames) - 1, min(_VIEWS, len(frames))).astype(int)]):
         T_cam_model, depth_m = sequence.truth[name].T_cam_model[k], sequence.frame(int(k)).depth_m
@@ -98,11 +94,11 @@ def seen_surface(
     return points[seen], f"seen part of {model.name if isinstance(model, Path) else 'the model points'}"
 
 
-def _sampled(path: Path, seed: int) -> np.ndarray:
+def _sampled(path: Path) -> np.ndarray:
     import trimesh
 
     mesh = trimesh.Trimesh(*load_mesh(path), process=False)
-    return trimesh.sample.sample_surface(mesh, REFERENCE_SAMPLES, seed=seed)[0]
+    return trimesh.sample.sample_surface(mesh, REFERENCE_SAMPLES, seed=0)[0]
 
 
 def _cleaned(mesh: trimesh.Trimesh, T_model_obj: np.ndarray, truth: np.ndarray) -> trimesh.Trimesh | None:

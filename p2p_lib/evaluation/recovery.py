@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from p2p_lib.datasets.runs import ObjectRun
-from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ObjectScore, scored_frames
+from p2p_lib.evaluation.protocol import ObjectScore, scored_frames
 
 MIN_HIDDEN_FRAMES = 10
 MAX_ADDS_M = 0.02
@@ -33,12 +33,9 @@ class RecoveryEvent:
     frames_to_recovery: int | None
 
 
-def recovery_events(obj: ObjectRun, score: ObjectScore, min_visible_px: int = MIN_VISIBLE_PX) -> list[RecoveryEvent]:
-    """The returns of one object in a run, by the rule that also decides which frames are scored.
-
-    ``score`` is the object's from :func:`~p2p_lib.evaluation.protocol.evaluate` with the same ``min_visible_px``.
-    """
-    visible = scored_frames(obj, min_visible_px)
+def recovery_events(obj: ObjectRun, score: ObjectScore) -> list[RecoveryEvent]:
+    """The returns of one object in a run, by the rule that also decides which frames are scored."""
+    visible = scored_frames(obj)
     adds_m = np.full(len(obj), np.inf)
     adds_m[visible] = score.adds_m
     seen = np.flatnonzero(visible)

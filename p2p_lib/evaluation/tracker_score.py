@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,14 +15,7 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.oracle import OracleTracker
-from p2p_lib.evaluation.point_tracks import (
-    THRESHOLDS_PX,
-    TapVid,
-    after_query,
-    redetection_shares,
-    redetections,
-    tapvid,
-)
+from p2p_lib.evaluation.point_tracks import after_query, redetection_shares, redetections, tapvid
 from p2p_lib.evaluation.true_tracks import Queries, Sight, TrueScene, draw_queries, true_tracks
 
 if TYPE_CHECKING:
@@ -47,7 +40,7 @@ class TrackRun:
 class TrackerScore:
     """A tracker's scores on one sequence, with what they were measured on."""
 
-    tapvid: TapVid
+    tapvid: dict[str, Any]
     redetections: DataFrame
     truth: Sight
     run: TrackRun
@@ -56,11 +49,9 @@ class TrackerScore:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as ``p2p eval-tracks --json`` prints them; shares in [0, 1], cost in milliseconds."""
-        scores, cost = asdict(self.tapvid), self.run.cpu_ms[np.isfinite(self.run.cpu_ms)]
-        for name in ("jaccard", "within"):
-            scores[name] = {f"{px}_px": value for px, value in zip(THRESHOLDS_PX, scores[name], strict=True)}
+        cost = self.run.cpu_ms[np.isfinite(self.run.cpu_ms)]
         cpu_ms = {"mean": float(cost.mean()), "p95": float(np.percentile(cost, 95))} if len(cost) else {}
-        return {**self.info, **scores, "redetection": redetection_shares(self.redetections), "cpu_ms": cpu_ms}
+        return {**self.info, **self.tapvid, "redetection": redetection_shares(self.redetections), "cpu_ms": cpu_ms}
 
     def as_table(self) -> str:
         """The same for people."""
@@ -104,8 +95,8 @@ class TrackTask:
         """(T, N) bool: after the query, where truth says whether the point is visible."""
         return after_query(self.queries.frame, len(self.sequence)) & self.truth.known
 
-    def tracker(self, name: str, config: Config) -> PointTracker:
-        """The tracker of this name: ``oracle``, which knows the truth, or one of the known trackers."""
+    def tracker(self, name: str | PointTracker, config: Config) -> PointTracker:
+        """The tracker of this name: ``oracle``, which knows the truth, or a known one; or the one given."""
         known = OracleTracker(self.scene, config.oracle, self.seed) if name == OracleTracker.name else name
         return make_tracker(known, config.tracking, np.random.default_rng(self.seed))
 

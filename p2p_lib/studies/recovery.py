@@ -137,7 +137,7 @@ def reliability_plot(judged: Mapping[str, Judged]) -> Figure:
         label = f"{label}: ECE {one.calibration_error:.2f}, AUROC {one.auroc:.2f}".replace("nan", "-")
         axes[0].plot(bins.confidence, 100 * bins.right, "o-", ms=4, color=colour, label=label)
         left = np.floor(np.minimum(bins.confidence, 0.999) * 10) / 10 + 0.01 + k * width
-        axes[1].bar(left, bins.count, width, align="edge", color=colour)
+        axes[1].bar(left, bins.poses, width, align="edge", color=colour)
     axes[0].set(xlim=(0, 1.02), ylim=(0, 103), xlabel="stated confidence", ylabel=f"within {_RIGHT} [%]")
     axes[1].set(xlim=(0, 1.02), xlabel="stated confidence", ylabel="poses")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=2, fontsize=8)

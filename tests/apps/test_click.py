@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from p2p_lib.apps.click import PAGE, collect_clicks
+from p2p_lib.apps.click import PAGE, Clicker
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.prompts import Prompt, load_prompts, save_prompts
 from p2p_lib.datasets.sequence import open_sequence
@@ -66,7 +66,7 @@ def one(name="cup", frame=0, points=((40, 30), [50, 20])) -> dict:
 
 
 def test_a_whole_visit(sequence, out):
-    with collect_clicks(sequence, out, frame=1) as clicker:
+    with Clicker(sequence, out, frame=1) as clicker:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", clicker.url)
         status, page, kind = get(clicker.url)
         assert (status, kind) == (200, "text/html") and b"<canvas" in page
@@ -93,7 +93,7 @@ def test_a_whole_visit(sequence, out):
 
 def test_what_the_file_holds_is_shown_first(sequence, out):
     save_prompts(out, [Prompt("cup", 1, [[30, 20]])])
-    with collect_clicks(sequence, out) as clicker:
+    with Clicker(sequence, out) as clicker:
         assert json.loads(get(clicker.url + "session")[1])["objects"] == [one("cup", 1, [[30, 20]])]
         assert not clicker.wait(0)
 
@@ -103,7 +103,7 @@ REFUSED = {
     "no depth": ({"objects": [one(points=[(5, 5)])]}, "(5, 5) has no depth in frame 0"),
     "same click": ({"objects": [one(), one("bowl")]}, "clicks on 'bowl': got a click that is also one of 'cup'"),
     "same name": ({"objects": [one(), one()]}, "'cup' twice"),
-    "late frame": ({"objects": [one(frame=3)]}, "prompt of 'cup': got frame 3, expected below 3"),
+    "late frame": ({"objects": [one(frame=3)]}, "prompt of 'cup': got frame 3, expected a frame from 0 to 2"),
     "no points": ({"objects": [one(points=())]}, "at least one [x, y]"),
     "nothing": ({"objects": []}, "prompts: got"),
     "a list": ([1, 2], "prompts: got"),
@@ -114,14 +114,14 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_does_not_fit_is_said_on_the_page_and_not_saved(case, sequence, out):
     content, why = REFUSED[case]
-    with collect_clicks(sequence, out) as clicker:
+    with Clicker(sequence, out) as clicker:
         status, answer = post(clicker.url, content)
         assert status == 400 and why in answer["error"] and not out.exists() and not clicker.wait(0)
         assert post(clicker.url, {"objects": [one()]})[0] == 200  # it goes on
 
 
 def test_nothing_else_is_served(sequence, out):
-    with collect_clicks(sequence, out) as clicker:
+    with Clicker(sequence, out) as clicker:
         for path in ("frame/3", "frame/-1", "frame/x", "../pyproject.toml", "prompts", "frame/"):
             assert get(clicker.url + path)[0] == 404
         assert post(clicker.url, {"objects": [one()]}, kind="text/plain")[0] == 404
@@ -135,21 +135,21 @@ def test_nothing_else_is_served(sequence, out):
 
 
 def test_the_notebook_shows_the_page(sequence, out):
-    with collect_clicks(sequence, out) as clicker:
+    with Clicker(sequence, out) as clicker:
         assert f'src="{clicker.url}"' in clicker._repr_html_()
 
 
 def test_refusals_at_the_start(sequence, out):
     with pytest.raises(BadInput, match="frame: got 3, expected a number from 0 to 2"):
-        collect_clicks(sequence, out, frame=3)
-    with collect_clicks(sequence, out) as clicker:
+        Clicker(sequence, out, frame=3)
+    with Clicker(sequence, out) as clicker:
         port = int(clicker.url.rstrip("/").rpartition(":")[2])
         with pytest.raises(BadInput, match=f"port: got {port}, expected a free port"):
-            collect_clicks(sequence, out, port=port)
+            Clicker(sequence, out, port=port)
     out.parent.mkdir()
     out.write_text("{}")
     with pytest.raises(BadInput, match=r"prompts\.json: prompts"):
-        collect_clicks(sequence, out)
+        Clicker(sequence, out)
 
 
 def test_the_page_needs_nothing_from_elsewhere():

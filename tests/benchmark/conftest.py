@@ -69,6 +69,6 @@ def plan(slides, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def whole(plan, tmp_path_factory):
     """The plan in full, run at once."""
-    from p2p_lib.benchmark import run_benchmark
+    from p2p_lib.benchmark import run_benchmarks
 
-    return run_benchmark(plan, tmp_path_factory.mktemp("whole"), progress=False, jobs=2)
+    return run_benchmarks([plan], tmp_path_factory.mktemp("whole"), progress=False, jobs=2)[0]

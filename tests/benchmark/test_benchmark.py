@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.apps import cli
-from p2p_lib.benchmark import read_plan, run_benchmark
+from p2p_lib.benchmark import read_plan, run_benchmarks
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import jobs_of
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome, load_outcome, save_outcome
@@ -24,6 +24,11 @@ from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import evaluate
+
+
+def run_benchmark(plan, *where, **options):
+    """One plan of the benchmarks."""
+    return run_benchmarks([plan], *where, **options)[0]
 
 
 def table(benchmark: Benchmark, name: str = "results") -> list[dict[str, str]]:

@@ -6,7 +6,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.apps.cli import main
-from p2p_lib.apps.evaluate import evaluate_poses, export_run
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
@@ -16,6 +15,7 @@ from p2p_lib.datasets.exchange import FORMATS, export, read_poses
 from p2p_lib.datasets.runs import RunWriter, load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.protocol import evaluate
+from p2p_lib.run import evaluate_poses, export_run
 
 W, H, N = 40, 30, 12
 STEMS = [str(1581120424100262102 + i * 33_000_000) for i in range(N)]  # nanoseconds, as YCBInEOAT names pictures

@@ -13,7 +13,7 @@ def test_bins_hold_what_they_should():
     bins = reliability(judged)
     np.testing.assert_allclose(bins.confidence, [0.065, 0.31, (0.99 + 2) / 3])
     np.testing.assert_allclose(bins.right, [0.5, 1, 2 / 3])
-    assert bins.count.tolist() == [2, 1, 3]
+    assert bins.poses.tolist() == [2, 1, 3]
     by_hand = (2 * abs(0.5 - 0.065) + 1 * 0.69 + 3 * abs(2 / 3 - 2.99 / 3)) / 6
     assert judged.calibration_error == pytest.approx(by_hand)
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from p2p_lib.evaluation import metrics, numbers
-from p2p_lib.evaluation.numbers import Number
+from p2p_lib.benchmark import rows as numbers
+from p2p_lib.benchmark.rows import Number
+from p2p_lib.evaluation import metrics
 
 ERRORS = {"add_m": np.array([0.0, 0.02, np.inf, 0.05]), "adds_m": np.array([0.0, 0.01, np.inf, 0.02])}
 
@@ -32,20 +33,20 @@ def test_an_object_never_found_scores_zero_and_nothing():
 
 def test_a_mean_counts_failed_runs_where_failures_count():
     perfect = numbers.areas({"add_m": np.zeros(2), "adds_m": np.zeros(2)}, "first")
-    means = numbers.mean([perfect, numbers.areas(ERRORS, "first")], failed=2)
+    means = numbers.mean([*perfect, *numbers.areas(ERRORS, "first")], failed=2)
     assert value(means, metric="ADD AUC", form="exact", failures="zero") == pytest.approx((100 + 57.5) / 4)
     left_out = value(means, metric="ADD AUC", form="exact", failures="left out")
     assert left_out == pytest.approx((100 + 230 / 3) / 2)
 
 
 def test_distances_have_no_worst_value():
-    one = numbers.chamfer({"BundleSDF": 0.5, "release": 0.4}, "first")
-    means = numbers.mean([one, numbers.chamfer({"BundleSDF": 0.7, "release": 0.6}, "first")], failed=3)
+    one, other = ({"BundleSDF": 0.5, "release": 0.4}, {"BundleSDF": 0.7, "release": 0.6})
+    means = numbers.mean([*numbers.chamfer(one), *numbers.chamfer(other)], failed=3)
     assert value(means, form="BundleSDF") == pytest.approx(0.6) and {n.unit for n in means} == {"cm"}
 
 
 def test_returns_are_counted():
-    found = numbers.returns([0, 5, 6, 30, 31, None], (5, 30), "first")
+    found = numbers.returns([0, 5, 6, 30, 31, None])
     assert value(found, form="all") == 6
     assert value(found, form="recovered within 5 frames") == 2
     assert value(found, form="recovered within 30 frames") == 4
