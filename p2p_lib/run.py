@@ -20,8 +20,7 @@ from p2p_lib.core.options import RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets import sequence as sequences
-from p2p_lib.datasets.export import export
-from p2p_lib.datasets.imported import as_run, read_poses
+from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import Prompt, clicks_by_frame, load_prompts
@@ -137,7 +136,7 @@ def evaluate_poses(
     start: int = 0,
     stop: int | None = None,
 ) -> Evaluation:
-    """Score any method's poses (:mod:`p2p_lib.datasets.imported`) by the rules of a run of ours over these frames."""
+    """Score any method's poses (:mod:`p2p_lib.datasets.exchange`) by the rules of a run of ours over these frames."""
     if isinstance(sequence, str | Path):
         sequence = sequences.open_sequence(sequence, format)
     known = find_models(sequence) | given_models(models or {}, sequence.objects)
