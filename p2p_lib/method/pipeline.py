@@ -200,7 +200,7 @@ class Point2Pose:
 
     def _segment(self, frame: Frame, tracks: Tracks, clicks: dict[str, np.ndarray]) -> Masks:
         """Masks of the objects that were clicked on in this frame or before."""
-        clicks = {name: at for name, at in clicks.items() if name in self.objects}  # some may be gone again
+        clicks = {name: at for name, at in sorted(clicks.items()) if name in self.objects}  # some may be gone again
         if not self.segmenter.names and not clicks:
             return {}
         with self.stopwatch("segmentation"):
