@@ -23,7 +23,7 @@ REQUIRED = set("jupyterlab numpy torch opencv-python-headless gtsam open3d trime
 #: Import name to distribution, where they differ; and what comes as a part of another.
 DISTRIBUTIONS = {"rerun": "rerun-sdk", "cv2": "opencv-python-headless", "skimage": "scikit-image", "PIL": "pillow"}
 PARTS = {"IPython": "jupyterlab", "jupyter_client": "jupyterlab", "nbconvert": "jupyterlab", "nbformat": "papermill"}
-PARTS |= {"nbclient": "papermill", "jinja2": "jupyterlab"}
+PARTS |= {"nbclient": "papermill", "jinja2": "jinja2"}
 
 
 @pytest.fixture(scope="module")
