@@ -108,7 +108,7 @@ def align(image: np.ndarray, patches: Patches, uv_px: np.ndarray, A: np.ndarray,
         shift = np.linalg.norm(step[:, :2], axis=1, keepdims=True)
         step[:, :2] *= np.minimum(1, 3 / np.maximum(shift, 1e-6))
         D = np.clip(step[:, 2:], -0.25, 0.25).reshape(-1, 2, 2)
-        A = A @ np.linalg.inv(identity + D)
+        A = A @ _inverse(identity + D)
         uv = uv - (A @ step[:, :2, None])[..., 0]
     pixels, contrast = _normalised(_sample(image, uv, A @ _GRID))
     ncc = np.einsum("np,np->n", pixels, patches.pixels)
@@ -138,3 +138,13 @@ def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     centred -= (centred @ _RAMPS.T) @ _RAMPS
     norm = np.sqrt(np.maximum(np.einsum("np,np->n", centred, centred), 1.0))
     return centred / norm[:, None], norm
+
+
+def _inverse(A: np.ndarray) -> np.ndarray:
+    """Inverses of (N, 2, 2), in closed form: LAPACK's overhead exceeds the work."""
+    det = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
+    det = np.where(np.abs(det) < 1e-6, 1e-6, det)
+    out = np.empty_like(A)
+    out[:, 0, 0], out[:, 1, 1] = A[:, 1, 1], A[:, 0, 0]
+    out[:, 0, 1], out[:, 1, 0] = -A[:, 0, 1], -A[:, 1, 0]
+    return out / det[:, None, None]
