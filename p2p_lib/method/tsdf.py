@@ -19,7 +19,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TsdfConfig
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, MissingBackend
 
 if TYPE_CHECKING:
     import torch
@@ -96,7 +96,7 @@ class TsdfVolume:
     the arrays hold lattice indices ``lo`` to ``lo + shape``. With ``origin_m`` and ``shape`` the grid is
     fixed there and does not grow.
 
-    Raises :class:`BadInput` for a fixed grid beyond ``config.max_voxels``.
+    Raises :class:`BadInput` for a fixed grid beyond ``config.max_voxels``, :class:`MissingBackend` without the device.
     """
 
     def __init__(
@@ -109,6 +109,9 @@ class TsdfVolume:
     ):
         import torch
 
+        if device != "cpu" and not torch.cuda.is_available():
+            fix = "Say --device cpu, or see environment.md for PyTorch with CUDA."
+            raise MissingBackend(f"device {device}", "PyTorch finds no CUDA device here", fix)
         self.config, self.device = config, torch.device(device)
         self.voxel_m, self.tau_m = config.voxel_m, config.voxel_m * config.truncation_voxels
         self.grows = shape is None

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.config import TsdfConfig
+from p2p_lib.core.errors import MissingBackend
 from p2p_lib.method.tsdf import TsdfVolume
 from tests.method.analytic_scene import CAMERA, LUMP, around, render
 
@@ -48,3 +49,11 @@ def test_every_device_agrees_with_the_cpu(volume):
         np.testing.assert_allclose(here, there, atol=1e-5)
     np.testing.assert_array_equal(volume.mesh().faces, cpu.mesh().faces)
     np.testing.assert_allclose(volume.mesh().vertices, cpu.mesh().vertices, atol=1e-5)
+
+
+def test_a_device_that_is_not_there_is_refused():
+    torch = pytest.importorskip("torch")
+    if torch.cuda.is_available():
+        pytest.skip("torch finds a CUDA device")
+    with pytest.raises(MissingBackend, match="device cuda: PyTorch finds no CUDA device here"):
+        TsdfVolume(CONFIG, device="cuda")
