@@ -35,48 +35,29 @@ def motion_weight(
 
 
 def nearest_to_surface(
-    hypotheses: Sequence[Hypothesis],
-    distance_m: np.ndarray | None,
-    config: SelectionConfig,
-    weight: np.ndarray | None = None,
-) -> tuple[int | None, str]:
-    """The hypothesis with the least mean distance to the surface, and why; see :func:`select`."""
-    best = _best(hypotheses, weight)
-    scores = _scores(distance_m)
-    if scores is None or best is None:
-        return best, _WHY[len(hypotheses) if len(hypotheses) < 2 else 2]
-    best = int(np.argmin(scores))
-    return best, f"nearest to the surface ({1e3 * scores[best]:.2f} mm)"
+    best: int, distance_m: np.ndarray, scores: np.ndarray, config: SelectionConfig
+) -> tuple[int, str]:
+    """The hypothesis with the least mean distance to the surface; see :func:`select`."""
+    nearest = int(np.argmin(scores))
+    return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
 
 
-def best_supported(
-    hypotheses: Sequence[Hypothesis],
-    distance_m: np.ndarray | None,
-    config: SelectionConfig,
-    weight: np.ndarray | None = None,
-) -> tuple[int | None, str]:
-    """The best supported hypothesis unless the surface prefers another, and why; see :func:`select`.
+def best_supported(best: int, distance_m: np.ndarray, scores: np.ndarray, config: SelectionConfig) -> tuple[int, str]:
+    """The best supported hypothesis unless the surface prefers another; see :func:`select`.
 
     It does where the other one is nearer by more than ``surface_sigmas`` standard errors and a small margin. The same
     points are compared under both poses, so the difference of each counts.
     """
-    best = _best(hypotheses, weight)
-    scores = _scores(distance_m)
-    if scores is None or best is None:
-        return best, _WHY[len(hypotheses) if len(hypotheses) < 2 else 2]
     nearest = int(np.argmin(scores))
     nearer = distance_m[best] - distance_m[nearest]
     chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
     if scores[best] - scores[nearest] > max(chance, _MARGIN_M):
-        return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
+        return nearest_to_surface(best, distance_m, scores, config)
     return best, "most inliers, the surface does not tell the hypotheses apart"
 
 
-#: The rules by name.
-RULES: dict[str, Callable[..., tuple[int | None, str]]] = {
-    "surface": nearest_to_surface,
-    "support": best_supported,
-}
+#: The rules by name: from the best supported row, distances (H, N) and mean distances (H,) to the row taken, and why.
+RULES: dict[str, Callable[..., tuple[int, str]]] = {"surface": nearest_to_surface, "support": best_supported}
 
 
 def select(
@@ -91,16 +72,18 @@ def select(
                 metres); None while there is no surface
     weight      (H,) factors of the support
     """
-    return RULES[config.rule](hypotheses, distance_m, config, weight)
-
-
-_WHY = ("no hypothesis: too few correspondences agree", "the only hypothesis", "most inliers, there is no surface yet")
-
-
-def _best(hypotheses: Sequence[Hypothesis], weight: np.ndarray | None) -> int | None:
-    """The hypothesis with most support, then with the least mean residual."""
     if not hypotheses:
-        return None
+        return None, "no hypothesis: too few correspondences agree"
+    if len(hypotheses) == 1:
+        return 0, "the only hypothesis"
+    best, scores = _best(hypotheses, weight), _scores(distance_m)
+    if scores is None:
+        return best, "most inliers, there is no surface yet"
+    return RULES[config.rule](best, distance_m, scores, config)
+
+
+def _best(hypotheses: Sequence[Hypothesis], weight: np.ndarray | None) -> int:
+    """The hypothesis with most support, then with the least mean residual."""
     support = np.array([h.support for h in hypotheses]) * (1 if weight is None else weight)
     residual_m = np.array([h.residual_m[h.inliers].mean() if h.support else np.inf for h in hypotheses])
     return int(np.lexsort((residual_m, -support))[0])
@@ -108,7 +91,7 @@ def _best(hypotheses: Sequence[Hypothesis], weight: np.ndarray | None) -> int | 
 
 def _scores(distance_m: np.ndarray | None) -> np.ndarray | None:
     """(H,) mean distances, infinite where one is not finite; None where nothing can be compared."""
-    if distance_m is None or len(distance_m) < 2 or not distance_m.size:
+    if distance_m is None or not distance_m.size:
         return None
     finite = np.isfinite(distance_m).all(1)
     return np.where(finite, distance_m.mean(1), np.inf) if finite.any() else None
