@@ -20,7 +20,7 @@ from p2p_lib.core.config import TsdfConfig, preset
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.native import load_open3d
 from p2p_lib.method.observation import sample_cloud
-from p2p_lib.method.refinement import refine, surface_score
+from p2p_lib.method.refinement import refine, surface_distances
 from p2p_lib.method.tsdf import TsdfVolume
 
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
@@ -103,7 +103,7 @@ def main() -> None:
     row(f"query {len(p)} points", query)
     row(f"query {len(p)} points with gradient", median_ms(lambda: volume.query_with_gradient(p_obj), 100))
     many = np.stack([T @ se3.exp(rng.normal(0, 0.02, 6)) for _ in range(10)])
-    row(f"score 10 hypotheses on {len(p)} points", median_ms(lambda: surface_score(volume, p, many), 50))
+    row(f"score 10 hypotheses on {len(p)} points", median_ms(lambda: surface_distances(volume, p, many).mean(1), 50))
 
     start = T @ se3.exp([0.03, -0.03, 0.03, 0.003, -0.003, 0.003])
     refining = {}

@@ -353,12 +353,6 @@ def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray)
     return np.where(valid, np.abs(value), volume.tau_m)
 
 
-def surface_score(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:
-    """(H,) mean of :func:`surface_distances`; infinite without any finite point."""
-    distance_m = surface_distances(volume, p_cam, T_cam_obj)
-    return distance_m.mean(1) if distance_m.size else np.full(len(distance_m), np.inf)
-
-
 def _usable(p_cam: np.ndarray, max_points: int) -> np.ndarray:
     p_cam = np.asarray(p_cam, float).reshape(-1, 3)
     p_cam = p_cam[np.isfinite(p_cam).all(-1)]

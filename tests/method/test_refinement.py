@@ -9,11 +9,18 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import RefinementConfig, TsdfConfig, preset
 from p2p_lib.method import refinement
 from p2p_lib.method.observation import sample_cloud
-from p2p_lib.method.refinement import Keypoints, refine, surface_jacobian, surface_score
+from p2p_lib.method.refinement import Keypoints, refine, surface_distances, surface_jacobian
 from p2p_lib.method.tsdf import TsdfVolume
 from tests.method.analytic_scene import CAMERA, LUMP, around, box, can, look_from, render
 
 CONFIG = RefinementConfig()
+
+
+def surface_score(volume, p_cam, T_cam_obj) -> np.ndarray:
+    """(H,) the paper's measure for choosing a hypothesis."""
+    return surface_distances(volume, p_cam, T_cam_obj).mean(1)
+
+
 WHITE = np.full((CAMERA.height, CAMERA.width, 3), 255, np.uint8)
 
 
