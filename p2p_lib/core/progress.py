@@ -15,11 +15,17 @@ def progress_bar(title: str, total: int | None = None, unit: str = "frame", show
     options = {"desc": title, "total": total, "unit": unit, **options}
     if not shown or os.environ.get("P2P_PROGRESS") == "off":
         return tqdm(disable=True, **options)
-    if "ipykernel" in sys.modules:
+    if _in_notebook():
         from tqdm.auto import tqdm as of_notebook
 
         return of_notebook(**options)
     return tqdm(**options) if sys.stderr.isatty() else _AtTheEnd(**options)
+
+
+def _in_notebook() -> bool:
+    """Whether this code runs in a notebook's cell; whoever drives notebooks has imported their packages too."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    return shell is not None and hasattr(shell, "kernel")
 
 
 class _AtTheEnd(tqdm):

@@ -19,6 +19,13 @@ def test_without_a_terminal_it_is_one_line(capsys):
     assert "things" in err and "500/500" in err and "at 499" in err
 
 
+def test_to_have_imported_the_packages_of_notebooks_is_not_to_be_in_one(capsys):
+    import ipykernel.zmqshell  # noqa: F401
+
+    count(5)
+    assert "\r" not in capsys.readouterr().err
+
+
 def test_a_terminal_gets_a_bar(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     count(3)
