@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,9 +33,13 @@ from p2p_lib.core.types import Frame, PoseEstimate, Tracks
 from p2p_lib.method.object_model import NO_IDS, Requests
 from p2p_lib.method.object_tracker import ObjectTracker
 from p2p_lib.method.observation import Observation
+from p2p_lib.method.scene import Scene
+from p2p_lib.method.search import Sighting
 
 #: Object to (H, W) bool; None where nobody knows.
 Masks = dict[str, np.ndarray | None]
+#: The camera is located every so many frames while all objects have poses.
+_LOCATE_EVERY = 5
 NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
@@ -56,12 +61,15 @@ class Point2Pose:
         self.detector = make_detector(detector, self.config.sampling, self._rng)
         rng = np.random.default_rng([self.config.seed, 1])
         self.segmenter = make_segmenter(segmenter, camera, self.config.segmentation, rng)
+        scene_rng = np.random.default_rng([self.config.seed, 2])
+        self.scene = Scene(camera, self.config.depth, scene_rng) if self.config.method.scene else None
         self.objects: dict[str, ObjectTracker] = {}
         self.masks: Masks = {}
         self.tracks = NOTHING_TRACKED
         self.stopwatch = Stopwatch()
         self._first_masks: dict[str, np.ndarray] = {}
         self._streaming = False
+        self._unlocated = _LOCATE_EVERY
         self._first_clicks: dict[str, np.ndarray] = {}
         self._clicked: set[str] = set()  # the objects that the segmenter looks after
         self._waiting: deque[tuple[Frame, Masks, dict[str, np.ndarray]]] = deque()  # frames without an answer yet
@@ -141,15 +149,46 @@ class Point2Pose:
         if len(self._waiting) <= self.tracker.latency_frames:
             return {}
         frame, masks, clicks = self._waiting.popleft()
-        self.tracks, self.masks = tracks, masks | self._segment(frame, tracks, clicks)
+        frame = self._located(frame)
         # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
         objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
-        seen = {name: obj.observe(frame, self.masks[name], tracks) for name, obj in objects.items()}
+        self.tracks = tracks
+        sightings = self._sightings(frame, masks, objects)
+        self.masks = masks | self._segment(frame, clicks, sightings)
+        seen = {
+            name: obj.observe(frame, self.masks[name], self.tracks, sightings.get(name))
+            for name, obj in objects.items()
+        }
         self._apply({name: obj.misplaced(seen[name]) for name, obj in objects.items()})
         seen |= self._redetect(seen)
         steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
         self._apply({name: step.requests for name, step in steps.items()})
         return {name: steps[name].estimate for name in self.objects if name in steps}
+
+    def _located(self, frame: Frame) -> Frame:
+        """The frame with the camera's pose, as far as it is known: often while an object is away, else now and then."""
+        self._unlocated += 1
+        every = 1 if any(obj.away for obj in self.objects.values()) else _LOCATE_EVERY
+        if self.scene is None or frame.T_world_cam is not None or self._unlocated < every:
+            return frame
+        self._unlocated = 0
+        with self.stopwatch("scene"):
+            known = [mask for mask in self.masks.values() if mask is not None]
+            occupied = np.logical_or.reduce(known) if known else None
+            return replace(frame, T_world_cam=self.scene.locate(frame, occupied))
+
+    def _sightings(self, frame: Frame, masks: Masks, objects: Mapping[str, ObjectTracker]) -> dict[str, Sighting]:
+        """Absent objects that show again; the tracker looks for their points there."""
+        found = {}
+        for name, obj in objects.items():
+            obs = obj.observe(frame, masks[name], self.tracks) if obj.away else None
+            sighting = None if obs is None else obj.sighted(obs)
+            if sighting is not None:
+                found[name] = sighting
+                with self.stopwatch("tracking"):
+                    expected = self.tracker.suggest(obj.map.ids, obj.points_px(obs, sighting.T_cam_obj))
+                    self.tracks = self.tracks if expected is None else expected
+        return found
 
     def _redetect(self, seen: Mapping[str, Observation]) -> dict[str, Observation]:
         """Guided re-detection: the tracker looks for points where their objects expect them; what is seen then."""
@@ -161,7 +200,7 @@ class Point2Pose:
                 found = None if uv_px is None else self.tracker.suggest(self.objects[name].map.ids, uv_px)
                 self.tracks = self.tracks if found is None else found
         sought = [name for name, uv_px in expected.items() if uv_px is not None]
-        return {name: self.objects[name].observe(seen[name].frame, seen[name].mask, self.tracks) for name in sought}
+        return {name: self.objects[name].seen_anew(seen[name], self.tracks) for name in sought}
 
     def _apply(self, requests: Mapping[str, Requests]) -> None:
         """The one place where the shared tracker is changed, after all objects have been looked at."""
@@ -198,13 +237,15 @@ class Point2Pose:
         clicks, self._first_clicks = self._first_clicks, {}
         return clicks
 
-    def _segment(self, frame: Frame, tracks: Tracks, clicks: dict[str, np.ndarray]) -> Masks:
+    def _segment(self, frame: Frame, clicks: dict[str, np.ndarray], sightings: Mapping[str, Sighting]) -> Masks:
         """Masks of the objects that were clicked on in this frame or before."""
         clicks = {name: at for name, at in sorted(clicks.items()) if name in self.objects}  # some may be gone again
         if not self.segmenter.names and not clicks:
             return {}
         with self.stopwatch("segmentation"):
-            hints = {name: self.objects[name].hint(frame, tracks) for name in self.segmenter.names}
+            hints = {
+                name: self.objects[name].hint(frame, self.tracks, sightings.get(name)) for name in self.segmenter.names
+            }
             self._apply({name: requests for name, (_, requests) in hints.items()})
             labels = self.segmenter.segment(frame, clicks, {name: hint for name, (hint, _) in hints.items()})
             return {name: labels == label for label, name in enumerate(self.segmenter.names, 1)}
