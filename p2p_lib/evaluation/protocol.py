@@ -37,7 +37,7 @@ HEADS = {
     "add_auc_voc": "ADD AUC, VOC [%]",
 }
 #: What a score says of the run.
-WHAT_RAN = ("tracker", "masks", "preset", "seed")
+WHAT_RAN = ("tracker", "masks", "segmenter", "preset", "seed")
 
 
 @dataclass(frozen=True, eq=False)
