@@ -365,7 +365,7 @@ class ObjectTracker:
         keypoints = np.where(self.map.promoted[:, None], self.map.p_obj, np.nan)
         return self.observer.expected_px(obs, T_cam_obj, keypoints)
 
-    def hint(self, frame: Frame, tracks: Tracks, sighting: Sighting | None) -> tuple[Hint, Requests]:
+    def hint(self, frame: Frame, tracks: Tracks, sighting: Sighting | None = None) -> tuple[Hint, Requests]:
         """Where this object should be, by its tracks and its model, before the frame is segmented.
 
         Also the tracks to reject: while the object is away, points that agree on no pose are somewhere else.
