@@ -72,7 +72,7 @@ def test_pairs_that_lie_close_say_nothing() -> None:
     rng = np.random.default_rng(3)
     T, p_b, p_a = moved(3, 42)
     p_b[:30] = rng.uniform(-0.002, 0.002, (30, 3))
-    p_a[:30] = rng.uniform(-0.002, 0.002, (30, 3)) + [0.05, 0.05, 0.05]
+    p_a[:30] = 0.05 + rng.uniform(-0.002, 0.002, (30, 3))
     found, agrees = robust.consensus(p_b, p_a, 0.008)
     assert agrees[30:].all() and off_m(found, T, p_b[30:]) < 1e-6
 
