@@ -232,6 +232,23 @@ def test_ours_refines_before_it_selects_the_paper_after(rule, before, monkeypatc
     assert (len(refined) > 1) == before and refined
 
 
+def test_a_refused_return_leaves_the_object_lost():
+    lump = settled(begun(**NO_SURFACE), [2])
+    lump.see(turned(3), mask=np.zeros((CAMERA.height, CAMERA.width), bool))
+    few = hide(lambda tracks: np.cumsum(tracks.visible) > 6)
+    refused = lump.see(turned(4), few).estimate
+    assert refused.status is Status.LOST and refused.T_cam_obj is None and refused.reason.startswith("only 6 points")
+    assert refused.last_T_cam_obj is not None
+    assert lump.see(turned(4)).estimate.status is Status.RECOVERED
+
+
+def test_without_any_pose_an_object_is_lost_where_its_mask_is_seen_and_else_hidden():
+    lump, nothing = settled(begun(**NO_SURFACE, method__motion=False), [2]), hide(lambda tracks: tracks.visible)
+    assert lump.see(turned(3), nothing).estimate.status is Status.LOST
+    unknown = replace(lump.observed(turned(3), nothing), mask=None)
+    assert lump.tracker.step(unknown).estimate.status is Status.OCCLUDED
+
+
 # --- what is believed, kept and asked for ------------------------------------------------------
 
 
@@ -363,12 +380,11 @@ def test_an_object_that_still_comes_into_view_is_not_started():
     lump, (_, mask) = Lump(), render(LUMP, START)
     columns = np.flatnonzero(mask.any(0))
     sliver = mask & (np.arange(CAMERA.width) < columns[len(columns) // 2])
-    first = Lump()
-    first.tracker.life = replace(first.tracker.life, start_px=int(sliver.sum()))
+    first, paper = Lump(), Lump(method__gates="none")
+    first.tracker.life = paper.tracker.life = replace(first.tracker.life, start_px=int(sliver.sum()))
     assert first.see(START).estimate.reason == "still coming into view"
+    assert first.see(START).estimate.status is Status.TRACKED, "it has stopped growing"
     assert lump.see(START).estimate.status is Status.TRACKED
-    paper = Lump(method__gates="none")
-    paper.tracker.life = first.tracker.life
     assert paper.see(START).estimate.status is Status.TRACKED
 
 
