@@ -5,15 +5,15 @@ It starts an object, or corrects what was made of it so far.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.image import bounds
-from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import histogram
@@ -22,10 +22,14 @@ from p2p_lib.segmenters.builtin.patch import Box, Patch, around, connected, dila
 
 #: Room around an object, besides a share of its size: small ones move by pixels too.
 ROOM_PX = 6
+#: About so many pixels of a mask stand for what is right about it.
+_MIDDLE = 40
+#: A box is drawn a little too tight now and then, by this share of its size.
+_TIGHT = 0.05
 #: Length of a step between like pixels, where one across the strongest edge has length 1.
-_LIKE = 0.02
-#: Log odds of what lies nearer to a click beside the object than to one on it: more than all other evidence.
-_NOT_IT = 6.0
+_LIKE = 0.1
+#: Log odds of what lies nearer to a click beside the object than to one on it: more than geometry says.
+_NOT_IT = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +51,7 @@ class Cutter:
         cfg, frame, around_px = self.config, self.frame, self.prompt.box_px
         clicks = self.prompt.points_px if len(self.prompt.points_px) else points_in_box(around_px, frame)
         if around_px is None:
-            reach_px = cfg.reach_m * np.array([self.camera.fx, self.camera.fy]) / np.median(depths_at(clicks, frame))
+            reach_px = cfg.reach_m * np.array([self.camera.fx, self.camera.fy]) / np.nanmedian(depths_at(clicks, frame))
             box = around(clicks.mean(0), np.maximum(reach_px, 2 * np.ptp(clicks, 0)), frame.shape)
         else:
             box = self._room(around_px[:2], around_px[2:])
@@ -63,26 +67,19 @@ class Cutter:
         x = self._cut_out(patch, plane, clicks, was > 0.5, was < 0.5, was)
         return patch.box, patch.up(x)
 
-    def correct(self, was: np.ndarray, hint: Hint) -> tuple[Box, np.ndarray]:
-        """From what was made of it, probabilities (H, W), and clicks that say where this is wrong."""
-        cfg, prompt = self.config, self.prompt
-        rows, columns = bounds(was > 0.5)
-        spots = np.array([[columns.start, rows.start], [columns.stop, rows.stop], *prompt.points_px])
-        patch = Patch.of(self.frame, self._room(spots.min(0), spots.max(0)), self.camera, cfg)
-        before = patch.down(was)
-        on = np.concatenate([prompt.points_px, hint.uv_px])
-        seeds = patch.dots(on, 1)
-        if not len(on):  # what lies far from the clicks beside it is right
-            v, u = np.nonzero(before > 0.5)
-            apart = np.stack([u, v], -1)[:, None] - patch.grid(prompt.negative_px)
-            away = np.linalg.norm(apart, axis=-1).min(1, initial=np.inf)
-            far = away >= np.median(away)
-            seeds[v[far], u[far]] = True
-        plane = support_plane(patch, (patch.depth_m > 0) & (before < 0.2), self.rng)
-        by_depth, _ = by_geometry(patch, seeds, plane, cfg)
-        colour = by_colour(patch, histogram(patch.codes[seeds]), (before < 0.2) & ~seeds, cfg)
-        log_odds = by_depth + colour + cfg.prior_weight * (2 * before - 1)
-        return patch.box, patch.up(self._settled(patch, log_odds, seeds, before))
+    def correct(self, was: np.ndarray, known_px: np.ndarray) -> tuple[Box, np.ndarray]:
+        """Anew, from clicks that say what is wrong with a mask (H, W) bool, and from what is right about it.
+
+        known_px  (K, 2) pixels that are known to be on the object; what lies in the middle of the mask counts as well,
+                  where it is far from clicks beside the object
+        """
+        inner = cv2.distanceTransform(np.pad(was, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+        v, u = np.nonzero(inner >= inner.max() / 2)
+        middle_px = np.stack([u, v], -1)[:: max(1, len(u) // _MIDDLE)]
+        away_px = np.linalg.norm(middle_px[:, None] - self.prompt.negative_px, axis=-1).min(1, initial=np.inf)
+        middle_px = middle_px[away_px >= np.median(away_px)]
+        points_px = np.concatenate([self.prompt.points_px, known_px, middle_px])
+        return replace(self, prompt=replace(self.prompt, points_px=points_px)).start()
 
     def _cut_out(
         self,
@@ -101,7 +98,7 @@ class Cutter:
 
     def _settled(self, patch: Patch, log_odds: np.ndarray, seeds: np.ndarray, start: np.ndarray | None) -> np.ndarray:
         """(h, w) probability by the evidence, of what is connected with the seeds; clicks count as certain."""
-        beside = patch.dots(self.prompt.negative_px, 1) & ~seeds
+        beside = patch.dots(self.prompt.negative_px, 0) & ~seeds
         if beside.any():
             log_odds = log_odds - _NOT_IT * patch.nearer(beside, seeds, _LIKE)
         barred = beside | patch.dots(self.others_px, 1) | patch.border()
@@ -133,5 +130,6 @@ def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:
     (h, w), (rows, columns) = patch.shape, patch.box.shape
     u = (np.arange(w) + 0.5) * (columns / w) - 0.5 + patch.box.left
     v = (np.arange(h) + 0.5) * (rows / h) - 0.5 + patch.box.top
-    left, top, right, bottom = box_px
+    slack = _TIGHT * np.ptp(box_px.reshape(2, 2), 0)
+    left, top, right, bottom = box_px + np.concatenate([-slack, slack])
     return ((v >= top) & (v <= bottom))[:, None] & ((u >= left) & (u <= right))

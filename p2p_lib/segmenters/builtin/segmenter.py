@@ -117,12 +117,12 @@ class BuiltinSegmenter:
     ) -> tuple[Box, np.ndarray] | None:
         """By what is said of it, and for a correction by where it would have been taken for."""
         cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, others_px)
-        was = np.zeros(frame.shape, np.float32)
+        was = np.zeros(frame.shape, bool)
         found = None if prompt.box_px is not None else self._looked_for(frame, target, hint)
         if found is not None:
-            was[found[0].slices] = found[1]
-        if (was > 0.5).any():
-            return cutter.correct(was, hint)
+            was[found[0].slices] = found[1] > 0.5
+        if was.any():
+            return cutter.correct(was, hint.uv_px)
         return cutter.start() if prompt.starts else None
 
     def _looked_for(self, frame: Frame, target: _Target, hint: Hint) -> tuple[Box, np.ndarray] | None:
