@@ -70,7 +70,7 @@ class MethodConfig(_Checked):
         True, "Where few points are seen, their pose tells the tracker where to look for the others."
     )
     scene: bool = _p(
-        True, "The static background tells how the camera moved, and so where an object is that was left lying."
+        True, "An absent object is searched for by shape and colour, where the static scene says that it was left."
     )
     gates: str = _p("all", "A pose has to pass all gates of the life cycle, or none.", choices=("none", "all"))
     noise: str = _p(

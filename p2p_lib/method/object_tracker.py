@@ -35,7 +35,7 @@ _GROWTH = 1.1
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A hypothesis, its pose refined on the surface once that has been done, and how much of the surface shows there."""
+    """A hypothesis, its pose refined on the surface, and how much of the surface shows there, once they are known."""
 
     hypothesis: Hypothesis
     refined: Refinement | None = None
@@ -192,11 +192,16 @@ class ObjectTracker:
 
     def _look_again(self, obs: Observation, candidates: list[Candidate]) -> list[Candidate]:
         """Candidates for a return, with how much of the surface shows in the image under each."""
-        if not (self.life.unconfirmed and self.model.has_surface):
+        if not (self.life.unconfirmed and self._searches):
             return candidates
         search = self._search(obs.frame)
         found = [search.at(c.T_cam_obj, self.model.sample) for c in candidates]
         return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
+
+    @property
+    def _searches(self) -> bool:
+        """Whether shape and colour have a say in a return."""
+        return self.config.method.scene and self.model.has_surface
 
     def _search(self, frame: Frame) -> ImageSearch:
         return ImageSearch(frame, self.observer.camera, self.config.depth)
@@ -350,7 +355,7 @@ class ObjectTracker:
 
     def sighted(self, obs: Observation) -> Sighting | None:
         """Where an absent object shows by shape and colour, near where the scene or a few points propose it."""
-        if not (self.away and self.model.has_surface) or (obs.mask is not None and self._hidden(obs.mask)):
+        if not (self.away and self._searches) or (obs.mask is not None and self._hidden(obs.mask)):
             return None
         proposed = [*self.life.scene_prior(obs.frame.T_world_cam).values()]
         proposed += [hypothesis.T_cam_obj for hypothesis in self._register(obs)[:1]]

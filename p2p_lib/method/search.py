@@ -125,7 +125,7 @@ class ImageSearch:
     def _compare(
         self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The share (H,) as in :class:`Sighting`, -inf where unknown, points found (H, M) bool, and pixels (H, M, 2)."""
+        """Shares (H,) as in :class:`Sighting`, -inf where unknown, points found (H, M) bool, and pixels (H, M, 2)."""
         p_cam = se3.transform(T_cam_obj, sample.p_obj)
         view = p_cam / np.maximum(np.linalg.norm(p_cam, axis=-1, keepdims=True), 1e-9)
         n_cam = np.einsum("hij,mj->hmi", T_cam_obj[:, :3, :3], sample.n_obj)

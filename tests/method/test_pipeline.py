@@ -287,7 +287,7 @@ def test_hidden_points_are_looked_for_in_the_masks_where_all_are_known():
     method.step(first, masks)
     method.step(second, later)
     method.step(third)
-    method.step(fourth, {"left": last["left"]})  # the other one is hidden
+    method.step(fourth, {"left": last["left"], "right": np.zeros_like(last["right"])})  # the other one is hidden
     both, unknown, left = Asked.searches
     np.testing.assert_array_equal(both, later["left"] | later["right"])
     np.testing.assert_array_equal(left, last["left"])
