@@ -38,8 +38,8 @@ from p2p_lib.method.search import Sighting
 
 #: Object to (H, W) bool; None where nobody knows.
 Masks = dict[str, np.ndarray | None]
-#: The camera is located every so many frames while all objects have poses.
-_LOCATE_EVERY = 5
+#: The camera is located every so many frames: while all objects have poses, while one is away.
+_LOCATE_EVERY, _LOCATE_EVERY_AWAY = 5, 2
 NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
@@ -193,7 +193,8 @@ class Point2Pose:
     def _located(self, frame: Frame) -> Frame:
         """The frame with the camera's pose, as far as it is known: often while an object is away, else now and then."""
         self._unlocated += 1
-        every = 1 if any(obj.away for obj in self.objects.values()) else _LOCATE_EVERY
+        away = any(obj.away for obj in self.objects.values())
+        every = _LOCATE_EVERY_AWAY if away else _LOCATE_EVERY
         if self.scene is None or frame.T_world_cam is not None or self._unlocated < every:
             return frame
         self._unlocated = 0

@@ -29,7 +29,7 @@ _POINTS, _FEWEST = 300, 40
 _FACING = -0.25
 #: A measured point this near to the surface is on it, m: while searching, at last.
 _ROUGH_M, _FINE_M = 0.02, 0.01
-#: Largest difference of CIELAB's a and b (8 bit), and of the logarithm of the lightness beside that of the whole.
+#: Largest distance in CIELAB's a and b (8 bit), and of the logarithm of the lightness beside that of the whole.
 _CHROMA, _LIGHTNESS = 20.0, 0.45
 #: A measured point is on the surface up to so many standard deviations of its depth, too.
 _SIGMAS = 2.0
@@ -152,7 +152,7 @@ class ImageSearch:
         lightness = np.log((lab[..., 0] + 8) / (own[:, 0] + 8))
         count = np.maximum(on.sum(1, keepdims=True), 1)
         exposure = (lightness * on).sum(1, keepdims=True) / count
-        chroma = np.abs(lab[..., 1:] - own[:, 1:]).max(-1)
+        chroma = np.linalg.norm(lab[..., 1:] - own[:, 1:], axis=-1)
         return (chroma < _CHROMA) & (np.abs(lightness - exposure) < _LIGHTNESS)
 
 

@@ -126,7 +126,8 @@ class BuiltinSegmenter:
         return cutter.start() if prompt.starts else None
 
     def _looked_for(self, frame: Frame, target: _Target, hint: Hint) -> tuple[Box, np.ndarray] | None:
-        return self._find(frame, target, hint) if target.seen is None else self._follow(frame, target, hint)
+        lost = target.seen is None or hint.sighted  # what has been followed is not where the object was found
+        return self._find(frame, target, hint) if lost else self._follow(frame, target, hint)
 
     def remove(self, name: str) -> None:
         """Forget an object."""
