@@ -24,6 +24,8 @@ _AT_THE_BORDER = 0.02
 _STANDS_OUT = 2.0
 #: A strip of this height above the plane, besides noise, belongs to the plane: its fit is no better.
 _PLANE_SLACK_M = 0.003
+#: Pixels of the smallest image whose optical flow is taken.
+_SMALLEST_FLOW = 32
 
 
 def by_geometry(
@@ -94,8 +96,19 @@ def cut(
 
 def warped(was: np.ndarray, before: Patch, patch: Patch) -> tuple[np.ndarray, np.ndarray]:
     """A mask (h, w) of the patch before, in [0, 1], and its depth, warped by the optical flow to this patch."""
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(patch.gray, before.gray, None)
     v, u = np.mgrid[: patch.shape[0], : patch.shape[1]]
-    at = flow + np.stack([u, v], -1).astype(np.float32)
+    at = _flow(patch.gray, before.gray) + np.stack([u, v], -1).astype(np.float32)
     mask = cv2.remap(was.astype(np.float32), at, None, cv2.INTER_LINEAR, borderValue=0)
     return mask, cv2.remap(before.depth_m, at, None, cv2.INTER_NEAREST, borderValue=0)
+
+
+def _flow(gray: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """(h, w, 2) optical flow in pixels from an image (h, w) uint8 to the one before.
+
+    OpenCV chooses the levels of its pyramid by the longer side and reads beyond the coarsest one where the shorter side
+    is not as long as its windows there: the images are padded to a square that is large enough for one level at least.
+    """
+    h, w = gray.shape
+    side = max(h, w, _SMALLEST_FLOW)
+    square = [cv2.copyMakeBorder(g, 0, side - h, 0, side - w, cv2.BORDER_REPLICATE) for g in (gray, before)]
+    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(*square, None)[:h, :w]

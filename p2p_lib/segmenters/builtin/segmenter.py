@@ -9,7 +9,7 @@ lifted, and depth is missing just where a silhouette is doubtful.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.clicks import checked_clicks, depths_at
 from p2p_lib.core.config import SegmentationConfig
-from p2p_lib.core.image import bounds
+from p2p_lib.core.image import bounds, nearest_px
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
@@ -76,10 +76,12 @@ class BuiltinSegmenter:
     ) -> np.ndarray:
         """One frame in, one label image out; where two objects claim a pixel the likelier one has it."""
         new = checked_clicks(clicks or {}, self.camera, frame)
-        found: dict[str, tuple[Box, np.ndarray] | None] = {}
-        for name, target in self._targets.items():
-            hint = (hints or {}).get(name) or Hint()
-            found[name] = self._find(frame, target, hint) if target.seen is None else self._follow(frame, target, hint)
+        hints = {name: (hints or {}).get(name) or Hint() for name in self._targets}
+        present = {name: target for name, target in self._targets.items() if target.seen is not None}
+        found = {name: self._follow(frame, target, hints[name]) for name, target in present.items()}
+        taken = _taken(frame, found.values())
+        absent = [name for name in self._targets if name not in present]
+        found |= {name: self._find(frame, self._targets[name], hints[name], taken) for name in absent}
         for name, at in new.items():
             others = np.concatenate([*(c for n, c in new.items() if n != name), np.zeros((0, 2))])
             self._targets[name], found[name] = _Target(), self._start(frame, at, others)
@@ -167,22 +169,25 @@ class BuiltinSegmenter:
         log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
         return box, patch.up(_only(cut(patch, log_odds, start=prior), core))
 
-    def _find(self, frame: Frame, target: _Target, hint: Hint) -> tuple[Box, np.ndarray] | None:
-        """Where enough of its points have come back."""
+    def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> tuple[Box, np.ndarray] | None:
+        """Where enough of its points have come back, on nothing that is ``taken`` (H, W) bool by another object."""
         cfg = self.config
-        if target.colours is None or len(hint.uv_px) < cfg.find_points:
+        u, v = nearest_px(hint.uv_px, frame.shape)
+        uv_px = hint.uv_px[~taken[v, u]]
+        if target.colours is None or len(uv_px) < cfg.find_points:
             return None
-        z_m = float(np.nanmedian(depths_at(hint.uv_px, frame)))
-        low, high = hint.uv_px.min(0), hint.uv_px.max(0)
+        z_m = float(np.nanmedian(depths_at(uv_px, frame)))
+        low, high = uv_px.min(0), uv_px.max(0)
         half = np.maximum(target.size_m * self._focal_px / z_m * (0.5 + cfg.margin), high - low) + _ROOM_PX
         box = around((low + high) / 2, half, frame.shape)
         patch = Patch.of(frame, box, self.camera, cfg)
-        seeds, surface = patch.dots(hint.uv_px, 1) & (patch.depth_m > 0), by_surface(patch, hint, cfg)
+        barred = patch.down(taken.astype(np.float32)) > 0.5
+        seeds, surface = patch.dots(uv_px, 1) & (patch.depth_m > 0) & ~barred, by_surface(patch, hint, cfg)
         outside = ~dilated(seeds | (surface > 0), 3)
         plane = support_plane(patch, (patch.depth_m > 0) & outside, self._rng)
         log_odds, component = by_geometry(patch, seeds, plane, cfg)
         colour = by_colour(patch, target.colours, outside & ~component, cfg)
-        background = patch.border() & ~seeds
+        background = (patch.border() | barred) & ~seeds
         x = _only(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
         own_colours = colour[x > 0.5]
         return (box, patch.up(x)) if len(own_colours) and own_colours.mean() > 0 else None
@@ -212,6 +217,14 @@ def _seen(frame: Frame, mask: np.ndarray) -> _Seen:
     rows, columns = bounds(mask)
     box = Box(columns.start, rows.start, columns.stop, rows.stop)
     return _Seen(box, mask[rows, columns], float(np.median(frame.depth_m[mask])))
+
+
+def _taken(frame: Frame, found: Iterable[tuple[Box, np.ndarray]]) -> np.ndarray:
+    """(H, W) bool: pixels that are already somebody's."""
+    taken = np.zeros(frame.shape, bool)
+    for box, x in found:
+        taken[box.slices] |= x > 0.5
+    return taken
 
 
 def _only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
