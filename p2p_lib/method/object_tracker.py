@@ -338,4 +338,4 @@ class ObjectTracker:
         surface, distance_m = self.model.surface, None
         if self.model.has_surface:
             distance_m = surface_distance(surface, frame.depth_m, self.observer.camera, best.T_cam_obj)
-        return Hint(obs.tracks.uv_px[best.inliers], distance_m), requests
+        return Hint(obs.tracks.uv_px[best.inliers], distance_m, best.T_cam_obj), requests

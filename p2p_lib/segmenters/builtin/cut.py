@@ -12,6 +12,7 @@ from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import evidence, histogram
+from p2p_lib.segmenters.builtin.motion import Motion, parts_that_follow
 from p2p_lib.segmenters.builtin.patch import Patch, connected, dilated, plane_heights
 
 #: Weight of a pixel's certain evidence beside a tie to a like neighbour.
@@ -29,12 +30,17 @@ _SMALLEST_FLOW = 32
 
 
 def by_geometry(
-    patch: Patch, seeds: np.ndarray, plane: np.ndarray | None, config: SegmentationConfig
+    patch: Patch,
+    seeds: np.ndarray,
+    plane: np.ndarray | None,
+    config: SegmentationConfig,
+    motion: Motion | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """An object is connected in depth and is not what it stands on.
 
     seeds (h, w) bool lie on the object, ``plane`` is what may support it. Returns the evidence (h, w) and the
-    component (h, w) bool: what is connected with the seeds, where that looks like one object; else nothing.
+    component (h, w) bool: what is connected with the seeds, where that looks like one object; else nothing. Parts
+    beside it that share its ``motion`` are of it.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
@@ -55,6 +61,10 @@ def by_geometry(
             log_odds[measured & low] -= config.geometry_weight
             free = free & ~low
     component = connected(free, seeds)
+    if motion is not None:
+        parts = parts_that_follow(patch, free, component, motion)
+        component |= parts
+        log_odds[parts] += config.geometry_weight
     log_odds[measured & ~dilated(component, 1)] -= config.geometry_weight
     if component[patch.border()].mean() > _AT_THE_BORDER:
         return log_odds, nothing  # it goes on beyond the patch: more than one object is connected

@@ -9,12 +9,14 @@ lifted, and depth is missing just where a silhouette is doubtful.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.clicks import checked_clicks, depths_at
 from p2p_lib.core.config import SegmentationConfig
@@ -23,10 +25,13 @@ from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
+from p2p_lib.segmenters.builtin.motion import Motion, scene_follows
 from p2p_lib.segmenters.builtin.patch import Box, Patch, around, connected, dilated, support_plane
 
 #: Room around an object, besides a share of its size: small ones move by pixels too.
 _ROOM_PX = 6
+#: Every how many frames one is remembered, and how many are: about a second.
+_REMEMBERED, _MEMORY = 5, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +67,7 @@ class BuiltinSegmenter:
         self._focal_px = np.array([camera.fx, camera.fy])
         self._targets: dict[str, _Target] = {}
         self._previous: Frame | None = None
+        self._past: deque[tuple[Frame, dict[str, np.ndarray]]] = deque(maxlen=_MEMORY)  # with the poses T_cam_obj then
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,13 +84,16 @@ class BuiltinSegmenter:
         new = checked_clicks(clicks or {}, self.camera, frame)
         hints = {name: (hints or {}).get(name) or Hint() for name in self._targets}
         present = {name: target for name, target in self._targets.items() if target.seen is not None}
-        found = {name: self._follow(frame, target, hints[name]) for name, target in present.items()}
+        found = {name: self._follow(frame, name, hints[name]) for name in present}
         taken = _taken(frame, found.values())
         absent = [name for name in self._targets if name not in present]
         found |= {name: self._find(frame, self._targets[name], hints[name], taken) for name in absent}
         for name, at in new.items():
             others = np.concatenate([*(c for n, c in new.items() if n != name), np.zeros((0, 2))])
             self._targets[name], found[name] = _Target(), self._start(frame, at, others)
+        if frame.index % _REMEMBERED == 0:
+            sure = {name: hint.T_cam_obj for name, hint in hints.items() if self._sure(hint)}
+            self._past.append((frame, sure))
         return self._shared_out(frame, found)
 
     def remove(self, name: str) -> None:
@@ -149,9 +158,10 @@ class BuiltinSegmenter:
         half = (high - low) / 2 * (1 + 2 * self.config.margin) + _ROOM_PX
         return around((low + high) / 2 + [patch.box.left, patch.box.top], half, frame.shape)
 
-    def _follow(self, frame: Frame, target: _Target, hint: Hint) -> tuple[Box, np.ndarray] | None:
+    def _follow(self, frame: Frame, name: str, hint: Hint) -> tuple[Box, np.ndarray]:
         """From where it was a frame ago."""
-        cfg, seen = self.config, target.seen
+        cfg, target = self.config, self._targets[name]
+        seen = target.seen
         box = self._box_of_all(target, frame.shape)
         patch, before = (Patch.of(f, box, self.camera, cfg) for f in (frame, self._previous))
         mask = np.zeros(frame.shape, np.float32)
@@ -161,13 +171,26 @@ class BuiltinSegmenter:
         jumped = measured & (prior > 0.5) & (np.abs(patch.depth_m - z_before) > patch.step_m)
         core = (prior > 0.8) & ~jumped
         plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
-        log_odds, component = by_geometry(patch, core, plane, cfg)
+        log_odds, component = by_geometry(patch, core, plane, cfg, self._motion(frame, patch, name, hint))
         stays = cfg.prior_weight * (2 * prior - 1)
         # Parts that come into view are connected with those that were seen before.
         log_odds += np.where(component, np.maximum(stays, 0), stays)
         log_odds[jumped] -= cfg.geometry_weight
         log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
         return box, patch.up(_only(cut(patch, log_odds, start=prior), core))
+
+    def _sure(self, hint: Hint) -> bool:
+        """Whether enough points agree on a pose."""
+        return hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
+
+    def _motion(self, frame: Frame, patch: Patch, name: str, hint: Hint) -> Motion | None:
+        """An object's motion since one of the frames remembered, each in its turn; None where it tells nothing."""
+        known = [(then, poses[name]) for then, poses in self._past if name in poses]
+        if not known or not self._sure(hint):
+            return None
+        then, T_cam_obj = known[frame.index % len(known)]
+        motion = Motion(then, T_cam_obj @ se3.inverse(hint.T_cam_obj))
+        return None if scene_follows(frame, patch, motion) else motion
 
     def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> tuple[Box, np.ndarray] | None:
         """Where enough of its points have come back, on nothing that is ``taken`` (H, W) bool by another object."""

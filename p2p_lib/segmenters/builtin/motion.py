@@ -1,0 +1,80 @@
+"""What moves with an object: pixels of now are held against an earlier frame, as if they had moved as the object did."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.types import Frame
+from p2p_lib.segmenters.builtin.patch import Patch, depth_step_m, dilated
+
+#: Two looks at one place differ by less than this in colour, as a mean over the channels.
+_SAME_COLOUR = 40.0
+#: So much of a part agrees with the object's motion, and at most so much with standing still or of the scene with it.
+_AGREES, _UNDECIDED = 0.75, 0.5
+#: A part of fewer pixels of the grid proves nothing; one this near to the object may hang together with it.
+_FEWEST, _NEAR = 12, 4
+#: Less of a part than this on the patch's border is an accident.
+_AT_THE_BORDER = 0.02
+#: Every how many pixels the scene is looked at.
+_SCENE_STRIDE = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How an object moved since an earlier frame: T_then_now (4, 4) takes points of the camera now to the camera then."""
+
+    then: Frame
+    T_then_now: np.ndarray
+
+
+def agrees(p_cam: np.ndarray, rgb: np.ndarray, then: Frame, camera: Camera, T_then_now: np.ndarray) -> np.ndarray:
+    """(...,) bool: points p_cam (..., 3) of now, of colours rgb, were seen in an earlier frame by this motion.
+
+    T_then_now (4, 4) takes points of the camera now to the camera then.
+    """
+    p_then = se3.transform(T_then_now, p_cam)
+    uv_px = camera.project(p_then)
+    inside = camera.inside(uv_px, -0.5)
+    u, v = np.moveaxis(np.rint(np.where(inside[..., None], uv_px, 0)).astype(int), -1, 0)
+    z = then.depth_m[v, u]
+    near = inside & (z > 0) & (np.abs(z - p_then[..., 2]) < depth_step_m(z))
+    return near & (np.abs(then.rgb[v, u].astype(np.int16) - rgb).mean(-1) < _SAME_COLOUR)
+
+
+def scene_follows(frame: Frame, patch: Patch, motion: Motion) -> bool:
+    """Whether what lies around a patch moved as the object did, or cannot tell: then its motion tells nothing."""
+    around = np.ones(frame.shape, bool)
+    around[patch.box.slices] = False
+    v, u = np.mgrid[: frame.shape[0] : _SCENE_STRIDE, : frame.shape[1] : _SCENE_STRIDE]
+    some = around[v, u] & (frame.depth_m[v, u] > 0)
+    v, u = v[some], u[some]
+    p_cam = patch.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
+    follows = agrees(p_cam, frame.rgb[v, u], motion.then, patch.camera, motion.T_then_now)
+    return len(follows) < _FEWEST or follows.mean() > _UNDECIDED
+
+
+def parts_that_follow(patch: Patch, smooth: np.ndarray, component: np.ndarray, motion: Motion) -> np.ndarray:
+    """(h, w) bool: smooth parts beside an object's component (h, w) bool that moved as it did, and did not stand still."""
+    count, part = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
+    size = np.bincount(part.ravel(), minlength=count)
+    beside = np.zeros(count, bool)
+    beside[part[dilated(component, _NEAR) & ~component]] = True
+    beside[part[component]] = False
+    beside &= size >= _FEWEST
+    beside[0] = False
+    at_border = np.bincount(part[patch.border()], minlength=count) / patch.border().sum()
+    beside &= at_border < _AT_THE_BORDER
+    v, u = np.nonzero(beside[part])
+    if not len(v):
+        return np.zeros(patch.shape, bool)
+    p_cam, rgb = patch.points()[v, u], patch.rgb[v, u]
+    shares = [
+        np.bincount(part[v, u], agrees(p_cam, rgb, motion.then, patch.camera, T), minlength=count) / np.maximum(size, 1)
+        for T in (motion.T_then_now, np.eye(4))
+    ]
+    return (beside & (shares[0] > _AGREES) & (shares[1] < _UNDECIDED))[part]
