@@ -1,4 +1,4 @@
-"""What moves with an object: pixels of now are held against an earlier frame, as if they had moved as the object did."""
+"""What moves with an object: pixels of now, held against an earlier frame as if they had moved as the object did."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ _SCENE_STRIDE = 24
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How an object moved since an earlier frame: T_then_now (4, 4) takes points of the camera now to the camera then."""
+    """How an object moved since an earlier frame.
+
+    T_then_now (4, 4) takes its points from the frame of the camera now to that of the camera then.
+    """
 
     then: Frame
     T_then_now: np.ndarray
@@ -59,7 +62,7 @@ def scene_follows(frame: Frame, patch: Patch, motion: Motion) -> bool:
 
 
 def parts_that_follow(patch: Patch, smooth: np.ndarray, component: np.ndarray, motion: Motion) -> np.ndarray:
-    """(h, w) bool: smooth parts beside an object's component (h, w) bool that moved as it did, and did not stand still."""
+    """(h, w) bool: smooth parts beside an object's component (h, w) bool that moved as it did and did not stay."""
     count, part = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
     size = np.bincount(part.ravel(), minlength=count)
     beside = np.zeros(count, bool)

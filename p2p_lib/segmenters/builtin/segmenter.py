@@ -84,6 +84,8 @@ class BuiltinSegmenter:
         new = checked_clicks(clicks or {}, self.camera, frame)
         hints = {name: (hints or {}).get(name) or Hint() for name in self._targets}
         present = {name: target for name, target in self._targets.items() if target.seen is not None}
+        if frame.index % _REMEMBERED == 0:
+            self._targets |= {name: self._with_room(frame, name, hints[name]) for name in present}
         found = {name: self._follow(frame, name, hints[name]) for name in present}
         taken = _taken(frame, found.values())
         absent = [name for name in self._targets if name not in present]
@@ -92,8 +94,7 @@ class BuiltinSegmenter:
             others = np.concatenate([*(c for n, c in new.items() if n != name), np.zeros((0, 2))])
             self._targets[name], found[name] = _Target(), self._start(frame, at, others)
         if frame.index % _REMEMBERED == 0:
-            sure = {name: hint.T_cam_obj for name, hint in hints.items() if self._sure(hint)}
-            self._past.append((frame, sure))
+            self._past.append((frame, {name: hint.T_cam_obj for name, hint in hints.items() if self._sure(hint)}))
         return self._shared_out(frame, found)
 
     def remove(self, name: str) -> None:
@@ -191,6 +192,24 @@ class BuiltinSegmenter:
         then, T_cam_obj = known[frame.index % len(known)]
         motion = Motion(then, T_cam_obj @ se3.inverse(hint.T_cam_obj))
         return None if scene_follows(frame, patch, motion) else motion
+
+    def _with_room(self, frame: Frame, name: str, hint: Hint) -> _Target:
+        """An object with room for parts that move with it, which may reach farther than all that it has shown."""
+        cfg, target = self.config, self._targets[name]
+        if not self._sure(hint):
+            return target
+        half = cfg.reach_m * self._focal_px / target.seen.z_m
+        patch = Patch.of(frame, around(hint.uv_px.mean(0), half, frame.shape), self.camera, cfg)
+        motion = self._motion(frame, patch, name, hint)
+        if motion is None:
+            return target
+        plane = support_plane(patch, patch.depth_m > 0, self._rng)
+        _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motion)
+        if not component.any():
+            return target
+        rows, columns = bounds(component)
+        size_px = np.array([columns.stop - columns.start, rows.stop - rows.start]) * patch.box.shape[1] / patch.shape[1]
+        return replace(target, size_m=np.maximum(target.size_m, size_px * target.seen.z_m / self._focal_px))
 
     def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> tuple[Box, np.ndarray] | None:
         """Where enough of its points have come back, on nothing that is ``taken`` (H, W) bool by another object."""
