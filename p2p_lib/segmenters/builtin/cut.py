@@ -34,13 +34,13 @@ def by_geometry(
     seeds: np.ndarray,
     plane: np.ndarray | None,
     config: SegmentationConfig,
-    motion: Motion | None = None,
+    motions: tuple[Motion, Motion] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """An object is connected in depth and is not what it stands on.
 
     seeds (h, w) bool lie on the object, ``plane`` is what may support it. Returns the evidence (h, w) and the
     component (h, w) bool: what is connected with the seeds, where that looks like one object; else nothing. Parts
-    beside it that share its ``motion`` are of it.
+    beside it that share its ``motions``, since a recent frame and since the first, are of it.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
@@ -61,8 +61,8 @@ def by_geometry(
             log_odds[measured & low] -= config.geometry_weight
             free = free & ~low
     component = connected(free, seeds)
-    if motion is not None:
-        parts = parts_that_follow(patch, free, component, motion)
+    if motions is not None:
+        parts = parts_that_follow(patch, free, component, *motions)
         component |= parts
         log_odds[parts] += config.geometry_weight
     log_odds[measured & ~dilated(component, 1)] -= config.geometry_weight

@@ -16,6 +16,8 @@ from p2p_lib.segmenters.builtin.patch import Patch, depth_step_m, dilated
 _SAME_COLOUR = 40.0
 #: So much of a part agrees with the object's motion, and at most so much with standing still or of the scene with it.
 _AGREES, _UNDECIDED = 0.75, 0.5
+#: A part of which more was not there in the first frame has come to the object since.
+_ABSENT = 0.3
 #: A part of fewer pixels of the grid proves nothing; one this near to the object may hang together with it.
 _FEWEST, _NEAR = 12, 4
 #: Less of a part than this on the patch's border is an accident.
@@ -35,18 +37,22 @@ class Motion:
     T_then_now: np.ndarray
 
 
-def agrees(p_cam: np.ndarray, rgb: np.ndarray, then: Frame, camera: Camera, T_then_now: np.ndarray) -> np.ndarray:
-    """(...,) bool: points p_cam (..., 3) of now, of colours rgb, were seen in an earlier frame by this motion.
+def agrees(
+    p_cam: np.ndarray, rgb: np.ndarray, camera: Camera, then: Frame, T_then_now: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether points p_cam (..., 3) of now, of colours rgb, were seen in an earlier frame, if they moved like this.
 
-    T_then_now (4, 4) takes points of the camera now to the camera then.
+    Returns those that were, (...,) bool, and those that were not there: what is behind them was seen then.
     """
     p_then = se3.transform(T_then_now, p_cam)
     uv_px = camera.project(p_then)
     inside = camera.inside(uv_px, -0.5)
     u, v = np.moveaxis(np.rint(np.where(inside[..., None], uv_px, 0)).astype(int), -1, 0)
     z = then.depth_m[v, u]
-    near = inside & (z > 0) & (np.abs(z - p_then[..., 2]) < depth_step_m(z))
-    return near & (np.abs(then.rgb[v, u].astype(np.int16) - rgb).mean(-1) < _SAME_COLOUR)
+    behind_m, step_m = z - p_then[..., 2], depth_step_m(z)
+    known = inside & (z > 0)
+    alike = np.abs(then.rgb[v, u].astype(np.int16) - rgb).mean(-1) < _SAME_COLOUR
+    return known & (np.abs(behind_m) < step_m) & alike, known & (behind_m > 2 * step_m)
 
 
 def scene_follows(frame: Frame, patch: Patch, motion: Motion) -> bool:
@@ -57,12 +63,18 @@ def scene_follows(frame: Frame, patch: Patch, motion: Motion) -> bool:
     some = around[v, u] & (frame.depth_m[v, u] > 0)
     v, u = v[some], u[some]
     p_cam = patch.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
-    follows = agrees(p_cam, frame.rgb[v, u], motion.then, patch.camera, motion.T_then_now)
+    follows, _ = agrees(p_cam, frame.rgb[v, u], patch.camera, motion.then, motion.T_then_now)
     return len(follows) < _FEWEST or follows.mean() > _UNDECIDED
 
 
-def parts_that_follow(patch: Patch, smooth: np.ndarray, component: np.ndarray, motion: Motion) -> np.ndarray:
-    """(h, w) bool: smooth parts beside an object's component (h, w) bool that moved as it did and did not stay."""
+def parts_that_follow(
+    patch: Patch, smooth: np.ndarray, component: np.ndarray, motion: Motion, first: Motion
+) -> np.ndarray:
+    """(h, w) bool: smooth parts beside an object's component (h, w) bool that moved as it did and did not stay.
+
+    motion  since a frame of the last second
+    first   since the first frame: what was not there then, a hand that took the object, is not of it
+    """
     count, part = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
     size = np.bincount(part.ravel(), minlength=count)
     beside = np.zeros(count, bool)
@@ -76,8 +88,8 @@ def parts_that_follow(patch: Patch, smooth: np.ndarray, component: np.ndarray, m
     if not len(v):
         return np.zeros(patch.shape, bool)
     p_cam, rgb = patch.points()[v, u], patch.rgb[v, u]
-    shares = [
-        np.bincount(part[v, u], agrees(p_cam, rgb, motion.then, patch.camera, T), minlength=count) / np.maximum(size, 1)
-        for T in (motion.T_then_now, np.eye(4))
-    ]
-    return (beside & (shares[0] > _AGREES) & (shares[1] < _UNDECIDED))[part]
+    moved, _ = agrees(p_cam, rgb, patch.camera, motion.then, motion.T_then_now)
+    stayed, _ = agrees(p_cam, rgb, patch.camera, motion.then, np.eye(4))
+    _, absent = agrees(p_cam, rgb, patch.camera, first.then, first.T_then_now)
+    moved, stayed, absent = (np.bincount(part[v, u], w, count) / np.maximum(size, 1) for w in (moved, stayed, absent))
+    return (beside & (moved > _AGREES) & (stayed < _UNDECIDED) & (absent < _ABSENT))[part]

@@ -50,11 +50,13 @@ class _Target:
     seen     in the newest frame; None while it is absent
     colours  (4096,) shares of the colours it has shown; None if it has not been seen yet
     size_m   (2,) its largest width and height so far
+    first    the first frame remembered, with its pose T_cam_obj (4, 4) then
     """
 
     seen: _Seen | None = None
     colours: np.ndarray | None = None
     size_m: np.ndarray | None = None
+    first: tuple[Frame, np.ndarray] | None = None
 
 
 class BuiltinSegmenter:
@@ -94,12 +96,18 @@ class BuiltinSegmenter:
             others = np.concatenate([*(c for n, c in new.items() if n != name), np.zeros((0, 2))])
             self._targets[name], found[name] = _Target(), self._start(frame, at, others)
         if frame.index % _REMEMBERED == 0:
-            self._past.append((frame, {name: hint.T_cam_obj for name, hint in hints.items() if self._sure(hint)}))
+            sure = {name: hint.T_cam_obj for name, hint in hints.items() if self._sure(hint)}
+            self._past.append((frame, sure))
+            for name, T_cam_obj in sure.items():
+                if self._targets[name].first is None:
+                    self._targets[name] = replace(self._targets[name], first=(frame, T_cam_obj))
         return self._shared_out(frame, found)
 
     def remove(self, name: str) -> None:
         """Forget an object."""
         del self._targets[name]
+        for _, poses in self._past:
+            poses.pop(name, None)
 
     def _shared_out(self, frame: Frame, found: Mapping[str, tuple[Box, np.ndarray] | None]) -> np.ndarray:
         """The label image of what was found of every object: its probability in a box of the image."""
@@ -172,7 +180,7 @@ class BuiltinSegmenter:
         jumped = measured & (prior > 0.5) & (np.abs(patch.depth_m - z_before) > patch.step_m)
         core = (prior > 0.8) & ~jumped
         plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
-        log_odds, component = by_geometry(patch, core, plane, cfg, self._motion(frame, patch, name, hint))
+        log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, patch, name, hint))
         stays = cfg.prior_weight * (2 * prior - 1)
         # Parts that come into view are connected with those that were seen before.
         log_odds += np.where(component, np.maximum(stays, 0), stays)
@@ -184,14 +192,20 @@ class BuiltinSegmenter:
         """Whether enough points agree on a pose."""
         return hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
 
-    def _motion(self, frame: Frame, patch: Patch, name: str, hint: Hint) -> Motion | None:
-        """An object's motion since one of the frames remembered, each in its turn; None where it tells nothing."""
+    def _motions(self, frame: Frame, patch: Patch, name: str, hint: Hint) -> tuple[Motion, Motion] | None:
+        """An object's motions since one of the frames remembered, each in its turn, and since its first.
+
+        None where they tell nothing.
+        """
         known = [(then, poses[name]) for then, poses in self._past if name in poses]
         if not known or not self._sure(hint):
             return None
-        then, T_cam_obj = known[frame.index % len(known)]
-        motion = Motion(then, T_cam_obj @ se3.inverse(hint.T_cam_obj))
-        return None if scene_follows(frame, patch, motion) else motion
+        T_obj_cam = se3.inverse(hint.T_cam_obj)
+        recent, first = (
+            Motion(then, T_cam_obj @ T_obj_cam)
+            for then, T_cam_obj in (known[frame.index % len(known)], self._targets[name].first)
+        )
+        return None if scene_follows(frame, patch, recent) else (recent, first)
 
     def _with_room(self, frame: Frame, name: str, hint: Hint) -> _Target:
         """An object with room for parts that move with it, which may reach farther than all that it has shown."""
@@ -200,11 +214,11 @@ class BuiltinSegmenter:
             return target
         half = cfg.reach_m * self._focal_px / target.seen.z_m
         patch = Patch.of(frame, around(hint.uv_px.mean(0), half, frame.shape), self.camera, cfg)
-        motion = self._motion(frame, patch, name, hint)
-        if motion is None:
+        motions = self._motions(frame, patch, name, hint)
+        if motions is None:
             return target
         plane = support_plane(patch, patch.depth_m > 0, self._rng)
-        _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motion)
+        _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions)
         if not component.any():
             return target
         rows, columns = bounds(component)
@@ -249,9 +263,10 @@ class BuiltinSegmenter:
         size_m = np.array(seen.mask.shape[::-1]) * seen.z_m / self._focal_px
         colours = histogram(colour_codes(frame.rgb[seen.box.slices][seen.mask]))
         if target.colours is None:
-            return _Target(seen, colours, size_m)
+            return replace(target, seen=seen, colours=colours, size_m=size_m)
         rate = self.config.colour_rate
-        return _Target(seen, (1 - rate) * target.colours + rate * colours, np.maximum(size_m, target.size_m))
+        colours, size_m = (1 - rate) * target.colours + rate * colours, np.maximum(size_m, target.size_m)
+        return replace(target, seen=seen, colours=colours, size_m=size_m)
 
 
 def _seen(frame: Frame, mask: np.ndarray) -> _Seen:
