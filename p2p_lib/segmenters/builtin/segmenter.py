@@ -24,7 +24,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
 from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, support_plane
-from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, only
+from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start, only
 
 _NO_PX = np.zeros((0, 2))
 
@@ -84,6 +84,7 @@ class BuiltinSegmenter:
             check_depth(prompt, frame)
         masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
         found: dict[str, tuple[Box, np.ndarray] | None] = {}
+        new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
         for name in dict.fromkeys([*self._targets, *said]):
             target, hint = self._targets.get(name, _Target()), (hints or {}).get(name) or Hint()
             if name in masks:
@@ -101,6 +102,11 @@ class BuiltinSegmenter:
         for label, name in enumerate(self._targets, 1):
             if name in masks:
                 labels[masks[name]] = label
+        label_of = {name: label for label, name in enumerate(self._targets, 1)}
+        for prompt in new:
+            others = {name: labels == label for name, label in label_of.items() if name != prompt.name}
+            cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, _NO_PX)
+            doubt_start(cutter, labels == label_of[prompt.name], others)
         self._previous = frame
         return labels
 
