@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.method.lifecycle import CONFIRM_FRAMES
 from p2p_lib.method.pipeline import Point2Pose
@@ -167,7 +167,7 @@ def test_where_the_object_frame_starts():
 
 
 def test_nobody_knows_the_masks():
-    """The first mask alone; from then on every object goes by its points."""
+    """The first mask alone; from then on the segmenter looks after every object."""
     method = Point2Pose(CAMERA, quick())
     for name in TRUTH:
         method.add_object(name, mask=film()[0][1][name])
@@ -273,7 +273,8 @@ def test_a_return_that_is_not_confirmed_is_taken_back():
 
 
 def test_one_hides_the_other_goes_on():
-    frames = [(f, {"right": m["right"]} if k in HIDDEN else m) for k, (f, m) in enumerate(film())]
+    nothing = {"left": np.zeros((300, 400), bool)}
+    frames = [(f, m | nothing if k in HIDDEN else m) for k, (f, m) in enumerate(film())]
     estimates = track(frames)
     assert [k for k in range(LENGTH) if statuses(estimates, "left")[k] == "occluded"] == list(HIDDEN)
     assert set(statuses(estimates, "right")) == {"tracked"}
@@ -321,10 +322,14 @@ def test_an_object_waits_until_its_mask_has_come_and_stopped_growing():
 
 
 def test_the_first_mask_serves_the_next_frame_only():
+    """From then on the segmenter looks; an empty mask says that the object is hidden."""
     method = Point2Pose(CAMERA, quick())
     method.add_object("left", mask=film()[0][1]["left"])
-    assert method.step(film()[0][0], {})["left"].status == Status.TRACKED
-    assert method.step(film()[1][0], {})["left"].status == Status.OCCLUDED
+    assert method.step(film()[0][0])["left"].status == Status.TRACKED
+    assert method.step(film()[1][0])["left"].status == Status.TRACKED
+    assert iou(method.masks["left"], film()[1][1]["left"]) > 0.85
+    hidden = {"left": np.zeros((300, 400), bool)}
+    assert method.step(film()[2][0], hidden)["left"].status == Status.OCCLUDED
 
 
 def test_a_removed_object_is_gone_and_its_points_with_it():
@@ -451,7 +456,8 @@ def test_a_black_blind_camera_is_no_trouble(name):
 
 def test_masks_may_touch_the_border_and_be_everything():
     everything = np.ones((300, 400), bool)
-    estimates = track([(f, {"left": everything}) for f, _ in film()[:4]], names=("left",), config=preset())
+    with pytest.warns(Doubt, match="mask of 'left': the whole image in frame 0"):
+        estimates = track([(f, {"left": everything}) for f, _ in film()[:4]], names=("left",), config=preset())
     assert statuses(estimates, "left")[0] == "tracked"
 
 
@@ -570,7 +576,8 @@ def test_a_late_object_is_clicked_while_another_has_masks():
         np.testing.assert_array_equal(method.masks["left"], masks["left"])
     assert {str(e.status) for e in estimates.values()} == {"tracked"}
     assert iou(method.masks["right"], masks["right"]) > 0.85
-    with pytest.raises(BadInput, match="mask of 'right': got a mask of an object with clicks"):
+    method.correct("right", clicks=clicks_on(film()[12][1]["right"]))
+    with pytest.raises(BadInput, match="mask of 'right': got a mask and clicks in frame 12"):
         method.step(film()[12][0], film()[12][1])
     method.remove_object("right")
     assert set(method.step(film()[12][0], {"left": film()[12][1]["left"]})) == {"left"} == set(method.masks)
@@ -591,12 +598,75 @@ def test_clicks_that_do_not_fit_are_refused_and_leave_no_object_behind():
             method.add_object("cup", clicks=clicks)
     with pytest.raises(BadInput, match="object 'cup': got a mask and clicks"):
         method.add_object("cup", mask=masks["left"], clicks=good)
-    with pytest.raises(BadInput, match="mask of 'cup': got an empty mask"):
+    with pytest.raises(BadInput, match="object 'cup': got an empty mask"):
         method.add_object("cup", mask=np.zeros((300, 400), bool))
     method.add_object("left", clicks=good)
     with pytest.raises(BadInput, match="clicks on 'cup': got a click that is also one of 'left'"):
         method.add_object("cup", clicks=[good[1] + 0.2, [10, 10]])
+    with pytest.raises(BadInput, match="mask of 'cup': got the whole image"):
+        method.add_object("cup", mask=np.ones((300, 400), bool))
+    with pytest.raises(BadInput, match=r"box around 'cup': got \[500.0, .*, expected a box within 400x300"):
+        method.add_object("cup", box=(500, 10, 600, 90))
+    with pytest.raises(BadInput, match="clicks on 'cup': got a click that is also one beside it"):
+        method.add_object("cup", clicks=[[5, 5], [9, 9]], negative=[[9, 9]])
+    for beside_alone in ({"negative": [[9, 9]]}, {"mask": np.zeros((300, 400), bool)}):
+        with pytest.raises(BadInput, match=r"object 'left': got (clicks beside it alone|an empty mask)"):
+            method.correct("left", **beside_alone)  # it has not started yet
+    with pytest.raises(BadInput, match="correct: got 'cup', expected one of left"):
+        method.correct("cup", clicks=good)
     assert list(method.objects) == ["left"]
+
+
+def test_a_click_on_anothers_mask_is_refused():
+    method, (frame, masks) = Point2Pose(CAMERA, quick()), film()[0]
+    on_left = clicks_on(masks["left"])
+    method.add_object("left", mask=masks["left"])
+    with pytest.raises(BadInput, match=r"clicks on 'right': got \(\d+, \d+\) on the mask of 'left' in frame 0"):
+        method.add_object("right", clicks=on_left)
+    assert list(method.objects) == ["left"]
+    method.remove_object("left")
+    method.add_object("left")
+    method.add_object("right", clicks=on_left)
+    with pytest.raises(BadInput, match=r"clicks on 'right': got \(\d+, \d+\) on the mask of 'left' in frame 0"):
+        method.step(frame, {"left": masks["left"]})
+    method.correct("right", clicks=clicks_on(masks["right"]))  # the last word counts
+    assert {str(e.status) for e in method.step(frame, {"left": masks["left"]}).values()} == {"tracked"}
+    np.testing.assert_array_equal(method.masks["left"], masks["left"])
+    assert iou(method.masks["right"], masks["right"]) > 0.85
+
+
+@pytest.mark.parametrize("start", ["mask", "clicks", "box", "first step", "some steps"])
+def test_every_start_leads_to_the_same_road(start):
+    """Whatever says where the objects are at first, the segmenter looks after every frame without a mask."""
+    method, frames = Point2Pose(CAMERA, preset()), film()
+    for name, mask in frames[0][1].items():
+        v, u = np.nonzero(mask)
+        how = {"mask": mask, "clicks": clicks_on(mask), "box": (u.min(), v.min(), u.max(), v.max())}
+        method.add_object(name, **{start: how[start]} if start in how else {})
+    estimates = []
+    for k, (frame, masks) in enumerate(frames):
+        given = {"first step": k == 0, "some steps": k % 5 == 0}.get(start, False)
+        estimates.append(method.step(frame, masks if given else None))
+        measured = frame.depth_m > 0
+        assert all(iou(method.masks[name] & measured, mask & measured) > 0.85 for name, mask in masks.items())
+    assert_honest(estimates)
+    for name in TRUTH:
+        angle_deg, shift_mm = errors(estimates, name)
+        assert len(angle_deg) == LENGTH and angle_deg.max() < 4 and shift_mm.max() < 6
+
+
+def test_a_correction_mends_what_was_wrong():
+    """The right object is started with the left one's half as well; a click there says that it is not of it."""
+    method, frames = Point2Pose(CAMERA, quick()), film()
+    wrong = frames[0][1]["left"] | frames[0][1]["right"]
+    method.add_object("right", mask=wrong)
+    method.step(frames[0][0])
+    method.step(frames[1][0])
+    assert iou(method.masks["right"], frames[1][1]["right"]) < 0.7
+    method.correct("right", clicks=clicks_on(frames[2][1]["right"]), negative=clicks_on(frames[2][1]["left"]))
+    for frame, masks in frames[2:8]:
+        method.step(frame)
+        assert iou(method.masks["right"], masks["right"] & (frame.depth_m > 0)) > 0.85
 
 
 def test_clicks_without_depth_are_refused_before_anything_is_done():

@@ -7,6 +7,7 @@ import pytest
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.interfaces import Hint
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.motion import Motion, agrees, parts_that_follow, scene_follows
 from p2p_lib.segmenters.builtin.patch import Box, Patch, connected
@@ -102,14 +103,14 @@ def test_points_agree_with_an_earlier_frame_at_their_depth_and_in_their_colour()
 def test_the_segmenter_takes_in_what_moves_along(part_moves):
     """Clicks lie on the plate alone; the pose of the plate is known. What stands still beside it stays outside."""
     segmenter = BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0))
-    clicks = {"it": [[130.0, 125], [150, 130], [140, 140]]}
+    clicks = [Prompt("it", 0, np.array([[130.0, 125], [150, 130], [140, 140]]))]
     points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
     for k in range(26):
         moved_m = 0.003 * k
         frame = scene(k, moved_m)
         T_cam_obj = left(moved_m) if part_moves else left(0.0)
         hint = Hint(points - [CAMERA.fx * moved_m / PLATE_M, 0], T_cam_obj=T_cam_obj)
-        found = segmenter.segment(frame, clicks if not k else None, {"it": hint} if k else None) == 1
+        found = segmenter.segment(frame, () if k else clicks, {"it": hint} if k else None) == 1
     part, neighbour = at(PART, moved_m, PART_M), at(NEIGHBOUR, 0.0, PART_M)
     assert found[at(PLATE, moved_m)].mean() > 0.9 and found[neighbour].mean() < 0.05
     assert (found[part].mean() > 0.8) == part_moves

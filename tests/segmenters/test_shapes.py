@@ -10,6 +10,7 @@ import sys
 import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.cut import warped
 from p2p_lib.segmenters.builtin.patch import Box, Patch
@@ -40,7 +41,7 @@ for left, top, w, h in eval(sys.argv[1]):
     box = np.s_[max(top, 0) : top + h, max(left, 0) : left + w]
     u, v = np.clip([left + w // 2, top + h // 2], 0, [319, 239])
     for k in range(4):
-        labels = segmenter.segment(frame(k, box), None if k else {"it": [[u, v]]})
+        labels = segmenter.segment(frame(k, box), () if k else [Prompt("it", 0, np.array([[u, v]], float))])
         assert labels.shape == (240, 320) and set(np.unique(labels)) <= {0, 1}
 """
 

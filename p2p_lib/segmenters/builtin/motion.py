@@ -22,6 +22,8 @@ _ABSENT = 0.3
 _FEWEST, _NEAR = 12, 4
 #: Less of a part than this on the patch's border is an accident.
 _AT_THE_BORDER = 0.02
+#: Every how many frames one is remembered, and how many are besides the first.
+EVERY, _KEPT = 5, 6
 #: Every how many pixels the scene is looked at.
 _SCENE_STRIDE = 24
 
@@ -35,6 +37,27 @@ class Motion:
 
     then: Frame
     T_then_now: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """Frames that an object was seen in, with its poses T_cam_obj (4, 4): the first, and some of the last second."""
+
+    seen: tuple[tuple[Frame, np.ndarray], ...] = ()
+
+    def with_frame(self, frame: Frame, T_cam_obj: np.ndarray) -> Past:
+        """With one more frame where one is due: the oldest but the first gives way to it."""
+        if self.seen and frame.index < self.seen[-1][0].index + EVERY:
+            return self
+        return Past((*self.seen[:1], *self.seen[1:][1 - _KEPT :], (frame, T_cam_obj)))
+
+    def motions(self, frame: Frame, T_cam_obj: np.ndarray) -> tuple[Motion, Motion] | None:
+        """The motions since one of these frames, each in its turn, and since the first; None where there is none."""
+        if not self.seen:
+            return None
+        T_obj_cam, recent = se3.inverse(T_cam_obj), self.seen[1:] or self.seen
+        both = recent[frame.index % len(recent)], self.seen[0]
+        return tuple(Motion(then, T_then_obj @ T_obj_cam) for then, T_then_obj in both)
 
 
 def agrees(

@@ -9,29 +9,25 @@ lifted, and depth is missing just where a silhouette is doubtful.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import checked_clicks, depths_at
 from p2p_lib.core.config import SegmentationConfig
-from p2p_lib.core.image import bounds, nearest_px
+from p2p_lib.core.depth import depths_at
+from p2p_lib.core.image import bounds, in_mask
 from p2p_lib.core.interfaces import Hint
+from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
-from p2p_lib.segmenters.builtin.motion import Motion, scene_follows
-from p2p_lib.segmenters.builtin.patch import Box, Patch, around, connected, dilated, support_plane
+from p2p_lib.segmenters.builtin.motion import EVERY, Motion, Past, scene_follows
+from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, support_plane
+from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start, only
 
-#: Room around an object, besides a share of its size: small ones move by pixels too.
-_ROOM_PX = 6
-#: Every how many frames one is remembered, and how many are: about a second.
-_REMEMBERED, _MEMORY = 5, 6
+_NO_PX = np.zeros((0, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +46,16 @@ class _Target:
     seen     in the newest frame; None while it is absent
     colours  (4096,) shares of the colours it has shown; None if it has not been seen yet
     size_m   (2,) its largest width and height so far
-    first    the first frame remembered, with its pose T_cam_obj (4, 4) then
+    past     frames that it was seen in, with its poses
+    given    the newest frame with a mask that was given and showed something, from which nothing is learnt yet: that
+             costs time, and where every frame brings a mask it is never needed
     """
 
     seen: _Seen | None = None
     colours: np.ndarray | None = None
     size_m: np.ndarray | None = None
-    first: tuple[Frame, np.ndarray] | None = None
+    past: Past = field(default_factory=Past)
+    given: tuple[Frame, np.ndarray] | None = None
 
 
 class BuiltinSegmenter:
@@ -69,7 +68,6 @@ class BuiltinSegmenter:
         self._focal_px = np.array([camera.fx, camera.fy])
         self._targets: dict[str, _Target] = {}
         self._previous: Frame | None = None
-        self._past: deque[tuple[Frame, dict[str, np.ndarray]]] = deque(maxlen=_MEMORY)  # with the poses T_cam_obj then
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,98 +77,118 @@ class BuiltinSegmenter:
     def segment(
         self,
         frame: Frame,
-        clicks: Mapping[str, ArrayLike] | None = None,
+        prompts: Iterable[Prompt] = (),
         hints: Mapping[str, Hint] | None = None,
     ) -> np.ndarray:
         """One frame in, one label image out; where two objects claim a pixel the likelier one has it."""
-        new = checked_clicks(clicks or {}, self.camera, frame)
-        hints = {name: (hints or {}).get(name) or Hint() for name in self._targets}
-        present = {name: target for name, target in self._targets.items() if target.seen is not None}
-        if frame.index % _REMEMBERED == 0:
-            self._targets |= {name: self._with_room(frame, name, hints[name]) for name in present}
-        found = {name: self._follow(frame, name, hints[name]) for name in present}
-        taken = _taken(frame, found.values())
-        absent = [name for name in self._targets if name not in present]
-        found |= {name: self._find(frame, self._targets[name], hints[name], taken) for name in absent}
-        for name, at in new.items():
-            others = np.concatenate([*(c for n, c in new.items() if n != name), np.zeros((0, 2))])
-            self._targets[name], found[name] = _Target(), self._start(frame, at, others)
-        if frame.index % _REMEMBERED == 0:
-            sure = {name: hint.T_cam_obj for name, hint in hints.items() if self._sure(hint)}
-            self._past.append((frame, sure))
-            for name, T_cam_obj in sure.items():
-                if self._targets[name].first is None:
-                    self._targets[name] = replace(self._targets[name], first=(frame, T_cam_obj))
-        return self._shared_out(frame, found)
+        said = {prompt.name: prompt for prompt in prompts}
+        for prompt in (p for p in said.values() if p.mask is None):
+            check_prompt(prompt, self.camera)
+            check_depth(prompt, frame)
+        masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
+        found: dict[str, tuple[Box, np.ndarray] | None] = {}
+        taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
+        new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
+        # An object that is looked for is not one of those in view.
+        absent = {name for name, target in self._targets.items() if target.seen is None and target.given is None}
+        for name in sorted(dict.fromkeys([*self._targets, *said]), key=absent.__contains__):
+            target, hint = self._targets.get(name, _Target()), (hints or {}).get(name) or Hint()
+            if name in masks:
+                given = (frame, masks[name]) if masks[name].any() else target.given
+                self._targets[name] = replace(target, seen=None, given=given)
+                continue
+            target = self._targets[name] = self._learnt(target)
+            if name in said:
+                others_px = [p.points_px for n, p in said.items() if n != name]
+                found[name] = self._prompted(
+                    frame, target, said[name], np.concatenate([_NO_PX, *others_px]), hint, taken
+                )
+                self._targets[name] = _Target()  # its colours and its size are learnt anew
+            else:
+                self._targets[name], found[name] = self._looked_for(frame, target, hint, taken)
+            if found[name] is not None:
+                box, x = found[name]
+                taken[box.slices] |= x > 0.5
+        labels = self._shared_out(frame, found)
+        for label, name in enumerate(self._targets, 1):
+            if name in masks:
+                labels[masks[name]] = label
+        label_of = {name: label for label, name in enumerate(self._targets, 1)}
+        for prompt in new:
+            others = {name: labels == label for name, label in label_of.items() if name != prompt.name}
+            cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, _NO_PX)
+            doubt_start(cutter, labels == label_of[prompt.name], others)
+        self._previous = frame
+        return labels
+
+    def _learnt(self, target: _Target) -> _Target:
+        """What is known of an object with what the mask that was given of it tells."""
+        if target.given is None:
+            return target
+        frame, mask = target.given
+        target = self._updated(frame, target, _seen(frame, mask, self.config.min_px))
+        return replace(target, given=None, seen=target.seen if frame is self._previous else None)
+
+    def _prompted(
+        self,
+        frame: Frame,
+        target: _Target,
+        prompt: Prompt,
+        others_px: np.ndarray,
+        hint: Hint,
+        taken: np.ndarray,
+    ) -> tuple[Box, np.ndarray] | None:
+        """By what is said of it, and for a correction by where it would have been taken for."""
+        cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, others_px)
+        was = np.zeros(frame.shape, bool)
+        found = None if prompt.box_px is not None else self._looked_for(frame, target, hint, taken)[1]
+        if found is not None:
+            was[found[0].slices] = found[1] > 0.5
+        if was.any():
+            return cutter.correct(was, hint.uv_px)
+        return cutter.start() if prompt.starts else None
+
+    def _looked_for(
+        self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray
+    ) -> tuple[_Target, tuple[Box, np.ndarray] | None]:
+        """Where an object is, outside what is ``taken`` (H, W) bool where it was absent; and it, with its past."""
+        if target.seen is None:
+            return target, self._find(frame, target, hint, taken)
+        if not self._sure(hint):
+            return target, self._follow(frame, target, hint)
+        if frame.index % EVERY == 0:
+            target = self._with_room(frame, target, hint)
+        found = self._follow(frame, target, hint)
+        return replace(target, past=target.past.with_frame(frame, hint.T_cam_obj)), found
 
     def remove(self, name: str) -> None:
         """Forget an object."""
         del self._targets[name]
-        for _, poses in self._past:
-            poses.pop(name, None)
 
     def _shared_out(self, frame: Frame, found: Mapping[str, tuple[Box, np.ndarray] | None]) -> np.ndarray:
         """The label image of what was found of every object: its probability in a box of the image."""
-        labels, best = np.zeros(frame.shape, np.int32), np.full(frame.shape, 0.5, np.float32)
+        labels = np.zeros(frame.shape, np.int32)
+        if not found:
+            return labels
+        best = np.full(frame.shape, 0.5, np.float32)
         for label, name in enumerate(self._targets, 1):
-            if found[name] is not None:
+            if found.get(name) is not None:
                 box, x = found[name]
                 part, likeliest = labels[box.slices], best[box.slices]
                 wins = (x > likeliest) & (frame.depth_m[box.slices] > 0)
                 part[wins], likeliest[wins] = label, x[wins]
         for label, (name, target) in enumerate(self._targets.items(), 1):
-            mask = labels == label
-            seen = _seen(frame, mask) if mask.sum() >= self.config.min_px else None
-            self._targets[name] = self._updated(frame, target, seen)
-            if seen is None:
-                labels[mask] = 0
-        self._previous = frame
+            if name in found:
+                mask = labels == label
+                seen = _seen(frame, mask, self.config.min_px)
+                self._targets[name] = self._updated(frame, target, seen)
+                if seen is None:
+                    labels[mask] = 0
         return labels
 
-    def _start(self, frame: Frame, clicks: np.ndarray, others: np.ndarray) -> tuple[Box, np.ndarray]:
-        """From clicks, and those on other objects: in a wide box at low resolution, then in one that fits."""
-        cfg = self.config
-        z_m = float(np.median(depths_at(clicks, frame)))
-        box = around(clicks.mean(0), np.maximum(cfg.reach_m * self._focal_px / z_m, 2 * np.ptp(clicks, 0)), frame.shape)
-        patch = Patch.of(frame, box, self.camera, cfg)
-        plane = support_plane(patch, patch.depth_m > 0, self._rng)
-        seeds = patch.dots(clicks, 1)
-        x = self._cut_out(patch, plane, seeds, others, dilated(seeds, 2), ~dilated(seeds, min(seeds.shape) // 6))
-        whole = np.zeros(frame.shape, np.float32)
-        whole[box.slices] = patch.up(x)
-        patch = Patch.of(frame, self._fitting(patch, x > 0.5, frame), self.camera, cfg)
-        was = patch.down(whole)
-        x = self._cut_out(patch, plane, patch.dots(clicks, 1), others, was > 0.5, was < 0.5, was)
-        return patch.box, patch.up(x)
-
-    def _cut_out(
-        self,
-        patch: Patch,
-        plane: np.ndarray | None,
-        seeds: np.ndarray,
-        others: np.ndarray,
-        inside: np.ndarray,
-        outside: np.ndarray,
-        start: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """(h, w) probability of what is connected with the seeds; colours are those ``inside`` and ``outside``."""
-        background = (patch.dots(others, 1) | patch.border()) & ~seeds
-        by_depth, _ = by_geometry(patch, seeds, plane, self.config)
-        colour = by_colour(patch, histogram(patch.codes[inside]), outside, self.config)
-        return _only(cut(patch, by_depth + colour, start=start, seeds=seeds, background=background), seeds)
-
-    def _fitting(self, patch: Patch, inside: np.ndarray, frame: Frame) -> Box:
-        """A box with room around what is ``inside`` a patch."""
-        rows, columns = bounds(inside)
-        scale = np.array(patch.box.shape[::-1]) / patch.shape[::-1]
-        low, high = np.array([columns.start, rows.start]) * scale, np.array([columns.stop, rows.stop]) * scale
-        half = (high - low) / 2 * (1 + 2 * self.config.margin) + _ROOM_PX
-        return around((low + high) / 2 + [patch.box.left, patch.box.top], half, frame.shape)
-
-    def _follow(self, frame: Frame, name: str, hint: Hint) -> tuple[Box, np.ndarray]:
+    def _follow(self, frame: Frame, target: _Target, hint: Hint) -> tuple[Box, np.ndarray] | None:
         """From where it was a frame ago."""
-        cfg, target = self.config, self._targets[name]
-        seen = target.seen
+        cfg, seen = self.config, target.seen
         box = self._box_of_all(target, frame.shape)
         patch, before = (Patch.of(f, box, self.camera, cfg) for f in (frame, self._previous))
         mask = np.zeros(frame.shape, np.float32)
@@ -180,41 +198,28 @@ class BuiltinSegmenter:
         jumped = measured & (prior > 0.5) & (np.abs(patch.depth_m - z_before) > patch.step_m)
         core = (prior > 0.8) & ~jumped
         plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
-        log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, patch, name, hint))
+        log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, patch, target, hint))
         stays = cfg.prior_weight * (2 * prior - 1)
         # Parts that come into view are connected with those that were seen before.
         log_odds += np.where(component, np.maximum(stays, 0), stays)
         log_odds[jumped] -= cfg.geometry_weight
         log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
-        return box, patch.up(_only(cut(patch, log_odds, start=prior), core))
+        return box, patch.up(only(cut(patch, log_odds, start=prior), core))
 
     def _sure(self, hint: Hint) -> bool:
         """Whether enough points agree on a pose."""
         return hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
 
-    def _motions(self, frame: Frame, patch: Patch, name: str, hint: Hint) -> tuple[Motion, Motion] | None:
-        """An object's motions since one of the frames remembered, each in its turn, and since its first.
+    def _motions(self, frame: Frame, patch: Patch, target: _Target, hint: Hint) -> tuple[Motion, Motion] | None:
+        """An object's motions since a frame of the last second and since its first; None where they tell nothing."""
+        motions = target.past.motions(frame, hint.T_cam_obj) if self._sure(hint) else None
+        return None if motions is None or scene_follows(frame, patch, motions[0]) else motions
 
-        None where they tell nothing.
-        """
-        known = [(then, poses[name]) for then, poses in self._past if name in poses]
-        if not known or not self._sure(hint):
-            return None
-        T_obj_cam = se3.inverse(hint.T_cam_obj)
-        recent, first = (
-            Motion(then, T_cam_obj @ T_obj_cam)
-            for then, T_cam_obj in (known[frame.index % len(known)], self._targets[name].first)
-        )
-        return None if scene_follows(frame, patch, recent) else (recent, first)
-
-    def _with_room(self, frame: Frame, name: str, hint: Hint) -> _Target:
+    def _with_room(self, frame: Frame, target: _Target, hint: Hint) -> _Target:
         """An object with room for parts that move with it, which may reach farther than all that it has shown."""
-        cfg, target = self.config, self._targets[name]
-        if not self._sure(hint):
-            return target
-        half = cfg.reach_m * self._focal_px / target.seen.z_m
-        patch = Patch.of(frame, around(hint.uv_px.mean(0), half, frame.shape), self.camera, cfg)
-        motions = self._motions(frame, patch, name, hint)
+        cfg, px_m = self.config, self._focal_px / target.seen.z_m
+        patch = Patch.of(frame, around(hint.uv_px.mean(0), cfg.reach_m * px_m, frame.shape), self.camera, cfg)
+        motions = self._motions(frame, patch, target, hint)
         if motions is None:
             return target
         plane = support_plane(patch, patch.depth_m > 0, self._rng)
@@ -223,18 +228,16 @@ class BuiltinSegmenter:
             return target
         rows, columns = bounds(component)
         size_px = np.array([columns.stop - columns.start, rows.stop - rows.start]) * patch.box.shape[1] / patch.shape[1]
-        return replace(target, size_m=np.maximum(target.size_m, size_px * target.seen.z_m / self._focal_px))
+        return replace(target, size_m=np.maximum(target.size_m, size_px / px_m))
 
     def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> tuple[Box, np.ndarray] | None:
         """Where enough of its points have come back, on nothing that is ``taken`` (H, W) bool by another object."""
-        cfg = self.config
-        u, v = nearest_px(hint.uv_px, frame.shape)
-        uv_px = hint.uv_px[~taken[v, u]]
+        cfg, uv_px = self.config, hint.uv_px[~in_mask(hint.uv_px, taken)]
         if target.colours is None or len(uv_px) < cfg.find_points:
             return None
         z_m = float(np.nanmedian(depths_at(uv_px, frame)))
         low, high = uv_px.min(0), uv_px.max(0)
-        half = np.maximum(target.size_m * self._focal_px / z_m * (0.5 + cfg.margin), high - low) + _ROOM_PX
+        half = np.maximum(target.size_m * self._focal_px / z_m * (0.5 + cfg.margin), high - low) + ROOM_PX
         box = around((low + high) / 2, half, frame.shape)
         patch = Patch.of(frame, box, self.camera, cfg)
         barred = patch.down(taken.astype(np.float32)) > 0.5
@@ -244,7 +247,7 @@ class BuiltinSegmenter:
         log_odds, component = by_geometry(patch, seeds, plane, cfg)
         colour = by_colour(patch, target.colours, outside & ~component, cfg)
         background = (patch.border() | barred) & ~seeds
-        x = _only(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
+        x = only(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
         own_colours = colour[x > 0.5]
         return (box, patch.up(x)) if len(own_colours) and own_colours.mean() > 0 else None
 
@@ -254,7 +257,7 @@ class BuiltinSegmenter:
         extent = np.array(seen.mask.shape[::-1])
         half = np.maximum(extent / 2, np.minimum(whole_px / 2, whole_px - extent / 2))
         centre = np.array([seen.box.left, seen.box.top]) + extent / 2
-        return around(centre, half * (1 + self.config.margin) + _ROOM_PX, shape)
+        return around(centre, half * (1 + self.config.margin) + ROOM_PX, shape)
 
     def _updated(self, frame: Frame, target: _Target, seen: _Seen | None) -> _Target:
         """What is known of an object after a frame."""
@@ -265,25 +268,15 @@ class BuiltinSegmenter:
         if target.colours is None:
             return replace(target, seen=seen, colours=colours, size_m=size_m)
         rate = self.config.colour_rate
-        colours, size_m = (1 - rate) * target.colours + rate * colours, np.maximum(size_m, target.size_m)
-        return replace(target, seen=seen, colours=colours, size_m=size_m)
+        colours = (1 - rate) * target.colours + rate * colours
+        return replace(target, seen=seen, colours=colours, size_m=np.maximum(size_m, target.size_m))
 
 
-def _seen(frame: Frame, mask: np.ndarray) -> _Seen:
-    """Where a mask (H, W) lies in a frame."""
+def _seen(frame: Frame, mask: np.ndarray, min_px: int) -> _Seen | None:
+    """Where the measured pixels of a mask (H, W) lie in a frame; None where they are too few."""
+    mask = mask & (frame.depth_m > 0)
+    if mask.sum() < min_px:
+        return None
     rows, columns = bounds(mask)
     box = Box(columns.start, rows.start, columns.stop, rows.stop)
     return _Seen(box, mask[rows, columns], float(np.median(frame.depth_m[mask])))
-
-
-def _taken(frame: Frame, found: Iterable[tuple[Box, np.ndarray]]) -> np.ndarray:
-    """(H, W) bool: pixels that are already somebody's."""
-    taken = np.zeros(frame.shape, bool)
-    for box, x in found:
-        taken[box.slices] |= x > 0.5
-    return taken
-
-
-def _only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The probabilities without the islands that hold no seed."""
-    return np.where(connected(x > 0.5, seeds) | (x <= 0.5), x, 0)
