@@ -87,7 +87,9 @@ class BuiltinSegmenter:
             check_depth(prompt, frame)
         masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
         found: dict[str, tuple[Box, np.ndarray] | None] = {}
-        taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
+        taken = np.zeros(frame.shape, bool)
+        for mask in masks.values():
+            taken |= mask
         new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
         # An object that is looked for is not one of those in view.
         absent = {name for name, target in self._targets.items() if target.seen is None and target.given is None}
@@ -274,9 +276,14 @@ class BuiltinSegmenter:
 
 def _seen(frame: Frame, mask: np.ndarray, min_px: int) -> _Seen | None:
     """Where the measured pixels of a mask (H, W) lie in a frame; None where they are too few."""
-    mask = mask & (frame.depth_m > 0)
-    if mask.sum() < min_px:
+    if not mask.any():
         return None
     rows, columns = bounds(mask)
-    box = Box(columns.start, rows.start, columns.stop, rows.stop)
-    return _Seen(box, mask[rows, columns], float(np.median(frame.depth_m[mask])))
+    depth_m = frame.depth_m[rows, columns]
+    mask = mask[rows, columns] & (depth_m > 0)
+    if mask.sum() < min_px:
+        return None
+    inner = bounds(mask)
+    left, top = columns.start + inner[1].start, rows.start + inner[0].start
+    box = Box(left, top, left + inner[1].stop - inner[1].start, top + inner[0].stop - inner[0].start)
+    return _Seen(box, mask[inner], float(np.median(depth_m[mask])))
