@@ -9,7 +9,7 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.motion import Motion, agrees, parts_that_follow, scene_follows
+from p2p_lib.segmenters.builtin.motion import Motion, Motions, agrees, parts_that_follow, scene_follows
 from p2p_lib.segmenters.builtin.patch import Box, Patch, connected
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
@@ -51,6 +51,11 @@ def left(moved_m: float) -> np.ndarray:
     return T
 
 
+def motions_of(then: Frame, now: Frame, moved_m: float) -> Motions:
+    motion = Motion(then, np.linalg.inv(left(moved_m)))
+    return Motions(now, motion, motion)
+
+
 def patch_and_plate(frame: Frame, moved_m: float) -> tuple[Patch, np.ndarray]:
     patch = Patch.of(frame, Box(60, 60, 220, 180), CAMERA, CONFIG)
     return patch, connected(patch.smooth, patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
@@ -59,29 +64,29 @@ def patch_and_plate(frame: Frame, moved_m: float) -> tuple[Patch, np.ndarray]:
 def test_a_part_that_moves_along_is_told_from_a_neighbour_that_stays():
     then, now, moved_m = scene(0, 0.0), scene(30, 0.05), 0.05
     patch, plate = patch_and_plate(now, moved_m)
-    motion = Motion(then, np.linalg.inv(left(moved_m)))
-    parts = parts_that_follow(patch, patch.smooth, plate, motion, motion)
+    motions = motions_of(then, now, moved_m)
+    parts = parts_that_follow(patch, patch.smooth, plate, motions)
     part, neighbour = (
         patch.down(at(*a).astype(np.float32)) > 0.5 for a in ((PART, moved_m, PART_M), (NEIGHBOUR, 0, PART_M))
     )
     assert (parts & part).sum() > 0.8 * part.sum()
     assert not (parts & ~part).any() and neighbour.any()
-    assert not scene_follows(now, patch, motion)
+    assert not scene_follows(patch, motions)
 
 
 def test_nothing_is_a_part_before_it_has_moved():
     """Where nothing has moved yet, standing still explains all."""
     then, now = scene(0, 0.0), scene(1, 0.0)
     patch, plate = patch_and_plate(now, 0.0)
-    motion = Motion(then, np.eye(4))
-    assert not parts_that_follow(patch, patch.smooth, plate, motion, motion).any()
+    motions = motions_of(then, now, 0.0)
+    assert not parts_that_follow(patch, patch.smooth, plate, motions).any()
 
 
 def test_a_camera_that_moves_past_what_lies_still_tells_nothing():
     moved_m = 0.05
     then, now = scene(0, 0.0), scene(30, 0.0, moved_m)
     patch, _ = patch_and_plate(now, moved_m)
-    assert scene_follows(now, patch, Motion(then, np.linalg.inv(left(moved_m))))
+    assert scene_follows(patch, motions_of(then, now, moved_m))
 
 
 def test_points_agree_with_an_earlier_frame_at_their_depth_and_in_their_colour():

@@ -12,7 +12,7 @@ from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import evidence, histogram
-from p2p_lib.segmenters.builtin.motion import Motion, parts_that_follow
+from p2p_lib.segmenters.builtin.motion import Motions, parts_that_follow
 from p2p_lib.segmenters.builtin.patch import Patch, connected, dilated, plane_heights
 
 #: Weight of a pixel's certain evidence beside a tie to a like neighbour.
@@ -34,13 +34,13 @@ def by_geometry(
     seeds: np.ndarray,
     plane: np.ndarray | None,
     config: SegmentationConfig,
-    motions: tuple[Motion, Motion] | None = None,
+    motions: Motions | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """An object is connected in depth and is not what it stands on.
 
     seeds (h, w) bool lie on the object, ``plane`` is what may support it. Returns the evidence (h, w) and the
     component (h, w) bool: what is connected with the seeds, where that looks like one object; else nothing. Parts
-    beside it that share its ``motions``, since a recent frame and since the first, are of it.
+    beside it that share its ``motions`` are of it.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
@@ -62,7 +62,7 @@ def by_geometry(
             free = free & ~low
     component = connected(free, seeds)
     if motions is not None:
-        parts = parts_that_follow(patch, free, component, *motions)
+        parts = parts_that_follow(patch, free, component, motions)
         component |= parts
         log_odds[parts] += config.geometry_weight
     log_odds[measured & ~dilated(component, 1)] -= config.geometry_weight

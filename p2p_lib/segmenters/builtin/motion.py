@@ -40,6 +40,15 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
+class Motions:
+    """How an object moved until ``now``: since a frame of the last second, and since the first that it was seen in."""
+
+    now: Frame
+    recent: Motion
+    first: Motion
+
+
+@dataclass(frozen=True, eq=False)
 class Past:
     """Frames that an object was seen in, with its poses T_cam_obj (4, 4): the first, and some of the last second."""
 
@@ -51,13 +60,13 @@ class Past:
             return self
         return Past((*self.seen[:1], *self.seen[1:][1 - _KEPT :], (frame, T_cam_obj)))
 
-    def motions(self, frame: Frame, T_cam_obj: np.ndarray) -> tuple[Motion, Motion] | None:
+    def motions(self, now: Frame, T_cam_obj: np.ndarray) -> Motions | None:
         """The motions since one of these frames, each in its turn, and since the first; None where there is none."""
         if not self.seen:
             return None
         T_obj_cam, recent = se3.inverse(T_cam_obj), self.seen[1:] or self.seen
-        both = recent[frame.index % len(recent)], self.seen[0]
-        return tuple(Motion(then, T_then_obj @ T_obj_cam) for then, T_then_obj in both)
+        both = recent[now.index % len(recent)], self.seen[0]
+        return Motions(now, *(Motion(then, T_then_obj @ T_obj_cam) for then, T_then_obj in both))
 
 
 def agrees(
@@ -78,8 +87,9 @@ def agrees(
     return known & (np.abs(behind_m) < step_m) & alike, known & (behind_m > 2 * step_m)
 
 
-def scene_follows(frame: Frame, patch: Patch, motion: Motion) -> bool:
+def scene_follows(patch: Patch, motions: Motions) -> bool:
     """Whether what lies around a patch moved as the object did, or cannot tell: then its motion tells nothing."""
+    frame, motion = motions.now, motions.recent
     around = np.ones(frame.shape, bool)
     around[patch.box.slices] = False
     v, u = np.mgrid[: frame.shape[0] : _SCENE_STRIDE, : frame.shape[1] : _SCENE_STRIDE]
@@ -90,13 +100,10 @@ def scene_follows(frame: Frame, patch: Patch, motion: Motion) -> bool:
     return len(follows) < _FEWEST or follows.mean() > _UNDECIDED
 
 
-def parts_that_follow(
-    patch: Patch, smooth: np.ndarray, component: np.ndarray, motion: Motion, first: Motion
-) -> np.ndarray:
+def parts_that_follow(patch: Patch, smooth: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
     """(h, w) bool: smooth parts beside an object's component (h, w) bool that moved as it did and did not stay.
 
-    motion  since a frame of the last second
-    first   since the first frame: what was not there then, a hand that took the object, is not of it
+    What was not there in the first frame, a hand that took the object, is not of it.
     """
     count, part = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
     size = np.bincount(part.ravel(), minlength=count)
@@ -108,9 +115,9 @@ def parts_that_follow(
     at_border = np.bincount(part[patch.border()], minlength=count) / patch.border().sum()
     beside &= at_border < _AT_THE_BORDER
     v, u = np.nonzero(beside[part])
-    if not len(v):
+    if not len(v) or scene_follows(patch, motions):
         return np.zeros(patch.shape, bool)
-    p_cam, rgb = patch.points()[v, u], patch.rgb[v, u]
+    p_cam, rgb, motion, first = patch.points()[v, u], patch.rgb[v, u], motions.recent, motions.first
     moved, _ = agrees(p_cam, rgb, patch.camera, motion.then, motion.T_then_now)
     stayed, _ = agrees(p_cam, rgb, patch.camera, motion.then, np.eye(4))
     _, absent = agrees(p_cam, rgb, patch.camera, first.then, first.T_then_now)

@@ -23,7 +23,7 @@ from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
-from p2p_lib.segmenters.builtin.motion import EVERY, Motion, Past, scene_follows
+from p2p_lib.segmenters.builtin.motion import EVERY, Motions, Past, scene_follows
 from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, support_plane
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start, only
 
@@ -200,7 +200,7 @@ class BuiltinSegmenter:
         jumped = measured & (prior > 0.5) & (np.abs(patch.depth_m - z_before) > patch.step_m)
         core = (prior > 0.8) & ~jumped
         plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
-        log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, patch, target, hint))
+        log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, target, hint))
         stays = cfg.prior_weight * (2 * prior - 1)
         # Parts that come into view are connected with those that were seen before.
         log_odds += np.where(component, np.maximum(stays, 0), stays)
@@ -212,17 +212,16 @@ class BuiltinSegmenter:
         """Whether enough points agree on a pose."""
         return hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
 
-    def _motions(self, frame: Frame, patch: Patch, target: _Target, hint: Hint) -> tuple[Motion, Motion] | None:
-        """An object's motions since a frame of the last second and since its first; None where they tell nothing."""
-        motions = target.past.motions(frame, hint.T_cam_obj) if self._sure(hint) else None
-        return None if motions is None or scene_follows(frame, patch, motions[0]) else motions
+    def _motions(self, frame: Frame, target: _Target, hint: Hint) -> Motions | None:
+        """How an object moved; None where nobody knows."""
+        return target.past.motions(frame, hint.T_cam_obj) if self._sure(hint) else None
 
     def _with_room(self, frame: Frame, target: _Target, hint: Hint) -> _Target:
         """An object with room for parts that move with it, which may reach farther than all that it has shown."""
         cfg, px_m = self.config, self._focal_px / target.seen.z_m
         patch = Patch.of(frame, around(hint.uv_px.mean(0), cfg.reach_m * px_m, frame.shape), self.camera, cfg)
-        motions = self._motions(frame, patch, target, hint)
-        if motions is None:
+        motions = self._motions(frame, target, hint)
+        if motions is None or scene_follows(patch, motions):
             return target
         plane = support_plane(patch, patch.depth_m > 0, self._rng)
         _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions)
