@@ -9,7 +9,7 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.motion import Motion, Motions, agrees, parts_that_follow, scene_follows
+from p2p_lib.segmenters.builtin.motion import Motion, Motions, Past, agrees, parts_that_follow, scene_follows
 from p2p_lib.segmenters.builtin.patch import Box, Patch, connected
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
@@ -119,3 +119,48 @@ def test_the_segmenter_takes_in_what_moves_along(part_moves):
     part, neighbour = at(PART, moved_m, PART_M), at(NEIGHBOUR, 0.0, PART_M)
     assert found[at(PLATE, moved_m)].mean() > 0.9 and found[neighbour].mean() < 0.05
     assert (found[part].mean() > 0.8) == part_moves
+
+
+def test_what_came_to_the_object_later_is_not_a_part_of_it():
+    """A hand that takes it moves along from then on; where it is now, the wall was seen in the first frame."""
+    moved_m = 0.05
+    then, now = scene(25, 0.0), scene(30, moved_m)
+    before = scene(0, 0.0)
+    empty = at(PART, 0.0, PART_M)
+    before.rgb[empty], before.depth_m[empty] = _texture(9)[empty], WALL_M
+    patch, plate = patch_and_plate(now, moved_m)
+    both = motions_of(then, now, moved_m)
+    assert parts_that_follow(patch, patch.smooth, plate, both).any()
+    later = Motions(now, both.recent, Motion(before, both.first.T_then_now))
+    assert not parts_that_follow(patch, patch.smooth, plate, later).any()
+
+
+def test_the_first_frame_is_remembered_and_the_newest():
+    past, seen = Past(), range(0, 60)
+    for k in seen:
+        past = past.with_frame(scene_of_nothing(k), left(0.01 * k))
+    kept = [frame.index for frame, _ in past.seen]
+    assert kept[0] == 0 and kept[-1] == 55 and len(kept) < 10 and min(np.diff(kept)) >= 5
+    motions = past.motions(scene_of_nothing(60), left(0.6))
+    np.testing.assert_allclose(motions.first.T_then_now, left(-0.6), atol=1e-12)
+    np.testing.assert_allclose(motions.recent.T_then_now, left(0.01 * motions.recent.then.index - 0.6), atol=1e-12)
+    assert 25 <= motions.recent.then.index <= 55
+    assert Past().motions(scene_of_nothing(0), left(0.0)) is None
+
+
+def scene_of_nothing(k: int) -> Frame:
+    return Frame(k, k / 30, np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32))
+
+
+def test_there_is_room_for_parts_that_reach_farther_than_all_that_was_seen():
+    """The part sticks out of the box that the plate alone asks for."""
+    segmenter, tall = BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0)), (125, 20, 30, 90)
+    points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
+    for k in range(36):
+        moved_m = 0.003 * k
+        frame, plate, part = scene(k, moved_m), at(PLATE, moved_m), at(tall, moved_m, PART_M)
+        frame.rgb[part & ~plate], frame.depth_m[part & ~plate] = (40, 170, 60), PART_M
+        hint = Hint(points - [CAMERA.fx * moved_m / PLATE_M, 0], T_cam_obj=left(moved_m))
+        clicks = () if k else [Prompt("it", 0, np.array([[130.0, 125], [150, 130], [140, 140]]))]
+        found = segmenter.segment(frame, clicks, {"it": hint} if k else None) == 1
+    assert found[part & ~plate].mean() > 0.8

@@ -38,6 +38,11 @@ class _Seen:
     mask: np.ndarray
     z_m: float
 
+    @property
+    def centre_px(self) -> np.ndarray:
+        """(2,) middle of the box."""
+        return np.array([self.box.left + self.box.right, self.box.top + self.box.bottom]) / 2
+
 
 @dataclass(frozen=True, eq=False)
 class _Target:
@@ -46,6 +51,7 @@ class _Target:
     seen     in the newest frame; None while it is absent
     colours  (4096,) shares of the colours it has shown; None if it has not been seen yet
     size_m   (2,) its largest width and height so far
+    room_m   (2,) how far parts reach from the middle of what was seen that may be of it too
     past     frames that it was seen in, with its poses
     given    the newest frame with a mask that was given and showed something, from which nothing is learnt yet: that
              costs time, and where every frame brings a mask it is never needed
@@ -54,6 +60,7 @@ class _Target:
     seen: _Seen | None = None
     colours: np.ndarray | None = None
     size_m: np.ndarray | None = None
+    room_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
     past: Past = field(default_factory=Past)
     given: tuple[Frame, np.ndarray] | None = None
 
@@ -228,8 +235,9 @@ class BuiltinSegmenter:
         if not component.any():
             return target
         rows, columns = bounds(component)
-        size_px = np.array([columns.stop - columns.start, rows.stop - rows.start]) * patch.box.shape[1] / patch.shape[1]
-        return replace(target, size_m=np.maximum(target.size_m, size_px / px_m))
+        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]]) * patch.box.shape[1] / patch.shape[1]
+        away_px = np.abs(ends + np.array([patch.box.left, patch.box.top]) - target.seen.centre_px).max(0)
+        return replace(target, room_m=away_px / px_m)
 
     def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> tuple[Box, np.ndarray] | None:
         """Where enough of its points have come back, on nothing that is ``taken`` (H, W) bool by another object."""
@@ -254,11 +262,9 @@ class BuiltinSegmenter:
 
     def _box_of_all(self, target: _Target, shape: tuple[int, int]) -> Box:
         """Where to look for an object that was seen: room for all of it to either side of what showed."""
-        seen, whole_px = target.seen, target.size_m * self._focal_px / target.seen.z_m
-        extent = np.array(seen.mask.shape[::-1])
-        half = np.maximum(extent / 2, np.minimum(whole_px / 2, whole_px - extent / 2))
-        centre = np.array([seen.box.left, seen.box.top]) + extent / 2
-        return around(centre, half * (1 + self.config.margin) + ROOM_PX, shape)
+        seen, px_m = target.seen, self._focal_px / target.seen.z_m
+        half = np.maximum(target.size_m / 2, target.room_m) * px_m
+        return around(seen.centre_px, half * (1 + self.config.margin) + ROOM_PX, shape)
 
     def _updated(self, frame: Frame, target: _Target, seen: _Seen | None) -> _Target:
         """What is known of an object after a frame."""
