@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,7 +21,7 @@ import numpy as np
 from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, make_detector, make_segmenter
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.alignment import background_share, misfit
@@ -95,7 +96,9 @@ def check_folder(
         chosen = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist()
         frames = [sequence.frame(i) for i in chosen]
         masks = [sequence.masks(i) or {} for i in chosen]
-        firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
+        with warnings.catch_warnings(record=True) as doubts:
+            warnings.simplefilter("always", Doubt)
+            firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
     except P2PError as error:
         return [_unreadable(error)]
     size = f"{len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
@@ -108,6 +111,7 @@ def check_folder(
         return [*findings, _no_masks(sequence, any(masks), config)]
     if beyond := _all_beyond(firsts, config):
         return [*findings, beyond]  # what follows would only be its consequences
+    findings += [Finding("clicks", Level.LOOK, str(of.message)) for of in doubts if issubclass(of.category, Doubt)]
     for name, (frame, mask) in firsts.items():
         if mask.sum() < config.lifecycle.min_mask_px:
             findings.append(_nothing_there(name, frame, mask, config))
@@ -371,10 +375,9 @@ def _clicked(sequence: Sequence, prompts: Iterable[Prompt], config: Config) -> F
     """Each clicked object's first mask, as the built-in segmenter cuts it out."""
     firsts: FirstMasks = {}
     for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
-        frame = sequence.frame(i)
-        for prompt in said:
-            rng = np.random.default_rng(config.seed)
-            segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
-            if prompt.name not in firsts:
-                firsts[prompt.name] = frame, segmenter.segment(frame, [prompt]) > 0
+        frame, new = sequence.frame(i), [prompt for prompt in said if prompt.name not in firsts]
+        rng = np.random.default_rng(config.seed)
+        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
+        labels = segmenter.segment(frame, new)
+        firsts |= {name: (frame, labels == label) for label, name in enumerate(segmenter.names, 1)}
     return firsts

@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from p2p_lib import __version__
-from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.options import RunOptions, add_options, names, pairs
 
 EXIT_INTERRUPTED = 130
@@ -31,7 +32,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     arguments = _parser().parse_args(argv)
     try:
-        return arguments.command(arguments) or 0
+        with warnings.catch_warnings():
+            warnings.showwarning = partial(_show_doubt, warnings.showwarning, arguments.name)
+            return arguments.command(arguments) or 0
     except BrokenPipeError:  # the reader of our output (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -505,6 +508,13 @@ def _meant(word: str, known: list[str]) -> str:
 def _warn(line: object) -> None:
     """Standard output is for results."""
     print(line, file=sys.stderr)
+
+
+def _show_doubt(others: Callable, name: str, message: Any, category: type, *where: Any) -> None:
+    if issubclass(category, Doubt):
+        _warn(f"p2p {name}: {message}")
+    else:
+        others(message, category, *where)
 
 
 def _show(score: Any, as_json: bool) -> None:

@@ -5,6 +5,8 @@ The command line prints the message on one line and leaves with ``exit_code``.
 
 from __future__ import annotations
 
+import warnings
+
 
 class P2PError(Exception):
     """Any error the user can mend. ``str(error)`` is one line."""
@@ -45,6 +47,15 @@ class MissingBackend(P2PError, ImportError):
     def __init__(self, name: str, missing: str, fix: str):
         self.missing, self.fix = missing, fix
         super().__init__(_sentence(f"{name}: {missing}", fix), name=name)
+
+
+class Doubt(UserWarning):
+    """What can be meant, and most often is not: tracking goes on."""
+
+
+def doubt(name: str, got: object, fix: str) -> None:
+    """Warn of what came, saying what to do if it was not meant."""
+    warnings.warn(Doubt(_sentence(f"{name}: {got}", fix)), stacklevel=3)
 
 
 def _sentence(what: str, fix: str) -> str:

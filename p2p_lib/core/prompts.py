@@ -11,6 +11,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame
 
 
@@ -90,8 +91,9 @@ def check_mask(name: str, mask: np.ndarray, camera: Camera) -> None:
 
 
 def check_apart(others: Iterable[Prompt], prompt: Prompt) -> None:
-    """Refuse a click that is also one of another object's in the same frame."""
+    """Refuse a click that is also one of another object's in the same frame, or on its mask."""
     for other in others:
+        check_not_on(prompt, other, prompt.frame)
         if _meet(other.points_px, prompt.points_px):
             got = f"a click that is also one of {other.name!r}"
             raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel that belongs to one object only")
@@ -107,6 +109,13 @@ def check_depth(prompt: Prompt, frame: Frame) -> None:
     if prompt.box_px is not None and not len(prompt.points_px) and not len(points_in_box(prompt.box_px, frame)):
         got = f"no depth inside it in frame {frame.index}"
         raise BadInput(f"box around {prompt.name!r}", got, "measured pixels in its middle", "Click on the object.")
+
+
+def check_not_on(prompt: Prompt, other: Prompt, frame_index: int) -> None:
+    """Refuse a click on what another object's mask in the same frame says is the other's."""
+    if other.name != prompt.name and other.mask is not None and (on := in_mask(prompt.points_px, other.mask)).any():
+        got = f"{_pixel(prompt.points_px[on][0])} on the mask of {other.name!r} in frame {frame_index}"
+        raise BadInput(f"clicks on {prompt.name!r}", got, "pixels of this object alone")
 
 
 def points_in_box(box_px: np.ndarray, frame: Frame) -> np.ndarray:

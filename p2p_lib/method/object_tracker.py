@@ -385,14 +385,15 @@ class ObjectTracker:
             enough = best is not None and best.support >= self.config.lifecycle.return_inliers
             if sighting is not None and not enough:
                 uv_px = np.concatenate([obs.tracks.uv_px[agrees], sighting.uv_px])
-                return Hint(uv_px, self._distance_m(frame, sighting.T_cam_obj), True), requests
+                return self._hint(frame, uv_px, sighting.T_cam_obj, True), requests
             best = best if enough else None
         if best is None:
             return Hint(), requests
-        return Hint(obs.tracks.uv_px[best.inliers], self._distance_m(frame, best.T_cam_obj)), requests
+        return self._hint(frame, obs.tracks.uv_px[best.inliers], best.T_cam_obj, False), requests
 
-    def _distance_m(self, frame: Frame, T_cam_obj: np.ndarray) -> np.ndarray | None:
-        """(H, W) from the surface; None where there is none."""
-        if not self.model.has_surface:
-            return None
-        return surface_distance(self.model.surface, frame.depth_m, self.observer.camera, T_cam_obj)
+    def _hint(self, frame: Frame, uv_px: np.ndarray, T_cam_obj: np.ndarray, sighted: bool) -> Hint:
+        """The hint of a pose, with the distances from the surface under it."""
+        distance_m = None
+        if self.model.has_surface:
+            distance_m = surface_distance(self.model.surface, frame.depth_m, self.observer.camera, T_cam_obj)
+        return Hint(uv_px, distance_m, T_cam_obj, sighted)

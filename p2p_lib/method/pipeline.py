@@ -25,9 +25,9 @@ from p2p_lib.core.backends import (
 )
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.interfaces import PointTracker, Segmenter
-from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_mask, check_prompt
+from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_mask, check_not_on, check_prompt
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
 from p2p_lib.method.object_model import NO_IDS, Requests
@@ -251,8 +251,13 @@ class Point2Pose:
         given = {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items()}
         for name, prompt in given.items():
             check_mask(name, prompt.mask, self.camera)
+        for name, prompt in given.items():
+            if prompt.mask.all():
+                doubt(f"mask of {name!r}", f"the whole image in frame {frame.index}", "Is it inverted?")
         for name, prompt in self._said.items():
             check_depth(prompt, frame)
+            for other in given.values():
+                check_not_on(prompt, other, frame.index)
             if name in given and prompt.mask is None:
                 fix = "Leave it out of the masks, or do not click on it."
                 raise BadInput(f"mask of {name!r}", f"a mask and clicks in frame {frame.index}", "one of them", fix)

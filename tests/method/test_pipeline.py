@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.method.lifecycle import CONFIRM_FRAMES
 from p2p_lib.method.pipeline import Point2Pose
@@ -478,7 +478,8 @@ def test_a_black_blind_camera_is_no_trouble(name):
 
 def test_masks_may_touch_the_border_and_be_everything():
     everything = np.ones((300, 400), bool)
-    estimates = track([(f, {"left": everything}) for f, _ in film()[:4]], names=("left",), config=preset())
+    with pytest.warns(Doubt, match="mask of 'left': the whole image in frame 0"):
+        estimates = track([(f, {"left": everything}) for f, _ in film()[:4]], names=("left",), config=preset())
     assert statuses(estimates, "left")[0] == "tracked"
 
 
@@ -624,7 +625,70 @@ def test_clicks_that_do_not_fit_are_refused_and_leave_no_object_behind():
     method.add_object("left", clicks=good)
     with pytest.raises(BadInput, match="clicks on 'cup': got a click that is also one of 'left'"):
         method.add_object("cup", clicks=[good[1] + 0.2, [10, 10]])
+    with pytest.raises(BadInput, match="mask of 'cup': got the whole image"):
+        method.add_object("cup", mask=np.ones((300, 400), bool))
+    with pytest.raises(BadInput, match=r"box around 'cup': got \[500.0, .*, expected a box within 400x300"):
+        method.add_object("cup", box=(500, 10, 600, 90))
+    with pytest.raises(BadInput, match="clicks on 'cup': got a click that is also one beside it"):
+        method.add_object("cup", clicks=[[5, 5], [9, 9]], negative=[[9, 9]])
+    for beside_alone in ({"negative": [[9, 9]]}, {"mask": np.zeros((300, 400), bool)}):
+        with pytest.raises(BadInput, match=r"object 'left': got (clicks beside it alone|an empty mask)"):
+            method.correct("left", **beside_alone)  # it has not started yet
+    with pytest.raises(BadInput, match="correct: got 'cup', expected one of left"):
+        method.correct("cup", clicks=good)
     assert list(method.objects) == ["left"]
+
+
+def test_a_click_on_anothers_mask_is_refused():
+    method, (frame, masks) = Point2Pose(CAMERA, quick()), film()[0]
+    on_left = clicks_on(masks["left"])
+    method.add_object("left", mask=masks["left"])
+    with pytest.raises(BadInput, match=r"clicks on 'right': got \(\d+, \d+\) on the mask of 'left' in frame 0"):
+        method.add_object("right", clicks=on_left)
+    assert list(method.objects) == ["left"]
+    method.remove_object("left")
+    method.add_object("left")
+    method.add_object("right", clicks=on_left)
+    with pytest.raises(BadInput, match=r"clicks on 'right': got \(\d+, \d+\) on the mask of 'left' in frame 0"):
+        method.step(frame, {"left": masks["left"]})
+    method.correct("right", clicks=clicks_on(masks["right"]))  # the last word counts
+    assert {str(e.status) for e in method.step(frame, {"left": masks["left"]}).values()} == {"tracked"}
+    np.testing.assert_array_equal(method.masks["left"], masks["left"])
+    assert iou(method.masks["right"], masks["right"]) > 0.85
+
+
+@pytest.mark.parametrize("start", ["mask", "clicks", "box", "first step", "some steps"])
+def test_every_start_leads_to_the_same_road(start):
+    """Whatever says where the objects are at first, the segmenter looks after every frame without a mask."""
+    method, frames = Point2Pose(CAMERA, preset()), film()
+    for name, mask in frames[0][1].items():
+        v, u = np.nonzero(mask)
+        how = {"mask": mask, "clicks": clicks_on(mask), "box": (u.min(), v.min(), u.max(), v.max())}
+        method.add_object(name, **{start: how[start]} if start in how else {})
+    estimates = []
+    for k, (frame, masks) in enumerate(frames):
+        given = {"first step": k == 0, "some steps": k % 5 == 0}.get(start, False)
+        estimates.append(method.step(frame, masks if given else None))
+        measured = frame.depth_m > 0
+        assert all(iou(method.masks[name] & measured, mask & measured) > 0.85 for name, mask in masks.items())
+    assert_honest(estimates)
+    for name in TRUTH:
+        angle_deg, shift_mm = errors(estimates, name)
+        assert len(angle_deg) == LENGTH and angle_deg.max() < 4 and shift_mm.max() < 6
+
+
+def test_a_correction_mends_what_was_wrong():
+    """The right object is started with the left one's half as well; a click there says that it is not of it."""
+    method, frames = Point2Pose(CAMERA, quick()), film()
+    wrong = frames[0][1]["left"] | frames[0][1]["right"]
+    method.add_object("right", mask=wrong)
+    method.step(frames[0][0])
+    method.step(frames[1][0])
+    assert iou(method.masks["right"], frames[1][1]["right"]) < 0.7
+    method.correct("right", clicks=clicks_on(frames[2][1]["right"]), negative=clicks_on(frames[2][1]["left"]))
+    for frame, masks in frames[2:8]:
+        method.step(frame)
+        assert iou(method.masks["right"], masks["right"] & (frame.depth_m > 0)) > 0.85
 
 
 def test_clicks_without_depth_are_refused_before_anything_is_done():

@@ -1,12 +1,15 @@
 """What somebody says of an object, to the built-in segmenter: boxes, masks, clicks beside it, corrections."""
 
+import re
+import warnings
+
 import cv2
 import numpy as np
 import pytest
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
@@ -130,3 +133,33 @@ def test_a_refused_prompt_changes_nothing():
             follow.segment(frame, [Prompt("left", 1, negative_px=[[5, 5]]), prompt])
     assert follow.names == ("left",)
     np.testing.assert_array_equal(follow.segment(frame), other.segment(frame))
+
+
+@pytest.mark.parametrize(
+    ("prompts", "said"),
+    [
+        ([Prompt("a", points_px=[[30, 40]])], "clicks on 'a' in frame 0: .* flat in what is around it"),
+        (
+            [Prompt("a", points_px=[[100, 90]]), Prompt("b", points_px=[[140, 130]])],
+            "clicks on 'b' in frame 0: most of 'a' belongs to what is clicked. If both are one body",
+        ),
+        ([Prompt("left", points_px=[[100, 90]]), Prompt("right", points_px=[[175, 110]])], None),
+        ([Prompt("left", box_px=(90, 80, 150, 140))], None),
+    ],
+)
+def test_what_is_hardly_meant_is_said(prompts, said):
+    """The wall; two objects on one body. What is meant is taken without a word."""
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always")
+        labels = segmenter().segment(picture(), prompts)
+    assert [d.category for d in doubts] == [Doubt] * len(doubts) and bool(doubts) == bool(said)
+    assert said is None or any(re.search(said, str(d.message)) for d in doubts)
+    assert labels.max() == len(prompts)  # tracking goes on
+
+
+def test_nothing_found_is_said():
+    frame = picture()
+    speck = np.zeros_like(frame.depth_m)
+    speck[108:111, 173:176] = frame.depth_m[108:111, 173:176]
+    with pytest.warns(Doubt, match="clicks on 'right' in frame 0: no object is found there"):
+        segmenter().segment(Frame(0, 0.0, frame.rgb, speck), [Prompt("right", points_px=[[174, 109]])])

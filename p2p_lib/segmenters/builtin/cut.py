@@ -12,6 +12,7 @@ from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import evidence, histogram
+from p2p_lib.segmenters.builtin.motion import Motions, parts_that_follow
 from p2p_lib.segmenters.builtin.patch import Patch, connected, dilated, plane_heights
 
 #: Weight of a pixel's certain evidence beside a tie to a like neighbour.
@@ -24,15 +25,22 @@ _AT_THE_BORDER = 0.02
 _STANDS_OUT = 2.0
 #: A strip of this height above the plane, besides noise, belongs to the plane: its fit is no better.
 _PLANE_SLACK_M = 0.003
+#: Pixels of the smallest image whose optical flow is taken.
+_SMALLEST_FLOW = 32
 
 
 def by_geometry(
-    patch: Patch, seeds: np.ndarray, plane: np.ndarray | None, config: SegmentationConfig
+    patch: Patch,
+    seeds: np.ndarray,
+    plane: np.ndarray | None,
+    config: SegmentationConfig,
+    motions: Motions | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """An object is connected in depth and is not what it stands on.
 
     seeds (h, w) bool lie on the object, ``plane`` is what may support it. Returns the evidence (h, w) and the
-    component (h, w) bool: what is connected with the seeds, where that looks like one object; else nothing.
+    component (h, w) bool: what is connected with the seeds, where that looks like one object; else nothing. Parts
+    beside it that share its ``motions`` are of it.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
@@ -53,6 +61,10 @@ def by_geometry(
             log_odds[measured & low] -= config.geometry_weight
             free = free & ~low
     component = connected(free, seeds)
+    if motions is not None:
+        parts = parts_that_follow(patch, free, component, motions)
+        component |= parts
+        log_odds[parts] += config.geometry_weight
     log_odds[measured & ~dilated(component, 1)] -= config.geometry_weight
     if component[patch.border()].mean() > _AT_THE_BORDER:
         return log_odds, nothing  # it goes on beyond the patch: more than one object is connected
@@ -94,8 +106,19 @@ def cut(
 
 def warped(was: np.ndarray, before: Patch, patch: Patch) -> tuple[np.ndarray, np.ndarray]:
     """A mask (h, w) of the patch before, in [0, 1], and its depth, warped by the optical flow to this patch."""
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(patch.gray, before.gray, None)
     v, u = np.mgrid[: patch.shape[0], : patch.shape[1]]
-    at = flow + np.stack([u, v], -1).astype(np.float32)
+    at = _flow(patch.gray, before.gray) + np.stack([u, v], -1).astype(np.float32)
     mask = cv2.remap(was.astype(np.float32), at, None, cv2.INTER_LINEAR, borderValue=0)
     return mask, cv2.remap(before.depth_m, at, None, cv2.INTER_NEAREST, borderValue=0)
+
+
+def _flow(gray: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """(h, w, 2) optical flow in pixels from an image (h, w) uint8 to the one before.
+
+    OpenCV chooses the levels of its pyramid by the longer side and reads beyond the coarsest one where the shorter side
+    is not as long as its windows there: the images are padded to a square that is large enough for one level at least.
+    """
+    h, w = gray.shape
+    side = max(h, w, _SMALLEST_FLOW)
+    square = [cv2.copyMakeBorder(g, 0, side - h, 0, side - w, cv2.BORDER_REPLICATE) for g in (gray, before)]
+    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(*square, None)[:h, :w]

@@ -87,7 +87,7 @@ class Patch:
     @cached_property
     def step_m(self) -> np.ndarray:
         """(h, w): a larger change of depth from pixel to pixel is an edge, beyond noise and slant."""
-        return 3 * self.sigma_m + _SLANT_M
+        return depth_step_m(self.depth_m)
 
     @cached_property
     def smooth(self) -> np.ndarray:
@@ -160,12 +160,22 @@ class Patch:
         edge[1:-1, 1:-1] = False
         return edge
 
+    def points(self) -> np.ndarray:
+        """(h, w, 3) in the camera's frame; 0 where nothing is measured."""
+        x, y = self.rays()
+        return np.stack(np.broadcast_arrays(x, y[:, None], 1.0), -1) * self.depth_m[..., None]
+
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         """The slopes x / z of the columns (w,) and y / z of the rows (h,)."""
         (h, w), (rows, cols) = self.shape, self.box.shape
         u = (np.arange(w) + 0.5) * (cols / w) - 0.5 + self.box.left
         v = (np.arange(h) + 0.5) * (rows / h) - 0.5 + self.box.top
         return (u - self.camera.cx) / self.camera.fx, (v - self.camera.cy) / self.camera.fy
+
+
+def depth_step_m(depth_m: np.ndarray) -> np.ndarray:
+    """Of what depth (...,): a larger change than this is an edge, beyond noise and slant."""
+    return 3 * depth_noise_m(depth_m) + _SLANT_M
 
 
 def dilated(region: np.ndarray, radius: int) -> np.ndarray:

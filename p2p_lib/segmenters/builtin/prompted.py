@@ -5,6 +5,7 @@ It starts an object, or corrects what was made of it so far.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,17 +14,20 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depths_at
+from p2p_lib.core.errors import doubt
 from p2p_lib.core.image import bounds
 from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, cut
-from p2p_lib.segmenters.builtin.patch import Box, Patch, around, connected, dilated, support_plane
+from p2p_lib.segmenters.builtin.patch import Box, Patch, around, connected, dilated, plane_heights, support_plane
 
 #: Room around an object, besides a share of its size: small ones move by pixels too.
 ROOM_PX = 6
 #: About so many pixels of a mask stand for what is right about it.
 _MIDDLE = 40
+#: Standard deviations of depth below which an object's median height above the plane around it is none.
+_FLAT = 2.0
 #: A box is drawn a little too tight now and then, by this share of its size.
 _TIGHT = 0.05
 #: Length of a step between like pixels, where one across the strongest edge has length 1.
@@ -70,15 +74,18 @@ class Cutter:
     def correct(self, was: np.ndarray, known_px: np.ndarray) -> tuple[Box, np.ndarray]:
         """Anew, from clicks that say what is wrong with a mask (H, W) bool, and from what is right about it.
 
-        known_px  (K, 2) pixels that are known to be on the object; what lies in the middle of the mask counts as well,
-                  where it is far from clicks beside the object
+        known_px  (K, 2) pixels that are thought to be on the object, as is the middle of the mask: those are that lie
+                  nearer to a click on it than to one beside it; with clicks beside it alone, those far from them
         """
         inner = cv2.distanceTransform(np.pad(was, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
         v, u = np.nonzero(inner >= inner.max() / 2)
-        middle_px = np.stack([u, v], -1)[:: max(1, len(u) // _MIDDLE)]
-        away_px = np.linalg.norm(middle_px[:, None] - self.prompt.negative_px, axis=-1).min(1, initial=np.inf)
-        middle_px = middle_px[away_px >= np.median(away_px)]
-        points_px = np.concatenate([self.prompt.points_px, known_px, middle_px])
+        right_px = np.concatenate([known_px, np.stack([u, v], -1)[:: max(1, len(u) // _MIDDLE)]])
+        on, beside = (
+            np.linalg.norm(right_px[:, None] - at, axis=-1).min(1, initial=np.inf)
+            for at in (self.prompt.points_px, self.prompt.negative_px)
+        )
+        right_px = right_px[beside >= (on if np.isfinite(on).all() else np.median(beside))]
+        points_px = np.concatenate([self.prompt.points_px, right_px])
         return replace(self, prompt=replace(self.prompt, points_px=points_px)).start()
 
     def _cut_out(
@@ -123,6 +130,36 @@ class Cutter:
 def only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     """The probabilities without the islands that hold no seed."""
     return np.where(connected(x > 0.5, seeds) | (x <= 0.5), x, 0)
+
+
+def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> None:
+    """Warn where what was started with a mask (H, W) bool is most likely no object of its own.
+
+    others  object to mask (H, W) bool, of the other objects in this frame
+    """
+    frame, name = cutter.frame, cutter.prompt.name
+    who = f"{'clicks on' if len(cutter.prompt.points_px) else 'box around'} {name!r} in frame {frame.index}"
+    if not mask.any():
+        return doubt(
+            who, "no object is found there", "Click in its middle, on parts that look different, or draw a box."
+        )
+    rows, columns = bounds(mask)
+    corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
+    patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)
+    plane = support_plane(patch, patch.depth_m > 0, np.random.default_rng(0))
+    inside = (patch.down(mask.astype(np.float32)) > 0.5) & (patch.depth_m > 0)
+    if plane is not None and inside.any():
+        height = np.median(np.abs(plane_heights(patch, plane)[inside]) / patch.sigma_m[inside])
+        if height < _FLAT:
+            got = f"{mask.mean():.0%} of the image, flat in what is around it, as a table or a wall is"
+            return doubt(who, got, "If it is not the object, click in the object's middle.")
+    alone = np.zeros(frame.shape, bool)
+    box, x = replace(cutter, others_px=np.zeros((0, 2)), rng=np.random.default_rng(0)).start()
+    alone[box.slices] = x > 0.5
+    for other, there in others.items():
+        if there.any() and (alone & there).sum() > there.sum() / 2:
+            fix = "If both are one body, leave one out; else give each clicks beside it (negative), on the other."
+            doubt(who, f"most of {other!r} belongs to what is clicked", fix)
 
 
 def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:

@@ -1,0 +1,125 @@
+"""What moves with an object: pixels of now, held against an earlier frame as if they had moved as the object did."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.types import Frame
+from p2p_lib.segmenters.builtin.patch import Patch, depth_step_m, dilated
+
+#: Two looks at one place differ by less than this in colour, as a mean over the channels.
+_SAME_COLOUR = 40.0
+#: So much of a part agrees with the object's motion, and at most so much with standing still or of the scene with it.
+_AGREES, _UNDECIDED = 0.75, 0.5
+#: A part of which more was not there in the first frame has come to the object since.
+_ABSENT = 0.3
+#: A part of fewer pixels of the grid proves nothing; one this near to the object may hang together with it.
+_FEWEST, _NEAR = 12, 4
+#: Less of a part than this on the patch's border is an accident.
+_AT_THE_BORDER = 0.02
+#: Every how many frames one is remembered, and how many are besides the first.
+EVERY, _KEPT = 5, 6
+#: Every how many pixels the scene is looked at.
+_SCENE_STRIDE = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How an object moved since an earlier frame.
+
+    T_then_now (4, 4) takes its points from the frame of the camera now to that of the camera then.
+    """
+
+    then: Frame
+    T_then_now: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """How an object moved until ``now``: since a frame of the last second, and since the first that it was seen in."""
+
+    now: Frame
+    recent: Motion
+    first: Motion
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """Frames that an object was seen in, with its poses T_cam_obj (4, 4): the first, and some of the last second."""
+
+    seen: tuple[tuple[Frame, np.ndarray], ...] = ()
+
+    def with_frame(self, frame: Frame, T_cam_obj: np.ndarray) -> Past:
+        """With one more frame where one is due: the oldest but the first gives way to it."""
+        if self.seen and frame.index < self.seen[-1][0].index + EVERY:
+            return self
+        return Past((*self.seen[:1], *self.seen[1:][1 - _KEPT :], (frame, T_cam_obj)))
+
+    def motions(self, now: Frame, T_cam_obj: np.ndarray) -> Motions | None:
+        """The motions since one of these frames, each in its turn, and since the first; None where there is none."""
+        if not self.seen:
+            return None
+        T_obj_cam, recent = se3.inverse(T_cam_obj), self.seen[1:] or self.seen
+        both = recent[now.index % len(recent)], self.seen[0]
+        return Motions(now, *(Motion(then, T_then_obj @ T_obj_cam) for then, T_then_obj in both))
+
+
+def agrees(
+    p_cam: np.ndarray, rgb: np.ndarray, camera: Camera, then: Frame, T_then_now: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether points p_cam (..., 3) of now, of colours rgb, were seen in an earlier frame, if they moved like this.
+
+    Returns those that were, (...,) bool, and those that were not there: what is behind them was seen then.
+    """
+    p_then = se3.transform(T_then_now, p_cam)
+    uv_px = camera.project(p_then)
+    inside = camera.inside(uv_px, -0.5)
+    u, v = np.moveaxis(np.rint(np.where(inside[..., None], uv_px, 0)).astype(int), -1, 0)
+    z = then.depth_m[v, u]
+    behind_m, step_m = z - p_then[..., 2], depth_step_m(z)
+    known = inside & (z > 0)
+    alike = np.abs(then.rgb[v, u].astype(np.int16) - rgb).mean(-1) < _SAME_COLOUR
+    return known & (np.abs(behind_m) < step_m) & alike, known & (behind_m > 2 * step_m)
+
+
+def scene_follows(patch: Patch, motions: Motions) -> bool:
+    """Whether what lies around a patch moved as the object did, or cannot tell: then its motion tells nothing."""
+    frame, motion = motions.now, motions.recent
+    around = np.ones(frame.shape, bool)
+    around[patch.box.slices] = False
+    v, u = np.mgrid[: frame.shape[0] : _SCENE_STRIDE, : frame.shape[1] : _SCENE_STRIDE]
+    some = around[v, u] & (frame.depth_m[v, u] > 0)
+    v, u = v[some], u[some]
+    p_cam = patch.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
+    follows, _ = agrees(p_cam, frame.rgb[v, u], patch.camera, motion.then, motion.T_then_now)
+    return len(follows) < _FEWEST or follows.mean() > _UNDECIDED
+
+
+def parts_that_follow(patch: Patch, smooth: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
+    """(h, w) bool: smooth parts beside an object's component (h, w) bool that moved as it did and did not stay.
+
+    What was not there in the first frame, a hand that took the object, is not of it.
+    """
+    count, part = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
+    size = np.bincount(part.ravel(), minlength=count)
+    beside = np.zeros(count, bool)
+    beside[part[dilated(component, _NEAR) & ~component]] = True
+    beside[part[component]] = False
+    beside &= size >= _FEWEST
+    beside[0] = False
+    at_border = np.bincount(part[patch.border()], minlength=count) / patch.border().sum()
+    beside &= at_border < _AT_THE_BORDER
+    v, u = np.nonzero(beside[part])
+    if not len(v) or scene_follows(patch, motions):
+        return np.zeros(patch.shape, bool)
+    p_cam, rgb, motion, first = patch.points()[v, u], patch.rgb[v, u], motions.recent, motions.first
+    moved, _ = agrees(p_cam, rgb, patch.camera, motion.then, motion.T_then_now)
+    stayed, _ = agrees(p_cam, rgb, patch.camera, motion.then, np.eye(4))
+    _, absent = agrees(p_cam, rgb, patch.camera, first.then, first.T_then_now)
+    moved, stayed, absent = (np.bincount(part[v, u], w, count) / np.maximum(size, 1) for w in (moved, stayed, absent))
+    return (beside & (moved > _AGREES) & (stayed < _UNDECIDED) & (absent < _ABSENT))[part]

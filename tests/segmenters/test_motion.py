@@ -1,0 +1,166 @@
+"""What moves with an object, on a made-up scene: a plate before a wall, a part of it, a neighbour that stays."""
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import preset
+from p2p_lib.core.interfaces import Hint
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.types import Frame
+from p2p_lib.segmenters.builtin.motion import Motion, Motions, Past, agrees, parts_that_follow, scene_follows
+from p2p_lib.segmenters.builtin.patch import Box, Patch, connected
+from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
+
+CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
+CONFIG = preset().segmentation
+PLATE_M, PART_M, WALL_M = 0.7, 0.76, 1.2
+#: (x, y, width, height) in the first frame; the part shows above the plate, the neighbour stands beside it.
+PLATE, PART, NEIGHBOUR = (110, 110, 60, 40), (120, 80, 40, 30), (172, 100, 30, 50)
+
+
+def _texture(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return cv2.resize(rng.integers(30, 226, (60, 80, 3), np.uint8), (320, 240), interpolation=cv2.INTER_NEAREST)
+
+
+def at(place: tuple[int, int, int, int], moved_m: float = 0.0, z_m: float = PLATE_M) -> np.ndarray:
+    """(H, W) bool of a rectangle at a depth after a motion to the left."""
+    x, y, w, h = place
+    x -= round(CAMERA.fx * moved_m / z_m)
+    mask = np.zeros((240, 320), bool)
+    mask[y : y + h, x : x + w] = True
+    return mask
+
+
+def scene(k: int, moved_m: float, camera_m: float = 0.0) -> Frame:
+    """Plate and part moved to the left by so much, and everything by what the camera moved."""
+    rgb, depth = np.roll(_texture(9), -round(CAMERA.fx * camera_m / WALL_M), 1), np.full((240, 320), WALL_M, np.float32)
+    things = (PART, PART_M, 1, moved_m), (NEIGHBOUR, PART_M, 2, 0.0), (PLATE, PLATE_M, 3, moved_m)
+    for place, z_m, seed, own_m in things:
+        mask = at(place, own_m + camera_m, z_m)
+        shift = -round(CAMERA.fx * (own_m + camera_m) / z_m)
+        rgb[mask], depth[mask] = np.roll(_texture(seed), shift, 1)[mask], z_m
+    return Frame(k, k / 30, rgb, depth)
+
+
+def left(moved_m: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = -moved_m
+    return T
+
+
+def motions_of(then: Frame, now: Frame, moved_m: float) -> Motions:
+    motion = Motion(then, np.linalg.inv(left(moved_m)))
+    return Motions(now, motion, motion)
+
+
+def patch_and_plate(frame: Frame, moved_m: float) -> tuple[Patch, np.ndarray]:
+    patch = Patch.of(frame, Box(60, 60, 220, 180), CAMERA, CONFIG)
+    return patch, connected(patch.smooth, patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
+
+
+def test_a_part_that_moves_along_is_told_from_a_neighbour_that_stays():
+    then, now, moved_m = scene(0, 0.0), scene(30, 0.05), 0.05
+    patch, plate = patch_and_plate(now, moved_m)
+    motions = motions_of(then, now, moved_m)
+    parts = parts_that_follow(patch, patch.smooth, plate, motions)
+    part, neighbour = (
+        patch.down(at(*a).astype(np.float32)) > 0.5 for a in ((PART, moved_m, PART_M), (NEIGHBOUR, 0, PART_M))
+    )
+    assert (parts & part).sum() > 0.8 * part.sum()
+    assert not (parts & ~part).any() and neighbour.any()
+    assert not scene_follows(patch, motions)
+
+
+def test_nothing_is_a_part_before_it_has_moved():
+    """Where nothing has moved yet, standing still explains all."""
+    then, now = scene(0, 0.0), scene(1, 0.0)
+    patch, plate = patch_and_plate(now, 0.0)
+    motions = motions_of(then, now, 0.0)
+    assert not parts_that_follow(patch, patch.smooth, plate, motions).any()
+
+
+def test_a_camera_that_moves_past_what_lies_still_tells_nothing():
+    moved_m = 0.05
+    then, now = scene(0, 0.0), scene(30, 0.0, moved_m)
+    patch, _ = patch_and_plate(now, moved_m)
+    assert scene_follows(patch, motions_of(then, now, moved_m))
+
+
+def test_points_agree_with_an_earlier_frame_at_their_depth_and_in_their_colour():
+    then = scene(0, 0.0)
+    uv = np.array([[140.0, 130], [140, 130], [140, 130], [20, 20]])
+    p_cam = CAMERA.unproject(uv, np.array([PLATE_M, PLATE_M, PLATE_M + 0.1, WALL_M]))
+    rgb = then.rgb[uv[:, 1].astype(int), uv[:, 0].astype(int)].copy()
+    rgb[1] = 255 - rgb[1] // 4
+    assert [a.tolist() for a in agrees(p_cam, rgb, CAMERA, then, np.eye(4))] == [
+        [True, False, False, True],
+        [False, False, False, False],
+    ]
+    far = np.eye(4)
+    far[0, 3] = 5.0
+    assert not np.any(agrees(p_cam, rgb, CAMERA, then, far))
+
+
+@pytest.mark.parametrize("part_moves", [True, False])
+def test_the_segmenter_takes_in_what_moves_along(part_moves):
+    """Clicks lie on the plate alone; the pose of the plate is known. What stands still beside it stays outside."""
+    segmenter = BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0))
+    clicks = [Prompt("it", 0, np.array([[130.0, 125], [150, 130], [140, 140]]))]
+    points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
+    for k in range(26):
+        moved_m = 0.003 * k
+        frame = scene(k, moved_m)
+        T_cam_obj = left(moved_m) if part_moves else left(0.0)
+        hint = Hint(points - [CAMERA.fx * moved_m / PLATE_M, 0], T_cam_obj=T_cam_obj)
+        found = segmenter.segment(frame, () if k else clicks, {"it": hint} if k else None) == 1
+    part, neighbour = at(PART, moved_m, PART_M), at(NEIGHBOUR, 0.0, PART_M)
+    assert found[at(PLATE, moved_m)].mean() > 0.9 and found[neighbour].mean() < 0.05
+    assert (found[part].mean() > 0.8) == part_moves
+
+
+def test_what_came_to_the_object_later_is_not_a_part_of_it():
+    """A hand that takes it moves along from then on; where it is now, the wall was seen in the first frame."""
+    moved_m = 0.05
+    then, now = scene(25, 0.0), scene(30, moved_m)
+    before = scene(0, 0.0)
+    empty = at(PART, 0.0, PART_M)
+    before.rgb[empty], before.depth_m[empty] = _texture(9)[empty], WALL_M
+    patch, plate = patch_and_plate(now, moved_m)
+    both = motions_of(then, now, moved_m)
+    assert parts_that_follow(patch, patch.smooth, plate, both).any()
+    later = Motions(now, both.recent, Motion(before, both.first.T_then_now))
+    assert not parts_that_follow(patch, patch.smooth, plate, later).any()
+
+
+def test_the_first_frame_is_remembered_and_the_newest():
+    past, seen = Past(), range(0, 60)
+    for k in seen:
+        past = past.with_frame(scene_of_nothing(k), left(0.01 * k))
+    kept = [frame.index for frame, _ in past.seen]
+    assert kept[0] == 0 and kept[-1] == 55 and len(kept) < 10 and min(np.diff(kept)) >= 5
+    motions = past.motions(scene_of_nothing(60), left(0.6))
+    np.testing.assert_allclose(motions.first.T_then_now, left(-0.6), atol=1e-12)
+    np.testing.assert_allclose(motions.recent.T_then_now, left(0.01 * motions.recent.then.index - 0.6), atol=1e-12)
+    assert 25 <= motions.recent.then.index <= 55
+    assert Past().motions(scene_of_nothing(0), left(0.0)) is None
+
+
+def scene_of_nothing(k: int) -> Frame:
+    return Frame(k, k / 30, np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32))
+
+
+def test_there_is_room_for_parts_that_reach_farther_than_all_that_was_seen():
+    """The part sticks out of the box that the plate alone asks for."""
+    segmenter, tall = BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0)), (125, 20, 30, 90)
+    points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
+    for k in range(36):
+        moved_m = 0.003 * k
+        frame, plate, part = scene(k, moved_m), at(PLATE, moved_m), at(tall, moved_m, PART_M)
+        frame.rgb[part & ~plate], frame.depth_m[part & ~plate] = (40, 170, 60), PART_M
+        hint = Hint(points - [CAMERA.fx * moved_m / PLATE_M, 0], T_cam_obj=left(moved_m))
+        clicks = () if k else [Prompt("it", 0, np.array([[130.0, 125], [150, 130], [140, 140]]))]
+        found = segmenter.segment(frame, clicks, {"it": hint} if k else None) == 1
+    assert found[part & ~plate].mean() > 0.8
