@@ -81,11 +81,13 @@ class Hint:
     uv_px       (K, 2) its tracked points whose measured places agree with one rigid motion
     distance_m  (H, W) float32: signed distance of each measured pixel to the object's reconstructed surface
                 at the pose those points give, positive in front of it; NaN where unknown. None without a surface
+    sighted     the object has been found there by shape and colour, after an absence
     T_cam_obj   (4, 4) that pose; None where there is none
     """
 
     uv_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     distance_m: np.ndarray | None = None
+    sighted: bool = False
     T_cam_obj: np.ndarray | None = None
 
 
