@@ -74,11 +74,19 @@ def test_a_part_that_moves_along_is_told_from_a_neighbour_that_stays():
     assert not scene_follows(patch, motions)
 
 
-def test_nothing_is_a_part_before_it_has_moved():
-    """Where nothing has moved yet, standing still explains all."""
-    then, now = scene(0, 0.0), scene(1, 0.0)
-    patch, plate = patch_and_plate(now, 0.0)
-    motions = motions_of(then, now, 0.0)
+def test_what_may_as_well_have_stood_still_is_no_part():
+    """A plain board beside the plate is in most of its pixels the same, whether it moved along or not."""
+    board, moved_m = np.zeros((240, 320), bool), 0.02
+    board[60:105, 80:240] = True
+    frames = []
+    for k, by_m in enumerate((0.0, moved_m)):
+        frame, plate = scene(k, by_m), at(PLATE, by_m)
+        frame.rgb[board & ~plate], frame.depth_m[board & ~plate] = 120, PART_M
+        frames.append(frame)
+    patch = Patch.of(frames[1], Box(40, 40, 280, 200), CAMERA, CONFIG)
+    plate = connected(patch.smooth, patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
+    motions = motions_of(*frames, moved_m)
+    assert not scene_follows(patch, motions)
     assert not parts_that_follow(patch, patch.smooth, plate, motions).any()
 
 
@@ -86,7 +94,10 @@ def test_a_camera_that_moves_past_what_lies_still_tells_nothing():
     moved_m = 0.05
     then, now = scene(0, 0.0), scene(30, 0.0, moved_m)
     patch, _ = patch_and_plate(now, moved_m)
-    assert scene_follows(patch, motions_of(then, now, moved_m))
+    motions = motions_of(then, now, moved_m)
+    plate = connected(patch.smooth, patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
+    assert scene_follows(patch, motions)
+    assert not parts_that_follow(patch, patch.smooth, plate, motions).any()
 
 
 def test_points_agree_with_an_earlier_frame_at_their_depth_and_in_their_colour():
@@ -164,3 +175,26 @@ def test_there_is_room_for_parts_that_reach_farther_than_all_that_was_seen():
         clicks = () if k else [Prompt("it", 0, np.array([[130.0, 125], [150, 130], [140, 140]]))]
         found = segmenter.segment(frame, clicks, {"it": hint} if k else None) == 1
     assert found[part & ~plate].mean() > 0.8
+
+
+def test_a_look_alike_in_view_is_not_the_absent_object():
+    """The tracked points of the one that is covered have gone over to the other, which has its colours."""
+    here, there = (60, 90, 50, 50), (200, 90, 50, 50)
+
+    def two(k: int, covered: bool) -> Frame:
+        rgb, depth = _texture(9) // 4 + 20, np.full((240, 320), WALL_M, np.float32)
+        for place in (here, there):
+            rgb[at(place)], depth[at(place)] = np.roll(_texture(5), place[0], 1)[at(place)], PLATE_M
+        if covered:
+            rgb[:, :150], depth[:, :150] = 90, 0.5
+        return Frame(k, k / 30, rgb, depth)
+
+    segmenter = BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0))
+    clicks = [
+        Prompt(name, 0, np.add(at_px[:2], [[15.0, 15], [30, 30], [15, 35]]))
+        for name, at_px in (("one", here), ("two", there))
+    ]
+    points = np.stack(np.meshgrid(np.linspace(205, 245, 4), np.linspace(95, 135, 4)), -1).reshape(-1, 2)
+    for k in range(4):
+        found = segmenter.segment(two(k, k > 0), () if k else clicks, {"one": Hint(points)} if k > 1 else None)
+    assert not (found == 1).any() and (found == 2)[at(there)].mean() > 0.9
