@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from skimage.measure import marching_cubes
 
 from p2p_lib.core.errors import BadInput
 
@@ -54,6 +53,8 @@ def save(mesh: trimesh.Trimesh, path: str | Path) -> Path:
 
 def _marching_cubes(volume: TsdfVolume, min_weight: float) -> tuple[np.ndarray, np.ndarray]:
     """Vertices in array indices (N, 3) and faces (M, 3), over fully observed cells."""
+    from skimage.measure import marching_cubes
+
     value, observed = volume.values(), volume.weights() >= min_weight
     cells = _cells(observed)
     known = value[observed & np.isfinite(value)]

@@ -182,7 +182,8 @@ class ObjectModel:
 
 def _volume(config: Config) -> TsdfVolume:
     """An empty surface. torch and scikit-image take seconds to import: when there is to be one, not at an absence."""
-    from p2p_lib.method import mesh  # noqa: F401
+    import skimage.measure  # noqa: F401
+
     from p2p_lib.method.tsdf import TsdfVolume
 
     return TsdfVolume(config.tsdf, device=config.device)
