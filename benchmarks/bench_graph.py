@@ -27,12 +27,10 @@ SIGMA_RAD, SIGMA_M = 0.0015, 0.003
 
 @dataclass
 class World:
-    """True points, true poses, and what each keyframe saw."""
+    """True points p_obj (N, 3); of each keyframe its true T_cam_obj, the ids of what it saw, and where (M, 3)."""
 
     p_obj: np.ndarray
-    T_cam_obj: np.ndarray
-    seen: list[np.ndarray]
-    p_cam: list[np.ndarray]
+    keyframes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def turntable(keyframes: int, seed: int, points: int = 300, per_view: int = 45) -> World:
@@ -40,7 +38,7 @@ def turntable(keyframes: int, seed: int, points: int = 300, per_view: int = 45) 
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=(points, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    world = World(normal * [0.05, 0.08, 0.05] * rng.uniform(0.85, 1, (points, 1)), [], [], [])
+    world = World(normal * [0.05, 0.08, 0.05] * rng.uniform(0.85, 1, (points, 1)), [])
     for m in range(keyframes):
         tilt, turn = 0.35 * np.sin(0.15 * m), np.radians(10) * m
         T = se3.exp(np.array([tilt, 0, 0, 0, 0, 0])) @ se3.exp(np.array([0, turn, 0, 0, 0, 0]))
@@ -51,10 +49,7 @@ def turntable(keyframes: int, seed: int, points: int = 300, per_view: int = 45) 
         ids = np.sort(rng.permutation(facing)[:per_view])
         bearing = p_cam[ids] / range_m[ids] + SIGMA_RAD * rng.normal(size=(len(ids), 3))
         bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
-        world.seen.append(ids)
-        world.p_cam.append(bearing * (range_m[ids] + SIGMA_M * rng.normal(size=(len(ids), 1))))
-        world.T_cam_obj.append(T)
-    world.T_cam_obj = np.array(world.T_cam_obj)
+        world.keyframes.append((T, ids, bearing * (range_m[ids] + SIGMA_M * rng.normal(size=(len(ids), 1)))))
     return world
 
 
@@ -122,7 +117,7 @@ class Smoother:
 def run(world: World, graph: Ours | Smoother) -> tuple[np.ndarray, float, float]:
     """CPU ms of each keyframe, root mean square error of the map (m), normalised squared error of the last pose."""
     known, times = {}, []
-    for ids, p_cam, truth in zip(world.seen, world.p_cam, world.T_cam_obj, strict=True):
+    for truth, ids, p_cam in world.keyframes:
         shared = [k for k, i in enumerate(ids.tolist()) if i in known]
         T = fit_rigid(np.array([known[ids[k]] for k in shared]), p_cam[shared]) if known else truth
         start = time.process_time()
@@ -131,7 +126,7 @@ def run(world: World, graph: Ours | Smoother) -> tuple[np.ndarray, float, float]
     rows = np.array(sorted(known))
     estimate, truth = np.array([known[i] for i in rows]), world.p_obj[rows]
     error = se3.transform(fit_rigid(truth, estimate), truth) - estimate
-    off = se3.log(se3.inverse(T_last) @ world.T_cam_obj[-1])
+    off = se3.log(se3.inverse(T_last) @ world.keyframes[-1][0])
     nees = np.nan if covariance is None else off @ np.linalg.solve(covariance, off)
     return np.array(times), float(np.sqrt(np.mean(np.sum(error**2, 1)))), float(nees)
 

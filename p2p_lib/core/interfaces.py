@@ -81,10 +81,12 @@ class Hint:
     uv_px       (K, 2) its tracked points whose measured places agree with one rigid motion
     distance_m  (H, W) float32: signed distance of each measured pixel to the object's reconstructed surface
                 at the pose those points give, positive in front of it; NaN where unknown. None without a surface
+    sighted     the object has been found there by shape and colour, after an absence
     """
 
     uv_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     distance_m: np.ndarray | None = None
+    sighted: bool = False
 
 
 class Segmenter(Protocol):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,9 +33,13 @@ from p2p_lib.core.types import Frame, PoseEstimate, Tracks
 from p2p_lib.method.object_model import NO_IDS, Requests
 from p2p_lib.method.object_tracker import ObjectTracker
 from p2p_lib.method.observation import Observation
+from p2p_lib.method.scene import Scene
+from p2p_lib.method.search import Sighting
 
 #: Object to (H, W) bool; None where nobody knows.
 Masks = dict[str, np.ndarray | None]
+#: The camera is located every so many frames while all objects have poses.
+_LOCATE_EVERY = 5
 NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
@@ -56,11 +61,14 @@ class Point2Pose:
         self.detector = make_detector(detector, self.config.sampling, self._rng)
         rng = np.random.default_rng([self.config.seed, 1])
         self.segmenter = make_segmenter(segmenter, camera, self.config.segmentation, rng)
+        scene_rng = np.random.default_rng([self.config.seed, 2])
+        self.scene = Scene(camera, self.config.depth, scene_rng) if self.config.method.scene else None
         self.objects: dict[str, ObjectTracker] = {}
         self.masks: Masks = {}
         self.tracks = NOTHING_TRACKED
         self.stopwatch = Stopwatch()
         self._streaming = False
+        self._unlocated = _LOCATE_EVERY
         self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
         self._waiting: deque[tuple[Frame, Masks, dict[str, Prompt]]] = deque()  # frames without an answer yet
 
@@ -166,27 +174,57 @@ class Point2Pose:
         if len(self._waiting) <= self.tracker.latency_frames:
             return {}
         frame, masks, said = self._waiting.popleft()
-        self.tracks, self.masks = tracks, self._segment(frame, tracks, masks, said)
+        frame = self._located(frame)
         # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
         objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
-        seen = {name: obj.observe(frame, self.masks[name], tracks) for name, obj in objects.items()}
+        self.tracks = tracks
+        sightings = self._sightings(frame, masks, objects)
+        self.masks = self._segment(frame, masks, said, sightings)
+        seen = {
+            name: obj.observe(frame, self.masks[name], self.tracks, sightings.get(name))
+            for name, obj in objects.items()
+        }
         self._apply({name: obj.misplaced(seen[name]) for name, obj in objects.items()})
         seen |= self._redetect(seen)
         steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
         self._apply({name: step.requests for name, step in steps.items()})
         return {name: steps[name].estimate for name in self.objects if name in steps}
 
+    def _located(self, frame: Frame) -> Frame:
+        """The frame with the camera's pose, as far as it is known: often while an object is away, else now and then."""
+        self._unlocated += 1
+        every = 1 if any(obj.away for obj in self.objects.values()) else _LOCATE_EVERY
+        if self.scene is None or frame.T_world_cam is not None or self._unlocated < every:
+            return frame
+        self._unlocated = 0
+        with self.stopwatch("scene"):
+            known = [mask for mask in self.masks.values() if mask is not None]
+            occupied = np.logical_or.reduce(known) if known else None
+            return replace(frame, T_world_cam=self.scene.locate(frame, occupied))
+
+    def _sightings(self, frame: Frame, masks: Masks, objects: Mapping[str, ObjectTracker]) -> dict[str, Sighting]:
+        """Absent objects that show again by shape and colour; the tracker looks for their points there."""
+        seen = {name: obj.observe(frame, masks[name], self.tracks) for name, obj in objects.items() if obj.away}
+        looked = {name: objects[name].sighted(obs) for name, obs in seen.items()}
+        found = {name: sighting for name, sighting in looked.items() if sighting is not None}
+        self._suggest({name: objects[name].points_px(seen[name], at.T_cam_obj) for name, at in found.items()})
+        return found
+
+    def _suggest(self, expected_px: Mapping[str, np.ndarray]) -> None:
+        """Have the tracker look for points where their objects expect them, unless it answers late."""
+        if self.tracker.latency_frames:
+            return
+        with self.stopwatch("tracking"):
+            for name, uv_px in expected_px.items():
+                found = self.tracker.suggest(self.objects[name].map.ids, uv_px)
+                self.tracks = self.tracks if found is None else found
+
     def _redetect(self, seen: Mapping[str, Observation]) -> dict[str, Observation]:
         """Guided re-detection: the tracker looks for points where their objects expect them; what is seen then."""
-        if self.tracker.latency_frames:
-            return {}
-        expected = {name: self.objects[name].expected_px(obs) for name, obs in seen.items()}
-        with self.stopwatch("tracking"):
-            for name, uv_px in expected.items():
-                found = None if uv_px is None else self.tracker.suggest(self.objects[name].map.ids, uv_px)
-                self.tracks = self.tracks if found is None else found
-        sought = [name for name, uv_px in expected.items() if uv_px is not None]
-        return {name: self.objects[name].observe(seen[name].frame, seen[name].mask, self.tracks) for name in sought}
+        looked = {name: self.objects[name].expected_px(obs) for name, obs in seen.items()}
+        expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}
+        self._suggest(expected)
+        return {name: self.objects[name].seen_anew(seen[name], self.tracks) for name in expected}
 
     def _apply(self, requests: Mapping[str, Requests]) -> None:
         """The one place where the shared tracker is changed, after all objects have been looked at."""
@@ -225,7 +263,7 @@ class Point2Pose:
         given = {name: prompt for name, prompt in self._said.items() if prompt.mask is not None} | given
         return {name: given[name].mask if name in given else None for name in self.objects}
 
-    def _segment(self, frame: Frame, tracks: Tracks, masks: Masks, said: dict[str, Prompt]) -> Masks:
+    def _segment(self, frame: Frame, masks: Masks, said: dict[str, Prompt], sightings: Mapping[str, Sighting]) -> Masks:
         """Every object's mask: the one given, else the segmenter's, which learns from those that are given."""
         masks = {name: mask for name, mask in masks.items() if name in self.objects}  # some may be gone again
         said = {name: prompt for name, prompt in sorted(said.items()) if name in masks}
@@ -234,7 +272,7 @@ class Point2Pose:
             return masks
         with self.stopwatch("segmentation"):
             sought = [name for name in self.segmenter.names if name in masks and masks[name] is None]
-            hints = {name: self.objects[name].hint(frame, tracks) for name in sought}
+            hints = {name: self.objects[name].hint(frame, self.tracks, sightings.get(name)) for name in sought}
             self._apply({name: requests for name, (_, requests) in hints.items()})
             labels = self.segmenter.segment(frame, said.values(), {name: hint for name, (hint, _) in hints.items()})
             label_of = {name: label for label, name in enumerate(self.segmenter.names, 1)}

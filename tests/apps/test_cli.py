@@ -20,36 +20,11 @@ from p2p_lib.core.errors import MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.method.pipeline import Point2Pose
+from tests.fixtures.sliding_board import DEPTH_M, H, K, W, write_sequence
 
-FRAMES, W, H = 8, 160, 120
-K = np.array([[200.0, 0, 79.5], [0, 200, 59.5], [0, 0, 1]])
-DEPTH_M = 0.5
+FRAMES = 8
 #: Points alone: the rest of the method is tested elsewhere, and torch takes seconds to import.
 POINTS_ALONE = ["--set", "method.surface=false", "--set", "method.graph=false", "--quiet"]
-
-
-def write_sequence(folder: Path, frames: int = FRAMES) -> Path:
-    """A printed board that slides by 2 px right and 1 px down a frame before a wall, in the YCBInEOAT layout."""
-    rng = np.random.default_rng(0)
-    print_ = [cv2.resize(rng.integers(0, 256, (s, s, 3)).astype(np.float32), (60, 60)) for s in (6, 15, 30)]
-    board = np.clip(np.mean(print_, 0) * 1.6 - 70, 0, 255).astype(np.uint8)
-    for name in ("rgb", "depth", "gt_mask", "annotated_poses", "models/object"):
-        (folder / name).mkdir(parents=True)
-    np.savetxt(folder / "cam_K.txt", K)
-    corners = np.array([[x, y, 0] for x in np.linspace(-0.075, 0.075, 7) for y in np.linspace(-0.075, 0.075, 7)])
-    np.savetxt(folder / "models/object/points.xyz", corners)
-    for k in range(frames):
-        x, y = 30 + 2 * (k % 20), 20 + k % 20
-        rgb, depth = np.full((H, W, 3), 90, np.uint8), np.full((H, W), 900, np.uint16)
-        rgb[y : y + 60, x : x + 60], depth[y : y + 60, x : x + 60] = board, 1000 * DEPTH_M
-        mask = np.zeros((H, W), np.uint8)
-        mask[y : y + 60, x : x + 60] = 255
-        for name, image in (("rgb", rgb), ("depth", depth), ("gt_mask", mask)):
-            cv2.imwrite(str(folder / name / f"{k:04d}.png"), image)
-        T = np.eye(4)
-        T[:3, 3] = (x + 29.5 - K[0, 2]) / 200 * DEPTH_M, (y + 29.5 - K[1, 2]) / 200 * DEPTH_M, DEPTH_M
-        np.savetxt(folder / "annotated_poses" / f"{k:04d}.txt", T)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,8 @@ from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.prompts import save_prompts
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.run import run
-from tests.apps.test_cli import POINTS_ALONE, H, K, W, write_sequence
+from tests.apps.test_cli import POINTS_ALONE
+from tests.fixtures.sliding_board import H, K, W, write_sequence
 
 FRAMES = 20  # then the board jumps back
 SETTINGS = {"method.surface": "false", "method.graph": "false"}

@@ -12,6 +12,7 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.sequence import open_sequence
 
 W, H, N = 40, 30, 3
+LABELS = "is_mask_visible/can/is_mask_visible.npy"
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def sequence(tmp_path):
             cv2.imwrite(str(folder / "masks" / obj / f"{i:04d}.png"), np.full((H, W), 255, np.uint8))
             np.savetxt(folder / "annotated_poses" / obj / f"{i:04d}.txt", se3.exp(np.full(6, 0.1 * i)))
     (folder / "is_mask_visible" / "can").mkdir(parents=True)
-    np.save(folder / "is_mask_visible" / "can" / "is_mask_visible.npy", np.ones(N, bool))
+    np.save(folder / LABELS, np.ones(N, bool))
     np.savetxt(folder / "cam_K.txt", [[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
     read_all(folder)
     return folder
@@ -46,139 +47,134 @@ def png(path, image):
     assert cv2.imwrite(str(path), image)
 
 
-def cut(path):
-    path.write_bytes(path.read_bytes()[:-20])
-
-
-CASES = {
+MATRIX, TIMES = "expected a 3x3 camera matrix", "expected times in seconds that increase"
+#: The file that is spoilt, what it holds then (None: it is gone), and what is said.
+FAULTS = {
     "colour unreadable": (
-        lambda f: (f / "rgb/0001.png").write_bytes(b"not a picture"),
+        "rgb/0001.png",
+        b"not a picture",
         r"rgb/0001\.png: got an unreadable file of 13 bytes, expected a colour image",
     ),
-    "colour cut off": (lambda f: cut(f / "rgb/0002.png"), r"rgb/0002\.png: got an unreadable file of \d+ bytes"),
-    "colour empty": (
-        lambda f: (f / "rgb/0000.png").write_bytes(b""),
-        r"rgb/0000\.png: got an unreadable file of 0 bytes",
-    ),
+    "colour empty": ("rgb/0000.png", b"", r"rgb/0000\.png: got an unreadable file of 0 bytes"),
     "colour missing": (
-        lambda f: (f / "rgb/0001.png").unlink(),
+        "rgb/0001.png",
+        None,
         r"depth: got 3 files, expected 2, one for each in .*rgb\. 0001\.png is too many",
     ),
     "depth missing": (
-        lambda f: (f / "depth/0001.png").unlink(),
+        "depth/0001.png",
+        None,
         r"depth: got 2 files, expected 3, one for each in .*rgb\. 0001\.png is missing",
     ),
     "colour of another size": (
-        lambda f: png(f / "rgb/0002.png", np.zeros((H, W + 2, 3), np.uint8)),
+        "rgb/0002.png",
+        np.zeros((H, W + 2, 3), np.uint8),
         r"rgb/0002\.png: got 42x30 pixels, expected 40x30 as the first image",
     ),
     "depth of another size": (
-        lambda f: png(f / "depth/0001.png", np.zeros((H // 2, W // 2), np.uint16)),
+        "depth/0001.png",
+        np.zeros((H // 2, W // 2), np.uint16),
         r"depth/0001\.png: got 20x15 pixels, expected 40x30 as the colour image\. Register",
     ),
     "depth of eight bits": (
-        lambda f: png(f / "depth/0001.png", np.zeros((H, W), np.uint8)),
+        "depth/0001.png",
+        np.zeros((H, W), np.uint8),
         r"depth/0001\.png: got 30x40 uint8, expected one channel, uint16",
     ),
     "depth in colour": (
-        lambda f: png(f / "depth/0001.png", np.zeros((H, W, 3), np.uint16)),
+        "depth/0001.png",
+        np.zeros((H, W, 3), np.uint16),
         r"depth/0001\.png: got 30x40x3 uint16, expected one channel",
     ),
-    "no pictures": (
-        lambda f: [p.unlink() for p in (f / "rgb").iterdir()],
-        r"rgb: got no files, expected colour images \(\.png",
-    ),
-    "no depth folder": (lambda f: shutil.rmtree(f / "depth"), r"depth: no such folder, expected depth images"),
-    "no camera": (lambda f: (f / "cam_K.txt").unlink(), r"cam_K\.txt: no such file, expected a 3x3 camera matrix"),
-    "camera of two rows": (
-        lambda f: (f / "cam_K.txt").write_text("50 0 20\n0 50 15\n"),
-        r"cam_K\.txt: got shape \(2, 3\), expected a 3x3 camera matrix",
-    ),
-    "camera of one row": (
-        lambda f: (f / "cam_K.txt").write_text("50 0 20 0 50 15 0 0 1"),
-        r"cam_K\.txt: got shape \(1, 9\), expected a 3x3 camera matrix",
-    ),
-    "camera empty": (lambda f: (f / "cam_K.txt").write_text(""), r"cam_K\.txt: got shape \(0,\), expected a 3x3"),
-    "camera in words": (
-        lambda f: (f / "cam_K.txt").write_text("fx 50\nfy 50\n"),
-        r"cam_K\.txt: got unreadable numbers .*'fx'.*, expected a 3x3 camera matrix",
-    ),
+    "no depth folder": ("depth", None, "depth: no such folder, expected depth images"),
+    "no camera": ("cam_K.txt", None, rf"cam_K\.txt: no such file, {MATRIX}"),
+    "camera of two rows": ("cam_K.txt", "50 0 20\n0 50 15\n", rf"cam_K\.txt: got shape \(2, 3\), {MATRIX}"),
+    "camera of one row": ("cam_K.txt", "50 0 20 0 50 15 0 0 1", rf"cam_K\.txt: got shape \(1, 9\), {MATRIX}"),
+    "camera empty": ("cam_K.txt", "", rf"cam_K\.txt: got shape \(0,\), {MATRIX}"),
+    "camera in words": ("cam_K.txt", "fx 50\nfy 50\n", rf"cam_K\.txt: got unreadable numbers .*'fx'.*, {MATRIX}"),
     "camera ragged": (
-        lambda f: (f / "cam_K.txt").write_text("50 0 20\n0 50\n0 0 1\n"),
-        r"cam_K\.txt: got unreadable numbers .*row 2.*, expected a 3x3",
+        "cam_K.txt",
+        "50 0 20\n0 50\n0 0 1\n",
+        rf"cam_K\.txt: got unreadable numbers .*row 2.*, {MATRIX}",
     ),
-    "camera NaN": (
-        lambda f: (f / "cam_K.txt").write_text("nan 0 20\n0 50 15\n0 0 1\n"),
-        r"cam_K\.txt: got nan 0 20.*, expected fx 0 cx",
-    ),
+    "camera NaN": ("cam_K.txt", "nan 0 20\n0 50 15\n0 0 1\n", r"cam_K\.txt: got nan 0 20.*, expected fx 0 cx"),
     "pose NaN": (
-        lambda f: np.savetxt(f / "annotated_poses/can/0001.txt", np.full((4, 4), np.nan)),
+        "annotated_poses/can/0001.txt",
+        np.full((4, 4), np.nan),
         r"annotated_poses/can/0001\.txt: got NaN or infinite entries, expected a finite 4x4",
     ),
     "pose not rigid": (
-        lambda f: np.savetxt(f / "annotated_poses/can/0001.txt", np.diag([1, 1, 1.1, 1])),
+        "annotated_poses/can/0001.txt",
+        np.diag([1, 1, 1.1, 1]),
         r"annotated_poses/can/0001\.txt: got a matrix that is not a rotation",
     ),
     "pose of three rows": (
-        lambda f: np.savetxt(f / "annotated_poses/can/0001.txt", np.eye(4)[:3]),
+        "annotated_poses/can/0001.txt",
+        np.eye(4)[:3],
         r"annotated_poses/can/0001\.txt: got shape \(3, 4\), expected a 4x4",
     ),
     "pose missing": (
-        lambda f: (f / "annotated_poses/box/0002.txt").unlink(),
+        "annotated_poses/box/0002.txt",
+        None,
         r"annotated_poses/box: got 2 files, expected 3, one for each in .*rgb\. 0002\.txt is missing",
     ),
-    "mask missing": (
-        lambda f: (f / "masks/box/0000.png").unlink(),
-        r"masks/box: got 2 files, expected 3.*0000\.png is missing",
-    ),
-    "masks of an object missing": (
-        lambda f: shutil.rmtree(f / "masks/box"),
-        r"masks/box: no such folder, expected mask",
-    ),
+    "mask missing": ("masks/box/0000.png", None, r"masks/box: got 2 files, expected 3.*0000\.png is missing"),
+    "masks of an object missing": ("masks/box", None, "masks/box: no such folder, expected mask"),
     "mask unreadable": (
-        lambda f: (f / "masks/can/0001.png").write_bytes(b"x"),
+        "masks/can/0001.png",
+        b"x",
         r"masks/can/0001\.png: got an unreadable file of 1 bytes, expected a mask image",
     ),
     "mask of another size": (
-        lambda f: png(f / "masks/can/0001.png", np.zeros((8, 9), np.uint8)),
+        "masks/can/0001.png",
+        np.zeros((8, 9), np.uint8),
         r"masks/can/0001\.png: got 9x8 pixels, expected 40x30",
     ),
-    "labels too short": (
-        lambda f: np.save(f / "is_mask_visible/can/is_mask_visible.npy", np.ones(N - 1, bool)),
-        r"is_mask_visible/can/is_mask_visible\.npy: got shape \(2,\) bool, expected 3 labels",
-    ),
-    "labels pickled": (
-        lambda f: np.save(f / "is_mask_visible/can/is_mask_visible.npy", np.array([{}] * N), allow_pickle=True),
-        r"is_mask_visible/can/is_mask_visible\.npy: got an unreadable array",
-    ),
-    "labels damaged": (
-        lambda f: (f / "is_mask_visible/can/is_mask_visible.npy").write_bytes(b"\x93NUMPY"),
-        r"is_mask_visible/can/is_mask_visible\.npy: got an unreadable array",
-    ),
-    "times too few": (
-        lambda f: (f / "times.txt").write_text("0\n0.1\n"),
-        r"times\.txt: got 2 times, expected 3, one for each in .*rgb",
-    ),
-    "times standing still": (
-        lambda f: (f / "times.txt").write_text("0\n0.1\n0.1\n"),
-        r"times\.txt: got 0\.100000 s at frame 2, expected times in seconds that increase",
-    ),
-    "times NaN": (
-        lambda f: (f / "times.txt").write_text("0\n0.1\nnan\n"),
-        r"times\.txt: got nan s at frame 2, expected times in seconds that increase",
-    ),
+    "labels too short": (LABELS, np.ones(N - 1, bool), rf"{LABELS}: got shape \(2,\) bool, expected 3 labels"),
+    "labels pickled": (LABELS, np.array([{}] * N), f"{LABELS}: got an unreadable array"),
+    "labels damaged": (LABELS, b"\x93NUMPY", f"{LABELS}: got an unreadable array"),
+    "times too few": ("times.txt", "0\n0.1\n", r"times\.txt: got 2 times, expected 3, one for each in .*rgb"),
+    "times standing still": ("times.txt", "0\n0.1\n0.1\n", rf"times\.txt: got 0\.100000 s at frame 2, {TIMES}"),
+    "times NaN": ("times.txt", "0\n0.1\nnan\n", rf"times\.txt: got nan s at frame 2, {TIMES}"),
 }
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_fault_names_the_file(sequence, case):
-    spoil, expected = CASES[case]
-    spoil(sequence)
+def put(path, content):
+    """What a file holds from now on: bytes, text, an image, numbers, an array; None for nothing, folders too."""
+    if content is None:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    elif isinstance(content, np.ndarray):
+        write = {".png": png, ".txt": np.savetxt, ".npy": np.save}[path.suffix]
+        write(path, content)
+    else:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def assert_named(sequence, expected):
     with pytest.raises((BadInput, MissingData)) as error:
         read_all(sequence)
     message = str(error.value)
     assert re.search(expected, message), message
     assert "\n" not in message and str(sequence) in message
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_names_the_file(sequence, fault):
+    file, content, expected = FAULTS[fault]
+    put(sequence / file, content)
+    assert_named(sequence, expected)
+
+
+def test_a_picture_cut_off_is_named(sequence):
+    path = sequence / "rgb/0002.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    assert_named(sequence, r"rgb/0002\.png: got an unreadable file of \d+ bytes")
+
+
+def test_a_folder_without_pictures_is_named(sequence):
+    for path in (sequence / "rgb").iterdir():
+        path.unlink()
+    assert_named(sequence, r"rgb: got no files, expected colour images \(\.png")
 
 
 def test_a_picture_that_vanishes_after_opening_is_named(sequence):

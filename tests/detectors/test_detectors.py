@@ -101,3 +101,13 @@ def test_the_variants_of_the_comparison_are_what_they_say():
     config = preset().with_values(CHOICES["uniform"][1]).sampling
     found = detect("uniform", disc(), config=config)
     assert choose(found, np.zeros((0, 2)), 30, config).tolist() == list(range(30))  # the first drawn
+
+
+def test_blobs_are_found_at_their_middle():
+    spots = np.array([[130, 100], [190, 110], [160, 150]])
+    far2 = ((np.stack(np.meshgrid(np.arange(W), np.arange(H)), -1)[:, :, None] - spots) ** 2).sum(-1)
+    grey = 60 + 150 * np.exp(-0.5 * far2 / 5.0**2).max(-1)
+    found = detect("corners", disc(), np.repeat(grey[..., None], 3, 2).astype(np.uint8))
+    near = np.linalg.norm(found.uv_px[:, None] - spots, axis=-1) < 0.5
+    best = [found.score[at].max() for at in near.T]
+    assert min(best) > 0.5, "blobs stand above corners"

@@ -332,6 +332,20 @@ def test_an_unheld_keyframe_is_left_out_and_the_rest_stays() -> None:
     assert after.ok and key == 5 and after.keys.tolist() == [0, 1, 2, 3, 5]
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"), [({"error_after": 1e9}, "the loss grew"), ({"points": {3: np.full(3, np.nan)}}, "not finite")]
+)
+def test_a_solution_that_cannot_be_is_refused_and_the_rest_stays(monkeypatch, wrong, words) -> None:
+    world, solve = Turntable.made(20, 4), factor_graph._solve
+    graph, before = added_at_once(world, ALL, world.T_cam_obj)
+    monkeypatch.setattr(factor_graph, "_solve", lambda *args: replace(solve(*args), **wrong))
+    graph.add_keyframe(world.T_cam_obj[3], world.seen[3], world.p_cam[3], p_obj_init=0 * world.p_cam[3])
+    refused = graph.optimise()
+    assert not refused.ok and words in refused.reason and refused.keys.tolist() == [0, 1, 2, 3]
+    np.testing.assert_array_equal(refused.T_cam_obj, before.T_cam_obj)
+    np.testing.assert_array_equal(refused.p_obj, before.p_obj)
+
+
 def test_nothing_and_next_to_nothing() -> None:
     graph = ObjectGraph(DEFAULT)
     empty = graph.optimise()

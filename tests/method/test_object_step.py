@@ -11,7 +11,7 @@ from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.method import refinement
-from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
+from p2p_lib.method.object_tracker import Candidate, ObjectStep, ObjectTracker
 from tests.method.analytic_scene import CAMERA, LUMP, look_from, render
 
 START = look_from((1.0, 0.2, 0.5))
@@ -32,6 +32,13 @@ class Grid:
         v, u = np.nonzero(mask)
         on = (u % 7 == 0) & (v % 7 == 0)
         return Candidates(np.stack([u[on], v[on]], -1).astype(float), np.linspace(1, 0.5, on.sum()))
+
+
+class Pair(Grid):
+    """Offers two pixels only."""
+
+    def detect(self, frame, mask):
+        return super().detect(frame, mask).select(np.arange(2))
 
 
 class Lump:
@@ -225,6 +232,23 @@ def test_ours_refines_before_it_selects_the_paper_after(rule, before, monkeypatc
     assert (len(refined) > 1) == before and refined
 
 
+def test_a_refused_return_leaves_the_object_lost():
+    lump = settled(begun(**NO_SURFACE), [2])
+    lump.see(turned(3), mask=np.zeros((CAMERA.height, CAMERA.width), bool))
+    few = hide(lambda tracks: np.cumsum(tracks.visible) > 6)
+    refused = lump.see(turned(4), few).estimate
+    assert refused.status is Status.LOST and refused.T_cam_obj is None and refused.reason.startswith("only 6 points")
+    assert refused.last_T_cam_obj is not None
+    assert lump.see(turned(4)).estimate.status is Status.RECOVERED
+
+
+def test_without_any_pose_an_object_is_lost_where_its_mask_is_seen_and_else_hidden():
+    lump, nothing = settled(begun(**NO_SURFACE, method__motion=False), [2]), hide(lambda tracks: tracks.visible)
+    assert lump.see(turned(3), nothing).estimate.status is Status.LOST
+    unknown = replace(lump.observed(turned(3), nothing), mask=None)
+    assert lump.tracker.step(unknown).estimate.status is Status.OCCLUDED
+
+
 # --- what is believed, kept and asked for ------------------------------------------------------
 
 
@@ -278,6 +302,29 @@ def test_points_follow_what_the_graph_finds():
     assert 0.001 < np.median(moved_mm) < 2
 
 
+def test_the_pose_of_a_keyframe_is_the_graphs_and_its_view_as_registered():
+    lump, shift = settled(begun(), [5]), se3.exp(np.array([0, 0, 0, 0.002, 0, 0]))
+    model, solve = lump.tracker.model, lump.tracker.model.graph.optimise
+    model.graph.optimise = lambda: replace(found := solve(), T_cam_obj=found.T_cam_obj @ shift)
+    step = lump.see(turned(12))
+    assert step.estimate.keyframe
+    np.testing.assert_array_equal(step.estimate.T_cam_obj, model._corrected[max(model._corrected)])
+    off_m = np.linalg.norm((step.estimate.T_cam_obj - model.views.T_cam_obj[-1])[:3, 3])
+    assert 0.0015 < off_m < 0.0025, "the view does not have the graph's shift"
+
+
+@pytest.mark.parametrize("noise", ["sensor", "constant"])
+def test_the_graph_gets_the_noise_of_the_sensor_and_of_registration(noise):
+    lump, known = settled(begun(method__noise=noise), [5]), 1e-6 * np.diag([1.0, 2, 3, 4, 5, 6])
+    lump.tracker._covariance = lambda obs, best: known
+    assert lump.see(turned(12)).estimate.keyframe
+    keyframe = lump.tracker.model.graph._keyframes[max(lump.tracker.model.graph.keys)]
+    by_range = 0.001 + 0.0025 * keyframe.p_cam[:, 2] ** 2
+    A = se3.adjoint(lump.tracker.model.views.T_cam_obj[-1])  # right tangent of T_cam_obj to that of its inverse
+    assert np.allclose(keyframe.sigma[:, 1], by_range, rtol=1e-6) == (noise == "sensor")
+    assert np.allclose(keyframe.link.covariance, A @ known @ A.T, rtol=1e-6) == (noise == "sensor")
+
+
 def test_the_surface_follows_what_the_graph_finds():
     lump, moved = settled(begun(), [5, 12]), []
     lump.tracker.model.surface.move = lambda poses, limit: moved.append((set(poses), limit)) or []
@@ -305,19 +352,39 @@ def test_points_that_a_doubtful_pose_placed_count_less():
     assert one.see(turned(3)).estimate.confidence > other.see(turned(3)).estimate.confidence + 0.02
 
 
+def test_the_covariance_of_refinement_goes_before_that_of_the_keypoints():
+    lump = settled(begun(), [2])
+    obs, known = lump.observed(turned(3)), np.diag([1.0, 2, 3, 4, 5, 6])
+    best = max(lump.tracker._register(obs), key=lambda h: h.support)
+    refined = refinement.Refinement(best.T_cam_obj, covariance=known)
+    np.testing.assert_array_equal(lump.tracker._covariance(obs, Candidate(best, refined)), known)
+    by_keypoints = lump.tracker._covariance(obs, Candidate(best, refinement.Refinement(best.T_cam_obj)))
+    sigma_m = 0.001 + 0.0025 * np.median(obs.p_cam[best.inliers, 2]) ** 2
+    mean_m = np.sqrt(np.diag(by_keypoints)[3:].max())
+    assert sigma_m / np.sqrt(best.support) < mean_m < 10 * sigma_m, "about that of a mean of as many points"
+
+
 # --- start, absence, and what others are told --------------------------------------------------
+
+
+def test_an_object_with_next_to_no_texture_starts_on_its_surface():
+    lump, points_alone = Lump(), Lump(**NO_SURFACE)
+    lump.tracker.detector = points_alone.tracker.detector = Pair()
+    assert points_alone.see(START).estimate.reason == "only 2 points to start from"
+    assert lump.see(START).estimate.status is Status.DEGRADED
+    lump.see(turned(3))
+    assert lump.off(turned(3))[0] < 1
 
 
 def test_an_object_that_still_comes_into_view_is_not_started():
     lump, (_, mask) = Lump(), render(LUMP, START)
     columns = np.flatnonzero(mask.any(0))
     sliver = mask & (np.arange(CAMERA.width) < columns[len(columns) // 2])
-    first = Lump()
-    first.tracker.life = replace(first.tracker.life, start_px=int(sliver.sum()))
+    first, paper = Lump(), Lump(method__gates="none")
+    first.tracker.life = paper.tracker.life = replace(first.tracker.life, start_px=int(sliver.sum()))
     assert first.see(START).estimate.reason == "still coming into view"
+    assert first.see(START).estimate.status is Status.TRACKED, "it has stopped growing"
     assert lump.see(START).estimate.status is Status.TRACKED
-    paper = Lump(method__gates="none")
-    paper.tracker.life = first.tracker.life
     assert paper.see(START).estimate.status is Status.TRACKED
 
 

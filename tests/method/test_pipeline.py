@@ -272,6 +272,28 @@ def test_a_return_that_is_not_confirmed_is_taken_back():
     np.testing.assert_array_equal(taken.last_T_cam_obj, before.T_cam_obj)
 
 
+def test_hidden_points_are_looked_for_in_the_masks_where_all_are_known():
+    class Asked(BuiltinTracker):
+        searches = []
+
+        def track(self, frame, search=None, urgent=False):
+            self.searches.append(search)
+            return super().track(frame, search, urgent)
+
+    (first, masks), (second, later), (third, _), (fourth, last) = film()[:4]
+    method = Point2Pose(CAMERA, quick(), tracker=Asked(quick().tracking))
+    method.add_object("left")
+    method.add_object("right")
+    method.step(first, masks)
+    method.step(second, later)
+    method.step(third)
+    method.step(fourth, {"left": last["left"], "right": np.zeros_like(last["right"])})  # the other one is hidden
+    both, unknown, left = Asked.searches
+    np.testing.assert_array_equal(both, later["left"] | later["right"])
+    np.testing.assert_array_equal(left, last["left"])
+    assert unknown is None
+
+
 def test_one_hides_the_other_goes_on():
     nothing = {"left": np.zeros((300, 400), bool)}
     frames = [(f, m | nothing if k in HIDDEN else m) for k, (f, m) in enumerate(film())]

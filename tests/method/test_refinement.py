@@ -11,7 +11,7 @@ from p2p_lib.method import refinement
 from p2p_lib.method.observation import sample_cloud
 from p2p_lib.method.refinement import Keypoints, refine, surface_distances, surface_jacobian
 from p2p_lib.method.tsdf import TsdfVolume
-from tests.method.analytic_scene import CAMERA, LUMP, around, box, can, look_from, render
+from tests.method.analytic_scene import CAMERA, LUMP, around, box, can, look_from, render, union
 
 CONFIG = RefinementConfig()
 
@@ -124,6 +124,25 @@ def test_keypoint_system_equals_the_numerical_derivatives_of_its_cost():
     np.testing.assert_allclose(g, J.T @ residual(np.zeros(6)), rtol=1e-4, atol=1e-4 * np.abs(g).max())
 
 
+def test_the_gradient_is_the_derivative_of_the_robust_cost():
+    """A seventh of the depth points and a third of the keypoints lie beyond Huber's thresholds."""
+    rng = np.random.default_rng(3)
+    T, p_obj = VIEW @ perturbation(rng, 3, 4), rng.uniform(-0.05, 0.05, (12, 3))
+    p_cam = se3.transform(VIEW, p_obj + rng.normal(0, 0.002, p_obj.shape))
+    p_cam[:4] += rng.normal(0, 0.03, (4, 3))
+    keypoints = Keypoints(p_obj, p_cam, np.full(12, 0.002))
+    problem = refinement._Problem.about(T, cloud_of(LUMP, VIEW), Exact(LUMP), CONFIG, keypoints)
+    at = problem.surface(T, widest_m=0.012)
+    assert (np.abs(at.distance_m) > CONFIG.huber_m).mean() > 0.12 and at.used == len(at.distance_m)
+
+    def cost(step):
+        return problem.cost(problem.surface(problem.moved(T, step)), at)
+
+    numeric = np.array([(cost(h) - cost(-h)) / 2e-6 for h in 1e-6 * np.eye(6)])
+    _, g = problem.joint(at)
+    np.testing.assert_allclose(2 * g, numeric, atol=0.01 * np.abs(numeric).max())
+
+
 # -- convergence ---------------------------------------------------------------------------------------
 
 
@@ -164,6 +183,27 @@ def test_recovers_under_noise_and_outliers():
         turned, moved = error(found.T_cam_obj, VIEW)
         assert turned < 2 and moved < 2
         assert found.inliers < 0.95
+
+
+#: A block on a plate: seen from above, few points hold it against sliding.
+BLOCK = union(box((0, 0, 0), (0.08, 0.08, 0.01)), box((0, 0, 0.02), (0.025, 0.015, 0.01)))
+
+
+def test_the_few_points_that_hold_a_direction_are_no_outliers_at_first():
+    T = look_from((0.7, 0.5, 1.0))
+    found = refine(T @ se3.exp([0, 0, 0, -0.008, 0, 0]), cloud_of(BLOCK, T), Exact(BLOCK), CONFIG)
+    assert error(found.T_cam_obj, T)[1] < 0.5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_flying_points_do_not_pull(seed):
+    """A fifth of the points float 12 mm above the surface."""
+    T, rng = look_from((0.7, 0.5, 1.0)), np.random.default_rng(seed)
+    p_cam = cloud_of(BLOCK, T)
+    flying = rng.random(len(p_cam)) < 0.2
+    p_cam[flying] += 0.012 * T[:3, 2]
+    found = refine(T @ se3.exp([0.02, -0.03, 0, 0.002, 0.002, 0.002]), p_cam, Exact(BLOCK), CONFIG)
+    assert abs((se3.inverse(T) @ found.T_cam_obj)[2, 3]) < 2e-4
 
 
 def test_the_true_pose_is_left_where_it_is_within_the_reported_covariance():
@@ -386,6 +426,8 @@ def test_sampled_points_are_measured_spread_inside_and_clear_of_edges():
     np.testing.assert_allclose(px.mean(0), [u.mean(), v.mean()], atol=3)
     np.testing.assert_allclose(px.std(0), [u.std(), v.std()], rtol=0.15)
     np.testing.assert_array_equal(p_cam, sample_cloud(step, mask, CAMERA, 300))
+    every_column = CAMERA.project(sample_cloud(step, mask, CAMERA, 10**6))[:, 0].round()
+    assert {116, 119} <= set(every_column) and not {117, 118} & set(every_column)
 
 
 def test_nothing_to_sample_gives_no_points():

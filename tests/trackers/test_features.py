@@ -108,3 +108,27 @@ def test_stays_in_the_region():
 def test_nothing_to_find():
     assert features.detect(np.full(SHAPE, 70, np.uint8), None, 50).shape == (0, 2)
     assert features.detect(picture(), np.zeros(SHAPE, bool), 50).shape == (0, 2)
+
+
+def test_a_turn_in_the_plane_is_found_out():
+    """Nobody says by how much the surface has turned about its normal."""
+    A, image = turned(70), picture()
+    M, (uv, before) = seen_under(A), described(image, np.eye(2))
+    uv_after, after = described(cv2.warpAffine(image, M, SHAPE[::-1]), np.eye(2))
+    wanted, found = features.match(before, after, uv_after, 4.0, 0.8)
+    error_px = np.linalg.norm(uv_after[found] - (uv @ M[:, :2].T + M[:, 2])[wanted], axis=1)
+    assert len(error_px) > 60 and (error_px < 4).mean() > 0.8
+
+
+def test_noise_makes_few_wrong_matches():
+    right, wrong = [], []
+    for seed in range(3):
+        image, noise = picture(seed), np.random.default_rng(seed).normal(0, 20, SHAPE)
+        uv = features.detect(image, None, 120)
+        steps = np.tile(1.5 * np.eye(2), (len(uv), 1, 1))
+        noisy = np.clip(image + noise, 0, 255).astype(np.uint8)
+        wanted, found = features.match(*(features.describe(one, uv, steps) for one in (image, noisy)), uv, 4.0, 0.85)
+        same = np.linalg.norm(uv[wanted] - uv[found], axis=1) < 4
+        right.append(same.sum() / len(uv))
+        wrong.append((~same).sum() / len(uv))
+    assert np.mean(right) > 0.9 and np.mean(wrong) < 0.07

@@ -1,11 +1,12 @@
 """Landmarks of a segment: which corners are taken, how many, and the search that finds the segment by them."""
 
+import cv2
 import numpy as np
 import pytest
 
 from p2p_lib.core.config import TrackingConfig
-from p2p_lib.trackers.builtin.landmarks import Landmarks
-from tests.trackers.made_up import CAMERA, DEPTH_M, grid, image, shifted, started
+from p2p_lib.trackers.builtin.landmarks import Landmarks, corners
+from tests.trackers.made_up import CAMERA, DEPTH_M, SHAPE, grid, image, shifted, started, texture
 
 UV = grid((80, 180), (70, 170), 20)
 
@@ -52,3 +53,17 @@ def test_no_more_landmarks_than_the_cap(cap):
         segments.add_landmarks(p, now)
     assert len(segment.landmarks.p_seg) == len(segment.landmarks.descriptors)
     assert (len(segment.landmarks.p_seg) <= 100) == (cap == 100)
+
+
+def test_small_islands_of_what_was_seen_are_recognised():
+    """Of each landmark's surroundings 18 px are left, three centimetres: the wider descriptors hold other things."""
+    now, islands = image(), np.zeros(SHAPE, np.uint8)
+    known = corners(now, None, 60)
+    for u, v in np.rint(known.uv_px).astype(int).tolist():
+        if not islands[max(v - 25, 0) : v + 26, max(u - 25, 0) : u + 26].any():
+            cv2.circle(islands, (u, v), 9, 1, -1)
+    there = corners(image(np.where(islands[..., None] > 0, texture(), texture(5))), islands > 0, 200)
+    marks = Landmarks(known.p_cam, known.descriptors)
+    p_seg, p_cam, corner = marks.match(there, TrackingConfig().match_ratio, np.random.default_rng(0))
+    right = np.linalg.norm(p_seg - p_cam, axis=1) < 0.005
+    assert len(np.unique(corner[right])) > 12 and right.mean() > 0.5

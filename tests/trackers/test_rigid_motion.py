@@ -121,3 +121,34 @@ def test_distance_between_poses():
     assert pose_distance_m(T, T, np.ones(3)) == 0
     # A turn of 0.2 rad about the centre moves what is 5 cm off by 1 cm; sqrt 2 of it as the norm counts both axes.
     np.testing.assert_allclose(pose_distance_m(np.eye(4), T, np.zeros(3)), 0.01 * np.sqrt(2), rtol=0.01)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_start_far_off_is_no_crowd_of_outliers(seed):
+    """Ten degrees and ten centimetres off, no point is near where the start has it."""
+    T, p_seg, p_cam = scene(seed)
+    start = T @ se3.exp(np.array([0.2, -0.15, 0.2, 0.08, -0.08, 0.04]))
+    fit = fit_pose(start, p_seg, np.zeros((len(p_seg), 3, 3)), *seen(p_cam, seed), CAMERA)
+    turn_deg, shift_mm = off_deg_mm(fit.T_cam_seg, T)
+    assert turn_deg < 0.5 and shift_mm < 1.5 and fit.agrees.all()
+
+
+def test_what_the_points_leave_free_stays_as_expected():
+    """Points on a line say nothing of the turn about it: it is kept, and known as well as motion is expected."""
+    T, p_seg = scene(1)[0], np.outer(np.linspace(-0.06, 0.06, 8), [1, 0, 0])
+    start = T @ se3.exp(np.array([0.1, 0.05, -0.05, 0.002, 0.002, 0.002]))
+    fit = fit_pose(start, p_seg, np.zeros((8, 3, 3)), *seen(se3.transform(T, p_seg), 1), CAMERA)
+    roll_deg, *across_deg = np.degrees(se3.log(se3.inverse(T) @ fit.T_cam_seg)[:3])
+    assert abs(roll_deg - np.degrees(0.1)) < 0.3 and np.abs(across_deg).max() < 0.6
+    axis = T[:3, 0]
+    np.testing.assert_allclose(np.sqrt(axis @ fit.covariance[:3, :3] @ axis), 0.15, rtol=0.01)
+
+
+def test_depth_tells_the_range_better_than_pixels():
+    T, p_seg, p_cam = scene(2)
+    uv, cov, z = seen(p_cam, 2)
+    range_sigma = []
+    for measured in (z, 0 * z):
+        fit = fit_pose(T, p_seg, np.zeros((len(z), 3, 3)), uv, cov, measured, CAMERA)
+        range_sigma.append(np.sqrt(fit.covariance[5, 5]))
+    assert range_sigma[0] < 0.5 * range_sigma[1]

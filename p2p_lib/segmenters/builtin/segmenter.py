@@ -197,7 +197,7 @@ class BuiltinSegmenter:
         background = patch.border() & ~seeds
         x = only(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
         own_colours = colour[x > 0.5]
-        return (box, patch.up(x)) if len(own_colours) and own_colours.mean() > 0 else None
+        return (box, patch.up(x)) if len(own_colours) and (hint.sighted or own_colours.mean() > 0) else None
 
     def _box_of_all(self, target: _Target, shape: tuple[int, int]) -> Box:
         """Where to look for an object that was seen: room for all of it to either side of what showed."""
