@@ -111,13 +111,14 @@ def check_folder(
         return [*findings, _no_masks(sequence, any(masks), config)]
     if beyond := _all_beyond(firsts, config):
         return [*findings, beyond]  # what follows would only be its consequences
-    findings += [Finding("clicks", Level.LOOK, str(of.message)) for of in doubts if issubclass(of.category, Doubt)]
     for name, (frame, mask) in firsts.items():
         if mask.sum() < config.lifecycle.min_mask_px:
             findings.append(_nothing_there(name, frame, mask, config))
             continue
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         findings.append(_range(name, frame, mask, config))
+        own = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
+        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in own]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
     return findings
 

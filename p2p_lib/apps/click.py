@@ -81,7 +81,7 @@ class Clicker:
             "height": self.sequence.camera.height,
             "names": list(self.sequence.objects),
             "file": str(self.path),
-            "objects": [prompt.as_dict() for prompt in self.prompts],
+            "objects": [prompt.as_dict() for prompt in self.prompts if prompt.mask is None],
         }
 
     def _image_png(self, i: int) -> bytes:
@@ -90,6 +90,8 @@ class Clicker:
     def save(self, content: object) -> None:
         """Check prompts as the page sends them, and write the file; :class:`BadInput` says what does not fit."""
         prompts = parse_prompts(content)
+        said = {(prompt.name, prompt.frame) for prompt in prompts}
+        prompts += tuple(p for p in self.prompts if p.mask is not None and (p.name, p.frame) not in said)
         by_frame = prompts_by_frame(prompts, range(len(self.sequence)), self.sequence.camera)
         for i, said in by_frame.items():
             for prompt in said:

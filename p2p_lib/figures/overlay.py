@@ -15,6 +15,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.figures import style
 
 _SHIFT = 4  # OpenCV's fixed-point coordinates: sixteenths of a pixel
@@ -124,6 +125,15 @@ def draw_points(
     for at, colour in zip(np.rint(uv_px[shown] * one).astype(int).tolist(), colours[shown].tolist()):
         for (size, thickness), paint in ((behind, style.rgb(_RIM)), (before, colour)):
             cv2.circle(image, at, size, paint, thickness, cv2.LINE_AA, _SHIFT)
+    return image
+
+
+def draw_clicks(image: np.ndarray, prompts: Iterable[Prompt], colours: Mapping[str, str]) -> np.ndarray:
+    """An image with the clicks on objects, each in its object's colour."""
+    for prompt in prompts:
+        image = draw_points(image, prompt.points_px, colours[prompt.name], radius_px=7)
+        for radius_px in (15, 16, 17):
+            image = draw_points(image, prompt.points_px, colours[prompt.name], radius_px, filled=False)
     return image
 
 

@@ -7,7 +7,7 @@ go; the image's features, which are most of the work, are computed once for all 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,7 +57,8 @@ class Sam2Segmenter:
     def __init__(self, model: torch.nn.Module, camera: Camera, device: str = "cpu"):
         self._model, self._device, self._camera = model.to(device).eval(), device, camera
         self._size = int(model.config.image_size)
-        self._sessions: dict[str, Any] = {}
+        self._sessions: dict[str, Any] = {}  # None where nothing has been seen of the object yet
+        self._given: dict[str, tuple[Frame, np.ndarray]] = {}  # newest masks, that no session has been told of yet
         self._at = 0  # number of the frame to come
 
     @property
@@ -68,6 +69,7 @@ class Sam2Segmenter:
     def remove(self, name: str) -> None:
         """Forget an object."""
         del self._sessions[name]
+        self._given.pop(name, None)
 
     def segment(
         self,
@@ -82,24 +84,44 @@ class Sam2Segmenter:
         for prompt in (p for p in said.values() if p.mask is None):
             check_prompt(prompt, self._camera)
             check_depth(prompt, frame)
+        masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
+        for name in said:
+            self._sessions.setdefault(name, None)
+        self._given |= {name: (frame, mask) for name, mask in masks.items() if mask.any()}
         with torch.inference_mode():
-            self._tell(said)
-            labels = self._labels(frame) if self._sessions else np.zeros(frame.shape, np.int32)
+            for name in self._given.keys() - masks.keys():
+                self._restart(name, *self._given.pop(name))
+            self._click([prompt for prompt in said.values() if prompt.mask is None])
+            known = [name for name, session in self._sessions.items() if session is not None]
+            labels = self._labels(frame, [name for name in known if name not in masks])
         self._at += 1
         for label, name in enumerate(self._sessions, 1):
-            if name in said and said[name].mask is not None:
-                labels[said[name].mask] = label
+            if name in masks:
+                labels[masks[name]] = label
         return labels
 
-    def _tell(self, said: Mapping[str, Prompt]) -> None:
-        """Put what is said of objects in the frame to come into their sessions; new ones get theirs."""
-        for name, prompt in said.items():
-            session = self._sessions.setdefault(name, self._session())
-            at = session.obj_id_to_idx(_OBJECT)
-            if prompt.mask is not None:
-                session.add_mask_inputs(at, self._at, self._mask(prompt.mask))
-            else:
-                session.add_point_inputs(at, self._at, self._points(prompt))
+    def _restart(self, name: str, frame: Frame, mask: np.ndarray) -> None:
+        """A session that begins with a mask (H, W) bool given in an earlier frame.
+
+        Not before it is needed: where every frame brings a mask, the network has nothing to do.
+        """
+        session = self._sessions[name] = self._session()
+        at, before = session.obj_id_to_idx(_OBJECT), self._at - 1
+        session.add_mask_inputs(at, before, self._mask(mask))
+        session.obj_with_new_inputs = [_OBJECT]
+        self._look(session, self._pixels(frame.rgb), before)
+
+    def _click(self, prompts: Iterable[Prompt]) -> None:
+        """Put clicks into the sessions for the frame to come; an object that has none yet gets one."""
+        for prompt in prompts:
+            session = self._sessions[prompt.name]
+            if session is None:
+                session = self._sessions[prompt.name] = self._session()
+                at = session.obj_id_to_idx(_OBJECT)
+            else:  # a correction: what the memory says of this frame counts as well
+                at = session.obj_id_to_idx(_OBJECT)
+                session.frames_tracked_per_obj[at][self._at] = {"reverse": False}
+            session.add_point_inputs(at, self._at, self._points(prompt))
             session.obj_with_new_inputs = [_OBJECT]
 
     def _points(self, prompt: Prompt) -> dict[str, torch.Tensor]:
@@ -136,21 +158,35 @@ class Sam2Segmenter:
             dtype=torch.float32,
         )
 
-    def _labels(self, frame: Frame) -> np.ndarray:
+    def _labels(self, frame: Frame, names: Sequence[str]) -> np.ndarray:
+        """The label image of these objects."""
         import torch
 
+        if not names:
+            return np.zeros(frame.shape, np.int32)
         pixels = self._pixels(frame.rgb)
-        found = self._model.get_image_features(pixels, return_dict=True)
-        features = {"vision_feats": found.fpn_hidden_states, "vision_pos_embeds": found.fpn_position_encoding}
-        logits = []
-        for session in self._sessions.values():
-            session.cache.cache_vision_features(self._at, features)
-            told = self._model(inference_session=session, frame=pixels, frame_idx=self._at)
-            logits.append(torch.where(told.object_score_logits.view(-1, 1, 1, 1) > 0, told.pred_masks, _ABSENT))
-            self._trim(session)
+        features = self._features(pixels)
+        logits = [self._look(self._sessions[name], pixels, self._at, features) for name in names]
         masks = torch.nn.functional.interpolate(torch.cat(logits), frame.shape, mode="bilinear", align_corners=False)
         best, which = masks[:, 0].max(0)
-        return torch.where(best > 0, which + 1, 0).cpu().numpy().astype(np.int32)
+        label = torch.tensor([1 + list(self._sessions).index(name) for name in names], device=best.device)
+        return torch.where(best > 0, label[which], 0).cpu().numpy().astype(np.int32)
+
+    def _features(self, pixels: torch.Tensor) -> dict[str, Any]:
+        """The image's features, which all objects share."""
+        found = self._model.get_image_features(pixels, return_dict=True)
+        return {"vision_feats": found.fpn_hidden_states, "vision_pos_embeds": found.fpn_position_encoding}
+
+    def _look(
+        self, session: Any, pixels: torch.Tensor, at: int, features: dict[str, Any] | None = None
+    ) -> torch.Tensor:
+        """(1, 1, h, w) the logits of a session's object in the image of number ``at``."""
+        import torch
+
+        session.cache.cache_vision_features(at, features or self._features(pixels))
+        told = self._model(inference_session=session, frame=pixels, frame_idx=at)
+        self._trim(session, at)
+        return torch.where(told.object_score_logits.view(-1, 1, 1, 1) > 0, told.pred_masks, _ABSENT)
 
     def _pixels(self, rgb: np.ndarray) -> torch.Tensor:
         """(1, 3, S, S) as the network wants it."""
@@ -163,17 +199,17 @@ class Sam2Segmenter:
         mean, deviation = (torch.tensor(v, device=self._device).view(1, 3, 1, 1) for v in (MEAN, DEVIATION))
         return (image - mean) / deviation
 
-    def _trim(self, session: Any) -> None:
+    def _trim(self, session: Any, now: int) -> None:
         """Let go of what is not read any more: by itself a session grows by megabytes a frame."""
         config = self._model.config
         session.processed_frames = {}
         at = session.obj_id_to_idx(_OBJECT)
-        session.frames_tracked_per_obj[at] = {self._at: {"reverse": False}}
+        session.frames_tracked_per_obj[at] = {now: {"reverse": False}}
         kept = session.output_dict_per_obj[at]
         recent = kept["non_cond_frame_outputs"]
-        for old in [i for i in recent if i <= self._at - config.max_object_pointers_in_encoder]:
+        for old in [i for i in recent if i <= now - config.max_object_pointers_in_encoder]:
             del recent[old]
         for i, output in [*recent.items(), *kept["cond_frame_outputs"].items()]:
-            spent = _SPATIAL if i in recent and i <= self._at - config.num_maskmem else ()
+            spent = _SPATIAL if i in recent and i <= now - config.num_maskmem else ()
             for key in (*_READ_ONCE, *spent):
                 output.pop(key, None)

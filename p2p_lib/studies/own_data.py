@@ -133,23 +133,13 @@ def story(playback: Playback, prompts: Sequence[Prompt], rows: Sequence[int], wi
     boxes = {name: tight_box(mesh) for name, mesh in playback.meshes.items()}
     scene = Scene(playback.sequence, playback.run, boxes=boxes, truth=False)
     region_px = scene.region()
-    clicked = clicked_image(playback.sequence.frame(prompts[0].frame), prompts, playback.colours)
+    clicked = overlay.draw_clicks(playback.sequence.frame(prompts[0].frame).rgb, prompts, playback.colours)
     clicked, camera = overlay.zoomed(clicked, playback.sequence.camera, region_px, width_px)
     images = [overlay.draw_caption(clicked, "clicks")]
     images += [scene.draw(row, region_px, width_px, trail=60) for row in rows]
     for name, mesh in playback.meshes.items():
         images.append(overlay.draw_caption(mesh_portrait(mesh, camera.width, camera.height), f"{name}: surface"))
     return overlay.montage(images, columns=3)
-
-
-def clicked_image(frame: Frame, prompts: Sequence[Prompt], colours: Mapping[str, str]) -> np.ndarray:
-    """An image with the clicks in it."""
-    image = frame.rgb
-    for prompt in prompts:
-        image = overlay.draw_points(image, prompt.points_px, colours[prompt.name], radius_px=7)
-        for radius_px in (15, 16, 17):
-            image = overlay.draw_points(image, prompt.points_px, colours[prompt.name], radius_px, filled=False)
-    return image
 
 
 def mesh_portrait(mesh: trimesh.Trimesh, width_px: int, height_px: int, turn_deg: float = 25.0) -> np.ndarray:

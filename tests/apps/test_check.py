@@ -16,7 +16,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
 from p2p_lib.datasets.alignment import background_share, misfit
-from p2p_lib.datasets.prompts import load_prompts
+from p2p_lib.datasets.prompts import load_prompts, prompts_in
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.synthetic.faults import FAULTS, spoil
 
@@ -205,6 +205,14 @@ def test_a_click_on_the_background_is_worth_a_look(good):
     finding = found(good, "box: mask", **click(230, 240))
     assert finding.level is Level.LOOK and re.match(r"it covers \d+ % of the image, over 0\.[34]", finding.text)
     assert "table or wall" in finding.fix
+
+
+def test_clicks_of_two_objects_on_one_body_are_worth_a_look(good):
+    """The same warning as a run gives."""
+    (box,) = prompts_in({"box": open_sequence(good).masks(0)["box"]})
+    twice = [box, Prompt("lid", 0, np.add(box.points_px, [15, 10]))]
+    finding = found(good, "lid: clicks", prompts=twice)
+    assert finding.level is Level.LOOK and "most of 'box' belongs to what is clicked" in finding.text
 
 
 def test_a_click_that_segments_nothing_is_said_once(good, recwarn):

@@ -78,9 +78,10 @@ def test_eval_prints_exactly_one_json_object(done, capsys):
     out, err = capsys.readouterr()
     got = json.loads(out)  # anything beside one object would be "Extra data"
     assert err == "" and "NaN" not in out and "Infinity" not in out
-    assert set(got) == {"objects", "mean", "hz", "p95_ms", "tracker", "masks", "preset", "seed", "align"}
+    ran = {"tracker", "masks", "segmenter", "preset", "seed", "align"}
+    assert set(got) == {"objects", "mean", "hz", "p95_ms"} | ran
     assert set(got["objects"]) == {"object"}
-    assert set(got["objects"]["object"]) == SCORES | {"frames", "lost"}
+    assert set(got["objects"]["object"]) == SCORES | {"frames", "lost", "frames_to_recovery"}
     assert set(got["mean"]) == SCORES
     assert got["objects"]["object"]["frames"] == FRAMES and got["objects"]["object"]["lost"] == 0
     assert 98 < got["mean"]["add_auc"] <= got["mean"]["adds_auc"] <= 100
@@ -403,6 +404,77 @@ def test_clicks_replace_masks(sequence, tmp_path, capsys):
     assert load_run(again).objects["object"].has_pose.all() and not (again / "masks").exists()
     assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--stop", "2") == 0
     assert not list((out / "masks").rglob("*.png"))
+
+
+def masks_kept(out: Path) -> list[np.ndarray]:
+    return [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) > 0 for path in sorted((out / "masks" / "object").iterdir())]
+
+
+def truth(k: int) -> np.ndarray:
+    mask = np.zeros((H, W), bool)
+    mask[20 + k : 80 + k, 30 + 2 * k : 90 + 2 * k] = True
+    return mask
+
+
+def iou(one: np.ndarray, other: np.ndarray) -> float:
+    return (one & other).sum() / (one | other).sum()
+
+
+@pytest.mark.parametrize("source", ["first", "clicks", "builtin"])
+def test_a_run_starts_from_first_masks_or_from_clicks_drawn_in_them(source, sequence, tmp_path):
+    """The masks of later frames are not used: here they are of something else."""
+    for k in range(1, FRAMES):
+        cv2.imwrite(str(sequence / "gt_mask" / f"{k:04d}.png"), np.roll(truth(k), 50, 1).astype(np.uint8))
+    out = tmp_path / "out"
+    assert run(sequence, out, "--masks", source, "--save-masks", "--seed", "4") == 0
+    assert all(iou(mask, truth(k)) > 0.9 for k, mask in enumerate(masks_kept(out)))
+    info = load_run(out).info
+    assert (info["masks"], info["segmenter"]) == ("first" if source == "first" else "clicks", "builtin")
+    (prompt,) = info["prompts"]
+    if source == "first":
+        assert prompt == {"name": "object", "frame": 0, "mask_px": 3600}
+    else:  # which starts the same run again
+        again = tmp_path / "again"
+        (tmp_path / "p.json").write_text(json.dumps({"objects": info["prompts"]}))
+        assert run(sequence, again, "--prompts", str(tmp_path / "p.json"), "--save-masks", "--seed", "4") == 0
+        assert all((a == b).all() for a, b in zip(masks_kept(out), masks_kept(again), strict=True))
+
+
+def test_masks_of_some_frames_count_where_they_are_and_corrections_between_them(sequence, tmp_path):
+    """A wrong mask in frame 3 is used as it is; clicks in frame 5 mend what followed from it."""
+    drawn, out = sequence / "drawn", tmp_path / "out"
+    drawn.mkdir()
+    wrong = np.roll(truth(3), 12, 0)
+    for k, mask in ((0, truth(0)), (3, wrong)):
+        cv2.imwrite(str(drawn / f"{k:04d}.png"), mask.astype(np.uint8))
+    at = [[45 + 10, 40 + 5], [70 + 10, 70 + 5]]
+    assert run(sequence, out, "--masks", "drawn", *clicks(tmp_path, ("object", 5, at)), "--save-masks") == 0
+    kept = masks_kept(out)
+    np.testing.assert_array_equal(kept[3], wrong)
+    assert all(iou(kept[k], truth(k)) > 0.9 for k in (0, 1, 2, 5, 6, 7))
+    info = load_run(out).info
+    assert (info["masks"], [p["frame"] for p in info["prompts"]]) == ("drawn", [5])
+
+
+def test_a_folder_of_ones_own_may_have_masks_of_some_images(sequence, tmp_path, capsys):
+    """Named as their images, in a folder per object; images without one are the segmenter's."""
+    own = tmp_path / "own"
+    for name in ("rgb", "depth"):
+        shutil.copytree(sequence / name, own / name)
+    shutil.copy(sequence / "cam_K.txt", own)
+    (own / "masks" / "board").mkdir(parents=True)
+    for k in (0, 4):
+        cv2.imwrite(str(own / "masks" / "board" / f"{k:04d}.png"), truth(k).astype(np.uint8))
+    assert run(own, tmp_path / "out") == 0
+    assert "board: a pose in 8 of 8 frames" in capsys.readouterr().out
+    assert run(own, tmp_path / "out", "--start", "1", "--stop", "4") == 2
+    assert "none in frames 1 to 3" in capsys.readouterr().err
+
+
+def test_what_is_hardly_meant_is_said_in_one_line(sequence, tmp_path, capsys):
+    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("object", 0, [[140, 100]])), "--stop", "2") in (0, 2)
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "clicks on 'object' in frame 0" in line]
+    assert line.startswith("p2p run: ") and "a table or a wall" in line
 
 
 def test_names_of_earlier_versions_go_on_working(sequence, tmp_path):

@@ -3,10 +3,12 @@
 import http.client
 import json
 import re
+import shutil
 import subprocess
 import sys
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -156,6 +158,45 @@ def test_refusals_at_the_start(sequence, out):
 def test_the_page_needs_nothing_from_elsewhere():
     text = PAGE.read_text()
     assert "http" not in text.replace("http-equiv", "") and 'src="' not in text
+
+
+def visit(session: dict, *steps: list) -> dict:
+    """What the page's own script makes of these steps of a user."""
+    given = json.dumps({"session": session, "steps": steps})
+    probe = Path(__file__).with_name("click_probe.js")
+    done = subprocess.run(["node", str(probe), str(PAGE)], input=given, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
+def test_the_page_makes_prompts_of_clicks_boxes_and_later_frames(sequence, out):
+    """Dots on the object and beside it, a dragged box, corrections in another frame, one click taken back."""
+    save_prompts(out, [Prompt("cup", 0, [[40, 30]]), Prompt("lid", 1, mask=np.eye(H, W, dtype=bool))])
+    with Clicker(sequence, out) as clicker:
+        session = clicker.session()
+        seen = visit(
+            session,
+            ["press", 50, 20],  # on the cup, frame 0
+            ["press", 60, 50, True],  # beside it
+            ["press", 30, 40],
+            ["press", 30, 40],  # taken back
+            ["frame", 2],
+            ["press", 62, 51, True],
+            ["row", 1],  # the sequence's own object
+            ["press", 70, 10, False, 30, 44],  # a box, from its upper right corner
+        )
+        assert seen["sent"]["objects"] == [
+            {"name": "cup", "frame": 0, "points": [[40, 30], [50, 20]], "negative": [[60, 50]]},
+            {"name": "cup", "frame": 2, "negative": [[62, 51]]},
+            {"name": "object", "frame": 2, "box": [30, 10, 70, 44]},
+        ]
+        assert seen["rows"] == ["cup: frame 0, 2", "object: frame 2"] and seen["message"].startswith("Saved")
+        assert post(clicker.url, seen["sent"])[0] == 200
+        assert [(p.name, p.frame) for p in clicker.prompts] == [("cup", 0), ("cup", 2), ("object", 2), ("lid", 1)]
+        again = visit(clicker.session(), ["clear", 0])
+    assert again["sent"]["objects"] == seen["sent"]["objects"][2:]
+    np.testing.assert_array_equal(load_prompts(out)[-1].mask, np.eye(H, W, dtype=bool))  # masks stay as they were
 
 
 def test_the_command_ends_when_it_is_saved(sequence, out):

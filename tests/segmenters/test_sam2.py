@@ -204,6 +204,69 @@ def test_labels_are_the_likelier_objects_and_absent_ones_have_none():
     assert set(np.unique(ours.segment(frames[2])[:, :78])) == {1}
 
 
+def mask_of(left: int, top: int, right: int, bottom: int) -> np.ndarray:
+    mask = np.zeros((120, 160), bool)
+    mask[top:bottom, left:right] = True
+    return mask
+
+
+@needs_transformers
+def test_what_is_said_reaches_the_network_as_the_official_processor_says_it(model):
+    """A box is two clicks, its corners; clicks beside the object have another label; a mask is what it is."""
+    import torch
+    from transformers import Sam2VideoInferenceSession, Sam2VideoProcessor
+
+    class Processor(Sam2VideoProcessor):
+        def __init__(self):  # without an image processor, which wants torchvision
+            self.target_size, self.point_pad_value = SIDE, -10
+
+    ours = sam2.Sam2Segmenter(model, CAMERA)
+    said = Prompt("cup", points_px=CLICKS, negative_px=[[10, 20]], box_px=(60, 40, 100, 90))
+    official = Sam2VideoInferenceSession(video_height=120, video_width=160, dtype=torch.float32)
+    clicks = [[[*CLICKS.tolist(), [10.0, 20.0]]]]
+    box = [[[60.0, 40.0, 100.0, 90.0]]]
+    Processor().process_new_points_or_boxes_for_video_frame(
+        official, 0, [1], input_points=clicks, input_labels=[[[1, 1, 0]]], input_boxes=box, original_size=(120, 160)
+    )
+    expected, got = official.point_inputs_per_obj[0][0], ours._points(said)
+    assert got["point_labels"].flatten().tolist() == expected["point_labels"].flatten().tolist() == [2, 3, 1, 1, 0]
+    apart = got["point_coords"].numpy().reshape(-1, 2) - expected["point_coords"].numpy().reshape(-1, 2)
+    assert np.abs(apart).max() <= 0.5
+    mask = mask_of(60, 40, 100, 90)
+    Processor().process_new_mask_for_video_frame(official, 0, [1], [mask])
+    np.testing.assert_array_equal(ours._mask(mask).numpy(), official.mask_inputs_per_obj[0][0].numpy())
+
+
+@needs_transformers
+def test_a_mask_is_taken_as_it_is_and_the_network_goes_on_from_the_newest(model):
+    """As an official session that is given the mask in its frame."""
+    import torch
+    from transformers import Sam2VideoInferenceSession
+
+    ours, frames = Watched(model), film(4)
+    first, newest = mask_of(20, 20, 60, 60), mask_of(60, 40, 100, 90)
+    for frame, mask in zip(frames, (first, newest)):
+        np.testing.assert_array_equal(ours.segment(frame, [Prompt("cup", mask=mask)]) == 1, mask)
+    assert not ours.logits  # it has not been needed yet
+    ours.segment(frames[2])
+    ours.segment(frames[3], [Prompt("cup", negative_px=[[10, 20]])])
+    told, ours.logits = ours.logits, []
+    session = Sam2VideoInferenceSession(video_height=120, video_width=160, dtype=torch.float32)
+    at = session.obj_id_to_idx(1)
+    session.add_mask_inputs(at, 0, ours._mask(newest))
+    session.obj_with_new_inputs = [1]
+    for k, frame in enumerate(frames[1:]):
+        if k == 2:
+            session.frames_tracked_per_obj[at][k] = {"reverse": False}
+            session.add_point_inputs(at, k, ours._points(Prompt("cup", negative_px=[[10, 20]])))
+            session.obj_with_new_inputs = [1]
+        output = model(inference_session=session, frame=ours._pixels(frame.rgb), frame_idx=k)
+        np.testing.assert_allclose(told[k][0], output.pred_masks.numpy(), atol=1e-5)
+    # Nothing has been seen of an object whose first mask is empty.
+    assert not (ours.segment(frames[3], [Prompt("late", mask=np.zeros_like(first))]) == 2).any()
+    assert not (ours.segment(frames[3]) == 2).any() and ours.names == ("cup", "late")
+
+
 @needs_transformers
 def test_the_pipeline_takes_it(model):
     method = Point2Pose(CAMERA, preset(), segmenter=sam2.Sam2Segmenter(model, CAMERA))

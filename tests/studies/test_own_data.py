@@ -12,7 +12,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.prompts import prompts_in
-from p2p_lib.figures import style
+from p2p_lib.figures import overlay, style
 from p2p_lib.studies import own_data
 from p2p_lib.studies.own_data import errors_against, surface_fit
 from p2p_lib.studies.surface import carton
@@ -28,7 +28,7 @@ def has(image, colour, at_least=1):
 
 
 def test_clicks_are_drawn_where_they_are():
-    image = own_data.clicked_image(FRAME, [Prompt("mug", 0, [[40, 50]])], {"mug": style.OBJECTS[0]})
+    image = overlay.draw_clicks(FRAME.rgb, [Prompt("mug", 0, [[40, 50]])], {"mug": style.OBJECTS[0]})
     v, u = np.nonzero((image == style.rgb(style.OBJECTS[0])).all(-1))
     assert abs(u.mean() - 40) < 0.5 and abs(v.mean() - 50) < 0.5
 
