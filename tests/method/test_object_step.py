@@ -147,9 +147,11 @@ def test_uncertain_tracks_have_no_say():
     assert lump.off(turned(2))[0] < 0.5
 
 
-def pending_and_promoted() -> tuple[Lump, np.ndarray]:
+def pending_and_promoted(**settings) -> tuple[Lump, np.ndarray]:
     """A lump whose newest points are pending; (N,) bool which."""
-    lump = settled(begun(**NO_SURFACE, sampling__max_visible=200, sampling__points=60), [4, 8, 11])
+    lump = settled(
+        begun(**{**NO_SURFACE, "sampling__max_visible": 200, "sampling__points": 60, **settings}), [4, 8, 11]
+    )
     pending = ~lump.tracker.map.promoted
     assert pending.sum() > 15 and lump.tracker.map.promoted.sum() > 15
     return lump, pending
@@ -259,6 +261,28 @@ def test_tracks_that_contradict_the_motion_are_rejected():
     wrong = obs.tracks.ids[visible_first(8)(obs.tracks) & obs.seen]
     step = lump.see(turned(4), spoilt)
     assert set(step.requests.reject.tolist()) == set(wrong.tolist()) != set()
+
+
+def test_pending_points_are_not_rejected_and_enter_the_graph():
+    """They took no part in registration, so that they agree with nothing."""
+    lump, pending = pending_and_promoted(method__graph=True)
+    step = lump.see(turned(12))
+    assert not len(step.requests.reject)
+    pending = lump.tracker.map.keys[~lump.tracker.map.promoted & lump.tracks(turned(23)).visible]
+    assert lump.see(turned(23)).estimate.keyframe
+    graph = lump.tracker.model.graph
+    assert len(pending) and np.isin(pending, graph._keyframes[max(graph.keys)].ids).all()
+
+
+def test_contradiction_lowers_the_confidence():
+    """The same points agree on the pose; ten others are hidden, or elsewhere."""
+    told = []
+    for spoil in (hide(visible_first(10)), None):
+        lump = settled(begun(**NO_SURFACE), [2])
+        told.append(lump.see(turned(4), spoil or moved_to(turned(30), lump, visible_first(10))).estimate)
+    hidden, elsewhere = told
+    assert hidden.inliers == elsewhere.inliers > 12
+    assert elsewhere.confidence < hidden.confidence - 0.005
 
 
 def test_wrong_observations_stay_out_of_a_keyframe():
