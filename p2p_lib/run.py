@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.core.backends import ALIASES, DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.options import RunOptions
+from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, given_models
-from p2p_lib.datasets.prompts import Prompt, clicks_by_frame, load_prompts
+from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
 from p2p_lib.datasets.runs import Run, RunWriter, load_run
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
@@ -31,6 +31,9 @@ from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.method.mesh import save as save_mesh
 from p2p_lib.method.pipeline import Point2Pose
+
+#: So many clicks an object are drawn from its first mask.
+CLICKS = 3
 
 
 @dataclass(frozen=True)
@@ -65,9 +68,12 @@ def run(
     """Track the objects of a sequence and write a run folder (see :mod:`p2p_lib.datasets.runs`).
 
     ``changes`` are fields of :class:`RunOptions` over those of ``options``: ``run("synthetic/mug", "out", seed=3)``.
-    ``options.masks`` says where masks come from: ``dataset``, ``dataset:FOLDER``, or a segmenter by name, which starts
-    from ``options.prompts``. The default is the dataset's, or with prompts the built-in segmenter. With the dataset's,
-    each object is started by its first mask that is large enough.
+    ``options.masks`` says where masks come from; the segmenter looks after every object in frames that bring none:
+
+    - ``dataset``: the dataset's, or those in a ``FOLDER`` (the default without prompts)
+    - ``first``: of each object the dataset's first usable one alone
+    - ``clicks``: ``options.prompts`` (the default with them), or else three clicks an object that are drawn, by the
+      seed, from the dataset's first usable mask. The name of a segmenter means the same, with that segmenter
 
     ``sequence`` may be an open one. An earlier run in ``out`` is replaced, of which ``say`` is told before anything is
     tracked. Raises :class:`P2PError` for anything that does not fit; Ctrl-C ends the run early and is reported in the
@@ -78,9 +84,8 @@ def run(
     tracker = options.tracker
     if tracker == OracleTracker.name:  # which has to know the sequence
         tracker = OracleTracker(TrueScene.of(job.sequence, options.models), job.config.oracle, job.config.seed)
-    segmenter = job.segmenter or DEFAULT_SEGMENTER
-    method = Point2Pose(job.sequence.camera, job.config, tracker, options.detector, segmenter)
-    for name in () if job.segmenter else job.objects:
+    method = Point2Pose(job.sequence.camera, job.config, tracker, options.detector, job.masks.segmenter)
+    for name in job.objects if job.masks.every_mask else ():
         method.add_object(name)
     writer = _writer(job, options, method, out)
     if writer.replaced:
@@ -165,8 +170,8 @@ class _Job:
     """A run whose options have been checked.
 
     source   the sequence, and the prompts, as they would be given to the command line
-    masks    where they come from; ``segmenter`` is its name where that is a segmenter
-    clicked  frame to the clicks (N, 2) that start objects there, by object
+    masks    where they come from; those of a folder are the sequence's then
+    prompts  what starts objects and corrects their masks, by frame
     """
 
     source: str
@@ -174,10 +179,8 @@ class _Job:
     sequence: sequences.Sequence
     frames: range
     objects: tuple[str, ...]
-    masks: str
-    segmenter: str | None
-    prompts: tuple[Prompt, ...]
-    clicked: Mapping[int, Mapping[str, np.ndarray]]
+    masks: MaskSource
+    prompts: Mapping[int, tuple[Prompt, ...]]
 
 
 def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> _Job:
@@ -187,19 +190,31 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
         source += f" --prompts {prompts}"
         prompts = load_prompts(prompts)
     prompts = tuple(prompts or ())
-    masks = _mask_source(options.masks, prompts)
-    segmenter = masks if masks in SEGMENTERS else None
+    masks = options.mask_source()
     if isinstance(sequence, str | Path):
-        folder = None if segmenter else masks.partition(":")[2] or None
-        sequence = sequences.open_sequence(sequence, options.format, options.depth_scale, config.seed, masks=folder)
+        how = {"format": options.format, "depth_scale": options.depth_scale}
+        sequence = sequences.open_sequence(sequence, **how, seed=config.seed, masks=masks.folder)
     frames = _frame_range(len(sequence), options.start, options.stop)
-    objects = _chosen([p.name for p in prompts] if segmenter else sequence.objects, options.objects)
-    clicked = clicks_by_frame([p for p in prompts if p.name in objects], frames, sequence.camera)
-    if not segmenter and all(sequence.masks(i) is None for i in frames):
+    told = masks.name == "clicks" and bool(prompts)  # all that is known of the objects
+    objects = _chosen([p.name for p in prompts] if told else sequence.objects, options.objects)
+    if not told and all(sequence.masks(i) is None for i in frames):
         fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
         expected = "masks of the first image at least, or clicks"
         raise BadInput("masks", f"none in frames {frames[0]} to {frames[-1]} of {sequence.name}", expected, fix)
-    return _Job(source, config, sequence, frames, objects, masks, segmenter, prompts, clicked)
+    if not told and not masks.every_mask:
+        rng, clicks = np.random.default_rng([config.seed, 2]), CLICKS if masks.name == "clicks" else 0
+        drawn = first_prompts(sequence, frames, objects, config.lifecycle.min_mask_px, clicks, rng)
+        if not drawn:
+            got = f"no mask of {', '.join(objects)} that is large enough"
+            raise BadInput("masks", got, f"one of {config.lifecycle.min_mask_px} pixels", "Click on the objects.")
+        prompts += drawn
+    started = objects if masks.every_mask else ()
+    by_frame = prompts_by_frame([p for p in prompts if p.name in objects], frames, sequence.camera, started)
+    for i, said in by_frame.items() if masks.every_mask else ():
+        if both := [p.name for p in said if p.name in (sequence.masks(i) or {})]:
+            fix = "Leave --masks out to start from the prompts, or take the mask of that frame away."
+            raise BadInput(f"prompt of {both[0]!r}", f"a mask in frame {i} too", "one of them", fix)
+    return _Job(source, config, sequence, frames, objects, masks, by_frame)
 
 
 def _frame_range(count: int, start: int, stop: int | None) -> range:
@@ -208,21 +223,6 @@ def _frame_range(count: int, start: int, stop: int | None) -> range:
     if not 0 <= start < end:
         raise BadInput("frames", f"start {start}, stop {stop}", f"0 <= start < stop within {count} frames")
     return range(start, end)
-
-
-def _mask_source(masks: str | None, prompts: Sequence[Prompt]) -> str:
-    """The checked source of masks; None means the dataset, or with prompts the segmenter that is the default."""
-    source = masks or (DEFAULT_SEGMENTER if prompts else "dataset")
-    source = ALIASES.get(source, source)
-    kind, colon, folder = source.partition(":")
-    if (kind != "dataset" or (colon and not folder)) and source not in SEGMENTERS:
-        raise BadInput("masks", repr(masks), f"dataset, dataset:FOLDER, or {', '.join(SEGMENTERS)}")
-    if source in SEGMENTERS and not prompts:
-        fix = "Make some with p2p click SEQ --out prompts.json and give them with --prompts."
-        raise BadInput("masks", f"{source!r} without prompts", "clicks for the segmenter to start from", fix)
-    if source not in SEGMENTERS and prompts:
-        raise BadInput("masks", f"{source!r} and prompts", "one of them", f"Segmenters: {', '.join(SEGMENTERS)}.")
-    return source
 
 
 def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> tuple[str, ...]:
@@ -243,14 +243,15 @@ def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path)
         job.sequence,
         job.config,
         method.tracker.name,
-        job.masks,
+        job.masks.name,
         job.objects,
         job.frames.start,
         job.frames.stop,
         {name: path for name, path in known.items() if name in job.objects},
     )
-    prompts = [{"name": p.name, "frame": p.frame, "points": p.points_px.tolist()} for p in job.prompts]
-    writer.info |= {"detector": method.detector.name, "prompts": prompts, "options": options.as_dict()}
+    prompts = [prompt.as_dict() for of_frame in job.prompts.values() for prompt in of_frame]
+    writer.info |= {"detector": method.detector.name, "segmenter": method.segmenter.name}
+    writer.info |= {"prompts": prompts, "options": options.as_dict()}
     return writer
 
 
@@ -258,12 +259,11 @@ def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str,
     """Every frame with its estimates, which a late 2D tracker gives some frames later."""
     waiting: deque[Frame] = deque()
     for i in job.frames:
-        frame, seen = job.sequence.frame(i), None if job.segmenter else job.sequence.masks(i)
-        for name, clicks in job.clicked.get(i, {}).items():
-            method.add_object(name, clicks=clicks)
+        frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
+        for prompt in job.prompts.get(i, ()):
+            method.tell(prompt)
         waiting.append(frame)
-        known = None if seen is None else {name: seen[name] for name in method.objects if name in seen}
-        estimates = method.step(frame, known)
+        estimates = method.step(frame, {name: masks[name] for name in method.objects if name in masks})
         if len(waiting) > method.tracker.latency_frames:
             yield waiting.popleft(), estimates
     for estimates in method.finish():
@@ -326,7 +326,7 @@ def _advice(run: Run, job: _Job) -> str:
     why = " ".join(reasons.values())
     if "pixels with depth" in why:
         fix = "its depth is missing or out of range, or in another unit (--depth-scale)"
-    elif "not seen yet" in why and job.segmenter:
+    elif "not seen yet" in why and not job.masks.every_mask:
         fix = "click in the middle of it, elsewhere"
     elif "not seen yet" in why:
         fix = "its masks are empty or too small: draw it, or use p2p click"

@@ -21,9 +21,10 @@ from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, make_dete
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.alignment import background_share, misfit
-from p2p_lib.datasets.prompts import Prompt, clicks_by_frame
+from p2p_lib.datasets.prompts import prompts_by_frame
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.method.sampling import choose, usable_region
 from p2p_lib.synthetic.faults import spoil
@@ -369,10 +370,11 @@ def _first_masks(sequence: Sequence, config: Config) -> FirstMasks:
 def _clicked(sequence: Sequence, prompts: Iterable[Prompt], config: Config) -> FirstMasks:
     """Each clicked object's first mask, as the built-in segmenter cuts it out."""
     firsts: FirstMasks = {}
-    for i, clicked in clicks_by_frame(prompts, range(len(sequence)), sequence.camera).items():
+    for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
         frame = sequence.frame(i)
-        for name, clicks in clicked.items():
+        for prompt in said:
             rng = np.random.default_rng(config.seed)
             segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
-            firsts[name] = frame, segmenter.segment(frame, {name: clicks}) > 0
+            if prompt.name not in firsts:
+                firsts[prompt.name] = frame, segmenter.segment(frame, [prompt]) > 0
     return firsts

@@ -19,9 +19,9 @@ from typing import Any
 import cv2
 
 from p2p_lib.core.browser import open_page
-from p2p_lib.core.clicks import checked_clicks
 from p2p_lib.core.errors import BadInput, P2PError
-from p2p_lib.datasets.prompts import Prompt, clicks_by_frame, load_prompts, parse_prompts, save_prompts
+from p2p_lib.core.prompts import Prompt, check_depth
+from p2p_lib.datasets.prompts import load_prompts, parse_prompts, prompts_by_frame, save_prompts
 from p2p_lib.datasets.sequence import Sequence
 
 HOST = "127.0.0.1"
@@ -81,7 +81,7 @@ class Clicker:
             "height": self.sequence.camera.height,
             "names": list(self.sequence.objects),
             "file": str(self.path),
-            "objects": [{"name": p.name, "frame": p.frame, "points": p.points_px.tolist()} for p in self.prompts],
+            "objects": [prompt.as_dict() for prompt in self.prompts],
         }
 
     def _image_png(self, i: int) -> bytes:
@@ -90,9 +90,10 @@ class Clicker:
     def save(self, content: object) -> None:
         """Check prompts as the page sends them, and write the file; :class:`BadInput` says what does not fit."""
         prompts = parse_prompts(content)
-        clicked = clicks_by_frame(prompts, range(len(self.sequence)), self.sequence.camera)
-        for i, clicks in clicked.items():
-            checked_clicks(clicks, self.sequence.camera, self.sequence.frame(i))
+        by_frame = prompts_by_frame(prompts, range(len(self.sequence)), self.sequence.camera)
+        for i, said in by_frame.items():
+            for prompt in said:
+                check_depth(prompt, self.sequence.frame(i))
         save_prompts(self.path, prompts)
         self.prompts = prompts
         self._saved.set()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from time import monotonic
@@ -16,12 +16,12 @@ from time import monotonic
 import numpy as np
 
 from p2p_lib.apps.click import Clicker, wait_for_clicks
-from p2p_lib.core.backends import DEFAULT_SEGMENTER
+from p2p_lib.core.backends import SEGMENTERS
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.cameras import LiveCamera, Newest, Still
-from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.method.pipeline import Point2Pose
 
 
@@ -55,7 +55,8 @@ def track_live(
 ) -> LiveCount:
     """Follow the objects of the prompts until the camera ends; every estimate goes to ``on_estimate`` at once.
 
-    prompts  clicks; those of frame k start their object at the camera's k-th image, which is not dropped
+    prompts  clicks, boxes, masks; those of frame k start their object, or correct its mask, at the camera's k-th image,
+             which is not dropped
     options  the method and its parameters; ``masks`` names the segmenter
     first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
@@ -64,9 +65,10 @@ def track_live(
     """
     options, count = options or RunOptions(), count or LiveCount()
     prompts = sorted(prompts, key=lambda p: p.frame)
-    config = options.config()
-    segmenter = options.masks or DEFAULT_SEGMENTER
-    method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
+    config, masks = options.config(), replace(options, prompts=prompts).mask_source()
+    if masks.name != "clicks":
+        raise BadInput("masks", repr(options.masks), f"the name of a segmenter: {', '.join(SEGMENTERS)}")
+    method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
     if config.method.surface:
         import_module("torch")  # which takes seconds, in which the camera need not run
     start_s = monotonic()
@@ -74,8 +76,7 @@ def track_live(
         frame = first or newest.take()
         while frame is not None:
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
-                prompt = prompts.pop(0)
-                method.add_object(prompt.name, clicks=prompt.points_px)
+                method.tell(prompts.pop(0))
             for estimate in method.step(frame).values():
                 on_estimate(estimate)
             if frame is not first:  # which may be long ago

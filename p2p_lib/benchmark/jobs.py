@@ -24,9 +24,9 @@ from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.models import find_models
-from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.datasets.resized import Resized
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 
@@ -66,14 +66,10 @@ class Job:
     def options(self, known: tuple[str, ...] = ()) -> RunOptions:
         """What its run is asked for, on a sequence of the ``known`` objects.
 
-        Raises :class:`MissingData` where the method starts from clicks and the plan has none.
+        Where the method starts from clicks and the plan has none, the run draws some.
         """
         planned, method, prompts = self.sequence, self.method, None
-        if uses_clicks(method):
-            if not planned.clicks:
-                fix = "Give the plan's sequence clicks = { object = [[u, v], ...] }."
-                what = f"no clicks in the plan, which masks = {method.masks!r} needs"
-                raise MissingData(planned.name, what, fix)
+        if uses_clicks(method) and planned.clicks:
             clicks = {name: np.array(at) * method.scale for name, at in planned.clicks.items()}
             prompts = [Prompt(name, planned.start, at) for name, at in clicks.items()]
         objects = tuple(planned.objects) or (tuple(planned.clicks) if prompts else known)
@@ -108,7 +104,7 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
 def open_planned(job: Job) -> Sequence:
     """The sequence of a job, rendered first where it is synthetic and the cache lacks it."""
     planned, method = job.sequence, job.method
-    masks = None if uses_clicks(method) else method.masks.partition(":")[2] or None
+    masks = RunOptions(masks=method.masks).mask_source().folder
     if planned.name.startswith(SYNTHETIC):
         from p2p_lib.synthetic import scenario_dir
 

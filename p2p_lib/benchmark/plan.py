@@ -12,8 +12,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from p2p_lib.core.backends import ALIASES, DEFAULT_DETECTOR, DEFAULT_TRACKER, SEGMENTERS
+from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_TRACKER
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.sequence import SYNTHETIC
 
 PROFILES = ("quick", "full")
@@ -34,7 +35,7 @@ class Method(_Strict):
 
     paper     the method of the paper's table that it stands beside ("Ours", "No SDF refinement"), "" for none
     detector  the first of these that is installed
-    masks     dataset, dataset:FOLDER, or a segmenter, which starts from the sequence's clicks
+    masks     as of ``p2p run``; clicks are the sequence's, or drawn where it has none
     settings  single parameters of the configuration, ``{"stage.key" = value}``
     synthetic parameters of synthetic sequences; ``noise`` is one of exact, realsense, hard
     scale     of the images, 1 = as they are
@@ -63,7 +64,7 @@ class PlannedSequence(_Strict):
     seed       of a synthetic sequence; None: that of the run
     synthetic  parameters of a synthetic sequence; ``models = "DATASET"`` stands for that dataset's folder
     models     object to model file or folder, relative to ``$P2P_DATA``, where the layout has none
-    clicks     object to pixels [u, v] in frame ``start``, for methods with a segmenter
+    clicks     object to pixels [u, v] in frame ``start``, for methods that start from clicks
     column     of the paper's table; with several objects, ``columns`` has one for each
     """
 
@@ -176,5 +177,5 @@ def read_plan(plan: str | Path) -> Plan:
 
 
 def uses_clicks(method: Method) -> bool:
-    """Whether its masks come from a segmenter."""
-    return ALIASES.get(method.masks, method.masks) in SEGMENTERS
+    """Whether its objects are started by clicks."""
+    return RunOptions(masks=method.masks).mask_source().name == "clicks"

@@ -19,10 +19,9 @@ from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.evaluation import reconstruction
 from p2p_lib.evaluation.protocol import ObjectScore, evaluate
-from p2p_lib.evaluation.recovery import recovery_events
 
 #: What of ``run.json`` an outcome repeats.
-RAN = ("tracker", "detector", "masks", "preset", "frames", "commit", "modified", "versions")
+RAN = ("tracker", "detector", "masks", "segmenter", "preset", "frames", "commit", "modified", "versions")
 Models = Mapping[str, str | Path]
 
 
@@ -38,7 +37,7 @@ def scored(done: Run, sequence: Sequence | None, models: Models, key: str = "") 
             lost=score.lost,
             first=_errors(score),
             all=_errors(over_all.objects[name]),
-            returns=[event.frames_to_recovery for event in recovery_events(done.objects[name], score)],
+            returns=[event.frames_to_recovery for event in score.returns],
             **(_chamfer(done, sequence, models, name, score) if sequence else {}),
         )
     ran = {key: done.info.get(key) for key in RAN}

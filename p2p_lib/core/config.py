@@ -69,6 +69,9 @@ class MethodConfig(_Checked):
     redetection: bool = _p(
         True, "Where few points are seen, their pose tells the tracker where to look for the others."
     )
+    scene: bool = _p(
+        True, "An absent object is searched for by shape and colour, where the static scene says that it was left."
+    )
     gates: str = _p("all", "A pose has to pass all gates of the life cycle, or none.", choices=("none", "all"))
     noise: str = _p(
         "sensor",
@@ -382,6 +385,7 @@ _PAPER: dict[str, Any] = {
     "method.object_frame": "camera",
     "method.motion": False,
     "method.redetection": False,
+    "method.scene": False,
     "method.gates": "none",
     "method.noise": "constant",
     "sampling.max_visible": 50,

@@ -7,6 +7,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import DepthConfig
+from p2p_lib.core.image import nearest_px
 from p2p_lib.core.types import Frame
 
 #: The 3x3 neighbourhood, its middle first: (9, 2) pixels.
@@ -34,6 +35,14 @@ def off_edges(depth_m: np.ndarray, edge_m: float) -> np.ndarray:
     around = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(depth_m, around), cv2.dilate(depth_m, around)
     return (low > 0) & (high - low <= edge_m)
+
+
+def depths_at(uv_px: np.ndarray, frame: Frame, radius: int = 2) -> np.ndarray:
+    """(N,) median depth around each pixel (N, 2); NaN where nothing is measured."""
+    d = np.arange(-radius, radius + 1)
+    around = np.stack(np.meshgrid(d, d), -1).reshape(-1, 2)
+    u, v = nearest_px(np.rint(uv_px)[:, None] + around, frame.shape)
+    return np.ma.median(np.ma.masked_equal(frame.depth_m[v, u], 0), axis=1).astype(float).filled(np.nan)
 
 
 def lift(frame: Frame, uv_px: np.ndarray, camera: Camera, config: DepthConfig) -> np.ndarray:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Rows, Tracks
 
 
@@ -80,10 +81,12 @@ class Hint:
     uv_px       (K, 2) its tracked points whose measured places agree with one rigid motion
     distance_m  (H, W) float32: signed distance of each measured pixel to the object's reconstructed surface
                 at the pose those points give, positive in front of it; NaN where unknown. None without a surface
+    sighted     the object has been found there by shape and colour, after an absence
     """
 
     uv_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     distance_m: np.ndarray | None = None
+    sighted: bool = False
 
 
 class Segmenter(Protocol):
@@ -98,15 +101,17 @@ class Segmenter(Protocol):
     def segment(
         self,
         frame: Frame,
-        clicks: Mapping[str, np.ndarray] | None = None,
+        prompts: Iterable[Prompt] = (),
         hints: Mapping[str, Hint] | None = None,
     ) -> np.ndarray:
         """(H, W) int32 label image of the next frame: 0 for no object, else 1 + the object's place in ``names``.
 
-        clicks  of objects that are new: (N, 2) pixels on them in this frame
-        hints   what others know of the objects that are not; a segmenter may use it
+        prompts  what is said of objects in this frame, one each: of a new object, which starts it, or of one that is
+                 looked after, whose mask it corrects. A mask is labelled as it is, where no later one claims its pixels
+        hints    what others know of the objects; a segmenter may use it
 
-        An object that is not to be seen has no pixels. Raises :class:`BadInput` for clicks where there is no depth.
+        An object that is not to be seen has no pixels. Raises :class:`BadInput` for prompts where there is no depth,
+        and nothing has changed then.
         """
 
     def remove(self, name: str) -> None:

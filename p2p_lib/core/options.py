@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from p2p_lib.core import config as configuration
-from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, DEFAULT_TRACKER, DETECTORS, SEGMENTERS, TRACKERS
+from p2p_lib.core.backends import (
+    ALIASES,
+    DEFAULT_DETECTOR,
+    DEFAULT_SEGMENTER,
+    DEFAULT_TRACKER,
+    DETECTORS,
+    SEGMENTERS,
+    TRACKERS,
+)
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker
@@ -54,11 +62,14 @@ _SEED = _typed("of every random choice (default 0)", type=int, metavar="N")
 _DEVICE = _typed("where surfaces are fused and refined: cpu (default), cuda or cuda:N")
 _TRACKER = _typed(f"2D point tracker: {', '.join(TRACKERS)} (default {DEFAULT_TRACKER})", metavar="NAME")
 _DETECTOR = _typed(f"source of new points: {', '.join(DETECTORS)} (default {DEFAULT_DETECTOR})", metavar="NAME")
+#: Where masks come from, beside folders. A segmenter's name stands for clicks with that segmenter.
+MASK_SOURCES = ("dataset", "first", "clicks", *SEGMENTERS)
 _MASKS = _typed(
-    f"dataset, dataset:FOLDER, {', '.join(SEGMENTERS)} (default: dataset; with --prompts {DEFAULT_SEGMENTER})",
+    "dataset (all its masks), first (each object's first), clicks (--prompts, or drawn from the first masks), "
+    f"{' or '.join(SEGMENTERS)} (clicks, with that segmenter), FOLDER (default: dataset; with --prompts clicks)",
     metavar="SOURCE",
 )
-_PROMPTS = _typed("clicks on the objects (see p2p click)", type=Path, metavar="FILE")
+_PROMPTS = _typed("what starts objects and corrects masks (see p2p click)", type=Path, metavar="FILE")
 _SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")
 _FORMAT = _typed("layout: ho3d, bop, ycbmultitrack, ycbineoat, folder (default: recognised)")
 _DEPTH_SCALE = _typed("metres per raw depth unit (default 0.001)", type=float, metavar="M")
@@ -72,6 +83,20 @@ _MODELS = _typed(
     action="extend",
     metavar="NAME=PATH",
 )
+
+
+@dataclass(frozen=True)
+class MaskSource:
+    """Where masks come from: one of :data:`MASK_SOURCES`, or a ``folder``; and who looks after the other frames."""
+
+    name: str
+    segmenter: str
+    folder: str | None = None
+
+    @property
+    def every_mask(self) -> bool:
+        """Whether the masks of all frames are used."""
+        return self.name not in ("first", "clicks")
 
 
 @dataclass(frozen=True)
@@ -108,6 +133,16 @@ class RunOptions:
                 value, read = getattr(arguments, option.name), option.metadata["read"]
                 given[option.name] = read(value) if read and value is not None else value
         return cls(**given)
+
+    def mask_source(self) -> MaskSource:
+        """Where masks come from."""
+        asked = self.masks or ("clicks" if self.prompts else "dataset")
+        asked = ALIASES.get(asked, asked).removeprefix("dataset:")
+        if not asked:
+            raise BadInput("masks", repr(self.masks), "a folder, or one of " + ", ".join(MASK_SOURCES))
+        if asked in SEGMENTERS:
+            return MaskSource("clicks", asked)
+        return MaskSource(asked, DEFAULT_SEGMENTER, None if asked in MASK_SOURCES else asked)
 
     def config(self) -> Config:
         """The parameters: preset, then file, then single settings, then device and seed."""

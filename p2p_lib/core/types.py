@@ -20,12 +20,14 @@ class Frame:
     rgb      (H, W, 3) uint8, red first
     depth_m  (H, W) float32, metres along the optical axis, registered to rgb; 0 = no measurement
     time_s   seconds, increasing within a sequence
+    T_world_cam  (4, 4) pose of the camera in a static world, where somebody knows it (a robot, SLAM)
     """
 
     index: int
     time_s: float
     rgb: np.ndarray
     depth_m: np.ndarray
+    T_world_cam: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         rgb, depth = self.rgb, self.depth_m
@@ -39,6 +41,8 @@ class Frame:
             raise BadInput(f"frame {self.index} depth", depth.dtype, "metres as floats", "Apply the depth scale first.")
         if not np.isfinite(self.time_s):
             raise BadInput(f"frame {self.index} time_s", self.time_s, "a finite time in seconds")
+        if self.T_world_cam is not None:
+            object.__setattr__(self, "T_world_cam", se3.check(f"frame {self.index} T_world_cam", self.T_world_cam))
         # A sensor's NaN, infinity and negative readings all mean "no measurement", which is 0 here.
         clean = depth.astype(np.float32, copy=False)
         bad = ~((clean >= 0) & (clean < np.inf))

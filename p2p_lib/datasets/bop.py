@@ -120,7 +120,7 @@ def _visible_masks(folder: Path, numbers, listed, objects, shape: tuple[int, int
         found = listed[at].get(obj)
         return None if found is None else where / f"{numbers[at]:06d}_{found[0]:06d}.png"
 
-    files = {obj: tuple(file(obj, at) for at in range(len(numbers))) for obj in objects}
+    files = {obj: {at: file(obj, at) for at in range(len(numbers))} for obj in objects}
     return MaskFiles(files, dict.fromkeys(objects), shape)
 
 

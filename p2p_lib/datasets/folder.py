@@ -1,9 +1,9 @@
 """A plain folder of one's own: ``rgb/``, ``depth/`` and ``cam_K.txt``; no truth.
 
 ``masks/`` is optional: one folder per object (named by it), or one label image per image (0 = background,
-k = object k). A single mask is taken as the first image's. ``times.txt`` (seconds, one a line) is optional;
-images whose names are nanoseconds need none. ``depth_scale.txt`` is optional: metres per unit of the depth images,
-which are in millimetres otherwise.
+k = object k): of all images, or of some, named as these; a single one is the first image's, whatever its name.
+``times.txt`` (seconds, one a line) is optional; images whose names are nanoseconds need none. ``depth_scale.txt`` is
+optional: metres per unit of the depth images, which are in millimetres otherwise.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from p2p_lib.datasets.sequence import Sequence
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)
-    found, _ = files.find_masks(masks, [] if masks else [folder / "masks"], first_frame_alone=True)
+    found, _ = files.find_masks(masks, [] if masks else [folder / "masks"], some_frames=True)
     objects = tuple(found.files) if found else ("object",)
     return ImageSequence(
         **vars(files),

@@ -37,21 +37,23 @@ class ImageFiles:
         asked: str | Path | None,
         places: Iterable[Path],
         objects: tuple[str, ...] | None = None,
-        first_frame_alone: bool = False,
+        some_frames: bool = False,
     ) -> tuple[MaskFiles | None, MaskFiles | None]:
         """The masks to use and the dataset's own, which are in the first of ``places`` that there is.
 
-        asked  another folder to use: a name inside the sequence, or a path. Other arguments as of ``find_masks``.
+        asked  another folder to use, with masks of some frames or of all: a name inside the sequence, or a path. Other
+               arguments as of ``find_masks``.
         """
 
         def find(where: Path) -> MaskFiles:
-            return find_masks(where, self.rgb, self.shape, objects, first_frame_alone)
+            return find_masks(where, self.rgb, self.shape, objects, some_frames or where == given)
 
+        inside = None if asked is None else self.path / asked
+        given = inside if inside is None or inside.is_dir() else Path(asked).expanduser()
         own = next((find(where) for where in places if where.is_dir()), None)
-        if asked is None:
+        if given is None:
             return own, own
-        inside = self.path / asked
-        chosen = find(inside if inside.is_dir() else Path(asked).expanduser())
+        chosen = find(given)
         return chosen, own or chosen
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.options import MASK_SOURCES
 from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_files, read_image
 
 
@@ -16,17 +18,18 @@ from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_fil
 class MaskFiles:
     """Masks on disk: for each object its files, and the label that means it (None: anything but 0).
 
-    An object has one file a frame (None: it is not in this image), or a single one for the first frame alone.
+    An object has one file a frame (None: it is not in this image), or files of some frames alone: of the others nobody
+    knows whether it is to be seen.
     """
 
-    files: dict[str, tuple[Path | None, ...]]
+    files: dict[str, Mapping[int, Path | None]]
     labels: dict[str, int | None]
     shape: tuple[int, int]
     _counts: dict[int, dict[str, int]] = field(default_factory=dict)
 
     def read(self, i: int) -> dict[str, np.ndarray] | None:
         """Object to (H, W) bool at frame i; None where no object has a mask for it."""
-        at_i = {name: files[i] for name, files in self.files.items() if i < len(files)}
+        at_i = {name: files[i] for name, files in self.files.items() if i in files}
         images = {path: read_labels(path, self.shape) for path in set(at_i.values()) if path}
         images[None] = np.zeros(self.shape, np.uint8)
         masks = {}
@@ -48,37 +51,44 @@ def find_masks(
     rgb_files: tuple[Path, ...],
     shape: tuple[int, int],
     objects: tuple[str, ...] | None = None,
-    first_frame_alone: bool = False,
+    some_frames: bool = False,
 ) -> MaskFiles:
     """The masks below a folder: one folder per object, or one label image per frame.
 
     ``objects`` are the names to find; None takes what is there: the folders' names, or ``object_k`` for
     label k (``object`` where there is a single one). With known names, label k is the k-th of them, and
-    a single object is everything that is not 0.
+    a single object is everything that is not 0. With ``some_frames`` there may be masks of some frames, named as their
+    images, or a single one, of the first image.
     """
     if not folder.is_dir():
-        raise MissingData(str(folder), "no such folder of masks", "Name a folder inside the sequence, or a path.")
+        fix = f"Name a folder inside the sequence, a path, or {', '.join(MASK_SOURCES)}."
+        raise MissingData(str(folder), "no such folder of masks", fix)
     below = tuple(sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")))
     names = below if objects is None else objects
-    hint = "One mask alone, of the first image, is allowed too." if first_frame_alone else ""
 
-    def paired(where: Path) -> tuple[Path, ...]:
+    def paired(where: Path) -> dict[int, Path | None]:
         files = list_files(where, LOSSLESS, "mask images")
-        return files if first_frame_alone and len(files) == 1 else check_paired(files, rgb_files, hint)
+        number = {path.stem: i for i, path in enumerate(rgb_files)}
+        if some_frames and len(files) < len(rgb_files) and all(path.stem in number for path in files):
+            return {number[path.stem]: path for path in files}
+        if some_frames and len(files) == 1:
+            return {0: files[0]}
+        hint = "Masks of some images have their names; one alone may be called otherwise, and is the first image's."
+        return dict(enumerate(check_paired(files, rgb_files, hint if some_frames else "")))
 
     if below:
         return MaskFiles({name: paired(folder / name) for name in names}, dict.fromkeys(names), shape)
     files = paired(folder)
     labels: dict[str, int | None]
     if objects is None:
-        found = _labels_in(files, shape)
+        found = _labels_in(files.values(), shape)
         labels = {f"object_{k}": k for k in found} if len(found) > 1 else {"object": None}
     else:
         labels = {name: k + 1 for k, name in enumerate(names)} if len(names) > 1 else {names[0]: None}
     return MaskFiles(dict.fromkeys(labels, files), labels, shape)
 
 
-def _labels_in(files: tuple[Path, ...], shape: tuple[int, int]) -> list[int]:
+def _labels_in(files: Iterable[Path], shape: tuple[int, int]) -> list[int]:
     """All labels above 0 of a set of label images: an object may enter late, so every image is looked at."""
     counts = (np.bincount(read_labels(path, shape).ravel()) for path in files)
     return sorted({int(k) for count in counts for k in np.flatnonzero(count)} - {0})

@@ -1,47 +1,38 @@
-"""Clicks on objects, on disk: ``{"objects": [{"name": "mug", "frame": 0, "points": [[x, y], ...]}]}`` in pixels."""
+"""Prompts on disk: what somebody says of objects, in pixels of frames, as ``p2p click`` writes it.
+
+``{"objects": [{"name": "mug", "frame": 0, "points": [[x, y], ...]}]}``. An entry has ``points`` (clicks on the object),
+``negative`` (clicks that are not on it), ``box`` (left, top, right, bottom) or ``mask`` (an image beside the file, 0 =
+not the object). An object's first entry starts it, those of later frames correct its mask.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import check_apart, check_clicks
+from p2p_lib.core.depth import depths_at
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.prompts import Prompt, check_apart, check_prompt
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.images import read_image, save_png
+from p2p_lib.datasets.sequence import Sequence
 
 _FORM = '{"objects": [{"name": "mug", "frame": 0, "points": [[x, y], ...]}]}'
-
-
-@dataclass(frozen=True, eq=False)
-class Prompt:
-    """The clicks on one object: points_px (N, 2) float64 in the frame of this index."""
-
-    name: str
-    frame: int
-    points_px: np.ndarray
-
-    def __post_init__(self) -> None:
-        who = f"prompt of {self.name!r}"
-        if not isinstance(self.name, str) or not self.name:
-            raise BadInput("prompt", f"the name {self.name!r}", "a word")
-        if isinstance(self.frame, bool) or not isinstance(self.frame, int) or self.frame < 0:
-            raise BadInput(who, f"frame {self.frame!r}", "a whole number from 0")
-        try:
-            points = np.array(self.points_px, float)
-        except (TypeError, ValueError):
-            points = np.zeros(0)
-        if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not np.isfinite(points).all():
-            raise BadInput(who, f"points {str(self.points_px)[:60]}", "at least one [x, y] in pixels")
-        object.__setattr__(self, "points_px", points)
+_KEYS = {"name", "frame", "points", "negative", "box", "mask"}
+#: Clicks that are drawn from a mask lie within this share of its inscribed circle.
+_WELL_INSIDE = 0.6
+#: A mask that grows by more than this from frame to frame belongs to an object still coming into view.
+_GROWTH = 1.1
 
 
 def load_prompts(path: str | Path) -> tuple[Prompt, ...]:
-    """The prompts of a file, one per object.
+    """The prompts of a file.
 
     Raises :class:`MissingData` where there is no file, :class:`BadInput` where it does not fit.
     """
@@ -53,54 +44,125 @@ def load_prompts(path: str | Path) -> tuple[Prompt, ...]:
     except (ValueError, OSError) as error:
         raise BadInput(str(path), f"unreadable JSON ({error})", _FORM) from None
     try:
-        return parse_prompts(content)
+        return parse_prompts(content, path.parent)
     except BadInput as error:
         raise BadInput(f"{path}: {error.name}", error.got, error.expected, error.fix) from None
 
 
-def parse_prompts(content: object) -> tuple[Prompt, ...]:
-    """The prompts in the plain values of a JSON file; :class:`BadInput` where they do not fit."""
+def parse_prompts(content: object, folder: Path | None = None) -> tuple[Prompt, ...]:
+    """The prompts in the plain values of a JSON file; :class:`BadInput` where they do not fit.
+
+    folder  where the images of masks lie; None allows no masks
+    """
     objects = content.get("objects") if isinstance(content, dict) else None
     if not isinstance(objects, list) or not objects:
         raise BadInput("prompts", str(content)[:60], _FORM)
-    prompts = []
-    for given in objects:
-        if not isinstance(given, dict) or not {"name", "points"} <= given.keys() <= {"name", "frame", "points"}:
-            raise BadInput("prompts", f"the object {str(given)[:60]}", _FORM)
-        prompts.append(Prompt(given["name"], given.get("frame", 0), given["points"]))
-    names = [p.name for p in prompts]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise BadInput("prompts", f"{twice[0]!r} twice", "one entry per object, with all its points")
+    prompts = [_prompt(given, folder) for given in objects]
+    said = [(p.name, p.frame) for p in prompts]
+    if twice := [f"{name!r} in frame {frame}" for name, frame in said if said.count((name, frame)) > 1]:
+        raise BadInput("prompts", f"{twice[0]} twice", "one entry per object and frame, with all its points")
     return tuple(prompts)
 
 
-def clicks_by_frame(prompts: Iterable[Prompt], frames: range, camera: Camera) -> dict[int, dict[str, np.ndarray]]:
-    """Frame to the clicks (N, 2) in it by object.
+def _prompt(given: Any, folder: Path | None) -> Prompt:
+    """An entry of a file."""
+    if not isinstance(given, dict) or not {"name"} < given.keys() <= _KEYS:
+        raise BadInput("prompts", f"the object {str(given)[:60]}", _FORM)
+    mask = None
+    if given.get("mask") is not None:
+        if folder is None or not isinstance(given["mask"], str):
+            raise BadInput(f"mask of {given['name']!r}", repr(given["mask"])[:60], "an image beside the prompts")
+        mask = read_image(folder / given["mask"], cv2.IMREAD_GRAYSCALE, "a mask image") > 0
+    fields = {"points_px": given.get("points"), "negative_px": given.get("negative"), "box_px": given.get("box")}
+    fields = {key: value for key, value in fields.items() if value is not None}
+    return Prompt(given["name"], given.get("frame", 0), **fields, mask=mask)
 
-    Raises :class:`BadInput` for a click in no frame, outside the image, or on two objects.
+
+def prompts_by_frame(
+    prompts: Iterable[Prompt], frames: range, camera: Camera, started: Iterable[str] = ()
+) -> dict[int, tuple[Prompt, ...]]:
+    """The prompts of each frame, checked; objects that are ``started`` otherwise may only be corrected.
+
+    Raises :class:`BadInput` for one of no frame, outside the image, or on two objects, and for an object whose first
+    says only what is not it.
     """
-    clicked: dict[int, dict[str, np.ndarray]] = {}
-    for prompt in prompts:
+    found: dict[int, tuple[Prompt, ...]] = {}
+    known = set(started)
+    for prompt in sorted(prompts, key=lambda p: p.frame):
+        who = f"prompt of {prompt.name!r}"
         if prompt.frame not in frames:
-            expected = f"a frame from {frames[0]} to {frames[-1]}"
-            raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", expected)
-        clicks = check_clicks(prompt.name, prompt.points_px, camera)
-        check_apart(prompt.name, clicks, clicked.setdefault(prompt.frame, {}))
-        clicked[prompt.frame][prompt.name] = clicks
-    return clicked
+            raise BadInput(who, f"frame {prompt.frame}", f"a frame from {frames[0]} to {frames[-1]}")
+        check_prompt(prompt, camera)
+        check_apart(found.setdefault(prompt.frame, ()), prompt)
+        found[prompt.frame] += (prompt,)
+        if not prompt.starts and prompt.name not in known:
+            fix = "Click on it in that frame or before."
+            raise BadInput(who, f"nothing on it in frame {prompt.frame}", "a click, a box or a mask first", fix)
+        known.add(prompt.name)
+    return found
 
 
 def prompts_in(masks: Mapping[str, np.ndarray], frame: int = 0) -> tuple[Prompt, ...]:
     """One click in each mask (H, W) that is not empty, where it is farthest from the rim: where one would click."""
-    depths = {name: cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 5) for name, m in masks.items() if m.any()}
-    places = {name: np.unravel_index(int(depth.argmax()), depth.shape)[::-1] for name, depth in depths.items()}
-    return tuple(Prompt(name, frame, np.array([place], float)) for name, place in places.items())
+    found = {name: _deepest(mask)[0] for name, mask in masks.items() if mask.any()}
+    return tuple(Prompt(name, frame, np.array([at], float)) for name, at in found.items())
+
+
+def first_prompts(
+    sequence: Sequence, frames: range, objects: Iterable[str], min_px: int, clicks: int, rng: np.random.Generator
+) -> tuple[Prompt, ...]:
+    """What starts each object, of its first usable mask: one large enough, which has stopped growing.
+
+    clicks  so many pixels of it, drawn well inside where depth is measured; 0: the mask itself
+    """
+    found: dict[str, Prompt] = {}
+    before: dict[str, int] = {}
+    wanted = set(objects)
+    for i in frames:
+        masks = {name: mask for name, mask in (sequence.masks(i) or {}).items() if name in wanted - found.keys()}
+        for name, mask in sorted(masks.items()):
+            pixels = int(mask.sum())
+            if pixels >= min_px and pixels <= _GROWTH * before.get(name, pixels):
+                points = _drawn(mask, sequence.frame(i), clicks, rng) if clicks else np.zeros((0, 2))
+                if len(points) == clicks:
+                    found[name] = Prompt(name, i, points, mask=None if clicks else mask)
+            before[name] = pixels
+        if wanted <= found.keys():
+            break
+    return tuple(found.values())
+
+
+def _deepest(mask: np.ndarray) -> tuple[np.ndarray, float]:
+    """The pixel (2,) of a mask that is farthest from its rim, and how far."""
+    depth = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    v, u = np.unravel_index(int(depth.argmax()), depth.shape)
+    return np.array([u, v]), float(depth.max())
+
+
+def _drawn(mask: np.ndarray, frame: Frame, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, 2) pixels with depth, the first at the mask's deepest place; fewer where there are none."""
+    at, radius = _deepest(mask)
+    v, u = np.nonzero(mask)
+    px = np.stack([u, v], -1)
+    away = np.linalg.norm(px - at, axis=1)
+    near = (away <= max(_WELL_INSIDE * radius, 1)) & np.isfinite(depths_at(px, frame, 0))
+    px = px[near][np.argsort(away[near], kind="stable")]
+    if len(px) < count:
+        return px[:0].astype(float)
+    return px[[0, *(1 + rng.choice(len(px) - 1, count - 1, replace=False))]].astype(float)
 
 
 def save_prompts(path: str | Path, prompts: Iterable[Prompt]) -> Path:
-    """Write prompts as :func:`load_prompts` reads them."""
+    """Write prompts as :func:`load_prompts` reads them; their masks as images beside the file."""
     path = Path(path)
-    objects = [{"name": p.name, "frame": p.frame, "points": p.points_px.tolist()} for p in prompts]
     path.parent.mkdir(parents=True, exist_ok=True)
+    objects = []
+    for prompt in prompts:
+        plain = prompt.as_dict()
+        if prompt.mask is not None:
+            del plain["mask_px"]
+            plain["mask"] = f"{path.stem}_{prompt.name}_{prompt.frame}.png"
+            save_png(path.parent / plain["mask"], prompt.mask)
+        objects.append(plain)
     path.write_text(json.dumps({"objects": objects}, indent=1) + "\n", encoding="utf-8")
     return path

@@ -12,7 +12,7 @@ The tracker's object frame is its own choice, so one rigid constant T_obj_model 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from p2p_lib.datasets.models import given_models, load_points
 from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.alignment import ALIGNMENTS, align_first
+from p2p_lib.evaluation.recovery import RecoveryEvent, recovery_events, returns_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -36,8 +37,10 @@ HEADS = {
     "adds_auc_voc": "ADD-S AUC, VOC [%]",
     "add_auc_voc": "ADD AUC, VOC [%]",
 }
+#: Sources of masks that do not tell when an object is back.
+NOT_TOLD = ("clicks", "first")
 #: What a score says of the run.
-WHAT_RAN = ("tracker", "masks", "preset", "seed")
+WHAT_RAN = ("tracker", "masks", "segmenter", "preset", "seed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +51,7 @@ class ObjectScore:
     add_m, adds_m        (m,) metres; infinite where there was no pose
     T_obj_model          (4, 4) the constant that the alignment fixed; NaN where there was never a pose
     lost                 scored frames without a pose
+    returns              each return after an absence, see :mod:`p2p_lib.evaluation.recovery`
     """
 
     frame_index: np.ndarray
@@ -56,9 +60,10 @@ class ObjectScore:
     adds_m: np.ndarray
     T_obj_model: np.ndarray
     lost: int
+    returns: tuple[RecoveryEvent, ...] = ()
 
-    def as_dict(self) -> dict[str, float | int]:
-        """The four areas under the curve, frames scored, frames lost."""
+    def as_dict(self) -> dict[str, Any]:
+        """The four areas under the curve, frames scored, frames lost, and the frames to recovery of each return."""
         return {
             "add_auc": metrics.auc_exact(self.add_m),
             "adds_auc": metrics.auc_exact(self.adds_m),
@@ -66,6 +71,7 @@ class ObjectScore:
             "adds_auc_voc": metrics.auc_voc(self.adds_m),
             "frames": len(self.add_m),
             "lost": self.lost,
+            "frames_to_recovery": [event.frames_to_recovery for event in self.returns],
         }
 
 
@@ -100,6 +106,10 @@ class Evaluation:
     def as_table(self) -> str:
         """The same for people, with the reason for what is not there."""
         lines = [tables.as_text(self.as_frame())]
+        returns = [f"{name}: {returns_of(score.returns)}" for name, score in self.objects.items() if score.returns]
+        if returns and self.info.get("masks") not in NOT_TOLD:
+            returns.append("The masks that were given tell when an object is back: see it from --masks clicks.")
+        lines += returns
         lines += [f"{name}: not scored, {reason}" for name, reason in self.left_out.items()]
         if self.hz is not None:
             lines.append(f"{self.hz:.1f} Hz, 95 % of the frames within {self.p95_ms:.1f} ms")
@@ -152,7 +162,7 @@ def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) ->
     if has_pose.any():
         T_obj_model = ALIGNMENTS[align](T_cam_obj[has_pose], T_cam_model[has_pose], points)
     T_pred = T_cam_obj @ T_obj_model
-    return ObjectScore(
+    scores = ObjectScore(
         frame_index=obj.frame_index[scored],
         time_s=obj.time_s[scored],
         add_m=metrics.add_m(T_pred, T_cam_model, points),
@@ -160,6 +170,7 @@ def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) ->
         T_obj_model=T_obj_model,
         lost=int((~has_pose).sum()),
     )
+    return replace(scores, returns=tuple(recovery_events(obj, scores)))
 
 
 def model_frames(run: Run) -> dict[str, np.ndarray]:

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from p2p_lib.datasets.runs import ObjectRun
-from p2p_lib.evaluation.protocol import ObjectScore, scored_frames
+
+if TYPE_CHECKING:
+    from p2p_lib.evaluation.protocol import ObjectScore
 
 MIN_HIDDEN_FRAMES = 10
 MAX_ADDS_M = 0.02
@@ -34,8 +37,8 @@ class RecoveryEvent:
 
 
 def recovery_events(obj: ObjectRun, score: ObjectScore) -> list[RecoveryEvent]:
-    """The returns of one object in a run, by the rule that also decides which frames are scored."""
-    visible = scored_frames(obj)
+    """The returns of one object in a run; it is visible in the frames that are scored."""
+    visible = np.isin(obj.frame_index, score.frame_index)
     adds_m = np.full(len(obj), np.inf)
     adds_m[visible] = score.adds_m
     seen = np.flatnonzero(visible)
@@ -56,3 +59,10 @@ def recovered_within(frames_to_recovery: Iterable[int | None], within: Iterable[
     """For each N, the number of returns after which the object was recovered within N frames."""
     delays = [delay for delay in frames_to_recovery if delay is not None]
     return {n: sum(delay <= n for delay in delays) for n in within}
+
+
+def returns_of(events: Iterable[RecoveryEvent]) -> str:
+    """The returns of an object for people."""
+    delays = [event.frames_to_recovery for event in events]
+    after = ", ".join("never" if delay is None else str(delay) for delay in delays)
+    return f"{len(delays)} returns after an absence, found again after {after} frames"

@@ -14,7 +14,6 @@ from p2p_lib.core import se3
 from p2p_lib.core.tables import as_html, as_markdown
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
-from p2p_lib.evaluation.recovery import recovery_events
 
 
 def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
@@ -25,7 +24,7 @@ def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
     rows = []
     for name, score in evaluation.objects.items():
         obj = run.objects[name]
-        for event in recovery_events(obj, score):
+        for event in score.returns:
             gone, back = np.searchsorted(obj.frame_index, [event.hidden_frame, event.return_frame])
             T_before, T_after = obj.T_cam_model[gone - 1], obj.T_cam_model[back]
             row = {

@@ -17,6 +17,8 @@ from p2p_lib.core.types import WITH_POSE, Status
 
 #: A return has to be confirmed for so many frames, and is marked as recovered meanwhile.
 CONFIRM_FRAMES = 5
+#: Shape and colour have found an object where this share of its surface shows.
+SIGHTED, SIGHTED_STILL = 0.5, 0.3
 
 
 @dataclass(frozen=True)
@@ -25,10 +27,12 @@ class Evidence:
 
     support        keypoints that agree with it
     surface_share  share of the depth points that lie on the surface under it; None where no surface was asked
+    sighting       share of the surface that shows in the image where and as it should; None where nobody has looked
     """
 
     support: int
     surface_share: float | None
+    sighting: float | None = None
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,7 @@ class Lifecycle:
     T_previous      pose of the frame before it; None after a gap
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
+    T_world_obj     newest pose in the scene, where the camera was known; None before
     start_px        pixels of the newest mask before the first pose; None without a mask
     """
 
@@ -59,6 +64,7 @@ class Lifecycle:
     T_previous: np.ndarray | None = None
     T_left: np.ndarray | None = None
     confirming: int = 0
+    T_world_obj: np.ndarray | None = None
     start_px: int | None = None
 
     @property
@@ -79,6 +85,18 @@ class Lifecycle:
         if self.T_previous is not None:
             priors["constant velocity"] = self.T_cam_obj @ se3.inverse(self.T_previous) @ self.T_cam_obj
         return priors
+
+    def scene_prior(self, T_world_cam: np.ndarray | None) -> dict[str, np.ndarray]:
+        """Where an absent object is if it has lain still: origin to T_cam_obj; empty where nobody knows."""
+        if self.has_pose or T_world_cam is None or self.T_world_obj is None:
+            return {}
+        return {"scene": se3.orthonormalised(se3.inverse(T_world_cam) @ self.T_world_obj)}
+
+    def placed(self, T_world_cam: np.ndarray | None) -> Lifecycle:
+        """The state with the newest pose's place in the scene, once a return has been confirmed."""
+        if T_world_cam is None or self.confirming:
+            return self
+        return replace(self, T_world_obj=T_world_cam @ self.T_cam_obj)
 
     def moved_from_last(self, T_cam_obj: np.ndarray) -> tuple[float, float] | None:
         """Metres and degrees from the pose of the frame before to another (4, 4); None after a gap."""
@@ -120,7 +138,8 @@ class Lifecycle:
 
 
 def _few_points_on_return(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
-    few = life.unconfirmed and evidence.support < config.return_inliers
+    enough = SIGHTED_STILL if life.has_pose else SIGHTED
+    few = life.unconfirmed and evidence.support < config.return_inliers and (evidence.sighting or 0.0) < enough
     return f"only {evidence.support} points agree on a return" if few else ""
 
 

@@ -14,6 +14,7 @@ from p2p_lib.method.factor_graph import ObjectGraph
 from p2p_lib.method.keyframe_views import KeyframeViews
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.observation import Observation, Observer
+from p2p_lib.method.search import SurfaceSample
 
 if TYPE_CHECKING:
     from p2p_lib.method.tsdf import TsdfVolume
@@ -62,6 +63,7 @@ class ObjectModel:
         self._observer, self._stopwatch = observer, stopwatch
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
         self._since_keyframe, self._next_key = 0, 0
+        self._sample: SurfaceSample | None = None  # of the surface as it is
 
     @property
     def empty(self) -> bool:
@@ -72,6 +74,13 @@ class ObjectModel:
     def has_surface(self) -> bool:
         """Whether depth can be compared with a surface."""
         return self.surface is not None and not self.surface.empty
+
+    @property
+    def sample(self) -> SurfaceSample:
+        """Points of the surface, for the search by shape and colour."""
+        if self._sample is None:
+            self._sample = SurfaceSample.of(self.surface)
+        return self._sample
 
     def noise_m(self, p_cam: np.ndarray) -> np.ndarray | None:
         """(N,) standard deviation of measured points by the sensor's model; None where one noise is assumed for all."""
@@ -126,6 +135,7 @@ class ObjectModel:
                 vertex, T_cam_obj = self._optimise(T_cam_obj, np.concatenate([old_keys, keys]), p_cam, covariance)
         self.views.add(registered)
         self._since_keyframe = 0
+        self._sample = None
         if self.surface is not None:
             with self._stopwatch("fusion"):
                 measured, frame = self._observer.measured(obs), obs.frame

@@ -19,12 +19,13 @@ from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method import refinement, registration, selection
 from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import GATES, Evidence, Lifecycle, Verdict
+from p2p_lib.method.lifecycle import GATES, SIGHTED, Evidence, Lifecycle, Verdict
 from p2p_lib.method.object_model import NewPoints, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.refinement import Keypoints, Refinement, surface_distance
 from p2p_lib.method.registration import Hypothesis
 from p2p_lib.method.sampling import choose, usable_region
+from p2p_lib.method.search import ImageSearch, Sighting
 
 #: With fewer visible keypoints, pending ones help to register (the release's).
 _FEW_KEYPOINTS = 12
@@ -34,10 +35,11 @@ _GROWTH = 1.1
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A hypothesis, and its pose refined on the surface once that has been done."""
+    """A hypothesis, its pose refined on the surface, and how much of the surface shows there, once they are known."""
 
     hypothesis: Hypothesis
     refined: Refinement | None = None
+    sighting: float | None = None
 
     @property
     def T_cam_obj(self) -> np.ndarray:
@@ -47,7 +49,7 @@ class Candidate:
     @property
     def evidence(self) -> Evidence:
         """What speaks for it."""
-        return Evidence(self.hypothesis.support, self.refined.inliers if self.refined.refined else None)
+        return Evidence(self.hypothesis.support, self.refined.inliers if self.refined.refined else None, self.sighting)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +86,17 @@ class ObjectTracker:
 
     # -- the step ------------------------------------------------------------------------------
 
-    def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
+    def observe(
+        self, frame: Frame, mask: np.ndarray | None, tracks: Tracks, sighting: Sighting | None = None
+    ) -> Observation:
         """The object's share of a frame; mask (H, W) bool, None where it is not known, and everybody's tracks."""
         with self._stopwatch("observation"):
-            return self.observer.observe(frame, mask, tracks.select(self.map.ids))
+            sighted = None if sighting is None else sighting.T_cam_obj
+            return self.observer.observe(frame, mask, tracks.select(self.map.ids), sighted)
+
+    def seen_anew(self, obs: Observation, tracks: Tracks) -> Observation:
+        """The observation again, with tracks that have been added to."""
+        return self.observer.observe(obs.frame, obs.mask, tracks.select(self.map.ids), obs.sighted)
 
     def step(self, obs: Observation) -> ObjectStep:
         """The object's pose at a frame. The paper selects a hypothesis and refines that one; ours refines all first."""
@@ -97,7 +106,7 @@ class ObjectTracker:
             return self._without_pose(obs, Status.OCCLUDED, f"{int(obs.mask.sum())} mask pixels")
         candidates = [Candidate(hypothesis) for hypothesis in self._register(obs)]
         if self.config.selection.rule == "support":
-            candidates = self._refine(obs, candidates)
+            candidates = self._look_again(obs, self._refine(obs, candidates))
         best, reason = self._select(obs, candidates)
         if best is None:
             nothing = obs.mask is None and not obs.seen.any()
@@ -120,6 +129,8 @@ class ObjectTracker:
             if use.sum() < _FEW_KEYPOINTS:
                 use = certain
             priors = self.life.motion_priors() if with_motion else {}
+            if not priors and obs.sighted is not None:
+                priors = {"sighting": obs.sighted}
             found = self._hypotheses(obs, use, priors)
             most = max((h.support for h in found), default=0)
             if priors and cfg.method != "svd" and most < cfg.contradicted * use.sum():
@@ -167,6 +178,9 @@ class ObjectTracker:
     def _select(self, obs: Observation, candidates: list[Candidate]) -> tuple[Candidate | None, str]:
         """The candidate to go on with, and why."""
         with self._stopwatch("selection"):
+            few = max((c.hypothesis.support for c in candidates), default=0) < self.config.lifecycle.return_inliers
+            if few and any(c.sighting is not None for c in candidates):
+                return max(candidates, key=lambda c: c.sighting or 0.0), "most of the surface shows"
             poses, distance_m, weight = [c.T_cam_obj for c in candidates], None, None
             if len(poses) > 1 and self.model.has_surface and len(obs.cloud):
                 distance_m = refinement.surface_distances(self.model.surface, obs.cloud, np.stack(poses))
@@ -175,6 +189,22 @@ class ObjectTracker:
             hypotheses = [c.hypothesis for c in candidates]
             row, reason = selection.select(hypotheses, distance_m, self.config.selection, weight)
             return (None if row is None else candidates[row]), reason
+
+    def _look_again(self, obs: Observation, candidates: list[Candidate]) -> list[Candidate]:
+        """Candidates for a return, with how much of the surface shows in the image under each."""
+        if not (self.life.unconfirmed and self._searches):
+            return candidates
+        search = self._search(obs.frame)
+        found = [search.at(c.T_cam_obj, self.model.sample) for c in candidates]
+        return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
+
+    @property
+    def _searches(self) -> bool:
+        """Whether shape and colour have a say in a return."""
+        return self.config.method.scene and self.model.has_surface
+
+    def _search(self, frame: Frame) -> ImageSearch:
+        return ImageSearch(frame, self.observer.camera, self.config.depth)
 
     # -- extend --------------------------------------------------------------------------------
 
@@ -196,7 +226,7 @@ class ObjectTracker:
             good = obs.seen & (agrees | ~self.map.promoted)
             T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, self._sample(obs), good, of_frame, sure)
             requests = replace(asked, reject=requests.reject)
-        self.life = replace(life, T_cam_obj=T_cam_obj)
+        self.life = replace(life, T_cam_obj=T_cam_obj).placed(obs.frame.T_world_cam)
         of_pose = self._of_pose(T_cam_obj, of_frame, best)
         sure = confidence(of_pose, agreeing, agreement)
         return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, of_pose, keyframe), requests)
@@ -250,7 +280,7 @@ class ObjectTracker:
             T_cam_obj[:3, 3] = np.median(p_cam, 0)
         T_cam_obj, requests = self.model.insert_keyframe(obs, T_cam_obj, points, np.zeros(0, bool))
         verdict = Verdict(True, Status.DEGRADED if few else Status.TRACKED, f"only {len(points)} points" * few)
-        self.life = self.life.started(T_cam_obj, obs.frame.time_s, verdict.status)
+        self.life = self.life.started(T_cam_obj, obs.frame.time_s, verdict.status).placed(obs.frame.T_world_cam)
         # The first pose defines the object frame: it is right by definition, whatever the points are worth.
         estimate = self._estimate(obs, verdict, len(self.map), 1.0, self.model.covariance, True)
         return ObjectStep(estimate, requests)
@@ -295,9 +325,14 @@ class ObjectTracker:
 
     # -- questions of the pipeline -------------------------------------------------------------
 
+    @property
+    def away(self) -> bool:
+        """Whether an object that has been seen has no pose now."""
+        return not self.model.empty and not self.life.has_pose
+
     def awaited(self, mask: np.ndarray | None) -> bool:
         """Whether the object was hidden or lost until now and its mask says that it is back."""
-        return not self.model.empty and not self.life.has_pose and mask is not None and not self._hidden(mask)
+        return self.away and mask is not None and not self._hidden(mask)
 
     def misplaced(self, obs: Observation) -> Requests:
         """Tracks that an absent object has outside its mask, on a look-alike perhaps: to be looked for elsewhere."""
@@ -316,26 +351,48 @@ class ObjectTracker:
         best = max(self._register(obs), key=lambda h: h.support, default=None)
         if best is None:
             return None
-        keypoints = np.where(self.map.promoted[:, None], self.map.p_obj, np.nan)
-        return self.observer.expected_px(obs, best.T_cam_obj, keypoints)
+        return self.points_px(obs, best.T_cam_obj)
 
-    def hint(self, frame: Frame, tracks: Tracks) -> tuple[Hint, Requests]:
+    def sighted(self, obs: Observation) -> Sighting | None:
+        """Where an absent object shows by shape and colour, near where the scene or a few points propose it."""
+        if not (self.away and self._searches) or (obs.mask is not None and self._hidden(obs.mask)):
+            return None
+        proposed = [*self.life.scene_prior(obs.frame.T_world_cam).values()]
+        proposed += [hypothesis.T_cam_obj for hypothesis in self._register(obs)[:1]]
+        with self._stopwatch("search"):
+            search = self._search(obs.frame)
+            found = [search.about(T_cam_obj, self.model.sample) for T_cam_obj in proposed]
+            best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
+            return best if best is not None and best.share >= SIGHTED else None
+
+    def points_px(self, obs: Observation, T_cam_obj: np.ndarray) -> np.ndarray:
+        """(N, 2) where keypoints show under a pose; NaN where not."""
+        keypoints = np.where(self.map.promoted[:, None], self.map.p_obj, np.nan)
+        return self.observer.expected_px(obs, T_cam_obj, keypoints)
+
+    def hint(self, frame: Frame, tracks: Tracks, sighting: Sighting | None = None) -> tuple[Hint, Requests]:
         """Where this object should be, by its tracks and its model, before the frame is segmented.
 
         Also the tracks to reject: while the object is away, points that agree on no pose are somewhere else.
         """
         if self.model.empty:
             return Hint(), Requests()
-        obs, requests = self.observer.observe(frame, None, tracks.select(self.map.ids)), Requests()
-        best = max(self._register(obs), key=lambda h: h.support, default=None)
-        if not self.life.has_pose:
+        obs = self.observe(frame, None, tracks, sighting)
+        best, requests = max(self._register(obs), key=lambda h: h.support, default=None), Requests()
+        if self.away:
             agrees = np.zeros(len(self.map), bool) if best is None else best.inliers
             requests = Requests(reject=self.map.ids[obs.tracks.visible & ~agrees])
-            if best is None or best.support < self.config.lifecycle.return_inliers:
-                return Hint(), requests
+            enough = best is not None and best.support >= self.config.lifecycle.return_inliers
+            if sighting is not None and not enough:
+                uv_px = np.concatenate([obs.tracks.uv_px[agrees], sighting.uv_px])
+                return Hint(uv_px, self._distance_m(frame, sighting.T_cam_obj), True), requests
+            best = best if enough else None
         if best is None:
             return Hint(), requests
-        surface, distance_m = self.model.surface, None
-        if self.model.has_surface:
-            distance_m = surface_distance(surface, frame.depth_m, self.observer.camera, best.T_cam_obj)
-        return Hint(obs.tracks.uv_px[best.inliers], distance_m), requests
+        return Hint(obs.tracks.uv_px[best.inliers], self._distance_m(frame, best.T_cam_obj)), requests
+
+    def _distance_m(self, frame: Frame, T_cam_obj: np.ndarray) -> np.ndarray | None:
+        """(H, W) from the surface; None where there is none."""
+        if not self.model.has_surface:
+            return None
+        return surface_distance(self.model.surface, frame.depth_m, self.observer.camera, T_cam_obj)

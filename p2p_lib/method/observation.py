@@ -31,6 +31,7 @@ class Observation:
     tracks   of the map's points
     p_cam    (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
     cloud    (M, 3) depth points in the mask, camera frame
+    sighted  (4, 4) T_cam_obj where an absent object was found by shape and colour; None where it was not
     """
 
     frame: Frame
@@ -38,6 +39,7 @@ class Observation:
     tracks: Tracks
     p_cam: np.ndarray
     cloud: np.ndarray
+    sighted: np.ndarray | None = None
 
     @property
     def seen(self) -> np.ndarray:
@@ -60,7 +62,9 @@ class Observer:
     def __init__(self, camera: Camera, config: DepthConfig, cloud_points: int):
         self.camera, self.config, self.cloud_points = camera, config, cloud_points
 
-    def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
+    def observe(
+        self, frame: Frame, mask: np.ndarray | None, tracks: Tracks, sighted: np.ndarray | None = None
+    ) -> Observation:
         """The observation of an object whose points have these ``tracks``."""
         p_cam, cloud = np.full((len(tracks), 3), np.nan), np.zeros((0, 3))
         rows = np.flatnonzero(tracks.visible)
@@ -68,7 +72,7 @@ class Observer:
             rows = rows[in_mask(tracks.uv_px[rows], mask)]
             cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
         p_cam[rows] = self.lift(frame, tracks.uv_px[rows])
-        return Observation(frame, mask, tracks, p_cam, cloud)
+        return Observation(frame, mask, tracks, p_cam, cloud, sighted)
 
     def lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
         """(N, 3) points behind pixels (N, 2); NaN where there is no trustworthy depth."""
@@ -92,7 +96,8 @@ class Observer:
         uv_px = self.camera.project(p_cam)
         at = np.flatnonzero((p_cam[:, 2] > 0) & self.camera.inside(uv_px))
         u, v = np.rint(uv_px[at]).astype(int).T
-        at = at[obs.mask[v, u] & (np.abs(obs.frame.depth_m[v, u] - p_cam[at, 2]) < _HIDDEN_M)]
+        inside = True if obs.mask is None else obs.mask[v, u]
+        at = at[inside & (np.abs(obs.frame.depth_m[v, u] - p_cam[at, 2]) < _HIDDEN_M)]
         expected = np.full_like(uv_px, np.nan)
         expected[at] = uv_px[at]
         return expected

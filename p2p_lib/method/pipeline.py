@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,18 +24,22 @@ from p2p_lib.core.backends import (
     make_tracker,
 )
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import check_apart, check_clicks, check_depth
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_mask, check_prompt
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
 from p2p_lib.method.object_model import NO_IDS, Requests
 from p2p_lib.method.object_tracker import ObjectTracker
 from p2p_lib.method.observation import Observation
+from p2p_lib.method.scene import Scene
+from p2p_lib.method.search import Sighting
 
 #: Object to (H, W) bool; None where nobody knows.
 Masks = dict[str, np.ndarray | None]
+#: The camera is located every so many frames while all objects have poses.
+_LOCATE_EVERY = 5
 NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
@@ -56,39 +61,67 @@ class Point2Pose:
         self.detector = make_detector(detector, self.config.sampling, self._rng)
         rng = np.random.default_rng([self.config.seed, 1])
         self.segmenter = make_segmenter(segmenter, camera, self.config.segmentation, rng)
+        scene_rng = np.random.default_rng([self.config.seed, 2])
+        self.scene = Scene(camera, self.config.depth, scene_rng) if self.config.method.scene else None
         self.objects: dict[str, ObjectTracker] = {}
         self.masks: Masks = {}
         self.tracks = NOTHING_TRACKED
         self.stopwatch = Stopwatch()
-        self._first_masks: dict[str, np.ndarray] = {}
         self._streaming = False
-        self._first_clicks: dict[str, np.ndarray] = {}
-        self._clicked: set[str] = set()  # the objects that the segmenter looks after
-        self._waiting: deque[tuple[Frame, Masks, dict[str, np.ndarray]]] = deque()  # frames without an answer yet
+        self._unlocated = _LOCATE_EVERY
+        self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
+        self._waiting: deque[tuple[Frame, Masks, dict[str, Prompt]]] = deque()  # frames without an answer yet
 
-    def add_object(self, name: str, mask: np.ndarray | None = None, clicks: ArrayLike | None = None) -> None:
-        """Follow one more object from the next frame on.
+    def add_object(
+        self,
+        name: str,
+        mask: np.ndarray | None = None,
+        clicks: ArrayLike | None = None,
+        negative: ArrayLike | None = None,
+        box: ArrayLike | None = None,
+    ) -> None:
+        """Follow one more object from the next frame on. The segmenter finds it in every frame that brings no mask.
 
-        mask    (H, W) bool: where it is in the next frame
-        clicks  (N, 2) pixels on the object in the next frame: the segmenter finds its mask there and in
-                every frame to come. :class:`BadInput` for clicks outside the image or on another object's
-                click; ``step`` raises it for clicks where there is no depth
-        With neither the object is started by the first mask that ``step`` gets for it.
+        mask      (H, W) bool: its pixels in the next frame
+        clicks    (N, 2) pixels on it in the next frame; ``negative`` (M, 2) are not of it
+        box       (4,) left, top, right, bottom: all of it is inside in the next frame
+
+        With none of them it is started by the first mask that ``step`` gets for it. Raises :class:`BadInput` for what
+        does not fit, and nothing has changed; ``step`` raises it for clicks where there is no depth.
         """
         if name in self.objects:
             raise BadInput("add_object", repr(name), "a name not in use", f"In use: {', '.join(self.objects)}.")
-        if mask is not None and clicks is not None:
-            raise BadInput(f"object {name!r}", "a mask and clicks", "one of them")
-        if mask is not None:
-            self._first_masks[name] = self._checked(name, mask)
-            if not self._first_masks[name].any():
-                del self._first_masks[name]
-                raise BadInput(f"mask of {name!r}", "an empty mask", "at least one pixel of the object")
-        if clicks is not None:
-            clicks = check_clicks(name, clicks, self.camera)
-            check_apart(name, clicks, self._first_clicks)
-            self._first_clicks[name] = clicks
-            self._clicked.add(name)
+        if mask is clicks is negative is box is None:
+            self._begin(name)
+        else:
+            self.tell(_prompt(name, mask, clicks, negative, box))
+
+    def correct(
+        self,
+        name: str,
+        mask: np.ndarray | None = None,
+        clicks: ArrayLike | None = None,
+        negative: ArrayLike | None = None,
+        box: ArrayLike | None = None,
+    ) -> None:
+        """Mend an object's mask in the next frame; arguments as of :meth:`add_object`. The last correction counts."""
+        if name not in self.objects:
+            raise BadInput("correct", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+        self.tell(_prompt(name, mask, clicks, negative, box))
+
+    def tell(self, prompt: Prompt) -> None:
+        """What is said of an object in the next frame, whichever that is: starts the object, or corrects its mask."""
+        name, known = prompt.name, self.segmenter.names
+        check_prompt(prompt, self.camera)
+        check_apart((other for other in self._said.values() if other.name != name), prompt)
+        if name not in known and not prompt.starts:
+            what = "an empty mask" if prompt.mask is not None else "clicks beside it alone"
+            raise BadInput(f"object {name!r}", what, "a click on it, a box or at least one pixel of its mask")
+        if name not in self.objects:
+            self._begin(name)
+        self._said[name] = prompt
+
+    def _begin(self, name: str) -> None:
         self.objects[name] = ObjectTracker(
             name,
             self.camera,
@@ -104,24 +137,24 @@ class Point2Pose:
             raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
         if len(ids := self.objects.pop(name).map.ids):
             self.tracker.drop(ids)
-        self._first_masks.pop(name, None)
-        self._first_clicks.pop(name, None)
-        self._clicked.discard(name)
+        self._said.pop(name, None)
         if name in self.segmenter.names:
             self.segmenter.remove(name)
 
     def step(self, frame: Frame, masks: Mapping[str, np.ndarray] | None = None) -> dict[str, PoseEstimate]:
         """One frame in, one estimate per object out.
 
-        masks  object -> (H, W) bool, the visible pixels of objects that have no clicks. One that is left out is
-               hidden in this frame; None says that nobody knows, and those objects go by their points alone.
+        masks  object -> (H, W) bool, its visible pixels, which are taken as they are; an empty mask says that it is
+               hidden. The segmenter looks after the objects that are left out.
 
         Where the 2D tracker answers late, so does this: the estimates are of the frame ``latency_frames`` ago,
         as each says, and there are none for the first of the stream until then. ``self.masks`` keeps the masks
         that they were made with, the segmenter's included, and ``self.tracks`` everybody's 2D tracks.
         """
         with self.stopwatch.frame():
-            return self._advance(frame, self._given(frame, masks), self._taken_clicks())
+            given = self._given(frame, masks or {})
+            said, self._said = self._said, {}
+            return self._advance(frame, given, said)
 
     def finish(self) -> Iterator[dict[str, PoseEstimate]]:
         """After the last frame: the estimates still owed, oldest first. None are unless the tracker answers late."""
@@ -134,34 +167,64 @@ class Point2Pose:
                 yield estimates
         self._waiting.clear()
 
-    def _advance(self, frame: Frame, masks: Masks, clicks: dict[str, np.ndarray]) -> dict[str, PoseEstimate]:
+    def _advance(self, frame: Frame, masks: Masks, said: dict[str, Prompt]) -> dict[str, PoseEstimate]:
         """Track into a frame, then segment and estimate at the frame that the tracks are of."""
         tracks = self._track(frame, masks)
-        self._waiting.append((frame, masks, clicks))
+        self._waiting.append((frame, masks, said))
         if len(self._waiting) <= self.tracker.latency_frames:
             return {}
-        frame, masks, clicks = self._waiting.popleft()
-        self.tracks, self.masks = tracks, masks | self._segment(frame, tracks, clicks)
+        frame, masks, said = self._waiting.popleft()
+        frame = self._located(frame)
         # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
         objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
-        seen = {name: obj.observe(frame, self.masks[name], tracks) for name, obj in objects.items()}
+        self.tracks = tracks
+        sightings = self._sightings(frame, masks, objects)
+        self.masks = self._segment(frame, masks, said, sightings)
+        seen = {
+            name: obj.observe(frame, self.masks[name], self.tracks, sightings.get(name))
+            for name, obj in objects.items()
+        }
         self._apply({name: obj.misplaced(seen[name]) for name, obj in objects.items()})
         seen |= self._redetect(seen)
         steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
         self._apply({name: step.requests for name, step in steps.items()})
         return {name: steps[name].estimate for name in self.objects if name in steps}
 
+    def _located(self, frame: Frame) -> Frame:
+        """The frame with the camera's pose, as far as it is known: often while an object is away, else now and then."""
+        self._unlocated += 1
+        every = 1 if any(obj.away for obj in self.objects.values()) else _LOCATE_EVERY
+        if self.scene is None or frame.T_world_cam is not None or self._unlocated < every:
+            return frame
+        self._unlocated = 0
+        with self.stopwatch("scene"):
+            known = [mask for mask in self.masks.values() if mask is not None]
+            occupied = np.logical_or.reduce(known) if known else None
+            return replace(frame, T_world_cam=self.scene.locate(frame, occupied))
+
+    def _sightings(self, frame: Frame, masks: Masks, objects: Mapping[str, ObjectTracker]) -> dict[str, Sighting]:
+        """Absent objects that show again by shape and colour; the tracker looks for their points there."""
+        seen = {name: obj.observe(frame, masks[name], self.tracks) for name, obj in objects.items() if obj.away}
+        looked = {name: objects[name].sighted(obs) for name, obs in seen.items()}
+        found = {name: sighting for name, sighting in looked.items() if sighting is not None}
+        self._suggest({name: objects[name].points_px(seen[name], at.T_cam_obj) for name, at in found.items()})
+        return found
+
+    def _suggest(self, expected_px: Mapping[str, np.ndarray]) -> None:
+        """Have the tracker look for points where their objects expect them, unless it answers late."""
+        if self.tracker.latency_frames:
+            return
+        with self.stopwatch("tracking"):
+            for name, uv_px in expected_px.items():
+                found = self.tracker.suggest(self.objects[name].map.ids, uv_px)
+                self.tracks = self.tracks if found is None else found
+
     def _redetect(self, seen: Mapping[str, Observation]) -> dict[str, Observation]:
         """Guided re-detection: the tracker looks for points where their objects expect them; what is seen then."""
-        if self.tracker.latency_frames:
-            return {}
-        expected = {name: self.objects[name].expected_px(obs) for name, obs in seen.items()}
-        with self.stopwatch("tracking"):
-            for name, uv_px in expected.items():
-                found = None if uv_px is None else self.tracker.suggest(self.objects[name].map.ids, uv_px)
-                self.tracks = self.tracks if found is None else found
-        sought = [name for name, uv_px in expected.items() if uv_px is not None]
-        return {name: self.objects[name].observe(seen[name].frame, seen[name].mask, self.tracks) for name in sought}
+        looked = {name: self.objects[name].expected_px(obs) for name, obs in seen.items()}
+        expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}
+        self._suggest(expected)
+        return {name: self.objects[name].seen_anew(seen[name], self.tracks) for name in expected}
 
     def _apply(self, requests: Mapping[str, Requests]) -> None:
         """The one place where the shared tracker is changed, after all objects have been looked at."""
@@ -176,38 +239,40 @@ class Point2Pose:
             if len(dropped):
                 self.tracker.drop(dropped)
 
-    def _given(self, frame: Frame, masks: Mapping[str, np.ndarray] | None) -> Masks:
-        """Every object's checked mask in this frame; None for one of which nobody knows (yet)."""
+    def _given(self, frame: Frame, masks: Mapping[str, np.ndarray]) -> Masks:
+        """Every object's checked mask in this frame; None for one that the segmenter has to find."""
         if frame.shape != (self.camera.height, self.camera.width):
             got = f"{frame.shape[1]}x{frame.shape[0]}"
             raise BadInput(f"frame {frame.index}", got, f"{self.camera.width}x{self.camera.height} as the camera")
-        if unknown := sorted(set(masks or {}) - set(self.objects)):
+        if unknown := sorted(set(masks) - set(self.objects)):
             known = ", ".join(self.objects) or "none yet"
             raise BadInput("masks", f"unknown object {unknown[0]!r}", f"objects added before: {known}")
-        if twice := sorted(set(masks or {}) & self._clicked):
-            raise BadInput(f"mask of {twice[0]!r}", "a mask of an object with clicks", "masks of the others alone")
-        for name, clicks in self._first_clicks.items():
-            check_depth(name, clicks, frame)
-        hidden = None if masks is None else np.zeros(frame.shape, bool)
-        given = self._first_masks | {name: self._checked(name, mask) for name, mask in (masks or {}).items()}
-        self._first_masks = {}
-        return {name: given.get(name, None if name in self._clicked else hidden) for name in self.objects}
+        given = {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items()}
+        for name, prompt in given.items():
+            check_mask(name, prompt.mask, self.camera)
+        for name, prompt in self._said.items():
+            check_depth(prompt, frame)
+            if name in given and prompt.mask is None:
+                fix = "Leave it out of the masks, or do not click on it."
+                raise BadInput(f"mask of {name!r}", f"a mask and clicks in frame {frame.index}", "one of them", fix)
+        given = {name: prompt for name, prompt in self._said.items() if prompt.mask is not None} | given
+        return {name: given[name].mask if name in given else None for name in self.objects}
 
-    def _taken_clicks(self) -> dict[str, np.ndarray]:
-        """The clicks that wait for the frame to come, which has come."""
-        clicks, self._first_clicks = self._first_clicks, {}
-        return clicks
-
-    def _segment(self, frame: Frame, tracks: Tracks, clicks: dict[str, np.ndarray]) -> Masks:
-        """Masks of the objects that were clicked on in this frame or before."""
-        clicks = {name: at for name, at in sorted(clicks.items()) if name in self.objects}  # some may be gone again
-        if not self.segmenter.names and not clicks:
-            return {}
+    def _segment(self, frame: Frame, masks: Masks, said: dict[str, Prompt], sightings: Mapping[str, Sighting]) -> Masks:
+        """Every object's mask: the one given, else the segmenter's, which learns from those that are given."""
+        masks = {name: mask for name, mask in masks.items() if name in self.objects}  # some may be gone again
+        said = {name: prompt for name, prompt in sorted(said.items()) if name in masks}
+        said |= {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items() if mask is not None}
+        if not self.segmenter.names and not said:
+            return masks
         with self.stopwatch("segmentation"):
-            hints = {name: self.objects[name].hint(frame, tracks) for name in self.segmenter.names}
+            sought = [name for name in self.segmenter.names if name in masks and masks[name] is None]
+            hints = {name: self.objects[name].hint(frame, self.tracks, sightings.get(name)) for name in sought}
             self._apply({name: requests for name, (_, requests) in hints.items()})
-            labels = self.segmenter.segment(frame, clicks, {name: hint for name, (hint, _) in hints.items()})
-            return {name: labels == label for label, name in enumerate(self.segmenter.names, 1)}
+            labels = self.segmenter.segment(frame, said.values(), {name: hint for name, (hint, _) in hints.items()})
+            label_of = {name: label for label, name in enumerate(self.segmenter.names, 1)}
+            looked_after = [name for name, mask in masks.items() if mask is None and name in label_of]
+            return masks | {name: labels == label_of[name] for name in looked_after}
 
     def _track(self, frame: Frame, masks: dict[str, np.ndarray | None]) -> Tracks:
         """All objects' points in a single pass of the 2D tracker."""
@@ -221,9 +286,9 @@ class Point2Pose:
             urgent = any(obj.awaited(masks[name]) for name, obj in self.objects.items())
             return self.tracker.track(frame, search, urgent)
 
-    def _checked(self, name: str, mask: np.ndarray) -> np.ndarray:
-        mask = np.asarray(mask)
-        if mask.shape != (self.camera.height, self.camera.width):
-            got = "x".join(map(str, mask.shape[::-1]))
-            raise BadInput(f"mask of {name!r}", got, f"{self.camera.width}x{self.camera.height} as the camera")
-        return mask if mask.dtype == bool else mask > 0
+
+def _prompt(
+    name: str, mask: np.ndarray | None, clicks: ArrayLike | None, negative: ArrayLike | None, box: ArrayLike | None
+) -> Prompt:
+    given = {"mask": mask, "points_px": clicks, "negative_px": negative, "box_px": box}
+    return Prompt(name, **{key: value for key, value in given.items() if value is not None})

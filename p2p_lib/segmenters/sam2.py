@@ -7,17 +7,16 @@ go; the image's features, which are most of the work, are computed once for all 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from p2p_lib.core import packages
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import checked_clicks
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.interfaces import Hint
+from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.raster import to_raster
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import checkpoints
@@ -27,6 +26,8 @@ if TYPE_CHECKING:
 
 #: What the publisher's image processor, which needs torchvision, scales colours by: ImageNet's mean and deviation.
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+#: What a click says, as the network numbers it: it is on the object, beside it, a corner of the box around it.
+_ON, _BESIDE, _CORNERS = 1, 0, [2, 3]
 _OBJECT = 1  # the id of a session's only object
 _ABSENT = -1024.0  # the logit of pixels of an object that is not to be seen, as the network itself has it
 #: What a session keeps of a frame but reads no more once its memory is encoded.
@@ -71,25 +72,62 @@ class Sam2Segmenter:
     def segment(
         self,
         frame: Frame,
-        clicks: Mapping[str, ArrayLike] | None = None,
+        prompts: Iterable[Prompt] = (),
         hints: Mapping[str, Hint] | None = None,
     ) -> np.ndarray:
         """One frame in, one label image out; where two objects claim a pixel the likelier one has it."""
         import torch
 
-        new = checked_clicks(clicks or {}, self._camera, frame)
-        self._sessions |= {name: self._session(at) for name, at in new.items()}
+        said = {prompt.name: prompt for prompt in prompts}
+        for prompt in (p for p in said.values() if p.mask is None):
+            check_prompt(prompt, self._camera)
+            check_depth(prompt, frame)
         with torch.inference_mode():
+            self._tell(said)
             labels = self._labels(frame) if self._sessions else np.zeros(frame.shape, np.int32)
         self._at += 1
+        for label, name in enumerate(self._sessions, 1):
+            if name in said and said[name].mask is not None:
+                labels[said[name].mask] = label
         return labels
 
-    def _session(self, clicks: np.ndarray) -> Any:
-        """A session whose object has clicks in the frame to come."""
+    def _tell(self, said: Mapping[str, Prompt]) -> None:
+        """Put what is said of objects in the frame to come into their sessions; new ones get theirs."""
+        for name, prompt in said.items():
+            session = self._sessions.setdefault(name, self._session())
+            at = session.obj_id_to_idx(_OBJECT)
+            if prompt.mask is not None:
+                session.add_mask_inputs(at, self._at, self._mask(prompt.mask))
+            else:
+                session.add_point_inputs(at, self._at, self._points(prompt))
+            session.obj_with_new_inputs = [_OBJECT]
+
+    def _points(self, prompt: Prompt) -> dict[str, torch.Tensor]:
+        """Clicks as the network takes them: a box is two of them, which are its corners."""
+        import torch
+
+        corners = np.zeros((0, 2)) if prompt.box_px is None else prompt.box_px.reshape(2, 2)
+        at = np.concatenate([corners, prompt.points_px, prompt.negative_px])
+        kinds = _CORNERS[: len(corners)] + [_ON] * len(prompt.points_px) + [_BESIDE] * len(prompt.negative_px)
+        shape = self._camera.height, self._camera.width
+        # The network adds the half by which a pixel's centre is off its edge.
+        points = torch.from_numpy(to_raster(at, shape, self._size) - 0.5).float()[None, None]
+        return {"point_coords": points, "point_labels": torch.tensor(kinds, dtype=torch.int32)[None, None]}
+
+    def _mask(self, mask: np.ndarray) -> torch.Tensor:
+        """(1, 1, S, S) as the network wants it."""
+        import torch
+
+        image = torch.from_numpy(mask).to(self._device)[None, None].float()
+        size = (self._size, self._size)
+        return (torch.nn.functional.interpolate(image, size, mode="bilinear", antialias=True) >= 0.5).float()
+
+    def _session(self) -> Any:
+        """A session of one object, of which nothing is said yet."""
         import torch
         from transformers import Sam2VideoInferenceSession
 
-        session = Sam2VideoInferenceSession(
+        return Sam2VideoInferenceSession(
             video_height=self._camera.height,
             video_width=self._camera.width,
             inference_device=torch.device(self._device),
@@ -97,14 +135,6 @@ class Sam2Segmenter:
             video_storage_device=torch.device(self._device),
             dtype=torch.float32,
         )
-        shape = self._camera.height, self._camera.width
-        # The network adds the half by which a pixel's centre is off its edge.
-        points = torch.from_numpy(to_raster(clicks, shape, self._size) - 0.5).float()[None, None]
-        labels = torch.ones(points.shape[:-1], dtype=torch.int32)  # all on the object
-        at = session.obj_id_to_idx(_OBJECT)
-        session.add_point_inputs(at, self._at, {"point_coords": points, "point_labels": labels})
-        session.obj_with_new_inputs = [_OBJECT]
-        return session
 
     def _labels(self, frame: Frame) -> np.ndarray:
         import torch

@@ -17,10 +17,10 @@ from pandas import DataFrame, Series
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.alignment import background_share, rim
 from p2p_lib.datasets.models import MESHES, find_models
-from p2p_lib.datasets.prompts import Prompt
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence as Recording
 from p2p_lib.figures import overlay, style

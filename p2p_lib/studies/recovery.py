@@ -15,7 +15,7 @@ from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M, Judged, reliability, right_poses
 from p2p_lib.evaluation.point_tracks import Outcome
 from p2p_lib.evaluation.protocol import Evaluation
-from p2p_lib.evaluation.recovery import MAX_ADDS_M, RecoveryEvent, recovered_within, recovery_events
+from p2p_lib.evaluation.recovery import MAX_ADDS_M, RecoveryEvent, recovered_within
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box
 from p2p_lib.figures.plots import WIDTH_IN, draw_strip, logarithmic, panels
@@ -149,7 +149,7 @@ def recovery_counts(cases: Mapping[tuple[str, str], tuple[Run, Evaluation]]) -> 
     rows = []
     for (sequence, label), (run, evaluation) in cases.items():
         objects = {name: (run.objects[name], score) for name, score in evaluation.objects.items()}
-        events = [event for obj, score in objects.values() for event in recovery_events(obj, score)]
+        events = [event for _, score in objects.values() for event in score.returns]
         row = {"sequence": sequence, "method": label, "returns": len(events)}
         row |= {
             f"within {n} frames": count for n, count in recovered_within(e.frames_to_recovery for e in events).items()

@@ -12,10 +12,11 @@ from p2p_lib.apps import check, cli
 from p2p_lib.apps.check import Level, as_lines, check_folder, check_spoilt
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
 from p2p_lib.datasets.alignment import background_share, misfit
-from p2p_lib.datasets.prompts import Prompt, load_prompts
+from p2p_lib.datasets.prompts import load_prompts
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.synthetic.faults import FAULTS, spoil
 
@@ -236,8 +237,9 @@ def test_depth_that_was_cut_off_must_be_exported_again(good, tmp_path):
 def test_what_is_missing_is_named(good, tmp_path):
     folder = shutil.copytree(good, tmp_path / "less")
     (folder / "masks/box/000000.png").unlink()
+    (folder / "masks/box/000001.png").rename(folder / "masks/box/one.png")
     (wrong,) = check_folder(folder)
-    assert "000000.png is missing. One mask alone" in wrong.fix
+    assert "000000.png is missing. Masks of some images have their names" in wrong.fix
     shutil.rmtree(folder / "rgb")
     (wrong,) = check_folder(folder)
     assert wrong.fix.startswith("rgb/ is missing")

@@ -114,7 +114,7 @@ def test_options_reach_the_run(sequence, tmp_path, capsys):
     assert code == 0
     loaded = load_run(tmp_path / "out")
     assert loaded.objects["object"].frame_index.tolist() == [2, 3, 4, 5]
-    assert (loaded.info["preset"], loaded.info["seed"], loaded.info["masks"]) == ("paper", 3, "dataset:drawn")
+    assert (loaded.info["preset"], loaded.info["seed"], loaded.info["masks"]) == ("paper", 3, "drawn")
     asked = RunOptions(**loaded.info["options"])
     assert (asked.start, asked.stop, asked.objects, asked.settings["sampling.points"]) == (2, 6, ["object"], "18")
     written = (tmp_path / "out" / "config.toml").read_text()
@@ -273,7 +273,7 @@ BAD_WORDS = {
     "unknown tracker": (["run", "{seq}", "--out", "{out}", "--tracker", "nope"], ["tracker: got 'nope'", "one of"]),
     "unknown preset": (["run", "{seq}", "--out", "{out}", "--preset", "papr"], ["preset: got 'papr'", "'paper'"]),
     "unknown format": (["run", "{seq}", "--out", "{out}", "--format", "bop5"], ["format: got 'bop5'", "ycbineoat"]),
-    "unknown masks": (["run", "{seq}", "--out", "{out}", "--masks", "sam9"], ["masks: got 'sam9'", "dataset:FOLDER"]),
+    "unknown masks": (["run", "{seq}", "--out", "{out}", "--masks", "sam9"], ["sam9: no such folder of masks", "sam2"]),
     "no mask folder": (["run", "{seq}", "--out", "{out}", "--masks", "dataset:"], ["masks: got 'dataset:'"]),
     "mask folder missing": (["run", "{seq}", "--out", "{out}", "--masks", "dataset:nowhere"], ["nowhere"]),
     "unknown key": (
@@ -388,7 +388,8 @@ def test_clicks_replace_masks(sequence, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--save-masks") == 0
     done = load_run(out)
-    assert done.info["masks"] == "builtin" and done.info["prompts"][0]["points"] == ON_BOARD
+    assert (done.info["masks"], done.info["segmenter"]) == ("clicks", "builtin")
+    assert done.info["prompts"][0]["points"] == ON_BOARD
     assert done.objects["object"].has_pose.all()
     for k in range(FRAMES):
         mask = cv2.imread(str(out / "masks" / "object" / f"{k:06d}.png"), cv2.IMREAD_UNCHANGED)
@@ -408,7 +409,7 @@ def test_names_of_earlier_versions_go_on_working(sequence, tmp_path):
     prompts = clicks(tmp_path, ("object", 0, ON_BOARD))
     assert run(sequence, tmp_path / "out", *prompts, "--masks", "embedded", "--tracker", "embedded", "--stop", "2") == 0
     info = load_run(tmp_path / "out").info
-    assert (info["masks"], info["tracker"]) == ("builtin", "builtin")
+    assert (info["masks"], info["segmenter"], info["tracker"]) == ("clicks", "builtin", "builtin")
 
 
 def test_what_counts_is_the_datasets_own_visibility(sequence, tmp_path, capsys):
@@ -418,7 +419,7 @@ def test_what_counts_is_the_datasets_own_visibility(sequence, tmp_path, capsys):
     assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 0
     got = json.loads(capsys.readouterr().out)
     assert got["objects"]["object"]["frames"] == FRAMES and got["objects"]["object"]["lost"] == 4
-    assert got["masks"] == "builtin"
+    assert (got["masks"], got["segmenter"]) == ("clicks", "builtin")
 
 
 def test_masks_are_scored(sequence, tmp_path, capsys):
@@ -427,7 +428,7 @@ def test_masks_are_scored(sequence, tmp_path, capsys):
     capsys.readouterr()
     assert cli.main(["eval-masks", str(out), "--json"]) == 0
     got = json.loads(capsys.readouterr().out)
-    assert got["mean_iou"] > 0.9 and got["objects"]["object"]["visible_frames"] == FRAMES and got["masks"] == "builtin"
+    assert got["mean_iou"] > 0.9 and got["objects"]["object"]["visible_frames"] == FRAMES and got["masks"] == "clicks"
     assert cli.main(["eval-masks", str(out)]) == 0
     assert "mean IoU" in capsys.readouterr().out
 
@@ -440,12 +441,11 @@ def test_an_object_of_ones_own_is_tracked_without_score(sequence, tmp_path, caps
 BAD_CLICKS = {
     "no file": (["--prompts", "{seq}/none.json"], ["none.json", "p2p click SEQ --out"]),
     "no JSON": (["--prompts", "{seq}/cam_K.txt"], ["cam_K.txt", "unreadable JSON"]),
-    "no prompts": (["--masks", "builtin"], ["masks: got 'builtin' without prompts", "p2p click", "--prompts"]),
-    "both": ([("object", 0, ON_BOARD), "--masks", "dataset"], ["masks: got 'dataset' and prompts", "builtin"]),
+    "both": ([("object", 0, ON_BOARD), "--masks", "dataset"], ["prompt of 'object': got a mask in frame 0 too"]),
     "outside": ([("object", 0, [[W, 10]])], ["clicks on 'object'", "(160, 10)", "160x120"]),
     "late and outside": ([("object", 5, [[3, -9]])], ["clicks on 'object'", "(3, -9)"]),
     "same click": ([("a", 0, ON_BOARD), ("b", 0, ON_BOARD[:1])], ["clicks on 'b'", "also one of 'a'"]),
-    "same name": ([("a", 0, ON_BOARD), ("a", 1, ON_BOARD)], ["'a' twice"]),
+    "same frame": ([("a", 1, ON_BOARD), ("a", 1, ON_BOARD)], ["'a' in frame 1 twice"]),
     "frame not run": ([("object", 5, ON_BOARD), "--stop", "4"], ["prompt of 'object'", "frame 5", "0 to 3"]),
     "unknown object": ([("object", 0, ON_BOARD), "--objects", "mug"], ["objects: got 'mug'", "object"]),
     "no name of a file": ([("a/b", 0, ON_BOARD)], ["object name", "'a/b'"]),

@@ -14,7 +14,8 @@ import pytest
 
 from p2p_lib.apps.click import PAGE, Clicker
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.datasets.prompts import Prompt, load_prompts, save_prompts
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.datasets.prompts import load_prompts, save_prompts
 from p2p_lib.datasets.sequence import open_sequence
 
 H, W = 60, 80
@@ -102,7 +103,7 @@ REFUSED = {
     "outside": ({"objects": [one(points=[(W, 5)])]}, "clicks on 'cup': got (80, 5), expected pixels within 80x60"),
     "no depth": ({"objects": [one(points=[(5, 5)])]}, "(5, 5) has no depth in frame 0"),
     "same click": ({"objects": [one(), one("bowl")]}, "clicks on 'bowl': got a click that is also one of 'cup'"),
-    "same name": ({"objects": [one(), one()]}, "'cup' twice"),
+    "same name": ({"objects": [one(), one()]}, "'cup' in frame 0 twice"),
     "late frame": ({"objects": [one(frame=3)]}, "prompt of 'cup': got frame 3, expected a frame from 0 to 2"),
     "no points": ({"objects": [one(points=())]}, "at least one [x, y]"),
     "nothing": ({"objects": []}, "prompts: got"),
@@ -195,9 +196,9 @@ def test_the_frame_may_be_left_out(tmp_path):
         '{"objects": [{"name": "a"}]}': "points",
         '{"objects": [{"name": "a", "points": [[1, 2]], "fram": 3}]}': "fram",
         '{"objects": [{"name": "", "points": [[1, 2]]}]}': "name",
-        '{"objects": [{"name": "a", "points": [[1, 2, 3]]}]}': "points",
-        '{"objects": [{"name": "a", "points": [[1, NaN]]}]}': "points",
-        '{"objects": [{"name": "a", "points": "here"}]}': "points",
+        '{"objects": [{"name": "a", "points": [[1, 2, 3]]}]}': "clicks on 'a'",
+        '{"objects": [{"name": "a", "points": [[1, NaN]]}]}': "clicks on 'a'",
+        '{"objects": [{"name": "a", "points": "here"}]}': "clicks on 'a'",
         '{"objects": [{"name": "a", "frame": -1, "points": [[1, 2]]}]}': "frame -1",
         '{"objects": [{"name": "a", "frame": 1.5, "points": [[1, 2]]}]}': "frame 1.5",
         '{"objects": [{"name": "a", "frame": true, "points": [[1, 2]]}]}': "frame True",

@@ -17,9 +17,10 @@ from p2p_lib.apps.live import json_line, track_live
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
-from p2p_lib.datasets.prompts import Prompt, save_prompts
+from p2p_lib.datasets.prompts import save_prompts
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.run import run
 from tests.apps.test_cli import POINTS_ALONE

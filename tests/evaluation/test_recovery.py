@@ -11,20 +11,24 @@ from p2p_lib.evaluation.recovery import RecoveryEvent, recovered_within, recover
 POINTS = np.random.default_rng(0).normal(0, 0.05, (400, 3))
 
 
-def events_of(visible, found, wrong=(), first_frame=0):
-    """Events of an object that stands still, visible in some frames, posed in some, 30 cm off in others."""
+def standing(visible, found, wrong=(), first_frame=0):
+    """An object that stands still, visible in some frames, posed in some, 30 cm off in others."""
     n = len(visible)
     truth = np.tile(se3.from_rt(np.eye(3), [0.0, 0, 0.6]), (n, 1, 1))
     poses = truth.copy()
     poses[list(wrong), 0, 3] += 0.3
     poses[~np.asarray(found)] = np.nan
     zeros = np.zeros(n, int)
-    obj = ObjectRun(
+    return ObjectRun(
         frame_index=np.arange(n) + first_frame, time_s=np.arange(n) / 30, status=np.full(n, "tracked"),
         T_cam_obj=poses, confidence=np.ones(n), covariance=np.full((n, 6, 6), np.nan), visible_points=zeros,
         inliers=zeros, keyframe=zeros > 0, T_cam_model=truth, labelled=np.ones(n, bool),
         visible_px=np.where(visible, 900, 50), reason=np.full(n, ""),
     )  # fmt: skip
+
+
+def events_of(*how, **where):
+    obj = standing(*how, **where)
     score = evaluate(Run(None, {}, {"mug": obj}, {"mug": POINTS}, {})).objects["mug"]
     return recovery_events(obj, score)
 
@@ -78,3 +82,18 @@ def test_frames_hidden_after_the_return_are_not_asked():
     events = events_of(visible, found, first_frame=100)
     assert events == [RecoveryEvent(120, 140, 8)]
     assert recovered_within(delays(events), (5, 8)) == {5: 0, 8: 1}
+
+
+@pytest.mark.parametrize(("masks", "told"), [("dataset", True), ("drawn/", True), ("clicks", False), ("first", False)])
+def test_a_score_says_where_masks_came_from_and_how_soon_objects_were_back(masks, told):
+    visible = spans(200, (20, 40), (80, 95), (150, 160))
+    found = visible.copy()
+    found[95:102] = False
+    found[160:] = False
+    obj = standing(visible, found)
+    scored = evaluate(Run(None, {"masks": masks, "segmenter": "builtin"}, {"mug": obj}, {"mug": POINTS}, {}))
+    table = scored.as_table()
+    assert "mug: 3 returns after an absence, found again after 0, 7, never frames" in table
+    assert f"masks {masks}, segmenter builtin" in table and ("masks that were given tell" in table) == told
+    assert scored.as_dict()["objects"]["mug"]["frames_to_recovery"] == [0, 7, None]
+    assert scored.as_dict()["masks"] == masks

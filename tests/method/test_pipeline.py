@@ -167,7 +167,7 @@ def test_where_the_object_frame_starts():
 
 
 def test_nobody_knows_the_masks():
-    """The first mask alone; from then on every object goes by its points."""
+    """The first mask alone; from then on the segmenter looks after every object."""
     method = Point2Pose(CAMERA, quick())
     for name in TRUTH:
         method.add_object(name, mask=film()[0][1][name])
@@ -287,7 +287,7 @@ def test_hidden_points_are_looked_for_in_the_masks_where_all_are_known():
     method.step(first, masks)
     method.step(second, later)
     method.step(third)
-    method.step(fourth, {"left": last["left"]})  # the other one is hidden
+    method.step(fourth, {"left": last["left"], "right": np.zeros_like(last["right"])})  # the other one is hidden
     both, unknown, left = Asked.searches
     np.testing.assert_array_equal(both, later["left"] | later["right"])
     np.testing.assert_array_equal(left, last["left"])
@@ -295,7 +295,8 @@ def test_hidden_points_are_looked_for_in_the_masks_where_all_are_known():
 
 
 def test_one_hides_the_other_goes_on():
-    frames = [(f, {"right": m["right"]} if k in HIDDEN else m) for k, (f, m) in enumerate(film())]
+    nothing = {"left": np.zeros((300, 400), bool)}
+    frames = [(f, m | nothing if k in HIDDEN else m) for k, (f, m) in enumerate(film())]
     estimates = track(frames)
     assert [k for k in range(LENGTH) if statuses(estimates, "left")[k] == "occluded"] == list(HIDDEN)
     assert set(statuses(estimates, "right")) == {"tracked"}
@@ -343,10 +344,14 @@ def test_an_object_waits_until_its_mask_has_come_and_stopped_growing():
 
 
 def test_the_first_mask_serves_the_next_frame_only():
+    """From then on the segmenter looks; an empty mask says that the object is hidden."""
     method = Point2Pose(CAMERA, quick())
     method.add_object("left", mask=film()[0][1]["left"])
-    assert method.step(film()[0][0], {})["left"].status == Status.TRACKED
-    assert method.step(film()[1][0], {})["left"].status == Status.OCCLUDED
+    assert method.step(film()[0][0])["left"].status == Status.TRACKED
+    assert method.step(film()[1][0])["left"].status == Status.TRACKED
+    assert iou(method.masks["left"], film()[1][1]["left"]) > 0.85
+    hidden = {"left": np.zeros((300, 400), bool)}
+    assert method.step(film()[2][0], hidden)["left"].status == Status.OCCLUDED
 
 
 def test_a_removed_object_is_gone_and_its_points_with_it():
@@ -592,7 +597,8 @@ def test_a_late_object_is_clicked_while_another_has_masks():
         np.testing.assert_array_equal(method.masks["left"], masks["left"])
     assert {str(e.status) for e in estimates.values()} == {"tracked"}
     assert iou(method.masks["right"], masks["right"]) > 0.85
-    with pytest.raises(BadInput, match="mask of 'right': got a mask of an object with clicks"):
+    method.correct("right", clicks=clicks_on(film()[12][1]["right"]))
+    with pytest.raises(BadInput, match="mask of 'right': got a mask and clicks in frame 12"):
         method.step(film()[12][0], film()[12][1])
     method.remove_object("right")
     assert set(method.step(film()[12][0], {"left": film()[12][1]["left"]})) == {"left"} == set(method.masks)
@@ -613,7 +619,7 @@ def test_clicks_that_do_not_fit_are_refused_and_leave_no_object_behind():
             method.add_object("cup", clicks=clicks)
     with pytest.raises(BadInput, match="object 'cup': got a mask and clicks"):
         method.add_object("cup", mask=masks["left"], clicks=good)
-    with pytest.raises(BadInput, match="mask of 'cup': got an empty mask"):
+    with pytest.raises(BadInput, match="object 'cup': got an empty mask"):
         method.add_object("cup", mask=np.zeros((300, 400), bool))
     method.add_object("left", clicks=good)
     with pytest.raises(BadInput, match="clicks on 'cup': got a click that is also one of 'left'"):

@@ -19,10 +19,11 @@ OCCASIONS = {
     "registration.iterations": ((100, 1), {"method.motion": False}),
     "registration.sample_size": ((4, 3), {"method.motion": False, "registration.iterations": 1}),
     "refinement.huber_m": ((0.01, 0.0005), {}),
-    "method.gates": (("none", "all"), {"method.redetection": False}),
+    "method.gates": (("none", "all"), {"method.redetection": False, "method.scene": False}),
+    "method.scene": ((False, True), {"method.redetection": False}),
 }
 #: A tracker that finds so few points again tells these.
-FEW_POINTS = {"method.redetection": 5, "method.gates": 6}
+FEW_POINTS = {"method.redetection": 5, "method.gates": 6, "method.scene": 6}
 
 
 class Lying(BuiltinTracker):

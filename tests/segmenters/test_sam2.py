@@ -13,6 +13,7 @@ from p2p_lib.core.backends import make_segmenter
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.manifests import manifest
 from p2p_lib.method.pipeline import Point2Pose
@@ -21,6 +22,7 @@ from p2p_lib.segmenters import sam2
 CAMERA = Camera(150.0, 150.0, 80, 60, 160, 120)
 SIDE = 128
 CLICKS = np.array([[80.0, 60], [70, 50]])
+CUP = Prompt("cup", points_px=CLICKS)
 
 needs_transformers = pytest.mark.skipif(
     importlib.util.find_spec("transformers") is None,
@@ -104,7 +106,7 @@ def test_trimmed_memory_changes_nothing(model):
 
     ours, frames = Watched(model), film(10)
     for k, frame in enumerate(frames):
-        ours.segment(frame, None if k else {"cup": CLICKS})
+        ours.segment(frame, () if k else [CUP])
     told, ours.logits = ours.logits, []
     session = Sam2VideoInferenceSession(video_height=120, video_width=160, dtype=torch.float32)
     at = session.obj_id_to_idx(1)
@@ -131,7 +133,7 @@ def test_memory_stays_bounded(model):
 
     ours, sizes = sam2.Sam2Segmenter(model, CAMERA), []
     for k, frame in enumerate(film(14)):
-        ours.segment(frame, None if k else {"cup": CLICKS})
+        ours.segment(frame, () if k else [CUP])
         sizes.append(megabytes(ours))
     assert sizes[13] == sizes[9] > 0
 
@@ -143,8 +145,7 @@ def test_points_and_pictures_are_the_official_processors(model):
     from transformers import Sam2VideoProcessor
 
     official = Sam2VideoProcessor._normalize_coordinates(None, SIDE, torch.tensor(CLICKS), (120, 160)).numpy()
-    session = sam2.Sam2Segmenter(model, CAMERA)._session(CLICKS)
-    ours = session.point_inputs_per_obj[0][0]["point_coords"].numpy()[0, 0]
+    ours = sam2.Sam2Segmenter(model, CAMERA)._points(CUP)["point_coords"].numpy()[0, 0]
     assert np.abs(ours - official).max() <= 0.5
     grey = np.full((120, 160, 3), 128, np.uint8)
     pixels = sam2.Sam2Segmenter(model, CAMERA)._pixels(grey).numpy()
@@ -193,7 +194,7 @@ def half(left: bool) -> np.ndarray:
 def test_labels_are_the_likelier_objects_and_absent_ones_have_none():
     answers = [(half(True), 3.0), (half(False), 3.0), (half(True), -1.0), (half(False) + 9, 2.0), (half(True) * 2, 2.0)]
     ours, frames = sam2.Sam2Segmenter(Says(answers), CAMERA), film(3)
-    both = ours.segment(frames[0], {"a": CLICKS, "b": CLICKS + 10})
+    both = ours.segment(frames[0], [Prompt("a", points_px=CLICKS), Prompt("b", points_px=CLICKS + 10)])
     assert both.shape == (120, 160) and both.dtype == np.int32 and ours.names == ("a", "b")
     assert (both[:, :78] == 1).all() and (both[:, 82:] == 2).all()
     # "a" is absent now, and "b" everywhere.
@@ -221,7 +222,7 @@ def test_clicks_without_depth_are_refused(model):
     frame = film(1)[0]
     hole = Frame(0, 0.0, frame.rgb, np.zeros_like(frame.depth_m))
     with pytest.raises(BadInput, match=r"\(80, 60\) has no depth"):
-        sam2.Sam2Segmenter(model, CAMERA).segment(hole, {"cup": CLICKS})
+        sam2.Sam2Segmenter(model, CAMERA).segment(hole, [CUP])
 
 
 # --- without the package or the weights --------------------------------------------------------

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.clicks import depths_at
 from p2p_lib.core.config import preset
+from p2p_lib.core.depth import depths_at
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import Hint
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.method.refinement import surface_distance
@@ -50,9 +51,10 @@ def picture(k: int, cards: list[tuple[tuple[int, int], int]], board: np.ndarray 
     return Frame(k, k / 30, rgb, (depth + rng.normal(0, 0.001, depth.shape)).astype(np.float32))
 
 
-def on(**at) -> dict[str, np.ndarray]:
+def on(**at) -> list[Prompt]:
     """Three clicks on each card, whose upper left corners are given."""
-    return {name: np.add(corner, [[12, 12], [40, 20], [25, 38]]) for name, corner in at.items()}
+    clicks = np.array([[12, 12], [40, 20], [25, 38]])
+    return [Prompt(name, points_px=corner + clicks) for name, corner in at.items()]
 
 
 def segmenter() -> BuiltinSegmenter:
@@ -99,7 +101,7 @@ def test_a_box_on_a_table_ends_at_the_table():
     rgb = (_print(7) // 8 + 100).astype(np.uint8)
     rgb[box] = rgb[box] // 2 + 40
     frame = Frame(0, 0.0, rgb, depth.astype(np.float32))
-    found = segmenter().segment(frame, {"box": [[150, 110], [170, 120], [160, 130]]})
+    found = segmenter().segment(frame, [Prompt("box", points_px=[[150, 110], [170, 120], [160, 130]])])
     assert iou(found == 1, box) > 0.85
 
 
@@ -122,7 +124,7 @@ def path(k: int) -> tuple[int, int]:
 def test_a_moving_object_is_followed():
     follow = segmenter()
     for k in range(30):
-        found = follow.segment(picture(k, [(path(k), 1)]), None if k else on(card=path(0))) == 1
+        found = follow.segment(picture(k, [(path(k), 1)]), () if k else on(card=path(0))) == 1
         assert iou(found, card(path(k))) > 0.9, k
 
 
@@ -131,7 +133,7 @@ def test_two_objects_pass_and_keep_their_names():
     one, two = lambda k: (60 + 4 * k, 90), lambda k: (180 - 4 * k, 120)
     follow = segmenter()
     for k in range(30):
-        clicks = None if k else on(far=one(0), near=two(0))
+        clicks = () if k else on(far=one(0), near=two(0))
         found = follow.segment(picture(k, [(one(k), 3), (two(k), 2)]), clicks)
         near = card(two(k))
         far = card(one(k)) & ~near
@@ -145,7 +147,7 @@ def test_what_is_covered_is_absent_whatever_covers_it():
     for k in range(26):
         board = np.zeros((240, 320), bool)
         board[40:200, max(0, 8 * k - 60) : 8 * k] = True
-        found = follow.segment(picture(k, [(at, 1)], board), None if k else on(card=at)) == 1
+        found = follow.segment(picture(k, [(at, 1)], board), () if k else on(card=at)) == 1
         assert not (found & board).any()
         if not (card(at) & ~board).any():
             assert not found.any()
@@ -171,7 +173,7 @@ def test_points_on_something_else_do_not_bring_it_back():
 def test_an_object_leaves_the_picture():
     follow = segmenter()
     for k in range(24):
-        found = follow.segment(picture(k, [((30 - 5 * k, 80), 1)]), None if k else on(card=(30, 80))) == 1
+        found = follow.segment(picture(k, [((30 - 5 * k, 80), 1)]), () if k else on(card=(30, 80))) == 1
         truth = card((30 - 5 * k, 80))
         assert iou(found, truth) > 0.7 or truth.sum() < 400
     assert not found.any()
@@ -180,9 +182,9 @@ def test_an_object_leaves_the_picture():
 def test_strictly_causal():
     """Every label image is the same, bit for bit, whatever comes after."""
     short, long = segmenter(), segmenter()
-    ends = [short.segment(picture(k, [(path(k), 1)]), None if k else on(card=path(0))) for k in range(8)]
+    ends = [short.segment(picture(k, [(path(k), 1)]), () if k else on(card=path(0))) for k in range(8)]
     for k in range(20):
-        found = long.segment(picture(k, [(path(k), 1)]), None if k else on(card=path(0)))
+        found = long.segment(picture(k, [(path(k), 1)]), () if k else on(card=path(0)))
         if k < 8:
             np.testing.assert_array_equal(found, ends[k])
 
@@ -208,13 +210,13 @@ def test_embedded_sequence(seed):
     """The first pass of synthetic/crossing: new sides come into view, and one covers part of the other."""
     sequence = open_sequence("synthetic/crossing", seed=seed)
     new = BuiltinSegmenter(sequence.camera, CONFIG, np.random.default_rng(0))
-    rng, first, clicks = np.random.default_rng(seed), sequence.frame(0), {}
+    rng, first, clicks = np.random.default_rng(seed), sequence.frame(0), []
     for name, mask in sequence.masks(0).items():
         v, u = np.nonzero((cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0) & (first.depth_m > 0))
-        clicks[name] = np.stack([u, v], -1)[rng.choice(len(v), 3, replace=False)]
-    scores = {name: [] for name in clicks}
+        clicks.append(Prompt(name, points_px=np.stack([u, v], -1)[rng.choice(len(v), 3, replace=False)]))
+    scores = {prompt.name: [] for prompt in clicks}
     for i in range(60):
-        labels, truth = new.segment(sequence.frame(i), None if i else clicks), sequence.masks(i)
+        labels, truth = new.segment(sequence.frame(i), () if i else clicks), sequence.masks(i)
         for k, name in enumerate(new.names, 1):
             if truth[name].sum() >= 300:
                 scores[name].append(iou(labels == k, truth[name]))

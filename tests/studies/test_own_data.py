@@ -9,8 +9,9 @@ import trimesh
 from p2p_lib.apps.check import Finding, Level
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Status
-from p2p_lib.datasets.prompts import Prompt, prompts_in
+from p2p_lib.datasets.prompts import prompts_in
 from p2p_lib.figures import style
 from p2p_lib.studies import own_data
 from p2p_lib.studies.own_data import errors_against, surface_fit

@@ -134,6 +134,26 @@ class Patch:
         dots[at[:, 1], at[:, 0]] = True
         return dilated(dots, radius)
 
+    def nearer(self, one: np.ndarray, other: np.ndarray, like: float) -> np.ndarray:
+        """(h, w) bool: the pixels that are nearer to ``one`` (h, w) bool than to ``other``, over like pixels.
+
+        like  length of a step between pixels that are alike; one across the strongest edge has length 1
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import dijkstra
+
+        number = np.arange(self.depth_m.size).reshape(self.shape)
+        right, below = self.edge_weights
+        ends = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
+        starts = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
+        length = like + 1 - np.concatenate([right.ravel(), below.ravel()])
+        grid = coo_array((length, (starts, ends)), shape=(number.size,) * 2).tocsr()
+        to_one, to_other = (
+            dijkstra(grid, directed=False, indices=number[of], min_only=True) if of.any() else np.inf
+            for of in (one, other)
+        )
+        return np.broadcast_to(to_one < to_other, number.size).reshape(self.shape)
+
     def border(self) -> np.ndarray:
         """(h, w) bool: the outermost pixels."""
         edge = np.ones(self.shape, bool)

@@ -1,0 +1,149 @@
+"""What somebody says of an object in one frame: clicks on it, clicks beside it, a box around it, its mask."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.depth import depths_at
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Prompt:
+    """What starts an object or corrects its mask.
+
+    frame        index of the frame that it is said of
+    points_px    (N, 2) pixels on the object
+    negative_px  (M, 2) pixels that are not of it
+    box_px       (4,) left, top, right, bottom: all of the object is inside; None where nobody says
+    mask         (H, W) bool: these pixels are the object, none where it is hidden; None where nobody says
+    """
+
+    name: str
+    frame: int = 0
+    points_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    negative_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    box_px: np.ndarray | None = None
+    mask: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise BadInput("prompt", f"the name {self.name!r}", "a word")
+        if isinstance(self.frame, bool) or not isinstance(self.frame, int | np.integer) or self.frame < 0:
+            raise BadInput(f"prompt of {self.name!r}", f"frame {self.frame!r}", "a whole number from 0")
+        for key, what in (("points_px", "clicks on"), ("negative_px", "clicks beside")):
+            object.__setattr__(self, key, _pixels(f"{what} {self.name!r}", getattr(self, key)))
+        if self.box_px is not None:
+            object.__setattr__(self, "box_px", _box(f"box around {self.name!r}", self.box_px))
+        if self.mask is not None:
+            mask = np.asarray(self.mask)
+            object.__setattr__(self, "mask", mask if mask.dtype == bool else mask > 0)
+        if not len(self.points_px) and not len(self.negative_px) and self.box_px is None and self.mask is None:
+            raise BadInput(f"clicks on {self.name!r}", "none", "at least one [x, y] in pixels, a box or a mask")
+        if self.mask is not None and (len(self.points_px) or len(self.negative_px) or self.box_px is not None):
+            raise BadInput(f"object {self.name!r}", "a mask and clicks", "one of them", "A mask says it all.")
+
+    @property
+    def starts(self) -> bool:
+        """Whether an object can be started by it: something has to be said of where it is."""
+        return bool(len(self.points_px) or self.box_px is not None or (self.mask is not None and self.mask.any()))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as files of prompts and ``run.json`` keep them; of a mask its number of pixels."""
+        plain: dict[str, Any] = {"name": self.name, "frame": int(self.frame)}
+        given = {"points": self.points_px, "negative": self.negative_px, "box": self.box_px}
+        plain |= {key: value.tolist() for key, value in given.items() if value is not None and len(value)}
+        return plain if self.mask is None else plain | {"mask_px": int(self.mask.sum())}
+
+
+def check_prompt(prompt: Prompt, camera: Camera) -> None:
+    """Refuse what does not lie in the image; :class:`BadInput` names the object, the frame's size and what to do."""
+    name, size = prompt.name, f"{camera.width}x{camera.height}"
+    for what, at in (("clicks on", prompt.points_px), ("clicks beside", prompt.negative_px)):
+        outside = ~camera.inside(at, -0.5)
+        if outside.any():
+            raise BadInput(f"{what} {name!r}", _pixel(at[outside][0]), f"pixels within {size}")
+    if prompt.box_px is not None:
+        left, top, right, bottom = prompt.box_px
+        if right < 0 or bottom < 0 or left > camera.width - 1 or top > camera.height - 1:
+            raise BadInput(f"box around {name!r}", prompt.box_px.tolist(), f"a box within {size}")
+    if prompt.mask is not None:
+        check_mask(name, prompt.mask, camera)
+        if prompt.mask.all():
+            fix = "Draw the object alone; is the mask inverted?"
+            raise BadInput(f"mask of {name!r}", "the whole image", "the object's pixels", fix)
+    if _meet(prompt.points_px, prompt.negative_px):
+        raise BadInput(f"clicks on {name!r}", "a click that is also one beside it", "one or the other")
+
+
+def check_mask(name: str, mask: np.ndarray, camera: Camera) -> None:
+    """Refuse a mask of another size than the camera's images."""
+    if mask.shape != (camera.height, camera.width):
+        got = "x".join(map(str, mask.shape[::-1]))
+        raise BadInput(f"mask of {name!r}", got, f"{camera.width}x{camera.height} as the camera")
+
+
+def check_apart(others: Iterable[Prompt], prompt: Prompt) -> None:
+    """Refuse a click that is also one of another object's in the same frame."""
+    for other in others:
+        if _meet(other.points_px, prompt.points_px):
+            got = f"a click that is also one of {other.name!r}"
+            raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel that belongs to one object only")
+
+
+def check_depth(prompt: Prompt, frame: Frame) -> None:
+    """Refuse clicks where nothing is measured, and a box in which nothing is."""
+    missing = ~np.isfinite(depths_at(prompt.points_px, frame))
+    if missing.any():
+        got = f"{_pixel(prompt.points_px[missing][0])} has no depth in frame {frame.index}"
+        fix = "Click beside the hole."
+        raise BadInput(f"clicks on {prompt.name!r}", got, "pixels with a depth measurement", fix)
+    if prompt.box_px is not None and not len(prompt.points_px) and not len(points_in_box(prompt.box_px, frame)):
+        got = f"no depth inside it in frame {frame.index}"
+        raise BadInput(f"box around {prompt.name!r}", got, "measured pixels in its middle", "Click on the object.")
+
+
+def points_in_box(box_px: np.ndarray, frame: Frame) -> np.ndarray:
+    """(N, 2) pixels that stand for clicks on what a box (4,) is around: in its middle, the nearer half of them."""
+    share = np.linspace(0.35, 0.65, 5)
+    u, v = box_px[0] + share * (box_px[2] - box_px[0]), box_px[1] + share * (box_px[3] - box_px[1])
+    at = np.clip(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2), 0, np.array(frame.shape[::-1]) - 1)
+    z_m = depths_at(at, frame)
+    at, z_m = at[np.isfinite(z_m)], z_m[np.isfinite(z_m)]
+    return at[z_m <= np.median(z_m)] if len(at) else at
+
+
+def _pixels(what: str, given: Any) -> np.ndarray:
+    """Pixels as (N, 2) float64."""
+    try:
+        at = np.array(given, float)
+    except (TypeError, ValueError):
+        at = np.zeros((1, 1))
+    if at.size and (at.ndim != 2 or at.shape[1] != 2 or not np.isfinite(at).all()):
+        raise BadInput(what, repr(given)[:60], "at least one [x, y] in pixels")
+    return at.reshape(-1, 2)
+
+
+def _box(what: str, given: Any) -> np.ndarray:
+    try:
+        box = np.array(given, float)
+    except (TypeError, ValueError):
+        box = np.zeros(0)
+    if box.shape != (4,) or not np.isfinite(box).all() or box[0] >= box[2] or box[1] >= box[3]:
+        raise BadInput(what, repr(given)[:60], "[left, top, right, bottom] in pixels")
+    return box
+
+
+def _meet(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two sets of pixels (N, 2) have one in common."""
+    return bool((np.abs(one[:, None] - other).max(-1) < 1).any())
+
+
+def _pixel(at: np.ndarray) -> str:
+    return "({:g}, {:g})".format(*at)

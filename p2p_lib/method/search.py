@@ -1,0 +1,164 @@
+"""Search by shape and colour: an object's surface, laid into the image under many poses at once (not in the paper).
+
+Where points do not suffice, a pose that something else has proposed is judged by what it predicts for every pixel: a
+point of the surface should be measured where it is, in its colour; where the depth goes on behind it, it is not there;
+where the depth ends before it, something hides it, which says nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import DepthConfig
+from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.image import in_image, nearest_px
+from p2p_lib.core.types import Frame, Rows
+
+if TYPE_CHECKING:
+    from p2p_lib.method.tsdf import TsdfVolume
+
+#: Points of the surface that are compared, and the fewest of them in the image that say anything.
+_POINTS, _FEWEST = 300, 40
+#: Cosine of normal and view up to which a point faces the camera.
+_FACING = -0.25
+#: A measured point this near to the surface is on it, m: while searching, at last.
+_ROUGH_M, _FINE_M = 0.02, 0.01
+#: Largest difference of CIELAB's a and b (8 bit), and of the logarithm of the lightness beside that of the whole.
+_CHROMA, _LIGHTNESS = 20.0, 0.45
+#: A measured point is on the surface up to so many standard deviations of its depth, too.
+_SIGMAS = 2.0
+#: A hidden point counts this much against a pose, and at least this share of those that face the camera must not be.
+_HIDDEN, _SHOWN = 0.5, 0.3
+#: Steps of the search about a proposed pose, m, and their number to each side.
+_STEP_M, _STEPS = 0.03, 2
+#: The search compares every so many points, and so many of its best poses are aligned.
+_COARSE, _TRIED = 3, 3
+#: A pose as far away as this (1/m^2) from the proposed one has to fit better by its square.
+_AWAY = 40.0
+#: Iterations of the alignment, and what keeps it where the shape leaves it free: rad, m.
+_ITERATIONS, _FREE = 6, np.diag(np.repeat([0.1, 0.03], 3) ** -2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSample(Rows):
+    """Points of a surface: p_obj (M, 3), outward normals n_obj (M, 3), and lab (M, 3), CIELAB in 8 bit."""
+
+    p_obj: np.ndarray
+    n_obj: np.ndarray
+    lab: np.ndarray
+
+    @classmethod
+    def of(cls, surface: TsdfVolume) -> SurfaceSample:
+        """Of what has been reconstructed so far."""
+        mesh = surface.mesh()
+        at = np.sort(np.random.default_rng(0).permutation(len(mesh.vertices))[:_POINTS])
+        rgb = np.asarray(mesh.visual.vertex_colors)[at, :3] if len(at) else np.zeros((0, 3), np.uint8)
+        lab = cv2.cvtColor(np.ascontiguousarray(rgb)[None], cv2.COLOR_RGB2LAB)[0] if len(at) else rgb
+        return cls(np.asarray(mesh.vertices)[at], np.asarray(mesh.vertex_normals)[at], lab.astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A pose and what speaks for it.
+
+    T_cam_obj  (4, 4)
+    share      of the points of the surface that should show: those that do, less those that are contradicted
+    uv_px      (K, 2) where points were found on the surface in their colour
+    """
+
+    T_cam_obj: np.ndarray
+    share: float
+    uv_px: np.ndarray
+
+
+class ImageSearch:
+    """One frame, made ready for comparison."""
+
+    def __init__(self, frame: Frame, camera: Camera, config: DepthConfig):
+        self._depth_m, self._camera, self._config = frame.depth_m, camera, config
+        self._lab = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2LAB)
+
+    def about(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
+        """The best pose near a proposed one; None where too little of the surface would be in the image."""
+        if len(sample.p_obj) < _FEWEST:
+            return None
+        if not in_image(self._camera.project(se3.transform(T_cam_obj, sample.p_obj)), self._depth_m.shape).any():
+            return None
+        poses = _shifted(T_cam_obj)
+        share, _, _ = self._compare(poses, sample.select(np.arange(0, len(sample), _COARSE)), _ROUGH_M)
+        # Where many fit alike, as on a table, the nearest to the proposed one.
+        score = share - _AWAY * ((poses - T_cam_obj)[:, :3, 3] ** 2).sum(1)
+        best = [k for k in np.argsort(-score)[:_TRIED] if np.isfinite(score[k])]
+        found = [self.at(self._aligned(poses[k], sample), sample) for k in best]
+        return max((s for s in found if s is not None), key=lambda s: s.share, default=None)
+
+    def at(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
+        """What speaks for one pose; None where too little of the surface would be in the image."""
+        (share,), (found,), (uv_px,) = self._compare(T_cam_obj[None], sample, _FINE_M)
+        return Sighting(T_cam_obj, float(share), uv_px[found]) if np.isfinite(share) else None
+
+    def _aligned(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> np.ndarray:
+        """The pose moved until its points lie in the tangent planes of those measured at their pixels, robustly."""
+        for _ in range(_ITERATIONS):
+            p_cam, normal = se3.transform(T_cam_obj, sample.p_obj), sample.n_obj @ T_cam_obj[:3, :3].T
+            uv_px = self._camera.project(p_cam)
+            u, v = nearest_px(uv_px, self._depth_m.shape)
+            z = self._depth_m[v, u]
+            off_m = ((self._camera.unproject(uv_px, z) - p_cam) * normal).sum(1)
+            facing = (normal * p_cam).sum(1) < _FACING * np.linalg.norm(p_cam, axis=1)
+            used = facing & (z > 0) & in_image(uv_px, self._depth_m.shape)
+            used &= np.abs(z - p_cam[:, 2]) < 2 * _ROUGH_M
+            centre = p_cam[used].mean(0) if used.any() else p_cam.mean(0)
+            J = np.concatenate([np.cross(p_cam - centre, normal), normal], 1)[used]
+            w = 1 / (_FINE_M**2 + off_m[used] ** 2)
+            step = np.linalg.solve((J * w[:, None]).T @ J + _FREE, (J * w[:, None]).T @ off_m[used])
+            R = cv2.Rodrigues(step[:3])[0]
+            T_cam_obj = se3.from_rt(R, centre - R @ centre + step[3:]) @ T_cam_obj
+        return T_cam_obj
+
+    def _compare(
+        self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Shares (H,) as in :class:`Sighting`, -inf where unknown, points found (H, M) bool, and pixels (H, M, 2)."""
+        p_cam = se3.transform(T_cam_obj, sample.p_obj)
+        view = p_cam / np.maximum(np.linalg.norm(p_cam, axis=-1, keepdims=True), 1e-9)
+        n_cam = np.einsum("hij,mj->hmi", T_cam_obj[:, :3, :3], sample.n_obj)
+        uv_px = self._camera.project(p_cam)
+        u, v = nearest_px(uv_px.reshape(-1, 2), self._depth_m.shape)
+        z = self._depth_m[v, u].reshape(p_cam.shape[:2])
+        lab = self._lab[v, u].reshape(p_cam.shape).astype(np.float32)
+        facing = ((n_cam * view).sum(-1) < _FACING) & (p_cam[..., 2] > 0)
+        asked = facing & in_image(uv_px.reshape(-1, 2), self._depth_m.shape).reshape(facing.shape) & (z > 0)
+        off_m = np.where(asked, z - p_cam[..., 2], np.nan)
+        near_m = np.maximum(near_m, _SIGMAS * depth_noise_m(z, self._config))
+        on = np.abs(off_m) < near_m
+        found = on & self._own_colour(lab, sample.lab, on)
+        behind = off_m > 2 * near_m
+        hidden = off_m < -near_m
+        shown = asked.sum(1) - hidden.sum(1)
+        share = (found.sum(1) - behind.sum(1)) / np.maximum(shown + _HIDDEN * hidden.sum(1), 1)
+        share[(shown < _FEWEST * p_cam.shape[1] / _POINTS) | (shown < _SHOWN * facing.sum(1))] = -np.inf
+        return share, found, uv_px
+
+    @staticmethod
+    def _own_colour(lab: np.ndarray, own: np.ndarray, on: np.ndarray) -> np.ndarray:
+        """(H, M) bool: pixels lab (H, M, 3) with the colours (M, 3); exposure may have changed for all alike."""
+        lightness = np.log((lab[..., 0] + 8) / (own[:, 0] + 8))
+        count = np.maximum(on.sum(1, keepdims=True), 1)
+        exposure = (lightness * on).sum(1, keepdims=True) / count
+        chroma = np.abs(lab[..., 1:] - own[:, 1:]).max(-1)
+        return (chroma < _CHROMA) & (np.abs(lightness - exposure) < _LIGHTNESS)
+
+
+def _shifted(T_cam_obj: np.ndarray) -> np.ndarray:
+    """(H, 4, 4) a pose moved by steps along the camera's axes."""
+    steps = _STEP_M * np.arange(-_STEPS, _STEPS + 1)
+    poses = np.repeat(T_cam_obj[None], len(steps) ** 3, 0)
+    poses[:, :3, 3] += np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
+    return poses

@@ -1,0 +1,132 @@
+"""What somebody says of an object, to the built-in segmenter: boxes, masks, clicks beside it, corrections."""
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import preset
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.types import Frame
+from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
+
+CAMERA = Camera(300.0, 310.0, 158.3, 121.7, 320, 240)
+
+
+def rectangle(left: int, top: int, right: int, bottom: int) -> np.ndarray:
+    mask = np.zeros((240, 320), bool)
+    mask[top:bottom, left:right] = True
+    return mask
+
+
+LEFT, RIGHT = rectangle(90, 80, 150, 140), rectangle(150, 80, 200, 140)  # two cards side by side at one depth
+
+
+def picture(k: int = 0, moved: int = 0, likeness: float = 0.0) -> Frame:
+    """A printed wall and the two cards before it; ``likeness`` of 1 gives both one colour, but a dark line between."""
+    rng = np.random.default_rng(3)
+    rgb = cv2.resize(rng.integers(60, 120, (24, 32, 3), np.uint8), (320, 240)).astype(float)
+    depth = np.full((240, 320), 1.0)
+    colours = np.array([[200.0, 60, 40], [40, 90, 200]])
+    for mask, colour in zip((LEFT, RIGHT), (colours[0], (1 - likeness) * colours[1] + likeness * colours[0])):
+        mask = np.roll(mask, moved, 1)
+        rgb[mask], depth[mask] = colour, 0.7
+    rgb[:, 149 + moved : 151 + moved][np.roll(LEFT | RIGHT, moved, 1)[:, 149 + moved : 151 + moved]] *= 0.3
+    rng = np.random.default_rng(k)
+    rgb = np.clip(rgb + rng.normal(0, 3, rgb.shape), 0, 255).astype(np.uint8)
+    return Frame(k, k / 30, rgb, (depth + rng.normal(0, 0.001, depth.shape)).astype(np.float32))
+
+
+def segmenter() -> BuiltinSegmenter:
+    return BuiltinSegmenter(CAMERA, preset().segmentation, np.random.default_rng(0))
+
+
+def iou(one: np.ndarray, other: np.ndarray) -> float:
+    return (one & other).sum() / max((one | other).sum(), 1)
+
+
+@pytest.mark.parametrize("wrong_px", [(0, 0, 0, 0), (-4, 3, 5, -2), (2, 2, -2, -2)])
+def test_a_box_starts_an_object(wrong_px):
+    """Drawn a little too wide or too tight; what lies outside is not of the object, though nothing parts them."""
+    box = np.add((90, 80, 150, 140), wrong_px)
+    found = segmenter().segment(picture(likeness=1.0), [Prompt("left", box_px=box)]) == 1
+    assert iou(found, LEFT) > 0.85
+
+
+def test_a_box_that_reaches_beyond_the_image_is_cut_to_it():
+    frame = picture(moved=-100)
+    found = segmenter().segment(frame, [Prompt("left", box_px=(-40, 75, 52, 145))]) == 1
+    assert iou(found, rectangle(0, 80, 50, 140)) > 0.85
+
+
+def test_a_mask_is_taken_as_it_is_and_followed():
+    follow, odd = segmenter(), LEFT & ~rectangle(100, 90, 110, 100)
+    np.testing.assert_array_equal(follow.segment(picture(), [Prompt("left", mask=odd)]) == 1, odd)
+    for k in range(1, 4):
+        found = follow.segment(picture(k, 3 * k)) == 1
+        assert iou(found, np.roll(LEFT, 3 * k, 1)) > 0.9
+
+
+def test_masks_in_between_are_taken_and_an_empty_one_says_hidden():
+    """The segmenter goes on from the newest: an object that is said to be hidden is not found where nobody saw it."""
+    follow = segmenter()
+    follow.segment(picture(0), [Prompt("left", mask=LEFT)])
+    follow.segment(picture(1))
+    given = np.roll(LEFT, 12, 1)
+    np.testing.assert_array_equal(follow.segment(picture(2, 12), [Prompt("left", mask=given)]) == 1, given)
+    assert iou(follow.segment(picture(3, 14)) == 1, np.roll(LEFT, 14, 1)) > 0.9
+    nothing = np.zeros_like(LEFT)
+    assert not follow.segment(picture(4, 14), [Prompt("left", mask=nothing)]).any()
+    assert not follow.segment(picture(5, 14)).any() and follow.names == ("left",)
+
+
+def test_a_click_beside_the_object_says_what_is_not_of_it():
+    """Both cards are one surface of one colour; the click on the other one takes it off, up to the line between."""
+    frame, on = picture(likeness=1.0), [[110, 100]]
+    without = segmenter().segment(frame, [Prompt("left", points_px=on)]) == 1
+    found = segmenter().segment(frame, [Prompt("left", points_px=on, negative_px=[[175, 110]])]) == 1
+    assert iou(without, LEFT | RIGHT) > 0.9 and iou(found, LEFT) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("was", "say"),
+    [
+        (LEFT | RIGHT, {"negative_px": [[175, 110]]}),
+        (LEFT & rectangle(90, 80, 115, 140), {"points_px": [[140, 120]], "negative_px": [[175, 110]]}),
+        (RIGHT, {"box_px": (90, 80, 150, 140)}),
+    ],
+)
+def test_a_correction_mends_the_mask_and_lasts(was, say):
+    follow = segmenter()
+    follow.segment(picture(0), [Prompt("left", mask=was)])
+    found = follow.segment(picture(1), [Prompt("left", 1, **say)]) == 1
+    assert iou(found, LEFT) > 0.85 > iou(was, LEFT)
+    assert iou(follow.segment(picture(2)) == 1, LEFT) > 0.8
+
+
+def test_a_click_brings_back_what_was_given_up():
+    follow = segmenter()
+    follow.segment(picture(0), [Prompt("left", mask=LEFT)])
+    follow.segment(picture(1), [Prompt("left", mask=np.zeros_like(LEFT))])
+    say = Prompt("left", 2, points_px=[[110, 100]], negative_px=[[175, 110]])
+    assert iou(follow.segment(picture(2), [say]) == 1, LEFT) > 0.9
+
+
+def test_a_refused_prompt_changes_nothing():
+    follow, other = segmenter(), segmenter()
+    for one in (follow, other):
+        one.segment(picture(0), [Prompt("left", mask=LEFT)])
+    frame = picture(1)
+    hole = frame.depth_m.copy()
+    hole[95:106, 170:181] = 0
+    frame = Frame(1, 1 / 30, frame.rgb, hole)
+    for prompt, match in (
+        (Prompt("right", 1, points_px=[[175, 100]]), r"clicks on 'right': got \(175, 100\) has no depth in frame 1"),
+        (Prompt("right", 1, points_px=[[320, 100]]), "clicks on 'right'"),
+        (Prompt("right", 1, box_px=(172, 97, 178, 103)), "box around 'right': got no depth inside it in frame 1"),
+    ):
+        with pytest.raises(BadInput, match=match):
+            follow.segment(frame, [Prompt("left", 1, negative_px=[[5, 5]]), prompt])
+    assert follow.names == ("left",)
+    np.testing.assert_array_equal(follow.segment(frame), other.segment(frame))
