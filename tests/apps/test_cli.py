@@ -78,7 +78,7 @@ def test_eval_prints_exactly_one_json_object(done, capsys):
     out, err = capsys.readouterr()
     got = json.loads(out)  # anything beside one object would be "Extra data"
     assert err == "" and "NaN" not in out and "Infinity" not in out
-    assert set(got) == {"objects", "mean", "hz", "p95_ms", "tracker", "masks", "preset", "seed", "align"}
+    assert set(got) == {"objects", "mean", "hz", "p95_ms", "tracker", "masks", "segmenter", "preset", "seed", "align"}
     assert set(got["objects"]) == {"object"}
     assert set(got["objects"]["object"]) == SCORES | {"frames", "lost"}
     assert set(got["mean"]) == SCORES
