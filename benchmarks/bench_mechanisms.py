@@ -170,7 +170,7 @@ def compare(runs: pd.DataFrame) -> pd.DataFrame:
             row |= {"most": f"{gain['add'][worst]:+.2f} {worst}", "least": f"{gain['add'][best]:+.2f} {best}"}
             row |= {"lost": -gain["lost"].sum(), "confidently wrong": -gain["confidently_wrong"].sum()}
             rows.append(
-                row | {"Brier": -gain["brier"].mean(), "unchanged": int((gain[["add", "adds"]] == 0).all(1).sum())}
+                row | {"Brier": -gain["brier"].mean(), "unchanged": int((gain[["add", "adds"]] == 0).all(axis=1).sum())}
             )
     return pd.DataFrame(rows).set_index("mechanism").sort_values("ADD", ascending=False) if rows else pd.DataFrame()
 

@@ -260,6 +260,10 @@ def test_beyond_the_cap_the_least_seen_go_first():
     assert len(points) == 10
 
 
+def test_below_the_cap_nothing_goes():
+    assert keypoints(14, replace(CFG, max_points=16)).retire()[0].tolist() == []
+
+
 def test_among_equals_the_oldest_go():
     points = keypoints(13, replace(CFG, max_points=10))
     assert points.retire()[0].tolist() == [0, 1, 2]

@@ -83,6 +83,13 @@ def test_a_vague_point_is_put_where_its_segment_predicts_it_and_a_sharp_one_stay
     assert p.cov[0, 0, 0] < 0.5
 
 
+def test_points_outside_the_region_are_invisible():
+    tracker, _ = started()
+    region = np.broadcast_to(np.arange(SHAPE[1]) < 100, SHAPE)
+    tracker._reconcile(region)
+    np.testing.assert_array_equal(tracker._points.visible, UV[:, 0] < 100)
+
+
 def test_positions_are_learned_from_points_that_are_recognised():
     tracker, _ = started()
     p = tracker._points
@@ -110,14 +117,18 @@ def test_lost_points_of_no_segment_are_looked_for_where_they_were_for_a_while(fr
 def test_rejected_points_are_not_looked_for_where_they_were():
     tracker, ids = started(FEW)
     tracker.reject(ids[:2])
+    assert tracker._points.visible.tolist() == [False, False, True, True], "at once"
     tracks = tracker.track(frame())
     assert tracks.visible.tolist() == [False, False, True, True]
 
 
-def test_a_segment_is_lost_with_most_of_its_points():
-    tracker, ids = started()
-    (segment,) = tracker._segments.segments
-    tracker.reject(ids[: len(ids) // 3])
-    assert segment.posed
-    tracker.reject(ids[len(ids) // 3 :])
-    assert not segment.posed and segment.rejected_for == TrackingConfig().reject_frames
+def test_a_segment_is_lost_with_most_of_its_points_and_another_stays():
+    far = UV + np.array([140, 0], np.float32)
+    tracker, ids = started(np.vstack([UV, far]))
+    one, other = tracker._segments.segments
+    mine = ids[: len(UV)]
+    tracker.reject(mine[: len(mine) // 3])
+    assert one.posed
+    tracker.reject(mine[len(mine) // 3 :])
+    assert not one.posed and one.rejected_for == TrackingConfig().reject_frames and other.posed
+    np.testing.assert_allclose(CAMERA.project(one.rejected), UV[len(mine) // 3 :], atol=0.1)

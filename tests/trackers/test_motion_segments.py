@@ -59,6 +59,16 @@ def test_points_that_leave_together_stay_verified_and_then_are_a_segment():
     assert len(segments.segments) == 2 and set(p.segment[part]) == {1} and not p.leaving.any()
 
 
+def test_points_that_come_back_are_not_leaving_any_more():
+    p, segments = started(np.vstack([LEFT, LEFT + np.array([48, 0])]), image())
+    p.uv[:10] += [0, 7]
+    segments.fit(p, image())
+    assert p.leaving[:10].all()
+    p.uv[:10] -= [0, 7]
+    segments.fit(p, image())
+    assert not p.leaving.any() and p.verified.all()
+
+
 def test_a_rejected_segment_is_not_searched_for_where_it_was(monkeypatch):
     p, segments = started(LEFT, image())
     segments.invalidate(p, np.ones(len(p), bool))
