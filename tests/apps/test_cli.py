@@ -80,7 +80,7 @@ def test_eval_prints_exactly_one_json_object(done, capsys):
     assert err == "" and "NaN" not in out and "Infinity" not in out
     assert set(got) == {"objects", "mean", "hz", "p95_ms", "tracker", "masks", "segmenter", "preset", "seed", "align"}
     assert set(got["objects"]) == {"object"}
-    assert set(got["objects"]["object"]) == SCORES | {"frames", "lost"}
+    assert set(got["objects"]["object"]) == SCORES | {"frames", "lost", "frames_to_recovery"}
     assert set(got["mean"]) == SCORES
     assert got["objects"]["object"]["frames"] == FRAMES and got["objects"]["object"]["lost"] == 0
     assert 98 < got["mean"]["add_auc"] <= got["mean"]["adds_auc"] <= 100
