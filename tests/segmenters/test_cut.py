@@ -58,7 +58,7 @@ def test_depth_beyond_the_reach_is_background_even_without_an_edge():
 
 def test_a_slope_between_an_object_and_its_support_does_not_join_them():
     """Without the plane, all of it would be one thing that goes on beyond the patch."""
-    patch, seeds, card = card_before_wall(card_m=0.93)
+    patch, seeds, _ = card_before_wall(card_m=0.93)
     patch.depth_m[8:22, 22:38] = np.linspace(0.93, 1.0, 16)
     _, component = by_geometry(patch, seeds, WALL, CONFIG)
     assert component[9:20, 11:21].all() and not component[:, 37:].any() and not component[:7].any()

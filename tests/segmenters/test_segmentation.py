@@ -184,7 +184,7 @@ def test_colours_that_change_are_learned():
         follow.segment(lit(k, at), () if k else on(card=at))
     follow.segment(picture(80, [], card(at, (160, 120))))
     back = (30, 150)
-    points = back + np.stack(np.meshgrid([8, 20, 35, 50], [8, 22, 40]), -1).reshape(-1, 2)).astype(float)
+    points = np.add(back, np.stack(np.meshgrid([8, 20, 35, 50], [8, 22, 40]), -1).reshape(-1, 2)).astype(float)
     found = follow.segment(lit(81, back), hints={"card": Hint(points)}) == 1
     assert iou(found, card(back)) > 0.9
 
