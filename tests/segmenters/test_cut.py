@@ -1,5 +1,7 @@
 """Evidence on made-up patches: what depth, the support plane and the reconstructed surface say of each pixel."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,11 +47,22 @@ def test_what_goes_on_beyond_the_patch_is_not_one_object():
 
 
 def test_depth_beyond_the_reach_is_background_even_without_an_edge():
-    depth = np.repeat(np.linspace(0.6, 1.4, W, dtype=np.float32)[None], H, 0)
+    """A slope goes on beyond the patch on both sides, so that nothing but its depth speaks."""
+    depth = np.repeat(np.linspace(0.85, 1.1, W, dtype=np.float32)[None], H, 0)
     patch, seeds = patch_of(depth), np.zeros((H, W), bool)
     seeds[15, 3] = True
-    log_odds, _ = by_geometry(patch, seeds, None, CONFIG)
-    assert (log_odds[depth > depth[15, 3] + CONFIG.reach_m] < 0).all()
+    log_odds, component = by_geometry(patch, seeds, None, replace(CONFIG, reach_m=0.1))
+    far = np.abs(depth - depth[15, 3]) > 0.1
+    assert not component.any() and (log_odds[far] < 0).all() and not log_odds[~far].any()
+
+
+def test_a_slope_between_an_object_and_its_support_does_not_join_them():
+    """Without the plane, all of it would be one thing that goes on beyond the patch."""
+    patch, seeds, _ = card_before_wall(card_m=0.93)
+    patch.depth_m[8:22, 22:38] = np.linspace(0.93, 1.0, 16)
+    _, component = by_geometry(patch, seeds, WALL, CONFIG)
+    assert component[9:20, 11:21].all() and not component[:, 37:].any() and not component[:7].any()
+    assert not by_geometry(patch, seeds, None, CONFIG)[1].any()
 
 
 def test_a_strip_above_the_support_plane_belongs_to_the_plane():

@@ -9,7 +9,7 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.motion import Motion, Motions, Past, agrees, parts_that_follow, scene_follows
+from p2p_lib.segmenters.builtin.motion import Motion, Motions, Past, agrees, parts_that_follow, scene_stays
 from p2p_lib.segmenters.builtin.patch import Box, Patch, connected
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
@@ -71,7 +71,7 @@ def test_a_part_that_moves_along_is_told_from_a_neighbour_that_stays():
     )
     assert (parts & part).sum() > 0.8 * part.sum()
     assert not (parts & ~part).any() and neighbour.any()
-    assert not scene_follows(patch, motions)
+    assert scene_stays(patch, motions)
 
 
 def test_what_may_as_well_have_stood_still_is_no_part():
@@ -86,7 +86,7 @@ def test_what_may_as_well_have_stood_still_is_no_part():
     patch = Patch.of(frames[1], Box(40, 40, 280, 200), CAMERA, CONFIG)
     plate = connected(patch.smooth, patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
     motions = motions_of(*frames, moved_m)
-    assert not scene_follows(patch, motions)
+    assert scene_stays(patch, motions)
     assert not parts_that_follow(patch, patch.smooth, plate, motions).any()
 
 
@@ -96,7 +96,7 @@ def test_a_camera_that_moves_past_what_lies_still_tells_nothing():
     patch, _ = patch_and_plate(now, moved_m)
     motions = motions_of(then, now, moved_m)
     plate = connected(patch.smooth, patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
-    assert scene_follows(patch, motions)
+    assert not scene_stays(patch, motions)
     assert not parts_that_follow(patch, patch.smooth, plate, motions).any()
 
 

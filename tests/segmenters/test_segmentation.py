@@ -170,6 +170,34 @@ def test_points_on_something_else_do_not_bring_it_back():
     assert not (follow.segment(gone, hints={"card": Hint(wrong)}) == 1).any()
 
 
+def test_colours_that_change_are_learned():
+    """The light turns from red to blue; when the card comes back it has the colours that it had last."""
+    at, follow = (120, 80), segmenter()
+
+    def lit(k: int, where: tuple[int, int]) -> Frame:
+        frame, share = picture(k, [(where, 1)]), min(k / 40, 1)
+        rgb = frame.rgb.copy()
+        rgb[card(where)] = (220 - 190 * share, 40, 40 + 190 * share)
+        return Frame(k, k / 30, rgb, frame.depth_m)
+
+    for k in range(80):
+        follow.segment(lit(k, at), () if k else on(card=at))
+    follow.segment(picture(80, [], card(at, (160, 120))))
+    back = (30, 150)
+    points = np.add(back, np.stack(np.meshgrid([8, 20, 35, 50], [8, 22, 40]), -1).reshape(-1, 2)).astype(float)
+    found = follow.segment(lit(81, back), hints={"card": Hint(points)}) == 1
+    assert iou(found, card(back)) > 0.9
+
+
+def test_what_nothing_else_tells_apart_stays_where_it_was():
+    """A piece of the printed wall, given as a mask: neither depth nor colours nor edges end it."""
+    piece, follow = card((120, 90)), segmenter()
+    follow.segment(picture(0, []), [Prompt("piece", 0, mask=piece)])
+    for k in range(1, 6):
+        found = follow.segment(picture(k, [])) == 1
+    assert iou(found, piece) > 0.8
+
+
 def test_an_object_leaves_the_picture():
     follow = segmenter()
     for k in range(24):

@@ -14,8 +14,8 @@ from p2p_lib.segmenters.builtin.patch import Patch, depth_step_m, dilated
 
 #: Two looks at one place differ by less than this in colour, as a mean over the channels.
 _SAME_COLOUR = 40.0
-#: So much of a part agrees with the object's motion, and at most so much with standing still or of the scene with it.
-_AGREES, _UNDECIDED = 0.75, 0.5
+#: So much of a part agrees with the object's motion, at most so much with standing still, and so much of a still scene.
+_AGREES, _UNDECIDED, _STAYS = 0.75, 0.5, 0.7
 #: A part of which more was not there in the first frame has come to the object since.
 _ABSENT = 0.3
 #: A part of fewer pixels of the grid proves nothing; one this near to the object may hang together with it.
@@ -87,17 +87,17 @@ def agrees(
     return known & (np.abs(behind_m) < step_m) & alike, known & (behind_m > 2 * step_m)
 
 
-def scene_follows(patch: Patch, motions: Motions) -> bool:
-    """Whether what lies around a patch moved as the object did, or cannot tell: then its motion tells nothing."""
-    frame, motion = motions.now, motions.recent
+def scene_stays(patch: Patch, motions: Motions) -> bool:
+    """Whether what lies around a patch stayed where it was: before a moving camera, all that lies still moves alike."""
+    frame, then = motions.now, motions.recent.then
     around = np.ones(frame.shape, bool)
     around[patch.box.slices] = False
     v, u = np.mgrid[: frame.shape[0] : _SCENE_STRIDE, : frame.shape[1] : _SCENE_STRIDE]
     some = around[v, u] & (frame.depth_m[v, u] > 0)
     v, u = v[some], u[some]
     p_cam = patch.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
-    follows, _ = agrees(p_cam, frame.rgb[v, u], patch.camera, motion.then, motion.T_then_now)
-    return len(follows) < _FEWEST or follows.mean() > _UNDECIDED
+    stayed, _ = agrees(p_cam, frame.rgb[v, u], patch.camera, then, np.eye(4))
+    return len(stayed) >= _FEWEST and stayed.mean() > _STAYS
 
 
 def parts_that_follow(patch: Patch, smooth: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
@@ -115,7 +115,7 @@ def parts_that_follow(patch: Patch, smooth: np.ndarray, component: np.ndarray, m
     at_border = np.bincount(part[patch.border()], minlength=count) / patch.border().sum()
     beside &= at_border < _AT_THE_BORDER
     v, u = np.nonzero(beside[part])
-    if not len(v) or scene_follows(patch, motions):
+    if not len(v) or not scene_stays(patch, motions):
         return np.zeros(patch.shape, bool)
     p_cam, rgb, motion, first = patch.points()[v, u], patch.rgb[v, u], motions.recent, motions.first
     moved, _ = agrees(p_cam, rgb, patch.camera, motion.then, motion.T_then_now)

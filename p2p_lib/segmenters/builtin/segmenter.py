@@ -23,7 +23,7 @@ from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
-from p2p_lib.segmenters.builtin.motion import EVERY, Motions, Past, scene_follows
+from p2p_lib.segmenters.builtin.motion import EVERY, Motions, Past, scene_stays
 from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, support_plane
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start, only
 
@@ -229,7 +229,7 @@ class BuiltinSegmenter:
         cfg, px_m = self.config, self._focal_px / target.seen.z_m
         patch = Patch.of(frame, around(hint.uv_px.mean(0), cfg.reach_m * px_m, frame.shape), self.camera, cfg)
         motions = self._motions(frame, target, hint)
-        if motions is None or scene_follows(patch, motions):
+        if motions is None or not scene_stays(patch, motions):
             return target
         plane = support_plane(patch, patch.depth_m > 0, self._rng)
         _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions)
