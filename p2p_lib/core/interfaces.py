@@ -82,14 +82,12 @@ class Hint:
     distance_m  (H, W) float32: signed distance of each measured pixel to the object's reconstructed surface
                 at the pose those points give, positive in front of it; NaN where unknown. None without a surface
     T_cam_obj   (4, 4) that pose; None where there is none
-    still       the object has not moved in the scene for a while: all around it moves in the image as it does
     sighted     the object has been found there by shape and colour, after an absence
     """
 
     uv_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     distance_m: np.ndarray | None = None
     T_cam_obj: np.ndarray | None = None
-    still: bool = False
     sighted: bool = False
 
 

@@ -17,8 +17,6 @@ from p2p_lib.core.types import WITH_POSE, Status
 
 #: A return has to be confirmed for so many frames, and is marked as recovered meanwhile.
 CONFIRM_FRAMES = 5
-#: An object has moved that is farther than this from where it lay, m, and lies still after so many seconds.
-_MOVED_M, _STILL_S = 0.03, 1.0
 #: Shape and colour have found an object where this share of its surface shows.
 SIGHTED, SIGHTED_STILL = 0.5, 0.3
 
@@ -57,7 +55,6 @@ class Lifecycle:
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
     T_world_obj     newest pose in the scene, where the camera was known; None before
-    T_world_lay     pose in the scene from which it has not moved since, and moved_s, when it last did
     start_px        pixels of the newest mask before the first pose; None without a mask
     """
 
@@ -68,8 +65,6 @@ class Lifecycle:
     T_left: np.ndarray | None = None
     confirming: int = 0
     T_world_obj: np.ndarray | None = None
-    T_world_lay: np.ndarray | None = None
-    moved_s: float = -np.inf
     start_px: int | None = None
 
     @property
@@ -101,15 +96,7 @@ class Lifecycle:
         """The state with the newest pose's place in the scene, once a return has been confirmed."""
         if T_world_cam is None or self.confirming:
             return self
-        now = T_world_cam @ self.T_cam_obj
-        lay = now if self.T_world_lay is None else self.T_world_lay
-        if np.linalg.norm(now[:3, 3] - lay[:3, 3]) > _MOVED_M:
-            return replace(self, T_world_obj=now, T_world_lay=now, moved_s=self.seen_s)
-        return replace(self, T_world_obj=now, T_world_lay=lay)
-
-    def lies_still(self, time_s: float) -> bool:
-        """Whether it has not moved in the scene for a while, as far as is known."""
-        return self.T_world_lay is not None and time_s > self.moved_s + _STILL_S
+        return replace(self, T_world_obj=T_world_cam @ self.T_cam_obj)
 
     def moved_from_last(self, T_cam_obj: np.ndarray) -> tuple[float, float] | None:
         """Metres and degrees from the pose of the frame before to another (4, 4); None after a gap."""

@@ -396,4 +396,4 @@ class ObjectTracker:
         distance_m = None
         if self.model.has_surface:
             distance_m = surface_distance(self.model.surface, frame.depth_m, self.observer.camera, T_cam_obj)
-        return Hint(uv_px, distance_m, T_cam_obj, self.life.lies_still(frame.time_s), sighted)
+        return Hint(uv_px, distance_m, T_cam_obj, sighted)

@@ -105,15 +105,6 @@ def test_what_was_left_is_kept_through_the_frames_of_an_absence():
 # -- the scene -------------------------------------------------------------------------------------
 
 
-def seen_from(T_world_cam: np.ndarray, time_s: float, T_cam_obj: np.ndarray, life: Lifecycle) -> Lifecycle:
-    """One more frame with a pose, with the camera known."""
-    return life.with_pose(T_cam_obj, time_s, Status.TRACKED).placed(T_world_cam)
-
-
-def shifted(x_m: float) -> np.ndarray:
-    return se3.exp(np.array([0, 0, 0, x_m, 0, 0]))
-
-
 def test_what_lay_still_is_expected_where_it_lay():
     life = lived(GOOD)[-1].placed(pose(3))
     assert life.scene_prior(pose(5)) == {}, "while it is seen it needs no prior"
@@ -127,19 +118,6 @@ def test_a_return_has_a_place_once_it_is_confirmed():
     life = lived(GOOD)[-1].placed(np.eye(4)).without_pose(Status.LOST)
     back = life.with_pose(pose(9), 9.0, Status.RECOVERED)
     np.testing.assert_array_equal(back.placed(np.eye(4)).T_world_obj, life.T_world_obj)
-
-
-def test_it_lies_still_while_the_camera_moves_and_not_once_it_is_carried():
-    life = Lifecycle().started(shifted(0.0), 0.0, Status.TRACKED)
-    assert not life.lies_still(0.0), "nobody knows the camera"
-    for k in range(10):  # the camera goes one way, the object the other in its image
-        life = seen_from(shifted(0.1 * k), 0.1 * k, shifted(-0.1 * k), life)
-        assert life.lies_still(0.1 * k)
-    life = seen_from(shifted(0.9), 1.0, shifted(-0.8), life)
-    assert not life.lies_still(1.0)
-    for k in range(12):
-        life = seen_from(shifted(0.9), 1.1 + 0.1 * k, shifted(-0.8), life)
-    assert life.lies_still(2.3)
 
 
 def test_shape_and_colour_stand_for_points_at_a_return():

@@ -221,8 +221,8 @@ class BuiltinSegmenter:
         return hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
 
     def _motions(self, frame: Frame, target: _Target, hint: Hint) -> Motions | None:
-        """How an object moved; None where nobody knows, or what is around it moves as it does."""
-        return target.past.motions(frame, hint.T_cam_obj) if self._sure(hint) and not hint.still else None
+        """How an object moved; None where nobody knows."""
+        return target.past.motions(frame, hint.T_cam_obj) if self._sure(hint) else None
 
     def _with_room(self, frame: Frame, target: _Target, hint: Hint) -> _Target:
         """An object with room for parts that move with it, which may reach farther than all that it has shown."""
