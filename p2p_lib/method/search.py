@@ -41,6 +41,10 @@ _STEP_M, _STEPS = 0.03, 2
 _COARSE, _TRIED = 3, 3
 #: A pose as far away as this (1/m^2) from the proposed one has to fit better by its square.
 _AWAY = 40.0
+#: From this share on a pose is polished: by small motions (rad, m), all at first, then smaller ones about the best.
+_PROMISING, _POLISH_SCALES = 0.3, (1.0, 0.4)
+_NEARBY = np.random.default_rng(0).normal(size=(150, 6)) * np.repeat([0.06, 0.015], 3)
+_NEARBY[0] = 0
 #: Iterations of the alignment, and what keeps it where the shape leaves it free: rad, m.
 _ITERATIONS, _FREE = 6, np.diag(np.repeat([0.1, 0.03], 3) ** -2.0)
 
@@ -96,7 +100,18 @@ class ImageSearch:
         score = share - _AWAY * ((poses - T_cam_obj)[:, :3, 3] ** 2).sum(1)
         best = [k for k in np.argsort(-score)[:_TRIED] if np.isfinite(score[k])]
         found = [self.at(self._aligned(poses[k], sample), sample) for k in best]
-        return max((s for s in found if s is not None), key=lambda s: s.share, default=None)
+        best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
+        return None if best is None or best.share < _PROMISING else self.at(self._polished(best, sample), sample)
+
+    def _polished(self, found: Sighting, sample: SurfaceSample) -> np.ndarray:
+        """The pose nearby that shows most: colours tell where the shape does not, as on a flat cover."""
+        T_cam_obj, centre = found.T_cam_obj, sample.p_obj.mean(0)
+        about, back = se3.from_rt(np.eye(3), centre), se3.from_rt(np.eye(3), -centre)
+        for scale in _POLISH_SCALES:
+            poses = T_cam_obj @ about @ se3.exp(scale * _NEARBY) @ back
+            share, _, _ = self._compare(poses, sample, _FINE_M)
+            T_cam_obj = poses[share.argmax()]
+        return se3.orthonormalised(T_cam_obj)
 
     def at(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
         """What speaks for one pose; None where too little of the surface would be in the image."""
