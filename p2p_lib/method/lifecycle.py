@@ -15,8 +15,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import LifecycleConfig
 from p2p_lib.core.types import WITH_POSE, Status
 
-#: A return has to be confirmed for so many frames, and is marked as recovered meanwhile.
-CONFIRM_FRAMES = 5
+#: A return has to be confirmed for so many frames, and is marked as recovered meanwhile; for more without points.
+CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES = 5, 15
 #: Shape and colour have found an object where this share of its surface shows.
 SIGHTED, SIGHTED_STILL = 0.5, 0.3
 
@@ -77,6 +77,11 @@ class Lifecycle:
         """Whether a pose would be a return, or one of the frames that confirm a return."""
         return not self.has_pose or self.confirming > 0
 
+    @property
+    def sought(self) -> bool:
+        """Whether it is absent, or back by shape and colour alone."""
+        return not self.has_pose or (self.confirming > 0 and self.status is Status.DEGRADED)
+
     def motion_priors(self) -> dict[str, np.ndarray]:
         """Where the object is if it stays or moves on evenly: origin to T_cam_obj; empty after a gap."""
         if not self.has_pose or self.T_cam_obj is None:
@@ -117,6 +122,7 @@ class Lifecycle:
 
     def with_pose(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:
         """The state after a frame with an accepted pose."""
+        longest = CONFIRM_SIGHTED_FRAMES if status is Status.DEGRADED else CONFIRM_FRAMES
         return replace(
             self,
             status=status,
@@ -124,7 +130,7 @@ class Lifecycle:
             seen_s=time_s,
             T_previous=self.T_cam_obj if self.has_pose else None,
             T_left=self.T_left if self.has_pose else self.T_cam_obj,
-            confirming=max(self.confirming - 1, 0) if self.has_pose else CONFIRM_FRAMES,
+            confirming=min(max(self.confirming - 1, 0), longest) if self.has_pose else longest,
         )
 
     def started(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:

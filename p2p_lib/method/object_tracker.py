@@ -129,8 +129,8 @@ class ObjectTracker:
             if use.sum() < _FEW_KEYPOINTS:
                 use = certain
             priors = self.life.motion_priors() if with_motion else {}
-            if not priors and obs.sighted is not None:
-                priors = {"sighting": obs.sighted}
+            if obs.sighted is not None:
+                priors = {"sighting": obs.sighted, **priors}
             found = self._hypotheses(obs, use, priors)
             most = max((h.support for h in found), default=0)
             if priors and cfg.method != "svd" and most < cfg.contradicted * use.sum():
@@ -326,6 +326,11 @@ class ObjectTracker:
     # -- questions of the pipeline -------------------------------------------------------------
 
     @property
+    def sought(self) -> bool:
+        """Whether an object that has been seen is absent, or back by shape and colour alone."""
+        return not self.model.empty and self.life.sought
+
+    @property
     def away(self) -> bool:
         """Whether an object that has been seen has no pose now."""
         return not self.model.empty and not self.life.has_pose
@@ -354,8 +359,8 @@ class ObjectTracker:
         return self.points_px(obs, best.T_cam_obj)
 
     def sighted(self, obs: Observation) -> Sighting | None:
-        """Where an absent object shows by shape and colour, near where the scene or a few points propose it."""
-        if not (self.away and self._searches) or (obs.mask is not None and self._hidden(obs.mask)):
+        """Where a sought object shows by shape and colour, near where the scene or a few points propose it."""
+        if not (self.sought and self._searches) or (obs.mask is not None and self._hidden(obs.mask)):
             return None
         proposed = [*self.life.scene_prior(obs.frame.T_world_cam).values()]
         proposed += [hypothesis.T_cam_obj for hypothesis in self._register(obs)[:1]]
@@ -379,7 +384,7 @@ class ObjectTracker:
             return Hint(), Requests()
         obs = self.observe(frame, None, tracks, sighting)
         best, requests = max(self._register(obs), key=lambda h: h.support, default=None), Requests()
-        if self.away:
+        if self.sought:
             agrees = np.zeros(len(self.map), bool) if best is None else best.inliers
             requests = Requests(reject=self.map.ids[obs.tracks.visible & ~agrees])
             enough = best is not None and best.support >= self.config.lifecycle.return_inliers

@@ -204,8 +204,8 @@ class Point2Pose:
             return replace(frame, T_world_cam=self.scene.locate(frame, occupied))
 
     def _sightings(self, frame: Frame, masks: Masks, objects: Mapping[str, ObjectTracker]) -> dict[str, Sighting]:
-        """Absent objects that show again by shape and colour; the tracker looks for their points there."""
-        seen = {name: obj.observe(frame, masks[name], self.tracks) for name, obj in objects.items() if obj.away}
+        """Sought objects that show by shape and colour; the tracker looks for their points there."""
+        seen = {name: obj.observe(frame, masks[name], self.tracks) for name, obj in objects.items() if obj.sought}
         looked = {name: objects[name].sighted(obs) for name, obs in seen.items()}
         found = {name: sighting for name, sighting in looked.items() if sighting is not None}
         self._suggest({name: objects[name].points_px(seen[name], at.T_cam_obj) for name, at in found.items()})

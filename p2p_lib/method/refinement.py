@@ -376,19 +376,23 @@ _STRIDE = 2
 def surface_distance(volume: Surface, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H, W) float32 signed distance of each measured pixel to the surface under a pose, in metres.
 
-    Positive in front of it; NaN where it is not known. Every second pixel is asked, where the surface can be seen.
+    Positive in front of it, infinite off the volume; NaN where it is not known. Every second pixel is asked, where
+    the surface can be seen.
     """
-    distance = np.full(depth_m.shape, np.nan, np.float32)
-    uv = camera.project(se3.transform(T_cam_obj, volume.corners_m()))
+    distance = np.where(depth_m > 0, np.float32(np.inf), np.float32(np.nan))
+    corners = volume.corners_m()
+    uv = camera.project(se3.transform(T_cam_obj, corners))
     if not np.isfinite(uv).all():
-        return distance
+        return np.full(depth_m.shape, np.nan, np.float32)
     size = np.array(depth_m.shape[::-1])
     (left, top), (right, bottom) = np.clip([uv.min(0), uv.max(0) + 1], 0, size).astype(int)
     v, u = np.mgrid[top:bottom:_STRIDE, left:right:_STRIDE]
     z = depth_m[v, u]
     p_obj = se3.transform(se3.inverse(T_cam_obj), camera.unproject(np.stack([u, v], -1), z).reshape(-1, 3))
     value, known = volume.query(p_obj)
-    found = np.where(known & (z.ravel() > 0), value, np.nan).reshape(z.shape)
+    off = ((p_obj < corners.min(0)) | (p_obj > corners.max(0))).any(1)
+    value = np.where(known, value, np.where(off, np.inf, np.nan))
+    found = np.where(z.ravel() > 0, value, np.nan).reshape(z.shape)
     coarse = np.repeat(np.repeat(found, _STRIDE, 0), _STRIDE, 1)
     distance[top:bottom, left:right] = coarse[: bottom - top, : right - left]
     return distance

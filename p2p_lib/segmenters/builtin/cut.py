@@ -78,12 +78,13 @@ def by_colour(patch: Patch, own: np.ndarray, outside: np.ndarray, config: Segmen
 
 
 def by_surface(patch: Patch, hint: Hint, config: SegmentationConfig) -> np.ndarray:
-    """The object's reconstructed surface passes here, or its outside does."""
+    """The object's reconstructed surface passes here, or its outside does; nothing of it is far from it."""
     if hint.distance_m is None:
         return np.zeros(patch.shape, np.float32)
     distance_m = patch.nearest(hint.distance_m)
     on, before = np.abs(distance_m) < _ON_SURFACE_M, distance_m > 2 * _ON_SURFACE_M
-    return config.surface_weight * (on.astype(np.float32) - before)
+    far = np.isinf(distance_m) & (len(hint.uv_px) >= config.find_points)  # by a pose that can be trusted
+    return config.surface_weight * (on.astype(np.float32) - before - far)
 
 
 def cut(
