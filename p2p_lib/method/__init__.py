@@ -9,6 +9,8 @@ object's step), then at the parts of that step in its order:
   determines;
 - select: ``selection``;
 - judge: ``lifecycle`` holds an object's state and every gate;
+- find again (ours): ``scene`` says how the camera moved and so where an object lies that was left, ``search`` whether
+  its surface shows there by shape and colour;
 - extend: ``object_model`` holds map, surface (``tsdf``, ``mesh``) and graph (``factor_graph``, ``keyframes``,
   ``keyframe_views``); ``sampling`` chooses new points; ``confidence`` says how well the pose is known.
 

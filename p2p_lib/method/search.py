@@ -39,8 +39,8 @@ _HIDDEN, _SHOWN = 0.5, 0.3
 _STEP_M, _STEPS = 0.03, 2
 #: The search compares every so many points, and so many of its best poses are aligned.
 _COARSE, _TRIED = 3, 3
-#: A pose as far away as this (1/m^2) from the proposed one has to fit better by its square.
-_AWAY = 40.0
+#: A place is no evidence where the surface, moved by its own size along itself, keeps this much of what it shows.
+_ANYWHERE = 0.7
 #: From this share on a pose is polished: by small motions (rad, m), all at first, then smaller ones about the best.
 _PROMISING, _POLISH_SCALES = 0.3, (1.0, 0.4)
 _NEARBY = np.random.default_rng(0).normal(size=(150, 6)) * np.repeat([0.06, 0.015], 3)
@@ -96,12 +96,21 @@ class ImageSearch:
             return None
         poses = _shifted(T_cam_obj)
         share, _, _ = self._compare(poses, sample.select(np.arange(0, len(sample), _COARSE)), _ROUGH_M)
-        # Where many fit alike, as on a table, the nearest to the proposed one.
-        score = share - _AWAY * ((poses - T_cam_obj)[:, :3, 3] ** 2).sum(1)
-        best = [k for k in np.argsort(-score)[:_TRIED] if np.isfinite(score[k])]
+        best = [k for k in np.argsort(-share)[:_TRIED] if np.isfinite(share[k])]
         found = [self.at(self._aligned(poses[k], sample), sample) for k in best]
         best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
-        return None if best is None or best.share < _PROMISING else self.at(self._polished(best, sample), sample)
+        if best is None or best.share < _PROMISING or not self._distinct(best, sample):
+            return None
+        return self.at(self._polished(best, sample), sample)
+
+    def _distinct(self, found: Sighting, sample: SurfaceSample) -> bool:
+        """Whether the surface fits worse beside the place: what a table shows as well anywhere proves nothing."""
+        spread = np.linalg.svd(sample.p_obj - sample.p_obj.mean(0), full_matrices=False)
+        along = 2 * spread[2][:2] * spread[1][:2, None] / np.sqrt(len(sample))
+        poses = np.repeat(found.T_cam_obj[None], 4, 0)
+        poses[:, :3, 3] += np.concatenate([along, -along]) @ found.T_cam_obj[:3, :3].T
+        share, _, _ = self._compare(poses, sample, _FINE_M)
+        return (share > _ANYWHERE * found.share).sum() < 2
 
     def _polished(self, found: Sighting, sample: SurfaceSample) -> np.ndarray:
         """The pose nearby that shows most: colours tell where the shape does not, as on a flat cover."""
