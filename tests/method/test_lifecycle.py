@@ -128,3 +128,14 @@ def test_shape_and_colour_stand_for_points_at_a_return():
     confirming = away.with_pose(pose(3), 3.0, Status.RECOVERED)
     assert confirming.judge(less, ALL, CFG).accepted, "what has been found may show a little less"
     assert not confirming.judge(dataclasses.replace(few, sighting=0.5 * SIGHTED), ALL, CFG).accepted
+
+
+def test_a_return_without_points_is_sought_until_points_confirm_it():
+    away = lived(GOOD, Status.LOST)[-1]
+    assert away.sought and not lived(GOOD)[-1].sought
+    life = away.with_pose(pose(3), 3.0, Status.DEGRADED)
+    for k in range(CONFIRM_FRAMES + 1):
+        assert life.sought and life.confirming
+        life = life.with_pose(pose(4 + k), 4.0 + k, Status.DEGRADED)
+    confirmed = life.with_pose(pose(20), 20.0, Status.RECOVERED)
+    assert not confirmed.sought and confirmed.confirming <= CONFIRM_FRAMES
