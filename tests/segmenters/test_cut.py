@@ -101,3 +101,15 @@ def test_a_mask_moves_with_the_texture():
     now, _ = warped(was, before, after)
     moved = np.roll(was, 2, 1)
     assert np.abs(now - moved).mean() < np.abs(was - moved).mean() / 2
+
+
+def test_nothing_far_from_a_known_surface_is_of_the_object():
+    """What lies off the whole volume, by a pose that enough points give; one of few points tells nothing."""
+    distance_m = np.full((H, W), np.nan, np.float32)
+    distance_m[:, : W // 2] = np.inf
+    sure, unsure = (np.zeros((k, 2)) for k in (CONFIG.find_points, CONFIG.find_points - 1))
+    patch = patch_of(np.ones((H, W), np.float32))
+    says = by_surface(patch, Hint(sure, distance_m), CONFIG)
+    before = by_surface(patch, Hint(unsure, distance_m), CONFIG)
+    far = patch.nearest(distance_m) == np.inf
+    assert far.any() and (says[far] < before[far]).all() and not says[~far].any()
