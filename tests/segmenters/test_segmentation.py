@@ -328,23 +328,6 @@ def test_depth_at_clicks_bridges_small_holes_only():
     assert abs(z[0] - WALL_M) < 0.01 and np.isnan(z[1]) and abs(z[2] - WALL_M) < 0.01
 
 
-def test_a_plane_that_few_samples_find_is_remembered():
-    """Three in ten pixels lie on a plane, the rest anywhere: by chance it is missed, not where it is known."""
-    frame = picture(0, [])
-    rng = np.random.default_rng(1)
-    depth = rng.uniform(0.5, 2.0, frame.shape).astype(np.float32)
-    depth[:, : round(0.3 * depth.shape[1])] = 0.8
-    frame = Frame(0, 0.0, frame.rgb, depth)
-    patch = Patch.of(frame, around(np.array([160.0, 120]), np.array([160.0, 120]), frame.shape), CAMERA, CONFIG)
-    known, everywhere = np.array([0.0, 0.0, -1.0, -0.8]), patch.depth_m > 0
-    fresh, remembered = (
-        [support_plane(patch, everywhere, np.random.default_rng(k), before) for k in range(60)]
-        for before in (None, known)
-    )
-    assert any(plane is None for plane in fresh) and all(plane is not None for plane in remembered)
-    assert all(np.allclose(plane, known, atol=0.02) for plane in remembered)
-
-
 def test_distances_to_a_known_surface():
     """A sphere stands for the reconstructed surface."""
 

@@ -192,13 +192,8 @@ def connected(region: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     return holds[part]
 
 
-def support_plane(
-    patch: Patch, where: np.ndarray, rng: np.random.Generator, before: np.ndarray | None = None
-) -> np.ndarray | None:
-    """(4,) n, d with n . p = d and n towards the camera: the plane of at least a fifth of the pixels; else None.
-
-    before  (4,) the plane of the frame before, which is tried too
-    """
+def support_plane(patch: Patch, where: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    """(4,) n, d with n . p = d and n towards the camera: the plane of at least a fifth of the pixels; else None."""
     v, u = np.nonzero(where)
     if len(v) < 100:
         return None
@@ -210,10 +205,7 @@ def support_plane(
     a, b, c = np.moveaxis(p[rng.integers(0, len(p), (80, 3))], 1, 0)
     n = np.cross(b - a, c - a)
     n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
-    d = (n * a).sum(1)
-    if before is not None:
-        n, d = np.vstack([n, before[:3]]), np.append(d, before[3])
-    off = np.abs(p @ n.T - d)
+    off = np.abs(p @ n.T - (n * a).sum(1))
     best = (off < within[:, None]).sum(0).argmax()
     inliers = off[:, best] < within
     for _ in range(3):

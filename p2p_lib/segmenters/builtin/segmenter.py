@@ -52,7 +52,6 @@ class _Target:
     colours  (4096,) shares of the colours it has shown; None if it has not been seen yet
     size_m   (2,) its largest width and height so far
     room_m   (2,) how far parts reach from the middle of what was seen that may be of it too
-    plane    (4,) what supports it, as :func:`support_plane` found it last; None where nothing does
     past     frames that it was seen in, with its poses
     given    the newest frame with a mask that was given and showed something, from which nothing is learnt yet: that
              costs time, and where every frame brings a mask it is never needed
@@ -62,7 +61,6 @@ class _Target:
     colours: np.ndarray | None = None
     size_m: np.ndarray | None = None
     room_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
-    plane: np.ndarray | None = None
     past: Past = field(default_factory=Past)
     given: tuple[Frame, np.ndarray] | None = None
 
@@ -167,10 +165,10 @@ class BuiltinSegmenter:
         if target.seen is None or hint.sighted:  # what has been followed is not where the object was found
             return target, self._find(frame, target, hint, taken)
         if not self._sure(hint):
-            return self._follow(frame, target, hint)
+            return target, self._follow(frame, target, hint)
         if frame.index % EVERY == 0:
             target = self._with_room(frame, target, hint)
-        target, found = self._follow(frame, target, hint)
+        found = self._follow(frame, target, hint)
         return replace(target, past=target.past.with_frame(frame, hint.T_cam_obj)), found
 
     def remove(self, name: str) -> None:
@@ -198,8 +196,8 @@ class BuiltinSegmenter:
                     labels[mask] = 0
         return labels
 
-    def _follow(self, frame: Frame, target: _Target, hint: Hint) -> tuple[_Target, tuple[Box, np.ndarray]]:
-        """From where it was a frame ago; and it, with what supports it."""
+    def _follow(self, frame: Frame, target: _Target, hint: Hint) -> tuple[Box, np.ndarray]:
+        """From where it was a frame ago."""
         cfg, seen = self.config, target.seen
         box = self._box_of_all(target, frame.shape)
         patch, before = (Patch.of(f, box, self.camera, cfg) for f in (frame, self._previous))
@@ -209,14 +207,14 @@ class BuiltinSegmenter:
         measured = (patch.depth_m > 0) & (z_before > 0)
         jumped = measured & (prior > 0.5) & (np.abs(patch.depth_m - z_before) > patch.step_m)
         core = (prior > 0.8) & ~jumped
-        plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng, target.plane)
+        plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
         log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, target, hint))
         stays = cfg.prior_weight * (2 * prior - 1)
         # Parts that come into view are connected with those that were seen before.
         log_odds += np.where(component, np.maximum(stays, 0), stays)
         log_odds[jumped] -= cfg.geometry_weight
         log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
-        return replace(target, plane=plane), (box, patch.up(only(cut(patch, log_odds, start=prior), core)))
+        return box, patch.up(only(cut(patch, log_odds, start=prior), core))
 
     def _sure(self, hint: Hint) -> bool:
         """Whether enough points agree on a pose."""
