@@ -54,7 +54,7 @@ class Lifecycle:
     T_previous      pose of the frame before it; None after a gap
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
-    T_world_obj     newest pose in the scene, where the camera was known; None before
+    T_world_obj     newest pose in the scene that many points agreed with, where the camera was known; None before
     start_px        pixels of the newest mask before the first pose; None without a mask
     """
 
@@ -98,8 +98,11 @@ class Lifecycle:
         return {"scene": se3.orthonormalised(se3.inverse(T_world_cam) @ self.T_world_obj)}
 
     def placed(self, T_world_cam: np.ndarray | None) -> Lifecycle:
-        """The state with the newest pose's place in the scene, once a return has been confirmed."""
-        if T_world_cam is None or self.confirming:
+        """The state with the newest pose's place in the scene, once a return has been confirmed.
+
+        A pose that few points agree with, as one of a sliver at the image's border, places nothing again.
+        """
+        if T_world_cam is None or self.confirming or (self.status is Status.DEGRADED and self.T_world_obj is not None):
             return self
         return replace(self, T_world_obj=T_world_cam @ self.T_cam_obj)
 

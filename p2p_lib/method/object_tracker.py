@@ -359,11 +359,11 @@ class ObjectTracker:
         return self.points_px(obs, best.T_cam_obj)
 
     def sighted(self, obs: Observation) -> Sighting | None:
-        """Where a sought object shows by shape and colour, near where the scene or a few points propose it."""
+        """Where a sought object shows by shape and colour, near where the scene says or it was found a frame ago."""
         if not (self.sought and self._searches) or (obs.mask is not None and self._hidden(obs.mask)):
             return None
         proposed = [*self.life.scene_prior(obs.frame.T_world_cam).values()]
-        proposed += [hypothesis.T_cam_obj for hypothesis in self._register(obs)[:1]]
+        proposed += [self.life.T_cam_obj] if self.life.has_pose else []
         with self._stopwatch("search"):
             search = self._search(obs.frame)
             found = [search.about(T_cam_obj, self.model.sample) for T_cam_obj in proposed]

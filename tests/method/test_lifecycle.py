@@ -114,6 +114,12 @@ def test_what_lay_still_is_expected_where_it_lay():
     assert away.scene_prior(None) == {} and away.placed(None) is away
 
 
+def test_a_pose_of_few_points_places_nothing_again():
+    life = lived(GOOD)[-1].placed(np.eye(4))
+    poor = life.with_pose(pose(7), 7.0, Status.DEGRADED).placed(np.eye(4))
+    np.testing.assert_array_equal(poor.T_world_obj, life.T_world_obj)
+
+
 def test_a_return_has_a_place_once_it_is_confirmed():
     life = lived(GOOD)[-1].placed(np.eye(4)).without_pose(Status.LOST)
     back = life.with_pose(pose(9), 9.0, Status.RECOVERED)
