@@ -17,7 +17,7 @@ OCCASIONS = {
     "factor_graph.iterations": ((20, 1), {"keypoint_map.keyframe_angle_deg": 3.0}),
     "sampling.max_visible": ((50, 60), {"sampling.points": 60}),
     "registration.iterations": ((100, 1), {"method.motion": False}),
-    "registration.sample_size": ((4, 3), {"method.motion": False, "registration.iterations": 1}),
+    "registration.sample_size": ((4, 3), {"method.motion": False, "registration.iterations": 1, "method.scene": False}),
     "refinement.huber_m": ((0.01, 0.0005), {}),
     "method.gates": (("none", "all"), {"method.redetection": False, "method.scene": False}),
     "method.scene": ((False, True), {"method.redetection": False}),
