@@ -94,20 +94,13 @@ class Point2Pose:
         if mask is clicks is negative is box is None:
             self._begin(name)
         else:
-            self.tell(_prompt(name, mask, clicks, negative, box))
+            self.tell(_prompt(name, mask=mask, clicks=clicks, negative=negative, box=box))
 
-    def correct(
-        self,
-        name: str,
-        mask: np.ndarray | None = None,
-        clicks: ArrayLike | None = None,
-        negative: ArrayLike | None = None,
-        box: ArrayLike | None = None,
-    ) -> None:
+    def correct(self, name: str, **said: ArrayLike | None) -> None:
         """Mend an object's mask in the next frame; arguments as of :meth:`add_object`. The last correction counts."""
         if name not in self.objects:
             raise BadInput("correct", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        self.tell(_prompt(name, mask, clicks, negative, box))
+        self.tell(_prompt(name, **said))
 
     def tell(self, prompt: Prompt) -> None:
         """What is said of an object in the next frame, whichever that is: starts the object, or corrects its mask."""
@@ -293,8 +286,9 @@ class Point2Pose:
             return self.tracker.track(frame, search, urgent)
 
 
-def _prompt(
-    name: str, mask: np.ndarray | None, clicks: ArrayLike | None, negative: ArrayLike | None, box: ArrayLike | None
-) -> Prompt:
-    given = {"mask": mask, "points_px": clicks, "negative_px": negative, "box_px": box}
-    return Prompt(name, **{key: value for key, value in given.items() if value is not None})
+def _prompt(name: str, **said: ArrayLike | None) -> Prompt:
+    """The prompt of the arguments of :meth:`Point2Pose.add_object`; TypeError for any other."""
+    field = {"mask": "mask", "clicks": "points_px", "negative": "negative_px", "box": "box_px"}
+    if unknown := sorted(set(said) - set(field)):
+        raise TypeError(f"unknown argument {unknown[0]!r}, expected some of {', '.join(field)}")
+    return Prompt(name, **{field[key]: value for key, value in said.items() if value is not None})
