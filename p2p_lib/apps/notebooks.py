@@ -31,8 +31,8 @@ from p2p_lib.figures import equations
 if TYPE_CHECKING:
     from nbformat import NotebookNode
 
-#: ``quick``: bundled data, CPU, about a minute a notebook. ``full``: the data and backends that are present.
-PROFILES = ("quick", "full")
+#: ``quick``: bundled data, CPU. ``full``: the data and backends that are present. Each with what it takes on two cores.
+PROFILES = {"quick": "some minutes", "full": "half an hour without data of yours, hours with it"}
 CHECKS_MIME = "application/vnd.p2p.checks+json"
 Value = bool | int | float | str
 
@@ -134,7 +134,8 @@ def run_notebooks(
         for suffix in (".ipynb", ".html"):
             (home / "notebooks" / path.name).with_suffix(suffix).unlink(missing_ok=True)
 
-    say(f"{_counted(plans)}, profile {profile}, results in {_near(home)}")
+    takes = "" if only else f" (all of them take {PROFILES[profile]})"
+    say(f"{_counted(plans)}, profile {profile}, results in {_near(home)}{takes}")
     results: list[NotebookResult] = []
     kernels: list[Any] = []
     pool = ThreadPoolExecutor(jobs)
@@ -269,7 +270,9 @@ def _kernel_manager(places: Mapping[str, Path], kernels: list[Any]) -> type:
             self.transport, self.ip = "ipc", str(Path(self._folder.name) / "kernel")
 
         async def start_kernel(self, **options: Any) -> None:
-            await super().start_kernel(**{**options, "env": {**os.environ, **environment}})
+            # What a cell raises is in the notebook; a kernel logs besides that it was interrupted when it is shut down.
+            quiet = [*options.pop("extra_arguments", ()), "--log-level=CRITICAL"]
+            await super().start_kernel(**options | {"extra_arguments": quiet, "env": {**os.environ, **environment}})
             kernels.append(self)
 
         def kill(self) -> None:

@@ -38,7 +38,10 @@ class LiveCamera(Protocol):
 
 
 class FolderCamera:
-    """A sequence on disk that plays like a camera: frame i is there i / rate_hz seconds after the first."""
+    """A sequence on disk that plays like a camera: frame i is there i / rate_hz seconds after the first.
+
+    The clock starts when the second is asked for: until then somebody may have clicked on the first.
+    """
 
     def __init__(self, sequence: Sequence, rate_hz: float = DEFAULT_RATE_HZ):
         if not 0 < rate_hz <= 1000:
@@ -51,7 +54,7 @@ class FolderCamera:
         """The next frame at its time; at once where that is past."""
         if self._next >= len(self._sequence):
             return None
-        if self._next == 0:
+        if self._next <= 1:
             self._start_s = monotonic()
         due_s = self._start_s + self._next / self._rate_hz
         if self._closed.wait(max(0.0, due_s - monotonic())):

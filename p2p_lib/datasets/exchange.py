@@ -45,7 +45,8 @@ def export(
 
     T_obj_frame  object to the constant (4, 4) from the frame wanted to the tracker's own, such as T_obj_model: what is
                  written is T_cam_frame, of these objects alone. By default T_cam_obj of all
-    sequence     names the frames and BOP's scene and objects; without it frames are named by number
+    sequence     names the frames and BOP's scene, and numbers its objects; without it frames are named by number, and
+                 objects that it does not know are numbered 1, 2, ... in the run's order
 
     Raises :class:`BadInput` for an unknown format.
     """
@@ -75,7 +76,8 @@ def export(
 
 
 def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: Sequence | None) -> Path:
-    numbers = _obj_ids(tuple(poses) if sequence is None else sequence.objects)
+    known = sequence is not None and set(poses) <= set(sequence.objects)  # a folder without masks knows no names
+    numbers = _obj_ids(sequence.objects if known else tuple(run.objects))
     total_ms = run.timings.get("total_ms", np.empty(0))
     lines = [BOP_HEADER]
     for name, T in poses.items():

@@ -184,7 +184,7 @@ def model_frames(run: Run) -> dict[str, np.ndarray]:
         if at.any():
             frames[name] = align_first(obj.T_cam_obj[at], obj.T_cam_model[at])
     if not frames:
-        fix = "Take the tracker's own object frame."
+        fix = "Take the tracker's own object frame: --frame object."
         raise MissingData(str(run.path), "no scored frame with truth and a pose, so no model frame", fix)
     return frames
 

@@ -32,6 +32,7 @@ from p2p_lib.figures import style
 from p2p_lib.figures.tables import Table
 
 _WHAT_RAN = "sequence objects start stop frames tracker masks preset seed commit modified".split()
+_OF_THE_CODE = {"versions", "commit", "modified", "run"}  # a run's name is a checksum that holds the commit, too
 _CRF = 23  # x264's constant quality: smaller is better and larger
 _SHOWN_PX = 900  # a notebook shows images at most this wide
 
@@ -203,8 +204,18 @@ def _write_note(
         **made,
         "sha256": files,
     }
-    path = target.with_name(f"{target.name}.json")
-    path.write_text(json.dumps(note, indent=1, ensure_ascii=False, default=_plain) + "\n", encoding="utf-8")
+    path, text = target.with_name(f"{target.name}.json"), json.dumps(note, ensure_ascii=False, default=_plain)
+    note = json.loads(text)
+    if path.is_file() and _of_the_data(json.loads(path.read_text(encoding="utf-8"))) == _of_the_data(note):
+        return  # other code made the same of the same: the note of the first stands, so that nothing has changed
+    path.write_text(json.dumps(note, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _of_the_data(note: Any) -> Any:
+    """A note, or a part of it, without what it says of the code."""
+    if isinstance(note, dict):
+        return {key: _of_the_data(value) for key, value in note.items() if key not in _OF_THE_CODE}
+    return [_of_the_data(value) for value in note] if isinstance(note, list) else note
 
 
 def _plain(value: Any) -> Any:

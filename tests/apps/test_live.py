@@ -121,6 +121,15 @@ def test_a_folder_that_is_closed_stops_waiting(folder):
     assert camera.read() is None and time.monotonic() - start < 10
 
 
+def test_a_folder_waits_for_whoever_clicks_on_its_first_image(folder):
+    camera = FolderCamera(open_sequence(folder), 20)
+    camera.read()
+    time.sleep(0.5)  # the user clicks
+    start = time.monotonic()
+    indices = [camera.read().index for _ in range(5)]
+    assert indices == [1, 2, 3, 4, 5] and time.monotonic() - start >= 5 / 20, "none is overdue"
+
+
 def test_slow_processing_drops_frames_and_counts_them(folder):
     got = []
 

@@ -180,6 +180,13 @@ def test_notebooks_learn_their_folders(run):
     assert (out / "figures").is_dir() and (out / "tables").is_dir()
 
 
+def test_a_kernel_logs_nothing_to_the_terminal(tmp_path, capfd):
+    """As it would when it is interrupted to be shut down."""
+    write(tmp_path / "00_logs.ipynb", "get_ipython().kernel.log.error('caught in kernel')")
+    run_notebooks("quick", out=tmp_path / "out", folder=tmp_path, say=lambda line: None)
+    assert "caught in kernel" not in "".join(capfd.readouterr())
+
+
 def test_gallery_shows_what_ran(run):
     page = (run[1] / "index.html").read_text()
     assert PNG in page and "ADD-S AUC fell to 12.34" in page and "<td>seed</td><td>3</td>" in page

@@ -1,5 +1,8 @@
 """Poses out and in again: every form keeps every pose, and a lost frame stays lost; faults name the line."""
 
+import shutil
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -107,6 +110,26 @@ def test_every_form_keeps_every_pose_and_every_loss(table, scene, tmp_path, layo
         got = theirs["objects"][name]
         assert got.pop("frames_to_recovery") == score.pop("frames_to_recovery")
         assert got == pytest.approx(score, abs=1e-4) and score["lost"] > 0
+
+
+def test_bop_of_own_data_numbers_the_objects_of_the_run(table, tmp_path, capsys):
+    """A folder without masks knows no names; whoever asks for the model's frame is told which flag does without."""
+    own = tmp_path / "own"
+    for part in ("rgb", "depth"):
+        shutil.copytree(table / part, own / part)
+    (own / "cam_K.txt").write_text(K)
+    sequence = open_sequence(own)
+    with RunWriter(tmp_path / "run", sequence, preset("default"), "lk", "clicks", ("mug", "bowl")) as writer:
+        for i in range(N):
+            frame, T = sequence.frame(i), se3.from_rt(np.eye(3), [0.01 * i, 0, 0.7])
+            of = [PoseEstimate(n, i, frame.time_s, Status.TRACKED, T, 0.8) for n in ("mug", "bowl")[: 2 - i % 2]]
+            writer.add(frame, {e.object: e for e in of}, 20.0)
+    words = ["export", str(tmp_path / "run"), "--format", "bop", "--out", str(tmp_path / "out")]
+    assert main(words) == 2 and "--frame object" in capsys.readouterr().err
+    assert main([*words, "--frame", "object"]) == 0
+    rows = Path(capsys.readouterr().out.strip()).read_text().splitlines()[1:]
+    numbers = [row.split(",")[2] for row in rows]
+    assert (numbers.count("1"), numbers.count("2"), len(rows)) == (N, N // 2, N + N // 2)
 
 
 def test_tum_as_scipy_reads_it(table, tmp_path):

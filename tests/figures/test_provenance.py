@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,6 +65,22 @@ def test_note_says_what_was_made_from_what(made, folders):
     import hashlib
 
     assert note["sha256"]["plot.png"] == hashlib.sha256((folder / "figures" / "plot.png").read_bytes()).hexdigest()
+
+
+def test_a_note_changes_only_with_what_it_is_of(made, folders, monkeypatch):
+    """Drawn again by another commit it stays, so that nothing tracked changes where nothing did."""
+    folder, earlier = folders("out"), provenance.provenance
+    save_figure(image(), "picture", sources=[made.run], parameters={"SEED": 0})
+    path = folder / "figures" / "picture.json"
+    first = path.read_text()
+    monkeypatch.setattr(provenance, "provenance", lambda: {**earlier(), "commit": "0" * 40, "modified": True})
+    later = replace(made.run, info=made.run.info | {"commit": "0" * 40})
+    save_figure(image(), "picture", sources=[later], parameters={"SEED": 0})
+    assert path.read_text() == first
+    save_figure(image(), "picture", sources=[later], parameters={"SEED": 1})
+    assert "0" * 40 in path.read_text()
+    save_figure(image()[:20], "picture", sources=[made.run], parameters={"SEED": 1})
+    assert json.loads(path.read_text())["sha256"]["picture.png"] != json.loads(first)["sha256"]["picture.png"]
 
 
 def test_nothing_tells_of_the_machine_or_the_hour(made, folders):
