@@ -1,0 +1,193 @@
+"""The pipeline as one diagram: its stages in the order in which a configuration runs them, and where each is kept.
+
+The paper's figure "Overview of the framework", drawn from :data:`STAGES`: the names under which the pipeline takes its
+times.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from p2p_lib.core.config import Config, preset
+from p2p_lib.core.errors import BadInput
+from p2p_lib.figures import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_BOX, _GRID, _MODEL = (1.24, 0.5), (1.42, 0.94), "#F1EFE9"
+_FLOW = {"arrowstyle": "-|>", "color": "#333333", "lw": 1.0, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 9}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One box.
+
+    title     what it does; ``source``, the module or package that does
+    notebook  number of the notebook about it, empty where it has none
+    ours      whether the paper does without it
+    switch    the key of the configuration that switches it, with the value that leaves it out
+    """
+
+    title: str
+    source: str
+    notebook: str = ""
+    ours: bool = False
+    switch: tuple[str, object] | None = None
+
+    def runs(self, config: Config) -> bool:
+        """Whether a configuration has this stage."""
+        if self.switch is None:
+            return True
+        (section, name), left_out = self.switch[0].split("."), self.switch[1]
+        return getattr(getattr(config, section), name) != left_out
+
+
+#: By the name that the pipeline's stopwatch and ``timings.csv`` have for it; judging takes no time worth a name.
+STAGES = {
+    "tracking": Stage("track points", "trackers/", "01"),
+    "segmentation": Stage("segment", "segmenters/", "10"),
+    "scene": Stage("locate camera", "method/scene.py", "07", True, ("method.scene", False)),
+    "search": Stage("search", "method/search.py", "07", True, ("method.scene", False)),
+    "observation": Stage("lift to 3D", "method/observation.py", "00"),
+    "registration": Stage("register", "method/registration.py", "03"),
+    "refinement": Stage("refine", "method/refinement.py", "04", switch=("refinement.residuals", "none")),
+    "selection": Stage("select", "method/selection.py", "03"),
+    "judging": Stage("judge", "method/lifecycle.py", "07", True, ("method.gates", "none")),
+    "sampling": Stage("sample points", "method/sampling.py", "02"),
+    "map": Stage("keypoint map", "method/keypoint_map.py", "02"),
+    "fusion": Stage("TSDF surface", "method/tsdf.py", "06", switch=("method.surface", False)),
+    "graph": Stage("factor graph", "method/factor_graph.py", "05", switch=("method.graph", False)),
+}
+
+
+def order(config: Config) -> list[str]:
+    """The stages that a configuration runs, in the order in which a frame that becomes a keyframe meets them."""
+    choose = ["refinement", "selection"] if config.selection.rule == "support" else ["selection", "refinement"]
+    names = ["tracking", "scene", "search", "segmentation", "observation", "registration", *choose, "judging"]
+    return [name for name in [*names, "map", "sampling", "graph", "fusion"] if STAGES[name].runs(config)]
+
+
+@style.styled
+def pipeline_diagram(
+    config: Config | None = None,
+    here: Collection[str] = (),
+    pages: Mapping[str, str] | None = None,
+    ms: Mapping[str, float] | None = None,
+) -> Figure:
+    """The stages of a configuration (default: preset ``default``) and what flows between them.
+
+    here   stages that are marked: "you are here"
+    pages  notebook number to the address that its boxes link to (in SVG and PDF)
+    ms     stage to milliseconds a frame, written into its box
+    """
+    from matplotlib.figure import Figure
+
+    if unknown := sorted(set(here) - set(STAGES)):
+        raise BadInput("stage", repr(unknown[0]), "one of " + ", ".join(STAGES))
+    figure = Figure((8.6, 3.35))
+    axis = figure.add_axes((0, 0, 1, 1))
+    axis.set(xlim=(-0.95, 7.65), ylim=(-0.62, 2.73))
+    axis.axis("off")
+    _draw(axis, config or preset(), here, pages or {}, ms or {})
+    return figure
+
+
+def as_svg(figure: Figure) -> str:
+    """A figure as SVG for a page, its words as text: the same figure gives the same."""
+    import matplotlib
+
+    with style.applied(), matplotlib.rc_context({"svg.fonttype": "none"}), io.StringIO() as text:
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+        svg = text.getvalue()
+    return svg[svg.index("<svg") :]
+
+
+def _draw(axis: Axes, config: Config, here: Collection[str], pages: Mapping[str, str], ms: Mapping[str, float]) -> None:
+    names = order(config)
+    row = [name for name in names if name in ("observation", "registration", "refinement", "selection", "judging")]
+    places = {name: (k, 1.0) for k, name in enumerate(row)}
+    places |= {"tracking": (1, 2), "segmentation": (2, 2), "search": (3, 2), "scene": (4, 2)}
+    places |= {"sampling": (0, 0), "map": (1, 0), "graph": (2.15, 0), "fusion": (3.25, 0)}
+    at = {name: (x * _GRID[0], y * _GRID[1]) for name, (x, y) in places.items() if name in names}
+    _model(axis, max(at[row[-1]][0], at.get("fusion", (0, 0))[0]) + _BOX[0] / 2)
+    for name, (x, y) in at.items():
+        _box(axis, name, x, y, name in here, pages, ms.get(name))
+    _flow(axis, at, row)
+
+
+def _model(axis: Axes, right: float) -> None:
+    """What is known of an object: the ground on which map, surface and graph stand."""
+    from matplotlib.patches import FancyBboxPatch
+
+    left, h = -_BOX[0] / 2, _BOX[1]
+    style_of = {"boxstyle": "round,pad=0.08", "facecolor": _MODEL, "edgecolor": "none", "zorder": 0}
+    axis.add_patch(FancyBboxPatch((left, -h / 2 - 0.02), right - left, h + 0.06, **style_of))
+    words = (
+        "the object's model: every accepted frame extends the map; a keyframe brings points, is solved for and fused"
+    )
+    axis.text(left, -h / 2 - 0.2, words, fontsize=7, color=style.NEUTRAL[0], ha="left", va="center")
+
+
+def _box(axis: Axes, name: str, x: float, y: float, marked: bool, pages: Mapping[str, str], ms: float | None) -> None:
+    from matplotlib.patches import FancyBboxPatch
+
+    stage, (w, h) = STAGES[name], _BOX
+    fill = style.METHODS[0] if marked else "#FFFFFF"
+    ink = style.ink(fill)
+    corner, line = (x - w / 2, y - h / 2), "--" if stage.ours else "-"
+    box = FancyBboxPatch(corner, w, h, "round,pad=0,rounding_size=0.06", facecolor=fill, edgecolor="#333333", lw=0.9)
+    box.set(linestyle=line, zorder=3, url=pages.get(stage.notebook))
+    axis.add_patch(box)
+    small = stage.source if ms is None else f"{ms:.1f} ms"
+    axis.text(x, y + 0.07, stage.title, ha="center", va="center", fontsize=8.5, color=ink, zorder=4, weight="bold")
+    axis.text(x, y - 0.12, small, ha="center", va="center", fontsize=6, color=ink, zorder=4, family="monospace")
+    number = {"ha": "right", "va": "top", "fontsize": 6.5, "zorder": 4, "color": ink}
+    axis.text(x + w / 2 - 0.04, y + h / 2 - 0.03, stage.notebook, **number)
+
+
+def _flow(axis: Axes, at: Mapping[str, tuple[float, float]], row: list[str]) -> None:
+    """The arrows: along the step, to the model and back, and the words at its ends."""
+    w, h = _BOX[0] / 2, _BOX[1] / 2
+
+    def arrow(*corners: tuple[float, float], look: str = "-|>") -> None:
+        *_, bend, end = corners
+        axis.plot(*zip(*corners[:-1], strict=True), color=_FLOW["color"], lw=_FLOW["lw"], zorder=2)
+        axis.annotate("", end, bend, arrowprops={**_FLOW, "arrowstyle": look}, zorder=2)
+
+    said = {"va": "center", "fontsize": 7.5}
+    (tx, ty), (ox, oy), (sx, _) = at["tracking"], at["observation"], at["segmentation"]
+    axis.text(ox, ty, "RGB-D frame $F_t$;\nat first also clicks,\nboxes or masks", ha="center", **said)
+    arrow((ox + w, ty), (tx - w, ty))
+    arrow((tx + w, ty), (sx - w, ty))
+    arrow((sx, ty - h), (sx, (ty + oy) / 2), (ox, (ty + oy) / 2), (ox, oy + h))
+    if "search" in at:
+        arrow((at["scene"][0] - w, ty), (at["search"][0] + w, ty))
+        arrow((at["search"][0] - w, ty), (sx + w, ty))
+    for a, b in pairwise(row):
+        arrow((at[a][0] + w, oy), (at[b][0] - w, oy))
+    last = at[row[-1]][0]
+    arrow((last + w, oy), (last + w + 0.22, oy))
+    axis.text(last + w + 0.28, oy, "pose $T^C_O$,\nstatus,\nconfidence", ha="left", **said)
+    arrow((last + 0.4, oy - h), (last + 0.4, h + 0.12))
+
+    (mx, my), (px, _) = at["map"], at["sampling"]
+    arrow((mx, my + h), (mx, oy - h))
+    arrow((px + w, my), (mx - w, my))
+    arrow((px - w, my), (-0.8, my), (-0.8, ty + h + 0.2), (tx, ty + h + 0.2), (tx, ty + h))
+    axis.text(-0.88, oy, "new points", rotation=90, ha="center", **said)
+    if "graph" in at:
+        arrow((at["graph"][0] - w, my), (mx + w, my), look="<|-|>")
+    if "fusion" in at:
+        if "graph" in at:
+            arrow((at["graph"][0] + w, my), (at["fusion"][0] - w, my))
+        for name in ("refinement", "selection"):
+            x = min(at[name][0] + 0.25, at["fusion"][0] + 0.1) if name in at else None
+            if x is not None:
+                arrow((at["fusion"][0] + (x - at["fusion"][0]) / 4, my + h), (x, oy - h))
+    axis.text(7.6, -0.56, "dashed: ours beyond the paper", ha="right", fontsize=6.5, color=style.NEUTRAL[0])
