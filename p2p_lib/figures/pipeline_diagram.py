@@ -54,7 +54,7 @@ STAGES = {
     "segmentation": Stage("segment", "segmenters/", "10"),
     "scene": Stage("locate camera", "method/scene.py", "07", True, ("method.scene", False)),
     "search": Stage("search", "method/search.py", "07", True, ("method.scene", False)),
-    "observation": Stage("lift to 3D", "method/observation.py", "00"),
+    "observation": Stage("lift to 3D", "method/observation.py", "10"),
     "registration": Stage("register", "method/registration.py", "03"),
     "refinement": Stage("refine", "method/refinement.py", "04", switch=("refinement.residuals", "none")),
     "selection": Stage("select", "method/selection.py", "03"),

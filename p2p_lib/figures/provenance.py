@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import html
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -39,20 +40,34 @@ _SHOWN_PX = 900  # a notebook shows images at most this wide
 
 @dataclass(frozen=True, eq=False)
 class Saved:
-    """What was written, and how a notebook shows it. The last expression of a cell is displayed."""
+    """What was written, and how a notebook shows it: the last expression of a cell, with its caption below."""
 
     path: Path
     shown: tuple[dict[str, Any], dict[str, Any]]
+    caption: str = ""
 
     def _repr_mimebundle_(self, include=None, exclude=None):
         return self.shown
 
+    def _ipython_display_(self) -> None:
+        from IPython.display import publish_display_data
+
+        publish_display_data(*self.shown)
+        if self.caption:
+            publish_display_data({"text/markdown": f"<small>{self.caption}</small>", "text/plain": self.caption})
+
 
 def save_figure(
-    figure: Any, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
+    figure: Any,
+    name: str,
+    caption: str = "",
+    *,
+    sources: Iterable[Any] = (),
+    parameters: Mapping[str, Any] | None = None,
 ) -> Saved:
     """Write a Matplotlib figure as PNG and PDF, or an image (H, W, 3) uint8 as PNG, with its note.
 
+    caption     whole sentences that say what is seen to somebody who reads nothing else; also the alternative text
     sources     what it was drawn from: runs, evaluations, sequences, files
     parameters  what decided how it was made: profile, seed, ...
     """
@@ -69,14 +84,16 @@ def save_figure(
             figure.savefig(png.with_suffix(".pdf"), metadata={"CreationDate": None})
             width_px = round(figure.get_figwidth() * figure.dpi)
         suffixes, drawn_with = [".png", ".pdf"], ["matplotlib"]
-    _write_note(target, suffixes, sources, parameters, drawn_with)
+    _write_note(target, suffixes, sources, parameters, drawn_with, caption)
     shown = {"image/png": base64.b64encode(png.read_bytes()).decode(), "text/plain": f"<{name}.png>"}
-    return Saved(png, (shown, {"image/png": {"width": min(width_px, _SHOWN_PX)}}))
+    look = {"width": min(width_px, _SHOWN_PX), "alt": _plain_words(caption) or name.replace("_", " ")}
+    return Saved(png, (shown, {"image/png": look}), caption)
 
 
 def save_video(
     images: Iterable[np.ndarray],
     name: str,
+    caption: str = "",
     *,
     fps: float = 30.0,
     sources: Iterable[Any] = (),
@@ -87,10 +104,11 @@ def save_video(
 
     target = _target(paths.figure_dir(), name)
     path = write_video(images, target.with_name(f"{name}.mp4"), fps)
-    _write_note(target, [path.suffix], sources, {**(parameters or {}), "fps": fps}, ["av"])
+    _write_note(target, [path.suffix], sources, {**(parameters or {}), "fps": fps}, ["av"], caption)
     # The whole film is inside the page, so that exported pages play it too.
-    page = Video(str(path), embed=True, html_attributes="controls autoplay loop muted playsinline")._repr_html_()
-    return Saved(path, ({"text/html": page, "text/plain": f"<{path.name}>"}, {}))
+    words = f'aria-label="{html.escape(_plain_words(caption))}" controls autoplay loop muted playsinline'
+    page = Video(str(path), embed=True, html_attributes=words)._repr_html_()
+    return Saved(path, ({"text/html": page, "text/plain": f"<{path.name}>"}, {}), caption)
 
 
 def write_video(images: Iterable[np.ndarray], path: str | Path, fps: float = 30.0) -> Path:
@@ -130,7 +148,12 @@ def _checked(images: Iterable[np.ndarray]) -> Iterable[np.ndarray]:
 
 
 def save_table(
-    table: DataFrame | Table, name: str, *, sources: Iterable[Any] = (), parameters: Mapping[str, Any] | None = None
+    table: DataFrame | Table,
+    name: str,
+    caption: str = "",
+    *,
+    sources: Iterable[Any] = (),
+    parameters: Mapping[str, Any] | None = None,
 ) -> Saved:
     """Write a table as CSV and Markdown, one for papers as LaTeX besides, with its note."""
     target = _target(paths.table_dir(), name)
@@ -142,8 +165,8 @@ def save_table(
         page = as_html(table)
     for suffix, text in files.items():
         target.with_name(f"{name}{suffix}").write_text(text, encoding="utf-8")
-    _write_note(target, list(files), sources, parameters, ["pandas"])
-    return Saved(target.with_name(f"{name}.csv"), ({"text/html": page, "text/plain": files[".md"]}, {}))
+    _write_note(target, list(files), sources, parameters, ["pandas"], caption)
+    return Saved(target.with_name(f"{name}.csv"), ({"text/html": page, "text/plain": files[".md"]}, {}), caption)
 
 
 def describe(source: Any) -> dict[str, Any]:
@@ -170,6 +193,11 @@ def describe(source: Any) -> dict[str, Any]:
     raise BadInput("figure source", type(source).__name__, "a Run, an Evaluation, a Benchmark, a Sequence, or a file")
 
 
+def _plain_words(caption: str) -> str:
+    """A caption without the marks of Markdown and TeX."""
+    return re.sub(r"[*`$\\{}]", "", caption)
+
+
 def _what_ran(info: Mapping[str, Any]) -> dict[str, Any]:
     return {key: info.get(key) for key in _WHAT_RAN}
 
@@ -192,6 +220,7 @@ def _write_note(
     sources: Iterable[Any],
     parameters: Mapping[str, Any] | None,
     drawn_with: list[str],
+    caption: str,
 ) -> None:
     from importlib.metadata import version
 
@@ -199,6 +228,7 @@ def _write_note(
     made["versions"] |= {name: version(name) for name in drawn_with}
     files = {f"{target.name}{suffix}": _sha256(target.with_name(f"{target.name}{suffix}")) for suffix in suffixes}
     note = {
+        **({"caption": caption} if caption else {}),
         "parameters": dict(parameters or {}),
         "sources": [describe(source) for source in sources],
         **made,

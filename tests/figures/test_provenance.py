@@ -162,3 +162,14 @@ def test_bad_input(folders):
         save_figure(image().astype(float), "picture")
     with pytest.raises(BadInput, match="figure source"):
         save_figure(image(), "picture", sources=[3])
+
+
+def test_a_caption_is_shown_kept_and_read_aloud(folders, monkeypatch):
+    folder, shown = folders("out"), []
+    monkeypatch.setattr("IPython.display.publish_display_data", lambda *data: shown.append(data[0]))
+    saved = save_figure(image(), "picture", "A *box*, $T^C_O$ below.")
+    saved._ipython_display_()
+    assert saved.shown[1]["image/png"]["alt"] == "A box, T^C_O below."
+    assert json.loads((folder / "figures" / "picture.json").read_text())["caption"] == "A *box*, $T^C_O$ below."
+    assert "image/png" in shown[0] and "A *box*" in shown[1]["text/markdown"]
+    assert 'aria-label="A &amp; B."' in save_video([image()] * 3, "film", "A & B.").shown[0]["text/html"]
