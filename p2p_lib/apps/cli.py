@@ -10,7 +10,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -81,6 +81,7 @@ _DATASET = _arg("dataset", metavar="NAME")
 _POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
 _JSON = _arg("--json", action="store_true", help="JSON instead of a table")
 _QUIET = _arg("--quiet", action="store_true", help="no progress bar")
+_OVERLAY = _arg("--overlay", type=Path, metavar="FILE", help="besides a film of it: .mp4 or .gif (see p2p film)")
 _NO_BROWSER = _arg("--no-browser", action="store_true", help="only say where the page is")
 _MIN_VISIBLE = _arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
 
@@ -94,18 +95,23 @@ _MIN_VISIBLE = _arg("--min-visible-px", type=int, default=300, metavar="N", help
     _SEQUENCE,
     _arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
     _options(),
+    _OVERLAY,
     _QUIET,
 )
 def _run(a: argparse.Namespace) -> int:
     from p2p_lib.run import run
 
-    result = run(a.sequence, a.out, RunOptions.of_arguments(a), progress=not a.quiet, say=_warn)
+    film = _film_wanted(a.overlay)
+    options = replace(RunOptions.of_arguments(a), save_masks=a.save_masks or film is not None)
+    result = run(a.sequence, a.out, options, progress=not a.quiet, say=_warn)
     print("\n".join(result.summary))
     if result.evaluation is not None:
         print(result.evaluation.as_table())
         print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
     else:
         print(f"Results in {a.out}; not scored, {result.not_scored}." + f" Next: p2p view {a.out}" * result.tracked)
+    if film is not None and not result.interrupted:
+        print(f"Film in {film(a.out, a.overlay)}")
     if result.interrupted:
         raise KeyboardInterrupt
     if result.advice:
@@ -283,6 +289,21 @@ def _view(a: argparse.Namespace) -> None:
     page = write_page(a.run, a.out)
     opened = not a.no_browser and open_page(page.resolve().as_uri())
     print(f"Written to {page}" + ("" if opened else ". Open it in a browser."))
+
+
+@_command(
+    "film",
+    "write a run as a film: boxes, axes, statuses, keypoints, masks",
+    _RUN,
+    _arg("--out", type=Path, metavar="FILE", help=".mp4 or .gif (default DIR/film.mp4)"),
+    _arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF)"),
+)
+def _film(a: argparse.Namespace) -> None:
+    from p2p_lib.figures.film import write_film
+
+    print(f"Written to {write_film(a.run, a.out or a.run / 'film.mp4', width_px=a.width)}")
+    if not (a.run / "masks").is_dir():
+        _warn("p2p film: no masks were kept, so none is outlined. p2p run --save-masks keeps them.")
 
 
 @_command(
@@ -515,6 +536,16 @@ def _show_doubt(others: Callable, name: str, message: Any, category: type, *wher
         _warn(f"p2p {name}: {message}")
     else:
         others(message, category, *where)
+
+
+def _film_wanted(path: Path | None) -> Callable[..., Path] | None:
+    """What writes the film of a run, if one is wanted; a name that it cannot have is refused at once."""
+    if path is None:
+        return None
+    from p2p_lib.figures.film import check_suffix, write_film
+
+    check_suffix(path)
+    return write_film
 
 
 def _show(score: Any, as_json: bool) -> None:

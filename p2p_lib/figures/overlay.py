@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,6 +18,9 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.figures import style
+
+if TYPE_CHECKING:
+    import trimesh
 
 _SHIFT = 4  # OpenCV's fixed-point coordinates: sixteenths of a pixel
 _NEAR_M = 0.02  # lines are cut off here, in front of the camera
@@ -56,6 +60,14 @@ class Box:
             raise BadInput("box", "no finite points", "at least one")
         low, high = points.min(0), points.max(0)
         return cls(T_obj_points @ se3.from_rt(np.eye(3), (low + high) / 2), high - low)
+
+
+def tight_box(mesh: trimesh.Trimesh) -> Box:
+    """The smallest box around a surface, along its own axes."""
+    import trimesh
+
+    T_box_obj, size_m = trimesh.bounds.oriented_bounds(mesh)
+    return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
 
 
 def box_corners(size_m: np.ndarray) -> np.ndarray:

@@ -62,6 +62,11 @@ class Playback:
         times_s = next(iter(self.run.objects.values())).time_s
         return times_s - times_s[0]
 
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second."""
+        return float((len(self) - 1) / self.times_s[-1]) if len(self) > 1 else 30.0
+
     @cached_property
     def colours(self) -> dict[str, str]:
         """Object to ``#RRGGBB``."""

@@ -14,7 +14,6 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +29,11 @@ from p2p_lib.datasets.provenance import provenance
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.figures import style
+from p2p_lib.figures.film import write_video
 from p2p_lib.figures.tables import Table
 
 _WHAT_RAN = "sequence objects start stop frames tracker masks preset seed commit modified".split()
 _OF_THE_CODE = {"versions", "commit", "modified", "run"}  # a run's name is a checksum that holds the commit, too
-_CRF = 23  # x264's constant quality: smaller is better and larger
 _SHOWN_PX = 900  # a notebook shows images at most this wide
 
 
@@ -109,42 +108,6 @@ def save_video(
     words = f'aria-label="{html.escape(_plain_words(caption))}" controls autoplay loop muted playsinline'
     page = Video(str(path), embed=True, html_attributes=words)._repr_html_()
     return Saved(path, ({"text/html": page, "text/plain": f"<{path.name}>"}, {}), caption)
-
-
-def write_video(images: Iterable[np.ndarray], path: str | Path, fps: float = 30.0) -> Path:
-    """Write images (H, W, 3) uint8 of one size as H.264 in MP4; the path written.
-
-    The last row or column of an image of odd size is left out, as the pixel format requires.
-    """
-    import av
-
-    path, stream = Path(path), None
-    if path.suffix != ".mp4":
-        raise BadInput("video", path.name, "a name that ends in .mp4")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Without "bitexact" the file would name the builds that wrote it.
-    with av.open(str(path), "w", options={"movflags": "+faststart", "fflags": "+bitexact"}) as container:
-        for image in _checked(images):
-            if stream is None:
-                stream = container.add_stream("libx264", Fraction(fps).limit_denominator(1000))
-                stream.height, stream.width = image.shape[:2]
-                stream.pix_fmt = "yuv420p"
-                # How many threads encode changes the bytes, and x264's macroblock tree reads memory it never wrote.
-                stream.options = {"crf": str(_CRF), "preset": "medium", "threads": "2", "x264-params": "mbtree=0"}
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24")))
-        if stream is None:
-            raise BadInput("video", "no images", "at least one")
-        container.mux(stream.encode())
-    return path
-
-
-def _checked(images: Iterable[np.ndarray]) -> Iterable[np.ndarray]:
-    shape = None
-    for image in images:
-        shape = shape or image.shape
-        if image.shape != shape or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise BadInput("video", f"an image {image.shape} {image.dtype}", "(H, W, 3) uint8, all of one size")
-        yield image[: shape[0] // 2 * 2, : shape[1] // 2 * 2]
 
 
 def save_table(

@@ -15,8 +15,12 @@ from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box, Label
+from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import gaps
 from p2p_lib.method.pipeline import Point2Pose
+
+#: How strongly a mask tints its inside, and the radius of a keypoint.
+_FILL, _POINT_PX = 0.15, 2.5
 
 
 class Scene:
@@ -54,6 +58,16 @@ class Scene:
             if name in run.points and np.isfinite(T).all()
         } | dict(boxes or {})
 
+        self._playback: Playback | None = None
+
+    @classmethod
+    def of(cls, playback: Playback) -> Scene:
+        """With all that the run's folder holds: keypoints, masks, and a box around each reconstructed surface."""
+        boxes = {name: overlay.tight_box(mesh) for name, mesh in playback.meshes.items()}
+        scene = cls(playback.sequence, playback.run, boxes=boxes, truth=False)
+        scene._playback = playback
+        return scene
+
     def __len__(self) -> int:
         return len(next(iter(self.run.objects.values())))
 
@@ -81,7 +95,7 @@ class Scene:
         """
         first = next(iter(self.run.objects.values()))
         frame = self.sequence.frame(int(first.frame_index[row]))
-        camera, image = self.sequence.camera, frame.rgb
+        camera, image = self.sequence.camera, self._with_what_was_seen(frame, row)
         region_px = region_px or (0, 0, camera.width, camera.height)
         image, camera = overlay.zoomed(image, camera, region_px, width_px or region_px[2] - region_px[0])
         labels = []
@@ -91,7 +105,7 @@ class Scene:
         if not words:
             return image
         image = overlay.draw_labels(image, [label for label in labels if label is not None])
-        return overlay.draw_caption(image, f"{self.sequence.name}  {frame.time_s:.2f} s")
+        return overlay.draw_caption(image, f"{self.sequence.name}  {frame.time_s - first.time_s[0]:.2f} s")
 
     def film(self, rows: Iterable[int] | None = None, **drawing) -> Iterator[np.ndarray]:
         """The images of these rows (default: all) one after the other; ``drawing`` as of :meth:`draw`."""
@@ -128,6 +142,15 @@ class Scene:
             return 0, 0, camera.width, camera.height
         margin_px = round(margin * camera.width)
         return overlay.region_around(uv, camera, (margin_px, margin_px))
+
+    def _with_what_was_seen(self, frame: Frame, row: int) -> np.ndarray:
+        """The image with the masks and keypoints of the row, where the run's folder has them."""
+        if self._playback is None:
+            return frame.rgb
+        image = overlay.draw_masks(frame.rgb, self._playback.masks(row), self.colours, fill=_FILL)
+        for name, points in self._playback.keypoints.items():
+            image = overlay.draw_points(image, points.uv_px[points.at(frame.index)], self.colours[name], _POINT_PX)
+        return image
 
     def _draw_object(
         self, image: np.ndarray, camera: Camera, name: str, obj: ObjectRun, row: int, axes: bool, trail: int
@@ -166,19 +189,28 @@ def draw_live(
     estimates: Mapping[str, PoseEstimate],
     masks: Mapping[str, np.ndarray] | None = None,
     title: str = "",
+    start_s: float = 0.0,
 ) -> np.ndarray:
-    """The tracker's own view of a frame: masks, axes, statuses, and the map's keypoints (pending ones as rings)."""
+    """The tracker's own view of a frame: masks, boxes, axes, statuses, and the map's keypoints (pending ones as rings).
+
+    masks    object to (H, W) bool (default: those that the tracker used)
+    start_s  the time of the first frame, from which seconds are counted
+    """
     image, labels = frame.rgb, []
     colours = style.object_colours(method.objects)
-    image = overlay.draw_masks(image, masks or {}, colours, fill=0.15)
+    masks = masks or {name: mask for name, mask in method.masks.items() if mask is not None}
+    image = overlay.draw_masks(image, masks, colours, fill=_FILL)
     for name, estimate in estimates.items():
         T_cam_obj, keypoints = estimate.T_cam_obj, method.objects[name].map
         if T_cam_obj is None or not len(keypoints):
             continue
         uv_px = method.camera.project(se3.transform(T_cam_obj, keypoints.p_obj))
         image = overlay.draw_points(image, uv_px[~keypoints.promoted], colours[name], 3, filled=False)
-        image = overlay.draw_points(image, uv_px[keypoints.promoted], colours[name], 2.5)
+        image = overlay.draw_points(image, uv_px[keypoints.promoted], colours[name], _POINT_PX)
+        box = Box.around(keypoints.p_obj)
+        image = overlay.draw_box(image, method.camera, T_cam_obj @ box.T_obj_box, box.size_m, colours[name])
         image = overlay.draw_axes(image, method.camera, T_cam_obj, 0.06)
         low, high = np.nanmin(uv_px, 0), np.nanmax(uv_px, 0)
         labels.append(Label(f"{name}: {estimate.status}", colours[name], (*low, *high)))
-    return overlay.draw_caption(overlay.draw_labels(image, labels), f"{title}  {frame.time_s:.2f} s".strip())
+    image = overlay.draw_labels(image, labels)
+    return overlay.draw_caption(image, f"{title}  {frame.time_s - start_s:.2f} s".strip())

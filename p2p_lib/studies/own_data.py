@@ -77,12 +77,6 @@ def errors_against(source: Recording, frames: Iterable[int], run: Run) -> dict[s
     return errors
 
 
-def tight_box(mesh: trimesh.Trimesh) -> Box:
-    """The smallest box around a surface, along its own axes."""
-    T_box_obj, size_m = trimesh.bounds.oriented_bounds(mesh)
-    return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
-
-
 def edges_mm(mesh: trimesh.Trimesh) -> np.ndarray:
     """(3,) edges of the box around a surface, longest first, without its fringes.
 
@@ -130,7 +124,7 @@ def findings_table(findings: Mapping[str, Sequence[Any]]) -> DataFrame:
 
 def story(playback: Playback, prompts: Sequence[Prompt], rows: Sequence[int], width_px: int = 430) -> np.ndarray:
     """Clicks, poses and surfaces on one sheet: the clicked image, the run at some rows, each object reconstructed."""
-    boxes = {name: tight_box(mesh) for name, mesh in playback.meshes.items()}
+    boxes = {name: overlay.tight_box(mesh) for name, mesh in playback.meshes.items()}
     scene = Scene(playback.sequence, playback.run, boxes=boxes, truth=False)
     region_px = scene.region()
     clicked = overlay.draw_clicks(playback.sequence.frame(prompts[0].frame).rgb, prompts, playback.colours)

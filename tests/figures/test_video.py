@@ -1,10 +1,21 @@
 """Films come back with as many images as went in, looking as they did."""
 
+import re
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from p2p_lib.core.errors import BadInput
-from p2p_lib.figures.provenance import save_video, write_video
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.datasets.images import save_png
+from p2p_lib.datasets.keypoint_log import KeypointLog
+from p2p_lib.figures import style
+from p2p_lib.figures.film import Film, write_film, write_video
+from p2p_lib.figures.playback import Playback
+from p2p_lib.figures.provenance import save_video
+from p2p_lib.figures.scenes import Scene
 
 
 def images(count, height=120, width=160):
@@ -56,9 +67,70 @@ def test_shown_films_are_embedded(tmp_path, monkeypatch):
 def test_what_is_no_film_is_refused(tmp_path):
     with pytest.raises(BadInput, match="no images"):
         write_video([], tmp_path / "film.mp4")
-    with pytest.raises(BadInput, match=r"\.mp4"):
+    with pytest.raises(BadInput, match=r"\.mp4 or \.gif"):
         write_video(images(1), tmp_path / "film.avi")
     with pytest.raises(BadInput, match="all of one size"):
         write_video([*images(1), *images(1, 100, 100)], tmp_path / "film.mp4")
     with pytest.raises(BadInput, match="uint8"):
         write_video([np.zeros((8, 8, 3))], tmp_path / "film.mp4")
+
+
+def test_a_gif_reads_back_and_repeats(tmp_path):
+    from PIL import Image
+
+    with Image.open(write_video(images(5), tmp_path / "film.gif", fps=10)) as film:
+        assert (film.n_frames, film.info["duration"], film.info["loop"]) == (5, 100, 0)
+        for k, written in enumerate(images(5)):
+            film.seek(k)
+            assert np.abs(np.asarray(film.convert("RGB")).astype(int) - written).mean() < 4
+
+
+def test_images_are_shown_when_they_were_taken(tmp_path):
+    """As those of a camera of which some were dropped."""
+    import av
+
+    times_s = [0.0, 0.04, 0.3, 0.31]
+    with Film(tmp_path / "film.mp4") as film:
+        for image, time_s in zip(images(4), times_s):
+            film.add(image, time_s)
+    with av.open(str(film.path)) as container:
+        assert [frame.time for frame in container.decode(video=0)] == pytest.approx(times_s, abs=1e-3)
+
+
+def test_a_run_as_a_film_has_its_masks_keypoints_and_seconds(made, tmp_path):
+    """Drawn from what the folder holds: without masks and keypoints these pixels are the image's."""
+    run, row = shutil.copytree(made.run.path, tmp_path / "run"), 2
+    playback = Playback.of(run, made.sequence)
+    at = int(playback.frame_index[row])
+    plain = Scene.of(playback).draw(row, axes=False, words=False)
+    mask = np.zeros(plain.shape[:2], bool)
+    mask[40:80, 20:90] = True
+    save_png(run / "masks" / "box" / f"{at:06d}.png", mask)
+    log, ids, nobody = KeypointLog(), np.arange(3), (np.zeros(0, int), np.zeros((0, 3)), np.zeros(0, bool))
+    log.add(at, "can", ids, np.array([[30.0, 20], [50, 20], [70, 20]]))
+    log.save(run, {"box": nobody, "can": (ids, np.zeros((3, 3)), np.ones(3, bool))})
+    scene = Scene.of(Playback.of(run, made.sequence))
+    drawn = scene.draw(row, axes=False, words=False)
+    for name, pixels in (("box", ([40, 79], [50, 50])), ("can", ([20, 20, 20], [30, 50, 70]))):
+        assert (np.abs(drawn[pixels].astype(int) - style.rgb(scene.colours[name])).max(-1) < 60).all(), name
+        assert (np.abs(plain[pixels].astype(int) - style.rgb(scene.colours[name])).max(-1) > 60).all(), name
+    frames, *_ = decoded(write_film(run, tmp_path / "film.mp4", made.sequence, width_px=160))
+    assert len(frames) == len(playback) and frames[0].shape == (120, 160, 3)
+
+
+def test_seconds_count_from_the_start(made):
+    """A camera's clock may begin anywhere."""
+    later = {k: replace(obj, time_s=obj.time_s + 1.6e9) for k, obj in made.run.objects.items()}
+    first = replace(made.sequence.frame(0), time_s=made.sequence.times_s[0] + 1.6e9)
+    sequence = SimpleNamespace(**{k: getattr(made.sequence, k) for k in ("name", "camera", "objects", "truth")})
+    sequence.frame = lambda i: first
+    images = Scene(sequence, replace(made.run, objects=later)).draw(0), Scene(made.sequence, made.run).draw(0)
+    np.testing.assert_array_equal(*images)
+
+
+def test_a_film_of_images_that_are_gone_says_so(made, tmp_path):
+    run = shutil.copytree(made.run.path, tmp_path / "run")
+    info = (run / "run.json").read_text()
+    (run / "run.json").write_text(re.sub(r'"path": [^,]*,', '"path": "/gone/away",', info))
+    with pytest.raises(MissingData, match="away: no such folder, so there are no images"):
+        write_film(run, tmp_path / "film.mp4")

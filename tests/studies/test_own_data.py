@@ -59,7 +59,7 @@ def test_portraits_show_the_surface_from_its_sides():
     covered = (portrait < 250).any(-1)
     assert 0.05 < covered.mean() < 0.7 and not covered[[0, -1]].any() and not covered[:, [0, -1]].any()
     assert own_data.mesh_portraits({"a": body, "b": body}, (0, 90)).shape[:2] == (524, 604)
-    np.testing.assert_allclose(np.sort(own_data.tight_box(body).size_m), [0.05, 0.1, 0.2], atol=1e-6)
+    np.testing.assert_allclose(np.sort(overlay.tight_box(body).size_m), [0.05, 0.1, 0.2], atol=1e-6)
 
 
 def test_the_table_of_findings_holds_what_is_not_fine():
