@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,25 +90,52 @@ def run(
     writer = _writer(job, options, method, out)
     if writer.replaced:
         say(f"{out} held {writer.replaced}, which this one replaces.")
-    keypoints = KeypointLog()
+    keeper = Keeper(writer, method, options.save_masks)
     with writer, progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
         try:
             for frame, estimates in _estimates(method, job):
-                if options.save_masks:
-                    writer.add_masks(frame, method.masks)
-                _log_keypoints(keypoints, frame, method)
-                times = method.stopwatch.last_ms
-                writer.add(frame, estimates, times["total"], {k: v for k, v in times.items() if k != "total"})
+                keeper.add(frame, estimates)
                 now = ", ".join(f"{name} {estimate.status}" for name, estimate in estimates.items())
-                bar.set_postfix_str(f"{1e3 / max(times['total'], 1e-3):.0f} Hz, {now}", refresh=False)
+                total_ms = max(method.stopwatch.last_ms["total"], 1e-3)
+                bar.set_postfix_str(f"{1e3 / total_ms:.0f} Hz, {now}", refresh=False)
                 bar.update()
         except KeyboardInterrupt:
             writer.info["stopped_by"] = "KeyboardInterrupt"
     interrupted = writer.info["stopped_by"] is not None
     if not writer.info["frames"]:
         return RunResult(Path(out), None, "no frame was finished", (f"0 of {len(job.frames)} frames",), interrupted)
-    _save_maps(method, keypoints, Path(out))
+    keeper.save_maps()
     return _result(job, Path(out), interrupted)
+
+
+@dataclass(frozen=True, eq=False)
+class Keeper:
+    """Keeps what a tracker says as a run's folder: frame by frame poses, times and masks, and its maps at the end."""
+
+    writer: RunWriter
+    method: Point2Pose
+    masks: bool = False
+    keypoints: KeypointLog = field(default_factory=KeypointLog)
+
+    def add(self, frame: Frame, estimates: Mapping[str, PoseEstimate]) -> None:
+        """The frame that has just been estimated."""
+        method = self.method
+        if self.masks:
+            self.writer.add_masks(frame, method.masks)
+        for name, obj in method.objects.items():
+            seen = method.tracks.visible & np.isin(method.tracks.ids, obj.model.map.ids)
+            self.keypoints.add(frame.index, name, method.tracks.ids[seen], method.tracks.uv_px[seen])
+        stages_ms = dict(method.stopwatch.last_ms)
+        self.writer.add(frame, estimates, stages_ms.pop("total"), stages_ms)
+
+    def save_maps(self) -> None:
+        """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
+        models = {name: obj.model for name, obj in self.method.objects.items()}
+        for name, model in models.items():
+            if model.has_surface and len((mesh := model.surface.mesh()).faces):
+                save_mesh(mesh, self.writer.path / "meshes" / f"{name}.ply")
+        maps = {name: (model.map.ids, model.map.p_obj, model.map.promoted) for name, model in models.items()}
+        self.keypoints.save(self.writer.path, maps)
 
 
 def evaluate_tracker(
@@ -268,26 +295,6 @@ def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str,
             yield waiting.popleft(), estimates
     for estimates in method.finish():
         yield waiting.popleft(), estimates
-
-
-def _log_keypoints(log: KeypointLog, frame: Frame, method: Point2Pose) -> None:
-    """Keep where each object's points were seen in the frame that has just been estimated."""
-    tracks = method.tracks
-    for name, obj in method.objects.items():
-        seen = tracks.visible & np.isin(tracks.ids, obj.model.map.ids)
-        log.add(frame.index, name, tracks.ids[seen], tracks.uv_px[seen])
-
-
-def _save_maps(method: Point2Pose, keypoints: KeypointLog, out: Path) -> None:
-    """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
-    for name, obj in method.objects.items():
-        if not obj.model.has_surface:
-            continue
-        mesh = obj.model.surface.mesh()
-        if len(mesh.faces):
-            save_mesh(mesh, out / "meshes" / f"{name}.ply")
-    maps = {name: obj.model.map for name, obj in method.objects.items()}
-    keypoints.save(out, {name: (m.ids, m.p_obj, m.promoted) for name, m in maps.items()})
 
 
 def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:

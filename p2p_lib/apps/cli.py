@@ -125,6 +125,8 @@ def _run(a: argparse.Namespace) -> int:
     _arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
     _arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
     _options(*METHOD, prompts="clicks; without, the first image is clicked on", masks="segmenter (default: builtin)"),
+    _arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
+    _OVERLAY,
     _NO_BROWSER,
 )
 def _live(a: argparse.Namespace) -> None:
@@ -134,13 +136,15 @@ def _live(a: argparse.Namespace) -> None:
 
     options, count, first = RunOptions.of_arguments(a), LiveCount(), None
     options.config()  # what does not fit is said before the camera starts
+    _film_wanted(a.overlay)
     prompts = load_prompts(a.prompts) if a.prompts else ()
     camera = open_camera(a.camera, a.rate)
     try:
         if not prompts:
             prompts, first = click_first(camera, _warn, not a.no_browser)
         show = partial(print, flush=True)
-        track_live(camera, prompts, lambda e: show(json_line(e)), options, first=first, count=count)
+        keep = {"first": first, "count": count, "out": a.out, "overlay": a.overlay}
+        track_live(camera, prompts, lambda estimate: show(json_line(estimate)), options, **keep)
     except KeyboardInterrupt:
         pass  # how one stops a camera
     finally:

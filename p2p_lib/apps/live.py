@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -21,8 +23,12 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
-from p2p_lib.datasets.cameras import LiveCamera, Newest, Still
+from p2p_lib.datasets.cameras import LiveCamera, Newest, Still, Stream
+from p2p_lib.datasets.runs import RunWriter
+from p2p_lib.figures.film import Film
+from p2p_lib.figures.scenes import draw_live
 from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.run import Keeper
 
 
 @dataclass
@@ -52,6 +58,8 @@ def track_live(
     *,
     first: Frame | None = None,
     count: LiveCount | None = None,
+    out: str | Path | None = None,
+    overlay: str | Path | None = None,
 ) -> LiveCount:
     """Follow the objects of the prompts until the camera ends; every estimate goes to ``on_estimate`` at once.
 
@@ -60,6 +68,8 @@ def track_live(
     options  the method and its parameters; ``masks`` names the segmenter
     first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
+    out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it
+    overlay  a film of it, .mp4 or .gif, as the tracker sees it
 
     Closes the camera at the end, whatever ends it. Raises :class:`BadInput` for clicks that do not fit.
     """
@@ -71,25 +81,81 @@ def track_live(
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
     if config.method.surface:
         import_module("torch")  # which takes seconds, in which the camera need not run
-    start_s = monotonic()
-    with Newest(camera, keep={p.frame for p in prompts}) as newest:
+    waiting: deque[Frame] = deque()  # those that a late 2D tracker has not answered yet
+    with ExitStack() as kept:
+        listeners = [lambda _, estimates: [on_estimate(estimate) for estimate in estimates.values()]]
+        if overlay is not None:
+            listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
+        if out is not None:
+            listeners.append(kept.enter_context(_kept(out, camera, method, options, prompts)))
+
+        def answer(estimates: dict[str, PoseEstimate]) -> None:
+            frame = waiting.popleft()
+            for listen in listeners:
+                listen(frame, estimates)
+
+        start_s = monotonic()
+        newest = kept.enter_context(Newest(camera, keep={p.frame for p in prompts}))
         frame = first or newest.take()
         while frame is not None:
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))
-            for estimate in method.step(frame).values():
-                on_estimate(estimate)
+            waiting.append(frame)
+            estimates = method.step(frame)
+            if len(waiting) > method.tracker.latency_frames:
+                answer(estimates)
             if frame is not first:  # which may be long ago
                 count.count(frame)
             count.seconds = monotonic() - start_s
             frame = newest.take()
         for estimates in method.finish():
-            for estimate in estimates.values():
-                on_estimate(estimate)
+            answer(estimates)
     if prompts:
         got = f"frame {prompts[0].frame}, which never came"
         raise BadInput(f"prompt of {prompts[0].name!r}", got, "a frame of the camera", "Click in an earlier one.")
     return count
+
+
+Listener = Callable[[Frame, dict[str, PoseEstimate]], object]
+
+
+def _filmed(film: Film, name: str, method: Point2Pose, first: Frame | None) -> Listener:
+    """Draws every frame into a film, but for one that was taken before."""
+    times_s: list[float] = []
+
+    def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
+        if frame is not first:
+            times_s.append(frame.time_s)
+            image = draw_live(method, frame, estimates, title=name, start_s=times_s[0])
+            film.add(image, frame.time_s - times_s[0])
+
+    return listen
+
+
+@contextmanager
+def _kept(
+    out: str | Path, camera: LiveCamera, method: Point2Pose, options: RunOptions, prompts: Iterable[Prompt]
+) -> Iterator[Listener]:
+    """Keeps every frame in a run's folder; Ctrl-C is how one stops a camera, so that it ends the run well."""
+    sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
+    objects = tuple(dict.fromkeys(prompt.name for prompt in prompts))
+    writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects)
+    writer.info |= {"detector": method.detector.name, "segmenter": method.segmenter.name, "options": options.as_dict()}
+    writer.info |= {"prompts": [prompt.as_dict() for prompt in prompts]}
+    keeper, stopped = Keeper(writer, method, options.save_masks), None
+
+    def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
+        writer.info["stop"] = frame.index + 1
+        keeper.add(frame, estimates)
+
+    with writer:
+        try:
+            yield listen
+        except KeyboardInterrupt as stop:
+            stopped = stop
+    keeper.save_maps()
+    if stopped:
+        raise stopped
 
 
 def click_first(

@@ -7,9 +7,9 @@ a tracker that is slower than the camera skips frames instead of falling behind.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Condition, Event
 from time import monotonic
@@ -18,7 +18,7 @@ from typing import Protocol
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.sequence import Sequence, open_sequence
+from p2p_lib.datasets.sequence import ObjectTruth, Sequence, open_sequence
 
 DEFAULT_RATE_HZ = 30.0
 _FORMS = "realsense, realsense:RECORDING or folder:PATH"
@@ -37,6 +37,24 @@ class LiveCamera(Protocol):
         """Stop; a ``read`` that waits comes back."""
 
 
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """What a run's folder says of a camera that plays no sequence: no frames to read again, no masks, no truth."""
+
+    name: str
+    camera: Camera
+    format: str = "live"
+    path: None = None
+    objects: tuple[str, ...] = ()
+    truth: Mapping[str, ObjectTruth] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return 0
+
+    def visible_px(self, i: int) -> None:
+        """Unknown."""
+
+
 class FolderCamera:
     """A sequence on disk that plays like a camera: frame i is there i / rate_hz seconds after the first.
 
@@ -47,12 +65,12 @@ class FolderCamera:
         if not 0 < rate_hz <= 1000:
             raise BadInput("rate", rate_hz, "frames per second, above 0 and at most 1000")
         self.name, self.camera = sequence.name, sequence.camera
-        self._sequence, self._rate_hz, self._closed = sequence, rate_hz, Event()
+        self.sequence, self._rate_hz, self._closed = sequence, rate_hz, Event()
         self._next, self._start_s = 0, 0.0
 
     def read(self) -> Frame | None:
         """The next frame at its time; at once where that is past."""
-        if self._next >= len(self._sequence):
+        if self._next >= len(self.sequence):
             return None
         if self._next <= 1:
             self._start_s = monotonic()
@@ -60,7 +78,7 @@ class FolderCamera:
         if self._closed.wait(max(0.0, due_s - monotonic())):
             return None
         self._next += 1
-        return self._sequence.frame(self._next - 1)
+        return self.sequence.frame(self._next - 1)
 
     def close(self) -> None:
         """Play no further."""

@@ -8,6 +8,7 @@ import threading
 import time
 from urllib.request import Request, urlopen
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -20,8 +21,11 @@ from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
+from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.prompts import save_prompts
+from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.figures.film import write_film
 from p2p_lib.run import run
 from tests.apps.test_cli import POINTS_ALONE
 from tests.fixtures.sliding_board import H, K, W, write_sequence
@@ -179,6 +183,41 @@ def test_a_prompt_of_a_frame_that_never_comes_is_refused(folder):
         track_live(camera, [Prompt("mug", 99, [[1, 1]])], print, RunOptions(settings=SETTINGS))
 
 
+def test_a_run_is_kept_and_filmed(folder, tmp_path):
+    """What is kept is what was said, and it can be looked at; the film has an image a frame."""
+    sequence, got = open_sequence(folder), []
+    where = {"out": tmp_path / "run", "overlay": tmp_path / "film.mp4"}
+    count = track_live(FolderCamera(sequence, 20), PROMPTS, got.append, RunOptions(settings=SETTINGS), **where)
+    kept = load_run(where["out"])
+    board = kept.objects["board"]
+    np.testing.assert_allclose(board.T_cam_obj, [e.T_cam_obj for e in got])
+    assert board.frame_index.tolist() == [e.frame_index for e in got] and len(got) == count.frames
+    assert kept.info["finished"] and kept.info["segmenter"] == "builtin" and kept.info["path"] == str(folder)
+    assert len(load_keypoints(where["out"])["board"].ids) > 10
+    write_film(where["out"], tmp_path / "again.mp4")
+    for film in ("film.mp4", "again.mp4"):
+        with av.open(str(tmp_path / film)) as container:
+            assert sum(1 for _ in container.decode(video=0)) == count.frames
+
+
+def test_stopping_a_camera_ends_its_run_well(scripted, folder, tmp_path):
+    """One without a sequence, too."""
+    sequence = open_sequence(folder)
+    for k in range(3):
+        scripted.hand.put(sequence.frame(k))
+
+    def stop(estimate):
+        if estimate.frame_index == 2:
+            raise KeyboardInterrupt
+        scripted.hand.put(sequence.frame(estimate.frame_index + 1))
+
+    with pytest.raises(KeyboardInterrupt):
+        track_live(scripted, PROMPTS, stop, RunOptions(settings=SETTINGS), out=tmp_path / "run")
+    kept = load_run(tmp_path / "run")
+    assert kept.info["finished"] and len(kept.objects["board"]) == 2 and kept.info["path"] is None
+    assert load_keypoints(tmp_path / "run")
+
+
 # --- the command -------------------------------------------------------------------------------
 
 
@@ -243,6 +282,7 @@ def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeyp
         (["--camera", "folder:{folder}", "--rate", "0"], "rate: got 0.0, expected frames per second, above 0"),
         (["--camera", "folder:{folder}x"], "slidex: no such folder"),
         (["--camera", "realsense:{folder}/no.bag"], "no.bag: no such recording"),
+        (["--camera", "folder:{folder}", "--overlay", "x.avi"], "film: got x.avi, expected a name that ends in .mp4"),
         (["--camera", "realsense", "--rate", "15"], "rate: got 15 with realsense"),
         (["--camera", "folder:{folder}", "--prompts", "{folder}/none.json"], "none.json: no such file of prompts"),
         (["--camera", "folder:{folder}", "--prompts", "{prompts}", "--masks", "sam9"], "sam9"),
