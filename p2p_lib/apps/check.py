@@ -18,7 +18,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_SEGMENTER, make_detector, make_segmenter
+from p2p_lib.apps.click import clicked_masks
+from p2p_lib.core.backends import DEFAULT_DETECTOR, make_detector
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
@@ -377,8 +378,6 @@ def _clicked(sequence: Sequence, prompts: Iterable[Prompt], config: Config) -> F
     firsts: FirstMasks = {}
     for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
         frame, new = sequence.frame(i), [prompt for prompt in said if prompt.name not in firsts]
-        rng = np.random.default_rng(config.seed)
-        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
-        labels = segmenter.segment(frame, new)
-        firsts |= {name: (frame, labels == label) for label, name in enumerate(segmenter.names, 1)}
+        found = clicked_masks(frame, new, sequence.camera, config)
+        firsts |= {name: (frame, mask) for name, mask in found.items()}
     return firsts

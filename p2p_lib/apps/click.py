@@ -8,19 +8,25 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Any
 
 import cv2
+import numpy as np
 
+from p2p_lib.core.backends import DEFAULT_SEGMENTER, make_segmenter
 from p2p_lib.core.browser import open_page
-from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import Config, preset
+from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.prompts import Prompt, check_depth
+from p2p_lib.core.types import Frame
 from p2p_lib.datasets.prompts import load_prompts, parse_prompts, prompts_by_frame, save_prompts
 from p2p_lib.datasets.sequence import Sequence
 
@@ -43,7 +49,7 @@ class Clicker:
         self.sequence, self.path, self.first = sequence, Path(path), frame
         self.prompts: tuple[Prompt, ...] = load_prompts(path) if self.path.is_file() else ()
         self.image_png = lru_cache(maxsize=8)(self._image_png)
-        self._saved = Event()
+        self._finished, self._segmenting = Event(), Lock()
         try:
             self._server = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"clicker": self}))
         except OSError as error:
@@ -54,8 +60,8 @@ class Clicker:
         Thread(target=self._server.serve_forever, daemon=True).start()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Until the page's Save was accepted; whether it was within the time."""
-        return self._saved.wait(timeout_s)
+        """Until the page has saved and finished; whether it has within the time."""
+        return self._finished.wait(timeout_s)
 
     def close(self) -> None:
         """Stop serving."""
@@ -87,8 +93,28 @@ class Clicker:
     def _image_png(self, i: int) -> bytes:
         return cv2.imencode(".png", cv2.cvtColor(self.sequence.frame(i).rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
 
+    def masks(self, content: object) -> dict[str, Any]:
+        """What the prompts of a frame, as the page sends them, make of it, and what is doubtful about them.
+
+        ``masks`` are outlines [[x, y], ...] of each object that its prompts can start.
+        """
+        prompts = [prompt for prompt in parse_prompts(content) if prompt.starts]
+        found: dict[str, Any] = {"masks": {}, "doubts": []}
+        by_frame = prompts_by_frame(prompts, range(len(self.sequence)), self.sequence.camera)
+        with self._segmenting, warnings.catch_warnings(record=True) as doubts:
+            warnings.simplefilter("always", Doubt)
+            for i, said in by_frame.items():
+                for name, mask in clicked_masks(self.sequence.frame(i), said, self.sequence.camera).items():
+                    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
+                    found["masks"][name] = [outline[:, 0].tolist() for outline in outlines]
+        found["doubts"] = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
+        return found
+
     def save(self, content: object) -> None:
-        """Check prompts as the page sends them, and write the file; :class:`BadInput` says what does not fit."""
+        """Check prompts as the page sends them, and write the file; :class:`BadInput` says what does not fit.
+
+        ``finish`` beside the objects ends the waiting for the page, which otherwise goes on.
+        """
         prompts = parse_prompts(content)
         said = {(prompt.name, prompt.frame) for prompt in prompts}
         prompts += tuple(p for p in self.prompts if p.mask is not None and (p.name, p.frame) not in said)
@@ -98,7 +124,18 @@ class Clicker:
                 check_depth(prompt, self.sequence.frame(i))
         save_prompts(self.path, prompts)
         self.prompts = prompts
-        self._saved.set()
+        if content.get("finish"):
+            self._finished.set()
+
+
+def clicked_masks(
+    frame: Frame, prompts: Iterable[Prompt], camera: Camera, config: Config | None = None
+) -> dict[str, np.ndarray]:
+    """Object to its mask (H, W) bool, as the built-in segmenter cuts it out of the frame that the prompts are of."""
+    config = config or preset()
+    segmenter = make_segmenter(DEFAULT_SEGMENTER, camera, config.segmentation, np.random.default_rng(config.seed))
+    labels = segmenter.segment(frame, list(prompts))
+    return {name: labels == label for label, name in enumerate(segmenter.names, 1)}
 
 
 def check_writable(path: Path) -> None:
@@ -110,12 +147,20 @@ def check_writable(path: Path) -> None:
 
 
 def wait_for_clicks(clicker: Clicker, say: Callable[[str], object], open_browser: bool = True) -> tuple[Prompt, ...]:
-    """What the page saves: says where the page is, opens it where there is a desktop, waits, closes."""
+    """What the page saves: says where the page is, opens it where there is a desktop, waits, closes.
+
+    Ctrl-C before anything was saved is passed on.
+    """
+    before = clicker.prompts
     with clicker:
-        say(f"Click in your browser at {clicker.url} and press Save there; Ctrl-C here gives up.")
+        say(f"Click in your browser at {clicker.url} and press Save and finish there; Ctrl-C here ends it, too.")
         if open_browser:
             open_page(clicker.url)
-        clicker.wait()
+        try:
+            clicker.wait()
+        except KeyboardInterrupt:
+            if clicker.prompts is before:
+                raise
     return clicker.prompts
 
 
@@ -140,17 +185,22 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         length = self.headers.get("Content-Length", "")
         # Pages of other sites cannot send this type here without being asked first, which this server never is.
-        if self.path != "/prompts" or self.headers.get_content_type() != _JSON:
-            return self._refuse(HTTPStatus.NOT_FOUND, "expected JSON, sent to /prompts")
+        answers = {"/prompts": self._save, "/masks": self.clicker.masks}
+        if self.path not in answers or self.headers.get_content_type() != _JSON:
+            return self._refuse(HTTPStatus.NOT_FOUND, f"expected JSON, sent to {' or '.join(answers)}")
         if not length.isdecimal() or int(length) > _LARGEST_BODY:
             return self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {_LARGEST_BODY} bytes")
         try:
-            self.clicker.save(json.loads(self.rfile.read(int(length))))
+            answer = answers[self.path](json.loads(self.rfile.read(int(length))))
         except (P2PError, ValueError) as error:
             return self._refuse(HTTPStatus.BAD_REQUEST, str(error))
         except OSError as error:
             return self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"{self.clicker.path}: {error.strerror}")
-        self._answer(json.dumps({"saved": str(self.clicker.path)}).encode(), _JSON)
+        self._answer(json.dumps(answer).encode(), _JSON)
+
+    def _save(self, content: object) -> dict[str, str]:
+        self.clicker.save(content)
+        return {"saved": str(self.clicker.path)}
 
     def _answer(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
         self.send_response(status)

@@ -1,6 +1,7 @@
 // Runs the script of the click page without a browser: node click_probe.js PAGE, on standard input
-// {"session": what the server says, "steps": [["frame", i] | ["press", x, y, shift, x to, y to] | ["row" | "clear", k]]}.
-// Prints what Save sends. Only what the page asks of a browser is here.
+// {"session": what the server says, "steps": [["frame", i] | ["press", x, y, shift, x to, y to] | ["zoom", x, y] |
+// ["row" | "clear" | "remove", k] | ["rename", k, name] | ["undo" | "save" | "finish"]]}.
+// Prints what Save sends, and what was asked for masks. Only what the page asks of a browser is here.
 const fs = require("fs");
 const given = JSON.parse(fs.readFileSync(0, "utf8"));
 const script = /<script>([\s\S]*)<\/script>/.exec(fs.readFileSync(process.argv[2], "utf8"))[1];
@@ -8,7 +9,7 @@ const drawn = [];
 const pen = new Proxy({}, { get: (_, key) => (...a) => drawn.push([key, ...a]), set: () => true });
 
 function element() {
-  const self = { style: {}, children: [], classList: { toggle() {} }, value: "", textContent: "" };
+  const self = { style: {}, children: [], classList: { toggle() {} }, value: "", textContent: "", checked: false };
   self.append = (...more) => self.children.push(...more);
   self.replaceChildren = (...all) => { self.children = all; };
   self.getContext = () => pen;
@@ -19,13 +20,26 @@ function element() {
 const elements = {};
 global.document = { getElementById: (id) => (elements[id] ??= element()), createElement: element };
 global.Image = class { complete = true; set src(_) { this.onload?.(); } };
-let sent = null;
+global.window = { prompt: () => renamed };
+let sent = null, renamed = null;
+const asked = [];
+document.getElementById("masks").checked = true;
 global.fetch = async (where, what) => {
   if (where === "session") return { json: async () => given.session };
-  sent = JSON.parse(what.body);
+  const content = JSON.parse(what.body);
+  if (where === "masks") {
+    asked.push(content.objects);
+    const square = [[[1, 1], [9, 1], [9, 9]]];
+    const masks = Object.fromEntries(content.objects.map(({ name }) => [name, square]));
+    return { ok: true, json: async () => ({ masks, doubts: ["is it a table?"] }) };
+  }
+  sent = content;
   return { ok: true, json: async () => ({ saved: "file" }) };
 };
-const at = (x, y, shift) => ({ clientX: 10 + 2 * x + 1, clientY: 20 + 2 * y + 1, shiftKey: shift, pointerId: 1 });
+const at = (x, y, shift) => (
+  { clientX: 10 + 2 * x + 1, clientY: 20 + 2 * y + 1, shiftKey: shift, pointerId: 1, button: 0, preventDefault() {} }
+);
+const own = (k, what) => elements.objects.children[k].children[what].onclick({ stopPropagation() {} });
 const steps = {
   frame: (i) => { elements.frame.value = i; elements.frame.oninput(); },
   press: (x, y, shift = false, x1 = x, y1 = y) => {
@@ -33,13 +47,22 @@ const steps = {
     elements.canvas.onpointerup(at(x1, y1, shift));
   },
   row: (k) => elements.objects.children[k].onclick(),
-  clear: (k) => elements.objects.children[k].children[2].onclick({ stopPropagation() {} }),
+  zoom: (x, y) => elements.canvas.onwheel({ ...at(x, y), deltaY: -1 }),
+  rename: (k, name) => { renamed = name; own(k, 2); },
+  clear: (k) => own(k, 3),
+  remove: (k) => own(k, 4),
+  undo: () => elements.undo.onclick(),
+  save: () => elements.save.onclick(),
 };
 (async () => {
   (0, eval)(script.replace('"use strict";', ""));
   await new Promise((done) => setTimeout(done, 20));
-  for (const [name, ...how] of given.steps) steps[name](...how);
-  await elements.save.onclick();
+  for (const [name, ...how] of given.steps) {
+    await steps[name](...how);
+    await new Promise((done) => setTimeout(done, 5));
+  }
+  await elements.finish.onclick();
   const rows = elements.objects.children.map((row) => row.children[1].textContent);
-  console.log(JSON.stringify({ sent, rows, message: elements.message.textContent }));
+  console.log(JSON.stringify({ sent, rows, message: elements.message.textContent,
+    doubts: elements.doubts.textContent, asked, tinted: drawn.some(([what, how]) => what === "fill" && how === "evenodd") }));
 })();

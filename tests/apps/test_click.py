@@ -47,9 +47,9 @@ def get(url: str) -> tuple[int, bytes, str]:
     return ask(urllib.request.Request(url))
 
 
-def post(url: str, body, kind: str = "application/json") -> tuple[int, dict]:
+def post(url: str, body, kind: str = "application/json", to: str = "prompts") -> tuple[int, dict]:
     data = body if isinstance(body, bytes) else json.dumps(body).encode()
-    status, answer, _ = ask(urllib.request.Request(url + "prompts", data, {"Content-Type": kind}))
+    status, answer, _ = ask(urllib.request.Request(url + to, data, {"Content-Type": kind}))
     return status, json.loads(answer)
 
 
@@ -84,7 +84,8 @@ def test_a_whole_visit(sequence, out):
             assert (status, kind) == (200, "image/png")
             np.testing.assert_array_equal(shown[..., ::-1], sequence.frame(k).rgb)
         assert not clicker.wait(0) and not out.exists()
-        status, answer = post(clicker.url, {"objects": [one(), one("bowl", 2, [(60, 40)])]})
+        assert post(clicker.url, {"objects": [one()]})[0] == 200 and out.exists() and not clicker.wait(0), "it goes on"
+        status, answer = post(clicker.url, {"objects": [one(), one("bowl", 2, [(60, 40)])], "finish": True})
         assert (status, answer) == (200, {"saved": str(out)}) and clicker.wait(0)
         assert [p.name for p in clicker.prompts] == ["cup", "bowl"]
     cup, bowl = load_prompts(out)
@@ -191,20 +192,74 @@ def test_the_page_makes_prompts_of_clicks_boxes_and_later_frames(sequence, out):
             {"name": "cup", "frame": 2, "negative": [[62, 51]]},
             {"name": "object", "frame": 2, "box": [30, 10, 70, 44]},
         ]
+        assert seen["sent"]["finish"] is True
         assert seen["rows"] == ["cup: frame 0, 2", "object: frame 2"] and seen["message"].startswith("Saved")
         assert post(clicker.url, seen["sent"])[0] == 200
         assert [(p.name, p.frame) for p in clicker.prompts] == [("cup", 0), ("cup", 2), ("object", 2), ("lid", 1)]
-        again = visit(clicker.session(), ["clear", 0])
+        again = visit(clicker.session(), ["remove", 0])
     assert again["sent"]["objects"] == seen["sent"]["objects"][2:]
     np.testing.assert_array_equal(load_prompts(out)[-1].mask, np.eye(H, W, dtype=bool))  # masks stay as they were
 
 
-def test_the_command_ends_when_it_is_saved(sequence, out):
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
+def test_the_page_undoes_renames_clears_and_zooms(sequence, out):
+    with Clicker(sequence, out) as clicker:
+        session = clicker.session()
+    first = {"name": "object", "frame": 0, "points": [[50, 20]]}
+    steps = [["press", 50, 20], ["frame", 1], ["press", 30, 30], ["frame", 0]]
+    moved = {"name": "object", "frame": 1, "points": [[30, 30]]}
+    cases = {
+        "as it is": ([], [first, moved]),
+        "undo": ([["undo"]], [first]),
+        "clear takes this frame's alone": ([["clear", 0]], [moved]),
+        "clear, undone": ([["clear", 0], ["undo"]], [first, moved]),
+        "rename": ([["rename", 0, "mug"]], [first | {"name": "mug"}, moved | {"name": "mug"}]),
+        "it goes on after saving": ([["save"], ["press", 60, 40]], [first | {"points": [[50, 20], [60, 40]]}, moved]),
+        # Zoomed by 1.25 about the upper left corner, the pixel under (20, 10) is (16, 8).
+        "zoom": ([["zoom", 0, 0], ["press", 20, 10]], [first | {"points": [[50, 20], [16, 8]]}, moved]),
+    }
+    for case, (more, objects) in cases.items():
+        assert visit(session, *steps, *more)["sent"]["objects"] == objects, case
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
+def test_the_page_asks_for_the_masks_of_the_frame_that_is_shown(sequence, out):
+    with Clicker(sequence, out) as clicker:
+        seen = visit(clicker.session(), ["press", 50, 20], ["frame", 1], ["press", 30, 30])
+    assert seen["asked"][0] == [{"name": "object", "frame": 0, "points": [[50, 20]]}]
+    assert seen["asked"][-1] == [{"name": "object", "frame": 1, "points": [[30, 30]]}]
+    assert seen["tinted"] and seen["doubts"] == "is it a table?"
+
+
+def test_the_server_says_what_mask_the_clicks_make(sequence, out):
+    """A board before a wall: its outline, and what is doubtful or wrong about the clicks."""
+    for k in range(3):
+        depth, rgb = np.full((H, W), 900, np.uint16), np.full((H, W, 3), 120, np.uint8)
+        depth[20:40, 30:60], rgb[20:40, 30:60] = 600, (30, 160, 220)
+        cv2.imwrite(str(sequence.path / "depth" / f"{k}.png"), depth)
+        cv2.imwrite(str(sequence.path / "rgb" / f"{k}.png"), rgb)
+    with Clicker(sequence, out) as clicker:
+        status, found = post(clicker.url, {"objects": [one(points=[(45, 30)])]}, to="masks")
+        mask = np.zeros((H, W), np.uint8)
+        cv2.fillPoly(mask, [np.array(outline) for outline in found["masks"]["cup"]], 1)
+        board = np.zeros((H, W), bool)
+        board[20:40, 30:60] = True
+        assert status == 200 and (mask.astype(bool) & board).sum() / (mask.astype(bool) | board).sum() > 0.85
+        assert found["doubts"] == []
+        wall = post(clicker.url, {"objects": [one(points=[(10, 10)])]}, to="masks")[1]
+        assert wall["doubts"][0].startswith("clicks on 'cup' in frame 0: ")
+        beside = {"name": "cup", "frame": 1, "negative": [[5, 5]]}
+        assert post(clicker.url, {"objects": [beside]}, to="masks") == (200, {"masks": {}, "doubts": []})
+        status, found = post(clicker.url, {"objects": [one(points=[(W, 5)])]}, to="masks")
+        assert status == 400 and "expected pixels within" in found["error"] and not out.exists()
+
+
+def test_the_command_ends_when_it_is_finished(sequence, out):
     command = [sys.executable, "-m", "p2p_lib.apps.cli", "click", str(sequence.path), "--out", str(out), "--no-browser"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         url = re.search(r"http://\S+", process.stdout.readline())[0]
-        assert post(url, {"objects": [one()]})[0] == 200
+        assert post(url, {"objects": [one()], "finish": True})[0] == 200
         said, _ = process.communicate(timeout=30)
     finally:
         process.kill()

@@ -262,7 +262,7 @@ def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeyp
     from p2p_lib.apps import click
 
     def press(url: str) -> None:
-        content = {"objects": [{"name": "board", "frame": 0, "points": [[60, 50]]}]}
+        content = {"objects": [{"name": "board", "frame": 0, "points": [[60, 50]]}], "finish": True}
         urlopen(Request(f"{url}prompts", json.dumps(content).encode(), {"Content-Type": "application/json"})).close()
 
     wait = click.Clicker.wait
