@@ -8,9 +8,9 @@ export MKL_NUM_THREADS := $(THREADS)
 # ROS and others put packages of another Python there.
 unexport PYTHONPATH PYTHONHOME
 
-.PHONY: help setup reproduce test mutants lab figures lock
+.PHONY: help setup reproduce test test-backends mutants lab figures lock
 help: ## this list
-	@grep -E '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 18
+	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 22
 
 setup: ## set up .venv (about a minute the first time, instant when nothing has changed)
 	@$(PYTHON) tools/bootstrap.py
@@ -25,6 +25,9 @@ test: setup ## linter, then all tests, every notebook included
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
 	@.venv/bin/python -m pytest --durations=5
+
+test-backends: setup ## the adapters of third-party networks against the official classes, in .venv-backends (no weights)
+	@.venv/bin/python tools/test_backends.py
 
 mutants: setup ## switch every mechanism off in turn and see its test fail (minutes)
 	@.venv/bin/python tools/mutants.py

@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,24 @@ settings.load_profile("suite")
 PROJECT = Path(__file__).resolve().parents[1]
 #: Fixtures of several packages.
 pytest_plugins = ["tests.fixtures.made_run", "tests.fixtures.moving_frames"]
+
+
+def pytest_terminal_summary(terminalreporter):
+    """How many tests were skipped for want of what."""
+    reasons = [
+        str(report.longrepr[2]).removeprefix("Skipped: ") for report in terminalreporter.stats.get("skipped", [])
+    ]
+    wants = Counter(reason.partition(". Run:")[0] for reason in reasons)
+    terminalreporter.section(f"{len(reasons)} tests skipped" if reasons else "no test skipped")
+    for want, count in wants.most_common():
+        terminalreporter.write_line(f"{count:5}  {want}")
+
+
+def pytest_sessionfinish(session):
+    """Where everything should be there, a test that is skipped has failed."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if os.environ.get("P2P_NO_SKIPS") and reporter and reporter.stats.get("skipped"):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.fixture(scope="session")

@@ -100,7 +100,8 @@ def _fetch_one(file: RemoteFile, record: _Record, progress: bool) -> str:
         raise BadInput(str(path), f"sha256 {digest}", f"sha256 {expected}")
     unpacked = record.unpacked(file)
     record.keep(file, digest, unpacked)
-    said = "checked" if expected else "its checksum is recorded"
+    unknown = f"no checksum is published: sha256 {digest} is what came, and is checked from now on"
+    said = "checked" if expected else unknown
     if file.unpack_to is not None and unpacked is None:
         into = record.folder / file.unpack_to
         with progress_bar(f"unpacking {file.path}", unit="B", unit_scale=True, shown=progress) as bar:

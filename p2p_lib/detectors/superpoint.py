@@ -1,6 +1,6 @@
 """SuperPoint (DeTone et al., 2018), the paper's detector, through the maintained class of ``transformers``.
 
-The weights are Magic Leap's: for academic and other non-commercial use only.
+The weights are Magic Leap's: for academic and other non-commercial use only. Last run with transformers 5.23.0.
 """
 
 from __future__ import annotations

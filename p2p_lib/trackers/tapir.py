@@ -1,7 +1,7 @@
 """Online BootsTAPIR (Doersch et al., ACCV 2024), the paper's tracker, through the official package ``tapnet``.
 
 Causal, frame by frame. Every query is a feature that is compared with the whole image, so a point is found
-again wherever it returns. Code and weights: Apache-2.0.
+again wherever it returns. Code and weights: Apache-2.0. Last run with tapnet 0.1.0 at c2cbab8 (July 2026).
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """TAPNext++ (arXiv:2604.10582): a recurrent tracker of points as tokens, through the official package ``tapnet``.
 
-Causal, frame by frame; its state takes no further queries. Code and weights: Apache-2.0.
+Causal, frame by frame; its state takes no further queries. Code and weights: Apache-2.0. Last run with tapnet 0.1.0 at
+c2cbab8 (July 2026).
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class TapNextModel:
         self.model, self.device = model.to(device).eval(), device
 
     def begin(self, images: list[np.ndarray], uv_px: np.ndarray) -> TapNextRollout:
-        """A rollout with queries in the newest image."""
+        """A rollout with queries in the first and only image: it is never late."""
         return TapNextRollout(self, images[0], uv_px)
 
 

@@ -121,7 +121,8 @@ def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):
 
 def test_a_detector_of_choice_is_the_first_that_is_there(monkeypatch):
     monkeypatch.delenv("P2P_DATA", raising=False)
-    chosen = {job.method.name: job.method.detector for job in jobs_of(read_plan("sampling"), "quick")}
+    jobs = jobs_of(read_plan("sampling_embedded"), "quick")
+    chosen = {job.method.name: job.method.detector for job in jobs}
     assert chosen == {"Proposed": "corners", "Detector only": "corners", "Uniform sampling": "uniform"}
 
 

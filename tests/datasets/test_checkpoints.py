@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from importlib import import_module
 
 import pytest
 
@@ -38,6 +39,22 @@ def test_manifests_of_all_models_say_what_they_must():
     for name in names("checkpoint"):
         for file in manifest(name).files:
             assert file.url.startswith("https://") and (file.sha256 or file.unknown)
+
+
+@pytest.mark.parametrize(
+    ("module", "package"),
+    [
+        ("trackers.tapir", "tapnet"),
+        ("trackers.tapnextpp", "tapnet"),
+        ("trackers.cotracker", "co-tracker"),
+        ("detectors.superpoint", "transformers"),
+        ("segmenters.sam2", "transformers"),
+    ],
+)
+def test_every_adapter_states_the_version_that_it_was_last_run_with(module, package):
+    said = " ".join(import_module(f"p2p_lib.{module}").__doc__.split())
+    assert f"Last run with {package} {packages.TRIED[package]}." in said
+    assert package in packages.tried()
 
 
 def test_tensors_are_read_and_the_first_checksum_is_kept(place):

@@ -115,7 +115,7 @@ def fetch(of, **options):
 def test_fetched_recorded_unpacked_and_verified(tiny, server, tmp_path):
     of = tiny()
     [line] = fetch(of)
-    assert "its checksum is recorded, 8 files unpacked" in line
+    assert "what came, and is checked from now on, 8 files unpacked" in line
     record = json.loads((tmp_path / "data/tiny/.p2p-tiny.json").read_text())["files"]["archives/one.tar.gz"]
     assert record["sha256"] == hashlib.sha256(server.data).hexdigest() and record["bytes"] == len(server.data)
     checks = list(inventory.verify(of, every_frame=True))
@@ -204,7 +204,7 @@ def test_what_must_be_had_by_hand(tiny, server, tmp_path):
     place = tmp_path / "data/tiny/archives"
     place.mkdir(parents=True)
     (place / "one.tar.gz").write_bytes(server.data)
-    assert "its checksum is recorded, 8 files unpacked" in fetch(of)[0] and server.asked == []
+    assert "what came, and is checked from now on, 8 files unpacked" in fetch(of)[0] and server.asked == []
     (place / "one.tar.gz").write_bytes(server.data[:-9])
     with pytest.raises(BadInput, match=r"one\.tar\.gz: got sha256 .*, expected sha256 "):
         fetch(of)

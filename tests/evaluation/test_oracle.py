@@ -72,6 +72,20 @@ def test_spoiled_as_much_as_asked_for(scene, queries):
     assert not (seen & ~visible).any()  # an outlier may leave the picture, none comes from nowhere
 
 
+def test_errors_that_last(scene, queries):
+    """A slide goes from one value to the next; who strays or is silent does so for the whole of a span."""
+    uv, visible = told(scene, queries, EXACT, frames=range(1, 25))
+    slid, _ = told(scene, queries, OracleConfig(noise_px=0, slide_px=2.0, lasting_frames=8), frames=range(1, 25))
+    off = np.where(visible[..., None], slid - uv, np.nan)
+    assert np.nanstd(off) == pytest.approx(2.0, rel=0.1)
+    assert np.nanstd(np.diff(off, axis=0)) < 1.0, "from frame to frame it changes little"
+    config = OracleConfig(noise_px=0, dropout=0.2, outliers=0.2, outlier_px=40, lasting_frames=8)
+    _, seen = told(scene, queries, config, frames=range(8, 16))
+    always = told(scene, queries, EXACT, frames=range(8, 16))[1].all(0)
+    assert (seen[:, always] == seen[0, always]).all(0).mean() > 0.95
+    assert 0.7 < seen[:, always].mean() < 0.9
+
+
 def test_seed_and_causality(scene, queries):
     spoiled = OracleConfig(noise_px=1, dropout=0.2, outliers=0.1)
     uv, visible = told(scene, queries, spoiled)

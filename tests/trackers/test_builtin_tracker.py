@@ -1,5 +1,6 @@
 """The long-range tracker on a printed card whose motion is known exactly, hidden and back elsewhere."""
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -9,6 +10,8 @@ import pytest
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.trackers.builtin import features
+from p2p_lib.trackers.builtin.image_only import ImageOnlyTracker
 from p2p_lib.trackers.builtin.tracker import BuiltinTracker
 from p2p_lib.trackers.lk import LkTracker
 
@@ -205,6 +208,41 @@ def test_suggested_places_are_verified():
     tracks = tracker.track(frames[HIDDEN.stop])
     assert tracks.visible.mean() > 0.7
     assert np.median(error_px(tracks, HIDDEN.stop)[tracks.visible]) < 0.5
+
+
+def test_what_of_it_is_2d_alone_sees_no_depth_and_still_finds_points_again():
+    """At corners of the card, as the sampler takes them: each is found by its own appearance."""
+    frames, back = film(), HIDDEN.stop + 8
+    inner = cv2.erode(cv2.warpAffine(np.ones(CARD, np.uint8), motion(0), SHAPE[::-1]), np.ones((25, 25))) > 0
+    uv = features.detect(cv2.cvtColor(frames[0].rgb, cv2.COLOR_RGB2GRAY), inner, 60).astype(float)
+    on_it = (uv - motion(0)[:, 2]) @ np.linalg.inv(motion(0)[:, :2]).T
+    told = {}
+    for depth in ("measured", "made up"):
+        tracker = ImageOnlyTracker(TrackingConfig())
+        tracker.start(frames[0])
+        tracker.add(uv)
+        for t in range(1, back + 1):
+            depth_m = frames[t].depth_m if depth == "measured" else np.full(SHAPE, 3.0 - t / 30, np.float32)
+            told[depth, t] = tracker.track(replace(frames[t], depth_m=depth_m))
+    for t in range(1, back + 1):
+        np.testing.assert_array_equal(told["measured", t].uv_px, told["made up", t].uv_px)
+    assert max(told["measured", t].visible.mean() for t in list(HIDDEN)[6:]) < 0.15
+    there = on_it @ motion(back)[:, :2].T + motion(back)[:, 2]
+    off_px = np.linalg.norm(told["measured", back].uv_px - there, axis=1)
+    visible = told["measured", back].visible
+    assert (visible & (off_px < 2)).mean() > 0.5 and (off_px[visible] < 4).mean() > 0.8
+    assert tracker.suggest(np.arange(3), there[:3]) is None
+
+
+def test_dropped_points_of_it_take_their_description_along():
+    tracker = ImageOnlyTracker(TrackingConfig())
+    tracker.start(film()[0])
+    ids = tracker.add(truth(0))
+    kept = tracker._described[1::2].copy()
+    tracker.drop(ids[::2])
+    np.testing.assert_array_equal(tracker._described, kept)
+    tracker.start(film()[0])
+    assert len(tracker._described) == 0 and len(tracker.track(film()[1])) == 0
 
 
 @pytest.mark.parametrize("call", ["add", "track"])

@@ -201,10 +201,10 @@ def test_dropped_points_are_gone_and_empty_rollouts_with_them():
     tracker.add(UV[:2])
     tracker.drop(np.array([0, 4]))
     tracks = tracker.track(value(2))
-    assert tracks.ids.tolist() == [2, 3] and len(tracker._rollouts) == 2
+    assert tracks.ids.tolist() == [2, 3] and len(tracker._queries) == 2
     np.testing.assert_allclose(tracks.uv_px, UV[[2, 0]] + 2)
     tracker.drop(np.array([2]))
-    assert len(tracker._rollouts) == 1
+    assert len(tracker._queries) == 1
 
 
 @settings(max_examples=25, deadline=None)
@@ -226,16 +226,87 @@ def test_any_coming_and_going_keeps_rows_and_points_together(seed):
             np.testing.assert_allclose(tracks.uv_px, np.array([here[k] for k in sorted(here)]) + t)
 
 
-def test_rollouts_are_bounded(monkeypatch):
+class Sight:
+    """Rollouts that know a point by the number painted where it was asked for, and see it where that is painted now."""
+
+    name, latency_frames, running = "sight", 0, 0
+
+    def begin(self, pictures, uv_px):
+        assert len(pictures) == self.latency_frames + 1
+        numbers = pictures[0][tuple(np.round(uv_px).astype(int).T[::-1])].astype(int) @ [1, 256, 65536]
+        return SightRollout(numbers, pictures[1:])
+
+
+class SightRollout:
+    def __init__(self, numbers, pictures):
+        self.numbers, self.waiting = numbers, list(pictures)
+
+    def step(self, rgb):
+        self.waiting.append(rgb)
+        painted = self.waiting.pop(0).astype(int) @ [1, 256, 65536]
+        uv = np.full((len(self.numbers), 2), np.nan)
+        for row, number in enumerate(self.numbers):
+            for v, u in np.argwhere(painted == number)[:1] if number else ():
+                uv[row] = u, v
+        return uv, np.isfinite(uv[:, 0]), np.full(len(uv), 0.1)
+
+
+def painted(t, numbers):
+    """A black picture with numbers at places: number to (u, v)."""
+    rgb = np.zeros((*SHAPE, 3), np.uint8)
+    for number, (u, v) in numbers.items():
+        rgb[v, u] = number % 256, number // 256 % 256, number // 65536
+    return Frame(t, t / 30, rgb, np.ones(SHAPE, np.float32))
+
+
+@pytest.mark.parametrize("late", [0, 3])
+def test_an_object_hidden_for_300_frames_keeps_its_points(late):
+    """Meanwhile another one turns and asks for new points every fifth frame, more often than rollouts can run."""
+    model, away, back, last = Sight(), 10, 310, 330 + late
+    model.latency_frames = late
+    tracker, ids, passes, returned = RolloutTracker(model), None, [], None
+
+    def shown(t):
+        hidden = {} if away <= t < back else {k: (10 + 3 * k + (40 if t >= back else 0), 20) for k in range(1, 13)}
+        # The other object's points: each is in sight for 200 frames.
+        return hidden | {
+            1000 + k: (5 + (k * 7) % 110, 50 + (k * 13) % 40) for k in range(t // 5 - 40, t // 5 + 1) if k >= 0
+        }
+
+    tracker.start(painted(0, shown(0)))
+    for t in range(1, last):
+        tracks = tracker.track(painted(t, shown(t)), urgent=t >= away)
+        answered = t - late
+        if answered < 0:
+            continue
+        if ids is None and answered >= 0:
+            ids = tracker.add(np.array([shown(answered)[k] for k in range(1, 13)], float))
+        elif answered % 5 == 0:
+            tracker.add(np.array([shown(answered)[1000 + answered // 5]], float))
+        passes.append(tracker.passes)
+        mine = tracks.select(ids[np.isin(ids, tracks.ids)])
+        if away <= answered < back:
+            assert not mine.visible.any()
+        elif answered >= back and returned is None and len(mine) and mine.visible.all():
+            returned = answered - back
+            np.testing.assert_allclose(mine.uv_px, [(10 + 3 * k + 40, 20) for k in range(1, 13)])
+    running = [q for q in tracker._queries if q.rollout is not None]
+    assert returned is not None and returned <= 6, "all of them, and soon"
+    assert len(running) <= rollouts.MAX_ROLLOUTS and max(passes) <= 24
+    assert len(tracker._queries) - len(running) <= rollouts.MAX_KEPT
+
+
+def test_kept_queries_are_bounded(monkeypatch):
     monkeypatch.setattr(rollouts, "MAX_ROLLOUTS", 3)
+    monkeypatch.setattr(rollouts, "MAX_KEPT", 2)
     tracker = RolloutTracker(EchoModel())
     tracker.start(value(0))
-    for t in range(1, 6):
+    for t in range(1, 9):
         # The second comes with a single point, the others with two.
         tracker.add(UV[:1] if t == 2 else UV[:2])
         tracks = tracker.track(value(t))
-    assert len(tracker._rollouts) == 3
-    assert len(tracks) == 9 and not tracks.visible[2] and tracks.visible.sum() == 6
+    assert len(tracker._queries) == 5 and len(tracks) == 15
+    assert not any(2 in queries.ids for queries in tracker._queries), "the fewest go first"
 
 
 # --- CoTracker3 ----------------------------------------------------------------------------------
