@@ -24,7 +24,8 @@ from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
-from p2p_lib.datasets.runs import Run, RunWriter, load_run
+from p2p_lib.datasets.run_writer import IfExists, RunWriter
+from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
@@ -61,6 +62,7 @@ def run(
     out: str | Path,
     options: RunOptions | None = None,
     *,
+    if_exists: IfExists = "refuse",
     progress: bool = True,
     say: Callable[[str], object] = lambda line: None,
     **changes: Any,
@@ -75,9 +77,11 @@ def run(
     - ``clicks``: ``options.prompts`` (the default with them), or else three clicks an object that are drawn, by the
       seed, from the dataset's first usable mask. The name of a segmenter means the same, with that segmenter
 
-    ``sequence`` may be an open one. An earlier run in ``out`` is replaced, of which ``say`` is told before anything is
-    tracked. Raises :class:`P2PError` for anything that does not fit; Ctrl-C ends the run early and is reported in the
-    result.
+    ``sequence`` may be an open one. ``if_exists`` says what becomes of an earlier run in ``out``: ``refuse`` with
+    :class:`BadInput`, ``replace`` it, or ``resume`` it where it was cut short. Resuming tracks its frames once more,
+    since what it knew went with it: that takes as long as it took, each pose is compared with the one on disk, and what
+    is there stays as it is until the first new frame. Of all this ``say`` is told before anything is tracked. Raises
+    :class:`P2PError` for anything that does not fit; Ctrl-C ends the run early and is reported in the result.
     """
     options = replace(options or RunOptions(), **changes)
     job = _prepare(sequence, options)
@@ -87,25 +91,16 @@ def run(
     method = Point2Pose(job.sequence.camera, job.config, tracker, options.detector, job.masks.segmenter)
     for name in job.objects if job.masks.every_mask else ():
         method.add_object(name)
-    writer = _writer(job, options, method, out)
-    if writer.replaced:
-        say(f"{out} held {writer.replaced}, which this one replaces.")
-    keeper = Keeper(writer, method, options.save_masks)
-    with writer, progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
-        try:
-            for frame, estimates in _estimates(method, job):
-                keeper.add(frame, estimates)
-                now = ", ".join(f"{name} {estimate.status}" for name, estimate in estimates.items())
-                total_ms = max(method.stopwatch.last_ms["total"], 1e-3)
-                bar.set_postfix_str(f"{1e3 / total_ms:.0f} Hz, {now}", refresh=False)
-                bar.update()
-        except KeyboardInterrupt:
-            writer.info["stopped_by"] = "KeyboardInterrupt"
+    writer = _writer(job, options, method, out, if_exists)
+    with writer:
+        _say_what_was_there(writer, say)
+        if not writer.complete:
+            _track(job, Keeper(writer, method, options.save_masks), progress)
     interrupted = writer.info["stopped_by"] is not None
-    if not writer.info["frames"]:
-        return RunResult(Path(out), None, "no frame was finished", (f"0 of {len(job.frames)} frames",), interrupted)
-    keeper.save_maps()
-    return _result(job, Path(out), interrupted)
+    if not writer.begun and not writer.earlier:
+        nothing = (f"0 of {len(job.frames)} frames",)
+        return RunResult(writer.path, None, "no frame was finished", nothing, interrupted, tracked=False)
+    return _result(job, writer.path, interrupted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +115,13 @@ class Keeper:
     def add(self, frame: Frame, estimates: Mapping[str, PoseEstimate]) -> None:
         """The frame that has just been estimated."""
         method = self.method
-        if self.masks:
-            self.writer.add_masks(frame, method.masks)
         for name, obj in method.objects.items():
             seen = method.tracks.visible & np.isin(method.tracks.ids, obj.model.map.ids)
             self.keypoints.add(frame.index, name, method.tracks.ids[seen], method.tracks.uv_px[seen])
         stages_ms = dict(method.stopwatch.last_ms)
         self.writer.add(frame, estimates, stages_ms.pop("total"), stages_ms)
+        if self.masks:
+            self.writer.add_masks(frame, method.masks)
 
     def save_maps(self) -> None:
         """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
@@ -262,8 +257,13 @@ def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> tuple[str, ..
     return chosen
 
 
-def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path) -> RunWriter:
+def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path, if_exists: IfExists) -> RunWriter:
     """The writer of the run, told all that ``run.json`` says of it."""
+    at, masks = job.sequence.path, job.masks.folder
+    read = {"the sequence": [at] if at else [], "the masks": [Path(at or "", masks), Path(masks)] if masks else []}
+    for what, places in read.items():
+        if any(place.is_dir() and place.resolve().is_relative_to(Path(out).resolve()) for place in places):
+            raise BadInput(str(out), f"a folder that holds {what}", "another one for the results")
     known = find_models(job.sequence) | given_models(options.models or {}, job.sequence.objects)
     writer = RunWriter(
         out,
@@ -275,11 +275,40 @@ def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path)
         job.frames.start,
         job.frames.stop,
         {name: path for name, path in known.items() if name in job.objects},
+        if_exists,
     )
     prompts = [prompt.as_dict() for of_frame in job.prompts.values() for prompt in of_frame]
     writer.info |= {"detector": method.detector.name, "segmenter": method.segmenter.name}
     writer.info |= {"prompts": prompts, "options": options.as_dict()}
     return writer
+
+
+def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None:
+    if writer.complete:
+        say(f"{writer.path} holds {writer.earlier}, which is finished.")
+    elif writer.resumed:
+        say(f"{writer.path} holds {writer.earlier}; its frames are tracked again and compared, then it goes on.")
+    elif writer.earlier:
+        say(f"{writer.path} held {writer.earlier}, which this one replaces.")
+
+
+def _track(job: _Job, keeper: Keeper, progress: bool) -> None:
+    """Every frame, and at the end the maps; Ctrl-C ends it early."""
+    writer, method = keeper.writer, keeper.method
+    with progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
+        try:
+            for frame, estimates in _estimates(method, job):
+                keeper.add(frame, estimates)
+                now = ", ".join(f"{name} {estimate.status}" for name, estimate in estimates.items())
+                total_ms = max(method.stopwatch.last_ms["total"], 1e-3)
+                bar.set_postfix_str(f"{1e3 / total_ms:.0f} Hz, {now}", refresh=False)
+                bar.update()
+            if not writer.begun:
+                writer.begin()  # all frames were on disk, the maps were not
+        except KeyboardInterrupt:
+            writer.info["stopped_by"] = "KeyboardInterrupt"
+    if writer.begun:
+        keeper.save_maps()
 
 
 def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:

@@ -6,7 +6,9 @@ import argparse
 import json
 import os
 import re
+import signal
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
@@ -20,7 +22,7 @@ from p2p_lib import __version__
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.options import RunOptions, add_options, names, pairs
 
-EXIT_INTERRUPTED = 130
+EXIT_INTERRUPTED = 128  # and the signal's number: 130 for Ctrl-C, 143 for SIGTERM
 #: Options that choose the method and its parameters.
 METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "detector")
 
@@ -31,6 +33,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The matrices are small: more threads cost time, most of all where other programs run. Set it to override.
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     arguments = _parser().parse_args(argv)
+    ended_by = [signal.SIGINT]
+
+    def terminated(number: int, frame: object) -> None:
+        ended_by.append(signal.Signals(number))
+        raise KeyboardInterrupt  # SIGTERM ends a command as Ctrl-C does: what is done so far is kept
+
+    in_main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, terminated) if in_main else None
     try:
         with warnings.catch_warnings():
             warnings.showwarning = partial(_show_doubt, warnings.showwarning, arguments.name)
@@ -46,7 +56,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return P2PError.exit_code
     except KeyboardInterrupt:
         _warn(f"p2p {arguments.name}: interrupted")
-        return EXIT_INTERRUPTED
+        return EXIT_INTERRUPTED + ended_by[-1]
+    finally:
+        if in_main:
+            signal.signal(signal.SIGTERM, before)
 
 
 # --- how a command is declared -------------------------------------------------------------------
@@ -83,6 +96,7 @@ _JSON = _arg("--json", action="store_true", help="JSON instead of a table")
 _QUIET = _arg("--quiet", action="store_true", help="no progress bar")
 _OVERLAY = _arg("--overlay", type=Path, metavar="FILE", help="besides a film of it: .mp4 or .gif (see p2p film)")
 _NO_BROWSER = _arg("--no-browser", action="store_true", help="only say where the page is")
+_FORCE = _arg("--force", dest="if_exists", action="store_const", const="replace", help="replace an earlier run in DIR")
 _MIN_VISIBLE = _arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
 
 
@@ -94,6 +108,8 @@ _MIN_VISIBLE = _arg("--min-visible-px", type=int, default=300, metavar="N", help
     "track the objects of a sequence and write poses, timings, scores",
     _SEQUENCE,
     _arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
+    _FORCE,
+    _arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
     _options(),
     _OVERLAY,
     _QUIET,
@@ -103,12 +119,13 @@ def _run(a: argparse.Namespace) -> int:
 
     film = _film_wanted(a.overlay)
     options = replace(RunOptions.of_arguments(a), save_masks=a.save_masks or film is not None)
-    result = run(a.sequence, a.out, options, progress=not a.quiet, say=_warn)
+    how = {"if_exists": a.if_exists or "refuse", "progress": not a.quiet, "say": _warn}
+    result = run(a.sequence, a.out, options, **how)
     print("\n".join(result.summary))
     if result.evaluation is not None:
         print(result.evaluation.as_table())
         print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
-    else:
+    elif a.out.is_dir():
         print(f"Results in {a.out}; not scored, {result.not_scored}." + f" Next: p2p view {a.out}" * result.tracked)
     if film is not None and not result.interrupted:
         print(f"Film in {film(a.out, a.overlay)}")
@@ -126,6 +143,7 @@ def _run(a: argparse.Namespace) -> int:
     _arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
     _options(*METHOD, prompts="clicks; without, the first image is clicked on", masks="segmenter (default: builtin)"),
     _arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
+    _FORCE,
     _OVERLAY,
     _NO_BROWSER,
 )
@@ -133,10 +151,14 @@ def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.live import LiveCount, click_first, json_line, track_live
     from p2p_lib.datasets.cameras import open_camera
     from p2p_lib.datasets.prompts import load_prompts
+    from p2p_lib.datasets.run_writer import look_into
 
     options, count, first = RunOptions.of_arguments(a), LiveCount(), None
     options.config()  # what does not fit is said before the camera starts
     _film_wanted(a.overlay)
+    if_exists = a.if_exists or "refuse"
+    if a.out is not None:
+        look_into(a.out, if_exists)  # before anyone clicks
     prompts = load_prompts(a.prompts) if a.prompts else ()
     camera = open_camera(a.camera, a.rate)
     try:
@@ -144,6 +166,7 @@ def _live(a: argparse.Namespace) -> None:
             prompts, first = click_first(camera, _warn, not a.no_browser)
         show = partial(print, flush=True)
         keep = {"first": first, "count": count, "out": a.out, "overlay": a.overlay}
+        keep["if_exists"] = if_exists
         track_live(camera, prompts, lambda estimate: show(json_line(estimate)), options, **keep)
     except KeyboardInterrupt:
         pass  # how one stops a camera

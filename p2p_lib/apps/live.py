@@ -24,7 +24,7 @@ from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.cameras import LiveCamera, Newest, Still, Stream
-from p2p_lib.datasets.runs import RunWriter
+from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
 from p2p_lib.method.pipeline import Point2Pose
@@ -60,6 +60,7 @@ def track_live(
     count: LiveCount | None = None,
     out: str | Path | None = None,
     overlay: str | Path | None = None,
+    if_exists: IfExists = "refuse",
 ) -> LiveCount:
     """Follow the objects of the prompts until the camera ends; every estimate goes to ``on_estimate`` at once.
 
@@ -68,7 +69,7 @@ def track_live(
     options  the method and its parameters; ``masks`` names the segmenter
     first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
-    out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it
+    out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
     overlay  a film of it, .mp4 or .gif, as the tracker sees it
 
     Closes the camera at the end, whatever ends it. Raises :class:`BadInput` for clicks that do not fit.
@@ -87,7 +88,7 @@ def track_live(
         if overlay is not None:
             listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
         if out is not None:
-            listeners.append(kept.enter_context(_kept(out, camera, method, options, prompts)))
+            listeners.append(kept.enter_context(_kept(out, camera, method, options, prompts, if_exists)))
 
         def answer(estimates: dict[str, PoseEstimate]) -> None:
             frame = waiting.popleft()
@@ -134,12 +135,17 @@ def _filmed(film: Film, name: str, method: Point2Pose, first: Frame | None) -> L
 
 @contextmanager
 def _kept(
-    out: str | Path, camera: LiveCamera, method: Point2Pose, options: RunOptions, prompts: Iterable[Prompt]
+    out: str | Path,
+    camera: LiveCamera,
+    method: Point2Pose,
+    options: RunOptions,
+    prompts: Iterable[Prompt],
+    if_exists: IfExists,
 ) -> Iterator[Listener]:
     """Keeps every frame in a run's folder; Ctrl-C is how one stops a camera, so that it ends the run well."""
     sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
     objects = tuple(dict.fromkeys(prompt.name for prompt in prompts))
-    writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects)
+    writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, if_exists=if_exists)
     writer.info |= {"detector": method.detector.name, "segmenter": method.segmenter.name, "options": options.as_dict()}
     writer.info |= {"prompts": [prompt.as_dict() for prompt in prompts]}
     keeper, stopped = Keeper(writer, method, options.save_masks), None
@@ -153,7 +159,8 @@ def _kept(
             yield listen
         except KeyboardInterrupt as stop:
             stopped = stop
-    keeper.save_maps()
+        if writer.begun:
+            keeper.save_maps()
     if stopped:
         raise stopped
 

@@ -1,43 +1,192 @@
-"""Files that are never half written, and archives of arrays without pickles."""
+"""Files: what is read is bounded, and faults name the file; what is written is whole or not there at all.
+
+Every limit of what is read is here. What is above it is a mistake or an attack, and refused before it costs anything.
+"""
 
 from __future__ import annotations
 
+import errno
+import json
+import lzma
 import os
+import re
+import stat
+import struct
+import tokenize
+import tomllib
 import zipfile
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, MissingData
+
+#: Bytes of any file; of JSON and tables; of TOML, whose reader takes the square of a key's length; of a pickle.
+LARGEST_FILE, LARGEST_TEXT, LARGEST_TOML, LARGEST_PICKLE = 1 << 28, 1 << 26, 1 << 16, 1 << 22
+#: Pixels of an image: more than 8K video.
+LARGEST_IMAGE_PX = 1 << 25
+#: Bytes of the arrays of an ``.npz`` file; values in a pickle, those said once and meant often counted as often.
+LARGEST_ARRAYS, MOST_VALUES = 1 << 30, 1 << 18
+#: An archive unpacks to at most so many times its size, and so many bytes besides.
+UNPACKED_RATIO, UNPACKED_BYTES = 100, 1 << 26
+#: What parsers raise at bytes that nobody expected.
+UNREADABLE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, EOFError, OSError, MemoryError)
+UNREADABLE += (RecursionError, RuntimeError, SyntaxError, struct.error, tokenize.TokenError)
+UNREADABLE += (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
+
+_NAME = re.compile(r"\w[\w .+-]{0,99}")
+
+
+# --- reading ---------------------------------------------------------------------------------------
+
+
+def read_bytes(path: Path, expected: str, largest: int = LARGEST_FILE, fix: str = "") -> bytes:
+    """What a regular file holds; ``expected`` says what that should be, ``fix`` what to do where there is none.
+
+    Raises :class:`MissingData` for no file and one that cannot be read, :class:`BadInput` for a pipe, a device and
+    more than ``largest`` bytes.
+    """
+    try:
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode) and not stat.S_ISDIR(about.st_mode):
+            raise BadInput(str(path), "a pipe or a device", f"a file: {expected}")
+        if about.st_size > largest:
+            raise BadInput(str(path), f"{about.st_size} bytes", f"{expected}, of at most {largest} bytes")
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        raise MissingData(str(path), f"no such file, expected {expected}", fix) from None
+    except OSError as error:
+        raise MissingData(str(path), f"cannot be read ({error.strerror}), expected {expected}", fix) from None
+
+
+def read_text(path: Path, expected: str, largest: int = LARGEST_TEXT, fix: str = "") -> str:
+    """A file of UTF-8 by :func:`read_bytes`; bytes that are none become question marks."""
+    return read_bytes(path, expected, largest, fix).decode("utf-8", "replace")
+
+
+def parse_json(text: str | bytes, name: str, expected: str) -> Any:
+    """The plain values of JSON; :class:`BadInput` calls it ``name``."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BadInput(name, f"unreadable JSON ({error})", expected) from None
+
+
+def read_toml(path: Path, expected: str, fix: str = "") -> dict[str, Any]:
+    """The tables of a TOML file; raises as :func:`read_bytes`, and :class:`BadInput` for what is no TOML."""
+    try:
+        return tomllib.loads(read_bytes(path, expected, LARGEST_TOML, fix).decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BadInput(str(path), f"unreadable TOML ({error})", expected) from None
+
+
+def read_array(path: Path, expected: str) -> np.ndarray:
+    """The array of an ``.npy`` file without pickles; raises as :func:`read_bytes`."""
+    data = BytesIO(read_bytes(path, expected))
+    try:
+        return np.lib.format.read_array(data, allow_pickle=False)
+    except UNREADABLE as error:
+        raise BadInput(str(path), f"an unreadable array ({error})", expected) from None
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` file by name, none where there is no file; :class:`BadInput` where it is damaged."""
+    expected = "arrays as p2p run wrote them"
+    if not path.exists():
+        return {}
+    if not path.is_file():
+        raise BadInput(str(path), "no regular file", expected)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > LARGEST_ARRAYS:
+            raise BadInput(str(path), f"arrays of {size} bytes", f"at most {LARGEST_ARRAYS}")
+        with np.load(path, allow_pickle=False) as file:
+            return {name: np.asarray(file[name]) for name in file.files}
+    except BadInput:
+        raise
+    except UNREADABLE as error:
+        raise BadInput(str(path), f"an unreadable archive ({error})", expected) from None
+
+
+def file_name(what: str, name: object) -> str:
+    """``name``, where a file may be called so wherever it was read: it can lead nowhere else."""
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        expected = "up to 100 letters, digits, '_', '-', '.', '+' or spaces: it names a file"
+        raise BadInput(what, repr(name)[:120], expected)
+    return name
+
+
+# --- writing ---------------------------------------------------------------------------------------
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file to write that then takes the place of ``path``: readers and crashes see either the old or the new one."""
+def replacing(path: Path, durable: bool = True) -> Iterator[BinaryIO]:
+    """A file to write that then takes the place of ``path``: readers and crashes see either the old or the new one.
+
+    durable  whether it is on the disk then, so that the computer may crash, too; that takes milliseconds
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with partial.open("wb") as file:
-        yield file
-    os.replace(partial, path)
+    try:
+        with partial.open("wb") as file:
+            yield file
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def replace_text(path: Path, text: str) -> None:
     """Write text as UTF-8 by :func:`replacing`."""
     with replacing(path) as file:
         file.write(text.encode())
-        file.flush()
-        os.fsync(file.fileno())
 
 
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz`` file by name, none where there is no file; :class:`BadInput` where it is damaged."""
+def append(path: Path, line: str) -> None:
+    """Write a line at the end of a file, all of it or, where the disk is full, nothing."""
+    with path.open("ab", buffering=0) as file:
+        before, data = file.tell(), line.encode()
+        try:
+            if file.write(data) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        except OSError:
+            with suppress(OSError):
+                file.truncate(before)
+            raise
+
+
+@contextmanager
+def writing_alone(folder: Path) -> Iterator[None]:
+    """Hold a folder, which is made: :class:`BadInput` where another process (or this one) holds it already.
+
+    It is the system's lock of the folder itself: nothing stays behind when a process is killed. Where the file system
+    has no such locks nobody is kept out.
+    """
+    import fcntl  # there is none on Windows
+
+    if folder.exists() and not folder.is_dir():
+        raise BadInput(str(folder), "a file", "a folder for the results")
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise BadInput(str(folder), "a folder that may not be written", "one for the results")
+    held = os.open(folder, os.O_RDONLY)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        return {}
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
-        raise BadInput(str(path), f"an unreadable archive ({error})", "arrays as p2p run wrote them") from None
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            fix = "Wait until it has ended, or name another folder."
+            raise BadInput(str(folder), "a folder that another run is writing to", "one of its own", fix) from None
+        except OSError:
+            pass
+        yield
+    finally:
+        os.close(held)

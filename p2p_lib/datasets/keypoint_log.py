@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.files import load_arrays
+from p2p_lib.core.files import load_arrays, replacing
 
 FILE = "keypoints.npz"
 
@@ -59,7 +59,8 @@ class KeypointLog:
             uv_px = np.concatenate([np.zeros((0, 2), np.float32), *(uv for _, _, uv in seen)])
             values = ids.astype(np.int32), p_obj.astype(np.float32), promoted, frames, track_id, uv_px
             arrays |= {f"{name}/{f.name}": value for f, value in zip(fields(ObjectKeypoints), values, strict=True)}
-        np.savez_compressed(folder / FILE, allow_pickle=False, **arrays)
+        with replacing(folder / FILE) as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def load_keypoints(folder: str | Path) -> dict[str, ObjectKeypoints]:

@@ -7,7 +7,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import LARGEST_TEXT, read_bytes
 
 
 class Strict(BaseModel):
@@ -18,11 +19,12 @@ class Strict(BaseModel):
 
 def read_json(path: Path, schema: Any, what: str) -> Any:
     """What a file holds, as ``schema`` (a type); :class:`BadInput` names the file and the first field that is wrong."""
+    data = read_bytes(path, what, LARGEST_TEXT)
     try:
-        return TypeAdapter(schema).validate_json(path.read_bytes())
-    except FileNotFoundError:
-        raise MissingData(str(path), f"no such file, expected {what}") from None
+        return TypeAdapter(schema).validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        raise BadInput(str(path), f"{where}: {first['msg']}", what) from None
+        where = ".".join(map(str, first["loc"]))
+        got = f"{where or 'the file'}: {first['msg']}"
+        got = f"unreadable JSON ({first['msg']})" if first["type"] == "json_invalid" else got
+        raise BadInput(str(path), got, what) from None

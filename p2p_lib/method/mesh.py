@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import replacing
 
 if TYPE_CHECKING:
     import trimesh
@@ -46,8 +47,8 @@ def save(mesh: trimesh.Trimesh, path: str | Path) -> Path:
         raise BadInput("mesh file", path.name, "a name that ends in .ply or .glb")
     if len(mesh.faces) == 0:
         raise BadInput("mesh", "no faces", "a mesh of an observed surface", "Integrate at least one keyframe first.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    mesh.export(path)
+    with replacing(path) as file:
+        mesh.export(file, file_type=path.suffix[1:].lower())
     return path
 
 

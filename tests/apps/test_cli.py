@@ -137,10 +137,104 @@ def test_progress_goes_where_it_does_not_disturb(sequence, tmp_path, capsys):
 def test_replacing_a_run_is_said(sequence, tmp_path, capsys):
     assert run(sequence, tmp_path / "out", "--seed", "4") == 0
     assert "replaces" not in capsys.readouterr().err
-    assert run(sequence, tmp_path / "out", "--stop", "3") == 0
+    assert run(sequence, tmp_path / "out", "--stop", "3", "--force") == 0
     err = capsys.readouterr().err
     assert re.search(rf"out held a run of slide \({FRAMES} frames, tracker \S+, seed 4\), which this one replaces", err)
     assert len(load_run(tmp_path / "out").objects["object"]) == 3
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_results_beside_the_data_leave_it_alone(sequence, tmp_path, capsys):
+    """``p2p run DATA --out DATA`` had deleted the masks, the poses and the meshes of DATA."""
+    shutil.move(sequence / "gt_mask", sequence / "masks" / "object")
+    (sequence / "meshes").mkdir()
+    (sequence / "meshes" / "mine.ply").write_text("mine")
+    before = contents(sequence)
+    for more in ([], ["--force"], ["--resume"]):
+        for out, got in ((sequence, "that holds the sequence"), (sequence / "masks", "with object, and no run")):
+            assert run(sequence, out, *more, "--format", "folder") == 2
+            assert f"{out}: got a folder {got}" in one_line(capsys)
+    assert contents(sequence) == before
+    assert run(sequence, sequence / "out", "--format", "folder") == 0  # a folder of its own may be anywhere
+    assert contents(sequence).items() > before.items()
+    assert run(sequence, tmp_path / "a", "--save-masks") == 0
+    assert run(sequence, tmp_path / "a", "--masks", str(tmp_path / "a" / "masks"), "--force") == 2
+    assert "a: got a folder that holds the masks" in capsys.readouterr().err and (tmp_path / "a" / "masks").is_dir()
+
+
+NEVER_STARTS = {
+    "unknown word": lambda s: ["--tracker", "nope"],
+    "bad value": lambda s: ["--set", "sampling.points=0"],
+    "unreadable first image": lambda s: cut(s / "rgb/0000.png") or [],
+    "unreadable truth": lambda s: spoil(s / "annotated_poses/0005.txt", b"1 2") or [],
+    "no masks": lambda s: shutil.rmtree(s / "gt_mask") or [],
+}
+
+
+@pytest.mark.parametrize("case", NEVER_STARTS)
+def test_a_run_that_never_starts_leaves_the_earlier_one(case, done, sequence, tmp_path, capsys):
+    out = Path(shutil.copytree(done, tmp_path / "out"))
+    before = contents(out)
+    assert run(sequence, out, "--force", *NEVER_STARTS[case](sequence)) == 2
+    assert contents(out) == before
+
+
+def test_a_full_disk_is_an_error_and_no_finished_run(sequence, tmp_path, capsys):
+    """No file may grow beyond 7.5 kB: the arrays of the run's last frames do."""
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (7_500, limit[1]))
+    try:
+        assert run(sequence, tmp_path / "out") == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert "File too large" in one_line(capsys)
+    loaded = load_run(tmp_path / "out")
+    assert not loaded.info["finished"] and 0 < len(loaded.objects["object"]) <= FRAMES
+    assert not list((tmp_path / "out").rglob(".*"))
+
+
+def test_a_mesh_that_cannot_be_written_is_an_error_and_no_finished_run(sequence, tmp_path, capsys, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("p2p_lib.datasets.keypoint_log.replacing", full)
+    assert run(sequence, tmp_path / "out") == 2
+    assert "No space left" in one_line(capsys)
+    info = load_run(tmp_path / "out").info
+    assert not info["finished"] and info["stopped_by"] == "OSError" and info["frames"] == FRAMES
+
+
+def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monkeypatch):
+    """What it comes to is what it would have come to, maps included; in the end there is nothing left to do."""
+    step, out, words = Point2Pose.step, tmp_path / "out", ["--seed", "7", "--resume"]
+
+    def interrupted(self, frame, masks=None):
+        if frame.index == 5:
+            raise KeyboardInterrupt
+        return step(self, frame, masks)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Point2Pose, "step", interrupted)
+        assert run(sequence, out, *words) == 130  # where there is nothing yet it begins
+    capsys.readouterr()
+    assert run(sequence, out, *words) == 0
+    assert "(5 frames" in (err := capsys.readouterr().err) and "then it goes on" in err
+    now, whole = load_run(out), load_run(done)
+    np.testing.assert_array_equal(now.objects["object"].T_cam_obj, whole.objects["object"].T_cam_obj)
+    with np.load(out / "keypoints.npz") as mine, np.load(done / "keypoints.npz") as theirs:
+        assert mine.files == theirs.files and all((mine[key] == theirs[key]).all() for key in mine.files)
+    assert now.info["finished"] and (out / "poses/object.txt").read_text() == (done / "poses/object.txt").read_text()
+    before = contents(out)
+    assert run(sequence, out, *words) == 0
+    assert "which is finished" in capsys.readouterr().err and contents(out) == before
+    assert run(sequence, out, "--seed", "8", "--resume") == 2
+    assert "seed: got 8, expected 7, as it began" in one_line(capsys)
+    assert contents(out) == before
 
 
 def test_without_truth_there_is_no_score_and_no_fuss(sequence, tmp_path, capsys):
@@ -402,7 +496,7 @@ def test_clicks_replace_masks(sequence, tmp_path, capsys):
     again = tmp_path / "again"
     assert run(sequence, again, "--masks", f"dataset:{out / 'masks'}") == 0
     assert load_run(again).objects["object"].has_pose.all() and not (again / "masks").exists()
-    assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--stop", "2") == 0
+    assert run(sequence, out, *clicks(tmp_path, ("object", 0, ON_BOARD)), "--stop", "2", "--force") == 0
     assert not list((out / "masks").rglob("*.png"))
 
 
@@ -577,10 +671,7 @@ def test_an_interruption_before_the_first_frame(sequence, tmp_path, capsys, monk
     monkeypatch.setattr(Point2Pose, "step", interrupted)
     assert run(sequence, tmp_path / "out") == 130
     assert capsys.readouterr().err == "p2p run: interrupted\n"
-    with pytest.raises(MissingData, match="a run without frames"):
-        load_run(tmp_path / "out")
-    assert cli.main(["eval", str(tmp_path / "out")]) == 2
-    assert "a run without frames" in one_line(capsys, "eval")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_fault_on_the_way_leaves_what_was_there(sequence, tmp_path, capsys):
@@ -597,8 +688,9 @@ def p2p(*words: str, **more) -> subprocess.Popen:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **more)
 
 
-def test_ctrl_c(tmp_path):
-    """The real thing: a process, a signal, what is on disk."""
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_signals(how, code, tmp_path):
+    """The real thing: a process, a signal, what is on disk, and that it goes on from there."""
     sequence, out = write_sequence(tmp_path / "long", frames=600), tmp_path / "out"
     # A shell that runs its jobs in the background has them ignore the signal, and they hand that on.
     heed = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
@@ -608,13 +700,14 @@ def test_ctrl_c(tmp_path):
     while not (timings.is_file() and timings.read_text().count("\n") > 10):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(how)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and err == "p2p run: interrupted\n"
+    assert process.returncode == code and err == ("" if code < 0 else "p2p run: interrupted\n")
     loaded = load_run(out)
-    frames = len(loaded.objects["object"])
-    assert 10 <= frames < 600 and loaded.info["finished"] is False
-    assert len(loaded.timings["total_ms"]) == frames
+    frames, timed = len(loaded.objects["object"]), len(loaded.timings["total_ms"])
+    assert loaded.info["finished"] is False
+    assert 10 <= frames == timed < 600 if code > 0 else 1 <= frames <= timed < 600
+    assert load_run(out).info["stopped_by"] == ("KeyboardInterrupt" if code > 0 else None)
 
 
 def test_as_a_process(tmp_path):

@@ -102,7 +102,7 @@ def test_without_truth_and_masks(scene):
 @pytest.mark.parametrize(
     ("name", "content", "expected"),
     [
-        ("scene_camera", "{", r"scene_camera\.json: got the file: "),
+        ("scene_camera", "{", r"scene_camera\.json: got unreadable JSON"),
         ("scene_camera", "[1]", r"scene_camera\.json: got the file: "),
         ("scene_camera", '{"1": {"cam_K": [1], "depth_scale": 1}}', r"scene_camera\.json: got 1\.cam_K: .*at least 9"),
         ("scene_camera", json.dumps({"1": {"cam_K": K, "depth_scale": 1}}), r"scene_camera\.json: got no image 36"),

@@ -15,7 +15,8 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets.bop import write_models, write_scene
 from p2p_lib.datasets.exchange import FORMATS, export, read_poses
-from p2p_lib.datasets.runs import RunWriter, load_run
+from p2p_lib.datasets.run_writer import RunWriter
+from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.run import evaluate_poses, export_run

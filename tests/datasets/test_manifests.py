@@ -100,7 +100,7 @@ def test_unknown_checksums_need_a_reason_only(folder):
 def test_broken_json_names_the_file(folder):
     (folder / "tiny.json").write_text("{")
     manifests.read_manifest.cache_clear()
-    with pytest.raises(BadInput, match=r"tiny\.json: got the file: Invalid JSON"):
+    with pytest.raises(BadInput, match=r"tiny\.json: got unreadable JSON"):
         manifests.manifest("tiny")
 
 

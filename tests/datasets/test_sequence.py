@@ -13,7 +13,8 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets.models import find_models
-from p2p_lib.datasets.runs import RunWriter, load_run
+from p2p_lib.datasets.run_writer import RunWriter
+from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import FORMATS, ObjectTruth, open_sequence
 from p2p_lib.evaluation.protocol import scored_frames
 

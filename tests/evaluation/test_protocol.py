@@ -9,7 +9,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame, PoseEstimate, Status
-from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run, RunWriter, load_run
+from p2p_lib.datasets.run_writer import RunWriter
+from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.alignment import align_all

@@ -1,0 +1,310 @@
+"""Writing a run as it happens, into a folder of its own (see :mod:`p2p_lib.datasets.runs` for what it holds)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from p2p_lib.core.config import Config
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import append, file_name, read_text, replace_text, replacing, writing_alone
+from p2p_lib.core.types import Frame, PoseEstimate, Status
+from p2p_lib.datasets.images import save_png
+from p2p_lib.datasets.keypoint_log import FILE as KEYPOINTS
+from p2p_lib.datasets.models import load_points
+from p2p_lib.datasets.provenance import provenance
+from p2p_lib.datasets.runs import COLUMNS, NO_POSE, ObjectRun, Run, load_run, read_info, tum_line
+from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
+
+IfExists = Literal["refuse", "replace", "resume"]
+#: What of ``run.json`` may be otherwise when a run is resumed: how far it came, and what made it, which poses tell.
+_MAY_DIFFER = {"frames", "finished", "stopped_by", "versions", "commit", "modified"}
+
+
+class RunWriter:
+    """Writes a run as it happens; a context manager, which keeps other runs out of its folder.
+
+    Nothing is written, nor taken away, before the first frame is done. Then poses and timings are appended every
+    frame; ``poses.npz`` is replaced as a whole, ever more rarely (after 1, 2, 4, ... 64, then every 50 or more frames)
+    and when the run ends: by itself, by an error or by Ctrl-C. Whoever catches the interruption inside says so in
+    ``info["stopped_by"]``.
+
+    objects    those that are tracked (default: all of the sequence); others may appear among the estimates later
+    models     object to model file; their points are kept with the run
+    if_exists  what becomes of a run that the folder holds already: ``refuse`` with :class:`BadInput`, ``replace`` it,
+               or ``resume`` it: its frames are compared as they are added again, and nothing is written before they
+               are all there. What was not written by a run is never touched
+    earlier    what run was in the folder before, in words; empty where there was none
+    complete   whether a run that is resumed had finished, so that nothing is left to do
+    begun      whether anything has been written
+    """
+
+    def __init__(
+        self,
+        out: str | Path,
+        sequence: Sequence,
+        config: Config,
+        tracker: str,
+        masks: str,
+        objects: tuple[str, ...] | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        models: Mapping[str, Path] | None = None,
+        if_exists: IfExists = "refuse",
+    ):
+        self.path, self._sequence, self._config, self._if_exists = Path(out), sequence, config, if_exists
+        _ = sequence.truth  # what is wrong with it is said before anything is written
+        names = sequence.objects if objects is None else objects
+        # Of each object one estimate for every frame so far.
+        self._estimates: dict[str, list[PoseEstimate]] = {file_name("object name", name): [] for name in names}
+        self._pose_files: dict[str, Path] = {}  # those that have been written
+        self._frames: list[tuple[int, float]] = []  # index and time of every frame so far
+        self._visible_px: list[Mapping[str, int] | None] = []
+        self._timing_columns = ["frame_index", "time_s", "total_ms", "keyframe"]
+        self._timings: list[dict[str, str]] = []
+        self._flush_at = 1
+        models = models or {}
+        self._points = {f"{name}/points": load_points(path) for name, path in models.items()}
+        self.earlier, self.complete, self.begun = "", False, False
+        self._resumed: Run | None = None
+        self._held = ExitStack()
+        synthetic = sequence.name.startswith(SYNTHETIC)
+        self.info: dict[str, Any] = {
+            "sequence": sequence.name,
+            "path": None if synthetic or sequence.path is None else str(sequence.path),
+            "format": sequence.format,
+            "objects": list(self._estimates),
+            "start": start,
+            "stop": len(sequence) if stop is None else min(stop, len(sequence)),
+            "tracker": tracker,
+            "masks": masks,
+            "preset": config.preset,
+            "seed": config.seed,
+            "models": {name: str(_from(sequence.path, path)) for name, path in models.items()},
+            "frames": 0,
+            "finished": False,
+            "stopped_by": None,
+            **provenance(),
+        }
+
+    def add(
+        self,
+        frame: Frame,
+        estimates: Mapping[str, PoseEstimate],
+        total_ms: float,
+        stages_ms: Mapping[str, float] | None = None,
+    ) -> None:
+        """One frame: its estimates (an object without one is not being tracked yet) and its processing time.
+
+        total_ms   the whole step, without decoding images and without writing results
+        stages_ms  parts of it by name; a stage may be absent from a frame
+        """
+        for name in estimates:
+            if name not in self._estimates:
+                past = [_not_yet(name, index, time_s) for index, time_s in self._frames]
+                self._estimates[file_name("object name", name)] = past
+        for name, kept in self._estimates.items():
+            kept.append(estimates.get(name) or _not_yet(name, frame.index, frame.time_s))
+        self._visible_px.append(self._sequence.visible_px(frame.index))
+        self._frames.append((frame.index, frame.time_s))
+        row = {"frame_index": str(frame.index), "time_s": f"{frame.time_s:.9f}", "total_ms": f"{total_ms:.4f}"}
+        row["keyframe"] = str(int(any(e.keyframe for e in estimates.values())))
+        self._timings.append(row | {f"{k}_ms": f"{v:.4f}" for k, v in (stages_ms or {}).items()})
+        n = len(self._frames)
+        if self._resumed is not None and n <= len(next(iter(self._resumed.objects.values()))):
+            return self._compare(self._resumed, n - 1)
+        if not self.begun:
+            return self.begin()
+        self._append_last()
+        if n >= self._flush_at:
+            self.flush()
+        return None
+
+    def begin(self) -> None:
+        """Write all so far in the place of an earlier run; what :meth:`add` does at the first frame that is new."""
+        for folder in ("poses", "meshes", "masks"):
+            if (self.path / folder).is_symlink():
+                raise BadInput(str(self.path / folder), "a link", "a folder of the run's own", "Take it away.")
+        (self.path / "poses").mkdir(exist_ok=True)
+        if self._resumed is None:
+            if (earlier := read_info(self.path)) is not None:
+                _clear(self.path, earlier)
+            self._write_info()  # by which the folder is known to be a run's: before anything else
+        replace_text(self.path / "config.toml", self._config.to_toml())
+        if self._points:
+            _save_arrays(self.path / "models.npz", self._points)
+        for name in self._estimates:
+            self._write_poses(name)
+        self._write_timings()
+        self.begun = True
+        self.flush()
+
+    def add_masks(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> None:
+        """Keep the masks (H, W) bool that served at the frame last added; all False where nothing is known."""
+        for name in self._estimates:
+            path = self.path / "masks" / name / f"{frame.index:06d}.png"
+            if self.begun or not path.exists():
+                mask = masks.get(name)
+                save_png(path, np.zeros(frame.shape, bool) if mask is None else mask)
+
+    @property
+    def resumed(self) -> bool:
+        """Whether the run in the folder goes on."""
+        return self._resumed is not None
+
+    def flush(self) -> None:
+        """Make everything so far readable on disk."""
+        n = len(self._frames)
+        self._flush_at = 2 * n if n <= 32 else n + max(50, n // 10)
+        if self._frames:
+            arrays = {}
+            for name, estimates in self._estimates.items():
+                run = ObjectRun.of(name, estimates, self._sequence, self._visible_px)
+                arrays |= {f"{name}/{column}": getattr(run, column) for column in COLUMNS}
+            _save_arrays(self.path / "poses.npz", arrays)
+        self.info |= {"frames": n, "objects": list(self._estimates)}
+        self._write_info()
+
+    def __enter__(self) -> RunWriter:
+        made = not self.path.exists()
+        if made:  # and nothing written by the end: then it goes again
+            self._held.callback(self._leave_nothing)
+        with self._held:
+            self._held.enter_context(writing_alone(self.path))
+            self._look_around()
+            self._held = self._held.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        with self._held:
+            if kind is not None:
+                self.info["stopped_by"] = kind.__name__
+            if self.begun:
+                self.info["finished"] = self.info["stopped_by"] is None
+                self.flush()
+
+    def _leave_nothing(self) -> None:
+        with suppress(OSError):
+            self.path.rmdir()
+
+    def _look_around(self) -> None:
+        """What is in the folder, and whether it may be written to."""
+        info = look_into(self.path, self._if_exists)
+        if info is None:
+            return
+        self.earlier = _in_words(info)
+        if self._if_exists == "resume":
+            self._resumed = load_run(self.path)
+            self.complete = info["finished"]
+            self._check_same(info)
+
+    def _check_same(self, earlier: Mapping[str, Any]) -> None:
+        """That what is to be resumed was asked for in the same words."""
+        mine, fix = json.loads(json.dumps(self.info)), "Ask for the same, or run it anew with --force."
+        for key, value in mine.items():
+            # Objects may have come later.
+            theirs = earlier.get(key) if key != "objects" else earlier[key][: len(value)]
+            if theirs != value and key not in _MAY_DIFFER:
+                raise BadInput(f"{self.path}: {key}", str(value)[:80], f"{str(theirs)[:80]}, as it began", fix)
+        if read_text(self.path / "config.toml", "the parameters of the run") != self._config.to_toml():
+            raise BadInput(str(self.path / "config.toml"), "other parameters", "those that it began with", fix)
+
+    def _compare(self, earlier: Run, k: int) -> None:
+        """That the k-th frame came out as it did before."""
+        for name, obj in earlier.objects.items():
+            now = self._estimates[name][k] if name in self._estimates else _not_yet(name, *self._frames[k])
+            pose = NO_POSE if now.T_cam_obj is None else now.T_cam_obj
+            same = (obj.frame_index[k], obj.status[k]) == (now.frame_index, now.status)
+            if not same or not np.array_equal(pose, obj.T_cam_obj[k], equal_nan=True):
+                fix = "Was it made with another version, or has the data changed? Run it anew with --force."
+                got = f"{now.status} with another pose of {name!r} in frame {now.frame_index}"
+                raise BadInput(str(self.path), got, f"what it came to before, {obj.status[k]}", fix)
+
+    def _append_last(self) -> None:
+        for name, estimates in self._estimates.items():
+            if name not in self._pose_files:
+                self._write_poses(name)  # of an object that nobody announced
+            else:
+                for line in _tum_lines(estimates[-1:]):
+                    append(self._pose_files[name], line)
+        row = self._timings[-1]
+        if row.keys() - set(self._timing_columns):
+            self._write_timings()  # with a stage that had not run before
+        else:
+            append(self.path / "timings.csv", self._csv_line(row))
+
+    def _csv_line(self, row: Mapping[str, str]) -> str:
+        return ",".join(row.get(key, "") for key in self._timing_columns) + "\n"
+
+    def _write_timings(self) -> None:
+        self._timing_columns = list(dict.fromkeys([*self._timing_columns, *(k for row in self._timings for k in row)]))
+        header = ",".join(self._timing_columns) + "\n"
+        replace_text(self.path / "timings.csv", header + "".join(map(self._csv_line, self._timings)))
+
+    def _write_info(self) -> None:
+        replace_text(self.path / "run.json", json.dumps(self.info, indent=1, ensure_ascii=False) + "\n")
+
+    def _write_poses(self, name: str) -> None:
+        self._pose_files[name] = self.path / "poses" / f"{name}.txt"
+        replace_text(self._pose_files[name], "".join(_tum_lines(self._estimates[name])))
+
+
+def look_into(out: Path, if_exists: IfExists) -> dict[str, Any] | None:
+    """What ``run.json`` says of the run that a folder holds, None where nothing would be lost.
+
+    Raises :class:`BadInput` where the folder is not free: it holds anything else, or a run that is to stay.
+    """
+    info = read_info(out)
+    if info is None:
+        held = sorted(path.name for path in out.iterdir() if not path.name.startswith(".")) if out.is_dir() else []
+        if held:
+            got = f"a folder with {', '.join(held[:3])}{', ...' * (len(held) > 3)}, and no run"
+            raise BadInput(str(out), got, "a new or empty folder, or that of a run", "Name another one.")
+        return None
+    if info["frames"] and if_exists == "refuse":
+        fix = "Name another folder, replace it (--force) or go on with it (--resume)."
+        raise BadInput(str(out), _in_words(info), "a new or empty folder", fix)
+    return info if info["frames"] else None
+
+
+def _in_words(info: Mapping[str, Any]) -> str:
+    tracker, seed = info["tracker"], info["seed"]
+    return f"a run of {info['sequence']} ({info['frames']} frames, tracker {tracker}, seed {seed})"
+
+
+def _tum_lines(estimates: Iterable[PoseEstimate]) -> Iterable[str]:
+    """A line for each that has a pose."""
+    return (tum_line(e.time_s, e.T_cam_obj) for e in estimates if e.T_cam_obj is not None)
+
+
+def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:
+    return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason="not added yet")
+
+
+def _from(folder: Path | None, path: Path) -> Path:
+    """The path as seen from the folder where it lies in there."""
+    return path.relative_to(folder) if folder is not None and path.is_relative_to(folder) else path
+
+
+def _clear(out: Path, info: Mapping[str, Any]) -> None:
+    """Take away what the run that ``info`` tells of has written, and nothing else; ``run.json`` is replaced later."""
+    kept_masks = (info.get("options") or {}).get("save_masks")
+    masks = [f"masks/{name}/{'[0-9]' * 6}.png" for name in info["objects"]] if kept_masks else []
+    poses, meshes = (
+        [f"{kind}/{name}.{end}" for name in info["objects"]] for kind, end in (("poses", "txt"), ("meshes", "ply"))
+    )
+    # First the one without which there is no run: two are never mixed, whenever a kill comes.
+    for pattern in ("poses.npz", *poses, *meshes, *masks, "config.toml", "models.npz", "timings.csv", KEYPOINTS):
+        for path in out.glob(pattern):
+            if not path.parent.is_symlink():
+                path.unlink()
+
+
+def _save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    with replacing(path) as file:
+        np.savez(file, allow_pickle=False, **arrays)
