@@ -180,7 +180,7 @@ def _live(a: argparse.Namespace) -> None:
 
 @_command(
     "eval",
-    "score a run against the truth of its sequence",
+    "score a run against the truth of its sequence; without any, against what the camera saw",
     _arg("run", type=Path, nargs="?", metavar="DIR", help="folder written by p2p run"),
     _arg("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)"),
     _arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
@@ -210,7 +210,13 @@ def _eval(a: argparse.Namespace) -> None:
         from p2p_lib.datasets.runs import load_run
         from p2p_lib.evaluation.protocol import evaluate
 
-        _show(evaluate(load_run(a.run), options.models, a.align, a.min_visible_px), a.json)
+        run = load_run(a.run)
+        if any(obj.has_truth.any() for obj in run.objects.values()):
+            _show(evaluate(run, options.models, a.align, a.min_visible_px), a.json)
+        else:
+            from p2p_lib.evaluation.consistency import consistency
+
+            _show(consistency(run), a.json)
 
 
 @_command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, _JSON, _MIN_VISIBLE)

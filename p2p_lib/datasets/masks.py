@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -12,6 +13,10 @@ import numpy as np
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import MASK_SOURCES
 from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_files, read_image
+
+if TYPE_CHECKING:
+    from p2p_lib.datasets.runs import Run
+    from p2p_lib.datasets.sequence import Sequence
 
 
 @dataclass(eq=False)
@@ -86,6 +91,16 @@ def find_masks(
     else:
         labels = {name: k + 1 for k, name in enumerate(names)} if len(names) > 1 else {names[0]: None}
     return MaskFiles(dict.fromkeys(labels, files), labels, shape)
+
+
+def masks_of_run(run: Run, sequence: Sequence, frame: int) -> dict[str, np.ndarray]:
+    """Object to (H, W) bool at a frame of the sequence: the masks that the run kept, else those of its that it used."""
+    kept = {name: run.path / "masks" / name / f"{frame:06d}.png" for name in run.objects}
+    if any(path.is_file() for path in kept.values()):
+        shape = sequence.camera.height, sequence.camera.width
+        return {name: read_labels(path, shape) > 0 for name, path in kept.items() if path.is_file()}
+    masks = sequence.masks(frame) if run.info["masks"] == "dataset" else None
+    return {name: masks[name] for name in run.objects if name in masks} if masks else {}
 
 
 def _labels_in(files: Iterable[Path], shape: tuple[int, int]) -> list[int]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -127,6 +127,11 @@ def open_sequence(
     format = format or recognise(folder)
     read = import_module(f"p2p_lib.datasets.{format}").load(folder, masks)
     return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale)
+
+
+def reopen(info: Mapping[str, Any]) -> Sequence:
+    """The sequence that a run was made on, as its ``run.json`` says; raises as :func:`open_sequence`."""
+    return open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
 
 
 def unknown_scenario(name: str, known: Iterable[str]) -> BadInput | None:

@@ -15,7 +15,7 @@ from p2p_lib.core import tables
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets.masks import read_labels
 from p2p_lib.datasets.runs import Run
-from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.datasets.sequence import reopen
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def evaluate_masks(run: Run, min_visible_px: int = MIN_VISIBLE_PX) -> MaskEvalua
     from pandas import DataFrame
 
     info = run.info
-    sequence = open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
+    sequence = reopen(info)
     kept = {path for name in run.objects for path in (run.path / "masks" / name).glob("*.png")}
     if not kept:
         raise MissingData(str(run.path / "masks"), "the run kept no masks", "Run it again with --save-masks.")

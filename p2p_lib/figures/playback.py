@@ -14,9 +14,9 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import P2PError
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
-from p2p_lib.datasets.masks import read_labels
+from p2p_lib.datasets.masks import masks_of_run
 from p2p_lib.datasets.runs import Run, load_run
-from p2p_lib.datasets.sequence import Sequence, open_sequence
+from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
 from p2p_lib.figures import style
 
@@ -43,9 +43,8 @@ class Playback:
         """Of a run's folder; the sequence is opened as the run says unless it is given."""
         run = run if isinstance(run, Run) else load_run(run)
         if sequence is None:
-            info = run.info
             with contextlib.suppress(P2PError):
-                sequence = open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
+                sequence = reopen(run.info)
         return cls(run, sequence, load_keypoints(run.path))
 
     def __len__(self) -> int:
@@ -115,18 +114,8 @@ class Playback:
         return self.sequence.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u]), frame.rgb[v, u]
 
     def masks(self, i: int) -> dict[str, np.ndarray]:
-        """The masks (H, W) bool of row i: those that the run kept, else the dataset's where it used them."""
-        frame = int(self.frame_index[i])
-        kept = {name: self.run.path / "masks" / name / f"{frame:06d}.png" for name in self.run.objects}
-        if self.sequence is None:
-            return {}
-        if any(path.is_file() for path in kept.values()):
-            shape = self.sequence.camera.height, self.sequence.camera.width
-            return {name: read_labels(path, shape) > 0 for name, path in kept.items() if path.is_file()}
-        if self.run.info["masks"] != "dataset":
-            return {}
-        masks = self.sequence.masks(frame) or {}
-        return {name: masks[name] for name in self.run.objects if name in masks}
+        """The masks (H, W) bool of row i, as :func:`~p2p_lib.datasets.masks.masks_of_run`; none without a sequence."""
+        return {} if self.sequence is None else masks_of_run(self.run, self.sequence, int(self.frame_index[i]))
 
     def add_m(self, name: str) -> np.ndarray:
         """(n,) ADD in metres, NaN where there is no pose or no truth."""

@@ -20,11 +20,11 @@ from p2p_lib.core.native import load_open3d
 from p2p_lib.datasets.runs import quaternion_xyzw
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
-from p2p_lib.figures.playback import Playback
+from p2p_lib.figures.playback import CLOUD_MAX_M, Playback
 from p2p_lib.figures.provenance import Saved
 
-#: Moments at which points and image are renewed, points each time, and the image's width: a page of about 2 MB.
-MOMENTS, POINTS, IMAGE_PX = 30, 5000, 240
+#: Frames that are shown at most, evenly spread, points of each, and the image's width: a page of at most about 6 MB.
+MOMENTS, POINTS, IMAGE_PX = 120, 3000, 240
 #: Sizes in metres of what is drawn at the object, its keyframes and its points.
 _AXES_M, _KEYFRAME_M, _POINT_M = 0.06, 0.012, 0.003
 _CLOUD_POINT_M, _CAMERA_M = 0.006, 0.08
@@ -45,16 +45,17 @@ def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS)
         try:
             scene = _Scene(server, playback, points)
             recording = server.get_scene_serializer()
-            shown = set(np.linspace(0, len(playback) - 1, moments).astype(int).tolist())
-            for i in range(len(playback)):
-                scene.show(i, i in shown)
-                after = playback.times_s[i + 1] if i + 1 < len(playback) else playback.times_s[i] + 1 / 30
-                recording.insert_sleep(float(after - playback.times_s[i]))
+            # Points, image and objects are all of the same frame: what is left out is left out of all.
+            rows = np.unique(np.linspace(0, len(playback) - 1, min(moments, len(playback))).astype(int))
+            ends_s = [*playback.times_s[rows[1:]], playback.times_s[-1] + 1 / 30]
+            for before, i, end_s in zip([None, *rows], rows, ends_s):
+                scene.show(int(i), before)
+                recording.insert_sleep(float(end_s - playback.times_s[i]))
             page = recording.as_html()
         finally:
             server.stop()
     end = page.rindex("</body>") if "</body>" in page else len(page)
-    return page[:end] + _legend(playback) + page[end:]
+    return page[:end] + _legend(playback, len(rows), points) + page[end:]
 
 
 def write_page(run: str | Path, out: str | Path | None = None, sequence: Sequence | None = None) -> Path:
@@ -134,24 +135,23 @@ class _Scene:
             scene.add_point_cloud(f"/paths/{name}", positions, colours, point_size=_POINT_M, precision="float32")
         return nodes
 
-    def show(self, i: int, renew: bool) -> None:
-        """Change the scene to row i; ``renew``: its points, image and bright keypoints too."""
+    def show(self, i: int, before: int | None) -> None:
+        """Change the scene from row ``before`` to row i."""
         for name, nodes in self._objects.items():
-            self._show_object(name, nodes, i, renew)
-        frame = self._playback.frame(i) if renew else None
+            self._show_object(name, nodes, i, before)
+        frame = self._playback.frame(i)
         if frame is not None:
             p_cam, colours = self._playback.cloud(frame, self._points)
             self._scene.add_point_cloud("/points", p_cam, colours, point_size=_CLOUD_POINT_M)
             size = (IMAGE_PX, round(IMAGE_PX * frame.shape[0] / frame.shape[1]))
             self._camera.image = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
 
-    def _show_object(self, name: str, nodes: dict[str, Any], i: int, renew: bool) -> None:
+    def _show_object(self, name: str, nodes: dict[str, Any], i: int, before: int | None) -> None:
         obj = self._playback.run.objects[name]
         has = bool(obj.has_pose[i])
-        before = bool(obj.has_pose[i - 1]) if i else None
-        if has != before:
+        if before is None or has != obj.has_pose[before]:
             nodes["frame"].visible = has
-        if i == 0 or obj.status[i] != obj.status[i - 1]:
+        if before is None or obj.status[i] != obj.status[before]:
             nodes["label"].text = f"{name}: {obj.status[i]}"
         if has:
             T = obj.T_cam_obj[i]
@@ -160,9 +160,10 @@ class _Scene:
             nodes["label"].position = T[:3, 3] - [0, 1.5 * _AXES_M, 0]
             if not nodes["label"].visible:
                 nodes["label"].visible = True
-        for k in np.flatnonzero(nodes["keyframe_rows"] == i):
+        since = -1 if before is None else before
+        for k in np.flatnonzero((nodes["keyframe_rows"] > since) & (nodes["keyframe_rows"] <= i)):
             nodes["keyframes"][k].visible = True
-        if renew and "keypoints" in nodes:
+        if "keypoints" in nodes:
             points = self._playback.keypoints[name]
             seen = np.isin(points.ids, points.track_id[points.at(int(self._playback.frame_index[i]))])
             shades = np.array([style.rgb(style.NEUTRAL[1]), style.rgb(self._playback.colours[name])], np.uint8)
@@ -185,10 +186,13 @@ def _thinned(mesh: Any) -> Any:
     return trimesh.Trimesh(np.asarray(thin.vertices), faces, vertex_colors=colours, process=False)
 
 
-def _legend(playback: Playback) -> str:
+def _legend(playback: Playback, shown: int, points: int) -> str:
     info, run = playback.run.info, playback.run
     occurring = [s for s in style.STATUS if any((obj.status == str(s)).any() for obj in run.objects.values())]
-    title = f"{info['sequence']}, tracker {info['tracker']}, {len(playback)} frames"
+    title = f"{info['sequence']}, tracker {info['tracker']}, "
+    title += f"{len(playback)} frames" if shown == len(playback) else f"{shown} of {len(playback)} frames are shown"
+    if playback.sequence is not None:
+        title += f", about {points} points of each, up to {CLOUD_MAX_M:g} m away"
     return _LEGEND.format(
         title=html.escape(title),
         objects=", ".join(f'<b style="color:{c}">{html.escape(name)}</b>' for name, c in playback.colours.items()),

@@ -1,8 +1,4 @@
-"""Notebook 10: what went in and what came out, what good masks are, how to tell without any truth that it works.
-
-A reconstructed surface is drawn at the estimated pose. Where the camera measured something behind it, the object cannot
-be: a wrong pose, or a surface that bulges. What lies in front of it hides it and says nothing.
-"""
+"""Notebook 10: what went in and what came out, what good masks are, how to tell without any truth that it works."""
 
 from __future__ import annotations
 
@@ -23,43 +19,14 @@ from p2p_lib.datasets.alignment import background_share, rim
 from p2p_lib.datasets.models import MESHES, find_models
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence as Recording
+from p2p_lib.evaluation.consistency import surface_fit as surface_fit
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.mesh_view import draw_mesh
 from p2p_lib.figures.overlay import Box
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, panels
 from p2p_lib.figures.scenes import Scene
-from p2p_lib.synthetic.render import render
-from p2p_lib.synthetic.shapes import Mesh, load_mesh
-
-#: As near to the surface is on it; so much before it is something else that hides it.
-ON_M, BEFORE_M = 0.005, 0.01
-
-
-def surface_fit(
-    sequence: Recording,
-    run: Run,
-    meshes: Mapping[str, Mesh],
-    rows: Iterable[int],
-    T_obj_wrong: np.ndarray = se3.IDENTITY,
-) -> dict[str, Series]:
-    """Per object, at these rows with a pose: the fraction of its unhidden surface on which depth was measured.
-
-    meshes       object to its reconstructed surface (:func:`p2p_lib.figures.mesh_view.as_body`)
-    T_obj_wrong  (4, 4) by which all poses are put off on purpose, to see what a wrong pose would look like
-    """
-    found: dict[str, dict[int, float]] = {name: {} for name in meshes}
-    for row in rows:
-        frame = sequence.frame(int(next(iter(run.objects.values())).frame_index[row]))
-        for name, body in meshes.items():
-            obj = run.objects[name]
-            if obj.has_pose[row]:
-                T_obj_cam = se3.inverse(obj.T_cam_obj[row] @ T_obj_wrong)
-                drawn_m = render([(body, se3.IDENTITY)], sequence.camera, T_obj_cam).depth_m
-                behind_m = (frame.depth_m - drawn_m)[(drawn_m > 0) & (frame.depth_m > 0)]
-                unhidden_m = behind_m[behind_m > -BEFORE_M]
-                found[name][row] = (np.abs(unhidden_m) < ON_M).mean() if len(unhidden_m) else np.nan
-    return {name: Series(fits, dtype=float) for name, fits in found.items()}
+from p2p_lib.synthetic.shapes import load_mesh
 
 
 def errors_against(source: Recording, frames: Iterable[int], run: Run) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -242,9 +242,10 @@ def test_without_truth_there_is_no_score_and_no_fuss(sequence, tmp_path, capsys)
     assert run(sequence, tmp_path / "out") == 0
     out, err = capsys.readouterr()
     assert "ADD" not in out and err == ""
-    assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 2
+    assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 0
     out, err = capsys.readouterr()
-    assert out == "" and "nothing to score" in err
+    said = json.loads(out)
+    assert err == "" and said["truth"] is None and said["objects"]["object"]["reprojection_px"] < 2, "what can be said"
 
 
 def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys):

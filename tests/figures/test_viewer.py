@@ -43,12 +43,16 @@ def folder(made, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(folder, made):
-    return scene_page(Playback.of(folder, made.sequence), moments=5, points=500)
+    return scene_page(Playback.of(folder, made.sequence), points=500)
 
 
 @pytest.fixture(scope="module")
 def messages(page):
     """(seconds, message) of the recording inside the page, as the viewer's own client unpacks it."""
+    return unpacked(page)
+
+
+def unpacked(page):
     import msgspec
     import zstandard
 
@@ -93,9 +97,19 @@ def test_everything_has_its_place(messages):
     assert "/objects/can/surface" not in names and "/objects/can/keypoints" not in names
 
 
-def test_points_are_renewed_at_the_moments_asked_for(messages):
+def test_points_and_objects_are_of_the_same_frames(folder, made):
+    """Where the run is longer than the page may be large, both leave out the same, and the page says so."""
+    page = scene_page(Playback.of(folder, made.sequence), moments=5, points=500)
+    messages, rows = unpacked(page), [0, 9, 19, 29, 39]
     clouds = told(messages, "PointCloudMessage", "/points")
-    assert [round(t * 30) for t, _ in clouds] == [0, 9, 19, 29, 39]
+    assert [round(t * 30) for t, _ in clouds] == rows
+    obj = made.run.objects["can"]
+    moves = {round(t * 30): m["position"] for t, m in told(messages, "SetPositionMessage", "/objects/can")}
+    assert set(moves) == {row for row in rows if obj.has_pose[row]}
+    for row, position in moves.items():
+        np.testing.assert_allclose(position, obj.T_cam_obj[row, :3, 3], atol=1e-6)
+    assert f"5 of {FRAMES} frames are shown, about 500 points of each, up to 2.5 m away" in page
+    assert messages["durationSeconds"] == pytest.approx(obj.time_s[-1] - obj.time_s[0] + 1 / 30)
 
 
 def test_the_page_needs_nothing_from_outside(page):
