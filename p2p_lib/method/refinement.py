@@ -13,10 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import RefinementConfig
 from p2p_lib.method import observability
 
@@ -207,22 +209,19 @@ class _Problem:
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj, _GRADIENT_VOXELS)
-        distance = np.where(valid, value, np.inf)
-        # Beyond the truncation the distance is not known and its gradient is 0.
-        near = np.flatnonzero(np.abs(distance) < 0.98 * self.volume.tau_m)
-        if len(near) < MIN_POINTS:
+        q, floor_m, reach_m = (p_obj - self.centre) / self.radius, *self.scales_m
+        huber_m, least_m = self.config.huber_m, max(self.config.huber_m, widest_m)
+        used, J, H, g, cut, rms, sigma = _linearised(q, value, gradient, valid, reach_m, floor_m, huber_m, least_m)
+        if len(used) < MIN_POINTS:
             return None
-        middle = _median(value[near])
-        scatter = _MAD_TO_SIGMA * _median(np.abs(value[near] - middle))
-        sigma = max(scatter, _SIGMA_FLOOR_VOXELS * self.volume.voxel_m)
-        cut = max(abs(middle) + _MAD_TRIM * sigma, self.config.huber_m, widest_m)
-        used = near[np.abs(value[near]) <= cut]
-        r = value[used]
-        J = surface_jacobian((p_obj[used] - self.centre) / self.radius, gradient[used])
-        Jw = J * np.minimum(1.0, self.config.huber_m / np.maximum(np.abs(r), 1e-12))[:, None]
-        n, rms = len(used), float(np.sqrt((r * r).mean()))
+        distance = np.where(valid, value, np.inf)
         held = (beside.eigenvalues, beside.directions) if beside else self.eigen(used, J)
-        return _Linear(T, distance, Jw.T @ J / n, Jw.T @ r / n, *held, cut, used, J, rms, sigma)
+        return _Linear(T, distance, H, g, *held, cut, used, J, rms, sigma)
+
+    @property
+    def scales_m(self) -> tuple[float, float]:
+        """The least standard deviation of a distance, and where the distance is no longer known."""
+        return _SIGMA_FLOOR_VOXELS * self.volume.voxel_m, 0.98 * self.volume.tau_m
 
     def eigen(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues (6,) ascending and eigenvectors (6, 6), columns, of what the shape determines."""
@@ -234,11 +233,7 @@ class _Problem:
     def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of T^-1 p_cam - p_obj in standard deviations, same variables."""
         k = self.keypoints
-        q = se3.transform(se3.inverse(T), k.p_cam)
-        J = np.concatenate([se3.hat(q - self.centre) / self.radius, np.broadcast_to(-np.eye(3), (len(q), 3, 3))], -1)
-        r = q - k.p_obj
-        scale = _huber_weight(np.linalg.norm(r, axis=-1) / k.sigma_m) / k.sigma_m**2
-        return np.einsum("mia,m,mib->ab", J, scale, J), np.einsum("mia,m,mi->a", J, scale, r)
+        return _keypoint_system(se3.inverse(T), k.p_obj, k.p_cam, k.sigma_m, self.centre, self.radius)
 
     # -- solving -------------------------------------------------------------------------------
 
@@ -278,23 +273,22 @@ class _Problem:
         return step / largest
 
     def moved(self, T: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """T exp(xi) with xi about the cloud's centre."""
-        C = se3.from_rt(np.eye(3), self.centre)
-        D = C @ se3.exp(np.concatenate([step[:3] / self.radius, step[3:]])) @ se3.inverse(C)
-        return se3.orthonormalised(T @ D)
+        """T turned and shifted about the cloud's centre."""
+        R = cv2.Rodrigues(step[:3] / self.radius)[0]
+        return T @ se3.from_rt(R, self.centre + step[3:] - R @ self.centre)
 
     def cost(self, new: _Linear, at: _Linear) -> float:
         """The objective at ``new`` in squared standard deviations, with the trimming and scale of ``at``.
 
         Trimmed points and those off the observed surface cost what the trimming distance does.
         """
-        r, d = np.minimum(np.abs(new.distance_m), at.cut_m), self.config.huber_m
-        total = self.effective_information(at) / at.used * np.where(r < d, r * r, 2 * d * r - d * d).sum()
+        distance_m = np.minimum(np.abs(new.distance_m), at.cut_m)
+        total = self.effective_information(at) / at.used * _huber_loss(distance_m, self.config.huber_m)
         if self.keypoints is not None:
             k = self.keypoints
-            e = np.linalg.norm(se3.transform(se3.inverse(new.T), k.p_cam) - k.p_obj, axis=-1) / k.sigma_m
-            total += np.where(e < _HUBER, e * e, 2 * _HUBER * e - _HUBER**2).sum()
-        return float(total)
+            off_m = se3.transform(se3.inverse(new.T), k.p_cam) - k.p_obj
+            total += _huber_loss(np.sqrt((off_m * off_m).sum(-1)) / k.sigma_m, _HUBER)
+        return total
 
     def result(self, at: _Linear, tries: int, converged: bool) -> Refinement:
         """The pose reached, its covariance moved from the cloud's centre to the object's origin."""
@@ -306,7 +300,7 @@ class _Problem:
         covariance = to_origin @ np.linalg.inv(H + np.diag(free)) @ to_origin.T
         loose = at.directions[:, at.eigenvalues < self.floor]
         return Refinement(
-            at.T,
+            se3.orthonormalised(at.T),
             (covariance + covariance.T) / 2,
             at.rms_m,
             at.used / len(self.p_cam),
@@ -323,22 +317,94 @@ class _Problem:
 _HUBER = 1.345
 
 
-def _huber_weight(e: np.ndarray) -> np.ndarray:
-    return np.minimum(1.0, _HUBER / np.maximum(e, 1e-12))
+@compiled
+def _huber_loss(e: np.ndarray, threshold: float) -> float:
+    """Twice Huber's loss of residuals (N,) at least 0, summed."""
+    total = 0.0
+    for x in e:
+        total += x * x if x < threshold else 2 * threshold * x - threshold * threshold
+    return total
 
 
-def _median(x: np.ndarray) -> float:
-    """The upper median: exact enough for a noise level, several times faster than NumPy's on small arrays."""
-    return float(np.partition(x, len(x) // 2)[len(x) // 2])
+@compiled
+def _upper_median(x: np.ndarray) -> float:
+    return np.partition(x, len(x) // 2)[len(x) // 2]
 
 
+@compiled
+def _linearised(
+    q: np.ndarray,
+    value: np.ndarray,
+    gradient: np.ndarray,
+    valid: np.ndarray,
+    reach_m: float,
+    floor_m: float,
+    huber_m: float,
+    least_m: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, float, float]:
+    """Of points q (N, 3) with these distances: rows (n,) used, their J (n, 6), H, g, the cut, the rms and the noise.
+
+    Points beyond ``reach_m`` know no distance. Those that scatter beyond the median, but at least ``least_m``, are cut.
+    """
+    near = np.flatnonzero(valid & (np.abs(value) < reach_m))
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    if len(near) < MIN_POINTS:
+        return near, np.zeros((0, 6)), H, g, 0.0, 0.0, 0.0
+    middle = _upper_median(value[near])
+    sigma = max(_MAD_TO_SIGMA * _upper_median(np.abs(value[near] - middle)), floor_m)
+    cut = max(abs(middle) + _MAD_TRIM * sigma, least_m)
+    used = near[np.abs(value[near]) <= cut]
+    J, squares = surface_jacobian(q[used], gradient[used]), 0.0
+    for n in range(len(used)):
+        r = value[used[n]]
+        w = min(1.0, huber_m / max(abs(r), 1e-12))
+        squares += r * r
+        for a in range(6):
+            g[a] += w * J[n, a] * r
+            for b in range(6):
+                H[a, b] += w * J[n, a] * J[n, b]
+    count = max(len(used), 1)
+    return used, J, H / count, g / count, cut, np.sqrt(squares / count), sigma
+
+
+@compiled
 def surface_jacobian(q: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     """(N, 6) derivative of Phi at points q (N, 3) when the pose turns right by xi: q -> exp(-xi) q.
 
     ``gradient`` (N, 3) is that of Phi at q. Rotation first, about q's origin.
     """
-    (x, y, z), (a, b, c) = q.T, gradient.T
-    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x, -a, -b, -c], -1)
+    J = np.empty((len(q), 6))
+    for n in range(len(q)):
+        (x, y, z), (a, b, c) = q[n], gradient[n]
+        J[n, 0], J[n, 1], J[n, 2] = b * z - c * y, c * x - a * z, a * y - b * x
+        J[n, 3], J[n, 4], J[n, 5] = -a, -b, -c
+    return J
+
+
+@compiled
+def _keypoint_system(
+    T_obj_cam: np.ndarray, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray, centre: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """H (6, 6), g (6,) of T^-1 p_cam - p_obj in standard deviations; turns about ``centre``, scaled by ``radius``."""
+    H, g, J, q = np.zeros((6, 6)), np.zeros(6), np.zeros((3, 6)), np.zeros(3)
+    J[0, 3] = J[1, 4] = J[2, 5] = -1.0
+    for n in range(len(p_obj)):
+        squared = 0.0
+        for i in range(3):
+            q[i] = T_obj_cam[i, 3]
+            for k in range(3):
+                q[i] += T_obj_cam[i, k] * p_cam[n, k]
+            squared += (q[i] - p_obj[n, i]) ** 2
+        e = np.sqrt(squared) / sigma_m[n]
+        w = min(1.0, _HUBER / max(e, 1e-12)) / sigma_m[n] ** 2
+        x, y, z = (q - centre) / radius
+        J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = -z, y, z, -x, -y, x
+        for i in range(3):
+            for a in range(6):
+                g[a] += w * J[i, a] * (q[i] - p_obj[n, i])
+                for b in range(6):
+                    H[a, b] += w * J[i, a] * J[i, b]
+    return H, g
 
 
 def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """3D reconstruction: one truncated signed distance volume per object (paper: 3D Reconstruction, appendix).
 
-A dense grid in the object frame, held as torch tensors, so that the same code runs on CPU and CUDA.
+A dense grid in the object frame, in memory or on a CUDA device (:mod:`p2p_lib.method.tsdf_grid`).
 The grid grows in blocks with the object and never beyond ``max_voxels``, whatever a wild depth pixel
 asks for. Every sum of the weighted mean is kept apart from its weight, so an observation can be taken
 out again and put back where the factor graph has moved its keyframe.
@@ -8,7 +8,7 @@ out again and put back where the factor graph has moved its keyframe.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -19,17 +19,14 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TsdfConfig
-from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.errors import BadInput
+from p2p_lib.method.tsdf_grid import NO_WEIGHT, CpuGrid, Image, TorchGrid
 
 if TYPE_CHECKING:
-    import torch
     import trimesh
 
 #: The grid's sides are multiples of this many voxels, so that it grows seldom.
 BLOCK = 8
-#: Voxels handled at once while fusing. On a CPU few enough for the temporaries to stay in its cache, and for
-#: torch not to share them among threads: on two busy cores, its threads wait for each other far longer than they work.
-_SLAB = {"cpu": 1 << 15, "cuda": 1 << 22}
 #: Room around new surface when the grid grows.
 _PADDING_M = 0.02
 #: Depth pixels looked at to decide where the object is.
@@ -40,8 +37,6 @@ _DEPTH_GAP_M = 0.05
 _POSE_TOLERANCE = 5e-3
 #: Background nearer than this to the mask does not carve: mask and pose are good to a pixel or two.
 _CARVE_MARGIN_PX = 1
-#: A weight below this is what rounding leaves of observations that were all taken out again.
-_NO_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +67,6 @@ class _View:
         return self.camera.unproject(np.array([left + w / 2, top + h / 2]), np.median(self.depth_m[self.inside]))
 
 
-def _slabs(lo: np.ndarray, hi: np.ndarray, voxels: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Box [lo, hi) cut across x, and across y where a sheet is too large, into boxes of about so many voxels."""
-    nx, ny, nz = (hi - lo).tolist()
-    rows = min(ny, max(1, voxels // nz))
-    sheets = max(1, voxels // (rows * nz)) if rows == ny else 1
-    for x in range(0, nx, sheets):
-        for y in range(0, ny, rows):
-            start = np.array([x, y, 0])
-            yield lo + start, np.minimum(lo + start + np.array([sheets, rows, nz]), hi)
-
-
 def _clear_of(mask: np.ndarray) -> np.ndarray:
     """Pixels beyond :data:`_CARVE_MARGIN_PX` of the mask."""
     kernel = np.ones((2 * _CARVE_MARGIN_PX + 1,) * 2, np.uint8)
@@ -107,12 +91,7 @@ class TsdfVolume:
         shape: tuple[int, int, int] | None = None,
         device: str = "cpu",
     ):
-        import torch
-
-        if device != "cpu" and not torch.cuda.is_available():
-            fix = "Say --device cpu, or see environment.md for PyTorch with CUDA."
-            raise MissingBackend(f"device {device}", "PyTorch finds no CUDA device here", fix)
-        self.config, self.device = config, torch.device(device)
+        self.config = config
         self.voxel_m, self.tau_m = config.voxel_m, config.voxel_m * config.truncation_voxels
         self.grows = shape is None
         self.anchor_m = np.zeros(3) if origin_m is None else np.asarray(origin_m, float)
@@ -121,19 +100,20 @@ class TsdfVolume:
         self._views: dict[int, _View] = {}
         self._total = 0.0  # of all weights
         self.lo = np.zeros(3, int)
-        self._allocate(self.lo, np.zeros(3, int) if shape is None else np.asarray(shape, int))
+        size = (0, 0, 0) if shape is None else tuple(map(int, shape))
+        self._grid = CpuGrid(size) if device == "cpu" else TorchGrid(size, device)
 
     # -- state ---------------------------------------------------------------------------------
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Voxels per axis; (0, 0, 0) before the first observation."""
-        return tuple(self._weight.shape)
+        return tuple(self._grid.weight.shape)
 
     @property
     def empty(self) -> bool:
         """Whether no voxel has been observed."""
-        return self._total < _NO_WEIGHT
+        return self._total < NO_WEIGHT
 
     @property
     def origin_m(self) -> np.ndarray:
@@ -152,11 +132,11 @@ class TsdfVolume:
 
     def values(self) -> np.ndarray:
         """(nx, ny, nz) float32: V(v) = the mean of min(1, d / tau), normalised to [-1, 1]; NaN where unobserved."""
-        return self._value.cpu().numpy().copy()
+        return self._grid.host(self._grid.value)
 
     def weights(self) -> np.ndarray:
         """(nx, ny, nz) float32: W(v), the sum of observation weights."""
-        return self._weight.cpu().numpy().copy()
+        return self._grid.host(self._grid.weight)
 
     def colours(self) -> np.ndarray:
         """(nx, ny, nz, 4) float32: sums of weighted red, green and blue (0 to 255) and of their weights.
@@ -164,29 +144,7 @@ class TsdfVolume:
         Averaged over the observations that met the voxel inside the truncation band; those that looked
         past it saw the colour of something else.
         """
-        return np.moveaxis(self._colour.cpu().numpy(), 0, -1).copy()
-
-    def _allocate(self, lo: np.ndarray, shape: np.ndarray) -> None:
-        """Fresh arrays over lattice box [lo, lo + shape), with what the old ones held copied in."""
-        import torch
-
-        old = (self._sum, self._weight, self._colour, self._value) if hasattr(self, "_sum") else ()
-        start = self.lo - lo
-        self.lo = np.array(lo, int)
-        size = tuple(int(n) for n in shape)
-        self._sum = torch.zeros(size, device=self.device)
-        self._weight = torch.zeros(size, device=self.device)
-        self._colour = torch.zeros((4, *size), device=self.device)
-        # What queries read: kept up to date voxel by voxel while fusing.
-        self._value = torch.full(size, float("nan"), device=self.device)
-        for new, was in zip((self._sum, self._weight, self._colour, self._value), old, strict=False):
-            box = (slice(int(a), int(a) + n) for a, n in zip(start, was.shape[-3:], strict=True))
-            new[..., *box] = was
-
-    def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        import torch
-
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+        return np.moveaxis(self._grid.host(self._grid.colour), 0, -1)
 
     # -- fusing --------------------------------------------------------------------------------
 
@@ -338,12 +296,13 @@ class TsdfVolume:
         want_lo = np.floor((region[0] - pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
         want_hi = np.ceil((region[1] + pad - self.anchor_m) / self.voxel_m / BLOCK).astype(int) * BLOCK
         old_lo, old_hi = self.lo, self.lo + self.shape
-        if self._weight.numel() == 0:
+        if 0 in self.shape:
             old_lo = (want_lo + want_hi) // 2 // BLOCK * BLOCK
             old_hi = old_lo + BLOCK
         lo, hi = self._capped(old_lo, old_hi, np.minimum(want_lo, old_lo), np.maximum(want_hi, old_hi))
         if (lo != self.lo).any() or (hi - lo != self.shape).any():
-            self._allocate(lo, hi - lo)
+            self._grid.enlarge(tuple((hi - lo).tolist()), tuple((self.lo - lo).tolist()))
+            self.lo = np.array(lo, int)
 
     def _capped(self, old_lo, old_hi, want_lo, want_hi) -> tuple[np.ndarray, np.ndarray]:
         """The largest share of the wanted growth, equal on all sides, that stays within ``max_voxels``."""
@@ -379,76 +338,16 @@ class TsdfVolume:
         return box_lo, np.clip(np.ceil(index.max(0)).astype(int) + 1, box_lo, hi)
 
     def _fuse(self, view: _View, weight: float) -> int:
-        size = view.hi - view.lo
-        if (size <= 0).any():
+        """Fuse a view; pixel coordinates times depth are affine in the voxel's indices."""
+        if (view.hi <= view.lo).any():
             return 0
-        depth = self._tensor(view.depth_m).view(-1)
-        gate = self._tensor(np.where(view.inside, -self.tau_m, self.tau_m).astype(np.float32)).view(-1)
-        rgbw = self._tensor(view.rgbw.astype(np.float32)).view(4, -1)
-        touched = 0
-        for lo, hi in _slabs(view.lo, view.hi, _SLAB[self.device.type]):
-            pixel, z = self._project(view, lo, hi)
-            d = depth.index_select(0, pixel).sub_(z)
-            least = gate.index_select(0, pixel) if self.config.carve else -self.tau_m
-            hit = (d >= least).nonzero().view(-1)
-            phi = d.index_select(0, hit).div_(self.tau_m).clamp_(max=1.0)
-            at = self._flat_index(lo, hi).index_select(0, hit)
-            self._accumulate(at, phi, weight)
-            near = (phi < 1).nonzero().view(-1)
-            at, pixel = at.index_select(0, near), pixel.index_select(0, hit.index_select(0, near))
-            for total, seen in zip(self._colour.view(4, -1), rgbw, strict=True):
-                total.index_add_(0, at, seen.index_select(0, pixel), alpha=weight)
-            touched += len(hit)
-        self._total += weight * touched
-        return touched
-
-    def _project(self, view: _View, lo: np.ndarray, hi: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-        """Index into the view's cut image and depth z in metres of every voxel in [lo, hi), flat.
-
-        Pixel coordinates times depth are affine in the voxel's indices, so each is a sum of three rows.
-        Whatever falls outside the cut image lands on its border, which holds no depth.
-        """
-        cam, (h, w) = view.camera, view.depth_m.shape
+        cam = view.camera
         K = np.array([[cam.fx, 0, cam.cx - view.corner[0] + 1], [0, cam.fy, cam.cy - view.corner[1] + 1], [0, 0, 1.0]])
         A = K @ view.T_cam_obj[:3, :3] * self.voxel_m
         b = K @ se3.transform(view.T_cam_obj, self.anchor_m[None])[0]
-
-        def affine(row: int) -> torch.Tensor:
-            x, y, z = (
-                self._tensor((A[row, axis] * np.arange(lo[axis], hi[axis])).astype(np.float32)) for axis in range(3)
-            )
-            return (x.add_(b[row])[:, None] + y)[:, :, None] + z
-
-        u, v, z = affine(0), affine(1), affine(2)
-        behind = z <= 1e-6
-        # Half a pixel more, cut off, is the nearest pixel; torch's own rounding is shared among threads.
-        u = u.div_(z).clamp_(0, w - 1).add_(0.5).int()
-        v = v.div_(z).clamp_(0, h - 1).add_(0.5).int()
-        pixel = v.mul_(w).add_(u)
-        # A voxel behind the camera goes to the border as well.
-        return (pixel.masked_fill_(behind, 0) if bool(behind.any()) else pixel).view(-1), z.view(-1)
-
-    def _flat_index(self, lo: np.ndarray, hi: np.ndarray) -> torch.Tensor:
-        """Position in the flattened arrays of every voxel in lattice box [lo, hi)."""
-        import torch
-
-        _, ny, nz = self.shape
-        first, last = (lo - self.lo).tolist(), (hi - self.lo).tolist()
-        i, j, k = (torch.arange(a, b, device=self.device) for a, b in zip(first, last, strict=True))
-        return ((i[:, None] * ny + j)[:, :, None] * nz + k).view(-1)
-
-    def _accumulate(self, at: torch.Tensor, phi: torch.Tensor, weight: float) -> None:
-        total, count = self._sum.view(-1), self._weight.view(-1)
-        new_sum = total.index_select(0, at).add_(phi, alpha=weight)
-        new_weight = count.index_select(0, at).add_(weight)
-        if weight < 0:
-            gone = new_weight < _NO_WEIGHT
-            new_sum.masked_fill_(gone, 0.0)
-            new_weight.masked_fill_(gone, 0.0)
-        total.index_copy_(0, at, new_sum)
-        count.index_copy_(0, at, new_weight)
-        # 0 / 0 is NaN, which is what an unobserved voxel holds.
-        self._value.view(-1).index_copy_(0, at, new_sum.div_(new_weight))
+        image = Image(view.depth_m, view.inside, view.rgbw, A, b, view.lo, view.hi)
+        self._total += weight * (touched := self._grid.fuse(image, self.lo, weight, self.tau_m, self.config.carve))
+        return touched
 
     # -- asking --------------------------------------------------------------------------------
 
@@ -477,21 +376,11 @@ class TsdfVolume:
 
     def _sample(self, p_obj: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Metres (K, N) at points (N, 3) moved by offsets (K, 3) in voxels, and whether all K are valid (N,)."""
-        last = np.array(self.shape) - 1.0
-        if (last < 1).any() or not len(p_obj):
+        if min(self.shape) < 2 or not len(p_obj):
             return np.zeros((len(offsets), len(p_obj))), np.zeros(len(p_obj), bool)
-        from torch.nn.functional import grid_sample
-
-        # grid_sample wants the last axis first and indices scaled to [-1, 1].
-        scale = 2 / last[::-1]
-        middle = (p_obj - self.origin_m)[:, ::-1] * (scale / self.voxel_m) - 1
-        around = offsets[:, ::-1] * scale
-        grid = middle.astype(np.float32) + around.astype(np.float32)[:, None]
-        inside = (np.abs(middle) <= 1 - np.abs(around).max(0)).all(1)
-        grid = self._tensor(grid).view(1, 1, 1, -1, 3)
-        value = grid_sample(self._value[None, None], grid, align_corners=True).view(len(offsets), -1)
-        value = value.cpu().numpy().astype(float) * self.tau_m
-        return value, inside & ~np.isnan(value.sum(0))
+        index = (p_obj - self.origin_m) / self.voxel_m
+        value = self._grid.at(index, offsets)
+        return value * self.tau_m, ~np.isnan(value.sum(0))
 
     def mesh(self, min_weight: float = 1.0, min_component: float = 0.1) -> trimesh.Trimesh:
         """The zero level with vertex colours, see :func:`p2p_lib.method.mesh.extract`."""
