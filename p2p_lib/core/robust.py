@@ -12,14 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.compiled import compiled
 
 # Weight (m^2) that holds a fit at its prior's rotation where the points say nothing (a line's roll).
 # Points spread over a centimetre outweigh it a thousandfold.
 _PRIOR_INERTIA_M2 = 1e-6
 _REFITS = 5
-# RANSAC draws this many samples at once, and stops when the chance that no sample so far was free of
+# RANSAC draws at least so many samples, for one that fits tightly, and stops when the chance that none so far was free of
 # outliers, taking the best consensus for the truth, is below this.
-_BATCH, _MISSED = 100, 1e-3
+_SAMPLES, _MISSED = 40, 1e-3
 # Triples of pairs that the deterministic consensus starts from.
 _TRIPLES = 100
 
@@ -43,19 +44,41 @@ def fit_rigid_inertia(
     """
     p_b, p_a = np.asarray(p_b, float), np.asarray(p_a, float)
     w = np.ones(p_b.shape[:-1]) if weights is None else np.asarray(weights, float)
-    total = np.maximum(w.sum(-1), np.finfo(float).tiny)[..., None]
-    mean_b = np.einsum("...n,...ni->...i", w, p_b) / total
-    mean_a = np.einsum("...n,...ni->...i", w, p_a) / total
-    centred = (p_a - mean_a[..., None, :]) * w[..., None]
-    H = np.swapaxes(centred, -1, -2) @ (p_b - mean_b[..., None, :])
-    if R_prior is not None:
-        H = H + _PRIOR_INERTIA_M2 * R_prior
+    prior = np.zeros((3, 3)) if R_prior is None else _PRIOR_INERTIA_M2 * R_prior
+    several, (n, _) = p_b.shape[:-2], p_b.shape[-2:]
+    p_a, w = np.broadcast_to(p_a, p_b.shape), np.broadcast_to(w, p_b.shape[:-1])
+    T, inertia_m2 = _fits(p_b.reshape(-1, n, 3), p_a.reshape(-1, n, 3), w.reshape(-1, n), prior)
+    return T.reshape(*several, 4, 4), inertia_m2.reshape(several)
+
+
+@compiled
+def _fits(p_b: np.ndarray, p_a: np.ndarray, w: np.ndarray, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    T, inertia_m2 = np.zeros((len(p_b), 4, 4)), np.zeros(len(p_b))
+    for n in range(len(p_b)):
+        inertia_m2[n] = _fit(p_b[n], p_a[n], w[n], prior, T[n])
+    return T, inertia_m2
+
+
+@compiled
+def _fit(p_b: np.ndarray, p_a: np.ndarray, w: np.ndarray, prior: np.ndarray, T: np.ndarray) -> float:
+    """Into T (4, 4) the motion of one set; returns the inertia. ``prior`` (3, 3) is added to the cross-covariance."""
+    mean_b, mean_a, H, total = np.zeros(3), np.zeros(3), prior.copy(), 1e-300
+    for n in range(len(w)):
+        total += w[n]
+        for i in range(3):
+            mean_b[i] += w[n] * p_b[n, i]
+            mean_a[i] += w[n] * p_a[n, i]
+    mean_b, mean_a = mean_b / total, mean_a / total
+    for n in range(len(w)):
+        for i in range(3):
+            for j in range(3):
+                H[i, j] += w[n] * (p_a[n, i] - mean_a[i]) * (p_b[n, j] - mean_b[j])
     U, s, Vt = np.linalg.svd(H)
     proper = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    U[..., 2] *= proper[..., None]
+    U[:, 2] *= proper
     R = U @ Vt
-    t = mean_a - np.einsum("...ij,...j->...i", R, mean_b)
-    return se3.from_rt(R, t), s[..., 1] + proper * s[..., 2]
+    T[:3, :3], T[:3, 3], T[3, 3] = R, mean_a - R @ mean_b, 1.0
+    return s[1] + proper * s[2]
 
 
 def residual_m(T_a_b: np.ndarray, p_b: np.ndarray, p_a: np.ndarray) -> np.ndarray:
@@ -74,41 +97,57 @@ def ransac(
 ) -> np.ndarray | None:
     """The T_a_b with the most inliers, residual at most limit_m (N,); None without any.
 
-    Samples come in batches until a better consensus is unlikely to have been missed.
+    Of those with equally many, the one that fits the tightest. Samples are drawn until a better consensus is unlikely
+    to have been missed.
     """
-    best, best_score, missed = None, -np.inf, 1.0
-    for drawn in range(0, iterations, _BATCH):
-        size = min(_BATCH, iterations - drawn)
-        T, score = _best_of_batch(p_b, p_a, limit_m, sample_size, size, rng)
+    drawn = rng.random((iterations, sample_size))
+    T, score = _ransac(np.asarray(p_b, float), np.asarray(p_a, float), np.asarray(limit_m, float), drawn)
+    return T if score > 0 else None
+
+
+@compiled
+def _ransac(p_b: np.ndarray, p_a: np.ndarray, limit_m: np.ndarray, drawn: np.ndarray) -> tuple[np.ndarray, float]:
+    """The best motion and its inliers, less a fraction of one for how loosely they fit; drawn (S, k) from 0 to 1."""
+    count, size = len(p_b), drawn.shape[1]
+    order, even, nothing = np.arange(count), np.ones(size), np.zeros((3, 3))
+    T, best, best_score, missed = np.eye(4), np.eye(4), 0.0, 1.0
+    for s in range(len(drawn)):
+        for i in range(size):
+            j = i + int(drawn[s, i] * (count - i))
+            order[i], order[j] = order[j], order[i]
+        sample = order[:size]
+        if not _lengths_agree(p_b, p_a, limit_m, sample):
+            continue
+        _fit(p_b[sample], p_a[sample], even, nothing, T)
+        score = 0.0
+        for n in range(count):
+            relative = _residual_m(T, p_b[n], p_a[n]) / limit_m[n]
+            score += 1 - relative / (count + 1) if relative <= 1 else 0.0
         if score > best_score:
-            best, best_score = T, score
-            missed = 1 - (np.ceil(score) / len(p_b)) ** sample_size
-        if missed ** (drawn + size) < _MISSED:
+            best[:], best_score = T, score
+            missed = 1 - (np.ceil(score) / count) ** size
+        if s + 1 >= _SAMPLES and missed ** (s + 1) < _MISSED:
             break
-    return best
+    return best, best_score
 
 
-def _best_of_batch(
-    p_b: np.ndarray, p_a: np.ndarray, limit_m: np.ndarray, sample_size: int, size: int, rng: np.random.Generator
-) -> tuple[np.ndarray | None, float]:
-    """The best pose of ``size`` samples and its inliers, less a fraction of one for how loosely they fit."""
-    order = rng.random((size, len(p_b)), np.float32)
-    sample = np.argpartition(order, sample_size - 1, axis=1)[:, :sample_size]
-    sample = sample[_lengths_agree(p_b[sample], p_a[sample], limit_m[sample])]
-    if not len(sample):
-        return None, -np.inf
-    T = fit_rigid(p_b[sample], p_a[sample])
-    relative = residual_m(T, p_b, p_a) / limit_m
-    agrees = relative <= 1
-    score = agrees.sum(1) - np.sum(np.where(agrees, relative, 0), 1) / (len(p_b) + 1)
-    best = np.argmax(score)
-    return T[best], float(score[best])
+@compiled
+def _residual_m(T: np.ndarray, p_b: np.ndarray, p_a: np.ndarray) -> float:
+    squared = 0.0
+    for i in range(3):
+        squared += (T[i, 0] * p_b[0] + T[i, 1] * p_b[1] + T[i, 2] * p_b[2] + T[i, 3] - p_a[i]) ** 2
+    return np.sqrt(squared)
 
 
-def _lengths_agree(p_b: np.ndarray, p_a: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
-    """Which samples (S, k, 3) keep the distances between successive points: no rigid motion fits the others."""
-    length_b, length_a = (np.linalg.norm(p - np.roll(p, 1, axis=1), axis=-1) for p in (p_b, p_a))
-    return (np.abs(length_b - length_a) <= limit_m + np.roll(limit_m, 1, axis=1)).all(1)
+@compiled
+def _lengths_agree(p_b: np.ndarray, p_a: np.ndarray, limit_m: np.ndarray, sample: np.ndarray) -> bool:
+    """Whether a sample keeps the distances between successive points: no rigid motion fits it otherwise."""
+    for i in range(len(sample)):
+        m, n = sample[i - 1], sample[i]
+        length_b, length_a = np.sqrt(((p_b[m] - p_b[n]) ** 2).sum()), np.sqrt(((p_a[m] - p_a[n]) ** 2).sum())
+        if abs(length_b - length_a) > limit_m[m] + limit_m[n]:
+            return False
+    return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,17 +181,26 @@ def refit(
     Fitting and choosing inliers in turn lowers the truncated cost, sum of w min(r, limit)^2, at each step.
     among  (N,) bool: pairs that may be inliers
     """
-    inliers = among & (residual_m(T_a_b, p_b, p_a) <= limit_m)
-    for _ in range(_REFITS):
-        if inliers.sum() < min_inliers:
-            return None
-        fitted = inliers
-        T_a_b, inertia_m2 = fit_rigid_inertia(p_b[fitted], p_a[fitted], weights[fitted], R_prior)
-        residual = residual_m(T_a_b, p_b, p_a)
-        inliers = among & (residual <= limit_m)
-        if np.array_equal(inliers, fitted):
+    prior = np.zeros((3, 3)) if R_prior is None else _PRIOR_INERTIA_M2 * R_prior
+    arrays = (np.ascontiguousarray(a, float) for a in (T_a_b, p_b, p_a, limit_m, weights))
+    T, inliers, residual, inertia_m2 = _refit(*arrays, min_inliers, among, prior)
+    return RigidFit(T, inliers, residual, inertia_m2) if inliers.sum() >= min_inliers else None
+
+
+@compiled
+def _refit(T_a_b, p_b, p_a, limit_m, weights, min_inliers, among, prior):
+    T, residual, inertia_m2, w = T_a_b.copy(), np.empty(len(p_b)), 0.0, np.empty(len(p_b))
+    inliers, fitted = np.zeros(len(p_b), np.bool_), np.zeros(len(p_b), np.bool_)
+    for turn in range(_REFITS + 1):
+        for n in range(len(p_b)):
+            residual[n] = _residual_m(T, p_b[n], p_a[n])
+            inliers[n] = among[n] and residual[n] <= limit_m[n]
+            w[n] = weights[n] if inliers[n] else 0.0
+        if turn == _REFITS or inliers.sum() < min_inliers or (turn > 0 and (inliers == fitted).all()):
             break
-    return RigidFit(T_a_b, inliers, residual, float(inertia_m2)) if inliers.sum() >= min_inliers else None
+        fitted[:] = inliers
+        inertia_m2 = _fit(p_b, p_a, w, prior, T)
+    return T, inliers, residual, inertia_m2
 
 
 def consensus(
