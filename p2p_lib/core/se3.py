@@ -28,8 +28,9 @@ def from_rt(R: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 def inverse(T_a_b: np.ndarray) -> np.ndarray:
     """T_b_a, by transposing the rotation (exact for a rigid transformation)."""
-    Rt = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
-    return from_rt(Rt, -(Rt @ T_a_b[..., :3, 3:])[..., 0])
+    Rt, T = np.swapaxes(T_a_b[..., :3, :3], -1, -2), np.zeros(T_a_b.shape)
+    T[..., :3, :3], T[..., :3, 3:], T[..., 3, 3] = Rt, -Rt @ T_a_b[..., :3, 3:], 1.0
+    return T
 
 
 def transform(T_a_b: np.ndarray, p_b: np.ndarray) -> np.ndarray:
@@ -109,7 +110,10 @@ def so3_log(R: np.ndarray) -> np.ndarray:
 
 def angle_rad(T: np.ndarray) -> np.ndarray:
     """Rotation angle (...,) in [0, pi] of (..., 4, 4) or (..., 3, 3)."""
-    return np.linalg.norm(so3_log(T[..., :3, :3]), axis=-1)
+    R = np.asarray(T, float)[..., :3, :3]
+    off = R - np.swapaxes(R, -1, -2)
+    # Twice the sine and twice the cosine: exact for small angles and at pi.
+    return np.arctan2(np.sqrt((off * off).sum((-2, -1)) / 2), np.trace(R, axis1=-2, axis2=-1) - 1)
 
 
 def error_deg_mm(T: np.ndarray, T_true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

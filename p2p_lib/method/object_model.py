@@ -181,8 +181,9 @@ class ObjectModel:
 
 
 def _volume(config: Config) -> TsdfVolume:
-    """An empty surface. torch and scikit-image take seconds to import: when there is to be one, not at an absence."""
+    """An empty surface. What makes meshes takes seconds to import: when there is to be one, not at an absence."""
     import skimage.measure  # noqa: F401
+    import trimesh  # noqa: F401
 
     from p2p_lib.method.tsdf import TsdfVolume
 
