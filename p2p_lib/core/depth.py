@@ -6,14 +6,11 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.image import nearest_px
 from p2p_lib.core.types import Frame
 
-#: The 3x3 neighbourhood, its middle first: (9, 2) pixels.
-_OFFSETS = np.array([(0, 0), (-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)])
-#: 1, x, y, xx, yy, xy of each, (9, 6).
-_MOMENTS = np.stack([np.ones(9), *_OFFSETS.T, *_OFFSETS.T**2, _OFFSETS.prod(1)], -1)
 # Holds the slope back where few or collinear readings would let noise choose it; nine readings outweigh it twelvefold.
 _RIDGE = 0.5
 #: What depth cameras have about: the built-in tracker and segmenter assume it of any.
@@ -53,27 +50,36 @@ def lift(frame: Frame, uv_px: np.ndarray, camera: Camera, config: DepthConfig) -
     slanted surface its depth at the pixel's fraction too. Depth outside ``config.min_m`` to ``config.max_m`` is
     invalid.
     """
-    p_cam = np.full((len(uv_px), 3), np.nan)
-    rows = np.flatnonzero(camera.inside(uv_px))
-    px = np.rint(uv_px[rows]).astype(int)
-    last = [camera.width - 1, camera.height - 1]
-    at = px[:, None] + _OFFSETS
-    x, y = np.moveaxis(np.clip(at, 0, last), -1, 0)
-    z = frame.depth_m[y, x].astype(float)
-    same_surface = in_range(z, config) & (np.abs(z - z[:, :1]) <= config.edge_m)
-    same_surface &= ((at >= 0) & (at <= last)).all(-1)
-    ok = same_surface[:, 0]
-    rows, uv = rows[ok], uv_px[rows[ok]]
-    p_cam[rows] = camera.unproject(uv, _plane_depth(uv - px[ok], z[ok], same_surface[ok]))
-    return p_cam
+    depth_m = _plane_depths(frame.depth_m, uv_px, config.min_m, config.max_m, config.edge_m)
+    return camera.unproject(uv_px, depth_m)
 
 
-def _plane_depth(d_px: np.ndarray, z: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Depth (N,) at d_px (N, 2) from the middle, of planes through the readings z (N, 9) that are ``used``."""
-    n, x, y, xx, yy, xy = (used @ _MOMENTS).T
-    mean, xz, yz = ((z - z[:, :1]) * used @ _MOMENTS[:, :3]).T
-    mean, x, y = mean / n, x / n, y / n
-    xx, yy, xy = xx - n * x * x + _RIDGE, yy - n * y * y + _RIDGE, xy - n * x * y
-    xz, yz = xz - n * x * mean, yz - n * y * mean
-    slope = np.stack([yy * xz - xy * yz, xx * yz - xy * xz]) / (xx * yy - xy * xy)
-    return z[:, 0] + mean + slope[0] * (d_px[:, 0] - x) + slope[1] * (d_px[:, 1] - y)
+@compiled
+def _plane_depths(depth_m: np.ndarray, uv_px: np.ndarray, min_m: float, max_m: float, edge_m: float) -> np.ndarray:
+    """(N,) depth at each pixel (N, 2), NaN where there is none to trust."""
+    height, width = depth_m.shape
+    out = np.full(len(uv_px), np.nan)
+    for row in range(len(uv_px)):
+        u, v = uv_px[row]
+        if not (0 <= u <= width - 1 and 0 <= v <= height - 1):  # NaN is outside as well
+            continue
+        column, line = int(np.rint(u)), int(np.rint(v))
+        middle = depth_m[line, column]
+        if not min_m <= middle <= max_m:
+            continue
+        # Sums over the readings on its surface: of their offsets from the middle, of their depths from the middle's.
+        n, x, y, xx, yy, xy, d, xd, yd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(max(line - 1, 0), min(line + 2, height)):
+            for i in range(max(column - 1, 0), min(column + 2, width)):
+                z = depth_m[j, i]
+                if min_m <= z <= max_m and abs(z - middle) <= edge_m:
+                    a, b, c = float(i - column), float(j - line), float(z) - float(middle)
+                    n, x, y, xx, yy, xy = n + 1, x + a, y + b, xx + a * a, yy + b * b, xy + a * b
+                    d, xd, yd = d + c, xd + a * c, yd + b * c
+        d, x, y = d / n, x / n, y / n
+        xx, yy, xy = xx - n * x * x + _RIDGE, yy - n * y * y + _RIDGE, xy - n * x * y
+        xd, yd = xd - n * x * d, yd - n * y * d
+        determinant = xx * yy - xy * xy
+        along_x, along_y = (yy * xd - xy * yd) / determinant, (xx * yd - xy * xd) / determinant
+        out[row] = middle + d + along_x * (u - column - x) + along_y * (v - line - y)
+    return out

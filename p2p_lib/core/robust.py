@@ -18,8 +18,8 @@ from p2p_lib.core.compiled import compiled
 # Points spread over a centimetre outweigh it a thousandfold.
 _PRIOR_INERTIA_M2 = 1e-6
 _REFITS = 5
-# RANSAC draws at least so many samples, for one that fits tightly, and stops when the chance that none so far was free of
-# outliers, taking the best consensus for the truth, is below this.
+# RANSAC draws at least so many samples, for one that fits tightly, and stops when the chance that none was free of
+# outliers, with the best consensus for the truth, is below this.
 _SAMPLES, _MISSED = 40, 1e-3
 # Triples of pairs that the deterministic consensus starts from.
 _TRIPLES = 100

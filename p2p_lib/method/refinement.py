@@ -452,9 +452,9 @@ def surface_distance(volume: Surface, depth_m: np.ndarray, camera: Camera, T_cam
         return np.full(depth_m.shape, np.nan, np.float32)
     size = np.array(depth_m.shape[::-1])
     (left, top), (right, bottom) = np.clip([uv.min(0), uv.max(0) + 1], 0, size).astype(int)
-    v, u = np.mgrid[top:bottom:_STRIDE, left:right:_STRIDE]
-    z = depth_m[v, u]
-    p_obj = se3.transform(se3.inverse(T_cam_obj), camera.unproject(np.stack([u, v], -1), z).reshape(-1, 3))
+    every = np.s_[top:bottom:_STRIDE, left:right:_STRIDE]
+    z = depth_m[every]
+    p_obj = se3.transform(se3.inverse(T_cam_obj), (camera.rays[every] * z[..., None]).reshape(-1, 3))
     value, known = volume.query(p_obj)
     off = ((p_obj < corners.min(0)) | (p_obj > corners.max(0))).any(1)
     value = np.where(known, value, np.where(off, np.inf, np.nan))

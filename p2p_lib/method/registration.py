@@ -126,7 +126,7 @@ class _Matches:
         if sigma_m is None or not len(p_obj):
             return cls(p_obj, p_cam, np.full(len(p_obj), config.inlier_m), np.ones(len(p_obj)))
         limit = np.maximum(config.inlier_m, _INLIER_SIGMAS * sigma_m)
-        return cls(p_obj, p_cam, limit, (np.median(sigma_m) / sigma_m) ** 2)
+        return cls(p_obj, p_cam, limit, (sigma_m.mean() / sigma_m) ** 2)
 
     def residual_m(self, T_cam_obj: np.ndarray) -> np.ndarray:
         """(..., n) of poses (..., 4, 4)."""
@@ -182,7 +182,7 @@ def _refit(
     if fit is None:
         return None
     hypothesis = Hypothesis(fit.T_a_b, fit.inliers, fit.residual_m, origin)
-    return hypothesis, bool(_determined(fit.inertia_m2, np.median(m.limit_m[fit.inliers])))
+    return hypothesis, bool(_determined(fit.inertia_m2, m.limit_m[fit.inliers].mean()))
 
 
 def _from_priors(matches: _Matches, priors: Mapping[str, np.ndarray], config: RegistrationConfig) -> list[Hypothesis]:

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.compiled import compiled
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.trackers.builtin.tangent_planes import projection
 
@@ -63,37 +63,78 @@ def fit_pose(
     not measured. Errors along an edge, where cov_px2 (N, 2, 2) is long, hardly count.
     """
     centre = p_seg.mean(0)
-    R, moved = T_cam_seg[:3, :3], np.zeros(6)
-    at = start = R @ centre + T_cam_seg[:3, 3]
-    arm = (p_seg - centre) @ R.T
-    _, P = projection(camera, arm + at)
-    map_cov_cam = R @ map_cov @ R.T
-    W = np.linalg.inv(cov_px2 + P @ map_cov_cam @ P.transpose(0, 2, 1) + _SHARED_PX**2 * np.eye(2))
-    z_weight = np.where(z_m > 0, 1 / (depth_noise_m(z_m) ** 2 + map_cov_cam[:, 2, 2]), 0)
-    H = _PRIOR
-    steps = _ITERATIONS
-    for step in range(steps + 1):
-        p_cam = arm + at
-        uv, P = projection(camera, p_cam)
-        r, r_z = uv_px - uv, np.where(z_m > 0, z_m - p_cam[:, 2], 0)
-        chi2, chi2_z = ((r[:, None] @ W)[:, 0] * r).sum(1), r_z**2 * z_weight
-        if step >= steps:
+    R, at, H, chi2, chi2_z = _fit_pose(
+        np.ascontiguousarray(T_cam_seg[:3, :3]),
+        T_cam_seg[:3, :3] @ centre + T_cam_seg[:3, 3],
+        p_seg - centre,
+        map_cov,
+        uv_px,
+        cov_px2,
+        z_m,
+        depth_noise_m(z_m),
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+    )
+    agrees = (chi2 < _AGREES_CHI2) & (chi2_z < _AGREES_DEPTH_CHI2)
+    return PoseFit(se3.from_rt(R, at - R @ centre), np.linalg.inv(H), centre, agrees)
+
+
+@compiled
+def _fit_pose(R, at, arm_seg, map_cov, uv_px, cov_px2, z_m, sigma_m, fx, fy, cx, cy):
+    """Rotation, centre, H (6, 6), and the squared residuals of pixels and depths (N,) in variances."""
+    count, start, turned = len(arm_seg), at.copy(), np.zeros(3)
+    W, z_weight, soft, soft_z = np.zeros((count, 2, 2)), np.zeros(count), 0.0, 0.0
+    chi2, chi2_z, r, J = np.zeros(count), np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 6))
+    H, last = _PRIOR.copy(), False
+    for step in range(_ITERATIONS + 1):
+        for n in range(count):
+            a = R @ arm_seg[n]
+            x, y, z = a[0] + at[0], a[1] + at[1], max(a[2] + at[2], 0.05)
+            P = np.zeros((3, 3))  # of the pixel and the depth by the point
+            P[0, 0], P[0, 2], P[1, 1], P[1, 2], P[2, 2] = fx / z, -fx * x / z**2, fy / z, -fy * y / z**2, 1.0
+            if step == 0:
+                cov = R @ map_cov[n] @ R.T
+                of_pixel = (P @ cov @ P.T)[:2, :2] + cov_px2[n] + _SHARED_PX**2 * np.eye(2)
+                W[n] = np.linalg.inv(of_pixel)
+                z_weight[n] = 1 / (sigma_m[n] ** 2 + cov[2, 2]) if z_m[n] > 0 else 0.0
+            r[n, 0], r[n, 1] = uv_px[n, 0] - fx * x / z - cx, uv_px[n, 1] - fy * y / z - cy
+            r[n, 2] = z_m[n] - a[2] - at[2] if z_m[n] > 0 else 0.0
+            chi2[n] = W[n, 0, 0] * r[n, 0] ** 2 + 2 * W[n, 0, 1] * r[n, 0] * r[n, 1] + W[n, 1, 1] * r[n, 1] ** 2
+            chi2_z[n] = z_weight[n] * r[n, 2] ** 2
+            for i in range(3):
+                J[n, i, 0], J[n, i, 1] = P[i, 2] * a[1] - P[i, 1] * a[2], P[i, 0] * a[2] - P[i, 2] * a[0]
+                J[n, i, 2] = P[i, 1] * a[0] - P[i, 0] * a[1]
+                J[n, i, 3:] = P[i]
+        if last or step == _ITERATIONS:
             break
         # While most points are far off, as at the start, a large residual is no sign of an outlier.
         soft, soft_z = max(_SOFT, 2 * np.median(chi2)), max(_SOFT, 2 * np.median(chi2_z))
-        w, w_z = 1 / (1 + chi2 / soft) ** 2, z_weight / (1 + chi2_z / soft_z) ** 2
-        J_cam = _motion_jacobian(arm)
-        J, J_z = P @ J_cam, J_cam[:, 2]
-        JW = ((w[:, None, None] * W) @ J).reshape(-1, 6)
-        H = _PRIOR + JW.T @ J.reshape(-1, 6) + (J_z * w_z[:, None]).T @ J_z
-        g = JW.T @ r.ravel() + J_z.T @ (w_z * r_z) - _PRIOR @ moved
+        H, g = _PRIOR.copy(), -_PRIOR @ np.concatenate((turned, at - start))
+        weight = np.zeros((3, 3))
+        for n in range(count):
+            weight[:2, :2] = W[n] / (1 + chi2[n] / soft) ** 2
+            weight[2, 2] = z_weight[n] / (1 + chi2_z[n] / soft_z) ** 2
+            JW = J[n].T @ weight
+            H += JW @ J[n]
+            g += JW @ r[n]
         delta = np.linalg.solve(H, g)
-        R, at = cv2.Rodrigues(delta[:3])[0] @ R, at + delta[3:]
-        arm, moved = (p_seg - centre) @ R.T, np.concatenate([moved[:3] + delta[:3], at - start])
-        if soft == _SOFT and np.abs(delta[:3]).max() < 1e-3 and np.abs(delta[3:]).max() < 2e-4:
-            steps = step + 1
-    agrees = (chi2 < _AGREES_CHI2) & (chi2_z < _AGREES_DEPTH_CHI2)
-    return PoseFit(se3.from_rt(R, at - R @ centre), np.linalg.inv(H), centre, agrees)
+        R, at, turned = _rotation(delta[:3]) @ R, at + delta[3:], turned + delta[:3]
+        last = soft == _SOFT and np.abs(delta[:3]).max() < 1e-3 and np.abs(delta[3:]).max() < 2e-4
+    return R, at, H, chi2, chi2_z
+
+
+@compiled
+def _rotation(w: np.ndarray) -> np.ndarray:
+    """(3, 3) turn about w (3,) by its length, rad."""
+    angle = np.sqrt((w * w).sum())
+    W = np.zeros((3, 3))
+    W[0, 1], W[0, 2], W[1, 2] = -w[2], w[1], -w[0]
+    W[1, 0], W[2, 0], W[2, 1] = w[2], -w[1], w[0]
+    if angle < 1e-9:
+        return np.eye(3) + W
+    return np.eye(3) + np.sin(angle) / angle * W + 2 * (np.sin(angle / 2) / angle) ** 2 * (W @ W)
 
 
 @dataclass(frozen=True, eq=False)
