@@ -25,13 +25,14 @@ LAYERS = [
 ]
 HOMES = {
     "gtsam": ["method/factor_graph.py"],
+    "numba": ["core/compiled.py"],
     "matplotlib": ["figures/*.py", "studies/*.py"],
     "open3d": ["core/native.py"],
     "papermill": ["apps/notebooks.py"],
 }
 MACHINE = re.compile(r"(?<![\w./~-])/(work|tmp|root|farm|home/[a-z]\w*|opt|mnt|Users)/\w")
 REGISTRY = re.compile(r"https?://[^\s\"']*(/simple\b|/packages/[0-9a-f]{2}/|/whl/)|index-url[ =]+http|pypi\.org")
-LAZY = ("torch", "open3d", "matplotlib", "pandas", "scipy", "skimage", "papermill", "gtsam", "trimesh")
+LAZY = ("torch", "numba", "open3d", "matplotlib", "pandas", "scipy", "skimage", "papermill", "gtsam", "trimesh")
 
 
 def part(module: str) -> str:

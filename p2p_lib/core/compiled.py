@@ -1,19 +1,41 @@
 """Inner loops as machine code: what runs many times a frame over few points, where NumPy mostly calls itself.
 
-A function under :func:`compiled` is compiled when it is first called with new types and kept in a cache beside its
-file, or in the user's cache folder where that cannot be written. It takes and gives arrays and numbers alone.
+A function under :func:`compiled` takes and gives arrays and numbers alone, and calls no compiled function of another
+file: the cache of one file does not know when another changes.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from functools import wraps
 from typing import TypeVar
-
-import numba
 
 F = TypeVar("F", bound=Callable)
 
+_waiting: dict[str, list[Callable]] = {}
+
 
 def compiled(function: F) -> F:
-    """The function, compiled. Sums keep their order (no ``fastmath``): results are the same in every run."""
-    return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    """The function, compiled by numba when a function of its file is first called.
+
+    The machine code is kept beside the file, or in the user's cache folder where that cannot be written. Sums keep
+    their order (no ``fastmath``): results are the same in every run.
+    """
+    _waiting.setdefault(function.__module__, []).append(function)
+
+    @wraps(function)
+    def first(*args):
+        _compile(function.__module__)
+        return getattr(sys.modules[function.__module__], function.__name__)(*args)
+
+    return first
+
+
+def _compile(module: str) -> None:
+    """Put the compiled functions of a module in the place of those that wait; numba takes long to import."""
+    import numba
+
+    for function in _waiting.pop(module, ()):
+        ready = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        setattr(sys.modules[module], function.__name__, ready)

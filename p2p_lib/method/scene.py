@@ -19,7 +19,7 @@ from p2p_lib.core.image import nearest_px
 from p2p_lib.core.types import Frame
 
 #: Corners of an image, and the room left around objects, px.
-_CORNERS, _ROOM_PX = 400, 10
+_CORNERS, _ROOM_PX = 600, 10
 #: Depth that is still of use for the camera's motion, m: it only has to lead to an object.
 _MAX_M = 5.0
 #: A descriptor is matched when it is nearer than this share of the second nearest.
