@@ -102,7 +102,7 @@ def check_folder(
             firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
     except P2PError as error:
         return [_unreadable(error)]
-    size = f"{len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
+    size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     depth = _depth(frames)
     findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
     findings += [_times(sequence), _repeated(frames, sequence), depth, _registered(frames)]
@@ -242,7 +242,7 @@ def _registered(frames: list[Frame]) -> Finding:
         return Finding(name, Level.OK, "edges of depth lie on edges of colour")
     where = f"shifted by ({round(found.du_px):+d}, {round(found.dv_px):+d}) px"
     size = f"{found.scale:.2f} times as large and " if abs(found.scale - 1) > 0.03 else ""
-    fix = "Register depth to colour when recording (`align` in the camera's software; p2p data convert-bag does)."
+    fix = "Register depth to colour when recording (`align` in the camera's software; p2p convert does for RealSense)."
     text = f"depth lies beside colour: {size}{where}, its edges would fit {found.gain:.1f} times as well"
     return Finding(name, Level.WRONG, text, fix)
 

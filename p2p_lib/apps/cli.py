@@ -396,6 +396,23 @@ def _check(a: argparse.Namespace) -> int:
 
 
 @_command(
+    "convert",
+    "make a folder for p2p run of a recording (ROS, RealSense, Azure Kinect) or of another layout",
+    _arg("source", type=Path, metavar="SOURCE", help=".bag, .db3, .mcap, .mkv, a ROS 2 folder, or any sequence"),
+    _arg("--out", type=Path, required=True, metavar="DIR", help="a new folder"),
+    _arg("--colour", metavar="TOPIC", help="of a ROS recording (default: the likeliest)"),
+    _arg("--depth", metavar="TOPIC", help="of a ROS recording, registered to colour (default: the likeliest)"),
+    _options("format", "depth_scale"),
+    _QUIET,
+)
+def _convert(a: argparse.Namespace) -> None:
+    from p2p_lib.datasets.convert import convert
+
+    count = convert(a.source, a.out, a.format, a.depth_scale, a.colour, a.depth, not a.quiet)
+    print(f"{count} frames in {a.out}. Next: p2p check {a.out}")
+
+
+@_command(
     "synth",
     "render a synthetic sequence in the YCBMultiTrack layout, with exact truth",
     _arg("scenario", nargs="?", metavar="SCENARIO", help="what happens; --list shows all"),
@@ -463,20 +480,6 @@ def _data_verify(a: argparse.Namespace) -> int:
         print(f"{'ok   ' if check.ok else 'WRONG'}  {check.what}: {check.text}", flush=True)
         good &= check.ok
     return 0 if good else P2PError.exit_code
-
-
-@_command(
-    "data convert-bag",
-    "turn a RealSense recording into a folder for p2p run",
-    _arg("recording", type=Path, metavar="FILE", help="a .bag (or .db3)"),
-    _arg("--out", type=Path, required=True, metavar="DIR", help="a new folder"),
-    _QUIET,
-)
-def _data_convert_bag(a: argparse.Namespace) -> None:
-    from p2p_lib.datasets.realsense import convert_bag
-
-    count = convert_bag(a.recording, a.out, not a.quiet)
-    print(f"{count} frames in {a.out}. Next: put the masks into {a.out}/masks, then p2p run {a.out} --out DIR")
 
 
 @_command(

@@ -71,7 +71,7 @@ _MASKS = _typed(
 )
 _PROMPTS = _typed("what starts objects and corrects masks (see p2p click)", type=Path, metavar="FILE")
 _SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")
-_FORMAT = _typed("layout: ho3d, bop, ycbmultitrack, ycbineoat, folder (default: recognised)")
+_FORMAT = _typed("layout: ho3d, bop, tum, open3d, ycbmultitrack, ycbineoat, folder (default: recognised)")
 _DEPTH_SCALE = _typed("metres per raw depth unit (default 0.001)", type=float, metavar="M")
 _OBJECTS = _typed("track only these objects", read=names, metavar="A,B")
 _START = _typed("first frame", type=int, metavar="I")

@@ -21,6 +21,7 @@ _HUB = "import torch; torch.hub.load('facebookresearch/co-tracker', 'cotracker3_
 #: What has to be typed, by package.
 INSTALL = {
     "transformers": PIP + "transformers",
+    "rosbags": PIP + "rosbags",
     "tapnet": PIP + "einshape dm-tree einops && " + _TAPNET,
     # The one built for the torch that Open3D is built for; any other replaces torch.
     "torchvision": PIP + "--torch-backend=auto torchvision==0.28.0",

@@ -3,7 +3,8 @@
 ``masks/`` is optional: one folder per object (named by it), or one label image per image (0 = background,
 k = object k): of all images, or of some, named as these; a single one is the first image's, whatever its name.
 ``times.txt`` (seconds, one a line) is optional; images whose names are nanoseconds need none. ``depth_scale.txt`` is
-optional: metres per unit of the depth images, which are in millimetres otherwise.
+optional: metres per unit of the depth images; otherwise they are in millimetres, and floats (``.tif``, ``.npy``) in
+metres where the first image's median is below 20.
 """
 
 from __future__ import annotations
@@ -14,10 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import Sequence
+
+#: Depth cameras see no farther; and nearer than 20 mm none does.
+_FARTHEST_M = 20.0
 
 
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
@@ -28,7 +34,7 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     return ImageSequence(
         **vars(files),
         objects=objects,
-        depth_scale=_depth_scale(folder / "depth_scale.txt"),
+        depth_scale=_depth_scale(folder / "depth_scale.txt", files.depth[0]),
         mask_files=found,
         own_masks=found,
         model_places={obj: (folder / "models" / obj,) for obj in objects},
@@ -52,26 +58,53 @@ def write(
     out = Path(out)
     for old in ("rgb", "depth", "masks") if overwrite else ():
         shutil.rmtree(out / old, ignore_errors=True)
-    if not overwrite and out.is_dir() and any(out.iterdir()):
-        raise BadInput(str(out), "a folder that is not empty", "a new one for the images")
+    if not overwrite:
+        check_new(out)
     frames = list(range(len(sequence)) if frames is None else frames)
     wanted = set(range(len(frames)) if masks is None else masks)
+    write_images(out, (sequence.frame(i) for i in frames))
     for number, i in enumerate(frames):
-        frame = sequence.frame(i)
-        depth = np.rint(frame.depth_m / images.DEPTH_SCALE).astype(np.uint16)
-        images.save_png(out / "rgb" / f"{number:06d}.png", frame.rgb)
-        images.save_png(out / "depth" / f"{number:06d}.png", depth)
         for name, mask in (sequence.masks(i) or {}).items() if number in wanted else ():
             images.save_png(out / "masks" / name / f"{number:06d}.png", mask)
-    np.savetxt(out / "cam_K.txt", sequence.camera.K, fmt="%.9g")
-    np.savetxt(out / "times.txt", sequence.times_s[frames] - sequence.times_s[frames[0]], fmt="%.6f")
+    write_about(out, sequence.camera, sequence.times_s[frames] - sequence.times_s[frames[0]])
     return out
 
 
-def _depth_scale(path: Path) -> float:
-    """Metres per unit, as the file says; millimetres where there is none."""
+def check_new(out: str | Path) -> None:
+    """Refuse a folder that holds anything."""
+    if Path(out).is_dir() and any(Path(out).iterdir()):
+        raise BadInput(str(out), "a folder that is not empty", "a new one for the images")
+
+
+def write_images(out: str | Path, frames: Iterable[Frame], unit_m: float = images.DEPTH_SCALE) -> list[float]:
+    """``rgb/`` and ``depth/``, numbered, depth in units of ``unit_m``; the frames' times in seconds."""
+    times_s: list[float] = []
+    for frame in frames:
+        raw = np.rint(frame.depth_m / unit_m)
+        raw[raw > np.iinfo(np.uint16).max] = 0  # too far to be told: no measurement
+        name = f"{len(times_s):06d}.png"
+        images.save_png(Path(out) / "rgb" / name, frame.rgb)
+        images.save_png(Path(out) / "depth" / name, raw.astype(np.uint16))
+        times_s.append(frame.time_s)
+    return times_s
+
+
+def write_about(out: str | Path, camera: Camera, times_s: Iterable[float], unit_m: float = images.DEPTH_SCALE) -> None:
+    """``cam_K.txt``, ``times.txt`` and, where depth is not in millimetres, ``depth_scale.txt``."""
+    np.savetxt(Path(out) / "cam_K.txt", camera.K, fmt="%.9g")
+    np.savetxt(Path(out) / "times.txt", np.asarray(times_s), fmt="%.6f")
+    if unit_m != images.DEPTH_SCALE:
+        np.savetxt(Path(out) / "depth_scale.txt", [unit_m], fmt="%.9g")
+
+
+def _depth_scale(path: Path, first: Path) -> float:
+    """Metres per unit, as the file says; where there is none millimetres, or what the floats of the first image are."""
     if not path.is_file():
-        return images.DEPTH_SCALE
+        floats = first.suffix.lower() in (".npy", ".tif", ".tiff")
+        raw = images.read_raw_depth(first) if floats else np.zeros(0, np.uint16)
+        known = raw[raw > 0]
+        in_metres = raw.dtype.kind == "f" and len(known) and np.median(known) < _FARTHEST_M
+        return 1.0 if in_metres else images.DEPTH_SCALE
     scale = images.read_numbers(path, "metres per unit of the depth images, one number")
     if scale.shape != (1, 1) or not 0 < scale[0, 0] <= 1:
         got = " ".join(path.read_text().split())[:40]

@@ -57,10 +57,10 @@ class ImageFiles:
         return chosen, own or chosen
 
 
-def paired_images(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """The files of ``rgb/`` and ``depth/``, one of each a frame."""
-    rgb = images.list_files(folder / "rgb", images.COLOUR, "colour images")
-    return rgb, images.check_paired(images.list_files(folder / "depth", images.LOSSLESS, "depth images"), rgb)
+def paired_images(folder: Path, colour: str = "rgb") -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """The files of ``rgb/`` (or as the layout calls it) and ``depth/``, one of each a frame."""
+    rgb = images.list_files(folder / colour, images.COLOUR, "colour images")
+    return rgb, images.check_paired(images.list_files(folder / "depth", images.DEPTH, "depth images"), rgb)
 
 
 def camera_for(rgb: Path, K: np.ndarray, name: str) -> Camera:

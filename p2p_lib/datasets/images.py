@@ -14,6 +14,7 @@ from p2p_lib.core.errors import BadInput, MissingData
 
 COLOUR = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
+DEPTH = (*LOSSLESS, ".npy")
 DEPTH_SCALE = 0.001  # metres per raw unit: all layouts here store millimetres
 DEFAULT_HZ = 30.0
 # YCBInEOAT's rotations are orthonormal to 0.3 % only: nearer than this they are made rigid, beyond refused.
@@ -72,10 +73,15 @@ def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
     return times_s
 
 
+def read_lines(path: Path, expected: str) -> list[str]:
+    """The lines of a text file that are neither empty nor a comment (#); ``expected`` says what they are."""
+    lines = _read(path, expected).decode("utf-8", "replace").splitlines()
+    return [line for line in lines if line.partition("#")[0].strip()]
+
+
 def read_numbers(path: Path, expected: str) -> np.ndarray:
     """(rows, columns) float64 of a text file of numbers between spaces or commas; ``expected`` says what they are."""
-    lines = _read(path, expected).decode("utf-8", "replace").replace(",", " ").splitlines()
-    lines = [line for line in lines if line.partition("#")[0].strip()]
+    lines = [line.replace(",", " ") for line in read_lines(path, expected)]
     try:
         return np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
     except ValueError as error:
@@ -118,8 +124,15 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 def read_raw_depth(path: Path) -> np.ndarray:
-    """(H, W) uint16 or float32 in the file's own unit."""
-    raw = read_image(path, cv2.IMREAD_UNCHANGED, "a 16-bit depth image")
+    """(H, W) uint16 or float32 in the file's own unit, of an image or of an array of NumPy's."""
+    if path.suffix == ".npy":
+        try:
+            raw = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise BadInput(str(path), f"an unreadable array ({error})", "a depth image (H, W) as .npy") from None
+        raw = raw.astype(np.float32) if raw.dtype.kind == "f" else raw
+    else:
+        raw = read_image(path, cv2.IMREAD_UNCHANGED, "a 16-bit depth image")
     if raw.ndim != 2 or raw.dtype not in (np.uint16, np.float32):
         raise BadInput(str(path), f"{'x'.join(map(str, raw.shape))} {raw.dtype}", "one channel, uint16 or float32")
     return raw

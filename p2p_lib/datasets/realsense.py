@@ -1,11 +1,12 @@
 """RealSense cameras, and their recordings (.bag; .db3 of newer software), through pyrealsense2.
 
-Depth is registered to the colour camera by the library itself. A recording becomes a folder of one's own, every pair
-of images kept however long it takes; a camera, or a recording in its stead, is read at its own pace.
+Depth is registered to the colour camera by the library itself. Of a recording every pair of images is kept, however
+long it takes (``p2p convert``); a camera, or a recording in its stead, is read at its own pace.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
 from threading import Event, Lock
@@ -16,9 +17,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
-from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.images import save_png
 
 WAIT_MS = 200
 #: A camera that sends nothing for so long has gone.
@@ -36,35 +35,6 @@ TO_RGB = {
     "yuyv": cv2.COLOR_YUV2RGB_YUY2,
     "uyvy": cv2.COLOR_YUV2RGB_UYVY,
 }
-
-
-def convert_bag(bag: str | Path, out: str | Path, progress: bool = True) -> int:
-    """Write ``rgb/``, ``depth/``, ``cam_K.txt``, ``depth_scale.txt`` and ``times.txt``; returns the number of frames.
-
-    Times are the colour images', in seconds from the first. ``masks/`` are for the user to add.
-
-    Raises :class:`MissingBackend` without pyrealsense2, :class:`MissingData` and :class:`BadInput` where the recording
-    is none, has no depth or no colour, or a lens distortion that cannot be ignored.
-    """
-    bag, out = Path(bag), Path(out)
-    if out.is_dir() and any(out.iterdir()):
-        raise BadInput(str(out), "a folder that is not empty", "a new one for the images")
-    camera = RealSenseCamera(bag, every=True)
-    times_s: list[float] = []
-    try:
-        with progress_bar(bag.name, shown=progress) as bar:
-            while (frame := camera.read()) is not None:
-                name = f"{len(times_s):06d}.png"
-                save_png(out / "rgb" / name, frame.rgb)
-                save_png(out / "depth" / name, np.rint(frame.depth_m / camera.unit_m).astype(np.uint16))
-                times_s.append(frame.time_s)
-                bar.update()
-    finally:
-        camera.close()
-    np.savetxt(out / "cam_K.txt", camera.camera.K, fmt="%.9g")
-    np.savetxt(out / "depth_scale.txt", [camera.unit_m], fmt="%.9g")
-    np.savetxt(out / "times.txt", times_s, fmt="%.6f")
-    return len(times_s)
 
 
 class RealSenseCamera:
@@ -107,6 +77,9 @@ class RealSenseCamera:
         depth_m = np.asanyarray(depth.get_data()) * np.float32(self.unit_m)
         time_s = (colour.get_timestamp() - self._start_ms) / 1000
         return Frame(colour.get_frame_number() - self._number, time_s, _rgb(self.name, colour), depth_m)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.read, None)
 
     def close(self) -> None:
         """Stop the camera, once the pair that is being waited for has come."""

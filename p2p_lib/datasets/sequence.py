@@ -24,10 +24,21 @@ from p2p_lib.core.types import Frame
 FORMATS: dict[str, tuple[str, ...]] = {
     "ho3d": ("meta/*.pkl",),
     "bop": ("scene_camera.json",),
+    "tum": ("rgb.txt",),
+    "open3d": ("color/",),
     "ycbmultitrack": ("annotated_poses/*/",),
     "ycbineoat": ("gt_mask/", "annotated_poses/*.txt"),
     "folder": ("rgb/",),
 }
+
+#: What a file is that may be given where a folder is meant.
+RECORDINGS = {
+    ".bag": "a recording of ROS 1 or a RealSense",
+    ".db3": "a recording of ROS 2 or a RealSense",
+    ".mcap": "a recording of ROS 2",
+    ".mkv": "a recording of an Azure Kinect",
+}
+_VIDEOS = (".mp4", ".avi", ".mov", ".webm", ".m4v")
 
 #: Sequences that are generated rather than read are called ``synthetic/NAME``.
 SYNTHETIC = "synthetic/"
@@ -147,6 +158,8 @@ def unknown_scenario(name: str, known: Iterable[str]) -> BadInput | None:
 def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:
     """An existing folder, and the layout where its dataset's manifest says it."""
     folder = Path(path_or_name).expanduser()
+    if folder.is_file() or is_recording(folder):
+        raise _not_a_folder(folder)
     if folder.is_dir():
         return folder, format
     from p2p_lib.datasets.manifests import find_sequence
@@ -160,6 +173,23 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
         where = "$P2P_DATA is not set" if data_dir() is None else f"no sequence of this name below {data_dir()}"
         raise MissingData(str(path_or_name), f"no such folder, and {where}", fix)
     return found[0], format or found[1].format
+
+
+def is_recording(path: Path) -> bool:
+    """Whether ``p2p convert`` makes a folder of it: a file of :data:`RECORDINGS`, or a ROS 2 recording's folder."""
+    return path.suffix.lower() in RECORDINGS if path.is_file() else (path / "metadata.yaml").is_file()
+
+
+def _not_a_folder(path: Path) -> BadInput:
+    """What a file is that was given where a folder is meant, and what to do with it."""
+    suffix = path.suffix.lower()
+    if is_recording(path):
+        fix = f"Make a folder of it: p2p convert {path} --out FOLDER"
+        return BadInput(str(path), RECORDINGS.get(suffix, "a recording of ROS 2"), "a folder of images", fix)
+    if suffix in _VIDEOS:
+        fix = "Record with a depth camera; a depth image for each colour image goes into depth/, cam_K.txt beside it."
+        return BadInput(str(path), "a video of colour alone", "colour and depth", f"Its depth is missing. {fix}")
+    return BadInput(str(path), "a file", "a folder with rgb/, depth/ and cam_K.txt", "Give the folder that it is in.")
 
 
 def recognise(folder: Path) -> str:

@@ -12,6 +12,7 @@ import pytest
 from p2p_lib.apps.cli import main
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
 from p2p_lib.datasets import realsense
+from p2p_lib.datasets.convert import convert
 from p2p_lib.datasets.sequence import open_sequence
 
 W, H, N = 64, 48, 20
@@ -83,7 +84,7 @@ def record(path, streams=("depth", "color"), coefficients=(0, 0, 0, 0, 0), units
 
 def test_a_recording_comes_out_as_it_went_in(tmp_path, capsys):
     bag = record(tmp_path / "a.bag")
-    assert main(["data", "convert-bag", str(bag), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert main(["convert", str(bag), "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert "frames in" in capsys.readouterr().out
     read = open_sequence(tmp_path / "out")
     assert read.camera.K.tolist() == [[50, 0, 31.5], [0, 51, 23.5], [0, 0, 1]]
@@ -104,26 +105,26 @@ def test_what_cannot_be_used_is_refused(tmp_path):
     pytest.importorskip("pyrealsense2")
     (tmp_path / "text.bag").write_text("hello")
     with pytest.raises(BadInput, match=r"text\.bag: got an unreadable recording"):
-        realsense.convert_bag(tmp_path / "text.bag", tmp_path / "out", progress=False)
+        realsense.RealSenseCamera(tmp_path / "text.bag", every=True)
     bag = record(tmp_path / "depth.bag", streams=("depth",))
     with pytest.raises(BadInput, match=r"depth\.\w+: got streams of depth, expected colour and depth"):
-        realsense.convert_bag(bag, tmp_path / "out", progress=False)
+        convert(bag, tmp_path / "out", progress=False)
     bag = record(tmp_path / "bent.bag", coefficients=(0.2, 0, 0, 0, 0))
     with pytest.raises(BadInput, match=r"lens moves the corners by \d+\.\d px, expected at most 0\.5 px"):
-        realsense.convert_bag(bag, tmp_path / "bent", progress=False)
+        convert(bag, tmp_path / "bent", progress=False)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("")
     with pytest.raises(BadInput, match=r"full: got a folder that is not empty"):
-        realsense.convert_bag(bag, tmp_path / "full", progress=False)
+        convert(bag, tmp_path / "full", progress=False)
 
 
 def test_without_the_library_it_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    (tmp_path / "a.bag").write_text("")
+    (tmp_path / "a.bag").write_text("/device_0/sensor_0/Color_0/image/data")
     with pytest.raises(MissingBackend, match=r"pyrealsense2: reads RealSense cameras and recordings .*uv pip install"):
-        realsense.convert_bag(tmp_path / "a.bag", tmp_path / "out")
+        convert(tmp_path / "a.bag", tmp_path / "out")
     with pytest.raises(MissingData, match=r"b\.bag: no such recording"):
-        realsense.convert_bag(tmp_path / "b.bag", tmp_path / "out")
+        realsense.RealSenseCamera(tmp_path / "b.bag")
 
 
 def test_a_recording_plays_as_a_camera_does(tmp_path):

@@ -1,0 +1,34 @@
+"""What Open3D's recorders write: ``color/``, ``depth/`` and ``camera_intrinsic.json`` or ``intrinsic.json``.
+
+Depth is registered to colour, in millimetres; images are numbered, at 30 a second where there is no ``times.txt``.
+Masks are those of a plain folder; there is no truth.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from p2p_lib.core.errors import MissingData
+from p2p_lib.datasets import images
+from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, paired_images
+from p2p_lib.datasets.schema import read_json
+
+INTRINSICS = ("camera_intrinsic.json", "intrinsic.json")
+
+
+def load(folder: Path, masks: str | Path | None) -> ImageSequence:
+    """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
+    rgb, depth = paired_images(folder, "color")
+    path = next((folder / name for name in INTRINSICS if (folder / name).is_file()), None)
+    if path is None:
+        raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}", "Open3D's recorder writes it beside color/.")
+    found = read_json(path, dict, "a pinhole camera as Open3D writes it")
+    # It is written column by column.
+    K = np.array(found.get("intrinsic_matrix", ()), float)
+    K = K.reshape(3, 3).T if K.size == 9 else K
+    files = ImageFiles(folder, rgb, depth, camera_for(rgb[0], K, str(path)), images.frame_times(folder, rgb))
+    masks_found, _ = files.find_masks(masks, [] if masks else [folder / "masks"], some_frames=True)
+    objects = tuple(masks_found.files) if masks_found else ("object",)
+    return ImageSequence(**vars(files), objects=objects, mask_files=masks_found, own_masks=masks_found)

@@ -1,0 +1,222 @@
+"""ROS recordings: ``.bag`` of ROS 1; ``.db3``, ``.mcap`` or a folder of them of ROS 2, through the package rosbags.
+
+Colour and depth are topics of ``sensor_msgs``: Image, or CompressedImage (JPEG, PNG, compressedDepth). Depth has to be
+registered to colour (``aligned_depth_to_color`` of realsense2_camera, ``depth_registered`` of others). A lens
+distortion that the colour camera's CameraInfo tells is taken out of both.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import packages
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame
+
+#: A colour image goes with the depth image nearest in time, if it is as near as this.
+APART_S = 0.025
+#: What an encoding is made RGB with; depth encodings and what their unit is in metres.
+TO_RGB = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
+DEPTH_M = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
+#: Words in the names of topics whose depth is registered, the best first.
+REGISTERED = ("aligned_depth_to_color", "registered", "aligned")
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_INFO = "sensor_msgs/msg/CameraInfo"
+_COMPRESSED_DEPTH_HEADER = 12  # bytes before the PNG
+#: Distortion that moves no pixel further than this is none.
+LEAST_DISTORTION_PX = 0.1
+
+
+class RosRecording:
+    """Frames of a recording, a context manager.
+
+    camera   of the colour images, without distortion; known after the first frame
+    unit_m   metres per unit in which depth may be written without loss
+
+    Raises :class:`MissingBackend` without rosbags, :class:`BadInput` for what is no recording of colour and depth.
+    """
+
+    unit_m = 0.001
+    camera: Camera
+
+    def __init__(self, path: Path, colour: str | None = None, depth: str | None = None):
+        self.name, self._open = str(path), ExitStack()
+        highlevel = packages.load("rosbags.highlevel", "ROS recordings", "rosbags")
+        typesys = packages.load("rosbags.typesys", "ROS recordings", "rosbags")
+        try:
+            typestore = typesys.get_typestore(typesys.Stores.LATEST)
+            reader = highlevel.AnyReader([path], default_typestore=typestore)
+            self._reader = self._open.enter_context(reader)
+        except Exception as error:  # noqa: BLE001 - whatever the package says of a damaged file
+            self.close()
+            said = " ".join(str(error).split())[:120]
+            raise BadInput(self.name, f"an unreadable recording ({said})", "a whole bag of ROS 1 or 2") from None
+        of = {c.topic: c for c in self._reader.connections}
+        pictures = [topic for topic, c in of.items() if c.msgtype in _IMAGES]
+        depth = depth or _likeliest(pictures, "depth")
+        colour = colour or _likeliest([t for t in pictures if t != depth], "colour")
+        info = _info_of(colour, [t for t, c in of.items() if c.msgtype == _INFO])
+        for what, topic in (("colour", colour), ("depth", depth), ("camera_info of colour", info)):
+            if topic not in of:
+                self.close()
+                got = f"topics {', '.join(sorted(of)) or 'none'}"
+                raise BadInput(f"{self.name}: {what}", got, "a topic of it", "Name it: --colour TOPIC --depth TOPIC.")
+        self._topics, self._of = {"colour": colour, "depth": depth, "info": info}, of
+
+    def __enter__(self) -> RosRecording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._open.close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames in the order of their colour images' times, in seconds from the first; those without depth go."""
+        lens, first_s, index = None, 0.0, 0
+        for time_s, rgb, depth_m in self._pairs():
+            if lens is None:
+                lens, first_s = _Lens(self.name, self._info(), rgb.shape), time_s
+                self.camera = lens.camera
+            if depth_m.shape != rgb.shape[:2]:
+                got, want = ("x".join(map(str, s[1::-1])) for s in (depth_m.shape, rgb.shape))
+                fix = "Record depth that is registered to colour (align_depth:=true), or name its topic: --depth."
+                raise BadInput(f"{self.name}: {self._topics['depth']}", got, f"{want} as colour", fix)
+            yield Frame(index, time_s - first_s, *lens.straightened(rgb, depth_m))
+            index += 1
+        if lens is None:
+            got = f"no images of {self._topics['colour']} and {self._topics['depth']} within {1000 * APART_S:g} ms"
+            raise BadInput(self.name, got, "pairs of colour and depth")
+
+    def _messages(self, *whats: str) -> Iterator[tuple[str, Any]]:
+        """What it is of, and the message."""
+        wanted = {self._topics[what]: what for what in whats}
+        for connection, _, raw in self._reader.messages([self._of[topic] for topic in wanted]):
+            yield wanted[connection.topic], self._reader.deserialize(raw, connection.msgtype)
+
+    def _info(self) -> Any:
+        for _, message in self._messages("info"):
+            return message
+        raise BadInput(f"{self.name}: {self._topics['info']}", "no message", "the colour camera's")
+
+    def _pairs(self) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+        """(time_s, rgb, depth_m) of each colour image with a depth image near to it."""
+        waiting: dict[str, deque] = {"colour": deque(), "depth": deque()}
+        colours, depths = waiting["colour"], waiting["depth"]
+        last_s = -np.inf
+        for what, message in self._messages("colour", "depth"):
+            stamp = message.header.stamp
+            waiting[what].append((stamp.sec + 1e-9 * stamp.nanosec, message))
+            # Until a depth image is later than the colour image, a nearer one may come.
+            while colours and depths and depths[-1][0] >= colours[0][0]:
+                pair = self._pair(colours.popleft(), depths)
+                if pair is not None and pair[0] > last_s:
+                    last_s = pair[0]
+                    yield pair
+        while colours and depths:
+            pair = self._pair(colours.popleft(), depths)
+            if pair is not None and pair[0] > last_s:
+                last_s = pair[0]
+                yield pair
+
+    def _pair(self, colour: tuple[float, Any], depths: deque) -> tuple[float, np.ndarray, np.ndarray] | None:
+        time_s, message = colour
+        while len(depths) > 1 and abs(depths[1][0] - time_s) <= abs(depths[0][0] - time_s):
+            depths.popleft()
+        if abs(depths[0][0] - time_s) > APART_S:
+            return None
+        return time_s, _rgb(self._topics["colour"], message), _depth_m(self._topics["depth"], depths[0][1])
+
+
+class _Lens:
+    """A camera's matrix, and how its distortion is taken out of images."""
+
+    def __init__(self, name: str, info: Any, shape: tuple[int, ...]):
+        K = np.array(getattr(info, "k", getattr(info, "K", None)), float).reshape(3, 3)
+        D = np.array(getattr(info, "d", getattr(info, "D", ())), float)
+        self.camera = Camera.from_K(K, shape[1], shape[0], name=f"{name}: camera_info")
+        self._maps = None
+        if not D.any():
+            return
+        if info.distortion_model not in ("plumb_bob", "rational_polynomial"):
+            got = f"the lens model {info.distortion_model}"
+            raise BadInput(name, got, "plumb_bob or rational_polynomial", "Rectify the images first (image_proc).")
+        u, v = cv2.initUndistortRectifyMap(K, D, None, K, shape[1::-1], cv2.CV_32FC1)
+        rows, columns = np.mgrid[: shape[0], : shape[1]]
+        if max(np.abs(u - columns).max(), np.abs(v - rows).max()) > LEAST_DISTORTION_PX:
+            self._maps = u, v
+
+    def straightened(self, rgb: np.ndarray, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Both as a pinhole camera sees them; depth from the nearest pixel, since means across edges are neither."""
+        if self._maps is None:
+            return rgb, depth_m
+        return cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR), cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST)
+
+
+def _likeliest(topics: list[str], kind: str) -> str | None:
+    """The topic that is most likely of colour or depth; uncompressed before compressed ones."""
+    of_depth = [topic for topic in topics if "depth" in topic.replace("aligned_depth_to_color/image", "depth")]
+    if kind == "depth":
+        rank = [next((k for k, word in enumerate(REGISTERED) if word in topic), len(REGISTERED)) for topic in of_depth]
+        chosen = zip(rank, ["ompressed" in topic for topic in of_depth], of_depth)
+    else:
+        others = [topic for topic in topics if topic not in of_depth and "infra" not in topic and "/ir/" not in topic]
+        named = [not _says_colour(topic) for topic in others]
+        chosen = zip(named, ["rect" not in topic for topic in others], ["ompressed" in t for t in others], others)
+    return min(chosen, default=(None,))[-1]
+
+
+def _says_colour(topic: str) -> bool:
+    """Whether a topic's name says that it is of colour."""
+    return any(word in topic for word in ("color", "colour", "rgb"))
+
+
+def _info_of(topic: str | None, infos: list[str]) -> str | None:
+    """The CameraInfo of an image topic: the one beside it."""
+    parent = (topic or "").removesuffix("/compressed").rpartition("/")[0]
+    return next((info for info in infos if info.rpartition("/")[0] == parent), None)
+
+
+def _image(topic: str, message: Any, channels: int, kind: type) -> np.ndarray:
+    """(H, W, channels) of an Image: rows may be padded, bytes of either order."""
+    kind = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
+    used = rows[:, : message.width * channels * kind.itemsize]
+    return np.ascontiguousarray(used).view(kind).reshape(message.height, message.width, channels).astype(kind.type)
+
+
+def _rgb(topic: str, message: Any) -> np.ndarray:
+    if hasattr(message, "format"):
+        bgr = cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise BadInput(topic, f"an unreadable image ({message.format})", "JPEG or PNG")
+        return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    if message.encoding not in TO_RGB:
+        raise BadInput(topic, f"colour as {message.encoding}", f"one of {', '.join(TO_RGB)}", "Name another: --colour.")
+    image = _image(topic, message, 4 if "a" in message.encoding else 3, np.uint8)
+    code = TO_RGB[message.encoding]
+    return image if code is None else cv2.cvtColor(image, code)
+
+
+def _depth_m(topic: str, message: Any) -> np.ndarray:
+    if hasattr(message, "format"):
+        data = bytes(message.data)
+        data = data[_COMPRESSED_DEPTH_HEADER:] if "compressedDepth" in message.format else data
+        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
+            raise BadInput(topic, f"depth as {message.format}", "16-bit PNG, or compressedDepth of 16UC1")
+        return raw * np.float32(DEPTH_M["16UC1"])
+    if message.encoding not in DEPTH_M:
+        raise BadInput(topic, f"depth as {message.encoding}", f"one of {', '.join(DEPTH_M)}", "Name another: --depth.")
+    kind = np.float32 if message.encoding == "32FC1" else np.uint16
+    return _image(topic, message, 1, kind)[..., 0] * np.float32(DEPTH_M[message.encoding])
