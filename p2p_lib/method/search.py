@@ -15,8 +15,8 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import DepthConfig
-from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.image import in_image, nearest_px
 from p2p_lib.core.types import Frame, Rows
 
@@ -150,34 +150,61 @@ class ImageSearch:
         self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Shares (H,) as in :class:`Sighting`, -inf where unknown, points found (H, M) bool, and pixels (H, M, 2)."""
-        p_cam = se3.transform(T_cam_obj, sample.p_obj)
-        view = p_cam / np.maximum(np.linalg.norm(p_cam, axis=-1, keepdims=True), 1e-9)
-        n_cam = np.einsum("hij,mj->hmi", T_cam_obj[:, :3, :3], sample.n_obj)
-        uv_px = self._camera.project(p_cam)
-        u, v = nearest_px(uv_px.reshape(-1, 2), self._depth_m.shape)
-        z = self._depth_m[v, u].reshape(p_cam.shape[:2])
-        lab = self._lab[v, u].reshape(p_cam.shape).astype(np.float32)
-        facing = ((n_cam * view).sum(-1) < _FACING) & (p_cam[..., 2] > 0)
-        asked = facing & in_image(uv_px.reshape(-1, 2), self._depth_m.shape).reshape(facing.shape) & (z > 0)
-        off_m = np.where(asked, z - p_cam[..., 2], np.nan)
-        near_m = np.maximum(near_m, _SIGMAS * depth_noise_m(z, self._config))
-        on = np.abs(off_m) < near_m
-        found = on & self._own_colour(lab, sample.lab, on)
-        behind = off_m > 2 * near_m
-        hidden = off_m < -near_m
-        shown = asked.sum(1) - hidden.sum(1)
-        share = (found.sum(1) - behind.sum(1)) / np.maximum(shown + _HIDDEN * hidden.sum(1), 1)
-        share[(shown < _FEWEST * p_cam.shape[1] / _POINTS) | (shown < _SHOWN * facing.sum(1))] = -np.inf
-        return share, found, uv_px
+        camera, config = self._camera, self._config
+        lens, noise = (camera.fx, camera.fy, camera.cx, camera.cy), (config.noise_m, config.noise_per_m2)
+        arrays = np.ascontiguousarray(T_cam_obj), sample.p_obj, sample.n_obj, sample.lab, self._depth_m, self._lab
+        return _compare(*arrays, lens, noise, near_m, _FEWEST * len(sample) / _POINTS)
 
-    @staticmethod
-    def _own_colour(lab: np.ndarray, own: np.ndarray, on: np.ndarray) -> np.ndarray:
-        """(H, M) bool: pixels lab (H, M, 3) with the colours (M, 3); exposure may have changed for all alike."""
-        lightness = np.log((lab[..., 0] + 8) / (own[:, 0] + 8))
-        count = np.maximum(on.sum(1, keepdims=True), 1)
-        exposure = (lightness * on).sum(1, keepdims=True) / count
-        chroma = np.linalg.norm(lab[..., 1:] - own[:, 1:], axis=-1)
-        return (chroma < _CHROMA) & (np.abs(lightness - exposure) < _LIGHTNESS)
+
+@compiled
+def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, fewest):
+    poses, points = len(T_cam_obj), len(p_obj)
+    (height, width), (fx, fy, cx, cy) = depth_m.shape, lens
+    share, found = np.full(poses, -np.inf), np.zeros((poses, points), np.bool_)
+    uv_px, lighter = np.full((poses, points, 2), np.nan), np.zeros(points)  # how much lighter, by its logarithm
+    for h in range(poses):
+        T = T_cam_obj[h]
+        facing, shown, hidden, behind, on, exposure = 0, 0, 0, 0, 0, 0.0
+        for m in range(points):
+            a, b, c = p_obj[m]
+            x, y = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3], T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+            z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+            if z <= 0:
+                continue
+            a, b, c = n_obj[m]
+            across = (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c) * x + (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c) * y
+            across += (T[2, 0] * a + T[2, 1] * b + T[2, 2] * c) * z
+            u, v = fx * x / z + cx, fy * y / z + cy
+            uv_px[h, m, 0], uv_px[h, m, 1] = u, v
+            if across >= _FACING * np.sqrt(x * x + y * y + z * z):
+                continue
+            facing += 1
+            if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+                continue
+            column, row = int(np.rint(u)), int(np.rint(v))
+            measured = depth_m[row, column]
+            if measured <= 0:
+                continue
+            off = measured - z
+            near = max(near_m, _SIGMAS * (noise[0] + noise[1] * measured**2))
+            hidden += off < -near
+            behind += off > 2 * near
+            shown += off >= -near
+            if abs(off) < near:
+                lighter[m] = np.log((seen[row, column, 0] + 8.0) / (lab[m, 0] + 8.0))
+                found[h, m], on, exposure = True, on + 1, exposure + lighter[m]
+        agree = 0
+        for m in range(points):
+            if found[h, m]:
+                # Exposure may have changed for all alike.
+                column, row = int(np.rint(uv_px[h, m, 0])), int(np.rint(uv_px[h, m, 1]))
+                a, b = float(seen[row, column, 1]) - lab[m, 1], float(seen[row, column, 2]) - lab[m, 2]
+                same = np.sqrt(a * a + b * b) < _CHROMA and abs(lighter[m] - exposure / on) < _LIGHTNESS
+                found[h, m] = same
+                agree += same
+        if shown >= fewest and shown >= _SHOWN * facing:
+            share[h] = (agree - behind) / max(shown + _HIDDEN * hidden, 1.0)
+    return share, found, uv_px
 
 
 def _shifted(T_cam_obj: np.ndarray) -> np.ndarray:
