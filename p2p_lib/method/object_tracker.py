@@ -27,6 +27,8 @@ from p2p_lib.method.registration import Hypothesis
 from p2p_lib.method.sampling import choose, usable_region
 from p2p_lib.method.search import ImageSearch, Sighting
 
+#: While an object has a pose, the tracker is asked every so many frames to look for points that are not seen.
+_LOOK_EVERY = 3
 #: With fewer visible keypoints, pending ones help to register (the release's).
 _FEW_KEYPOINTS = 12
 #: An object whose mask grows by more than this factor from frame to frame is still coming into view.
@@ -351,7 +353,8 @@ class ObjectTracker:
         """
         if not self.config.method.redetection or self.model.empty or obs.mask is None or self._hidden(obs.mask):
             return None
-        if self.life.has_pose and (obs.seen & self.map.promoted).sum() >= self.config.keypoint_map.keyframe_min_points:
+        enough = (obs.seen & self.map.promoted).sum() >= self.config.keypoint_map.keyframe_min_points
+        if self.life.has_pose and (enough or obs.frame.index % _LOOK_EVERY):
             return None
         best = max(self._register(obs), key=lambda h: h.support, default=None)
         if best is None:
