@@ -272,8 +272,6 @@ class SelectionConfig(_Checked):
         choices=("surface", "support"),
     )
     surface_sigmas: float = _p(2.5, "The surface must prefer another one by so many standard errors.", low=0)
-    motion_deg: float = _p(5.0, "This turn off the motion so far halves the support of a hypothesis.", "deg", low=0.01)
-    motion_m: float = _p(0.02, "This move off the motion so far does so too.", "m", low=1e-5)
 
 
 @dataclass(frozen=True)

@@ -187,7 +187,7 @@ class ObjectTracker:
             if len(poses) > 1 and self.model.has_surface and len(obs.cloud):
                 distance_m = refinement.surface_distances(self.model.surface, obs.cloud, np.stack(poses))
             if self.config.method.motion:
-                weight = selection.motion_weight(poses, list(self.life.motion_priors().values()), self.config.selection)
+                weight = selection.motion_weight(poses, list(self.life.motion_priors().values()))
             hypotheses = [c.hypothesis for c in candidates]
             row, reason = selection.select(hypotheses, distance_m, self.config.selection, weight)
             return (None if row is None else candidates[row]), reason

@@ -498,11 +498,13 @@ def test_few_points_say_where_the_others_show():
     lump = settled(begun(), [2])
     few, truth = hide(lambda tracks: np.cumsum(tracks.visible) > 8), lump.tracks(turned(4))
     obs = lump.observed(turned(4), few)
+    obs = replace(obs, frame=replace(obs.frame, index=3))
     expected = lump.tracker.expected_px(obs)
     known = np.isfinite(expected[:, 0])
     assert known.sum() > 15
     assert np.abs(expected - truth.uv_px)[known].max() < 1.5
     assert lump.tracker.expected_px(lump.observed(turned(4))) is None, "enough are seen"
+    assert lump.tracker.expected_px(replace(obs, frame=replace(obs.frame, index=4))) is None, "not in every frame"
     covered = replace(obs, frame=replace(obs.frame, depth_m=obs.frame.depth_m - np.float32(0.05)))
     assert not np.isfinite(lump.tracker.observer.expected_px(covered, START, lump.tracker.map.p_obj)).any()
 

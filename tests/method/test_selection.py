@@ -8,7 +8,7 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.method.registration import Hypothesis
-from p2p_lib.method.selection import motion_weight, select
+from p2p_lib.method.selection import MOTION_DEG, MOTION_M, motion_weight, select
 
 DEFAULT, PAPER = preset("default").selection, preset("paper").selection
 
@@ -59,14 +59,14 @@ def test_of_equal_support_the_tighter_fit_is_taken():
 
 
 def test_support_counts_less_for_what_is_off_the_motion():
-    """1 on a prior, 1/2 at the configured turn or move from the nearest, and so a jump loses to a third as many."""
-    turn = [se3.exp(np.array([np.radians(deg), 0, 0, 0, 0, 0])) for deg in (0, DEFAULT.motion_deg, 20)]
-    move = se3.exp(np.array([0, 0, 0, DEFAULT.motion_m, 0, 0]))
+    """1 on a prior, 1/2 at that turn or move from the nearest, and so a jump loses to a third as many."""
+    turn = [se3.exp(np.array([np.radians(deg), 0, 0, 0, 0, 0])) for deg in (0, MOTION_DEG, 20)]
+    move = se3.exp(np.array([0, 0, 0, MOTION_M, 0, 0]))
     T = se3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.05, 0.7]))
     poses = [T @ turn[0], T @ turn[1], T @ turn[2], T @ move, T @ turn[2] @ turn[1]]
     priors = [T, T @ turn[2]]
-    np.testing.assert_allclose(motion_weight(poses, priors, DEFAULT), [1, 0.5, 1, 0.5, 0.5], atol=1e-6)
-    assert motion_weight(poses, [], DEFAULT) is None
+    np.testing.assert_allclose(motion_weight(poses, priors), [1, 0.5, 1, 0.5, 0.5], atol=1e-6)
+    assert motion_weight(poses, []) is None
     same = np.zeros((2, 50))
     assert select([made(30), made(12)], same, DEFAULT)[0] == 0
     assert select([made(30), made(12)], same, DEFAULT, np.array([0.1, 1.0]))[0] == 1
