@@ -6,14 +6,14 @@ package lie in ``plans/`` and are known by their names.
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_TRACKER
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import file_name, read_toml
 from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.sequence import SYNTHETIC
 
@@ -113,7 +113,7 @@ class Plan(_Strict):
     tracks   whether the 2D trackers are scored by themselves as well
     """
 
-    name: Text
+    name: Annotated[str, AfterValidator(lambda name: file_name("name", name))]
     title: Text
     paper: str = ""
     kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs", "pairs"] = "methods"
@@ -168,14 +168,9 @@ def read_plan(plan: str | Path) -> Plan:
     if path.suffix != ".toml":
         path = PLANS / f"{plan}.toml"
     expected = "a plan (see p2p_lib/benchmark/plan.py)"
+    content = read_toml(path, expected, "Give a TOML file, or one of " + ", ".join(plan_names()) + ".")
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
         return Plan.model_validate({"name": path.stem, **content})
-    except (FileNotFoundError, IsADirectoryError):
-        fix = "Give a TOML file, or one of " + ", ".join(plan_names()) + "."
-        raise MissingData(str(plan), "no such plan", fix) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BadInput(str(path), f"unreadable TOML ({error})", expected) from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the file"

@@ -14,7 +14,7 @@ from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, Scope
 from p2p_lib.benchmark.rows import MEAN, MEAN_OF_ONE, Row, result_rows
 from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingData
-from p2p_lib.datasets.models import MESHES, find_models, given_models
+from p2p_lib.datasets.models import MESHES, find_models, given_models, read_mesh
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.evaluation import reconstruction
@@ -71,8 +71,6 @@ def _errors(score: ObjectScore) -> dict[str, list[float]]:
 
 def _chamfer(done: Run, sequence: Sequence, models: Models, name: str, score: ObjectScore) -> dict[str, Any]:
     """The fields of an outcome on the reconstruction."""
-    import trimesh
-
     mesh = done.path / "meshes" / f"{name}.ply"
     if not mesh.is_file():
         return {"no_chamfer": "no surface was reconstructed"}
@@ -84,6 +82,6 @@ def _chamfer(done: Run, sequence: Sequence, models: Models, name: str, score: Ob
     known = find_models(sequence, MESHES) | made_with | given_models(models, sequence.objects, MESHES)
     model = known[name] if name in known and known[name].suffix != ".xyz" else done.points[name]
     truth, reference = reconstruction.seen_surface(sequence, name, model, score.frame_index)
-    surface = trimesh.load(mesh, process=False)
+    surface = read_mesh(mesh)
     chamfer_cm = reconstruction.chamfer_cm(surface, se3.inverse(score.T_obj_model), truth)
     return {"chamfer_cm": chamfer_cm, "reference": reference, "no_chamfer": "" if chamfer_cm else "nothing near it"}

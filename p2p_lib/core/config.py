@@ -19,7 +19,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import read_toml
 
 
 def _p(default: Any, meaning: str, unit: str = "", source: str = "ours", **bounds: float) -> Any:
@@ -424,12 +425,7 @@ def diff(a: str = "paper", b: str = "default") -> dict[str, tuple[Any, Any]]:
 def from_toml(path: str | Path, base: Config | None = None) -> Config:
     """Read ``[stage] key = value`` from a TOML file over ``base``, else over the file's own ``preset``."""
     path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise MissingData(str(path), "no such configuration file", "Give --config an existing TOML file.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise BadInput(str(path), f"unreadable TOML ({error})", "[stage] tables of key = value") from None
+    table = read_toml(path, "TOML, [stage] tables of key = value", "Give --config an existing TOML file.")
     named = table.pop("preset", "default")
     base = base or preset(named)
     values: dict[str, Any] = {}
@@ -493,7 +489,7 @@ def _parse(value: Any, kind: type) -> Any:
     try:
         # TOML wants a digit before the point.
         return tomllib.loads(f"x = {'0' * text.startswith('.')}{text}")["x"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return value
 
 

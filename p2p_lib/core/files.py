@@ -5,13 +5,16 @@ Every limit of what is read is here. What is above it is a mistake or an attack,
 
 from __future__ import annotations
 
+import csv
 import errno
 import json
 import lzma
 import os
+import pickle
 import re
 import stat
 import struct
+import tarfile
 import tokenize
 import tomllib
 import zipfile
@@ -30,14 +33,14 @@ from p2p_lib.core.errors import BadInput, MissingData
 LARGEST_FILE, LARGEST_TEXT, LARGEST_TOML, LARGEST_PICKLE = 1 << 28, 1 << 26, 1 << 16, 1 << 22
 #: Pixels of an image: more than 8K video.
 LARGEST_IMAGE_PX = 1 << 25
-#: Bytes of the arrays of an ``.npz`` file; values in a pickle, those said once and meant often counted as often.
+#: Bytes of the arrays of an ``.npz`` file; values of a pickle, counted as often as they are meant, 64 bytes as one.
 LARGEST_ARRAYS, MOST_VALUES = 1 << 30, 1 << 18
 #: An archive unpacks to at most so many times its size, and so many bytes besides.
 UNPACKED_RATIO, UNPACKED_BYTES = 100, 1 << 26
 #: What parsers raise at bytes that nobody expected.
 UNREADABLE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, EOFError, OSError, MemoryError)
-UNREADABLE += (RecursionError, RuntimeError, SyntaxError, struct.error, tokenize.TokenError)
-UNREADABLE += (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
+UNREADABLE += (RuntimeError, SyntaxError, struct.error, tokenize.TokenError, csv.Error, pickle.PickleError)
+UNREADABLE += (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError)
 
 _NAME = re.compile(r"\w[\w .+-]{0,99}")
 

@@ -5,22 +5,20 @@ Links, devices, absolute paths, ``..`` and passwords are refused before the memb
 
 from __future__ import annotations
 
-import lzma
 import shutil
 import stat
 import tarfile
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO
 
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.files import UNPACKED_BYTES, UNPACKED_RATIO, UNREADABLE
 
-_FAULTS = (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, NotImplementedError)
-
-
+#: What a member costs however small it is.
+_MEMBER_BYTES = 512
 #: Name as stored, size, why it may not be unpacked ("": it may), what gives its bytes (None: a folder).
 _Member = tuple[str, int, str, Callable[[], IO[bytes] | None] | None]
 
@@ -38,9 +36,14 @@ def unpack(archive: str | Path, folder: str | Path, progress: Callable[[int], ob
         raise MissingData(str(archive), "no such archive")
     folder.mkdir(parents=True, exist_ok=True)
     written: dict[str, int] = {}
+    left = largest = UNPACKED_RATIO * archive.stat().st_size + UNPACKED_BYTES
     try:
         for name, size, refused, open_member in _members(archive):
             target = _target(archive, folder, name, refused)
+            left -= size + _MEMBER_BYTES
+            if left < 0:
+                fix = "If you trust the archive, unpack it by hand."
+                raise BadInput(str(archive), f"{name!r}, more than it may unpack to", f"at most {largest} bytes", fix)
             if open_member is None:
                 target.mkdir(parents=True, exist_ok=True)
                 continue
@@ -52,7 +55,9 @@ def unpack(archive: str | Path, folder: str | Path, progress: Callable[[int], ob
             written[target.relative_to(folder).as_posix()] = target.stat().st_size
             if progress is not None:
                 progress(size)
-    except (*_FAULTS, OSError) as error:
+    except BadInput:
+        raise
+    except UNREADABLE as error:
         if isinstance(error, OSError) and error.errno is not None:  # the disk's, not the archive's
             raise
         reason = " ".join(str(error).split())[:100]

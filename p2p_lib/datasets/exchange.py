@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.files import read_text, replace_text
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets import images
 from p2p_lib.datasets.models import load_points
@@ -64,7 +65,7 @@ def export(
         has_pose = np.flatnonzero(obj.has_pose)
         if format == "tum":
             written.append(out / f"{name}.txt")
-            written[-1].write_text("".join(tum_line(obj.time_s[i], T[i]) for i in has_pose))
+            replace_text(written[-1], "".join(tum_line(obj.time_s[i], T[i]) for i in has_pose))
         else:
             written.append(out / "annotated_poses" / ("" if tuple(poses) == ("object",) else name))
             written[-1].mkdir(parents=True, exist_ok=True)
@@ -92,7 +93,7 @@ def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: S
     # METHOD_DATASET-SPLIT.csv, as the BOP toolkit takes names apart.
     dataset = re.sub(r"[^A-Za-z0-9]+", "", str(run.info.get("sequence", "run"))) or "run"
     path = out / f"p2p_{dataset}-test.csv"
-    path.write_text("\n".join(lines) + "\n")
+    replace_text(path, "\n".join(lines) + "\n")
     return path
 
 
@@ -234,13 +235,14 @@ def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
 
 
 def _bop_rows(path: Path) -> list[dict[str, str]]:
-    if not path.is_file():
-        raise MissingData(str(path), "no such file, expected a BOP results CSV")
-    with path.open(newline="", errors="replace") as file:
-        rows = csv.DictReader(file)
-        if list(rows.fieldnames or []) != BOP_HEADER.split(","):
-            raise BadInput(str(path), f"the header {','.join(rows.fieldnames or [])[:80]!r}", BOP_HEADER)
-        return list(rows)
+    rows = csv.DictReader(read_text(path, "a BOP results CSV").splitlines())
+    try:
+        header, rows = rows.fieldnames or [], list(rows)
+    except csv.Error as error:
+        raise BadInput(str(path), f"unreadable ({error})", BOP_HEADER) from None
+    if header != BOP_HEADER.split(","):
+        raise BadInput(str(path), f"the header {','.join(header)[:80]!r}", BOP_HEADER)
+    return rows
 
 
 def _scene_id(sequence: Sequence | None) -> int:

@@ -107,6 +107,6 @@ def _depth_scale(path: Path, first: Path) -> float:
         return 1.0 if in_metres else images.DEPTH_SCALE
     scale = images.read_numbers(path, "metres per unit of the depth images, one number")
     if scale.shape != (1, 1) or not 0 < scale[0, 0] <= 1:
-        got = " ".join(path.read_text().split())[:40]
+        got = " ".join(map(str, scale.ravel()[:4]))
         raise BadInput(str(path), got, "one number above 0, at most 1: metres per unit")
     return float(scale[0, 0])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import struct
+from io import BytesIO
 from pathlib import Path
 
 import cv2
@@ -11,6 +13,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.files import LARGEST_IMAGE_PX, UNREADABLE, read_array, read_bytes, read_text, replacing
 
 COLOUR = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
@@ -58,7 +61,7 @@ def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
     stems = [p.stem for p in rgb_files]
     source = folder / "times.txt"
     if all(s.isdigit() and len(s) >= 16 for s in stems):
-        times_s = np.array([int(s) for s in stems]) * 1e-9
+        times_s = np.array([int(s) for s in stems], float) * 1e-9
         source = rgb_files[0].parent
     elif source.is_file():
         times_s = read_numbers(source, "one time in seconds a line").ravel()
@@ -75,7 +78,7 @@ def frame_times(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
 
 def read_lines(path: Path, expected: str) -> list[str]:
     """The lines of a text file that are neither empty nor a comment (#); ``expected`` says what they are."""
-    lines = _read(path, expected).decode("utf-8", "replace").splitlines()
+    lines = read_text(path, expected).splitlines()
     return [line for line in lines if line.partition("#")[0].strip()]
 
 
@@ -96,24 +99,40 @@ def read_poses(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
     return se3.orthonormalised(np.stack(T))
 
 
-def _read(path: Path, expected: str) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise MissingData(str(path), f"no such file, expected {expected}") from None
-    except OSError as error:
-        raise MissingData(str(path), f"cannot be read ({error.strerror}), expected {expected}") from None
-
-
 def read_image(path: Path, flags: int, expected: str) -> np.ndarray:
-    """A decoded image, or an error that names the file and what it should have been."""
-    data = _read(path, expected)
+    """A decoded PNG, JPEG, BMP or TIFF, or an error that names the file and what it should have been."""
+    data = read_bytes(path, expected)
+    unreadable = BadInput(str(path), f"an unreadable file of {len(data)} bytes", expected)
     # A PNG that was cut off lacks its end mark; the decoder would complain on stderr before it gives up.
-    whole = data and (not data.startswith(b"\x89PNG") or b"IEND" in data[-16:])
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if whole else None
+    if not data or (data.startswith(b"\x89PNG") and b"IEND" not in data[-16:]):
+        raise unreadable
+    try:
+        width, height = _size(data)
+        if width * height > LARGEST_IMAGE_PX:
+            raise BadInput(str(path), f"{width}x{height} pixels", f"{expected} of at most {LARGEST_IMAGE_PX} pixels")
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except BadInput:
+        raise
+    except (*UNREADABLE, cv2.error):
+        raise unreadable from None
     if image is None:
-        raise BadInput(str(path), f"an unreadable file of {len(data)} bytes", expected)
+        raise unreadable
     return image
+
+
+def _size(data: bytes) -> tuple[int, int]:
+    """Width and height as the header of an image says, before any memory is given to its pixels."""
+    from PIL import BmpImagePlugin, JpegImagePlugin, TiffImagePlugin
+
+    if data[:4] in (b"II*\0", b"MM\0*"):  # of TIFF, OpenCV reads more kinds than Pillow
+        header, stream = TiffImagePlugin.ImageFileDirectory_v2(data[:8]), BytesIO(data)
+        stream.seek(header.next)
+        header.load(stream)
+        return int(header[256]), int(header[257])
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return struct.unpack(">II", data[16:24])
+    kind = BmpImagePlugin.BmpImageFile if data[:2] == b"BM" else JpegImagePlugin.JpegImageFile
+    return kind(BytesIO(data)).size
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -126,10 +145,7 @@ def read_rgb(path: Path) -> np.ndarray:
 def read_raw_depth(path: Path) -> np.ndarray:
     """(H, W) uint16 or float32 in the file's own unit, of an image or of an array of NumPy's."""
     if path.suffix == ".npy":
-        try:
-            raw = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise BadInput(str(path), f"an unreadable array ({error})", "a depth image (H, W) as .npy") from None
+        raw = read_array(path, "a depth image (H, W) as .npy")
         raw = raw.astype(np.float32) if raw.dtype.kind == "f" else raw
     else:
         raw = read_image(path, cv2.IMREAD_UNCHANGED, "a 16-bit depth image")
@@ -149,7 +165,7 @@ def check_size(
 
 def save_png(path: Path, image: np.ndarray) -> None:
     """Write an image (H, W, 3), red first, or (H, W), a mask as 0 and 255, and the folders above it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     image = np.where(image, np.uint8(255), np.uint8(0)) if image.dtype == bool else image
     bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    path.write_bytes(cv2.imencode(".png", bgr)[1].tobytes())
+    with replacing(path, durable=False) as file:
+        file.write(cv2.imencode(".png", bgr)[1].tobytes())

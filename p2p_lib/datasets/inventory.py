@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
-from p2p_lib.core.files import replace_text
+from p2p_lib.core.files import read_text, replace_text
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.tables import as_text
 from p2p_lib.datasets.archives import unpack
@@ -178,8 +178,8 @@ def _verify_listed(path: Path) -> Check:
         return found
 
     try:
-        json.loads(path.read_text(), object_hook=note)
-    except ValueError as error:
+        json.loads(read_text(path, "checksums"), object_hook=note)
+    except (ValueError, RecursionError) as error:
         return Check(path.name, False, f"unreadable ({error})")
     here = [name for name in listed if (path.parent / name).is_file()]
     wrong = [name for name in here if sha256(path.parent / name) != listed[name]]

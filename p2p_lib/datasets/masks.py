@@ -124,7 +124,7 @@ def read_labels(path: Path, shape: tuple[int, int]) -> np.ndarray:
 def _palette_indices(path: Path) -> np.ndarray:
     from PIL import Image
 
-    with Image.open(path) as image:
+    with Image.open(path) as image:  # which has been read once, so that it is not too large
         if image.mode != "P":
             fix = "Save it with one channel."
             raise BadInput(str(path), f"a colour image ({image.mode})", "one label per pixel", fix)

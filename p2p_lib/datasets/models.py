@@ -6,12 +6,18 @@ Tracking never sees them: ADD and ADD-S are measured over all vertices of the tr
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.files import UNREADABLE, read_bytes
 from p2p_lib.datasets.sequence import Sequence
+
+if TYPE_CHECKING:
+    import trimesh
 
 #: What a model's folder is searched for, best first: the points that YCBInEOAT scores with, then meshes.
 PREFERRED = ("points.xyz", "textured_simple.obj", "textured.obj", "*.xyz", "*.obj", "*.ply")
@@ -64,14 +70,13 @@ def load_points(path: str | Path) -> np.ndarray:
     ``models_info.json`` is BOP's, which are in millimetres.
     """
     path = Path(path)
-    if not path.is_file():
-        raise MissingData(str(path), "no such model file")
     readers = {".xyz": _read_xyz, ".obj": _read_obj, ".ply": _read_ply}
     if path.suffix.lower() not in readers:
         raise BadInput(str(path), f"a file of kind {path.suffix or 'unknown'!r}", "a model: " + ", ".join(SUFFIXES))
+    data = read_bytes(path, "a model")
     try:
-        points = readers[path.suffix.lower()](path) * unit_m(path)
-    except (ValueError, IndexError, KeyError, OSError) as error:
+        points = readers[path.suffix.lower()](data) * unit_m(path)
+    except UNREADABLE as error:
         reason = " ".join(str(error).split())[:80]
         raise BadInput(str(path), f"an unreadable model ({reason})", "x y z of each vertex") from None
     if points.ndim != 2 or points.shape[1:] != (3,) or len(points) < 1 or not np.isfinite(points).all():
@@ -86,13 +91,33 @@ def load_points(path: str | Path) -> np.ndarray:
 
 def load_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) in metres and faces (F, 3) of a mesh file .obj or .ply; raises as :func:`load_points`."""
-    load_points(path)  # whatever is wrong with the file is said there
-    import trimesh
-
-    mesh = trimesh.load(Path(path), process=False, force="mesh", skip_materials=True)
-    if not len(getattr(mesh, "faces", ())):
+    load_points(path)  # whatever is wrong with the vertices is said there
+    mesh = read_mesh(Path(path))
+    if not len(mesh.faces):
         raise BadInput(str(path), "a model without faces", "a mesh", "Give a mesh, or none to go by the depth.")
     return np.asarray(mesh.vertices, float) * unit_m(Path(path)), np.asarray(mesh.faces)
+
+
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """A mesh file .obj or .ply as it is, without its materials; what it names beside itself is not looked at.
+
+    Raises as :func:`load_points`, and :class:`BadInput` for a face without its vertex.
+    """
+    import trimesh
+
+    data, kind = read_bytes(path, "a mesh"), path.suffix[1:].lower()
+    try:
+        mesh = trimesh.load(BytesIO(data), file_type=kind, process=False, force="mesh", skip_materials=True)
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces).reshape(-1, 3)
+    except UNREADABLE as error:
+        reason = " ".join(str(error).split())[:80]
+        raise BadInput(str(path), f"an unreadable mesh ({reason})", "vertices and faces") from None
+    if not np.isfinite(vertices).all():
+        raise BadInput(str(path), "vertices that are not finite", "finite coordinates")
+    if faces.size and not (0 <= faces.min() and faces.max() < len(vertices)):
+        odd = faces.min() if faces.min() < 0 else faces.max()
+        raise BadInput(str(path), f"a face of vertex {odd}", f"vertices 0 to {len(vertices) - 1}")
+    return mesh
 
 
 def unit_m(path: Path) -> float:
@@ -100,19 +125,17 @@ def unit_m(path: Path) -> float:
     return 0.001 if (path.parent / "models_info.json").is_file() else 1.0
 
 
-def _read_xyz(path: Path) -> np.ndarray:
-    rows = [line.split()[:3] for line in path.read_text().splitlines() if line.strip() and line.lstrip()[0] != "#"]
-    return np.array(rows, float)
+def _read_xyz(data: bytes) -> np.ndarray:
+    lines = data.decode("utf-8", "replace").splitlines()
+    return np.array([line.split()[:3] for line in lines if line.strip() and line.lstrip()[0] != "#"], float)
 
 
-def _read_obj(path: Path) -> np.ndarray:
+def _read_obj(data: bytes) -> np.ndarray:
     # Not through a mesh library: those merge, split or reorder vertices, and ADD is a mean over them.
-    with path.open("rb") as file:
-        rows = [line.split()[1:4] for line in file if line.startswith((b"v ", b"v\t"))]
-    return np.array(rows, float)
+    return np.array([line.split()[1:4] for line in data.splitlines() if line.startswith((b"v ", b"v\t"))], float)
 
 
-def _read_ply(path: Path) -> np.ndarray:
+def _read_ply(data: bytes) -> np.ndarray:
     import trimesh
 
-    return np.asarray(trimesh.load(path, process=False).vertices, float)
+    return np.asarray(trimesh.load(BytesIO(data), file_type="ply", process=False).vertices, float)

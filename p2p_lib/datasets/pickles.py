@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import io
 import pickle
+import pickletools
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import LARGEST_PICKLE, MOST_VALUES, UNREADABLE, read_bytes
 
 EXPECTED = "a pickle of NumPy arrays and plain values"
-# What a damaged or hostile stream makes the unpickler raise.
-_FAULTS = (pickle.UnpicklingError, EOFError, ValueError, TypeError, LookupError, AttributeError)
-_LIMITS = (ArithmeticError, MemoryError, RecursionError)
 _PLAIN = (str, bytes, int, float, complex, bool, type(None))
 _TYPE = re.compile(r"[<>|=][biufcSU]\d{1,4}")
 _DEEPEST = 20
@@ -55,6 +54,7 @@ class _Array:
 
     def made(self) -> np.ndarray:
         data, dtype, shape, order = self.parts
+        data = data.text if isinstance(data, _Bytes) else data
         if isinstance(data, str):  # Python 2 wrote its bytes as a string
             data = data.encode("latin1")
         if not isinstance(data, bytes | bytearray) or not isinstance(dtype, _Dtype) or order not in ("C", "F"):
@@ -63,18 +63,23 @@ class _Array:
         return np.frombuffer(data, dtype.made()).reshape(shape, order=order).copy()
 
 
-def _latin1(text: str, encoding: str) -> bytes:
-    """What protocol 2 calls to rebuild bytes; the codecs that unpack archives stay out."""
-    if encoding != "latin1":
-        raise pickle.UnpicklingError(f"bytes encoded as {encoding!r}")
-    return text.encode("latin1")
+class _Bytes:
+    """The text that protocol 2 rebuilds bytes from; the codecs that unpack archives stay out."""
+
+    def __init__(self, text: str, encoding: str):
+        if encoding != "latin1":
+            raise ValueError(f"bytes encoded as {encoding!r}")
+        self.text = text
+
+    def made(self) -> bytes:
+        return self.text.encode("latin1")
 
 
 # NumPy moved these modules in version 2; a pickle has the names that were current when it was written.
 _ADMITTED = {
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _Dtype,
-    ("_codecs", "encode"): _latin1,
+    ("_codecs", "encode"): _Bytes,
 }
 for _core in ("numpy.core", "numpy._core"):
     _ADMITTED[f"{_core}.multiarray", "_reconstruct"] = lambda *_: _Array()
@@ -97,28 +102,43 @@ def load_plain(path: str | Path) -> Any:
     anything else or is damaged; nothing of it is run.
     """
     path = Path(path)
+    data = read_bytes(path, EXPECTED, LARGEST_PICKLE)
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise MissingData(str(path), f"cannot be read ({error.strerror}), expected {EXPECTED}") from None
-    try:
+        for operation, argument, _ in pickletools.genops(data):
+            # Python makes room for as many values as the largest of these numbers says, whatever there is.
+            if operation.name.endswith("PUT") and argument > len(data):
+                raise ValueError(f"a value with the number {argument}")
         # latin1: HO-3D's files were written by Python 2, whose strings are bytes.
-        return _plain(_ArraysOnly(io.BytesIO(data), encoding="latin1").load(), 0)
-    except (*_FAULTS, *_LIMITS) as error:
+        return _Plain().value(_ArraysOnly(io.BytesIO(data), encoding="latin1").load(), 0)
+    except UNREADABLE as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise BadInput(str(path), f"an unreadable or unsafe pickle ({reason})", EXPECTED) from None
 
 
-def _plain(value: Any, depth: int) -> Any:
-    """The value with its arrays made; ValueError for anything that is no plain value."""
-    if depth > _DEEPEST:
-        raise ValueError(f"nested more than {_DEEPEST} deep")
-    if type(value) is _Array:
-        return value.made()
-    if isinstance(value, dict):
-        return {_plain(k, depth + 1): _plain(v, depth + 1) for k, v in value.items()}
-    if type(value) in (list, tuple):
-        return type(value)(_plain(item, depth + 1) for item in value)
-    if type(value) not in _PLAIN:
-        raise ValueError(f"a value of type {type(value).__name__.strip('_')}")
-    return value
+class _Plain:
+    """Makes arrays of what stands for them, within limits: values that are said once may be meant a million times."""
+
+    def __init__(self) -> None:
+        self._left = MOST_VALUES
+
+    def value(self, value: Any, depth: int) -> Any:
+        """The value with its arrays made; ValueError for anything that is no plain value."""
+        self._left -= 1 + _size(value) // 64
+        if depth > _DEEPEST or self._left < 0:
+            raise ValueError(f"nested more than {_DEEPEST} deep" if depth > _DEEPEST else "too many values")
+        if type(value) in (_Array, _Bytes):
+            return value.made()
+        if isinstance(value, dict):
+            return {self.value(k, depth + 1): self.value(v, depth + 1) for k, v in value.items()}
+        if type(value) in (list, tuple):
+            return type(value)(self.value(item, depth + 1) for item in value)
+        if type(value) not in _PLAIN:
+            raise ValueError(f"a value of type {type(value).__name__.strip('_')}")
+        return value
+
+
+def _size(value: Any) -> int:
+    """Bytes that are copied when the value is made."""
+    data = value.parts[0] if type(value) is _Array and value.parts else value
+    data = data.text if type(data) is _Bytes else data
+    return len(data) if data is not value and isinstance(data, str | bytes | bytearray) else 0

@@ -17,7 +17,8 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depths_at
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import file_name, parse_json, read_text, replace_text
 from p2p_lib.core.prompts import Prompt, check_apart, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.images import read_image, save_png
@@ -37,12 +38,8 @@ def load_prompts(path: str | Path) -> tuple[Prompt, ...]:
     Raises :class:`MissingData` where there is no file, :class:`BadInput` where it does not fit.
     """
     path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise MissingData(str(path), "no such file of prompts", f"Make one: p2p click SEQ --out {path}") from None
-    except (ValueError, OSError) as error:
-        raise BadInput(str(path), f"unreadable JSON ({error})", _FORM) from None
+    text = read_text(path, f"prompts, {_FORM}", fix=f"Make some: p2p click SEQ --out {path}")
+    content = parse_json(text, str(path), _FORM)
     try:
         return parse_prompts(content, path.parent)
     except BadInput as error:
@@ -73,6 +70,7 @@ def _prompt(given: Any, folder: Path | None) -> Prompt:
         if folder is None or not isinstance(given["mask"], str):
             raise BadInput(f"mask of {given['name']!r}", repr(given["mask"])[:60], "an image beside the prompts")
         mask = read_image(folder / given["mask"], cv2.IMREAD_GRAYSCALE, "a mask image") > 0
+    file_name("object name", given["name"])
     fields = {"points_px": given.get("points"), "negative_px": given.get("negative"), "box_px": given.get("box")}
     fields = {key: value for key, value in fields.items() if value is not None}
     return Prompt(given["name"], given.get("frame", 0), **fields, mask=mask)
@@ -155,14 +153,13 @@ def _drawn(mask: np.ndarray, frame: Frame, count: int, rng: np.random.Generator)
 def save_prompts(path: str | Path, prompts: Iterable[Prompt]) -> Path:
     """Write prompts as :func:`load_prompts` reads them; their masks as images beside the file."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     objects = []
     for prompt in prompts:
         plain = prompt.as_dict()
         if prompt.mask is not None:
             del plain["mask_px"]
-            plain["mask"] = f"{path.stem}_{prompt.name}_{prompt.frame}.png"
+            plain["mask"] = f"{path.stem}_{file_name('object name', prompt.name)}_{prompt.frame}.png"
             save_png(path.parent / plain["mask"], prompt.mask)
         objects.append(plain)
-    path.write_text(json.dumps({"objects": objects}, indent=1) + "\n", encoding="utf-8")
+    replace_text(path, json.dumps({"objects": objects}, indent=1) + "\n")
     return path

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import read_array
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import ObjectTruth
@@ -58,10 +59,7 @@ def read_labels(folder: Path, obj: str, n: int) -> np.ndarray:
         path = folder / kind / obj / file
         if not path.is_file():
             continue
-        try:
-            label = np.load(path, allow_pickle=False)
-        except (ValueError, EOFError, OSError) as error:
-            raise BadInput(str(path), f"an unreadable array ({error})", f"{n} labels as a .npy of bool") from None
+        label = read_array(path, f"{n} labels as a .npy of bool")
         if label.size != n or label.dtype.kind not in "biuf":
             raise BadInput(str(path), f"shape {label.shape} {label.dtype}", f"{n} labels, one for each image")
         holds &= label.ravel().astype(bool)

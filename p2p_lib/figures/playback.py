@@ -15,6 +15,7 @@ from p2p_lib.core.errors import P2PError
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.masks import masks_of_run
+from p2p_lib.datasets.models import read_mesh
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
@@ -74,10 +75,8 @@ class Playback:
     @cached_property
     def meshes(self) -> dict[str, trimesh.Trimesh]:
         """Object to its reconstructed surface, in its frame; those that have one."""
-        import trimesh
-
         files = {name: self.run.path / "meshes" / f"{name}.ply" for name in self.run.objects}
-        return {name: trimesh.load_mesh(path, process=False) for name, path in files.items() if path.is_file()}
+        return {name: read_mesh(path) for name, path in files.items() if path.is_file()}
 
     @cached_property
     def evaluation(self) -> Evaluation | None:

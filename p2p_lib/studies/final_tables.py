@@ -29,7 +29,7 @@ from p2p_lib.core.errors import MissingData
 from p2p_lib.core.files import replace_text
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
-from p2p_lib.datasets.models import MESHES, find_models
+from p2p_lib.datasets.models import MESHES, find_models, read_mesh
 from p2p_lib.datasets.paper_reported import FAIL, paper_reported
 from p2p_lib.datasets.paper_reported import Table as Reported
 from p2p_lib.datasets.runs import ObjectRun, Run
@@ -507,7 +507,7 @@ def _beside_truth(
     file, model = run.path / "meshes" / f"{name}.ply", find_models(video, MESHES).get(name)
     if not file.is_file() or model is None:
         return []
-    surface = trimesh.load(file, process=False)
+    surface = read_mesh(file)
     surface.apply_transform(se3.inverse(evaluation.objects[name].T_obj_model))
     truth = load_mesh(model)
     middle = (truth.vertices.max(0) + truth.vertices.min(0)) / 2
