@@ -1,13 +1,15 @@
 """Clicks on objects, collected in the browser: what ``p2p click`` and notebooks call.
 
-A page of the standard library's web server, on this machine alone, shows the frames; clicks make prompts
-(:mod:`p2p_lib.datasets.prompts`). In a notebook a :class:`Clicker` shows the page by itself.
+A page of the standard library's web server shows the frames to those on this machine who know its address; clicks make
+prompts (:mod:`p2p_lib.datasets.prompts`). In a notebook a :class:`Clicker` shows the page by itself.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
+import secrets
 import warnings
 from collections.abc import Callable, Iterable
 from functools import lru_cache
@@ -25,6 +27,7 @@ from p2p_lib.core.browser import open_page
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
+from p2p_lib.core.files import parse_json
 from p2p_lib.core.prompts import Prompt, check_depth
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.prompts import load_prompts, parse_prompts, prompts_by_frame, save_prompts
@@ -33,13 +36,14 @@ from p2p_lib.datasets.sequence import Sequence
 HOST = "127.0.0.1"
 PAGE = Path(__file__).with_name("click.html")
 _LARGEST_BODY = 1 << 20
+_HERE = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
 _JSON, _HTML, _PNG = "application/json", "text/html; charset=utf-8", "image/png"
 
 
 class Clicker:
     """A page that is being served, a context manager; ``prompts`` is what was saved last.
 
-    url   where the page is
+    url   where the page is; a word in it keeps others out
     path  the file that saving writes; the prompts it holds already are shown to begin with
     """
 
@@ -56,7 +60,9 @@ class Clicker:
             free = f"a free port ({error.strerror})"
             raise BadInput("port", port, free, "Leave --port out: one is chosen.") from None
         self._server.daemon_threads = True
-        self.url = f"http://{HOST}:{self._server.server_address[1]}/"
+        # Whoever does not know this word, another user of this machine say, gets no answer.
+        self.token = secrets.token_urlsafe(16)
+        self.url = f"http://{HOST}:{self._server.server_address[1]}/{self.token}/"
         Thread(target=self._server.serve_forever, daemon=True).start()
 
     def wait(self, timeout_s: float | None = None) -> bool:
@@ -167,12 +173,27 @@ def wait_for_clicks(clicker: Clicker, say: Callable[[str], object], open_browser
 class _Handler(BaseHTTPRequestHandler):
     clicker: Clicker
     protocol_version = "HTTP/1.1"
+    timeout = 60  # seconds for whoever sends nothing more
+
+    def _place(self) -> str | None:
+        """What is asked for below the page's address; a refusal and None for whoever comes in another's name."""
+        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+        token, slash, place = self.path.removeprefix("/").partition("/")
+        # A page from elsewhere whose name leads to this machine says that name; one that sends something, its own.
+        if not _HERE.fullmatch(host) or origin not in (None, f"http://{host}"):
+            return self._refuse(HTTPStatus.FORBIDDEN, "expected Host and Origin of this machine")
+        if not slash or not secrets.compare_digest(token.encode(), self.clicker.token.encode()):
+            return self._refuse(HTTPStatus.NOT_FOUND, "no such page: take the whole address that was printed")
+        return place
 
     def do_GET(self) -> None:
-        what, _, number = self.path.strip("/").partition("/")
-        if self.path == "/":
+        place = self._place()
+        if place is None:
+            return
+        what, _, number = place.partition("/")
+        if place == "":
             self._answer(PAGE.read_bytes(), _HTML)
-        elif self.path == "/session":
+        elif place == "session":
             self._answer(json.dumps(self.clicker.session()).encode(), _JSON)
         elif what == "frame" and number.isdecimal() and int(number) < len(self.clicker.sequence):
             try:
@@ -180,23 +201,25 @@ class _Handler(BaseHTTPRequestHandler):
             except P2PError as error:
                 self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
         else:
-            self._refuse(HTTPStatus.NOT_FOUND, f"{self.path}: no such page")
+            self._refuse(HTTPStatus.NOT_FOUND, f"{place}: no such page")
 
     def do_POST(self) -> None:
-        length = self.headers.get("Content-Length", "")
+        place, length = self._place(), self.headers.get("Content-Length", "")
+        if place is None:
+            return None
         # Pages of other sites cannot send this type here without being asked first, which this server never is.
-        answers = {"/prompts": self._save, "/masks": self.clicker.masks}
-        if self.path not in answers or self.headers.get_content_type() != _JSON:
+        answers = {"prompts": self._save, "masks": self.clicker.masks}
+        if place not in answers or self.headers.get_content_type() != _JSON:
             return self._refuse(HTTPStatus.NOT_FOUND, f"expected JSON, sent to {' or '.join(answers)}")
         if not length.isdecimal() or int(length) > _LARGEST_BODY:
             return self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {_LARGEST_BODY} bytes")
         try:
-            answer = answers[self.path](json.loads(self.rfile.read(int(length))))
-        except (P2PError, ValueError) as error:
+            answer = answers[place](parse_json(self.rfile.read(int(length)), "prompts", "JSON as the page sends it"))
+        except P2PError as error:
             return self._refuse(HTTPStatus.BAD_REQUEST, str(error))
         except OSError as error:
             return self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"{self.clicker.path}: {error.strerror}")
-        self._answer(json.dumps(answer).encode(), _JSON)
+        return self._answer(json.dumps(answer).encode(), _JSON)
 
     def _save(self, content: object) -> dict[str, str]:
         self.clicker.save(content)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_TRACKER
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import file_name, read_toml
 from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.sequence import SYNTHETIC
@@ -167,8 +167,11 @@ def read_plan(plan: str | Path) -> Plan:
     path = Path(plan).expanduser()
     if path.suffix != ".toml":
         path = PLANS / f"{plan}.toml"
+    if not path.exists():
+        fix = "Give a TOML file, or one of " + ", ".join(plan_names()) + "."
+        raise MissingData(str(plan), "no such plan", fix)
     expected = "a plan (see p2p_lib/benchmark/plan.py)"
-    content = read_toml(path, expected, "Give a TOML file, or one of " + ", ".join(plan_names()) + ".")
+    content = read_toml(path, expected)
     try:
         return Plan.model_validate({"name": path.stem, **content})
     except ValidationError as error:

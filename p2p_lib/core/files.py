@@ -29,8 +29,9 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput, MissingData
 
-#: Bytes of any file; of JSON and tables; of TOML, whose reader takes the square of a key's length; of a pickle.
-LARGEST_FILE, LARGEST_TEXT, LARGEST_TOML, LARGEST_PICKLE = 1 << 28, 1 << 26, 1 << 16, 1 << 22
+#: Bytes of any file; of JSON and tables; of a pickle; of TOML and its lines, the square of which its reader takes.
+LARGEST_FILE, LARGEST_TEXT, LARGEST_PICKLE = 1 << 28, 1 << 26, 1 << 22
+LARGEST_TOML, LONGEST_TOML_LINE = 1 << 16, 1 << 10
 #: Pixels of an image: more than 8K video.
 LARGEST_IMAGE_PX = 1 << 25
 #: Bytes of the arrays of an ``.npz`` file; values of a pickle, counted as often as they are meant, 64 bytes as one.
@@ -39,7 +40,7 @@ LARGEST_ARRAYS, MOST_VALUES = 1 << 30, 1 << 18
 UNPACKED_RATIO, UNPACKED_BYTES = 100, 1 << 26
 #: What parsers raise at bytes that nobody expected.
 UNREADABLE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, EOFError, OSError, MemoryError)
-UNREADABLE += (RuntimeError, SyntaxError, struct.error, tokenize.TokenError, csv.Error, pickle.PickleError)
+UNREADABLE += (RuntimeError, SyntaxError, NameError, struct.error, tokenize.TokenError, csv.Error, pickle.PickleError)
 UNREADABLE += (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError)
 
 _NAME = re.compile(r"\w[\w .+-]{0,99}")
@@ -82,9 +83,12 @@ def parse_json(text: str | bytes, name: str, expected: str) -> Any:
 
 def read_toml(path: Path, expected: str, fix: str = "") -> dict[str, Any]:
     """The tables of a TOML file; raises as :func:`read_bytes`, and :class:`BadInput` for what is no TOML."""
+    data = read_bytes(path, expected, LARGEST_TOML, fix)
+    if (longest := max(map(len, data.splitlines()), default=0)) > LONGEST_TOML_LINE:
+        raise BadInput(str(path), f"a line of {longest} bytes", f"{expected}, in lines of at most {LONGEST_TOML_LINE}")
     try:
-        return tomllib.loads(read_bytes(path, expected, LARGEST_TOML, fix).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return tomllib.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
         raise BadInput(str(path), f"unreadable TOML ({error})", expected) from None
 
 

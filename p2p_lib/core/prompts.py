@@ -14,6 +14,9 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame
 
+#: Clicks of one kind on an object in a frame.
+MOST_CLICKS = 1000
+
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
@@ -134,6 +137,8 @@ def _pixels(what: str, given: Any) -> np.ndarray:
         at = np.array(given, float)
     except (TypeError, ValueError):
         at = np.zeros((1, 1))
+    if len(at) > MOST_CLICKS:
+        raise BadInput(what, f"{len(at)} of them", f"at most {MOST_CLICKS}", "Give a mask.")
     if at.size and (at.ndim != 2 or at.shape[1] != 2 or not np.isfinite(at).all()):
         raise BadInput(what, repr(given)[:60], "at least one [x, y] in pixels")
     return at.reshape(-1, 2)

@@ -12,13 +12,17 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 
+#: No depth camera measures nearer or farther.
+NEAREST_M, FARTHEST_M = 0.001, 100.0
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One RGB-D image.
 
     rgb      (H, W, 3) uint8, red first
-    depth_m  (H, W) float32, metres along the optical axis, registered to rgb; 0 = no measurement
+    depth_m  (H, W) float32, metres along the optical axis, registered to rgb; 0 = no measurement, which NaN
+             and any reading outside :data:`NEAREST_M` to :data:`FARTHEST_M` become
     time_s   seconds, increasing within a sequence
     T_world_cam  (4, 4) pose of the camera in a static world, where somebody knows it (a robot, SLAM)
     """
@@ -43,9 +47,10 @@ class Frame:
             raise BadInput(f"frame {self.index} time_s", self.time_s, "a finite time in seconds")
         if self.T_world_cam is not None:
             object.__setattr__(self, "T_world_cam", se3.check(f"frame {self.index} T_world_cam", self.T_world_cam))
-        # A sensor's NaN, infinity and negative readings all mean "no measurement", which is 0 here.
-        clean = depth.astype(np.float32, copy=False)
-        bad = ~((clean >= 0) & (clean < np.inf))
+        # A sensor's NaN, infinity, negative and impossible readings all mean "no measurement", which is 0 here.
+        with np.errstate(over="ignore"):
+            clean = depth.astype(np.float32, copy=False)
+        bad = ~((clean == 0) | (clean >= NEAREST_M) & (clean <= FARTHEST_M))
         object.__setattr__(self, "depth_m", np.where(bad, np.float32(0), clean) if bad.any() else clean)
 
     @property

@@ -5,6 +5,7 @@ Links, devices, absolute paths, ``..`` and passwords are refused before the memb
 
 from __future__ import annotations
 
+import errno
 import shutil
 import stat
 import tarfile
@@ -58,7 +59,7 @@ def unpack(archive: str | Path, folder: str | Path, progress: Callable[[int], ob
     except BadInput:
         raise
     except UNREADABLE as error:
-        if isinstance(error, OSError) and error.errno is not None:  # the disk's, not the archive's
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):  # the disk's, not the archive's
             raise
         reason = " ".join(str(error).split())[:100]
         fix = "Fetch it again: p2p data fetch replaces an archive whose checksum is wrong."

@@ -60,7 +60,7 @@ def read_meta(path: Path) -> dict:
     meta = load_plain(path)
     if not isinstance(meta, dict):
         raise BadInput(str(path), f"a {type(meta).__name__}", "a dict with camMat, objTrans, objRot")
-    K = meta["camMat"]
+    K = meta.get("camMat")
     if not isinstance(K, np.ndarray) or K.shape != (3, 3) or K.dtype.kind not in "fiu":
         raise BadInput(f"{path}: camMat", f"{type(K).__name__} {np.shape(K)}", "an array of 3x3 numbers")
     return meta

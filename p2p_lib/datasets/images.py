@@ -122,13 +122,17 @@ def read_image(path: Path, flags: int, expected: str) -> np.ndarray:
 
 def _size(data: bytes) -> tuple[int, int]:
     """Width and height as the header of an image says, before any memory is given to its pixels."""
-    from PIL import BmpImagePlugin, JpegImagePlugin, TiffImagePlugin
+    from PIL import BmpImagePlugin, JpegImagePlugin
 
     if data[:4] in (b"II*\0", b"MM\0*"):  # of TIFF, OpenCV reads more kinds than Pillow
-        header, stream = TiffImagePlugin.ImageFileDirectory_v2(data[:8]), BytesIO(data)
-        stream.seek(header.next)
-        header.load(stream)
-        return int(header[256]), int(header[257])
+        order = "<" if data[:1] == b"I" else ">"
+        (at,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, at)
+        tags = {}
+        for entry in range(at + 2, at + 2 + 12 * count, 12):
+            tag, kind = struct.unpack_from(f"{order}HH", data, entry)
+            (tags[tag],) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, entry + 8)
+        return tags[256], tags[257]
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return struct.unpack(">II", data[16:24])
     kind = BmpImagePlugin.BmpImageFile if data[:2] == b"BM" else JpegImagePlugin.JpegImageFile

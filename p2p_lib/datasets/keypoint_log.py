@@ -34,6 +34,13 @@ class ObjectKeypoints:
     track_id: np.ndarray
     uv_px: np.ndarray
 
+    def __post_init__(self) -> None:
+        n, m = len(self.ids), len(self.frame_index)
+        of_map = {"ids": (n,), "p_obj": (n, 3), "promoted": (n,)}
+        for key, shape in (of_map | {"frame_index": (m,), "track_id": (m,), "uv_px": (m, 2)}).items():
+            if (got := getattr(self, key)).shape != shape or got.dtype.kind not in "iufb":
+                raise BadInput(f"keypoints: {key}", f"shape {got.shape} {got.dtype}", f"numbers {shape}")
+
     def at(self, frame: int) -> slice:
         """The rows of observations of one frame."""
         return slice(*np.searchsorted(self.frame_index, [frame, frame + 1]))
@@ -70,5 +77,5 @@ def load_keypoints(folder: str | Path) -> dict[str, ObjectKeypoints]:
     names = dict.fromkeys(key.rsplit("/", 1)[0] for key in arrays)
     try:
         return {n: ObjectKeypoints(*(arrays[f"{n}/{f.name}"] for f in fields(ObjectKeypoints))) for n in names}
-    except KeyError as error:
+    except (KeyError, TypeError) as error:
         raise BadInput(str(path), f"an archive without {error}", "arrays as p2p run wrote them") from None

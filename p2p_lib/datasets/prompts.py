@@ -8,6 +8,7 @@ not the object). An object's first entry starts it, those of later frames correc
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from p2p_lib.datasets.images import read_image, save_png
 from p2p_lib.datasets.sequence import Sequence
 
 _FORM = '{"objects": [{"name": "mug", "frame": 0, "points": [[x, y], ...]}]}'
+_MOST = 2000
 _KEYS = {"name", "frame", "points", "negative", "box", "mask"}
 #: Clicks that are drawn from a mask lie within this share of its inscribed circle.
 _WELL_INSIDE = 0.6
@@ -54,10 +56,14 @@ def parse_prompts(content: object, folder: Path | None = None) -> tuple[Prompt, 
     objects = content.get("objects") if isinstance(content, dict) else None
     if not isinstance(objects, list) or not objects:
         raise BadInput("prompts", str(content)[:60], _FORM)
+    if len(objects) > _MOST:
+        raise BadInput("prompts", f"{len(objects)} entries", f"at most {_MOST}")
     prompts = [_prompt(given, folder) for given in objects]
-    said = [(p.name, p.frame) for p in prompts]
-    if twice := [f"{name!r} in frame {frame}" for name, frame in said if said.count((name, frame)) > 1]:
-        raise BadInput("prompts", f"{twice[0]} twice", "one entry per object and frame, with all its points")
+    (name, frame), count = Counter((p.name, p.frame) for p in prompts).most_common(1)[0]
+    if count > 1:
+        raise BadInput(
+            "prompts", f"{name!r} in frame {frame} twice", "one entry per object and frame, with all its points"
+        )
     return tuple(prompts)
 
 

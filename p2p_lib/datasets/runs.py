@@ -66,6 +66,8 @@ class ObjectRun:
 
     def __post_init__(self) -> None:
         of_a_frame = {"T_cam_obj": (4, 4), "covariance": (6, 6), "T_cam_model": (4, 4)}
+        if self.frame_index.ndim != 1:
+            raise BadInput("run: frame_index", f"shape {self.frame_index.shape}", "one number for each frame")
         for column in COLUMNS:
             got, expected = getattr(self, column).shape, (len(self), *of_a_frame.get(column, ()))
             if got != expected:

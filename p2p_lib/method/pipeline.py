@@ -134,11 +134,11 @@ class Point2Pose:
         if name in self.segmenter.names:
             self.segmenter.remove(name)
 
-    def step(self, frame: Frame, masks: Mapping[str, np.ndarray] | None = None) -> dict[str, PoseEstimate]:
+    def step(self, frame: Frame, masks: Mapping[str, np.ndarray | None] | None = None) -> dict[str, PoseEstimate]:
         """One frame in, one estimate per object out.
 
         masks  object -> (H, W) bool, its visible pixels, which are taken as they are; an empty mask says that it is
-               hidden. The segmenter looks after the objects that are left out.
+               hidden. The segmenter looks after the objects that are left out, or whose mask is None.
 
         Where the 2D tracker answers late, so does this: the estimates are of the frame ``latency_frames`` ago,
         as each says, and there are none for the first of the stream until then. ``self.masks`` keeps the masks
@@ -233,7 +233,7 @@ class Point2Pose:
             if len(dropped):
                 self.tracker.drop(dropped)
 
-    def _given(self, frame: Frame, masks: Mapping[str, np.ndarray]) -> Masks:
+    def _given(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> Masks:
         """Every object's checked mask in this frame; None for one that the segmenter has to find."""
         if frame.shape != (self.camera.height, self.camera.width):
             got = f"{frame.shape[1]}x{frame.shape[0]}"
@@ -241,7 +241,7 @@ class Point2Pose:
         if unknown := sorted(set(masks) - set(self.objects)):
             known = ", ".join(self.objects) or "none yet"
             raise BadInput("masks", f"unknown object {unknown[0]!r}", f"objects added before: {known}")
-        given = {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items()}
+        given = {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items() if mask is not None}
         for name, prompt in given.items():
             check_mask(name, prompt.mask, self.camera)
         for name, prompt in given.items():

@@ -70,7 +70,7 @@ def one(name="cup", frame=0, points=((40, 30), [50, 20])) -> dict:
 
 def test_a_whole_visit(sequence, out):
     with Clicker(sequence, out, frame=1) as clicker:
-        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", clicker.url)
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{22}/", clicker.url)
         status, page, kind = get(clicker.url)
         assert (status, kind) == (200, "text/html") and b"<canvas" in page
         status, answer, kind = get(clicker.url + "session")
@@ -130,12 +130,51 @@ def test_nothing_else_is_served(sequence, out):
             assert get(clicker.url + path)[0] == 404
         assert post(clicker.url, {"objects": [one()]}, kind="text/plain")[0] == 404
         at = http.client.HTTPConnection(clicker.url.split("/")[2], timeout=20)
-        at.putrequest("POST", "/prompts")
+        at.putrequest("POST", f"/{clicker.token}/prompts")
         at.putheader("Content-Type", "application/json")
         at.putheader("Content-Length", str(1 << 40))  # it answers without waiting for all that
         at.endheaders()
         assert at.getresponse().status == 413
         assert not out.exists()
+
+
+FOREIGN = {
+    "a name that leads here": ({"Host": "evil.example:{port}"}, 403),
+    "another page": ({"Origin": "http://evil.example"}, 403),
+    "another program of this machine": ({"Origin": "http://127.0.0.1:1"}, 403),
+    "a page of nowhere": ({"Origin": "null"}, 403),
+    "its own page": ({"Origin": "http://127.0.0.1:{port}"}, 200),
+    "through a tunnel": ({"Host": "localhost:9000", "Origin": "http://localhost:9000"}, 200),
+}
+
+
+@pytest.mark.parametrize("who", FOREIGN)
+def test_only_the_page_itself_is_answered(who, sequence, out):
+    given, status = FOREIGN[who]
+    with Clicker(sequence, out) as clicker:
+        headers = {key: value.format(port=clicker.url.split("/")[2].partition(":")[2]) for key, value in given.items()}
+        assert ask(urllib.request.Request(clicker.url + "session", headers=headers))[0] == status
+        body = json.dumps({"objects": [one()]}).encode()
+        headers["Content-Type"] = "application/json"
+        assert ask(urllib.request.Request(clicker.url + "prompts", body, headers))[0] == status
+        assert out.exists() == (status == 200)
+
+
+def test_who_does_not_know_the_address_gets_nothing(sequence, out):
+    with Clicker(sequence, out) as clicker, Clicker(sequence, out) as other:
+        root = clicker.url.removesuffix(f"{clicker.token}/")
+        for place in (
+            "",
+            "session",
+            "frame/0",
+            f"{other.token}/session",
+            f"{clicker.token[:-1]}/session",
+            clicker.token,
+        ):
+            assert get(root + place)[0] == 404
+        assert post(root, {"objects": [one()]})[0] == 404 and not out.exists()
+        assert post(clicker.url, b"[" * 100_000)[0] == 400  # nested too deep
+        assert get(clicker.url)[0] == 200
 
 
 def test_the_notebook_shows_the_page(sequence, out):
@@ -147,7 +186,7 @@ def test_refusals_at_the_start(sequence, out):
     with pytest.raises(BadInput, match="frame: got 3, expected a number from 0 to 2"):
         Clicker(sequence, out, frame=3)
     with Clicker(sequence, out) as clicker:
-        port = int(clicker.url.rstrip("/").rpartition(":")[2])
+        port = int(clicker.url.split("/")[2].partition(":")[2])
         with pytest.raises(BadInput, match=f"port: got {port}, expected a free port"):
             Clicker(sequence, out, port=port)
     out.parent.mkdir()

@@ -24,7 +24,7 @@ def test_frame_keeps_good_pictures_as_they_are():
     assert frame.rgb is RGB and frame.depth_m is DEPTH and frame.shape == (4, 6)
 
 
-@pytest.mark.parametrize("reading", [np.nan, np.inf, -np.inf, -0.3, -1e-9])
+@pytest.mark.parametrize("reading", [np.nan, np.inf, -np.inf, -0.3, -1e-9, 1e15, 1e300, 1e-30])
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_readings_that_are_none_become_zero(reading, dtype):
     depth = DEPTH.astype(dtype)

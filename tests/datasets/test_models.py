@@ -71,7 +71,7 @@ def test_faults_name_the_model(tmp_path, name, text, expected):
 
 
 def test_a_model_that_is_not_there(tmp_path):
-    with pytest.raises(MissingData, match=r"none\.obj: no such model file"):
+    with pytest.raises(MissingData, match=r"none\.obj: no such file, expected a model"):
         load_points(tmp_path / "none.obj")
 
 

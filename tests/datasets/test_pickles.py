@@ -134,5 +134,5 @@ def test_damaged_files_never_raise_anything_else(tmp_path):
 
 
 def test_a_missing_file_says_so(tmp_path):
-    with pytest.raises(MissingData, match=r"none\.pkl: cannot be read"):
+    with pytest.raises(MissingData, match=r"none\.pkl: no such file, expected a pickle"):
         load_plain(tmp_path / "none.pkl")

@@ -535,6 +535,27 @@ def test_masks_of_numbers_count_where_they_are_above_zero():
     assert_same(track(frames), track(film()[:8]))
 
 
+def test_a_mask_of_none_is_one_left_out():
+    """As the pipeline's own ``masks`` say it of an object of which nobody knows."""
+    frames = film()[:6]
+    with_none = [(f, m if k < 3 else {"left": m["left"], "right": None}) for k, (f, m) in enumerate(frames)]
+    left_out = [(f, m if k < 3 else {"left": m["left"]}) for k, (f, m) in enumerate(frames)]
+    assert_same(track(with_none), track(left_out))
+
+
+@pytest.mark.parametrize("depth_m", [1e15, 1e-30, np.nan])
+def test_impossible_depth_is_none(depth_m):
+    """A third of the readings wild: poses are those without the readings."""
+    rng, frames = np.random.default_rng(0), film()[:8]
+    holes = [rng.random(f.shape) < 0.3 * (k > 3) for k, (f, _) in enumerate(frames)]
+
+    def given(value: float) -> list[dict[str, PoseEstimate]]:
+        made = [replace(f, depth_m=np.where(h, np.float32(value), f.depth_m)) for (f, _), h in zip(frames, holes)]
+        return track([(f, m) for f, (_, m) in zip(made, frames)])
+
+    assert_same(given(depth_m), given(0.0))
+
+
 def test_time_is_told_stage_by_stage():
     method = Point2Pose(CAMERA, preset())
     method.add_object("left")
