@@ -7,13 +7,20 @@ Masks are those of a plain folder; there is no truth.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.schema import read_json
+
+
+class _Intrinsic(BaseModel):
+    intrinsic_matrix: Annotated[list[float], Field(min_length=9, max_length=9)]
+
 
 INTRINSICS = ("camera_intrinsic.json", "intrinsic.json")
 
@@ -24,10 +31,8 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     path = next((folder / name for name in INTRINSICS if (folder / name).is_file()), None)
     if path is None:
         raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}", "Open3D's recorder writes it beside color/.")
-    found = read_json(path, dict, "a pinhole camera as Open3D writes it")
     # It is written column by column.
-    K = np.array(found.get("intrinsic_matrix", ()), float)
-    K = K.reshape(3, 3).T if K.size == 9 else K
+    K = np.array(read_json(path, _Intrinsic, "a pinhole camera as Open3D writes it").intrinsic_matrix).reshape(3, 3).T
     files = ImageFiles(folder, rgb, depth, camera_for(rgb[0], K, str(path)), images.frame_times(folder, rgb))
     masks_found, _ = files.find_masks(masks, [] if masks else [folder / "masks"], some_frames=True)
     objects = tuple(masks_found.files) if masks_found else ("object",)

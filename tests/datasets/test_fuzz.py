@@ -98,6 +98,15 @@ def home(tmp_path_factory):
     pose = {"obj_id": 1, "cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_m2c": [0, 0, 500.0]}
     (scene / "scene_gt.json").write_text(json.dumps({"0": [pose]}))
     (scene / "scene_gt_info.json").write_text('{"0": [{"px_count_visib": 5}]}')
+    intrinsic = {"width": 16, "height": 12, "intrinsic_matrix": [60, 0, 0, 0, 60, 0, 8, 6, 1]}
+    for name in ("recorded/color", "recorded/depth"):
+        shutil.copytree(scene / name[9:].replace("color", "rgb"), home / name)
+    (home / "recorded" / "intrinsic.json").write_text(json.dumps(intrinsic))
+    shutil.copytree(scene / "rgb", home / "rgbd_freiburg1" / "rgb")
+    shutil.copytree(scene / "depth", home / "rgbd_freiburg1" / "depth")
+    for name in ("rgb", "depth"):
+        (home / "rgbd_freiburg1" / f"{name}.txt").write_text(f"# {name}\n1305031453.35 {name}/000000.png\n")
+    np.save(home / "d.npy", depth)
     save_outcome(home, Outcome(key="k", status="done"))
     (home / "tiny.json").write_text('{"kind": "dataset", "name": "tiny", "title": "t", "version": "1"}')
     return home
@@ -124,6 +133,9 @@ def slide(home):
 READERS = {
     **{name: lambda home, name=name: images.read_rgb(home / name) for name in ("a.png", "a.jpg", "a.bmp", "a.tif")},
     **{name: lambda home, name=name: images.read_raw_depth(home / name) for name in ("d.png", "d.tif")},
+    "d.npy": lambda home: images.read_raw_depth(home / "d.npy"),
+    "recorded/intrinsic.json": lambda home: open_sequence(home / "recorded", "open3d").frame(0),
+    "rgbd_freiburg1/rgb.txt": lambda home: open_sequence(home / "rgbd_freiburg1", "tum").frame(0),
     "m.png": lambda home: read_labels(home / "m.png", (12, 16)),
     "K.txt": lambda home: images.read_numbers(home / "K.txt", "numbers"),
     "meta.pkl": lambda home: read_pose(home / "meta.pkl", read_meta(home / "meta.pkl"), slide(home).camera),
