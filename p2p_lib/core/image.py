@@ -18,7 +18,8 @@ def in_image(uv_px: np.ndarray, shape: tuple[int, int], margin_px: float = 0.0) 
 
 def nearest_px(uv_px: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Columns u and rows v (...,) int of the nearest pixels that an image of shape (H, W) has; (0, 0) for NaN."""
-    px = np.clip(np.rint(np.nan_to_num(uv_px)), 0, np.array(shape[::-1]) - 1).astype(int)
+    # fmax passes NaN over, where clip would keep it.
+    px = np.minimum(np.fmax(np.rint(uv_px), 0), (shape[1] - 1, shape[0] - 1)).astype(int)
     return px[..., 0], px[..., 1]
 
 
@@ -30,7 +31,7 @@ def in_mask(uv_px: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def bounds(mask: np.ndarray, margin_px: int = 0) -> tuple[slice, slice]:
     """Rows and columns of a mask's (H, W) bounding box with a margin around it, cut to the image."""
-    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    left, top, width, height = cv2.boundingRect(np.ascontiguousarray(mask, bool).view(np.uint8))
     spans = ((top, height, mask.shape[0]), (left, width, mask.shape[1]))
     rows, columns = (slice(max(at - margin_px, 0), min(at + size + margin_px, end)) for at, size, end in spans)
     return rows, columns

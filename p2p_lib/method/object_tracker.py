@@ -98,14 +98,14 @@ class ObjectTracker:
 
     def seen_anew(self, obs: Observation, tracks: Tracks) -> Observation:
         """The observation again, with tracks that have been added to."""
-        return self.observer.observe(obs.frame, obs.mask, tracks.select(self.map.ids), obs.sighted)
+        return self.observer.with_tracks(obs, tracks.select(self.map.ids))
 
     def step(self, obs: Observation) -> ObjectStep:
         """The object's pose at a frame. The paper selects a hypothesis and refines that one; ours refines all first."""
         if self.model.empty:
             return self._initialise(obs)
         if self._hidden(obs.mask):
-            return self._without_pose(obs, Status.OCCLUDED, f"{int(obs.mask.sum())} mask pixels")
+            return self._without_pose(obs, Status.OCCLUDED, f"{np.count_nonzero(obs.mask)} mask pixels")
         candidates = [Candidate(hypothesis) for hypothesis in self._register(obs)]
         if self.config.selection.rule == "support":
             candidates = self._look_again(obs, self._refine(obs, candidates))
@@ -262,7 +262,7 @@ class ObjectTracker:
     def _initialise(self, obs: Observation) -> ObjectStep:
         """The first frame: fix the object frame and start the map with the first points."""
         cfg, before = self.config, self.life.start_px
-        pixels = None if obs.mask is None else int(obs.mask.sum())
+        pixels = None if obs.mask is None else np.count_nonzero(obs.mask)
         self.life = replace(self.life, start_px=pixels)
         if pixels is None or self._hidden(obs.mask):
             return self._without_pose(obs, Status.INITIALISING, "not seen yet")
@@ -289,7 +289,7 @@ class ObjectTracker:
 
     def _hidden(self, mask: np.ndarray | None) -> bool:
         """Whether a mask says that nothing of the object is to be seen."""
-        return mask is not None and mask.sum() < self.config.lifecycle.min_mask_px
+        return mask is not None and np.count_nonzero(mask) < self.config.lifecycle.min_mask_px
 
     def _estimate(
         self, obs: Observation, verdict: Verdict, support: int, sure: float, covariance: np.ndarray, keyframe: bool

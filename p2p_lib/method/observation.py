@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import depth_noise_m, in_range, lift, off_edges
-from p2p_lib.core.image import in_mask
+from p2p_lib.core.image import bounds, in_mask
 from p2p_lib.core.types import Frame, Tracks
 
 #: Depth this near the mask's border mixes the object with what is behind it.
@@ -66,13 +66,21 @@ class Observer:
         self, frame: Frame, mask: np.ndarray | None, tracks: Tracks, sighted: np.ndarray | None = None
     ) -> Observation:
         """The observation of an object whose points have these ``tracks``."""
-        p_cam, cloud = np.full((len(tracks), 3), np.nan), np.zeros((0, 3))
-        rows = np.flatnonzero(tracks.visible)
+        cloud = np.zeros((0, 3))
+        if mask is not None:
+            cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
+        return Observation(frame, mask, tracks, self._lifted(frame, mask, tracks), cloud, sighted)
+
+    def with_tracks(self, obs: Observation, tracks: Tracks) -> Observation:
+        """The observation with these tracks of the object's points instead of its own."""
+        return replace(obs, tracks=tracks, p_cam=self._lifted(obs.frame, obs.mask, tracks))
+
+    def _lifted(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> np.ndarray:
+        p_cam, rows = np.full((len(tracks), 3), np.nan), np.flatnonzero(tracks.visible)
         if mask is not None:
             rows = rows[in_mask(tracks.uv_px[rows], mask)]
-            cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
         p_cam[rows] = self.lift(frame, tracks.uv_px[rows])
-        return Observation(frame, mask, tracks, p_cam, cloud, sighted)
+        return p_cam
 
     def lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
         """(N, 3) points behind pixels (N, 2); NaN where there is no trustworthy depth."""
@@ -109,11 +117,10 @@ def sample_cloud(depth_m: np.ndarray, mask: np.ndarray, camera: Camera, max_poin
     Leaves out a border inside the mask, and pixels whose 3x3 neighbourhood holds an invalid depth or a step: both mix
     two surfaces. Deterministic, spread over the whole mask. Empty where nothing is left.
     """
-    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if len(rows) == 0 or max_points < 1:
+    cut = bounds(mask, 1)
+    top, left = cut[0].start, cut[1].start
+    if max_points < 1 or not mask[cut].any():
         return np.zeros((0, 3))
-    top, left = max(rows[0] - 1, 0), max(cols[0] - 1, 0)
-    cut = np.s_[top : rows[-1] + 2, left : cols[-1] + 2]
     inside, depth = np.ascontiguousarray(mask[cut]).astype(np.uint8), np.ascontiguousarray(depth_m[cut], np.float32)
     kernel = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
     inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
