@@ -12,20 +12,23 @@ from dataclasses import dataclass, fields
 import cv2
 import numpy as np
 
+from p2p_lib.core.compiled import compiled
 from p2p_lib.core.types import Rows
 
 #: Half a patch's side in pixels, and the standard deviation of the window's weight.
 RADIUS, WINDOW_PX = 7, 5.0
 _SIDE = 2 * RADIUS + 1
 _Y, _X = (a.ravel().astype(np.float32) for a in np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1])
-_GRID = np.stack([_X, _Y])  # (2, P)
 _WEIGHT = np.exp(-0.5 * (_X**2 + _Y**2) / WINDOW_PX**2).astype(np.float32)
-_ROOT = np.sqrt(_WEIGHT / _WEIGHT.sum())
+_SQUARE = _WEIGHT / _WEIGHT.sum()
+_ROOT = np.sqrt(_SQUARE)
 # Shading of a round object stays in place in the image while its texture moves: patches are invariant to slopes.
 _RAMPS = np.stack([_X, _Y]) * _ROOT
 _RAMPS /= np.linalg.norm(_RAMPS, axis=1, keepdims=True)
 #: Effective number of independent samples in a patch: neighbouring pixels share their noise.
 _SAMPLES = 10.0
+#: A step (px, and of the affine part) that is smaller ends an alignment.
+_SETTLED = 0.005
 #: Ratio of areas beyond which an alignment has diverged.
 _MAX_AREA_CHANGE = 5.0
 #: Damping of an affine and of a translational step, in units of the normalised patch.
@@ -101,25 +104,64 @@ def align(image: np.ndarray, patches: Patches, uv_px: np.ndarray, A: np.ndarray,
     uv, A = uv_px.astype(np.float32), A.astype(np.float32)
     height, width = image.shape
     start, identity = uv.copy(), np.eye(2, dtype=np.float32)
-    for _ in range(iterations):
-        seen, _ = _normalised(_sample(image, uv, A @ _GRID))
-        step = (patches.solver @ (seen - patches.pixels)[..., None])[..., 0]
-        # The linearisation holds for a few pixels and a few tenths of scale.
-        shift = np.linalg.norm(step[:, :2], axis=1, keepdims=True)
-        step[:, :2] *= np.minimum(1, 3 / np.maximum(shift, 1e-6))
-        D = np.clip(step[:, 2:], -0.25, 0.25).reshape(-1, 2, 2)
-        A = A @ _inverse(identity + D)
-        uv = uv - (A @ step[:, :2, None])[..., 0]
-    pixels, contrast = _normalised(_sample(image, uv, A @ _GRID))
-    ncc = np.einsum("np,np->n", pixels, patches.pixels)
+    ncc, contrast = _aligned(image, patches.pixels, patches.solver, uv, A, iterations)
     inside = (uv >= 0).all(1) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1)
-    area = np.abs(np.linalg.det(A))
+    area = np.abs(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])
     found = inside & np.isfinite(A).all((1, 2)) & (area > 1 / _MAX_AREA_CHANGE) & (area < _MAX_AREA_CHANGE)
     uv, A = np.where(found[:, None], uv, start), np.where(found[:, None, None], A, identity)
     ncc = np.where(found, ncc, -1.0)
     variance = 2 * np.maximum(1 - ncc, 0.01) / _SAMPLES
     cov = A @ (variance[:, None, None] * patches.unit_cov) @ A.transpose(0, 2, 1)
     return Alignment(uv, A, ncc, cov, contrast / patches.contrast)
+
+
+@compiled
+def _aligned(image, pixels, solver, uv, A, iterations):
+    """Moves uv (N, 2) and A (N, 2, 2) to where the patches are; their correlation and contrast (N,) there."""
+    right, bottom, one = np.float32(image.shape[1] - 1), np.float32(image.shape[0] - 1), np.float32(1)
+    ncc, contrast, seen, step = np.zeros(len(uv)), np.zeros(len(uv)), np.zeros(pixels.shape[1], np.float32), np.ones(6)
+    for n in range(len(uv)):
+        step[:] = 1.0
+        for turn in range(iterations + 1):
+            mean, slope_x, slope_y, squared = 0.0, 0.0, 0.0, 0.0
+            (m00, m01), (m10, m11), (u, v) = A[n, 0], A[n, 1], uv[n]
+            for p in range(len(seen)):
+                # The border is repeated; NaN lands on it as well.
+                x = min(max(np.float32(0), u + m00 * _X[p] + m01 * _Y[p]), right)
+                y = min(max(np.float32(0), v + m10 * _X[p] + m11 * _Y[p]), bottom)
+                i, j = min(np.int32(x), image.shape[1] - 2), min(np.int32(y), image.shape[0] - 2)
+                a, b = x - np.float32(i), y - np.float32(j)
+                upper = image[j, i] * (one - a) + image[j, i + 1] * a
+                lower = image[j + 1, i] * (one - a) + image[j + 1, i + 1] * a
+                seen[p] = upper * (one - b) + lower * b
+                mean += seen[p] * _SQUARE[p]
+            mean = np.float32(mean)
+            for p in range(len(seen)):
+                seen[p] = (seen[p] - mean) * _ROOT[p]
+                slope_x += seen[p] * _RAMPS[0, p]
+                slope_y += seen[p] * _RAMPS[1, p]
+            slope_x, slope_y = np.float32(slope_x), np.float32(slope_y)
+            for p in range(len(seen)):
+                seen[p] -= slope_x * _RAMPS[0, p] + slope_y * _RAMPS[1, p]
+                squared += seen[p] * seen[p]
+            contrast[n] = np.sqrt(max(squared, 1.0))
+            seen *= np.float32(1 / contrast[n])
+            if turn == iterations or np.abs(step).max() < _SETTLED:
+                ncc[n] = np.dot(seen, pixels[n])
+                break
+            step[:] = np.dot(solver[n], seen - pixels[n])
+            # The linearisation holds for a few pixels and a few tenths of scale.
+            step[:2] *= min(1.0, 3.0 / max(np.sqrt(step[0] ** 2 + step[1] ** 2), 1e-6))
+            for k in range(2, 6):
+                step[k] = min(max(step[k], -0.25), 0.25)
+            # A times the inverse of identity + D.
+            d00, d01, d10, d11 = 1 + step[2], step[3], step[4], 1 + step[5]
+            area = d00 * d11 - d01 * d10
+            for row in range(2):
+                e, f = A[n, row]
+                A[n, row, 0], A[n, row, 1] = (e * d11 - f * d10) / area, (f * d00 - e * d01) / area
+                uv[n, row] -= A[n, row, 0] * step[0] + A[n, row, 1] * step[1]
+    return ncc, contrast
 
 
 def _sample(image: np.ndarray, uv: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -133,18 +175,8 @@ def _sample(image: np.ndarray, uv: np.ndarray, offsets: np.ndarray) -> np.ndarra
 
 def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weighted, without mean and slope, unit length; and the standard deviation (N,) before."""
-    mean = raw @ (_ROOT**2)
+    mean = raw @ _SQUARE
     centred = (raw - mean[:, None]) * _ROOT
     centred -= (centred @ _RAMPS.T) @ _RAMPS
     norm = np.sqrt(np.maximum(np.einsum("np,np->n", centred, centred), 1.0))
     return centred / norm[:, None], norm
-
-
-def _inverse(A: np.ndarray) -> np.ndarray:
-    """Inverses of (N, 2, 2), in closed form: LAPACK's overhead exceeds the work."""
-    det = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
-    det = np.where(np.abs(det) < 1e-6, 1e-6, det)
-    out = np.empty_like(A)
-    out[:, 0, 0], out[:, 1, 1] = A[:, 1, 1], A[:, 0, 0]
-    out[:, 0, 1], out[:, 1, 0] = -A[:, 0, 1], -A[:, 1, 0]
-    return out / det[:, None, None]
