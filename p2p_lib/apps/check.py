@@ -25,7 +25,7 @@ from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.alignment import background_share, misfit
+from p2p_lib.datasets.alignment import background_share, misfit, scale_change
 from p2p_lib.datasets.prompts import prompts_by_frame
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.method.sampling import choose, usable_region
@@ -43,6 +43,8 @@ NEAREST_M, FARTHEST_M = 0.05, 20.0
 VIEW_DEG = (20.0, 130.0)
 #: Frames per second that cameras have, and a gap as a multiple of the usual interval.
 RATES_HZ, GAP = (0.5, 500.0), 10.0
+#: A change of all depth from image to image, as a fraction: 0.015 at most on good sequences.
+SCALE_CHANGE = 0.03
 #: Fraction of images that may equal the next one.
 REPEATED_SHARE = 0.3
 #: Fraction of a mask's rim that may lie on the background: 0.4 at most on good sequences.
@@ -105,7 +107,8 @@ def check_folder(
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     depth = _depth(frames)
     findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
-    findings += [_times(sequence), _repeated(frames, sequence), depth, _registered(frames)]
+    pairs = [(f, sequence.frame(f.index + 1)) for f in frames if f.index + 1 < len(sequence)]
+    findings += [_times(sequence), _repeated(pairs), depth, _scale(pairs), _registered(frames)]
     if depth.level is Level.WRONG:
         return findings  # nothing that follows would mean anything
     if not firsts:
@@ -190,9 +193,19 @@ def _times(sequence: Sequence) -> Finding:
     return Finding("times", Level.OK, text)
 
 
-def _repeated(frames: list[Frame], sequence: Sequence) -> Finding:
+def _scale(pairs: list[tuple[Frame, Frame]]) -> Finding:
+    """Whether depth has one unit throughout."""
+    changes = np.array([scale_change(*pair) for pair in pairs])
+    if (np.abs(changes) > SCALE_CHANGE).sum() < min(2, len(pairs)) or not len(pairs):
+        return Finding("scale", Level.OK, "depth has one scale throughout")
+    first, second = pairs[int(np.abs(changes).argmax())]
+    text = f"all depth changes by {100 * np.abs(changes).max():.0f} % from frame {first.index} to {second.index}"
+    fix = "Nothing rigid does that: take what a depth camera measured, in one unit, not scaled image by image."
+    return Finding("scale", Level.WRONG, text, fix)
+
+
+def _repeated(pairs: list[tuple[Frame, Frame]]) -> Finding:
     """Whether images are copies of the one before: a recorder that was faster than its camera."""
-    pairs = [(f, sequence.frame(f.index + 1)) for f in frames if f.index + 1 < len(sequence)]
     copies = [a.index for a, b in pairs if np.array_equal(a.rgb, b.rgb)]
     frozen = [a.index for a, b in pairs if a.depth_m.any() and np.array_equal(a.depth_m, b.depth_m)]
     if max(len(copies), len(frozen)) > REPEATED_SHARE * len(pairs):

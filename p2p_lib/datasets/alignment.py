@@ -122,3 +122,12 @@ def rim(mask: np.ndarray, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
+
+
+def scale_change(before: Frame, after: Frame) -> float:
+    """By what fraction all depth changes from an image to the next: the median over pixels that both measured.
+
+    A camera that moves changes what single pixels see, in both directions; 0 where nothing is measured in both.
+    """
+    both = (before.depth_m > 0) & (after.depth_m > 0)
+    return float(np.median(after.depth_m[both] / before.depth_m[both])) - 1 if both.any() else 0.0

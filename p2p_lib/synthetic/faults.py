@@ -43,10 +43,9 @@ def _read(path: Path) -> np.ndarray:
     return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
 
 
-def _in_metres(folder: Path) -> None:
-    for path in (folder / "depth").iterdir():
-        cv2.imwrite(str(path.with_suffix(".tif")), _read(path).astype(np.float32) / 1000)
-        path.unlink()
+def _scaled(depth: np.ndarray, _: list[np.ndarray]) -> np.ndarray:
+    factor = np.random.default_rng(int(depth.sum())).uniform(0.85, 1.15)  # another one in every image
+    return np.rint(depth * factor).astype(depth.dtype)
 
 
 def _repeated(folder: Path) -> None:
@@ -79,8 +78,8 @@ def _hidden(depth: np.ndarray, masks: list[np.ndarray]) -> np.ndarray:
 FAULTS: dict[str, Callable[[Path], None]] = {
     # Depth in millimetres that is taken for metres.
     "depth unit": lambda folder: (folder / "depth_scale.txt").write_text("1\n"),
-    # Depth stored as metres where millimetres are expected.
-    "depth in metres": _in_metres,
+    # Depth that is right up to a factor, another one in every image: that of a network for single images.
+    "a moving scale": _images("depth/*", _scaled),
     # Depth in tenths of a millimetre that is taken for millimetres.
     "ten times as far": _images("depth/*", lambda depth, _: depth * np.uint16(10)),
     # Depth as a D435's depth camera sees it: a wider view, and 15 mm beside the colour camera.

@@ -23,7 +23,7 @@ from p2p_lib.synthetic.faults import FAULTS, spoil
 #: What must be found: the level, a part of what is said, and a part of the remedy.
 EXPECTED = {
     "depth unit": ("depth", Level.WRONG, r"^\d{3} m in the middle", r"--depth-scale .* 0\.001 times the present"),
-    "depth in metres": ("depth", Level.WRONG, r"^0\.000\d+ m in the middle", r"--depth-scale .* 1000 times"),
+    "a moving scale": ("scale", Level.WRONG, r"all depth changes by \d+ % from frame \d to \d", "a depth camera"),
     "ten times as far": ("box: depth", Level.WRONG, r"6\.\d+ m away.*0\.1 to 2\.5 m count", "the depth scale is wrong"),
     "depth not registered": ("registration", Level.WRONG, r"0\.7\d times as large", "Register depth to colour"),
     "depth shifted": ("registration", Level.WRONG, r"shifted by \(\+1[6-9]|\(\+20, [+-]0\) px", "Register depth"),
