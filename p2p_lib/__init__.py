@@ -3,8 +3,10 @@
 Importing this package is fast: it loads neither torch nor open3d nor matplotlib.
 """
 
+import logging
 from importlib import import_module
 
+logging.getLogger("p2p_lib").addHandler(logging.NullHandler())  # whoever wants to read it says so
 __version__ = "0.1.0"
 
 _WHERE = {

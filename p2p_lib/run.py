@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from p2p_lib.core.config import Config
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, doubt
 from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets import sequence as sequences
+from p2p_lib.datasets.alignment import moving_scale
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, given_models
@@ -85,6 +86,7 @@ def run(
     """
     options = replace(options or RunOptions(), **changes)
     job = _prepare(sequence, options)
+    _doubt_scale(job)
     tracker = options.tracker
     if tracker == OracleTracker.name:  # which has to know the sequence
         tracker = OracleTracker(TrueScene.of(job.sequence, options.models), job.config.oracle, job.config.seed)
@@ -237,6 +239,14 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
             fix = "Leave --masks out to start from the prompts, or take the mask of that frame away."
             raise BadInput(f"prompt of {both[0]!r}", f"a mask in frame {i} too", "one of them", fix)
     return _Job(source, config, sequence, frames, objects, masks, by_frame)
+
+
+def _doubt_scale(job: _Job) -> None:
+    """Warn, before anything is tracked, where depth is not of one scale."""
+    looked_at = np.unique(np.linspace(job.frames[0], job.frames[-1] - 1, 8).astype(int)) if len(job.frames) > 1 else ()
+    pairs = [(job.sequence.frame(int(i)), job.sequence.frame(int(i) + 1)) for i in looked_at]
+    if text := moving_scale(pairs):
+        doubt("depth", text, f"Nothing rigid does that: is each image scaled by itself? See p2p check {job.source}")
 
 
 def _frame_range(count: int, start: int, stop: int | None) -> range:

@@ -25,7 +25,7 @@ from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.alignment import background_share, misfit, scale_change
+from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.prompts import prompts_by_frame
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.method.sampling import choose, usable_region
@@ -43,8 +43,6 @@ NEAREST_M, FARTHEST_M = 0.05, 20.0
 VIEW_DEG = (20.0, 130.0)
 #: Frames per second that cameras have, and a gap as a multiple of the usual interval.
 RATES_HZ, GAP = (0.5, 500.0), 10.0
-#: A change of all depth from image to image, as a fraction: 0.015 at most on good sequences.
-SCALE_CHANGE = 0.03
 #: Fraction of images that may equal the next one.
 REPEATED_SHARE = 0.3
 #: Fraction of a mask's rim that may lie on the background: 0.4 at most on good sequences.
@@ -195,13 +193,10 @@ def _times(sequence: Sequence) -> Finding:
 
 def _scale(pairs: list[tuple[Frame, Frame]]) -> Finding:
     """Whether depth has one unit throughout."""
-    changes = np.array([scale_change(*pair) for pair in pairs])
-    if (np.abs(changes) > SCALE_CHANGE).sum() < min(2, len(pairs)) or not len(pairs):
-        return Finding("scale", Level.OK, "depth has one scale throughout")
-    first, second = pairs[int(np.abs(changes).argmax())]
-    text = f"all depth changes by {100 * np.abs(changes).max():.0f} % from frame {first.index} to {second.index}"
-    fix = "Nothing rigid does that: take what a depth camera measured, in one unit, not scaled image by image."
-    return Finding("scale", Level.WRONG, text, fix)
+    if text := moving_scale(pairs):
+        fix = "Nothing rigid does that: take what a depth camera measured, in one unit, not scaled image by image."
+        return Finding("scale", Level.WRONG, text, fix)
+    return Finding("scale", Level.OK, "depth has one scale throughout")
 
 
 def _repeated(pairs: list[tuple[Frame, Frame]]) -> Finding:

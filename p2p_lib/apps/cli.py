@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import re
 import signal
@@ -33,6 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The matrices are small: more threads cost time, most of all where other programs run. Set it to override.
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     arguments = _parser().parse_args(argv)
+    if arguments.log:
+        logging.basicConfig(format="%(name)s %(levelname)s %(message)s")
+        logging.getLogger("p2p_lib").setLevel(arguments.log.upper())
     ended_by = [signal.SIGINT]
 
     def terminated(number: int, frame: object) -> None:
@@ -505,6 +509,32 @@ def _data_where(a: argparse.Namespace) -> None:
     print(where(a.dataset))
 
 
+@_command(
+    "config",
+    "list and explain the parameters, or how the presets differ",
+    _arg("--stage", metavar="STAGE", help="only this one: registration, tsdf, ..."),
+    _arg("--diff", action="store_true", help="only those in which the presets paper and default differ"),
+    _options("preset", "config_file", "settings"),
+    _JSON,
+)
+def _config(a: argparse.Namespace) -> None:
+    from p2p_lib.core import config as configuration
+
+    rows = configuration.parameters(RunOptions.of_arguments(a).config(), a.stage)
+    if a.diff:
+        paper = {key: left for key, (left, _) in configuration.diff().items()}
+        rows = [{"key": r["key"], "paper": paper[r["key"]], **r} for r in rows if r["key"] in paper]
+    if a.json:
+        print(json.dumps(rows))
+        return
+    for row in rows:
+        value = f"{row['value']} {row['unit']}".strip()
+        value += f" (paper: {row['paper']})" if a.diff else ""
+        print(f"{row['key']} = {value}\n    {row['meaning']} [{row['source']}]")
+    whose = "paper (its text), release (the authors' configuration) or ours"
+    print(f"In brackets, whose value the default is: {whose}. Change one with --set KEY=VALUE.")
+
+
 @_command("doctor", "check this installation and say how to mend it")
 def _doctor(a: argparse.Namespace) -> int:
     from p2p_lib.apps.doctor import format_checks, run_doctor
@@ -524,7 +554,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Start with: p2p run synthetic/crossing --out out/crossing",
     )
     parser.add_argument("--version", action="version", version=__version__)
-    parser.set_defaults(debug=False)
+    parser.set_defaults(debug=False, log=None)
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
     data = commands.add_parser("data", help="datasets and checkpoints: what they are, where, whether whole")
     actions = data.add_subparsers(metavar="ACTION", required=True, parser_class=_Parser)
@@ -534,6 +564,7 @@ def _parser() -> argparse.ArgumentParser:
         for argument in arguments:
             argument(command)
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        command.add_argument("--log", choices=("info", "debug"), help="say on standard error what becomes of objects")
         command.set_defaults(command=function, parser=command, name=name)
     return parser
 

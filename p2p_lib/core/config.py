@@ -382,6 +382,23 @@ class Config:
         return "\n".join(lines) + "\n"
 
 
+def parameters(config: Config, stage: str | None = None) -> list[dict[str, Any]]:
+    """Every parameter, or one stage's: ``key``, ``value`` in this configuration, ``unit``, ``source``, ``meaning``.
+
+    Raises :class:`BadInput` for an unknown stage.
+    """
+    if stage is not None and stage not in _STAGES:
+        near = difflib.get_close_matches(stage, _STAGES, n=1)
+        fix = f"Did you mean {near[0]}?" if near else ""
+        raise BadInput("stage", repr(stage), f"one of {', '.join(_STAGES)}", fix)
+    return [
+        {"key": f"{s}.{f.name}", "value": getattr(getattr(config, s), f.name)}
+        | {key: f.metadata[key] for key in ("unit", "source", "meaning")}
+        for s in ([stage] if stage else _STAGES)
+        for f in fields(getattr(config, s))
+    ]
+
+
 _STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.default))
 
 #: The paper's composition, with the release's values where the text is silent.

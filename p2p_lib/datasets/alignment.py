@@ -2,7 +2,7 @@
 
 Where an object ends, its colour usually ends too: edges of depth are laid over the edges of colour at every offset and
 at several sizes; depth that was registered to the colour camera fits best where it is. Along a mask's rim, depth must
-not fall off to what stands behind.
+not fall off to what stands behind. From image to image its scale must not move.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ _MIN_CONTRAST = 3.5
 _INSET_PX, _NEARBY_PX = 2, 12
 #: So much farther than that is background, plus a fraction of the range.
 _GAP_M, _GAP_SHARE = 0.03, 0.02
+
+#: A change of all depth from image to image, as a fraction: 0.015 at most on good sequences.
+_SCALE_CHANGE = 0.03
 
 
 @dataclass(frozen=True)
@@ -124,10 +127,17 @@ def _disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
 
 
-def scale_change(before: Frame, after: Frame) -> float:
-    """By what fraction all depth changes from an image to the next: the median over pixels that both measured.
+def moving_scale(pairs: Sequence[tuple[Frame, Frame]]) -> str:
+    """What is wrong with pairs of neighbouring images whose depth has not one scale, in words; "" where nothing is.
 
-    A camera that moves changes what single pixels see, in both directions; 0 where nothing is measured in both.
+    All depth changes from one to the next: the median over the pixels that both measured. A camera that moves changes
+    what single pixels see, in both directions. Twice, since an image may be spoilt.
     """
-    both = (before.depth_m > 0) & (after.depth_m > 0)
-    return float(np.median(after.depth_m[both] / before.depth_m[both])) - 1 if both.any() else 0.0
+    changes = np.zeros(len(pairs))
+    for k, (before, after) in enumerate(pairs):
+        both = (before.depth_m > 0) & (after.depth_m > 0)
+        changes[k] = abs(np.median(after.depth_m[both] / before.depth_m[both]) - 1) if both.any() else 0
+    if (changes > _SCALE_CHANGE).sum() < 2:
+        return ""
+    first, second = pairs[int(changes.argmax())]
+    return f"all depth changes by {100 * changes.max():.0f} % from frame {first.index} to {second.index}"

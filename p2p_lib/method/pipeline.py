@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -29,13 +30,14 @@ from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_mask, check_not_on, check_prompt
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import Frame, PoseEstimate, Tracks
+from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method.object_model import NO_IDS, Requests
 from p2p_lib.method.object_tracker import ObjectTracker
 from p2p_lib.method.observation import Observation
 from p2p_lib.method.scene import Scene
 from p2p_lib.method.search import Sighting
 
+_LOG = logging.getLogger("p2p_lib")
 #: Object to (H, W) bool; None where nobody knows.
 Masks = dict[str, np.ndarray | None]
 #: The camera is located every so many frames: while all objects have poses, while one is away.
@@ -44,18 +46,25 @@ NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bo
 
 
 class Point2Pose:
-    """Causal 6D tracking of any number of unknown rigid objects in one RGB-D stream."""
+    """Causal 6D tracking of any number of unknown rigid objects in one RGB-D stream.
+
+    config  parameters, or the name of a preset (default: ``default``)
+
+    What becomes of the objects is logged as ``p2p_lib``.
+    """
 
     def __init__(
         self,
         camera: Camera,
-        config: Config | None = None,
+        config: Config | str | None = None,
         tracker: str | PointTracker = DEFAULT_TRACKER,
         detector: str = DEFAULT_DETECTOR,
         segmenter: str | Segmenter = DEFAULT_SEGMENTER,
     ):
         self.camera = camera
-        self.config = config or preset()
+        self.config = preset(config) if isinstance(config, str) else config or preset()
+        if not isinstance(self.config, Config):
+            raise BadInput("config", type(config).__name__, 'a Config, or the name of a preset: "default", "paper"')
         self._rng = np.random.default_rng(self.config.seed)
         self.tracker = make_tracker(tracker, self.config.tracking, self._rng)
         self.detector = make_detector(detector, self.config.sampling, self._rng)
@@ -69,6 +78,8 @@ class Point2Pose:
         self.stopwatch = Stopwatch()
         self._streaming = False
         self._unlocated = _LOCATE_EVERY
+        self._time_s: float | None = -np.inf  # of the frame before; None once it is said that time runs backwards
+        self._status: dict[str, Status] = {}
         self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
         self._waiting: deque[tuple[Frame, Masks, dict[str, Prompt]]] = deque()  # frames without an answer yet
 
@@ -147,6 +158,7 @@ class Point2Pose:
         with self.stopwatch.frame():
             given = self._given(frame, masks or {})
             said, self._said = self._said, {}
+            self._check_time(frame)
             return self._advance(frame, given, said)
 
     def finish(self) -> Iterator[dict[str, PoseEstimate]]:
@@ -181,7 +193,22 @@ class Point2Pose:
         seen |= self._redetect(seen)
         steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
         self._apply({name: step.requests for name, step in steps.items()})
-        return {name: steps[name].estimate for name in self.objects if name in steps}
+        estimates = {name: steps[name].estimate for name in self.objects if name in steps}
+        for name, estimate in estimates.items():
+            if estimate.status != self._status.get(name):
+                self._status[name] = estimate.status
+                why = f" ({estimate.reason})" if estimate.reason else ""
+                _LOG.info("frame %d: %s is %s%s", estimate.frame_index, name, estimate.status, why)
+        return estimates
+
+    def _check_time(self, frame: Frame) -> None:
+        """Warn, once, of frames that come in another order than they were taken."""
+        if self._time_s is not None and frame.time_s <= self._time_s:
+            got = f"{frame.time_s:.6f} s after {self._time_s:.6f} s"
+            doubt(f"time of frame {frame.index}", got, "Time runs backwards: give frames as they were taken.")
+            self._time_s = None
+        elif self._time_s is not None:
+            self._time_s = frame.time_s
 
     def _located(self, frame: Frame) -> Frame:
         """The frame with the camera's pose, as far as it is known: often while an object is away, else now and then."""

@@ -57,7 +57,7 @@ def alarms(findings):
 def test_a_good_folder_raises_no_alarm(good):
     findings = check_folder(good)
     assert alarms(findings) == []
-    names = ["files", "camera", "times", "motion", "depth", "registration"]
+    names = ["files", "camera", "times", "motion", "depth", "scale", "registration"]
     assert [f.name for f in findings] == names + [
         f"{o}: {w}" for o in ("box", "can") for w in ("depth", "mask", "points")
     ]

@@ -248,6 +248,37 @@ def test_without_truth_there_is_no_score_and_no_fuss(sequence, tmp_path, capsys)
     assert err == "" and said["truth"] is None and said["objects"]["object"]["reprojection_px"] < 2, "what can be said"
 
 
+def test_depth_whose_scale_moves_is_doubted_before_anything_is_tracked(sequence, tmp_path, capsys):
+    for k, path in enumerate(sorted((sequence / "depth").iterdir())):
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.rint(depth * (1 + 0.06 * (k % 2))).astype(np.uint16))
+    run(sequence, tmp_path / "out", "--stop", "4")
+    first = capsys.readouterr().err.splitlines()[0]
+    assert re.match(r"p2p run: depth: all depth changes by [67] % from frame \d to \d\. .* See p2p check", first)
+
+
+def test_config_explains_every_parameter_and_how_the_presets_differ(capsys):
+    from p2p_lib.core.config import diff, parameters, preset
+
+    assert cli.main(["config", "--json"]) == 0
+    rows = {row["key"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["tsdf.voxel_m"]["unit"] == "m" and all(row["meaning"].endswith(".") for row in rows.values())
+    assert [row["key"] for row in parameters(preset())] == list(rows)
+    assert cli.main(["config", "--diff", "--json"]) == 0
+    differ = {row["key"]: (row["paper"], row["value"]) for row in json.loads(capsys.readouterr().out)}
+    assert differ == diff()
+    assert cli.main(["config", "--stage", "tsdf", "--set", "tsdf.voxel_m=0.007"]) == 0
+    out = capsys.readouterr().out
+    assert "tsdf.voxel_m = 0.007 m\n    A voxel has this edge. [ours]" in out and "registration." not in out
+    assert cli.main(["config", "--stage", "tsdff"]) == 2
+    assert "Did you mean tsdf?" in capsys.readouterr().err
+
+
+def test_log_says_what_becomes_of_objects(sequence, tmp_path, capsys, caplog):
+    assert run(sequence, tmp_path / "out", "--stop", "3", "--log", "info") == 0
+    assert any("frame 0: object is" in message for message in caplog.messages)
+
+
 def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys):
     shutil.rmtree(sequence / "annotated_poses")
     shutil.move(sequence / "gt_mask", sequence / "masks")

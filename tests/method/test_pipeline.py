@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -164,6 +165,29 @@ def test_where_the_object_frame_starts():
         v, u = np.nonzero(masks[obj] & (frame.depth_m > 0))
         cloud = CAMERA.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
         np.testing.assert_allclose(T[:3, 3], np.median(cloud, 0), atol=1e-6)
+
+
+def test_the_configuration_may_be_a_presets_name():
+    assert Point2Pose(CAMERA, "paper").config == preset("paper")
+    with pytest.raises(BadInput, match="preset: got 'papers', expected one of default, paper"):
+        Point2Pose(CAMERA, "papers")
+    with pytest.raises(BadInput, match="config: got dict, expected a Config, or the name of a preset"):
+        Point2Pose(CAMERA, {"preset": "paper"})
+
+
+def test_time_that_runs_backwards_is_said_once_and_statuses_are_logged(caplog):
+    caplog.set_level("INFO", "p2p_lib")
+    frames = [film()[k] for k in (0, 1, 2, 1, 0, 3)]
+    with pytest.warns(Doubt) as said:
+        estimates = track(frames, names=("left",))
+    about_time = [str(of.message) for of in said if "time of frame" in str(of.message)]
+    assert about_time == [
+        "time of frame 1: 0.033333 s after 0.066667 s. Time runs backwards: give frames as they were taken."
+    ]
+    first = estimates[0]["left"].status
+    assert caplog.messages[0].startswith(f"frame 0: left is {first}")
+    changes = 1 + sum(a["left"].status != b["left"].status for a, b in pairwise(estimates))
+    assert len(caplog.messages) == changes and {record.name for record in caplog.records} == {"p2p_lib"}
 
 
 def test_nobody_knows_the_masks():
