@@ -8,7 +8,7 @@ export MKL_NUM_THREADS := $(THREADS)
 # ROS and others put packages of another Python there.
 unexport PYTHONPATH PYTHONHOME
 
-.PHONY: help setup reproduce test test-backends mutants lab figures lock
+.PHONY: help setup reproduce test test-backends mutants seeds lab figures lock
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 22
 
@@ -28,6 +28,9 @@ test: setup ## linter, then all tests, every notebook included
 
 test-backends: setup ## the adapters of third-party networks against the official classes, in .venv-backends (no weights)
 	@.venv/bin/python tools/test_backends.py
+
+seeds: setup ## run every notebook on seeds 1 to 4 (an hour and more)
+	@P2P_SEEDS=1,2,3,4 .venv/bin/python -m pytest -q tests/apps/test_notebooks.py -k other_seeds
 
 mutants: setup ## switch every mechanism off in turn and see its test fail (minutes)
 	@.venv/bin/python tools/mutants.py

@@ -59,17 +59,24 @@ class Browser:
         self._words += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run"]
         self._words += [f"--user-data-dir={home}", "--host-resolver-rules=MAP * ~NOTFOUND"]  # nothing from outside
 
-    def dom(self, page: Path, wait_ms: int = 5000) -> str:
+    def dom(self, page: Path, wait_ms: int = 5000, *more: str) -> str:
         """What the page has become once its scripts have run."""
-        return self._look("--dump-dom", page, wait_ms).stdout.decode()
+        return self._look("--dump-dom", page, wait_ms, *more).stdout.decode()
 
     def figures(self, page: Path, wait_ms: int = 10_000) -> list[dict]:
-        """Each picture, film and inner page as the browser has it: kind, width, height, shown_px (0: none)."""
+        """Each picture, film and inner page as the browser has it: kind, width, height, shown_px (0: none), alt."""
+        return self._probed(page, wait_ms)["found"]
+
+    def wider_than(self, page: Path, width_px: int) -> list[str]:
+        """The tables, drawings and equations that reach beyond a window of this width."""
+        return self._probed(page, 1000, f"--window-size={width_px},900")["wide"]
+
+    def _probed(self, page: Path, wait_ms: int, *more: str) -> dict:
         text, probe = page.read_text(encoding="utf-8"), page.with_name(f"{page.stem}.probe.html")
         end, script = text.rindex("</body>"), (PROJECT / "tests" / "figures_probe.js").read_text()
         probe.write_text(f"{text[:end]}<script>{script}</script>{text[end:]}", encoding="utf-8")
         try:
-            found = re.search(r'<pre id="probe">(.*?)</pre>', self.dom(probe, wait_ms), re.DOTALL)
+            found = re.search(r'<pre id="probe">(.*?)</pre>', self.dom(probe, wait_ms, *more), re.DOTALL)
             return json.loads(html.unescape(found[1]))
         finally:
             probe.unlink()

@@ -18,10 +18,13 @@ window.addEventListener("load", async () => {
   for (const x of document.querySelectorAll("img, video, iframe")) {
     const [width, height] = await size[x.tagName](x);
     const box = x.getBoundingClientRect();
-    found.push({ kind: x.tagName, width, height, shown_px: box.width * box.height });
+    found.push({ kind: x.tagName, width, height, shown_px: box.width * box.height, alt: x.alt ?? "" });
   }
+  const wide = [...document.querySelectorAll("table, svg, math")]
+    .filter((x) => x.getBoundingClientRect().right > document.documentElement.clientWidth)
+    .map((x) => `${x.tagName} ${x.textContent.trim().slice(0, 60)}`);
   const pre = document.createElement("pre");
   pre.id = "probe";
-  pre.textContent = JSON.stringify(found);
+  pre.textContent = JSON.stringify({ found, wide });
   document.body.append(pre);
 });

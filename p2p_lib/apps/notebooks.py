@@ -1,8 +1,9 @@
 """The notebooks of the suite: list, run headless, and collect what their last cells recorded.
 
 A notebook has one cell tagged ``parameters`` (literals alone, ``PROFILE`` among them) and ends with a cell tagged
-``checks`` that asserts what the notebook claimed and calls :func:`record` with the numbers. Whatever a run leaves
-behind is read back from the executed notebook, so that the gallery, the tests and a later visitor see the same.
+``checks`` that calls :func:`check` with what it claims: numbers, what they mean, and what they have to be. Whatever a
+run leaves behind is read back from the executed notebook, so that the gallery, the tests and a later visitor see the
+same.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,10 +27,12 @@ from pydantic import TypeAdapter, ValidationError
 
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.paths import PROJECT
-from p2p_lib.figures import equations
+from p2p_lib.core.tables import as_html, as_text
+from p2p_lib.figures import course, equations
 
 if TYPE_CHECKING:
     from nbformat import NotebookNode
+    from pandas import DataFrame
 
 #: ``quick``: bundled data, CPU. ``full``: the data and backends that are present. Each with what it takes on two cores.
 PROFILES = {"quick": "some minutes", "full": "half an hour without data of yours, hours with it"}
@@ -44,6 +47,51 @@ class NotebookFailed(P2PError):
 
 
 @dataclass(frozen=True)
+class Claim:
+    """A number that a notebook reports, what it means, and what it has to be.
+
+    what      its name, with its unit in brackets
+    value     True is a claim that holds, False one that does not; a number without a bar and a text are told only
+    means     what it says to somebody who sees this line alone
+    at_least  the bar: ``value`` must not be below; ``at_most``, not above
+    """
+
+    what: str
+    value: Value
+    means: str
+    at_least: float | None = None
+    at_most: float | None = None
+
+    def __post_init__(self) -> None:
+        value = self.value.item() if hasattr(self.value, "item") else self.value
+        object.__setattr__(self, "value", value)
+        if not isinstance(value, Value) or (isinstance(value, float) and not math.isfinite(value)):
+            raise BadInput(f"claim {self.what!r}", repr(value), "a finite number, a bool or a string")
+
+    def __bool__(self) -> bool:
+        if isinstance(self.value, bool | str):
+            return self.value is not False
+        low, high = (-math.inf if self.at_least is None else self.at_least), self.at_most
+        return low <= self.value <= (math.inf if high is None else high)
+
+    @property
+    def bar(self) -> str:
+        """What the value has to be, in words; empty where it is told only."""
+        if isinstance(self.value, bool):
+            return "yes"
+        bars = (("at least", self.at_least), ("at most", self.at_most))
+        return " and ".join(f"{word} {limit:g}" for word, limit in bars if limit is not None)
+
+    @property
+    def row(self) -> dict[str, str]:
+        """The claim as a row of a table."""
+        good = ("holds" if self else "does not hold") if self.bar else "for information"
+        return {"what": self.what, "value": _shown(self.value), "has to be": self.bar or "-", "": good} | {
+            "what it means": self.means
+        }
+
+
+@dataclass(frozen=True)
 class NotebookResult:
     """What one executed notebook holds.
 
@@ -51,7 +99,7 @@ class NotebookResult:
     title      its first heading
     executed   the executed notebook; its page for the browser is beside it with the suffix ``.html``
     seconds    wall-clock time of the whole run
-    checks     what the last cell recorded
+    checks     what the last cell claims
     image_png  its first image in base64, or empty
     error      empty, or the cell and the message that ended the run
     """
@@ -60,24 +108,23 @@ class NotebookResult:
     title: str
     executed: Path
     seconds: float
-    checks: dict[str, Value]
+    checks: tuple[Claim, ...]
     image_png: str
     error: str
 
 
-def record(**numbers: Value) -> None:
-    """Show and keep the numbers that a notebook's ``checks`` cell has asserted. Finite numbers, bools and strings."""
-    for name, value in numbers.items():
-        value = numbers[name] = value.item() if hasattr(value, "item") else value
-        if not isinstance(value, Value) or (isinstance(value, float) and not math.isfinite(value)):
-            raise BadInput(f"record({name}=...)", repr(value), "a finite number, a bool or a string")
+def check(*claims: Claim) -> None:
+    """Show and keep what a notebook's ``checks`` cell claims; AssertionError names every claim that does not hold."""
     from IPython import get_ipython
     from IPython.display import publish_display_data
 
     if get_ipython() is not None:
-        width = max(map(len, numbers), default=0)
-        lines = "\n".join(f"{name:{width}}  {_shown(value)}" for name, value in numbers.items())
-        publish_display_data({CHECKS_MIME: numbers, "text/plain": lines})
+        table = _claims_table(claims)
+        kept = [asdict(claim) for claim in claims]
+        publish_display_data({CHECKS_MIME: kept, "text/html": as_html(table, words=4), "text/plain": as_text(table)})
+    failed = [f"{claim.what}: {_shown(claim.value)}, not {claim.bar} ({claim.means})" for claim in claims if not claim]
+    if failed:
+        raise AssertionError("; ".join(failed))
 
 
 def list_notebooks(folder: Path | None = None, only: Sequence[str] = ()) -> list[Path]:
@@ -175,9 +222,7 @@ def read_result(executed: Path) -> NotebookResult:
     notebook = _read(executed)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     outputs = [(cell, output) for cell in code for output in cell.outputs]
-    checks: dict[str, Value] = {}
-    for _, output in outputs:
-        checks |= output.get("data", {}).get(CHECKS_MIME, {})
+    kept = [row for _, output in outputs for row in output.get("data", {}).get(CHECKS_MIME, ())]
     images = [output.data["image/png"] for _, output in outputs if "image/png" in output.get("data", {})]
     errors = [
         f"cell [{cell.execution_count}] {_failing_line(cell.source, output)!r}: "
@@ -196,7 +241,7 @@ def read_result(executed: Path) -> NotebookResult:
         title=[*titles, executed.stem][0].strip(),
         executed=executed,
         seconds=float(notebook.metadata.get("papermill", {}).get("duration") or 0.0),
-        checks=checks,
+        checks=tuple(Claim(**row) for row in kept),
         image_png="".join(images[0].split()) if images else "",
         error=errors[0] if errors else "",
     )
@@ -207,12 +252,13 @@ def write_gallery(home: Path, profile: str) -> Path:
     import jinja2
 
     results = [read_result(path) for path in sorted((home / "notebooks").glob("*.ipynb"))]
-    seconds, numbers = sum(r.seconds for r in results), sum(len(r.checks) for r in results)
+    seconds, claims = sum(r.seconds for r in results), sum(len(r.checks) for r in results)
     templates = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
-    templates.filters["shown"] = _shown
     html = templates.get_template("gallery.html").render(
         title=f"Point2Pose notebooks, profile {profile}",
-        summary=f"{_counted(results)}, {seconds:.0f} s, {numbers} numbers recorded",
+        summary=f"{_counted(results)}, {seconds:.0f} s, {claims} claims checked",
+        diagram=_as_pages(course.diagram().replace('href="', 'href="notebooks/')),
+        lessons={lesson.name: lesson for lesson in course.LESSONS},
         failed=sum(bool(result.error) for result in results),
         results=results,
     )
@@ -243,7 +289,7 @@ def _run_one(
         )
     _write_page(executed)
     result = read_result(executed)
-    outcome = "FAILED" if result.error else f"{len(result.checks)} numbers recorded"
+    outcome = "FAILED" if result.error else f"{len(result.checks)} claims checked"
     say(f"{source.stem}: {result.seconds:.1f} s, {outcome}")
     return result
 
@@ -318,7 +364,12 @@ def _write_page(executed: Path) -> None:
     exporter = HTMLExporter(embed_images=True, raw_template=template)
     exporter.register_filter("markdown2html", as_html)
     body, _ = exporter.from_filename(str(executed), resources={"equation_style": equations.STYLE})
-    executed.with_suffix(".html").write_text(body, encoding="utf-8")
+    executed.with_suffix(".html").write_text(_as_pages(body), encoding="utf-8")
+
+
+def _as_pages(html: str) -> str:
+    """Links from notebook to notebook as links from page to page."""
+    return re.sub(r'(href="[\w/]*\d\d_\w+)\.ipynb"', r'\1.html"', html)
 
 
 def _read(path: Path) -> NotebookNode:
@@ -338,7 +389,15 @@ def _failing_line(source: str, error: Mapping[str, Any]) -> str:
     return lines[min(int(at[1]), len(lines)) - 1 if at else 0].strip()
 
 
+def _claims_table(claims: Sequence[Claim]) -> DataFrame:
+    from pandas import DataFrame
+
+    return DataFrame([claim.row for claim in claims])
+
+
 def _shown(value: Value) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

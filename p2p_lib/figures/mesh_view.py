@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,8 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.figures import overlay
+from p2p_lib.figures.overlay import Box
 from p2p_lib.synthetic.render import Light, render
 from p2p_lib.synthetic.shapes import Mesh
 
@@ -47,3 +50,24 @@ def as_body(mesh: trimesh.Trimesh) -> Mesh:
     normals = np.asarray(mesh.vertex_normals)[faces]
     vertices = np.asarray(mesh.vertices, float)
     return Mesh(vertices, faces, np.repeat(uv[:, None], 3, 1), texture, normals)
+
+
+def portrait(mesh: trimesh.Trimesh, width_px: int, height_px: int, turn_deg: float = 25.0) -> np.ndarray:
+    """A surface from slightly above, filling the image; ``turn_deg`` about the vertical, 0 as it was first seen."""
+    centre = Box.around(mesh.vertices).T_obj_box[:3, 3]
+    radius_m = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+    focal_px = 1.4 * min(height_px, width_px)
+    camera = Camera(focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, width_px, height_px)
+    tilt, turn = se3.exp(np.radians([[25, 0, 0, 0, 0, 0], [0, turn_deg, 0, 0, 0, 0]]))
+    away, centred = se3.from_rt(np.eye(3), [0, 0, 3.2 * radius_m]), se3.from_rt(np.eye(3), -centre)
+    return draw_mesh(mesh, camera, away @ tilt @ turn @ centred)
+
+
+def portraits(meshes: Mapping[str, trimesh.Trimesh], turns_deg: Sequence[float] = (-70, 0, 70, 180)) -> np.ndarray:
+    """Every surface from several sides, a row each."""
+    sides = [
+        overlay.draw_caption(portrait(mesh, 300, 260, turn), f"{name}, {turn:+g} deg")
+        for name, mesh in meshes.items()
+        for turn in turns_deg
+    ]
+    return overlay.montage(sides, columns=len(turns_deg))

@@ -94,7 +94,7 @@ def status_strip(run: Run) -> Figure:
 
 @style.styled
 def accuracy_threshold(evaluation: Evaluation, max_m: float = metrics.MAX_M) -> Figure:
-    """The fraction of scored frames with an error below a threshold; its area is the AUC in the legend (exact form)."""
+    """The fraction of scored frames below a threshold, from 0.1 mm on; the legend has the AUC (exact form)."""
     figure, axes = panels(2, (WIDTH_IN, 2.9), side_by_side=True)
     colours = style.object_colours(evaluation.info.get("objects") or evaluation.objects)
     for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S"))):
@@ -102,9 +102,10 @@ def accuracy_threshold(evaluation: Evaluation, max_m: float = metrics.MAX_M) -> 
             errors_m = getattr(score, key)
             threshold_m, fraction = accuracy_curve(errors_m, max_m)
             label = f"{name}: {metrics.auc_exact(errors_m, max_m):.1f} %"
-            axis.step(100 * threshold_m, 100 * fraction, where="post", color=colours[name], label=label)
-        axis.set(xlabel=f"threshold on {title} [cm]", xlim=(0, 100 * max_m), ylim=(0, 102))
-        axis.set_title(f"{title}: area under the curve")
+            axis.step(1e3 * threshold_m, 100 * fraction, where="post", color=colours[name], label=label)
+        logarithmic(axis.xaxis)
+        axis.set(xlabel=f"threshold on {title} [mm]", xlim=(0.1, 1e3 * max_m), ylim=(0, 102))
+        axis.set_title(f"{title}: AUC to {100 * max_m:g} cm")
         axis.legend(loc="lower right")
     axes[0].set_ylabel("frames below [%]")
     figure.suptitle(evaluation.info.get("sequence"), x=0.01, ha="left", fontsize=9)

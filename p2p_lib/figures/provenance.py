@@ -158,7 +158,7 @@ def describe(source: Any) -> dict[str, Any]:
 
 def _plain_words(caption: str) -> str:
     """A caption without the marks of Markdown and TeX."""
-    return re.sub(r"[*`$\\{}]", "", caption)
+    return " ".join(re.sub(r"[*`$\\{}]", "", caption).split())
 
 
 def _what_ran(info: Mapping[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,8 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.figures import style
 from p2p_lib.figures.provenance import Saved, save_figure
 
-_WIDTH_PX = 880
+#: Pixels of a picture for one on the page.
+_FINE = 1.5
 #: Read by every slider of a page: the picture at the positions of all sliders of its box.
 _MOVE = (
     "const b=this.closest('figure'),s=[...b.querySelectorAll('input')];"
@@ -55,10 +56,10 @@ def save_sliders(
         f"data-values='{json.dumps([f'{v:g}' for v in values])}'> <output>{values[k]:g}</output></label>"
         for (label, values), k in zip(sliders.items(), at, strict=True)
     )
-    alt = saved.shown[1]["image/png"]["alt"]
+    look = saved.shown[1]["image/png"]
     page = (
         f"<figure data-pictures='{json.dumps(pictures)}' style='margin:0'>{rows}"
-        f'<img alt="{html.escape(alt)}" src="{shown}" style="max-width:100%"></figure>'
+        f'<img alt="{html.escape(look["alt"])}" src="{shown}" style="width:{look["width"]}px;max-width:100%"></figure>'
     )
     data, metadata = saved.shown
     return Saved(saved.path, ({**data, "text/html": page}, metadata), saved.caption)
@@ -68,7 +69,7 @@ def _embedded(picture: Any) -> str:
     """A drawn picture as an address that holds it."""
     if not isinstance(picture, np.ndarray):
         with style.applied(), io.BytesIO() as png:
-            picture.savefig(png, format="png", dpi=_WIDTH_PX / picture.get_figwidth())
+            picture.savefig(png, format="png", dpi=_FINE * picture.dpi)
             picture = np.asarray(Image.open(png).convert("RGB"))
     with io.BytesIO() as webp:
         Image.fromarray(picture).save(webp, "WEBP", quality=70, method=4)

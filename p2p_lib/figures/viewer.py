@@ -7,9 +7,7 @@ taken from. An object without a pose is not drawn; its path stays, coloured by s
 
 from __future__ import annotations
 
-import contextlib
 import html
-import io
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +35,11 @@ _SWATCH = '<span style="background:{colour};border:1px solid #888;padding:0 6px"
 
 def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS) -> str:
     """The whole page as HTML: it works offline, from a file, and inside another page."""
+    from IPython.utils.capture import capture_output
     from viser import ViserServer
 
-    # Viser prints when it starts and stops, even with verbose=False.
-    with contextlib.redirect_stdout(io.StringIO()):
+    # Viser prints when it starts and stops, even with verbose=False, and in a notebook it displays that.
+    with capture_output(stderr=False):
         server = ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
             scene = _Scene(server, playback, points)

@@ -150,6 +150,14 @@ def _growing_graph(turn: Turn, registered: Solved, config: Config) -> Iterator[O
         yield graph
 
 
+def with_outliers(config: Config, share_percent: float, turn_deg: float = 10.0, seed: int = 0) -> Figure:
+    """Registration, and the graph with either loss, on a turn with so many outliers: for sliders."""
+    turn = simulate_turn(np.random.default_rng(seed), config, step_deg=turn_deg, outliers=share_percent / 100)
+    registered, squares = register_turn(turn, config), config.with_values({"factor_graph.huber": 1e6})
+    ways = {"registration alone": registered, "all three, Huber": optimise(turn, registered, config)}
+    return errors_by_way(turn, {**ways, "all three, squares": optimise(turn, registered, squares)})
+
+
 def outlier_trials(seeds: Iterable[int], config: Config, outliers: float) -> DataFrame:
     """A row per turn: mean rotation error in degrees of each way, without outliers and with that share of them."""
     squares, rows = config.with_values({"factor_graph.huber": 1e6}), []
@@ -189,8 +197,8 @@ _LINES = {
     "all three": (style.METHODS[0], "-"),
     "all three, Huber": (style.METHODS[0], "-"),
     "without prior": (style.METHODS[1], "--"),
-    "without obs": (style.METHODS[4], "-."),
-    "without reg": (style.METHODS[3], ":"),
+    "without observations": (style.METHODS[4], "-."),
+    "without registration": (style.METHODS[3], ":"),
     "all three, squares": (style.METHODS[5], "--"),
 }
 _UNITS = ("rotation [°]", "translation [mm]")

@@ -490,7 +490,7 @@ def recovery_strip(benchmark: Benchmark, count: int = 4, width_px: int = 300) ->
 
 
 def reconstruction_sheet(benchmark: Benchmark, method: str) -> np.ndarray:
-    """Each object's reconstruction beside its true surface, seen as in its first frame and from behind."""
+    """Each object's reconstruction beside its true surface, seen as in its first frame and turned by 50 degrees."""
     run, video = benchmark.run(method), benchmark.video(method)
     evaluation, images = evaluate(run), []
     for name in evaluation.objects:
@@ -515,15 +515,15 @@ def _beside_truth(
     front = run.objects[name].T_cam_model[np.flatnonzero(run.objects[name].has_truth)[0]].copy()
     front[:3, 3] = np.array([0, 0, 4 * np.ptp(truth.vertices, axis=0).max()]) - front[:3, :3] @ middle
     camera = Camera(930, 930, 149.5, 149.5, 300, 300)
-    turn = se3.exp(np.array([0, 0, np.pi, 0, 0, 0]))
-    behind = front @ se3.from_rt(np.eye(3), middle) @ turn @ se3.from_rt(np.eye(3), -middle)
+    turn = se3.exp(np.array([0, 0, np.radians(50), 0, 0, 0]))
+    aside = front @ se3.from_rt(np.eye(3), middle) @ turn @ se3.from_rt(np.eye(3), -middle)
     kind = "synthetic" if video.name.startswith("synthetic") else "real"
     distance = "" if chamfer_cm is None else f", CD {10 * chamfer_cm:.1f} mm"
     shown: list[tuple[trimesh.Trimesh, np.ndarray, str]] = [
         (truth, front, f"{name}, {kind}: truth"),
         (surface, front, f"reconstructed{distance}"),
-        (truth, behind, "from behind: truth"),
-        (surface, behind, "reconstructed"),
+        (truth, aside, "turned by 50 degrees: truth"),
+        (surface, aside, "reconstructed"),
     ]
     return [overlay.draw_caption(mesh_view.draw_mesh(mesh, camera, T), title, scale=0.4) for mesh, T, title in shown]
 

@@ -19,10 +19,8 @@ from p2p_lib.datasets.alignment import background_share, rim
 from p2p_lib.datasets.models import MESHES, find_models
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence as Recording
-from p2p_lib.evaluation.consistency import surface_fit as surface_fit
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.mesh_view import draw_mesh
-from p2p_lib.figures.overlay import Box
+from p2p_lib.figures.mesh_view import portrait
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, panels
 from p2p_lib.figures.scenes import Scene
@@ -99,29 +97,8 @@ def story(playback: Playback, prompts: Sequence[Prompt], rows: Sequence[int], wi
     images = [overlay.draw_caption(clicked, "clicks")]
     images += [scene.draw(row, region_px, width_px, trail=60) for row in rows]
     for name, mesh in playback.meshes.items():
-        images.append(overlay.draw_caption(mesh_portrait(mesh, camera.width, camera.height), f"{name}: surface"))
+        images.append(overlay.draw_caption(portrait(mesh, camera.width, camera.height), f"{name}: surface"))
     return overlay.montage(images, columns=3)
-
-
-def mesh_portrait(mesh: trimesh.Trimesh, width_px: int, height_px: int, turn_deg: float = 25.0) -> np.ndarray:
-    """A surface from slightly above, filling the image; ``turn_deg`` about the vertical, 0 as it was first seen."""
-    centre = Box.around(mesh.vertices).T_obj_box[:3, 3]
-    radius_m = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
-    focal_px = 1.4 * min(height_px, width_px)
-    camera = Camera(focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, width_px, height_px)
-    tilt, turn = se3.exp(np.radians([[25, 0, 0, 0, 0, 0], [0, turn_deg, 0, 0, 0, 0]]))
-    away, centred = se3.from_rt(np.eye(3), [0, 0, 3.2 * radius_m]), se3.from_rt(np.eye(3), -centre)
-    return draw_mesh(mesh, camera, away @ tilt @ turn @ centred)
-
-
-def mesh_portraits(meshes: Mapping[str, trimesh.Trimesh], turns_deg: Sequence[float] = (-70, 0, 70, 180)) -> np.ndarray:
-    """Every surface from several sides, a row each."""
-    sides = [
-        overlay.draw_caption(mesh_portrait(mesh, 300, 260, turn), f"{name}, {turn:+g} deg")
-        for name, mesh in meshes.items()
-        for turn in turns_deg
-    ]
-    return overlay.montage(sides, columns=len(turns_deg))
 
 
 def mask_image(frame: Frame, mask: np.ndarray, title: str, width_px: int = 430) -> np.ndarray:

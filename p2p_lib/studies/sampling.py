@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import NullLocator
 from pandas import DataFrame, concat
 
 from p2p_lib.core import se3
@@ -307,11 +306,26 @@ def greedy_plot(situation: Situation, candidates: Candidates) -> tuple[Figure, T
 
 def choice_sheet(situation: Situation, scores: DataFrame) -> np.ndarray:
     """What each way chose in a situation, side by side."""
+    images = [_draw_choice(situation, uv, label) for uv, label in zip(scores["uv_px"], scores["choice"], strict=True)]
+    return overlay.montage(images, 3)
+
+
+def draw_weights(situation: Situation, candidates: Candidates, score_weight: float, r_ideal_px: float) -> np.ndarray:
+    """What J chooses with another weight of the score and another ideal distance, and what the choice is worth."""
+    config = replace(situation.config.sampling, score_weight=score_weight, r_ideal_px=r_ideal_px)
+    uv_px = candidates.uv_px[choose(candidates, _NOTHING, config.points, config)]
+    covered = coverage(situation.mask, uv_px, situation.config.sampling.r_ideal_px)
+    _, error_m = conditioning(situation.lift(uv_px), situation.surface(), situation.config)
+    return _draw_choice(situation, uv_px, f"covered {100 * covered:.0f} %, pose error {1e3 * error_m:.2f} mm", 460)
+
+
+def _draw_choice(situation: Situation, uv_px: np.ndarray, words: str, width_px: int = 300) -> np.ndarray:
+    """An object with the points that were chosen on it."""
     camera, colour = situation.video.camera, style.object_colours(situation.video.objects)[situation.name]
     box = overlay.region_around(situation.mask, camera)
-    image, seen_by = overlay.zoomed(situation.frame.rgb, camera, box, 300)
-    drawn = [overlay.draw_points(image, overlay.zoomed_px(uv, camera, seen_by), colour, 4) for uv in scores["uv_px"]]
-    return overlay.montage([overlay.draw_caption(i, w, 0.5) for i, w in zip(drawn, scores["choice"], strict=True)], 3)
+    image, seen_by = overlay.zoomed(situation.frame.rgb, camera, box, width_px)
+    image = overlay.draw_points(image, overlay.zoomed_px(uv_px, camera, seen_by), colour, 4)
+    return overlay.draw_caption(image, words, 0.5)
 
 
 def choice_table(scores: DataFrame) -> DataFrame:
@@ -333,21 +347,6 @@ def choice_plot(table: DataFrame) -> Figure:
         axis.set_xlabel(column)
         axis.set_title(f"{sense} is better", fontsize=8)
         axis.margins(x=0.15)
-    return figure
-
-
-@style.styled
-def spacing_plot(situations: Sequence[Situation], r_ideal_px: Sequence[float]) -> Figure:
-    """Coverage and conditioning against r_ideal, means over situations; dotted: as configured."""
-    ways = {f"{r:g}": ("corners", {"sampling.r_ideal_px": float(r)}) for r in r_ideal_px}
-    table = choice_table(compare_choices(situations, ways, frames_on=0))
-    figure, axes = panels(2, (WIDTH_IN, 2.5), side_by_side=True)
-    for axis, column in zip(axes, ("covered [%]", "pose error [mm]"), strict=True):
-        axis.plot(r_ideal_px, table[column], "o-", color=style.NEUTRAL[0], markersize=4)
-        axis.axvline(situations[0].config.sampling.r_ideal_px, color=style.NEUTRAL[0], lw=0.8, ls=":")
-        axis.set(xlabel=r"$r_{ideal}$ [px]", ylabel=column, xscale="log")
-        axis.set_xticks(list(r_ideal_px), list(ways))
-        axis.xaxis.set_minor_locator(NullLocator())
     return figure
 
 

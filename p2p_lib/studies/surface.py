@@ -17,12 +17,13 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from pandas import Series, cut
 from scipy.spatial import cKDTree
+from scipy.stats import beta
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import RefinementConfig, TsdfConfig
 from p2p_lib.figures import style
-from p2p_lib.figures.plots import logarithmic, panels
-from p2p_lib.method.refinement import Keypoints, refine
+from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
+from p2p_lib.method.refinement import Keypoints, refine, surface_distances
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.synthetic import shapes
 from p2p_lib.synthetic.motion import look_at
@@ -268,25 +269,25 @@ def errors_over_keyframes(counts: Sequence[int], errors_m: np.ndarray, bar_mm: f
 # --- refinement against the surface ----------------------------------------------------------------
 
 
+def random_starts(count: int, degrees: float, millimetres: float, seed: int = 0) -> np.ndarray:
+    """(count, 2) how far starts are off, uniform up to so many degrees and millimetres."""
+    return np.random.default_rng([seed, 6]).uniform(0, [degrees, millimetres], (count, 2))
+
+
 def basin_of_convergence(
     volume: TsdfVolume,
     p_cam: np.ndarray,
     T_true: np.ndarray,
     config: RefinementConfig,
-    degrees: Sequence[float],
-    millimetres: Sequence[float],
-    trials: int,
+    off: np.ndarray,
     seed: int = 0,
 ) -> np.ndarray:
-    """(R, S, trials, 2) errors after refinement, degrees and millimetres, from starts that far off.
+    """(n, 2) errors after refinement, degrees and millimetres, from starts that are ``off`` (n, 2) by so much.
 
     Depth points p_cam (N, 3) alone, without keypoints.
     """
-    errors = np.zeros((len(degrees), len(millimetres), trials, 2))
-    for i, j, k in np.ndindex(*errors.shape[:3]):
-        start = perturbed(T_true, degrees[i], millimetres[j], np.random.default_rng([seed, i, j, k]))
-        errors[i, j, k] = se3.error_deg_mm(refine(start, p_cam, volume, config).T_cam_obj, T_true)
-    return errors
+    starts = [perturbed(T_true, *by, np.random.default_rng([seed, k])) for k, by in enumerate(off)]
+    return np.array([se3.error_deg_mm(refine(T, p_cam, volume, config).T_cam_obj, T_true) for T in starts])
 
 
 def spin_errors(
@@ -331,6 +332,13 @@ def onto_the_surface(volume: TsdfVolume, p_cam: np.ndarray, poses: Mapping[str, 
     return figure
 
 
+def dragged(volume: TsdfVolume, p_cam: np.ndarray, T_true: np.ndarray, shift_mm: float, turn_deg: float) -> Figure:
+    """:func:`onto_the_surface`, the pose shifted along x and turned about z, and how far off all points are then."""
+    T_cam_obj = T_true @ se3.exp(np.array([0, 0, np.radians(turn_deg), shift_mm / 1e3, 0, 0]))
+    off_m = surface_distances(volume, p_cam, T_cam_obj[None]).mean()
+    return onto_the_surface(volume, p_cam, {f"mean distance {1e3 * off_m:.1f} mm": T_cam_obj})
+
+
 @style.styled
 def step_by_step(errors: np.ndarray) -> Figure:
     """Error (starts, steps + 1, 2) after every iteration, degrees and millimetres, a line per start."""
@@ -345,22 +353,24 @@ def step_by_step(errors: np.ndarray) -> Figure:
 
 
 @style.styled
-def basins(
-    errors: Mapping[str, np.ndarray], degrees: Sequence[float], millimetres: Sequence[float], limit: tuple[float, float]
-) -> Figure:
-    """The share of starts that come back to within ``limit`` (degrees, millimetres), by how far they were off."""
-    figure, axes = panels(len(errors), (4.0 * len(errors), 3.4), side_by_side=True)
-    for axis, (name, found) in zip(axes, errors.items(), strict=True):
-        share = 100 * (found <= limit).all(-1).mean(-1)
-        axis.imshow(share, cmap="cividis", vmin=0, vmax=100, origin="lower", aspect="auto")
-        for (i, j), value in np.ndenumerate(share):
-            axis.text(j, i, f"{value:.0f}", ha="center", va="center", color="white" if value < 55 else "black")
-        axis.set_xticks(range(len(millimetres)), millimetres)
-        axis.set_yticks(range(len(degrees)), degrees)
-        axis.set(xlabel="start off by [mm] (synthetic block)")
-        axis.set_title(f"{name}: back within {limit[0]:g}° and {limit[1]:g} mm [%], n = {found.shape[2]}", fontsize=9)
-        axis.grid(visible=False)
+def basins(errors: Mapping[str, np.ndarray], off: np.ndarray, limit: tuple[float, float]) -> Figure:
+    """Which starts, ``off`` (n, 2) degrees and millimetres, come back to within ``limit``, and the share by shift."""
+    figure, axes = panels(len(errors) + 1, (WIDTH_IN, 2.9), side_by_side=True)
+    bins = np.linspace(0, off[:, 1].max(), 7)
+    of = np.digitize(off[:, 1], bins[1:-1])
+    for axis, colour, (name, found) in zip(axes, style.METHODS, errors.items(), strict=False):
+        back = (found <= limit).all(-1)
+        for rows, mark, shade in ((back, "o", colour), (~back, "x", style.STATUS["lost"][0])):
+            axis.plot(off[rows, 1], off[rows, 0], mark, color=shade, markersize=4, alpha=0.8)
+        axis.set(xlabel="start off by [mm]", title=f"{name}: {back.sum()} of {len(back)} back")
+        tries, hits = np.bincount(of, minlength=6), np.bincount(of, back, minlength=6)
+        middle, low, high = (100 * beta.ppf(q, hits + 0.5, tries - hits + 0.5) for q in (0.5, 0.025, 0.975))
+        at = (bins[1:] + bins[:-1]) / 2
+        axes[-1].plot(at, middle, "o-", color=colour, markersize=4, label=name)
+        axes[-1].fill_between(at, low, high, color=colour, alpha=0.15, lw=0)
     axes[0].set_ylabel("start off by [°]")
+    axes[-1].set(xlabel="start off by [mm]", ylim=(0, 102), title="share that came back [%]")
+    axes[-1].legend(loc="lower left", fontsize=8)
     return figure
 
 

@@ -6,12 +6,18 @@ import pytest
 
 from p2p_lib.apps.notebooks import list_notebooks
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.paths import PROJECT
 from p2p_lib.figures.course import LESSONS, lesson
 from p2p_lib.figures.pipeline_diagram import STAGES
 
 
 def test_the_course_is_the_notebooks_in_their_order():
     assert [one.name for one in LESSONS] == [path.stem for path in list_notebooks()]
+
+
+def test_the_readme_says_the_same_of_each():
+    rows = re.findall(r"(?m)^\| `(\d\d_\w+)` \| (.*) \|$", (PROJECT / "README.md").read_text())
+    assert rows == [(one.name, one.shows) for one in LESSONS]
 
 
 @pytest.mark.parametrize("one", LESSONS, ids=lambda one: one.name)

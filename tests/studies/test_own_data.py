@@ -12,9 +12,10 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.prompts import prompts_in
-from p2p_lib.figures import overlay, style
+from p2p_lib.evaluation.consistency import surface_fit
+from p2p_lib.figures import mesh_view, overlay, style
 from p2p_lib.studies import own_data
-from p2p_lib.studies.own_data import errors_against, surface_fit
+from p2p_lib.studies.own_data import errors_against
 from p2p_lib.studies.surface import carton
 from p2p_lib.synthetic.render import render
 
@@ -55,10 +56,10 @@ def test_portraits_show_the_surface_from_its_sides():
     body = trimesh.creation.box((0.05, 0.2, 0.1))
     front = np.array([200, 30, 30, 255], np.uint8)
     body.visual.vertex_colors = np.tile(front, (len(body.vertices), 1))
-    portrait = own_data.mesh_portrait(body, 200, 150)
+    portrait = mesh_view.portrait(body, 200, 150)
     covered = (portrait < 250).any(-1)
     assert 0.05 < covered.mean() < 0.7 and not covered[[0, -1]].any() and not covered[:, [0, -1]].any()
-    assert own_data.mesh_portraits({"a": body, "b": body}, (0, 90)).shape[:2] == (524, 604)
+    assert mesh_view.portraits({"a": body, "b": body}, (0, 90)).shape[:2] == (524, 604)
     np.testing.assert_allclose(np.sort(overlay.tight_box(body).size_m), [0.05, 0.1, 0.2], atol=1e-6)
 
 

@@ -55,8 +55,15 @@ def test_near_starts_come_back_and_far_ones_do_not_and_a_tin_keeps_its_spin():
     volume = surface.fuse(surface.photograph(body, poses, 3), CONFIG.tsdf)
     shot = surface.photograph(body, poses[2:3], 4)[0]
     cloud = sample_cloud(shot.depth_m, shot.mask, VGA, 700)
-    errors = surface.basin_of_convergence(volume, cloud, poses[2], CONFIG.refinement, [0.5], [3, 40], 3)
-    assert errors.shape == (1, 2, 3, 2) and errors[0, 0, :, 1].max() < 2 < errors[0, 1, :, 1].max()
+    off = np.array([[0.5, 3]] * 3 + [[0.5, 40]] * 3)
+    errors = surface.basin_of_convergence(volume, cloud, poses[2], CONFIG.refinement, off)
+    assert errors.shape == (6, 2) and errors[:3, 1].max() < 2 < errors[3:, 1].max()
+    titles = [axis.get_title(loc="left") for axis in surface.basins({"default": errors}, off, (2.0, 2.0)).axes]
+    assert titles[0] == f"default: {(errors <= 2).all(1).sum()} of 6 back"
+    at_truth, away = (
+        surface.dragged(volume, cloud, poses[2], *by).axes[0].get_title(loc="left") for by in ((0, 0), (20, 0))
+    )
+    assert float(at_truth.split()[3]) < 2 < float(away.split()[3])
     left = surface.spin_errors(volume, [cloud], poses[2], 6.0, CONFIG.refinement)
     assert left[0] == pytest.approx(6, abs=0.7)
     points, normals = body.mesh.sample(2000, np.random.default_rng(0))

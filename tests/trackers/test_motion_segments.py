@@ -1,6 +1,7 @@
 """Rigid motion segments on made-up points: start, fit, split, loss, rejection, and positions that improve."""
 
 import numpy as np
+import pytest
 
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.types import joined
@@ -45,6 +46,20 @@ def test_a_segment_is_lost_where_too_few_of_its_points_agree():
     p.uv[5:] += 30 * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])[np.arange(len(RIGHT) - 5) % 4]
     segments.fit(p, image())
     assert len(RIGHT) > 20 and segments.segments[0].hidden_for == 1
+
+
+@pytest.mark.parametrize(("found", "posed"), [(3, False), (5, True)])
+def test_a_lost_segment_needs_a_fair_share_of_the_points_that_were_searched_for(found, posed):
+    """Three points that agree are enough to hold a segment, but three of twenty-four are chance on a look-alike.
+
+    What was found there goes with the pose: else chance would add up from frame to frame.
+    """
+    p, segments = started(RIGHT, image())
+    (segment,) = segments.segments
+    segment.hidden_for = 1
+    p.verified[found:] = False
+    segments.fit(p, image(), lost_only=True, sought=np.arange(24))
+    assert segment.posed == posed and p.verified.sum() == (found if posed else 0)
 
 
 def test_points_that_leave_together_stay_verified_and_then_are_a_segment():

@@ -23,6 +23,8 @@ from p2p_lib.trackers.builtin.tracked_points import Points
 _PROPOSED_COV = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
 #: Fraction of a segment's followed points that must agree on its pose.
 _MIN_AGREEING = 0.3
+#: Fraction of the points searched for on a lost segment that must be found: fewer are chance, on something like it.
+_MIN_FOUND = 0.2
 #: Effective information: errors of so many successive frames count as one observation of a position.
 _REPEATS = 4.0
 #: Error of a position (px) beside what alignment states: when a point is placed, when it is observed again.
@@ -30,6 +32,7 @@ _PLACED_PX, _OBSERVED_PX = 0.2, 0.3
 #: A neighbouring pixel's depth may be read: depth noise of an observation is larger than the sensor's by this.
 _DEPTH_NOISE = 1.5
 _EYE2, _EYE3 = np.eye(2), np.eye(3)
+_NO_ROWS = np.zeros(0, np.int64)
 
 
 @dataclass(eq=False)
@@ -110,8 +113,11 @@ class MotionSegments:
                 segment.rejected_for = self.config.reject_frames
                 segment.hidden_for = self.config.linger_frames + 1
 
-    def fit(self, p: Points, now: Image, lost_only: bool = False) -> None:
-        """Fit poses to the points that were followed or found; points that disagree are not verified."""
+    def fit(self, p: Points, now: Image, lost_only: bool = False, sought: np.ndarray = _NO_ROWS) -> None:
+        """Fit poses to the points that were followed or found; points that disagree are not verified.
+
+        ``sought`` (M,) are the rows that were searched for where lost segments predict them.
+        """
         p.leaving &= lost_only
         for s, segment in enumerate(self.segments):
             if lost_only and segment.posed:
@@ -119,18 +125,21 @@ class MotionSegments:
             if not lost_only:
                 segment.rejected_for = max(segment.rejected_for - 1, 0)
             at = np.flatnonzero(p.verified & (p.segment == s))
-            fit = self._fitted(segment, p, at, now)
+            own = sought[p.segment[sought] == s]
+            fit = self._fitted(segment, p, at, now, _MIN_FOUND * len(own))
             if fit is not None:
                 segment.before = segment.fit.T_cam_seg if segment.posed else fit.T_cam_seg
                 segment.fit, segment.hidden_for = fit, 0
                 p.verified[at[~fit.agrees]] = False
                 self._split(p, at[~fit.agrees], now)
-            elif not lost_only:
+            elif lost_only:  # what was found at a pose that is refused is refused with it
+                p.verified[own] = False
+            else:
                 segment.hidden_for += 1
 
-    def _fitted(self, segment: MotionSegment, p: Points, at: np.ndarray, now: Image) -> PoseFit | None:
-        """The pose of a segment by its points at these rows; None where too few agree on one."""
-        fewest = max(self.config.segment_min_points, _MIN_AGREEING * len(at))
+    def _fitted(self, segment: MotionSegment, p: Points, at: np.ndarray, now: Image, fewest: float) -> PoseFit | None:
+        """The pose of a segment by its points at these rows; None where too few, or than ``fewest``, agree on one."""
+        fewest = max(self.config.segment_min_points, _MIN_AGREEING * len(at), fewest)
         if len(at) < fewest:
             return None
         uv, cov, z = p.uv[at].astype(float), p.cov[at].astype(float), now.depth_at(p.uv[at])

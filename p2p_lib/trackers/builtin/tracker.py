@@ -124,8 +124,9 @@ class BuiltinTracker:
             predicted = self._segments.predict(p, rows, self._now)
             pick = np.flatnonzero(self._exposed(predicted, search) & (predicted.sigma_px < cfg.search_px))
             where = predicted.uv_px[pick], predicted.warp[pick], predicted.sigma_px[pick]
-            recognition.find(p, rows[pick], *where, self._now, cfg)
-        self._segments.fit(p, self._now, lost_only=True)
+            rows = rows[pick]
+            recognition.find(p, rows, *where, self._now, cfg)
+        self._segments.fit(p, self._now, lost_only=True, sought=rows)
 
     def _reconcile(self, search: np.ndarray | None) -> None:
         """Compare points with their segments' predictions: what faces away or is hidden is invisible.
