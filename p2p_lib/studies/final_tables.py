@@ -478,7 +478,8 @@ def tracks_by_error(benchmark: Benchmark, method: str, count: int = 3) -> Figure
 
 def recovery_strip(benchmark: Benchmark, count: int = 4, width_px: int = 300) -> np.ndarray:
     """Occlusion and recovery: a line for each method, the same moments below each other."""
-    scenes = {name: scene_of(benchmark, name)[0] for name in benchmark.methods}
+    ran = {job.method.name for job, outcome in benchmark.results if outcome.objects}
+    scenes = {name: scene_of(benchmark, name)[0] for name in benchmark.methods if name in ran}
     first = next(iter(scenes.values()))
     moments, region_px, images = first.moments(count), first.region(), []
     for name, scene in scenes.items():
