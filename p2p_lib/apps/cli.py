@@ -255,7 +255,9 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     _arg("--out", type=Path, metavar="DIR", help="runs, records and tables; several plans may share it"),
     _arg("--quick", action="store_true", help="a few frames of bundled data instead of the plan in full"),
     _arg("--jobs", type=int, metavar="N", help="runs at a time on this machine (default: one a core)"),
-    _arg("--scheduler", metavar="tcp://HOST:PORT", help="of a Dask cluster whose workers see DIR, too"),
+    _arg(
+        "--scheduler", metavar="tcp://HOST:PORT", help="of a Dask cluster whose workers see DIR; trust who can reach it"
+    ),
     _arg("--retry", action="store_true", help="try again what failed before"),
     _QUIET,
 )

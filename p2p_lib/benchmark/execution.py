@@ -95,7 +95,8 @@ def _tracks(job: Job) -> Outcome:
 def execute(jobs: Sequence[Job], out: Path, at_a_time: int, scheduler: str | None) -> Iterator[tuple[Job, Outcome]]:
     """The outcomes of jobs as they come; closing it ends what is still running.
 
-    scheduler  address of a Dask scheduler, whose workers see ``out`` under the same path; None: this machine
+    scheduler  address of a Dask scheduler, whose workers see ``out`` under the same path; None: this machine. By
+               ``tcp`` whoever reaches its port or a worker's runs what he likes there: a private network, or ``tls``
     """
     return _on_this_machine(jobs, out, at_a_time) if scheduler is None else _on_cluster(jobs, out, scheduler)
 

@@ -49,7 +49,7 @@ def export(
     sequence     names the frames and BOP's scene, and numbers its objects; without it frames are named by number, and
                  objects that it does not know are numbered 1, 2, ... in the run's order
 
-    Raises :class:`BadInput` for an unknown format.
+    Raises :class:`BadInput` for an unknown format, and where something lies already what would be written over.
     """
     if format not in FORMATS:
         raise BadInput("format", repr(format), "one of " + ", ".join(FORMATS))
@@ -64,16 +64,23 @@ def export(
         obj = run.objects[name]
         has_pose = np.flatnonzero(obj.has_pose)
         if format == "tum":
-            written.append(out / f"{name}.txt")
+            written.append(_new(out / f"{name}.txt"))
             replace_text(written[-1], "".join(tum_line(obj.time_s[i], T[i]) for i in has_pose))
         else:
-            written.append(out / "annotated_poses" / ("" if tuple(poses) == ("object",) else name))
+            written.append(_new(out / "annotated_poses" / ("" if tuple(poses) == ("object",) else name)))
             written[-1].mkdir(parents=True, exist_ok=True)
             for i in has_pose:
                 index = int(obj.frame_index[i])
                 stem = f"{index:07d}" if sequence is None else sequence.frame_names[index]
                 np.savetxt(written[-1] / f"{stem}.txt", T[i], fmt="%.12g")
     return written
+
+
+def _new(path: Path) -> Path:
+    """The path, where nothing lies yet: a dataset's own truth has the same names."""
+    if path.is_file() or (path.is_dir() and any(path.iterdir())):
+        raise BadInput(str(path), "what is there already", "a new file or folder", "Name another folder.")
+    return path
 
 
 def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: Sequence | None) -> Path:
@@ -92,7 +99,7 @@ def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: S
             lines.append(f"{head},{R},{t_mm},{times_s[i]:.6f}")
     # METHOD_DATASET-SPLIT.csv, as the BOP toolkit takes names apart.
     dataset = re.sub(r"[^A-Za-z0-9]+", "", str(run.info.get("sequence", "run"))) or "run"
-    path = out / f"p2p_{dataset}-test.csv"
+    path = _new(out / f"p2p_{dataset}-test.csv")
     replace_text(path, "\n".join(lines) + "\n")
     return path
 

@@ -113,6 +113,17 @@ def test_every_form_keeps_every_pose_and_every_loss(table, scene, tmp_path, layo
         assert got == pytest.approx(score, abs=1e-4) and score["lost"] > 0
 
 
+@pytest.mark.parametrize("format", FORMATS)
+def test_nothing_is_written_over(table, tmp_path, format):
+    """Least of all a dataset's own truth, which has the same names."""
+    run, out = run_on(table, tmp_path / "run"), tmp_path / "out"
+    export(run, out, format)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(BadInput, match="got what is there already"):
+        export(run, out, format, {name: np.diag([-1.0, -1, 1, 1]) for name in run.objects})
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
 def test_bop_of_own_data_numbers_the_objects_of_the_run(table, tmp_path, capsys):
     """A folder without masks knows no names; whoever asks for the model's frame is told which flag does without."""
     own = tmp_path / "own"
