@@ -37,5 +37,8 @@ def _compile(module: str) -> None:
     import numba
 
     for function in _waiting.pop(module, ()):
-        ready = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        try:
+            ready = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        except RuntimeError:  # there is nowhere to keep it: it is compiled in every process
+            ready = numba.njit(nogil=True, error_model="numpy")(function)
         setattr(sys.modules[module], function.__name__, ready)
