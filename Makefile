@@ -18,7 +18,9 @@ setup: ## set up .venv (about a minute the first time, instant when nothing has 
 reproduce: setup ## run every notebook on bundled data into out/quick (profile quick: CPU, no downloads)
 	@.venv/bin/p2p notebooks --profile quick
 
-figures: setup ## run every notebook on the data and backends present (profile full, half an hour or more) and fill figures/
+figures: setup ## every table and figure of the paper from the data and backends present; goes on where it was stopped
+	@.venv/bin/p2p benchmark --present --out out/benchmark --tables out/full/tables
+	@.venv/bin/p2p figures
 	@.venv/bin/p2p notebooks --profile full
 
 test: setup ## linter, then all tests, every notebook included

@@ -259,19 +259,25 @@ def _eval_tracks(a: argparse.Namespace) -> None:
         "--scheduler", metavar="tcp://HOST:PORT", help="of a Dask cluster whose workers see DIR; trust who can reach it"
     ),
     _arg("--retry", action="store_true", help="try again what failed before"),
+    _arg("--present", action="store_true", help="instead of plans: all whose data is there, at least in part"),
+    _arg("--tables", type=Path, metavar="DIR", help="tables with notes of what they are of go here, too"),
     _QUIET,
 )
 def _benchmark(a: argparse.Namespace) -> int:
     from p2p_lib.benchmark import plan_names, read_plan, run_benchmarks
+    from p2p_lib.apps.readiness import present_plans, readiness, what_to_fetch
     from p2p_lib.core.paths import data_dir
-    from p2p_lib.studies.final_tables import write_table
+    from p2p_lib.figures.provenance import save_table
+    from p2p_lib.studies.final_tables import paper_table, write_table
 
     if a.list:
-        for name in plan_names():
-            plan = read_plan(name)
-            print(f"{name:24}{plan.title}" + (f" (data: {', '.join(plan.data)})" if plan.data else ""))
-        print("(data: ...) is looked for below $P2P_DATA, see p2p data list; with --quick no plan needs any.")
+        print("\n".join(readiness(name) for name in plan_names()))
+        print("Data and weights are looked for below $P2P_DATA, see p2p data list; with --quick no plan needs any.")
         return 0
+    if a.present and not (present := present_plans()):
+        _warn("p2p benchmark: no dataset of a plan is below $P2P_DATA (see p2p data list), so there is nothing to run")
+        return 0
+    a.plan = present if a.present else a.plan
     if not a.plan or a.out is None:
         raise BadInput("benchmark", "no plan or no --out", "PLAN --out DIR; p2p benchmark --list names the plans")
     if not a.quick and data_dir() is None and (lacking := [str(plan) for plan in a.plan if read_plan(plan).data]):
@@ -282,12 +288,36 @@ def _benchmark(a: argparse.Namespace) -> int:
     for benchmark in benchmarks:
         counts = ", ".join(f"{count} {what}" for what, count in benchmark.counts().items())
         print(f"{write_table(benchmark)}\n{counts}. Tables in {benchmark.folder}\n")
+        print("".join(f"{line}\n" for line in what_to_fetch(benchmark)), end="")
+        if a.tables:
+            done = [(job, outcome) for job, outcome in benchmark.results if outcome.status == "done"]
+            made = {"runs": f"{len(done)} of {len(benchmark.results)}"}
+            made |= {"seeds": ", ".join(map(str, sorted({job.seed for job, _ in done})))}
+            made |= {"commit": next((str(outcome.ran.get("commit")) for _, outcome in done), None)}
+            save_table(paper_table(benchmark), benchmark.plan.name, sources=[benchmark], parameters=made, to=a.tables)
     if any(benchmark.interrupted for benchmark in benchmarks):
         raise KeyboardInterrupt
     if any(benchmark.counts()["done"] for benchmark in benchmarks):
         return 0
     _warn("p2p benchmark: nothing ran; the tables say why")
     return P2PError.exit_code
+
+
+@_command(
+    "figures",
+    "draw the paper's qualitative figures and write the index of all its figures and tables",
+    _arg("--out", type=Path, metavar="DIR", help="runs, found again the next time (default out/benchmark)"),
+    _arg("--poses", type=Path, metavar="PATH", help="a competitor's on synthetic/occlusion, drawn beside ours"),
+    _QUIET,
+)
+def _figures(a: argparse.Namespace) -> None:
+    from p2p_lib.benchmark import run_benchmarks
+    from p2p_lib.core.paths import benchmark_dir, figure_dir
+    from p2p_lib.studies.paper_figures import PLAN, draw_all
+
+    (runs,) = run_benchmarks([PLAN], a.out or benchmark_dir("full"), progress=not a.quiet)
+    for saved in draw_all(runs, figure_dir(), a.poses):
+        print(saved.path)
 
 
 # --- looking and handing on ----------------------------------------------------------------------

@@ -80,6 +80,7 @@ class Manifest(Strict):
     how_to_get        what has to be done by hand, or what there is to know before fetching
     folder            where it lies below ``$P2P_DATA``
     files_unknown     why there is no list of files
+    size              about how large it is, as somebody says who has it; "" where nobody does
     units, layout     what the numbers mean; the folders and files once unpacked
     format            which loader reads its sequences (see :data:`p2p_lib.datasets.sequence.FORMATS`)
     sequences_in      the folder of sequences, below ``folder``
@@ -97,6 +98,7 @@ class Manifest(Strict):
     folder: Below
     files: list[RemoteFile]
     files_unknown: str = ""
+    size: str = ""
     units: dict[str, str]
     layout: list[str]
     citation: Text

@@ -70,7 +70,8 @@ def save_figure(
     sources     what it was drawn from: runs, evaluations, sequences, files
     parameters  what decided how it was made: profile, seed, ...
     """
-    target = _target(paths.figure_dir(), name)
+    sources = list(sources)
+    target = _target(paths.figure_dir(), name, _is_quick(sources, parameters))
     png = target.with_name(f"{name}.png")
     if isinstance(figure, np.ndarray):
         if figure.ndim != 3 or figure.shape[2] != 3 or figure.dtype != np.uint8:
@@ -101,7 +102,8 @@ def save_video(
     """Write images as a film (see :func:`write_video`) with its note; shown embedded."""
     from IPython.display import Video
 
-    target = _target(paths.figure_dir(), name)
+    sources = list(sources)
+    target = _target(paths.figure_dir(), name, _is_quick(sources, parameters))
     path = write_video(images, target.with_name(f"{name}.mp4"), fps)
     _write_note(target, [path.suffix], sources, {**(parameters or {}), "fps": fps}, ["av"], caption)
     # The whole film is inside the page, so that exported pages play it too.
@@ -117,9 +119,10 @@ def save_table(
     *,
     sources: Iterable[Any] = (),
     parameters: Mapping[str, Any] | None = None,
+    to: Path | None = None,
 ) -> Saved:
-    """Write a table as CSV and Markdown, one for papers as LaTeX besides, with its note."""
-    target = _target(paths.table_dir(), name)
+    """Write a table as CSV and Markdown, one for papers as LaTeX besides, with its note; ``to`` another folder."""
+    target = _target(to or paths.table_dir(), name)
     if isinstance(table, Table):
         files = {".csv": table.csv(), ".md": table.markdown(), ".tex": table.latex()}
         page = table.html()
@@ -169,10 +172,21 @@ def _sha256(path: Path) -> str | None:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
 
-def _target(folder: Path, name: str) -> Path:
-    """The path of NAME, without a suffix."""
+def _is_quick(sources: Iterable[Any], parameters: Mapping[str, Any] | None) -> bool:
+    """Whether a figure is of a quick form: of few frames of bundled data."""
+    profiles = {source.profile for source in sources if isinstance(source, Benchmark)}
+    return "quick" in profiles | {(parameters or {}).get("PROFILE")}
+
+
+def _target(folder: Path, name: str, quick: bool = False) -> Path:
+    """The path of NAME, without a suffix. A quick form goes into ``quick/`` where a full one of this name lies."""
     if not re.fullmatch(r"\w[\w-]*", name):
         raise BadInput("figure name", repr(name), "letters, digits, '_' and '-': it names files")
+    note = folder / f"{name}.json"
+    if quick and note.is_file():
+        before = json.loads(note.read_text(encoding="utf-8"))
+        profiles = {source.get("profile") for source in before["sources"]} | {before["parameters"].get("PROFILE")}
+        folder = folder / "quick" if "quick" not in profiles else folder
     folder.mkdir(parents=True, exist_ok=True)
     return folder / name
 

@@ -2,43 +2,47 @@
 
 Ours are exact areas under the curve over 0 to 0.1 m, aligned at the first scored frame, frames without a pose counted
 as 0, mean over seeds ± their standard deviation; every other form is in the benchmark's ``results.csv``. Bold is the
-best among methods without a CAD model, of those that ran on the whole of what the paper ran on.
+best among methods without a CAD model, of those that ran on the whole of what the paper ran on: no re-creation did.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import trimesh
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from pandas import DataFrame
+from pandas import DataFrame, read_csv
+from scipy import stats
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import Job
 from p2p_lib.benchmark.outcome import Outcome
 from p2p_lib.benchmark.plan import Method
-from p2p_lib.benchmark.rows import MEAN, POOLED, Row, shown_name
+from p2p_lib.benchmark.rows import AREAS, MEAN, POOLED, Row, shown_name
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import MissingData
 from p2p_lib.core.files import replace_text
+from p2p_lib.core.paths import PROJECT
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.models import MESHES, find_models, read_mesh
 from p2p_lib.datasets.paper_reported import FAIL, paper_reported
 from p2p_lib.datasets.paper_reported import Table as Reported
 from p2p_lib.datasets.runs import ObjectRun, Run
-from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
 from p2p_lib.figures import mesh_view, overlay, style
 from p2p_lib.figures.overlay import Label
 from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
+from p2p_lib.figures.provenance import Saved, save_table
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.figures.tables import Cell, Table, emboldened, number
 from p2p_lib.synthetic.shapes import load_mesh
@@ -49,6 +53,8 @@ METRICS = {
     "add_auc": ("ADD AUC", "ADD (%)", True),
     "chamfer_cm": ("Chamfer distance", "CD (cm)", False),
 }
+#: The tables that come with the project.
+SHIPPED = PROJECT / "figures" / "tables"
 _AREAS = ("adds_auc", "add_auc")
 _AREA_HEADS = [METRICS[key][1] for key in _AREAS]
 _HOW = "Ours: exact area under the curve, aligned at the first scored frame, frames without a pose count as 0"
@@ -59,6 +65,26 @@ _NOT_IN_PAPER = Cell(note="not in the paper")
 def paper_table(benchmark: Benchmark) -> Table:
     """The table of a benchmark, arranged as its plan's ``kind`` says."""
     return KINDS[benchmark.plan.kind](Numbers(benchmark))
+
+
+def shown(benchmark: Benchmark, parameters: Mapping[str, object] | None = None) -> Saved | Shipped:
+    """A benchmark's table for a notebook; where only its quick form was run, the one that the project ships, if any."""
+    shipped = SHIPPED / f"{benchmark.plan.name}.md"
+    if benchmark.profile == "quick" and shipped.is_file():
+        return Shipped(shipped)
+    name = f"final_{benchmark.plan.name}"
+    return save_table(paper_table(benchmark), name, sources=[benchmark], parameters=parameters)
+
+
+@dataclass(frozen=True)
+class Shipped:
+    """A table of ``figures/tables/``: below it stands with which commit, seeds and parts it was run."""
+
+    path: Path
+
+    def _repr_markdown_(self) -> str:
+        said = "*Shipped with the project: nothing newer was run here.*"
+        return f"{said}\n\n{self.path.read_text(encoding='utf-8')}"
 
 
 def write_table(benchmark: Benchmark) -> str:
@@ -238,19 +264,22 @@ def _reported_line(paper: Reported, row: object) -> _Line:
 
 
 def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method: Method) -> _Line:
-    columns, cells, comparable = _columns(paper), {}, {"Mean"}
+    columns, cells, whole, same = _columns(paper), {}, set(), set()
     frames = {shown_name(j): o.ran.get("frames") for j, o in numbers.benchmark.results if j.method.name == method.name}
     for column, (job, name) in _places(numbers).items():
         cells[column] = numbers.cell(method.name, METRICS[metric][0], shown_name(job), name, form)
         if column in columns:
             part = _part(job, frames.get(shown_name(job)), paper.dataset)
-            comparable |= {column} if not part and cells[column].text != "-" else set()
-            cells[column] = replace(cells[column], note=cells[column].note or part)
+            ran, recreated = cells[column].text != "-", job.sequence.name.startswith(SYNTHETIC)
+            whole |= {column} if ran and not part else set()
+            same |= {column} if ran and not part and not recreated else set()
+            said = part or ("re-created, not the paper's files" if recreated and ran else "")
+            cells[column] = replace(cells[column], note=cells[column].note or said)
     cells["Mean"] = numbers.cell(method.name, METRICS[metric][0], MEAN, "", form)
-    whole = len(comparable & set(columns))
-    if whole < len(columns):
-        cells["Mean"] = Cell(note=f"{whole} of the table's {len(columns)} columns were run in whole")
+    if len(whole) < len(columns):
+        cells["Mean"] = Cell(note=f"{len(whole)} of the table's {len(columns)} columns were run in whole")
     name = method.name if metric in _AREAS else f"{method.name}, {form}'s form"
+    comparable = {*same, "Mean"} if len(same) == len(columns) else same
     return _Line("CAD-free", name, cells, comparable, numbers.not_planned())
 
 
@@ -352,6 +381,56 @@ def by_run(numbers: Numbers) -> Table:
     return Table(numbers.plan.title, heads, lines, groups, words=2, notes=[over, how, numbers.what_ran()])
 
 
+def by_pair(numbers: Numbers) -> Table:
+    """What each component is worth to whom: the areas with it less those without, run against run."""
+    areas: dict[str, dict[tuple[str, int], np.ndarray]] = defaultdict(dict)
+    for job, outcome in numbers.benchmark.results:
+        if outcome.objects:
+            errors = [obj.errors_m("first") for obj in outcome.objects.values()]
+            both = [np.mean([metrics.auc_exact(of[key]) for of in errors]) for key in AREAS.values()]
+            areas[job.method.name][shown_name(job), job.seed] = np.array(both)
+    scenes = list(dict.fromkeys(scene for runs in areas.values() for scene, _ in runs))
+    lines, rules = [], []
+    for method in numbers.methods:
+        own, base = areas[method.name], areas[method.against or method.name]
+        if not method.against:
+            rules += [len(lines)] if lines else []
+            levels = [[own[at] for at in own if scene in ("", at[0])] for scene in ("", *scenes)]
+            means = [np.mean(level, axis=0) if level else [None, None] for level in levels]
+            cells = [number(v, digits=1) for v in means[0]] + [number(mean[1], digits=1) for mean in means[1:]]
+            lines.append([Cell(method.name), Cell("with all"), Cell(str(len(own))), *cells])
+            continue
+        worth = {at: base[at] - own[at] for at in own if at in base}
+        cells = [_interval([w[k] for w in worth.values()], numbers.judges) for k in range(2)]
+        cells += [_interval([w[1] for at, w in worth.items() if at[0] == scene], numbers.judges) for scene in scenes]
+        name = method.name.removeprefix(method.against).lstrip(", ")
+        lines.append([Cell(""), Cell(name), Cell(str(len(worth))), *cells])
+    heads = ["2D tracker", "component", "runs", *_AREA_HEADS, *(scene.removeprefix(SYNTHETIC) for scene in scenes)]
+    groups = [("", 3), ("over all runs", 2), ("ADD (%) by scene", len(scenes))]
+    how = (
+        "First line of a tracker: its areas under the curve. Below: with the component less without it, in points, and "
+    )
+    how += "the 95 % interval of the mean by bootstrap over runs; bold where that leaves out 0"
+    notes = [how, numbers.what_ran()]
+    return Table(numbers.plan.title, heads, lines, groups, words=2, rules=rules, notes=notes)
+
+
+#: Of fewer differences the bootstrap's interval is too narrow to call one proven.
+_ENOUGH = 8
+
+
+def _interval(values: list[float], judges: bool) -> Cell:
+    """The mean of differences with its 95 % bootstrap interval; bold where that leaves out 0."""
+    if not values:
+        return Cell(note="not run")
+    if len(values) < 3:
+        return Cell(f"{np.mean(values):+.1f}")
+    how = {"n_resamples": 2000, "method": "percentile", "rng": np.random.default_rng(0)}
+    low, high = stats.bootstrap((np.array(values),), np.mean, **how).confidence_interval
+    proven = judges and len(values) >= _ENOUGH and (low > 0 or high < 0)
+    return Cell(f"{np.mean(values):+.1f} [{low:+.1f}, {high:+.1f}]", bold=bool(proven))
+
+
 #: Arrangements by the ``kind`` of a plan.
 KINDS: dict[str, Callable[[Numbers], Table]] = {
     "sequences": by_sequence,
@@ -360,6 +439,7 @@ KINDS: dict[str, Callable[[Numbers], Table]] = {
     "returns": by_return,
     "rates": by_rate,
     "runs": by_run,
+    "pairs": by_pair,
 }
 
 
@@ -406,6 +486,34 @@ def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
 
 
 # --- figures ---------------------------------------------------------------------------------------
+
+
+@style.styled
+def rate_figure(table: Path) -> Figure:
+    """Processor time per frame against objects, tracks, resolution and 2D tracker, from the table ``runtime.csv``."""
+    rows = read_csv(table).set_index("Setting")
+    time_ms = rows["processor, files included (ms)"].dropna().rename(lambda name: name.partition(",")[0])
+    whole = time_ms.iloc[0]
+    panels_of = {
+        "objects": {int(k.split()[0]): v for k, v in time_ms.items() if "object" in k},
+        "tracks an object": {int(k.split()[0]): v for k, v in time_ms.items() if "tracks" in k} | {60: whole},
+        "megapixels": {np.prod([int(n) for n in k.split("x")]) / 1e6: v for k, v in time_ms.items() if "x" in k}
+        | {0.3072: whole},
+        "2D tracker": {k.split()[1]: v for k, v in time_ms.items() if k.startswith("tracker")} | {"builtin": whole},
+    }
+    figure, axes = panels(4, (WIDTH_IN, 2.8), side_by_side=True)
+    for axis, (label, values) in zip(axes, panels_of.items(), strict=True):
+        at = sorted(values, key=lambda k: values[k] if isinstance(k, str) else k)
+        if isinstance(at[0], str):
+            axis.bar(at, [values[k] for k in at], color=style.METHODS[0])
+            axis.tick_params(axis="x", rotation=30)
+        else:
+            axis.plot(at, [values[k] for k in at], "o-", color=style.METHODS[0])
+            axis.set_xlim(0, None)
+        axis.set(xlabel=label, ylim=(0, None))
+    axes[0].set_ylabel("processor time a frame [ms]")
+    return figure
+
 
 #: Errors from a tenth of a millimetre to the ten centimetres at which a frame scores nothing.
 EDGES_MM = np.geomspace(0.1, 100, 31)

@@ -323,6 +323,23 @@ def texture_story(images: Mapping[str, np.ndarray], measures: Mapping[str, Seque
     return figure
 
 
+def extremes_story(scenes: Mapping[str, Scene], studies: Mapping[str, ObjectTexture], windows: int = 30) -> Figure:
+    """The paper's figure on texture: the objects with the least and the most of it side by side, with their tracks.
+
+    scenes  label to the scene of each study; two labels at least
+    """
+    least, *_, most = sorted(studies, key=lambda label: studies[label].measure().texture)
+    images, measures = {}, {label: study.windows(windows) for label, study in studies.items()}
+    for label in (least, most):
+        frames = studies[label].frames
+        middle, measure = int(frames.frame.iloc[len(frames) // 2]), studies[label].measure()
+        title = (
+            f"{label}: {measure.texture:.1f} levels/px, tracks off {measure.track_px:.1f} px, ADD {measure.add_auc:.0f}"
+        )
+        images[title] = draw_tracks(scenes[label], studies[label], middle, scenes[label].region(0.03), 330)
+    return texture_story(images, measures, "least and most texture; below, a point per window of frames")
+
+
 @style.styled
 def windows_against_texture(
     windows: Mapping[str, Sequence[Measure]],

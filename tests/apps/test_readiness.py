@@ -1,0 +1,39 @@
+"""What can run here and now, and what would have to be fetched."""
+
+import pytest
+
+from p2p_lib.benchmark import load_benchmark
+from p2p_lib.apps.readiness import present_plans, readiness, what_to_fetch
+from tests.fixtures.sliding_board import write_sequence
+
+
+@pytest.fixture
+def nothing(monkeypatch):
+    monkeypatch.delenv("P2P_DATA", raising=False)
+
+
+def test_a_plan_says_which_rows_can_run(nothing):
+    title, ours, papers = readiness("long_range").splitlines()
+    assert title.split()[0] == "long_range"
+    assert ours.startswith("  Ours; Ours, SH(10): 4 of 5 sequences; else: ycbmultitrack_real:")
+    assert papers.startswith(
+        "  paper_full; paper_sh10: 0 of 5 sequences; else: no weights of sam2, superpoint, tapir. Run:"
+    )
+
+
+def test_what_is_missing_names_sequences_frames_size_and_command(nothing, tmp_path):
+    (line,) = what_to_fetch(load_benchmark("ycbineoat", tmp_path))
+    assert "ycbineoat/mustard0 (737 frames)" in line and "about 22 GB" in line
+    assert line.endswith("p2p data fetch ycbineoat")
+    (line,) = what_to_fetch(load_benchmark("ho3d", tmp_path))
+    assert line.count("ho3d_v3/") == 13 and line.endswith("by hand, see p2p data info ho3d_v3")
+    (line,) = what_to_fetch(load_benchmark("ycbmultitrack_synthetic", tmp_path))
+    assert "synthetic/ycb_pitcher" in line and line.endswith("p2p data fetch ycb_models")
+    assert what_to_fetch(load_benchmark("ablation_embedded", tmp_path)) == []
+
+
+def test_plans_whose_data_is_there_are_found(nothing, tmp_path, monkeypatch):
+    assert present_plans() == []
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    write_sequence(tmp_path / "YCBInEOAT/mustard0", 6, 2, seed=2)
+    assert set(present_plans()) == {"readme", "segmenters", "trackers", "ycbineoat"}

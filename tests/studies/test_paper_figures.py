@@ -1,0 +1,86 @@
+"""The committed figures are those of their notes and of the tables they show, and the index is current."""
+
+import json
+import re
+import shutil
+
+import matplotlib.pyplot as plt
+import pytest
+
+from p2p_lib.benchmark import plan_names, read_plan
+from p2p_lib.core.paths import PROJECT
+from p2p_lib.datasets.paper_reported import paper_reported
+from p2p_lib.figures.provenance import save_figure
+from p2p_lib.studies.final_tables import rate_figure
+from p2p_lib.studies.paper_figures import ITEMS, index, outdated
+
+FIGURES = PROJECT / "figures"
+
+
+def test_no_committed_figure_is_older_than_the_numbers_it_shows():
+    assert outdated(FIGURES) == []
+
+
+def test_the_index_is_current():
+    text = (FIGURES / "README.md").read_text()
+    days = dict(re.findall(r"\| ([0-9a-f]{7}) (\d{4}-\d\d-\d\d) \|", text))
+    assert index(FIGURES, lambda commit: days.get(commit[:7], "")) == text, "Run: p2p figures"
+
+
+def test_committed_figures_are_small():
+    for path in FIGURES.rglob("*"):
+        assert path.stat().st_size < 1_500_000, path.name
+
+
+def test_every_table_of_the_paper_is_in_the_index():
+    listed = {item.file.removeprefix("tables/").removesuffix(".md") for item in ITEMS}
+    assert listed >= {name for name in plan_names() if read_plan(name).paper}
+    assert len([item for item in ITEMS if item.paper.startswith("Figure")]) == 5
+    assert len([item for item in ITEMS if item.paper.startswith("Table")]) == len(paper_reported().tables)
+
+
+@pytest.fixture
+def drawn(tmp_path, monkeypatch):
+    """A figure of a table, both with their notes."""
+    monkeypatch.setenv("P2P_FIGURES", str(tmp_path))
+    (tmp_path / "tables").mkdir()
+    table = tmp_path / "tables" / "runtime.csv"
+    rows = ["1 object, 640x480", "2 objects", "15 tracks", "320x240", "tracker lk"]
+    lines = [f'"{name}",{10 * (k + 1)}' for k, name in enumerate(rows)]
+    table.write_text("\n".join(['Setting,"processor, files included (ms)"', *lines]))
+    (tmp_path / "tables/runtime.json").write_text(json.dumps({"sha256": {}, "sources": []}))
+    save_figure(rate_figure(table), "runtime", sources=[table])
+    return tmp_path
+
+
+def test_a_table_that_changed_leaves_its_figure_behind(drawn):
+    assert outdated(drawn) == []
+    table = drawn / "tables" / "runtime.csv"
+    table.write_text(table.read_text().replace("10", "11"))
+    assert outdated(drawn) == ["runtime: runtime.csv is newer than what was drawn from it"]
+
+
+def test_a_picture_without_its_note_or_with_another_content_is_named(drawn):
+    shutil.copy(drawn / "runtime.png", drawn / "copy.png")
+    (drawn / "runtime.png").write_bytes(b"another")
+    assert outdated(drawn) == ["runtime.png: not what its note says", "copy.png: no note"]
+
+
+def test_the_rate_figure_shows_every_number_of_its_table(drawn):
+    axes = rate_figure(drawn / "tables" / "runtime.csv").axes
+    assert [list(axis.lines[0].get_xydata().round(3).ravel()) for axis in axes[:2]] == [
+        [1, 10, 2, 20],
+        [15, 30, 60, 10],
+    ]
+    assert sorted(bar.get_height() for bar in axes[3].patches) == [10, 50]
+
+
+def test_a_quick_form_never_takes_the_place_of_a_full_one(tmp_path, monkeypatch):
+    monkeypatch.setenv("P2P_FIGURES", str(tmp_path))
+    figure = plt.figure()
+    full = save_figure(figure, "f", parameters={"PROFILE": "full"}).path.read_bytes()
+    figure.text(0.5, 0.5, "quick")
+    quick = save_figure(figure, "f", parameters={"PROFILE": "quick"})
+    assert quick.path == tmp_path / "quick/f.png" and (tmp_path / "f.png").read_bytes() == full
+    assert save_figure(figure, "f", parameters={"PROFILE": "full"}).path == tmp_path / "f.png"
+    assert save_figure(figure, "g", parameters={"PROFILE": "quick"}).path == tmp_path / "g.png", "nothing lay there"
