@@ -264,8 +264,8 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     _QUIET,
 )
 def _benchmark(a: argparse.Namespace) -> int:
-    from p2p_lib.benchmark import plan_names, read_plan, run_benchmarks
     from p2p_lib.apps.readiness import present_plans, readiness, what_to_fetch
+    from p2p_lib.benchmark import plan_names, read_plan, run_benchmarks
     from p2p_lib.core.paths import data_dir
     from p2p_lib.figures.provenance import save_table
     from p2p_lib.studies.final_tables import paper_table, write_table

@@ -2,8 +2,8 @@
 
 import pytest
 
-from p2p_lib.benchmark import load_benchmark
 from p2p_lib.apps.readiness import present_plans, readiness, what_to_fetch
+from p2p_lib.benchmark import load_benchmark
 from tests.fixtures.sliding_board import write_sequence
 
 
