@@ -25,7 +25,7 @@ from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.datasets import manifests
+from p2p_lib.datasets import checkpoints, manifests
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.resized import Resized
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
@@ -89,6 +89,7 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
     scope = plan.scope(profile)
     measures = ("poses", "tracks") if plan.tracks and scope.tracks else ("poses",)
     methods = [_with_detector(method) for method in plan.methods(profile)]
+    lacking = {method.name: _lacking(method) for method in methods}
     known: dict[tuple, str] = {}  # of this call alone: files may change until the next
     jobs = []
     for planned in scope.sequence:
@@ -96,8 +97,9 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
             for method in (m for m in methods if not m.only or planned.name in m.only):
                 for measure in measures:
                     for seed in scope.seeds:
-                        job = Job(method, sequence, seed, measure, plan.chamfer, reason=missing)
-                        jobs.append(job if missing else _keyed(job, known))
+                        reason = missing or lacking[method.name]
+                        job = Job(method, sequence, seed, measure, plan.chamfer, reason=reason)
+                        jobs.append(job if reason else _keyed(job, known))
     return jobs
 
 
@@ -175,6 +177,25 @@ def _with_detector(method: Method) -> Method:
             chosen = name
             break
     return method.model_copy(update={"detector": chosen})
+
+
+def _lacking(method: Method) -> str:
+    """What this machine lacks to run a method, with the commands that fetch it; "" where it lacks nothing known."""
+    networks = {method.tracker, method.detector, RunOptions(masks=method.masks).mask_source().segmenter}
+    missing = []
+    for name in sorted(networks & set(manifests.names("checkpoint"))):
+        try:
+            checkpoints.checked_files(name)
+        except MissingBackend:
+            missing.append(name)
+        except BadInput as error:
+            return str(error)
+    if missing:
+        where = "" if data_dir() else "export P2P_DATA=DIR; "
+        commands = "; ".join(f"p2p data fetch {name}" for name in missing)
+        return f"no weights of {', '.join(missing)}. Run: {where}{commands}"
+    slow = method.gpu and not checkpoints.has_gpu()
+    return "no GPU here, and on a CPU its networks take seconds a frame" if slow else ""
 
 
 def _synthetic(planned: PlannedSequence, method: Method) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -34,6 +34,8 @@ class Method(_Strict):
     """One way to run: a row or column of the table.
 
     paper     the method of the paper's table that it stands beside ("Ours", "No SDF refinement"), "" for none
+    against   the method that it is compared with, run by run (a plan of kind ``pairs``)
+    gpu       whether it is left out where there is no GPU: its networks take seconds a frame without one
     detector  the first of these that is installed
     masks     as of ``p2p run``; clicks are the sequence's, or drawn where it has none
     settings  single parameters of the configuration, ``{"stage.key" = value}``
@@ -45,6 +47,8 @@ class Method(_Strict):
 
     name: Text
     paper: str = ""
+    against: str = ""
+    gpu: bool = False
     preset: Text = "default"
     tracker: Text = DEFAULT_TRACKER
     detector: Text | list[Text] = DEFAULT_DETECTOR
@@ -112,7 +116,7 @@ class Plan(_Strict):
     name: Text
     title: Text
     paper: str = ""
-    kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs"] = "methods"
+    kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs", "pairs"] = "methods"
     chamfer: bool = False
     tracks: bool = False
     method: Annotated[list[Method], Field(min_length=1)]
@@ -126,6 +130,8 @@ class Plan(_Strict):
             raise ValueError("two methods have one name")
         if unknown := {*self.quick.methods, *self.full.methods} - set(names):
             raise ValueError(f"methods: no method is called {unknown.pop()!r}")
+        if unknown := {method.against for method in self.method} - {*names, ""}:
+            raise ValueError(f"against: no method is called {unknown.pop()!r}")
         return self
 
     @property

@@ -16,6 +16,7 @@ from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 #: 2D trackers by the name that --tracker takes, as module:callable(config, rng).
 TRACKERS = {
     "builtin": "p2p_lib.trackers.builtin.tracker:BuiltinTracker",
+    "builtin2d": "p2p_lib.trackers.builtin.image_only:ImageOnlyTracker",
     "lk": "p2p_lib.trackers.lk:LkTracker",
     "tapir": "p2p_lib.trackers.tapir:load",
     "tapnextpp": "p2p_lib.trackers.tapnextpp:load",

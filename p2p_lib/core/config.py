@@ -179,6 +179,11 @@ class OracleConfig(_Checked):
         0.0, "This share of the visible points is reported at a wrong place in a frame.", low=0, high=1
     )
     outlier_px: float = _p(30.0, "Points at a wrong place are this far off.", "px", low=0)
+    slide_px: float = _p(0.0, "This is the standard deviation of the error that lasts, per axis.", "px", low=0)
+    lasting_frames: int = _p(
+        1, "Dropouts and wrong places last so many frames; the error that lasts goes from one to another in as many.",
+        "frames", low=1,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -56,11 +56,16 @@ def fill(model: torch.nn.Module, name: str, weights: dict[str, torch.Tensor]) ->
         raise BadInput(f"checkpoint {name}", reason, f"the weights of {type(model).__name__}", _fetch(name)) from None
 
 
-def device_of(device: str | None) -> str:
-    """The device asked for; by default CUDA where torch has it, else the CPU."""
+def has_gpu() -> bool:
+    """Whether torch has a CUDA device."""
     import torch
 
-    return device or ("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.cuda.is_available()
+
+
+def device_of(device: str | None) -> str:
+    """The device asked for; by default CUDA where torch has it, else the CPU."""
+    return device or ("cuda" if has_gpu() else "cpu")
 
 
 def _fetch(name: str) -> str:

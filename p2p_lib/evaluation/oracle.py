@@ -11,16 +11,17 @@ from p2p_lib.evaluation.true_tracks import NO_POINTS, TrueScene
 from p2p_lib.trackers.ids import PointIds
 
 # What is drawn for a frame; each kind has a stream of its own, so that points added later change no earlier draw.
-_NOISE, _DROPOUT, _OUTLIER, _PLACE = range(4)
+_NOISE, _DROPOUT, _OUTLIER, _PLACE, _SLIDE = range(5)
 
 
 class OracleTracker:
     """True tracks of a sequence's own frames. Implements :class:`p2p_lib.core.interfaces.PointTracker`.
 
     A query belongs to the object whose mask holds it, and lies on that object's true surface; one that lies on
-    no object is never visible again. A visible point is reported with Gaussian noise; a chosen share is called
-    invisible, another is put anywhere on a ring around the truth without saying so. The uncertainty is 0 where
-    visible, 1 elsewhere. What is drawn depends on the seed, the frame and the point's id alone.
+    no object is never visible again. A visible point is reported with Gaussian noise, new in each frame, and with an
+    error that lasts, as of a track that slides; a chosen share is called invisible, another is put anywhere on a ring
+    around the truth without saying so, both for some frames on end. The uncertainty is 0 where visible, 1 elsewhere.
+    What is drawn depends on the seed, the frame and the point's id alone.
     """
 
     name = "oracle"
@@ -49,10 +50,14 @@ class OracleTracker:
         self._ids.check_started()
         self._frame, cfg = frame, self.config
         sight = self._scene.see(frame, self._points)
-        visible = sight.visible & (self._drawn(_DROPOUT, "random") >= cfg.dropout)
-        uv = sight.uv_px + cfg.noise_px * self._drawn(_NOISE, "standard_normal", 2)
-        stray = self._drawn(_OUTLIER, "random") < cfg.outliers
-        turn = 2 * np.pi * self._drawn(_PLACE, "random")
+        span, part = divmod(frame.index, cfg.lasting_frames)
+        part /= cfg.lasting_frames
+        visible = sight.visible & (self._drawn(_DROPOUT, span, "random") >= cfg.dropout)
+        uv = sight.uv_px + cfg.noise_px * self._drawn(_NOISE, frame.index, "standard_normal", 2)
+        ends = (self._drawn(_SLIDE, span + k, "standard_normal", 2) for k in (0, 1))
+        uv += cfg.slide_px * sum(np.sqrt(weight) * end for weight, end in zip((1 - part, part), ends, strict=True))
+        stray = self._drawn(_OUTLIER, span, "random") < cfg.outliers
+        turn = 2 * np.pi * self._drawn(_PLACE, span, "random")
         uv += np.where(stray, cfg.outlier_px, 0)[:, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
         visible &= self._scene.sequence.camera.inside(uv)
         return Tracks(self._ids.live.copy(), np.where(visible[:, None], uv, np.nan), visible, 1.0 - visible)
@@ -67,7 +72,7 @@ class OracleTracker:
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Ignored: it knows better."""
 
-    def _drawn(self, kind: int, distribution: str, *columns: int) -> np.ndarray:
-        """Numbers of a distribution of :class:`numpy.random.Generator`, a row for each live point."""
-        rng, live = np.random.default_rng([self._seed, self._frame.index, kind]), self._ids.live
+    def _drawn(self, kind: int, time: int, distribution: str, *columns: int) -> np.ndarray:
+        """Numbers of a distribution of :class:`numpy.random.Generator` at a time, a row for each live point."""
+        rng, live = np.random.default_rng([self._seed, time, kind]), self._ids.live
         return getattr(rng, distribution)((live.max(initial=-1) + 1, *columns))[live]

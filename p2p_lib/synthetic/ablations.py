@@ -74,6 +74,23 @@ def long_turning(seed: int, frames: int = 660) -> Scenario:
     return _on_the_table(rng, Body("tin", mesh, T), (0.0, -0.85, 0.50))
 
 
+def eight_objects(seed: int, frames: int = 90) -> Scenario:
+    """Eight small cartons, tins and blocks in two rows, each swaying in its place; nothing is ever hidden."""
+    check("eight_objects", frames=(frames, 2, np.inf))
+    rng = np.random.default_rng([seed, 1])
+    kinds = [lambda: shapes.box(rng, (0.07, 0.04, 0.09)), lambda: shapes.can(rng, 0.03, 0.08)]
+    kinds.append(lambda: shapes.block(rng, 0.035, 0.08))
+    bodies = []
+    for k in range(8):
+        place = np.array([-0.21 + 0.14 * (k % 4), 0.04 * (k // 4), 0.07 + 0.14 * (k // 4)])
+        yaw = np.radians(40) * np.sin(2 * np.pi * np.arange(frames) / 120 + rng.uniform(0, 2 * np.pi))
+        T = turned(wander(rng, frames, 0.01, 10.0, 120), yaw + rng.uniform(0, 2 * np.pi), place)
+        bodies.append(Body(f"object_{k + 1}", kinds[k % 3](), T))
+    return Scenario(
+        VGA, standing(np.array([0.0, -0.62, 0.34]), np.array([0.0, 0.02, 0.14]), frames), tuple(bodies), room(rng)
+    )
+
+
 def _on_the_table(
     rng: np.random.Generator, body: Body, eye: tuple[float, float, float], light: Light | None = None
 ) -> Scenario:

@@ -17,6 +17,7 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
         ablations.weak_texture,
         ablations.fading_label,
         ablations.long_turning,
+        ablations.eight_objects,
         absences.occlusion,
         absences.exit_reentry,
         absences.look_alikes,

@@ -10,6 +10,7 @@ from p2p_lib.benchmark.jobs import jobs_of
 from p2p_lib.core.backends import DETECTORS, TRACKERS
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
+from p2p_lib.datasets import checkpoints
 from p2p_lib.datasets.manifests import manifest
 from p2p_lib.datasets.paper_reported import paper_reported
 from p2p_lib.evaluation.oracle import OracleTracker
@@ -72,10 +73,38 @@ def test_plans_are_part_of_an_installation():
 def test_what_is_not_there_says_why_and_costs_nothing(monkeypatch):
     monkeypatch.delenv("P2P_DATA", raising=False)
     jobs = jobs_of(read_plan("ycbineoat"), "full")
-    assert len(jobs) == 27 and not any(job.key for job in jobs)
-    assert all("$P2P_DATA is not set" in job.reason for job in jobs)
+    assert len(jobs) == 2 * 27 and not any(job.key for job in jobs)
+    assert {"$P2P_DATA is not set" in job.reason for job in jobs if job.method.name == "Ours"} == {True}
+    fetch = "; ".join(f"p2p data fetch {name}" for name in ("sam2", "superpoint", "tapir"))
+    asked = {job.reason for job in jobs if job.method.name == "paper_full"}
+    assert asked == {f"no weights of sam2, superpoint, tapir. Run: export P2P_DATA=DIR; {fetch}"}
     (real,) = {job.reason for job in jobs_of(read_plan("ycbmultitrack_real"), "full")}
     assert "P2P_DATA" in real
+
+
+def test_the_papers_own_configuration_stands_in_every_table_beside_ours():
+    for name in PLANS:
+        plan = read_plan(name)
+        own = [method for method in plan.method if method.name.startswith("paper_")]
+        assert own or not plan.paper
+        for method in own:
+            assert (method.preset, method.tracker, method.masks, method.gpu) == ("paper", "tapir", "sam2", True)
+            assert method.detector == "superpoint" or "uniform" in method.name
+            beside = {other.paper for other in plan.method if other not in own}
+            assert not plan.paper or method.paper in beside, f"{name}: {method.name}"
+
+
+def test_weights_without_a_gpu_are_not_enough(tmp_path, monkeypatch):
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    for name in ("sam2", "superpoint", "tapir"):
+        for file in manifest(name).files:
+            path = tmp_path / manifest(name).folder / file.path
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(b"weights")
+    for gpu in (False, True):
+        monkeypatch.setattr(checkpoints, "has_gpu", lambda gpu=gpu: gpu)
+        (job,) = [job for job in jobs_of(read_plan("long_range"), "quick") if job.method.name == "paper_full"]
+        assert bool(job.key) == gpu and ("no GPU here" in job.reason) != gpu
 
 
 def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):
@@ -86,7 +115,8 @@ def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):
     jobs = jobs_of(read_plan("ycbmultitrack_real"), "full")
     names = list(dict.fromkeys(job.sequence.name for job in jobs))
     assert names == ["ycbmultitrack_real/a_one", "ycbmultitrack_real/b_two"]
-    assert all("no files, expected colour" in job.reason for job in jobs), "and what is wrong with it"
+    ours = [job.reason for job in jobs if job.method.name == "Ours"]
+    assert ours and all("no files, expected colour" in reason for reason in ours), "and what is wrong with it"
 
 
 def test_a_detector_of_choice_is_the_first_that_is_there(monkeypatch):
