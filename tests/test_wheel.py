@@ -1,0 +1,92 @@
+"""The wheel in a clean environment does what the checkout does: the first commands of the README, from elsewhere."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from p2p_lib.core.paths import cache_dir
+from p2p_lib.datasets.runs import load_run
+from p2p_lib.run import run
+
+PROJECT = Path(__file__).resolve().parents[1]
+SOURCES = ("p2p_lib", "data_manifests", "pyproject.toml", "README.md", "LICENSE")
+FRAMES = 6
+
+
+def ran(*words: object, **more) -> str:
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, timeout=1800, **more)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """Built of a copy, so that nothing is left in the checkout."""
+    pytest.importorskip("setuptools")
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for name in SOURCES:
+        copy = shutil.copytree if (PROJECT / name).is_dir() else shutil.copy
+        copy(PROJECT / name, source / name)
+    ran(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", out, source)
+    return next(out.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def p2p(wheel, tmp_path_factory):
+    """Runs a program in an environment with the packages of this one but this project from the wheel."""
+    home = tmp_path_factory.mktemp("clean")
+    ran(sys.executable, "-m", "venv", "--without-pip", home / "env")
+    env = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "P2P_", "VIRTUAL_ENV"))}
+    env |= {"P2P_CACHE": str(cache_dir()), "OMP_NUM_THREADS": "1"}
+    (home / "empty").mkdir()
+    site = ran(home / "env/bin/python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", env=env).strip()
+    # Where a .pth file of its own installs a checkout it does not count in a folder that is named like this.
+    (Path(site) / "packages.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    ran(
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        home / "env/bin/python",
+        "install",
+        "-q",
+        "--no-deps",
+        "--no-index",
+        wheel,
+    )
+    return lambda *words: ran(home / "env" / "bin" / words[0], *words[1:], cwd=home / "empty", env=env)
+
+
+def test_the_wheel_has_all_that_is_no_source(wheel):
+    listed = zipfile.ZipFile(wheel).namelist()
+    ours = [path for path in (PROJECT / "p2p_lib").rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    assert {str(path.relative_to(PROJECT)) for path in ours} <= set(listed)
+    manifests = {str(path.relative_to(PROJECT)) for path in (PROJECT / "data_manifests").rglob("*.json")}
+    assert manifests <= {name.partition("share/p2p_lib/")[2] for name in listed}
+
+
+def test_the_first_commands_of_the_readme(p2p, tmp_path):
+    where = p2p("python", "-c", "import p2p_lib; print(p2p_lib.__file__)").strip()
+    assert "/clean" in where and not Path(where).is_relative_to(PROJECT)
+    words = ["--masks", "clicks", "--stop", FRAMES, "--quiet"]
+    said = p2p("p2p", "run", "synthetic/crossing", "--out", "out/crossing", *words)
+    out = Path(where).parents[5] / "empty" / "out" / "crossing"
+    assert f"{FRAMES} of {FRAMES} frames" in said and "ADD-S" in said
+    here = run("synthetic/crossing", tmp_path / "here", masks="clicks", stop=FRAMES, progress=False)
+    mine, theirs = load_run(here.path).objects, load_run(out).objects
+    assert mine.keys() == theirs.keys() and all(mine[name].has_pose.any() for name in mine)
+    for name in mine:
+        np.testing.assert_array_equal(mine[name].T_cam_obj, theirs[name].T_cam_obj)
+        mesh = f"meshes/{name}.ply"
+        assert (here.path / mesh).read_bytes() == (out / mesh).read_bytes()
+    assert json.loads(p2p("p2p", "eval", "out/crossing", "--json"))["mean"]["adds_auc"] > 50
+    assert "view.html" in p2p("p2p", "view", "out/crossing", "--no-browser")
+    assert "ycbineoat" in p2p("p2p", "data", "list") and "runtime" in p2p("p2p", "benchmark", "--list")
