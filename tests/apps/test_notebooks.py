@@ -115,9 +115,9 @@ def answers(path: Path) -> list[str]:
 
 
 def with_answers(path: Path, folder: Path) -> Path:
-    """A copy of a notebook that runs the answers to its exercises, before the checks."""
+    """A copy of a notebook that runs the answers to its exercises where they stand."""
     notebook, to = nbformat.read(path, 4), folder / path.name
-    at = next(k for k, cell in enumerate(notebook.cells) if "checks" in tags(cell))
+    at = max(k for k, cell in enumerate(notebook.cells) if "<details>" in cell.source) + 1
     notebook.cells[at:at] = map(new_code_cell, answers(path))
     nbformat.write(notebook, to)
     return to
