@@ -1,10 +1,28 @@
 """Point2Pose: 6D pose tracking and reconstruction of several unknown rigid objects from RGB-D video.
 
+>>> from p2p_lib import Point2Pose, open_sequence, preset
+>>> sequence = open_sequence("synthetic/crossing")
+>>> tracker = Point2Pose(sequence.camera, preset("default"))
+>>> tracker.add_object("box")
+>>> for i in range(3):
+...     estimates = tracker.step(sequence.frame(i), {"box": sequence.masks(i)["box"]})
+>>> estimates["box"].status, estimates["box"].T_cam_obj.shape
+(<Status.TRACKED: 'tracked'>, (4, 4))
+
 Importing this package is fast: it loads neither torch nor open3d nor matplotlib.
 """
 
 import logging
 from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what _WHERE says, for type checkers and editors
+    from p2p_lib.core.camera import Camera
+    from p2p_lib.core.config import Config, preset
+    from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
+    from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
+    from p2p_lib.datasets.sequence import open_sequence
+    from p2p_lib.method.pipeline import Point2Pose
 
 logging.getLogger("p2p_lib").addHandler(logging.NullHandler())  # whoever wants to read it says so
 __version__ = "0.1.0"
@@ -24,10 +42,25 @@ _WHERE = {
     "MissingBackend": "p2p_lib.core.errors",
     "P2PError": "p2p_lib.core.errors",
 }
-__all__ = [*_WHERE, "__version__"]
+__all__ = [
+    "BadInput",
+    "Camera",
+    "Config",
+    "Frame",
+    "MissingBackend",
+    "MissingData",
+    "P2PError",
+    "Point2Pose",
+    "PoseEstimate",
+    "Status",
+    "Tracks",
+    "__version__",
+    "open_sequence",
+    "preset",
+]
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     if name in _WHERE:
         return getattr(import_module(_WHERE[name]), name)
     raise AttributeError(f"module 'p2p_lib' has no attribute {name!r}")
