@@ -129,7 +129,7 @@ class Keeper:
         """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
         models = {name: obj.model for name, obj in self.method.objects.items()}
         for name, model in models.items():
-            if model.has_surface and len((mesh := model.surface.mesh()).faces):
+            if model.surface is not None and len((mesh := model.surface.mesh()).faces):
                 save_mesh(mesh, self.writer.path / "meshes" / f"{name}.ply")
         maps = {name: (model.map.ids, model.map.p_obj, model.map.promoted) for name, model in models.items()}
         self.keypoints.save(self.writer.path, maps)
@@ -216,8 +216,8 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     prompts = tuple(prompts or ())
     masks = options.mask_source()
     if isinstance(sequence, str | Path):
-        how = {"format": options.format, "depth_scale": options.depth_scale}
-        sequence = sequences.open_sequence(sequence, **how, seed=config.seed, masks=masks.folder)
+        how = options.format, options.depth_scale, config.seed
+        sequence = sequences.open_sequence(sequence, *how, masks=masks.folder)
     frames = _frame_range(len(sequence), options.start, options.stop)
     told = masks.name == "clicks" and bool(prompts)  # all that is known of the objects
     objects = _chosen([p.name for p in prompts] if told else sequence.objects, options.objects)

@@ -49,11 +49,8 @@ def make_tracker(
 
     :class:`BadInput` lists the known names where this one is unknown.
     """
-    if isinstance(tracker, str):
-        tracker = _find("tracker", tracker, TRACKERS)(config, rng)
-    if not config.forget_after:
-        return tracker
-    return _load(_SHORT_HORIZON)(tracker, config.forget_after)
+    made = _find("tracker", tracker, TRACKERS)(config, rng) if isinstance(tracker, str) else tracker
+    return _load(_SHORT_HORIZON)(made, config.forget_after) if config.forget_after else made
 
 
 def make_detector(detector: str | Detector, config: SamplingConfig, rng: np.random.Generator | None = None) -> Detector:

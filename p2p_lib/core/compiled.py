@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import wraps
-from typing import TypeVar
+from typing import TypeVar, cast
 
 F = TypeVar("F", bound=Callable)
 
@@ -29,7 +29,7 @@ def compiled(function: F) -> F:
         _compile(function.__module__)
         return getattr(sys.modules[function.__module__], function.__name__)(*args)
 
-    return first
+    return cast(F, first)
 
 
 def _compile(module: str) -> None:

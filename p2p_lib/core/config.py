@@ -23,7 +23,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import read_toml
 
 
-def _p(default: Any, meaning: str, unit: str = "", source: str = "ours", **bounds: float) -> Any:
+def _p(default: Any, meaning: str, unit: str = "", source: str = "ours", **bounds: Any) -> Any:
     """A field with its meaning; ``low``/``high`` bound it (inclusive), ``choices`` lists strings."""
     return field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **bounds})
 
@@ -36,6 +36,7 @@ def _section(stage: type) -> str:
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
+@dataclass(frozen=True)
 class _Checked:
     """Refuses values of another type or out of bounds when made."""
 
@@ -353,7 +354,7 @@ class Config:
         """
         stages: dict[str, dict[str, Any]] = {}
         top: dict[str, Any] = {}
-        known = {
+        known: dict[str, Any] = {
             **{f"{s}.{f.name}": f for s in _STAGES for f in fields(getattr(self, s))},
             "seed": None,
             "device": None,

@@ -39,6 +39,7 @@ LARGEST_ARRAYS, MOST_VALUES = 1 << 30, 1 << 18
 #: An archive unpacks to at most so many times its size, and so many bytes besides.
 UNPACKED_RATIO, UNPACKED_BYTES = 100, 1 << 26
 #: What parsers raise at bytes that nobody expected.
+UNREADABLE: tuple[type[Exception], ...]
 UNREADABLE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, EOFError, OSError, MemoryError)
 UNREADABLE += (RuntimeError, SyntaxError, NameError, struct.error, tokenize.TokenError, csv.Error, pickle.PickleError)
 UNREADABLE += (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError)

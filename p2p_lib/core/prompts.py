@@ -86,9 +86,9 @@ def check_prompt(prompt: Prompt, camera: Camera) -> None:
         raise BadInput(f"clicks on {name!r}", "a click that is also one beside it", "one or the other")
 
 
-def check_mask(name: str, mask: np.ndarray, camera: Camera) -> None:
-    """Refuse a mask of another size than the camera's images."""
-    if mask.shape != (camera.height, camera.width):
+def check_mask(name: str, mask: np.ndarray | None, camera: Camera) -> None:
+    """Refuse a mask of another size than the camera's images; none at all is fine."""
+    if mask is not None and mask.shape != (camera.height, camera.width):
         got = "x".join(map(str, mask.shape[::-1]))
         raise BadInput(f"mask of {name!r}", got, f"{camera.width}x{camera.height} as the camera")
 

@@ -182,8 +182,8 @@ def refit(
     among  (N,) bool: pairs that may be inliers
     """
     prior = np.zeros((3, 3)) if R_prior is None else _PRIOR_INERTIA_M2 * R_prior
-    arrays = (np.ascontiguousarray(a, float) for a in (T_a_b, p_b, p_a, limit_m, weights))
-    T, inliers, residual, inertia_m2 = _refit(*arrays, min_inliers, among, prior)
+    arrays = [*(np.ascontiguousarray(a, float) for a in (T_a_b, p_b, p_a, limit_m, weights)), min_inliers, among, prior]
+    T, inliers, residual, inertia_m2 = _refit(*arrays)
     return RigidFit(T, inliers, residual, inertia_m2) if inliers.sum() >= min_inliers else None
 
 

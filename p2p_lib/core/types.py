@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import Field, dataclass, fields, is_dataclass
 from enum import StrEnum
-from typing import Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 #: No depth camera measures nearer or farther.
 NEAREST_M, FARTHEST_M = 0.001, 100.0
@@ -92,11 +95,13 @@ class Tracks:
         return Tracks(ids, self.uv_px[at], self.visible[at], self.uncertainty[at])
 
 
-Arrays = TypeVar("Arrays")
+Arrays = TypeVar("Arrays", bound="DataclassInstance")
 
 
 class Rows:
     """What dataclasses have in common whose fields are arrays (or such dataclasses again) of one row per item."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))

@@ -165,7 +165,7 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
     from p2p_lib.datasets.manifests import find_sequence
 
     found = find_sequence(str(path_or_name))
-    below = None if data_dir() is None else data_dir() / folder
+    below = home / folder if (home := data_dir()) else None
     if found is None and below is not None and below.is_dir():
         return below, format
     if found is None:

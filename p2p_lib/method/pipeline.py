@@ -12,6 +12,7 @@ import logging
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -272,7 +273,7 @@ class Point2Pose:
         for name, prompt in given.items():
             check_mask(name, prompt.mask, self.camera)
         for name, prompt in given.items():
-            if prompt.mask.all():
+            if prompt.mask is not None and prompt.mask.all():
                 doubt(f"mask of {name!r}", f"the whole image in frame {frame.index}", "Is it inverted?")
         for name, prompt in self._said.items():
             check_depth(prompt, frame)
@@ -318,4 +319,5 @@ def _prompt(name: str, **said: ArrayLike | None) -> Prompt:
     field = {"mask": "mask", "clicks": "points_px", "negative": "negative_px", "box": "box_px"}
     if unknown := sorted(set(said) - set(field)):
         raise TypeError(f"unknown argument {unknown[0]!r}, expected some of {', '.join(field)}")
-    return Prompt(name, **{field[key]: value for key, value in said.items() if value is not None})
+    values: dict[str, Any] = {field[key]: value for key, value in said.items() if value is not None}
+    return Prompt(name, **values)
