@@ -8,7 +8,7 @@ export MKL_NUM_THREADS := $(THREADS)
 # ROS and others put packages of another Python there.
 unexport PYTHONPATH PYTHONHOME
 
-.PHONY: help setup reproduce test test-backends mutants seeds lab figures lock
+.PHONY: help setup reproduce test test-backends docs mutants seeds lab figures lock
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 22
 
@@ -23,10 +23,15 @@ figures: setup ## every table and figure of the paper from the data and backends
 	@.venv/bin/p2p figures
 	@.venv/bin/p2p notebooks --profile full
 
-test: setup ## linter, then all tests, every notebook included
+test: setup ## linter and types, then all tests, every notebook included, and the API reference
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
+	@.venv/bin/mypy
+	@.venv/bin/python tools/docs.py
 	@.venv/bin/python -m pytest --durations=5
+
+docs: setup ## the API reference from the docstrings, pages that work offline, into out/docs
+	@.venv/bin/python tools/docs.py
 
 test-backends: setup ## the adapters of third-party networks against the official classes, in .venv-backends (no weights)
 	@.venv/bin/python tools/test_backends.py

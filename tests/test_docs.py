@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import doctest
 import importlib
 import re
 import subprocess
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+import p2p_lib
 from p2p_lib import Point2Pose, preset
 from p2p_lib.apps import cli
 from p2p_lib.apps.notebooks import list_notebooks
@@ -119,6 +121,43 @@ def test_the_example_tracker_tracks():
         estimate = method.step(Frame(k, k / 30, rgb, np.full((120, 160), 0.8, np.float32)), {"poster": mask})["poster"]
     assert estimate.status is Status.TRACKED and estimate.inliers >= 20
     np.testing.assert_allclose(estimate.T_cam_obj[:3, :3], np.eye(3), atol=1e-6)
+
+
+def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
+    """All blocks, one after the other, as they stand; ``video`` is a printed card that slides by."""
+    monkeypatch.chdir(tmp_path)
+    print_ = np.kron(np.random.default_rng(0).integers(0, 255, (20, 25, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+    video = []
+    for k in range(5):
+        rgb, depth_mm = np.full((480, 640, 3), 90, np.uint8), np.full((480, 640), 1000, np.uint16)
+        part = np.s_[160:320, 220 + 4 * k : 420 + 4 * k]
+        rgb[part], depth_mm[part] = print_, 600
+        video.append((rgb, depth_mm))
+    names: dict = {"video": video}
+    for block in re.findall(r"```python\n(.*?)```", read("README.md"), re.DOTALL):
+        exec(block, names)
+    assert names["estimates"]["mug"].status is Status.TRACKED
+    assert np.isfinite(names["t_m"]).all() and len(names["keypoints_m"]) > 10
+    assert names["poses"].shape == (30, 4, 4) and np.isfinite(names["poses"][-1]).all()
+    assert (tmp_path / "box.ply").stat().st_size > 10_000 and 0.05 < names["mesh"].extents.max() < 0.5
+
+
+EXAMPLES = [path for path in sorted((PROJECT / "p2p_lib").rglob("*.py")) if ">>> " in path.read_text()]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: str(path.relative_to(PROJECT)))
+def test_examples_of_docstrings_say_what_happens(path):
+    name = ".".join(path.relative_to(PROJECT).with_suffix("").parts).removesuffix(".__init__")
+    ran = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS)
+    assert ran.attempted and not ran.failed
+
+
+def test_public_names_are_the_same_for_people_and_type_checkers():
+    body = ast.parse((PROJECT / "p2p_lib" / "__init__.py").read_text()).body
+    (typed,) = (node.body for node in body if isinstance(node, ast.If) and node.test.id == "TYPE_CHECKING")
+    said = {name.name: node.module for node in typed for name in node.names}
+    assert said == p2p_lib._WHERE and {*said, "__version__"} == set(p2p_lib.__all__)
+    assert (PROJECT / "p2p_lib" / "py.typed").exists()
 
 
 def test_the_papers_authors_are_cited_for_the_method_and_ours_for_the_package():

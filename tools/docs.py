@@ -5,6 +5,7 @@ What users call comes first: the names of ``p2p_lib`` itself. Behind it are all 
 
 import sys
 import warnings
+from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
@@ -18,8 +19,14 @@ LEFT_OUT = "p2p_lib.studies"  # what one notebook each needs
 
 def modules():
     """``p2p_lib`` itself and its packages, each of which brings its modules along."""
-    found = [module.name for module in iter_modules(p2p_lib.__path__, "p2p_lib.")]
-    return ["p2p_lib", *(name for name in found if name != LEFT_OUT)]
+    found = ["p2p_lib"]
+    for module in iter_modules(p2p_lib.__path__, "p2p_lib."):
+        if module.name not in (LEFT_OUT, "p2p_lib.__main__"):
+            found.append(module.name)
+            part = import_module(module.name)
+            if hasattr(part, "__all__"):  # which pdoc takes to be all there is
+                found += [inner.name for inner in iter_modules(part.__path__, f"{module.name}.")]
+    return found
 
 
 def write(out):

@@ -13,7 +13,14 @@ from p2p_lib.core.image import in_image
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels and image size in pixels, no distortion."""
+    """Intrinsics in pixels and image size in pixels, no distortion.
+
+    >>> camera = Camera(fx=600, fy=600, cx=319.5, cy=239.5, width=640, height=480)
+    >>> camera.project([0.1, 0, 0.5]).tolist()
+    [439.5, 239.5]
+    >>> camera.unproject([439.5, 239.5], 0.5).tolist()
+    [0.1, 0.0, 0.5]
+    """
 
     fx: float
     fy: float

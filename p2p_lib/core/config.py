@@ -428,14 +428,25 @@ _PRESETS: dict[str, dict[str, Any]] = {"default": {}, "paper": _PAPER}
 
 
 def preset(name: str = "default", seed: int = 0) -> Config:
-    """The configuration called ``default`` or ``paper``."""
+    """The configuration called ``default`` or ``paper``.
+
+    >>> preset("default", seed=3).with_values({"tsdf.voxel_m": 0.004}).tsdf.voxel_m
+    0.004
+    >>> preset("default").with_values({"tsdf.voxel": 0.004})
+    Traceback (most recent call last):
+    p2p_lib.core.errors.BadInput: configuration key: got 'tsdf.voxel', expected ... Did you mean 'tsdf.voxel_m'?
+    """
     if not isinstance(name, str) or name not in _PRESETS:
         raise _unknown("preset", name, _PRESETS)
     return replace(Config().with_values(_PRESETS[name]), preset=name, seed=_whole_number("config seed", seed))
 
 
 def diff(a: str = "paper", b: str = "default") -> dict[str, tuple[Any, Any]]:
-    """``{"stage.key": (value in a, value in b)}`` for every parameter that differs."""
+    """``{"stage.key": (value in a, value in b)}`` for every parameter that differs.
+
+    >>> diff("paper", "default")["selection.rule"]
+    ('surface', 'support')
+    """
     left, right = preset(a).as_dict(), preset(b).as_dict()
     return {f"{s}.{k}": (left[s][k], right[s][k]) for s in _STAGES for k in left[s] if left[s][k] != right[s][k]}
 

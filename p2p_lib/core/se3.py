@@ -3,6 +3,12 @@
 A transformation ``T_a_b`` is a (..., 4, 4) float64 array that takes coordinates in frame b to
 coordinates in frame a: ``p_a = T_a_b @ p_b``. Points are rows, (..., N, 3). Tangent vectors are
 (..., 6), rotation first, then translation, applied on the right: ``T @ exp(xi)``, as in gtsam.
+
+>>> T_cam_obj = exp(np.array([0, 0, np.pi / 2, 0, 0, 0]))  # a quarter turn about z
+>>> transform(T_cam_obj, np.array([[1.0, 0, 0]])).round(6).tolist()
+[[0.0, 1.0, 0.0]]
+>>> transform(inverse(T_cam_obj), np.array([[0.0, 1, 0]])).round(6).tolist()
+[[1.0, 0.0, 0.0]]
 """
 
 from __future__ import annotations

@@ -28,6 +28,13 @@ class Frame:
              and any reading outside :data:`NEAREST_M` to :data:`FARTHEST_M` become
     time_s   seconds, increasing within a sequence
     T_world_cam  (4, 4) pose of the camera in a static world, where somebody knows it (a robot, SLAM)
+
+    >>> rgb, depth_mm = np.zeros((480, 640, 3), np.uint8), np.full((480, 640), 700, np.uint16)
+    >>> Frame(index=0, time_s=0.0, rgb=rgb, depth_m=depth_mm / np.float32(1000)).shape
+    (480, 640)
+    >>> Frame(0, 0.0, rgb, depth_mm)
+    Traceback (most recent call last):
+    p2p_lib.core.errors.BadInput: frame 0 depth: got uint16, expected metres as floats. Apply the depth scale first.
     """
 
     index: int

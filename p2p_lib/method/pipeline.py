@@ -1,9 +1,11 @@
 """Point2Pose: the algorithm of the paper on one screen (paper: Fig. "Overview of the framework").
 
->>> tracker = Point2Pose(camera, preset("default"))
->>> tracker.add_object("mug", clicks=[[312, 207], [320, 240]])
->>> for frame in video:
-...     estimates = tracker.step(frame)
+What a caller writes:
+
+    tracker = Point2Pose(camera, preset("default"))
+    tracker.add_object("mug", clicks=[[312, 207], [320, 240]])
+    for frame in video:
+        estimates = tracker.step(frame)
 """
 
 from __future__ import annotations

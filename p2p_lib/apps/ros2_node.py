@@ -1,0 +1,173 @@
+"""A node for ROS 2: RGB-D images in, a pose per object and transforms out. An example to start from.
+
+Start it with
+
+    python -m p2p_lib.apps.ros2_node --ros-args -p prompts:=prompts.json -r rgb:=/camera/color/image_raw
+
+Needs ROS 2 (``rclpy``, ``cv_bridge``, ``message_filters``, ``tf2_ros``) on the Python that p2p_lib is installed for;
+``environment.md`` has the packages of a robot. It subscribes to ``rgb``, ``depth`` (registered to colour; 16UC1
+millimetres or 32FC1 metres) and ``camera_info`` (rectified images: distortion is ignored), and publishes
+``poses/<object>`` (PoseWithCovarianceStamped in the camera's optical frame) and the transform from it to
+``<object>``, while there is a pose and only then. ``prompts.json`` is what ``p2p click`` writes; its frame 0 is the
+first image that arrives.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame, PoseEstimate
+
+#: Metres per unit by a depth image's encoding (REP 118).
+DEPTH_SCALE_M = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
+
+
+def camera_of(info: Any) -> Camera:
+    """The camera of a ``sensor_msgs/CameraInfo``; raises :class:`BadInput` where it has not been calibrated."""
+    return Camera.from_K(np.reshape(info.k, (3, 3)), info.width, info.height, "camera_info.k")
+
+
+def seconds(stamp: Any) -> float:
+    """A ``builtin_interfaces/Time`` in seconds."""
+    return stamp.sec + 1e-9 * stamp.nanosec
+
+
+def pixels(image: Any, dtype: str, channels: int) -> np.ndarray:
+    """(H, W, channels) of a ``sensor_msgs/Image``: rows may be padded, bytes may be big-endian."""
+    kind = np.dtype(dtype).newbyteorder(">" if image.is_bigendian else "<")
+    width = image.width * channels * kind.itemsize
+    if image.step < width or len(image.data) < image.height * image.step:
+        got = f"{len(image.data)} bytes in rows of {image.step}"
+        raise BadInput(f"image {image.encoding}", got, f"{image.height} rows of at least {width} bytes")
+    rows = np.frombuffer(image.data, np.uint8, image.height * image.step).reshape(image.height, image.step)
+    whole = np.ascontiguousarray(rows[:, :width]).view(kind).reshape(image.height, image.width, channels)
+    return whole.astype(kind.newbyteorder("="), copy=False)
+
+
+def frame_of(index: int, rgb: Any, depth: Any) -> Frame:
+    """A frame of two ``sensor_msgs/Image`` taken at one time; :class:`BadInput` for encodings that are not known."""
+    if rgb.encoding not in ("rgb8", "bgr8"):
+        raise BadInput("rgb image", repr(rgb.encoding), "rgb8 or bgr8", "Subscribe to the colour image, not a raw one.")
+    if depth.encoding not in DEPTH_SCALE_M:
+        raise BadInput("depth image", repr(depth.encoding), "one of " + ", ".join(DEPTH_SCALE_M))
+    colour = pixels(rgb, "u1", 3)[..., :: 1 if rgb.encoding == "rgb8" else -1]
+    kind = "f4" if depth.encoding == "32FC1" else "u2"
+    depth_m = pixels(depth, kind, 1)[..., 0].astype(np.float32) * np.float32(DEPTH_SCALE_M[depth.encoding])
+    return Frame(index, seconds(rgb.header.stamp), np.ascontiguousarray(colour), depth_m)
+
+
+def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation (3, 3), as ROS has it."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(R).as_quat()
+    return float(x), float(y), float(z), float(w)
+
+
+def covariance_of(estimate: PoseEstimate) -> np.ndarray:
+    """(6, 6) as ``geometry_msgs/PoseWithCovariance`` wants it: translation first, about the camera's fixed axes.
+
+    Ours is the right tangent of T_cam_obj, [rotation, translation] in the object's axes: both are turned by R.
+    """
+    if estimate.covariance is None or estimate.T_cam_obj is None:
+        return np.zeros((6, 6))
+    turn = np.zeros((6, 6))
+    turn[:3, 3:] = turn[3:, :3] = estimate.T_cam_obj[:3, :3]
+    return turn @ estimate.covariance @ turn.T
+
+
+def fill_pose(message: Any, estimate: PoseEstimate, header: Any) -> Any:
+    """A ``geometry_msgs/PoseWithCovarianceStamped`` from an estimate that has a pose, in the frame of ``header``."""
+    T = se3.check("estimate", estimate.T_cam_obj)
+    message.header = header
+    at, turn = message.pose.pose.position, message.pose.pose.orientation
+    at.x, at.y, at.z = map(float, T[:3, 3])
+    turn.x, turn.y, turn.z, turn.w = quaternion(T[:3, :3])
+    message.pose.covariance = covariance_of(estimate).ravel().tolist()
+    return message
+
+
+def fill_transform(message: Any, estimate: PoseEstimate, header: Any) -> Any:
+    """A ``geometry_msgs/TransformStamped`` from the camera's frame to one that is called as the object."""
+    T = se3.check("estimate", estimate.T_cam_obj)
+    message.header, message.child_frame_id = header, estimate.object
+    at, turn = message.transform.translation, message.transform.rotation
+    at.x, at.y, at.z = map(float, T[:3, 3])
+    turn.x, turn.y, turn.z, turn.w = quaternion(T[:3, :3])
+    return message
+
+
+class TrackingNode:
+    """What happens between messages: starts a tracker with the first image, steps it, publishes what has a pose.
+
+    prompts     what is said of objects, see :func:`p2p_lib.datasets.prompts.load_prompts`
+    publish     takes an estimate with a pose and the header of its colour image
+    config      parameters or the name of a preset, as :class:`p2p_lib.method.pipeline.Point2Pose` takes them
+    """
+
+    def __init__(self, prompts: Any, publish: Any, config: Any = None):
+        self.prompts, self.publish, self.config = sorted(prompts, key=lambda p: p.frame), publish, config
+        self.tracker: Any = None
+        self._headers: list[Any] = []  # of frames without an answer yet
+        self._count = 0
+
+    def on_images(self, rgb: Any, depth: Any, info: Any) -> dict[str, PoseEstimate]:
+        """One synchronised triple of messages; the estimates, which are of an earlier one if the tracker is late."""
+        from p2p_lib.method.pipeline import Point2Pose
+
+        if self.tracker is None:
+            self.tracker = Point2Pose(camera_of(info), self.config)
+        while self.prompts and self.prompts[0].frame <= self._count:
+            self.tracker.tell(self.prompts.pop(0))
+        self._headers.append(rgb.header)
+        estimates = self.tracker.step(frame_of(self._count, rgb, depth))
+        self._count += 1
+        if len(self._headers) > self.tracker.tracker.latency_frames:
+            header = self._headers.pop(0)
+            for estimate in estimates.values():
+                if estimate.T_cam_obj is not None:
+                    self.publish(estimate, header)
+        return estimates
+
+
+def main() -> None:
+    """Spin the node until it is shut down. What ROS brings is imported here alone."""
+    from p2p_lib.datasets.prompts import load_prompts
+
+    rclpy, filters, tf2 = map(import_module, ("rclpy", "message_filters", "tf2_ros"))
+    sensors, geometry = map(import_module, ("sensor_msgs.msg", "geometry_msgs.msg"))
+    rclpy.init()
+    node = rclpy.create_node("point2pose")
+    path = node.declare_parameter("prompts", "prompts.json").value
+    preset = node.declare_parameter("preset", "default").value
+    transforms, publishers = tf2.TransformBroadcaster(node), {}
+
+    def publish(estimate: PoseEstimate, header: Any) -> None:
+        kind = geometry.PoseWithCovarianceStamped
+        if estimate.object not in publishers:
+            publishers[estimate.object] = node.create_publisher(kind, f"poses/{estimate.object}", 10)
+        publishers[estimate.object].publish(fill_pose(kind(), estimate, header))
+        transforms.sendTransform(fill_transform(geometry.TransformStamped(), estimate, header))
+
+    tracking = TrackingNode(load_prompts(path), publish, preset)
+    kinds = {"rgb": sensors.Image, "depth": sensors.Image, "camera_info": sensors.CameraInfo}
+    qos = import_module("rclpy.qos").qos_profile_sensor_data
+    topics = [filters.Subscriber(node, kind, topic, qos_profile=qos) for topic, kind in kinds.items()]
+    # Drivers publish as sensors do, and what comes while a frame is tracked soon takes the place of what waited.
+    synchronised = filters.ApproximateTimeSynchronizer(topics, queue_size=2, slop=0.02)
+    synchronised.registerCallback(tracking.on_images)
+    try:
+        rclpy.spin(node)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main()
