@@ -1,7 +1,9 @@
 """The set-up: its lock, its stamp, its refusals. Real installations are measured in environment.md."""
 
 import ast
+import importlib
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -10,6 +12,7 @@ import sys
 import time
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from packaging.requirements import Requirement
@@ -227,3 +230,55 @@ def make_whole(checkout: Path, bootstrap) -> None:
     (checkout / ".venv" / "bin").mkdir(parents=True)
     (checkout / ".venv" / "bin" / "python").symlink_to(sys.executable)
     (checkout / ".venv" / ".p2p-stamp").write_text(bootstrap.stamp_of(checkout, "cpu"))
+
+
+def test_the_quickstart_installs_what_it_lacks(monkeypatch):
+    """Its first cell of code, as Colab runs it: without p2p_lib, and with it."""
+    import importlib.util
+
+    import IPython
+
+    cells = json.loads((PROJECT / "notebooks" / "00_quickstart.ipynb").read_text())["cells"]
+    first = next("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    asked = []
+    shell = SimpleNamespace(run_line_magic=lambda *words: asked.append(words))
+    monkeypatch.setattr(IPython, "get_ipython", lambda: shell)
+    exec(first.partition("\nfrom p2p_lib")[0], {})
+    assert not asked, "it is installed here"
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    exec(first.partition("\nfrom p2p_lib")[0], {})
+    assert asked == [("pip", f"install -q {PYPROJECT['project']['name']}")]
+
+
+def test_the_container_is_given_what_the_set_up_reads(bootstrap, tmp_path):
+    """The steps before RUN of the recipe, followed: the set-up has its files then, and the same ones at the end."""
+    recipe = (PROJECT / "tools" / "Dockerfile").read_text()
+    early = recipe.partition("RUN python3 tools/bootstrap.py")[0]
+    for step in re.findall(r"(?m)^COPY --chown=1000 (.*)$", early):
+        *sources, to = step.split()
+        (tmp_path / to).mkdir(parents=True, exist_ok=True)
+        for source in map(PROJECT.joinpath, sources):
+            if source.is_dir():
+                shutil.copytree(source, tmp_path / to, dirs_exist_ok=True)
+            else:
+                shutil.copy(source, tmp_path / to)
+    assert bootstrap.stamp_of(tmp_path, "cpu").split()[-1] == bootstrap.stamp_of(PROJECT, "cpu").split()[-1]
+    ask = [sys.executable, "-c", "from p2p_lib.core import native; print(native.__file__)"]
+    ran = subprocess.run(ask, cwd=tmp_path, capture_output=True, text=True, env={"PYTHONPATH": str(tmp_path)})
+    assert Path(ran.stdout.strip()).is_relative_to(tmp_path)
+    libraries = set(re.findall(r"lib\S+", early.partition("apt-get install")[2].partition("&&")[0]))
+    assert libraries == set(importlib.import_module("p2p_lib.core.native").SYSTEM_LIBRARIES.values())
+
+
+def test_the_workflow_runs_the_two_commands_on_every_python():
+    yaml = pytest.importorskip("yaml")
+    flow = yaml.safe_load((PROJECT / ".github" / "workflows" / "ci.yml").read_text())
+    job = flow["jobs"]["test"]
+    assert tuple(sorted(job["strategy"]["matrix"]["python"])) == tuple(sorted(("3.11", "3.12", "3.13")))
+    run = [step["run"] for step in job["steps"] if "run" in step]
+    assert {"make reproduce", "make test"} <= set(run)
+    assert flow["jobs"]["backends"]["steps"][-1]["run"] == "make test-backends"
+    targets = set(re.findall(r"(?m)^([a-z-]+):", (PROJECT / "Makefile").read_text()))
+    assert {line.split()[1] for line in run if line.startswith("make ")} <= targets
+    for step in [*job["steps"], *flow["jobs"]["backends"]["steps"]]:
+        assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", step.get("uses", "a@" + "0" * 40)), "an action at one commit"
