@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import Field, dataclass, fields, is_dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 #: No depth camera measures nearer or farther.
 NEAREST_M, FARTHEST_M = 0.001, 100.0
@@ -102,7 +99,11 @@ class Tracks:
         return Tracks(ids, self.uv_px[at], self.visible[at], self.uncertainty[at])
 
 
-Arrays = TypeVar("Arrays", bound="DataclassInstance")
+class _Dataclass(Protocol):
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+Arrays = TypeVar("Arrays", bound=_Dataclass)
 
 
 class Rows:
