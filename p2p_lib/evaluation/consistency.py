@@ -45,7 +45,7 @@ HEADS = {
     ),
     "reprojection_px": ("reprojection [px]", "from keypoints at the pose to where they were seen: 0 is best"),
 }
-#: Measured on three real sequences from clicks, as tracked and with every pose put off by 1 cm.
+#: Measured from clicks on three real sequences as tracked, and on two of them with every pose put off by 1 cm.
 SCALE = (
     "On real video that was tracked well: depth 70 to 90 %, IoU 80 to 90 %, below 1 px; with poses 1 cm off: "
     "40 to 80 %, 70 to 80 %, 4 to 5 px."
