@@ -108,7 +108,7 @@ def test_the_command_prints_one_json_object(capsys):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ("synthetic/crossing --tracker lkk", "tracker: got 'lkk', expected one of builtin, lk"),
+        ("synthetic/crossing --tracker lkk", "tracker: got 'lkk', expected one of builtin, builtin2d, lk"),
         ("synthetic/crossing --models tin=x.obj", "model: got the name 'tin', expected one of the objects: box, can"),
         ("synthetic/crossing --models can=nowhere.obj", "nowhere.obj: no such model"),
         ("nowhere", "nowhere: no such folder"),
