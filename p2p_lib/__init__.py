@@ -42,21 +42,21 @@ _WHERE = {
     "MissingBackend": "p2p_lib.core.errors",
     "P2PError": "p2p_lib.core.errors",
 }
-__all__ = [
-    "BadInput",
+__all__ = [  # noqa: RUF022 what one needs first comes first, in the reference as well
+    "Point2Pose",
+    "open_sequence",
     "Camera",
     "Config",
+    "preset",
     "Frame",
-    "MissingBackend",
-    "MissingData",
-    "P2PError",
-    "Point2Pose",
     "PoseEstimate",
     "Status",
     "Tracks",
+    "BadInput",
+    "MissingData",
+    "MissingBackend",
+    "P2PError",
     "__version__",
-    "open_sequence",
-    "preset",
 ]
 
 
