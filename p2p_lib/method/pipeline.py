@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from p2p_lib.core.backends import (
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, doubt
-from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.core.interfaces import Hint, PointTracker, Segmenter
 from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_mask, check_not_on, check_prompt
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
@@ -296,9 +297,9 @@ class Point2Pose:
             return masks
         with self.stopwatch("segmentation"):
             sought = [name for name in self.segmenter.names if name in masks and masks[name] is None]
-            hints = {name: self.objects[name].hint(frame, self.tracks, sightings.get(name)) for name in sought}
-            self._apply({name: requests for name, (_, requests) in hints.items()})
-            labels = self.segmenter.segment(frame, said.values(), {name: hint for name, (hint, _) in hints.items()})
+            hints = _Hints(sought, lambda name: self.objects[name].hint(frame, self.tracks, sightings.get(name)))
+            self._apply({name: hints.requests(name) for name in sought if self.objects[name].sought})
+            labels = self.segmenter.segment(frame, said.values(), hints)
             label_of = {name: label for label, name in enumerate(self.segmenter.names, 1)}
             looked_after = [name for name, mask in masks.items() if mask is None and name in label_of]
             return masks | {name: labels == label_of[name] for name in looked_after}
@@ -314,6 +315,28 @@ class Point2Pose:
             search = np.logical_or.reduce(known) if len(known) == len(masks) > 0 else None
             urgent = any(obj.awaited(masks[name]) for name, obj in self.objects.items())
             return self.tracker.track(frame, search, urgent)
+
+
+class _Hints(Mapping[str, Hint]):
+    """The hints of some objects, each made when it is first asked for: they cost, and a segmenter needs but some."""
+
+    def __init__(self, names: Sequence[str], make: Callable[[str], tuple[Hint, Requests]]):
+        self._names, self._make = names, cache(make)
+
+    def __getitem__(self, name: str) -> Hint:
+        if name not in self._names:
+            raise KeyError(name)
+        return self._make(name)[0]
+
+    def requests(self, name: str) -> Requests:
+        """What an object wants of the tracker before anybody segments."""
+        return self._make(name)[1]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
 
 
 def _prompt(name: str, **said: ArrayLike | None) -> Prompt:

@@ -10,7 +10,7 @@ from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.motion import Motion, Motions, Past, agrees, parts_that_follow, scene_stays
-from p2p_lib.segmenters.builtin.patch import Box, Patch, connected
+from p2p_lib.segmenters.builtin.patch import Box, Patch, holding, parts_of
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
@@ -58,14 +58,14 @@ def motions_of(then: Frame, now: Frame, moved_m: float) -> Motions:
 
 def patch_and_plate(frame: Frame, moved_m: float) -> tuple[Patch, np.ndarray]:
     patch = Patch.of(frame, Box(60, 60, 220, 180), CAMERA, CONFIG)
-    return patch, connected(patch.smooth, patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
+    return patch, holding(parts_of(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
 
 
 def test_a_part_that_moves_along_is_told_from_a_neighbour_that_stays():
     then, now, moved_m = scene(0, 0.0), scene(30, 0.05), 0.05
     patch, plate = patch_and_plate(now, moved_m)
     motions = motions_of(then, now, moved_m)
-    parts = parts_that_follow(patch, patch.smooth, plate, motions)
+    parts = parts_that_follow(patch, parts_of(patch.smooth), plate, motions)
     part, neighbour = (
         patch.down(at(*a).astype(np.float32)) > 0.5 for a in ((PART, moved_m, PART_M), (NEIGHBOUR, 0, PART_M))
     )
@@ -84,10 +84,10 @@ def test_what_may_as_well_have_stood_still_is_no_part():
         frame.rgb[board & ~plate], frame.depth_m[board & ~plate] = 120, PART_M
         frames.append(frame)
     patch = Patch.of(frames[1], Box(40, 40, 280, 200), CAMERA, CONFIG)
-    plate = connected(patch.smooth, patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
+    plate = holding(parts_of(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
     motions = motions_of(*frames, moved_m)
     assert scene_stays(patch, motions)
-    assert not parts_that_follow(patch, patch.smooth, plate, motions).any()
+    assert not parts_that_follow(patch, parts_of(patch.smooth), plate, motions).any()
 
 
 def test_a_camera_that_moves_past_what_lies_still_tells_nothing():
@@ -95,9 +95,9 @@ def test_a_camera_that_moves_past_what_lies_still_tells_nothing():
     then, now = scene(0, 0.0), scene(30, 0.0, moved_m)
     patch, _ = patch_and_plate(now, moved_m)
     motions = motions_of(then, now, moved_m)
-    plate = connected(patch.smooth, patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
+    plate = holding(parts_of(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
     assert not scene_stays(patch, motions)
-    assert not parts_that_follow(patch, patch.smooth, plate, motions).any()
+    assert not parts_that_follow(patch, parts_of(patch.smooth), plate, motions).any()
 
 
 def test_points_agree_with_an_earlier_frame_at_their_depth_and_in_their_colour():
@@ -141,15 +141,16 @@ def test_what_came_to_the_object_later_is_not_a_part_of_it():
     before.rgb[empty], before.depth_m[empty] = _texture(9)[empty], WALL_M
     patch, plate = patch_and_plate(now, moved_m)
     both = motions_of(then, now, moved_m)
-    assert parts_that_follow(patch, patch.smooth, plate, both).any()
+    assert parts_that_follow(patch, parts_of(patch.smooth), plate, both).any()
     later = Motions(now, both.recent, Motion(before, both.first.T_then_now))
-    assert not parts_that_follow(patch, patch.smooth, plate, later).any()
+    assert not parts_that_follow(patch, parts_of(patch.smooth), plate, later).any()
 
 
 def test_the_first_frame_is_remembered_and_the_newest():
     past, seen = Past(), range(0, 60)
     for k in seen:
-        past = past.with_frame(scene_of_nothing(k), left(0.01 * k))
+        if past.due(scene_of_nothing(k)):
+            past = past.with_frame(scene_of_nothing(k), left(0.01 * k))
     kept = [frame.index for frame, _ in past.seen]
     assert kept[0] == 0 and kept[-1] == 55 and len(kept) < 10 and min(np.diff(kept)) >= 5
     motions = past.motions(scene_of_nothing(60), left(0.6))

@@ -13,7 +13,7 @@ from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import evidence, histogram
 from p2p_lib.segmenters.builtin.motion import Motions, parts_that_follow
-from p2p_lib.segmenters.builtin.patch import Patch, connected, dilated, plane_heights
+from p2p_lib.segmenters.builtin.patch import Patch, dilated, holding, middle, parts_of, plane_heights
 
 #: Weight of a pixel's certain evidence beside a tie to a like neighbour.
 _EVIDENCE = 0.06
@@ -47,22 +47,23 @@ def by_geometry(
     at = seeds & measured
     if not at.any():
         return log_odds, nothing
-    log_odds[measured & (np.abs(patch.depth_m - np.median(patch.depth_m[at])) > config.reach_m)] -= (
+    log_odds[measured & (np.abs(patch.depth_m - middle(patch.depth_m[at])) > config.reach_m)] -= (
         config.geometry_weight
     )
     free = patch.smooth
     if plane is not None:
-        height, sigma_m = plane_heights(patch, plane), float(np.median(patch.sigma_m[at]))
-        above_m = float(np.median(height[at]))
+        height, sigma_m = plane_heights(patch, plane), middle(patch.sigma_m[at])
+        above_m = middle(height[at])
         if abs(above_m) < _STANDS_OUT * sigma_m:
             return log_odds, nothing  # flat: depth does not tell it from what it lies on
         if above_m > 0:
             low = height < min(above_m / 2, (_STANDS_OUT + 0.5) * sigma_m + _PLANE_SLACK_M)
             log_odds[measured & low] -= config.geometry_weight
             free = free & ~low
-    component = connected(free, seeds)
+    part = parts_of(free)
+    component = holding(part, seeds)
     if motions is not None:
-        parts = parts_that_follow(patch, free, component, motions)
+        parts = parts_that_follow(patch, part, component, motions)
         component |= parts
         log_odds[parts] += config.geometry_weight
     log_odds[measured & ~dilated(component, 1)] -= config.geometry_weight

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from p2p_lib.core import se3
@@ -54,10 +53,12 @@ class Past:
 
     seen: tuple[tuple[Frame, np.ndarray], ...] = ()
 
+    def due(self, frame: Frame) -> bool:
+        """Whether a frame is to be remembered."""
+        return not self.seen or frame.index >= self.seen[-1][0].index + EVERY
+
     def with_frame(self, frame: Frame, T_cam_obj: np.ndarray) -> Past:
-        """With one more frame where one is due: the oldest but the first gives way to it."""
-        if self.seen and frame.index < self.seen[-1][0].index + EVERY:
-            return self
+        """With one more frame: the oldest but the first gives way to it."""
         return Past((*self.seen[:1], *self.seen[1:][1 - _KEPT :], (frame, T_cam_obj)))
 
     def motions(self, now: Frame, T_cam_obj: np.ndarray) -> Motions | None:
@@ -100,13 +101,15 @@ def scene_stays(patch: Patch, motions: Motions) -> bool:
     return len(stayed) >= _FEWEST and stayed.mean() > _STAYS
 
 
-def parts_that_follow(patch: Patch, smooth: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
-    """(h, w) bool: smooth parts beside an object's component (h, w) bool that moved as it did and did not stay.
+def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
+    """(h, w) bool: parts beside an object's component (h, w) bool that moved as it did and did not stay.
+
+    part  (h, w) int, see :func:`p2p_lib.segmenters.builtin.patch.parts_of`
 
     What was not there in the first frame, a hand that took the object, is not of it.
     """
-    count, part = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
-    size = np.bincount(part.ravel(), minlength=count)
+    size = np.bincount(part.ravel())
+    count = len(size)
     beside = np.zeros(count, bool)
     beside[part[dilated(component, _NEAR) & ~component]] = True
     beside[part[component]] = False

@@ -17,6 +17,10 @@ from p2p_lib.segmenters.builtin.colours import colour_codes
 
 #: Depth changes from pixel to pixel of the grid by this much on surfaces seen at a slant.
 _SLANT_M = 0.004
+#: So many values tell their median.
+_ENOUGH = 400
+#: Points that tell of a support plane, and planes that are tried.
+_PLANE_POINTS, _PLANES = 250, 50
 #: A plane that holds less than this share of the pixels supports nothing.
 _SUPPORTS = 0.2
 
@@ -51,14 +55,16 @@ def around(centre: np.ndarray, half: np.ndarray, shape: tuple[int, int]) -> Box:
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A box of a frame, no side longer than ``config.side_px``.
+    """A box of a frame on a grid of square cells, no side longer than ``config.side_px`` cells.
 
+    cell_px   side of a cell in pixels: a whole number, by which images are scaled several times faster than by another
     rgb       (h, w, 3) uint8, averaged
-    depth_m   (h, w) nearest reading, 0 = not measured
+    depth_m   (h, w) reading in the middle, 0 = not measured
     sigma_m   (h, w) noise of the depth
     """
 
     box: Box
+    cell_px: int
     camera: Camera
     rgb: np.ndarray
     depth_m: np.ndarray
@@ -66,13 +72,15 @@ class Patch:
 
     @classmethod
     def of(cls, frame: Frame, box: Box, camera: Camera, config: SegmentationConfig) -> Patch:
-        """The patch of a frame's box."""
-        h, w = box.shape
-        scale = min(1.0, config.side_px / max(h, w))
-        size = max(2, round(w * scale)), max(2, round(h * scale))
-        rgb = cv2.resize(frame.rgb[box.slices], size, interpolation=cv2.INTER_AREA)
-        z = cv2.resize(frame.depth_m[box.slices], size, interpolation=cv2.INTER_NEAREST)
-        return cls(box, camera, rgb, z, depth_noise_m(z))
+        """The patch of a frame's box, which is made larger to hold whole cells; at the image's end it may be cut."""
+        cell_px = -(-max(box.shape) // config.side_px)
+        return cls.like(frame, _whole_cells(box, cell_px, frame.shape), cell_px, camera)
+
+    @classmethod
+    def like(cls, frame: Frame, box: Box, cell_px: int, camera: Camera) -> Patch:
+        """The patch of another frame on the same grid."""
+        rgb, z = _averaged(frame.rgb[box.slices], cell_px), _middles(frame.depth_m[box.slices], cell_px)
+        return cls(box, cell_px, camera, rgb, z, depth_noise_m(z))
 
     @cached_property
     def gray(self) -> np.ndarray:
@@ -110,11 +118,11 @@ class Patch:
 
     def down(self, image: np.ndarray) -> np.ndarray:
         """A float image (H, W), averaged onto the grid."""
-        return cv2.resize(image[self.box.slices], self.shape[::-1], interpolation=cv2.INTER_AREA)
+        return _averaged(image[self.box.slices], self.cell_px)
 
     def nearest(self, image: np.ndarray) -> np.ndarray:
         """An image (H, W) on the grid, each pixel that of its nearest."""
-        return cv2.resize(image[self.box.slices], self.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        return _middles(image[self.box.slices], self.cell_px)
 
     def up(self, values: np.ndarray) -> np.ndarray:
         """Values (h, w) of the grid at the pixels of the box."""
@@ -123,8 +131,8 @@ class Patch:
 
     def grid(self, uv_px: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of the image as nearest columns and rows of the grid; those outside it are left out."""
-        (h, w), size = self.shape, np.array(self.box.shape[::-1])
-        at = (np.asarray(uv_px, float) - [self.box.left, self.box.top] + 0.5) * (np.array([w, h]) / size) - 0.5
+        h, w = self.shape
+        at = (np.asarray(uv_px, float) - [self.box.left, self.box.top] + 0.5) / self.cell_px - 0.5
         at = np.rint(at).astype(int)
         return at[((at >= 0) & (at < [w, h])).all(1)]
 
@@ -167,10 +175,40 @@ class Patch:
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         """The slopes x / z of the columns (w,) and y / z of the rows (h,)."""
-        (h, w), (rows, cols) = self.shape, self.box.shape
-        u = (np.arange(w) + 0.5) * (cols / w) - 0.5 + self.box.left
-        v = (np.arange(h) + 0.5) * (rows / h) - 0.5 + self.box.top
+        u, v = self.centres_px()
         return (u - self.camera.cx) / self.camera.fx, (v - self.camera.cy) / self.camera.fy
+
+    def centres_px(self) -> tuple[np.ndarray, np.ndarray]:
+        """The pixels (w,) and (h,) of the image in which columns and rows have their middles."""
+        u, v = ((np.arange(n) + 0.5) * self.cell_px - 0.5 for n in self.shape[::-1])
+        return u + self.box.left, v + self.box.top
+
+
+def _whole_cells(box: Box, cell_px: int, shape: tuple[int, int]) -> Box:
+    """A box of whole cells around another, inside an image where that is possible."""
+    spans = []
+    for low, high, end in ((box.left, box.right, shape[1]), (box.top, box.bottom, shape[0])):
+        size = min(max(-(-(high - low) // cell_px), 2), end // cell_px) * cell_px
+        low = min(low, end - size)
+        spans.append((low, low + size))
+    (left, right), (top, bottom) = spans
+    return Box(left, top, right, bottom)
+
+
+def _averaged(image: np.ndarray, cell_px: int) -> np.ndarray:
+    """An image (rows, columns, ...) by the means of its cells."""
+    size = image.shape[1] // cell_px, image.shape[0] // cell_px
+    return image.copy() if cell_px == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _middles(image: np.ndarray, cell_px: int) -> np.ndarray:
+    """An image (rows, columns, ...) by one pixel of each cell."""
+    return image[cell_px // 2 :: cell_px, cell_px // 2 :: cell_px].copy()
+
+
+def middle(values: np.ndarray) -> float:
+    """The median of values (N,), of some hundreds of them where there are many: it costs more than all else here."""
+    return float(np.median(values[:: 1 + len(values) // _ENOUGH]))
 
 
 def depth_step_m(depth_m: np.ndarray) -> np.ndarray:
@@ -183,10 +221,19 @@ def dilated(region: np.ndarray, radius: int) -> np.ndarray:
     return cv2.dilate(region.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
 
 
-def connected(region: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The parts of a region (h, w) bool that hold a seed."""
-    count, part = cv2.connectedComponents(region.astype(np.uint8), connectivity=4)
-    holds = np.zeros(count, bool)
+def filled(region: np.ndarray) -> np.ndarray:
+    """A region (h, w) bool with its gaps of a pixel: those of whose eight neighbours five are of it."""
+    return region | (cv2.blur(region.astype(np.float32), (3, 3)) > 4.5 / 9)
+
+
+def parts_of(region: np.ndarray) -> np.ndarray:
+    """(h, w) int: the number of each connected part of a region (h, w) bool, 0 outside it."""
+    return cv2.connectedComponents(region.astype(np.uint8), connectivity=4)[1]
+
+
+def holding(part: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the parts, see :func:`parts_of`, that hold a seed."""
+    holds = np.zeros(part.max() + 1, bool)
     holds[part[seeds]] = True
     holds[0] = False
     return holds[part]
@@ -194,15 +241,15 @@ def connected(region: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 
 def support_plane(patch: Patch, where: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
     """(4,) n, d with n . p = d and n towards the camera: the plane of at least a fifth of the pixels; else None."""
-    v, u = np.nonzero(where)
-    if len(v) < 100:
+    at = np.flatnonzero(where)
+    if len(at) < 100:
         return None
-    some = rng.integers(0, len(v), 400)
+    v, u = np.divmod(at[rng.integers(0, len(at), _PLANE_POINTS)], patch.shape[1])
     x, y = patch.rays()
-    z = patch.depth_m[v, u][some].astype(float)
-    p = np.stack([x[u[some]] * z, y[v[some]] * z, z], -1)
-    within = 2 * patch.sigma_m[v, u][some]
-    a, b, c = np.moveaxis(p[rng.integers(0, len(p), (80, 3))], 1, 0)
+    z = patch.depth_m[v, u].astype(float)
+    p = np.stack([x[u] * z, y[v] * z, z], -1)
+    within = 2 * patch.sigma_m[v, u]
+    a, b, c = p[rng.integers(0, len(p), (3, _PLANES))]
     n = np.cross(b - a, c - a)
     n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
     off = np.abs(p @ n.T - (n * a).sum(1))

@@ -20,7 +20,7 @@ from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, cut
-from p2p_lib.segmenters.builtin.patch import Box, Patch, around, connected, dilated, plane_heights, support_plane
+from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, holding, parts_of, plane_heights, support_plane
 
 #: Room around an object, besides a share of its size: small ones move by pixels too.
 ROOM_PX = 6
@@ -65,7 +65,7 @@ class Cutter:
         outside = ~dilated(seeds, min(seeds.shape) // 6) if around_px is None else ~_within(patch, around_px)
         x = self._cut_out(patch, plane, clicks, dilated(seeds, 2), outside)
         whole = np.zeros(frame.shape, np.float32)
-        whole[box.slices] = patch.up(x)
+        whole[patch.box.slices] = patch.up(x)
         patch = Patch.of(frame, self._fitting(patch, x > 0.5), self.camera, cfg)
         was = patch.down(whole)
         x = self._cut_out(patch, plane, clicks, was > 0.5, was < 0.5, was)
@@ -75,7 +75,7 @@ class Cutter:
         """Anew, from clicks that say what is wrong with a mask (H, W) bool, and from what is right about it.
 
         known_px  (K, 2) pixels that are thought to be on the object, as is the middle of the mask: those are that lie
-                  nearer to a click on it than to one beside it; with clicks beside it alone, those far from them
+                  nearer to a click on it than to one beside it; with clicks beside it alone, the third farthest from them
         """
         inner = cv2.distanceTransform(np.pad(was, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
         v, u = np.nonzero(inner >= inner.max() / 2)
@@ -84,7 +84,7 @@ class Cutter:
             np.linalg.norm(right_px[:, None] - at, axis=-1).min(1, initial=np.inf)
             for at in (self.prompt.points_px, self.prompt.negative_px)
         )
-        right_px = right_px[beside >= (on if np.isfinite(on).all() else np.median(beside))]
+        right_px = right_px[beside >= (on if np.isfinite(on).all() else np.quantile(beside, 2 / 3))]
         points_px = np.concatenate([self.prompt.points_px, right_px])
         return replace(self, prompt=replace(self.prompt, points_px=points_px)).start()
 
@@ -116,10 +116,9 @@ class Cutter:
     def _fitting(self, patch: Patch, inside: np.ndarray) -> Box:
         """A box with room around what is ``inside`` a patch."""
         rows, columns = bounds(inside)
-        scale = np.array(patch.box.shape[::-1]) / patch.shape[::-1]
         corner = np.array([patch.box.left, patch.box.top])
-        low, high = np.array([columns.start, rows.start]) * scale, np.array([columns.stop, rows.stop]) * scale
-        return self._room(low + corner, high + corner)
+        low, high = np.array([columns.start, rows.start]), np.array([columns.stop, rows.stop])
+        return self._room(low * patch.cell_px + corner, high * patch.cell_px + corner)
 
     def _room(self, low: np.ndarray, high: np.ndarray) -> Box:
         """A box with room around the pixels from ``low`` to ``high`` (x, y)."""
@@ -129,7 +128,7 @@ class Cutter:
 
 def only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     """The probabilities without the islands that hold no seed."""
-    return np.where(connected(x > 0.5, seeds) | (x <= 0.5), x, 0)
+    return np.where(holding(parts_of(x > 0.5), seeds) | (x <= 0.5), x, 0)
 
 
 def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> None:
@@ -164,9 +163,7 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
 
 def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:
     """(h, w) bool: the pixels of a patch inside a box (4,) of the image."""
-    (h, w), (rows, columns) = patch.shape, patch.box.shape
-    u = (np.arange(w) + 0.5) * (columns / w) - 0.5 + patch.box.left
-    v = (np.arange(h) + 0.5) * (rows / h) - 0.5 + patch.box.top
+    u, v = patch.centres_px()
     slack = _TIGHT * np.ptp(box_px.reshape(2, 2), 0)
     left, top, right, bottom = box_px + np.concatenate([-slack, slack])
     return ((v >= top) & (v <= bottom))[:, None] & ((u >= left) & (u <= right))

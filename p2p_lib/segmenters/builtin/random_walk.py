@@ -13,8 +13,8 @@ import numpy as np
 _LOOSE = 1e-4
 #: Factor of the edge weight between a measured and an unmeasured pixel: depth is missing mostly beside silhouettes.
 _INTO_THE_UNMEASURED = 0.05
-#: Conjugate gradients end when the residual falls below this, or after so many steps.
-_SETTLED, _STEPS = 2e-3, 40
+#: Conjugate gradients end when the residual is below this, as the root mean square of the pixels, or after so many steps.
+_SETTLED, _STEPS = 3e-4, 40
 
 
 def edge_weights(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -24,15 +24,14 @@ def edge_weights(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) ->
     step_m (H, W): a depth step of this size is an edge.
     """
     across = colour[:, 1:] - colour[:, :-1], colour[1:] - colour[:-1]
-    contrast = [(d * d).sum(-1) for d in across]
-    mean = np.concatenate([c.ravel() for c in contrast]).mean() if colour.size else 0.0
+    contrast = [np.einsum("ijk,ijk->ij", d, d) for d in across]
+    mean = sum(c.sum() for c in contrast) / max(sum(c.size for c in contrast), 1)
     pairs = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
-    weights = []
+    measured, weights = depth_m > 0, []
     for (a, b), c in zip(pairs, contrast, strict=True):
-        measured = (depth_m[a] > 0).astype(np.int8) + (depth_m[b] > 0)
-        jump = np.where(measured == 2, (depth_m[a] - depth_m[b]) / np.maximum(step_m[a], step_m[b]), 0)
+        jump = np.where(measured[a] & measured[b], (depth_m[a] - depth_m[b]) / np.maximum(step_m[a], step_m[b]), 0)
         w = np.exp(-c / (2 * mean + 1e-6) - np.minimum(jump * jump, 20))
-        weights.append(np.maximum(np.where(measured == 1, _INTO_THE_UNMEASURED * w, w), _LOOSE).astype(np.float32))
+        weights.append(np.maximum(np.where(measured[a] ^ measured[b], _INTO_THE_UNMEASURED * w, w), _LOOSE))
     return weights[0], weights[1]
 
 
@@ -62,6 +61,6 @@ def walk(
     right, below = right * scale[:-1] * scale[1:], below * (scale[:-columns] * scale[columns:])
     system = diags_array([np.ones_like(degree), -right, -right, -below, -below], offsets=[0, 1, -1, columns, -columns])
     evidence, first = (strength * target).ravel() * scale, start.ravel().astype(np.float32) / scale
-    x, _ = cg(system, evidence, first, rtol=0, atol=_SETTLED, maxiter=steps)
+    x, _ = cg(system, evidence, first, rtol=0, atol=_SETTLED * np.sqrt(degree.size), maxiter=steps)
     x *= scale
     return np.clip(x.reshape(target.shape), 0, 1)

@@ -23,11 +23,17 @@ from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
-from p2p_lib.segmenters.builtin.motion import EVERY, Motions, Past, scene_stays
-from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, support_plane
+from p2p_lib.segmenters.builtin.motion import Motions, Past, scene_stays
+from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, filled, middle, support_plane
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start, only
 
 _NO_PX = np.zeros((0, 2))
+#: An object whose points agree is cut out in every third frame, in turns, and moved by the optical flow in between,
+_TURNS = 3
+#: unless more of it than this jumped in depth, or its area changed by more.
+_JUMPED, _CHANGED = 0.03, 0.1
+#: Depth is missing in thin lines along edges: unmeasured pixels so near to measured ones of the object may be of it.
+_RIM_PX = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +49,26 @@ class _Seen:
         """(2,) middle of the box."""
         return np.array([self.box.left + self.box.right, self.box.top + self.box.bottom]) / 2
 
+    def whole(self, shape: tuple[int, int]) -> np.ndarray:
+        """The mask as an image (H, W) float32."""
+        image = np.zeros(shape, np.float32)
+        image[self.box.slices] = self.mask
+        return image
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """An object's mask of a frame ago, moved by the optical flow: on a patch of this frame, what it is there (h, w).
+
+    jumped    (h, w) bool: its depth is another one, something else has come before it or it has gone
+    doubtful  whether that says too little
+    """
+
+    patch: Patch
+    prior: np.ndarray
+    jumped: np.ndarray
+    doubtful: bool
+
 
 @dataclass(frozen=True, eq=False)
 class _Target:
@@ -53,6 +79,7 @@ class _Target:
     size_m   (2,) its largest width and height so far
     room_m   (2,) how far parts reach from the middle of what was seen that may be of it too
     past     frames that it was seen in, with its poses
+    sure     whether enough points agreed on its pose when it was cut out last
     given    the newest frame with a mask that was given and showed something, from which nothing is learnt yet: that
              costs time, and where every frame brings a mask it is never needed
     """
@@ -62,6 +89,7 @@ class _Target:
     size_m: np.ndarray | None = None
     room_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
     past: Past = field(default_factory=Past)
+    sure: bool = False
     given: tuple[Frame, np.ndarray] | None = None
 
 
@@ -75,6 +103,7 @@ class BuiltinSegmenter:
         self._focal_px = np.array([camera.fx, camera.fy])
         self._targets: dict[str, _Target] = {}
         self._previous: Frame | None = None
+        self._frames = 0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,11 +127,21 @@ class BuiltinSegmenter:
         for mask in masks.values():
             taken |= mask
         new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
-        # An object that is looked for is not one of those in view.
-        absent = {name for name, target in self._targets.items() if target.seen is None and target.given is None}
-        absent |= {name for name, hint in (hints or {}).items() if hint.sighted}
-        for name in sorted(dict.fromkeys([*self._targets, *said]), key=absent.__contains__):
-            target, hint = self._targets.get(name, _Target()), (hints or {}).get(name) or Hint()
+        self._frames += 1
+        in_turn = {name for turn, name in enumerate(self._targets) if (self._frames - turn) % _TURNS == 0}
+
+        def hint(name: str) -> Hint:
+            return (hints or {}).get(name) or Hint()
+
+        def absent(name: str) -> bool:
+            """An object that is looked for is not one of those in view."""
+            target = self._targets.get(name, _Target())
+            if name in masks or target.given is not None:
+                return False
+            return target.seen is None or (self._cuts(target, name in in_turn) and hint(name).sighted)
+
+        for name in sorted(dict.fromkeys([*self._targets, *said]), key=absent):
+            target = self._targets.get(name, _Target())
             if name in masks:
                 given = (frame, masks[name]) if masks[name].any() else target.given
                 self._targets[name] = replace(target, seen=None, given=given)
@@ -111,11 +150,15 @@ class BuiltinSegmenter:
             if name in said:
                 others_px = [p.points_px for n, p in said.items() if n != name]
                 found[name] = self._prompted(
-                    frame, target, said[name], np.concatenate([_NO_PX, *others_px]), hint, taken
+                    frame, target, said[name], np.concatenate([_NO_PX, *others_px]), hint(name), taken
                 )
                 self._targets[name] = _Target()  # its colours and its size are learnt anew
             else:
-                self._targets[name], found[name] = self._looked_for(frame, target, hint, taken)
+                moved = None if target.seen is None else self._moved(frame, target)
+                if moved is not None and not (self._cuts(target, name in in_turn) or moved.doubtful):
+                    found[name] = moved.patch.box, moved.patch.up(np.where(moved.jumped, 0, moved.prior))
+                else:
+                    self._targets[name], found[name] = self._looked_for(frame, target, hint(name), taken, moved)
             if found[name] is not None:
                 box, x = found[name]
                 taken[box.slices] |= x > 0.5
@@ -129,6 +172,7 @@ class BuiltinSegmenter:
             cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, _NO_PX)
             doubt_start(cutter, labels == label_of[prompt.name], others)
         self._previous = frame
+        self._frames += 1
         return labels
 
     def _learnt(self, target: _Target) -> _Target:
@@ -151,7 +195,8 @@ class BuiltinSegmenter:
         """By what is said of it, and for a correction by where it would have been taken for."""
         cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, others_px)
         was = np.zeros(frame.shape, bool)
-        found = None if prompt.box_px is not None else self._looked_for(frame, target, hint, taken)[1]
+        moved = None if target.seen is None else self._moved(frame, target)
+        found = None if prompt.box_px is not None else self._looked_for(frame, target, hint, taken, moved)[1]
         if found is not None:
             was[found[0].slices] = found[1] > 0.5
         if was.any():
@@ -159,16 +204,16 @@ class BuiltinSegmenter:
         return cutter.start() if prompt.starts else None
 
     def _looked_for(
-        self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray
+        self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray, moved: _Moved | None
     ) -> tuple[_Target, tuple[Box, np.ndarray] | None]:
         """Where an object is, outside what is ``taken`` (H, W) bool where it was absent; and it, with its past."""
-        if target.seen is None or hint.sighted:  # what has been followed is not where the object was found
+        target = replace(target, sure=self._sure(hint))
+        if moved is None or hint.sighted:  # what has been followed is not where the object was found
             return target, self._find(frame, target, hint, taken)
-        if not self._sure(hint):
-            return target, self._follow(frame, target, hint)
-        if frame.index % EVERY == 0:
-            target = self._with_room(frame, target, hint)
-        found = self._follow(frame, target, hint)
+        if not (target.sure and target.past.due(frame)):
+            return target, self._follow(frame, target, hint, moved)
+        target = self._with_room(frame, target, hint)
+        found = self._follow(frame, target, hint, moved)
         return replace(target, past=target.past.with_frame(frame, hint.T_cam_obj)), found
 
     def remove(self, name: str) -> None:
@@ -180,32 +225,40 @@ class BuiltinSegmenter:
         labels = np.zeros(frame.shape, np.int32)
         if not found:
             return labels
-        best = np.full(frame.shape, 0.5, np.float32)
+        best = np.zeros(frame.shape, np.float32)
         for label, name in enumerate(self._targets, 1):
             if found.get(name) is not None:
                 box, x = found[name]
                 part, likeliest = labels[box.slices], best[box.slices]
-                wins = (x > likeliest) & (frame.depth_m[box.slices] > 0)
+                wins = x > np.maximum(likeliest, 0.5)
                 part[wins], likeliest[wins] = label, x[wins]
         for label, (name, target) in enumerate(self._targets.items(), 1):
-            if name in found:
-                mask = labels == label
-                seen = _seen(frame, mask, self.config.min_px)
-                self._targets[name] = self._updated(frame, target, seen)
-                if seen is None:
-                    labels[mask] = 0
+            if found.get(name) is None:
+                self._targets[name] = replace(target, seen=None) if name in found else target
+                continue
+            box = found[name][0]
+            part, measured = labels[box.slices], frame.depth_m[box.slices] > 0
+            mask = part == label
+            seen = _seen(frame, mask & dilated(mask & measured, _RIM_PX), self.config.min_px, box)
+            self._targets[name] = self._updated(frame, target, seen)
+            part[mask & ~filled(mask & measured) if seen is not None else mask] = 0
         return labels
 
-    def _follow(self, frame: Frame, target: _Target, hint: Hint) -> tuple[Box, np.ndarray]:
-        """From where it was a frame ago."""
-        cfg, seen = self.config, target.seen
-        box = self._box_of_all(target, frame.shape)
-        patch, before = (Patch.of(f, box, self.camera, cfg) for f in (frame, self._previous))
-        mask = np.zeros(frame.shape, np.float32)
-        mask[seen.box.slices] = seen.mask
-        prior, z_before = warped(before.down(mask), before, patch)
+    def _moved(self, frame: Frame, target: _Target) -> _Moved:
+        """What was seen of an object a frame ago, moved by the optical flow."""
+        patch = Patch.of(frame, self._box_of_all(target, frame.shape), self.camera, self.config)
+        before = Patch.like(self._previous, patch.box, patch.cell_px, self.camera)
+        was = before.down(target.seen.whole(frame.shape))
+        prior, z_before = warped(was, before, patch)
         measured = (patch.depth_m > 0) & (z_before > 0)
         jumped = measured & (prior > 0.5) & (np.abs(patch.depth_m - z_before) > patch.step_m)
+        area = np.count_nonzero(prior > 0.5)
+        changed = abs(area - np.count_nonzero(was > 0.5)) > _CHANGED * area
+        return _Moved(patch, prior, jumped, changed or np.count_nonzero(jumped) > _JUMPED * area)
+
+    def _follow(self, frame: Frame, target: _Target, hint: Hint, moved: _Moved) -> tuple[Box, np.ndarray]:
+        """From where it was a frame ago."""
+        cfg, patch, prior, jumped = self.config, moved.patch, moved.prior, moved.jumped
         core = (prior > 0.8) & ~jumped
         plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
         log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, target, hint))
@@ -214,7 +267,12 @@ class BuiltinSegmenter:
         log_odds += np.where(component, np.maximum(stays, 0), stays)
         log_odds[jumped] -= cfg.geometry_weight
         log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
-        return box, patch.up(only(cut(patch, log_odds, start=prior), core))
+        return patch.box, patch.up(only(cut(patch, log_odds, start=prior), core))
+
+    @staticmethod
+    def _cuts(target: _Target, in_turn: bool) -> bool:
+        """Whether an object that was seen is cut out anew, whatever its flow says."""
+        return in_turn or not target.sure
 
     def _sure(self, hint: Hint) -> bool:
         """Whether enough points agree on a pose."""
@@ -236,7 +294,7 @@ class BuiltinSegmenter:
         if not component.any():
             return target
         rows, columns = bounds(component)
-        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]]) * patch.box.shape[1] / patch.shape[1]
+        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]]) * patch.cell_px
         away_px = np.abs(ends + np.array([patch.box.left, patch.box.top]) - target.seen.centre_px).max(0)
         return replace(target, room_m=away_px / px_m)
 
@@ -248,8 +306,7 @@ class BuiltinSegmenter:
         z_m = float(np.nanmedian(depths_at(uv_px, frame)))
         low, high = uv_px.min(0), uv_px.max(0)
         half = np.maximum(target.size_m * self._focal_px / z_m * (0.5 + cfg.margin), high - low) + ROOM_PX
-        box = around((low + high) / 2, half, frame.shape)
-        patch = Patch.of(frame, box, self.camera, cfg)
+        patch = Patch.of(frame, around((low + high) / 2, half, frame.shape), self.camera, cfg)
         barred = patch.down(taken.astype(np.float32)) > 0.5
         seeds, surface = patch.dots(uv_px, 1) & (patch.depth_m > 0) & ~barred, by_surface(patch, hint, cfg)
         outside = ~dilated(seeds | (surface > 0), 3)
@@ -259,7 +316,7 @@ class BuiltinSegmenter:
         background = (patch.border() | barred) & ~seeds
         x = only(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
         own_colours = colour[x > 0.5]
-        return (box, patch.up(x)) if len(own_colours) and (hint.sighted or own_colours.mean() > 0) else None
+        return (patch.box, patch.up(x)) if len(own_colours) and (hint.sighted or own_colours.mean() > 0) else None
 
     def _box_of_all(self, target: _Target, shape: tuple[int, int]) -> Box:
         """Where to look for an object that was seen: room for all of it to either side of what showed."""
@@ -272,7 +329,8 @@ class BuiltinSegmenter:
         if seen is None:
             return replace(target, seen=None)
         size_m = np.array(seen.mask.shape[::-1]) * seen.z_m / self._focal_px
-        colours = histogram(colour_codes(frame.rgb[seen.box.slices][seen.mask]))
+        some = np.s_[:: 1 + max(seen.mask.shape) // self.config.side_px,] * 2
+        colours = histogram(colour_codes(frame.rgb[seen.box.slices][some][seen.mask[some]]))
         if target.colours is None:
             return replace(target, seen=seen, colours=colours, size_m=size_m)
         rate = self.config.colour_rate
@@ -280,16 +338,13 @@ class BuiltinSegmenter:
         return replace(target, seen=seen, colours=colours, size_m=np.maximum(size_m, target.size_m))
 
 
-def _seen(frame: Frame, mask: np.ndarray, min_px: int) -> _Seen | None:
-    """Where the measured pixels of a mask (H, W) lie in a frame; None where they are too few."""
-    if not mask.any():
+def _seen(frame: Frame, mask: np.ndarray, min_px: int, box: Box | None = None) -> _Seen | None:
+    """Where the measured pixels of a mask (rows, columns) of a box, or of the image, lie; None where they are few."""
+    left, top = (box.left, box.top) if box is not None else (0, 0)
+    depth_m = frame.depth_m[top : top + mask.shape[0], left : left + mask.shape[1]]
+    measured = mask & (depth_m > 0)
+    if np.count_nonzero(measured) < min_px:
         return None
-    rows, columns = bounds(mask)
-    depth_m = frame.depth_m[rows, columns]
-    mask = mask[rows, columns] & (depth_m > 0)
-    if mask.sum() < min_px:
-        return None
-    inner = bounds(mask)
-    left, top = columns.start + inner[1].start, rows.start + inner[0].start
-    box = Box(left, top, left + inner[1].stop - inner[1].start, top + inner[0].stop - inner[0].start)
-    return _Seen(box, mask[inner], float(np.median(depth_m[mask])))
+    inner = rows, columns = bounds(mask)
+    box = Box(left + columns.start, top + rows.start, left + columns.stop, top + rows.stop)
+    return _Seen(box, mask[inner], middle(depth_m[measured]))
