@@ -83,12 +83,14 @@ class Hint:
                 at the pose those points give, positive in front of it; NaN where unknown. None without a surface
     T_cam_obj   (4, 4) that pose; None where there is none
     sighted     the object has been found there by shape and colour, after an absence
+    gone        it lies outside the image, if it has stayed where it was
     """
 
     uv_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     distance_m: np.ndarray | None = None
     T_cam_obj: np.ndarray | None = None
     sighted: bool = False
+    gone: bool = False
 
 
 class Segmenter(Protocol):
@@ -110,7 +112,7 @@ class Segmenter(Protocol):
 
         prompts  what is said of objects in this frame, one each: of a new object, which starts it, or of one that is
                  looked after, whose mask it corrects. A mask is labelled as it is, where no later one claims its pixels
-        hints    what others know of the objects; a segmenter may use it
+        hints    what others know of the objects; a segmenter may use it, and asks for those alone that it uses
 
         An object that is not to be seen has no pixels. Raises :class:`BadInput` for prompts where there is no depth,
         and nothing has changed then.

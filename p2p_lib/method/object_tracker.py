@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config
 from p2p_lib.core.interfaces import Detector, Hint
@@ -396,8 +397,13 @@ class ObjectTracker:
                 return self._hint(frame, uv_px, sighting.T_cam_obj, True), requests
             best = best if enough else None
         if best is None:
-            return Hint(), requests
+            return Hint(gone=self._gone(frame)), requests
         return self._hint(frame, obs.tracks.uv_px[best.inliers], best.T_cam_obj, False), requests
+
+    def _gone(self, frame: Frame) -> bool:
+        """Whether nothing of an absent object would show in the image if it has lain still; False if nobody knows."""
+        camera, poses = self.observer.camera, self.life.scene_prior(frame.T_world_cam).values()
+        return any(not camera.inside(camera.project(se3.transform(T, self.map.p_obj)), -0.5).any() for T in poses)
 
     def _hint(self, frame: Frame, uv_px: np.ndarray, T_cam_obj: np.ndarray, sighted: bool) -> Hint:
         """The hint of a pose, with the distances from the surface under it."""

@@ -22,7 +22,9 @@ WALL = np.array([0, 0, -1.0, -1.0])
 
 def patch_of(depth_m: np.ndarray, gray: np.ndarray | None = None) -> Patch:
     gray = np.zeros((H, W), np.uint8) if gray is None else gray
-    return Patch(Box(0, 0, W, H), 1, CAMERA, np.repeat(gray[..., None], 3, 2), depth_m, np.full((H, W), 0.002, np.float32))
+    return Patch(
+        Box(0, 0, W, H), 1, CAMERA, np.repeat(gray[..., None], 3, 2), depth_m, np.full((H, W), 0.002, np.float32)
+    )
 
 
 def card_before_wall(at=CARD, card_m=0.9) -> tuple[Patch, np.ndarray, np.ndarray]:

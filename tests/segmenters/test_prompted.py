@@ -84,6 +84,12 @@ def test_masks_in_between_are_taken_and_an_empty_one_says_hidden():
     assert not follow.segment(picture(5, 14)).any() and follow.names == ("left",)
 
 
+def test_two_of_one_colour_that_touch_are_told_apart_by_the_clicks_on_each():
+    prompts = [Prompt("left", points_px=[[110, 100]]), Prompt("right", points_px=[[175, 110]])]
+    found = segmenter().segment(picture(likeness=1.0), prompts)
+    assert iou(found == 1, LEFT) > 0.85 and iou(found == 2, RIGHT) > 0.85
+
+
 def test_a_click_beside_the_object_says_what_is_not_of_it():
     """Both cards are one surface of one colour; the click on the other one takes it off, up to the line between."""
     frame, on = picture(likeness=1.0), [[110, 100]]

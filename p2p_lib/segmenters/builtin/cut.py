@@ -47,9 +47,7 @@ def by_geometry(
     at = seeds & measured
     if not at.any():
         return log_odds, nothing
-    log_odds[measured & (np.abs(patch.depth_m - middle(patch.depth_m[at])) > config.reach_m)] -= (
-        config.geometry_weight
-    )
+    log_odds[measured & (np.abs(patch.depth_m - middle(patch.depth_m[at])) > config.reach_m)] -= config.geometry_weight
     free = patch.smooth
     if plane is not None:
         height, sigma_m = plane_heights(patch, plane), middle(patch.sigma_m[at])

@@ -20,7 +20,16 @@ from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, cut
-from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, holding, parts_of, plane_heights, support_plane
+from p2p_lib.segmenters.builtin.patch import (
+    Box,
+    Patch,
+    around,
+    dilated,
+    holding,
+    parts_of,
+    plane_heights,
+    support_plane,
+)
 
 #: Room around an object, besides a share of its size: small ones move by pixels too.
 ROOM_PX = 6
@@ -75,7 +84,8 @@ class Cutter:
         """Anew, from clicks that say what is wrong with a mask (H, W) bool, and from what is right about it.
 
         known_px  (K, 2) pixels that are thought to be on the object, as is the middle of the mask: those are that lie
-                  nearer to a click on it than to one beside it; with clicks beside it alone, the third farthest from them
+                  nearer to a click on it than to one beside it; with clicks beside it alone, the third that
+                  is farthest from them
         """
         inner = cv2.distanceTransform(np.pad(was, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
         v, u = np.nonzero(inner >= inner.max() / 2)

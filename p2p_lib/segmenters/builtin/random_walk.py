@@ -13,7 +13,7 @@ import numpy as np
 _LOOSE = 1e-4
 #: Factor of the edge weight between a measured and an unmeasured pixel: depth is missing mostly beside silhouettes.
 _INTO_THE_UNMEASURED = 0.05
-#: Conjugate gradients end when the residual is below this, as the root mean square of the pixels, or after so many steps.
+#: Conjugate gradients end when the residual is below this, in root mean square, or after so many steps.
 _SETTLED, _STEPS = 3e-4, 40
 
 

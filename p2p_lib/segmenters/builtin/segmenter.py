@@ -3,8 +3,8 @@
 A segmenter takes a few clicks on each object in some frame and labels every frame from there on, causally.
 The built-in one needs no weights: evidence of colour, depth and geometry, of where the object was a
 frame ago and of what the rest of the pipeline knows, is weighed per pixel and cut along edges by a random
-walker (:mod:`p2p_lib.segmenters.builtin.random_walk`). It labels measured pixels alone: without depth nothing can be
-lifted, and depth is missing just where a silhouette is doubtful.
+walker (:mod:`p2p_lib.segmenters.builtin.random_walk`). It labels measured pixels and gaps of a pixel between them:
+without depth nothing can be lifted, and depth is missing just where a silhouette is doubtful.
 """
 
 from __future__ import annotations
@@ -30,10 +30,12 @@ from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start, on
 _NO_PX = np.zeros((0, 2))
 #: An object whose points agree is cut out in every third frame, in turns, and moved by the optical flow in between,
 _TURNS = 3
-#: unless more of it than this jumped in depth, or its area changed by more.
-_JUMPED, _CHANGED = 0.03, 0.1
-#: Depth is missing in thin lines along edges: unmeasured pixels so near to measured ones of the object may be of it.
-_RIM_PX = 2
+#: unless more of it than this jumped in depth, its area changed by more, or more of it has no depth.
+_JUMPED, _CHANGED, _BLIND = 0.03, 0.1, 0.25
+#: An object is labelled where it is measured, and where more of it than the rest is not, also where its colours go on.
+_MEASURED = 0.6
+#: What shows again after nothing of an object was measured is near to where it was.
+_APART_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +63,14 @@ class _Moved:
     """An object's mask of a frame ago, moved by the optical flow: on a patch of this frame, what it is there (h, w).
 
     jumped    (h, w) bool: its depth is another one, something else has come before it or it has gone
+    shown     (h, w) bool: it has a depth, and had none: that of the object or of what has come before it
     doubtful  whether that says too little
     """
 
     patch: Patch
     prior: np.ndarray
     jumped: np.ndarray
+    shown: np.ndarray
     doubtful: bool
 
 
@@ -156,7 +160,7 @@ class BuiltinSegmenter:
             else:
                 moved = None if target.seen is None else self._moved(frame, target)
                 if moved is not None and not (self._cuts(target, name in in_turn) or moved.doubtful):
-                    found[name] = moved.patch.box, moved.patch.up(np.where(moved.jumped, 0, moved.prior))
+                    found[name] = moved.patch.box, moved.patch.up(moved.prior)
                 else:
                     self._targets[name], found[name] = self._looked_for(frame, target, hint(name), taken, moved)
             if found[name] is not None:
@@ -208,6 +212,8 @@ class BuiltinSegmenter:
     ) -> tuple[_Target, tuple[Box, np.ndarray] | None]:
         """Where an object is, outside what is ``taken`` (H, W) bool where it was absent; and it, with its past."""
         target = replace(target, sure=self._sure(hint))
+        if hint.gone:
+            return target, None
         if moved is None or hint.sighted:  # what has been followed is not where the object was found
             return target, self._find(frame, target, hint, taken)
         if not (target.sure and target.past.due(frame)):
@@ -239,9 +245,12 @@ class BuiltinSegmenter:
             box = found[name][0]
             part, measured = labels[box.slices], frame.depth_m[box.slices] > 0
             mask = part == label
-            seen = _seen(frame, mask & dilated(mask & measured, _RIM_PX), self.config.min_px, box)
+            seen = _seen(frame, mask, self.config.min_px, box, None if target.seen is None else target.seen.z_m)
             self._targets[name] = self._updated(frame, target, seen)
-            part[mask & ~filled(mask & measured) if seen is not None else mask] = 0
+            if seen is None:
+                part[mask] = 0
+            elif np.count_nonzero(mask & measured) > _MEASURED * np.count_nonzero(mask):
+                part[mask & ~filled(mask & measured)] = 0
         return labels
 
     def _moved(self, frame: Frame, target: _Target) -> _Moved:
@@ -250,24 +259,31 @@ class BuiltinSegmenter:
         before = Patch.like(self._previous, patch.box, patch.cell_px, self.camera)
         was = before.down(target.seen.whole(frame.shape))
         prior, z_before = warped(was, before, patch)
-        measured = (patch.depth_m > 0) & (z_before > 0)
-        jumped = measured & (prior > 0.5) & (np.abs(patch.depth_m - z_before) > patch.step_m)
-        area = np.count_nonzero(prior > 0.5)
+        likely, measured, known = prior > 0.5, patch.depth_m > 0, z_before > 0
+        jumped = likely & measured & known & (np.abs(patch.depth_m - z_before) > patch.step_m)
+        shown = likely & measured & ~known
+        area, blind = np.count_nonzero(likely), np.count_nonzero(likely & ~measured) + np.count_nonzero(shown)
         changed = abs(area - np.count_nonzero(was > 0.5)) > _CHANGED * area
-        return _Moved(patch, prior, jumped, changed or np.count_nonzero(jumped) > _JUMPED * area)
+        doubtful = changed or np.count_nonzero(jumped) > _JUMPED * area or blind > _BLIND * area
+        return _Moved(patch, prior, jumped, shown, doubtful)
 
     def _follow(self, frame: Frame, target: _Target, hint: Hint, moved: _Moved) -> tuple[Box, np.ndarray]:
         """From where it was a frame ago."""
         cfg, patch, prior, jumped = self.config, moved.patch, moved.prior, moved.jumped
-        core = (prior > 0.8) & ~jumped
+        core = (prior > 0.8) & ~(jumped | moved.shown)
+        if not (core & (patch.depth_m > 0)).any():
+            core |= moved.shown & (np.abs(patch.depth_m - target.seen.z_m) < _APART_M)
         plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
         log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, target, hint))
-        stays = cfg.prior_weight * (2 * prior - 1)
+        stays = cfg.prior_weight * np.where(jumped | moved.shown, 0, 2 * prior - 1)
+        stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours have as much to say
         # Parts that come into view are connected with those that were seen before.
         log_odds += np.where(component, np.maximum(stays, 0), stays)
         log_odds[jumped] -= cfg.geometry_weight
         log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
-        return patch.box, patch.up(only(cut(patch, log_odds, start=prior), core))
+        x = only(cut(patch, log_odds, start=prior), core)
+        beside = dilated((x > 0.5) & (patch.depth_m > 0), 1)
+        return patch.box, patch.up(np.where((patch.depth_m > 0) | (prior > 0.5) | beside, x, 0))
 
     @staticmethod
     def _cuts(target: _Target, in_turn: bool) -> bool:
@@ -338,13 +354,19 @@ class BuiltinSegmenter:
         return replace(target, seen=seen, colours=colours, size_m=np.maximum(size_m, target.size_m))
 
 
-def _seen(frame: Frame, mask: np.ndarray, min_px: int, box: Box | None = None) -> _Seen | None:
-    """Where the measured pixels of a mask (rows, columns) of a box, or of the image, lie; None where they are few."""
+def _seen(
+    frame: Frame, mask: np.ndarray, min_px: int, box: Box | None = None, z_m: float | None = None
+) -> _Seen | None:
+    """Where a mask (rows, columns) of a box, or of the image, lies; None where it is small.
+
+    z_m  its depth where nothing of it is measured: it is nowhere where that is not known either
+    """
     left, top = (box.left, box.top) if box is not None else (0, 0)
-    depth_m = frame.depth_m[top : top + mask.shape[0], left : left + mask.shape[1]]
-    measured = mask & (depth_m > 0)
-    if np.count_nonzero(measured) < min_px:
+    if np.count_nonzero(mask) < min_px:
         return None
     inner = rows, columns = bounds(mask)
     box = Box(left + columns.start, top + rows.start, left + columns.stop, top + rows.stop)
-    return _Seen(box, mask[inner], middle(depth_m[measured]))
+    mask, depth_m = mask[inner], frame.depth_m[box.slices]
+    measured = mask & (depth_m > 0)
+    z_m = middle(depth_m[measured]) if np.count_nonzero(measured) >= min_px else z_m
+    return None if z_m is None else _Seen(box, mask, z_m)
