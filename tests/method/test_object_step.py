@@ -522,6 +522,19 @@ def test_a_hint_rejects_what_agrees_on_no_pose_only_while_it_is_away():
     assert set(requests.reject.tolist()) >= set(few.ids[visible_first(6)(few)].tolist())
 
 
+def test_a_hint_says_that_what_lay_still_is_outside_the_image_where_the_camera_is_known():
+    lump, nothing = begun(), np.zeros((CAMERA.height, CAMERA.width), bool)
+    frame = lump.observed(turned(0)).frame
+    lump.tracker.life = lump.tracker.life.placed(np.eye(4))
+    lump.see(turned(0), mask=nothing)
+    hidden = replace(lump.tracks(turned(0)), visible=np.zeros(len(lump.tracks(turned(0))), bool))
+    for aside_m, gone in ((0.0, False), (5.0, True)):
+        T_world_cam = se3.exp(np.array([0, 0, 0, aside_m, 0, 0]))
+        hint, _ = lump.tracker.hint(replace(frame, T_world_cam=T_world_cam), hidden)
+        assert hint.gone == gone
+    assert not lump.tracker.hint(frame, hidden)[0].gone, "nobody knows where the camera is"
+
+
 def test_questions_change_nothing():
     lump, other = settled(begun(), [2]), settled(begun(), [2])
     for _ in range(3):
