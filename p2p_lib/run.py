@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from p2p_lib.core.config import Config
-from p2p_lib.core.errors import BadInput, MissingData, doubt
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt
 from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
@@ -244,7 +244,10 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
 def _doubt_scale(job: _Job) -> None:
     """Warn, before anything is tracked, where depth is not of one scale."""
     looked_at = np.unique(np.linspace(job.frames[0], job.frames[-1] - 1, 8).astype(int)) if len(job.frames) > 1 else ()
-    pairs = [(job.sequence.frame(int(i)), job.sequence.frame(int(i) + 1)) for i in looked_at]
+    try:
+        pairs = [(job.sequence.frame(int(i)), job.sequence.frame(int(i) + 1)) for i in looked_at]
+    except P2PError:
+        return  # said when the run comes to that frame, with the poses before it kept
     if text := moving_scale(pairs):
         doubt("depth", text, f"Nothing rigid does that: is each image scaled by itself? See p2p check {job.source}")
 

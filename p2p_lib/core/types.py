@@ -13,7 +13,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 
 #: No depth camera measures nearer or farther.
-NEAREST_M, FARTHEST_M = 0.001, 100.0
+NEAREST_M, FARTHEST_M = 0.001, 1e4
 
 
 @dataclass(frozen=True, eq=False)

@@ -284,7 +284,7 @@ def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeyp
         (["--camera", "realsense:{folder}/no.bag"], "no.bag: no such recording"),
         (["--camera", "folder:{folder}", "--overlay", "x.avi"], "film: got x.avi, expected a name that ends in .mp4"),
         (["--camera", "realsense", "--rate", "15"], "rate: got 15 with realsense"),
-        (["--camera", "folder:{folder}", "--prompts", "{folder}/none.json"], "none.json: no such file of prompts"),
+        (["--camera", "folder:{folder}", "--prompts", "{folder}/none.json"], "none.json: no such file"),
         (["--camera", "folder:{folder}", "--prompts", "{prompts}", "--masks", "sam9"], "sam9"),
     ],
 )
