@@ -176,7 +176,6 @@ class BuiltinSegmenter:
             cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, _NO_PX)
             doubt_start(cutter, labels == label_of[prompt.name], others)
         self._previous = frame
-        self._frames += 1
         return labels
 
     def _learnt(self, target: _Target) -> _Target:
