@@ -7,6 +7,7 @@ file: the cache of one file does not know when another changes.
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable
 from functools import wraps
 from typing import TypeVar, cast
@@ -14,6 +15,7 @@ from typing import TypeVar, cast
 F = TypeVar("F", bound=Callable)
 
 _waiting: dict[str, list[Callable]] = {}
+_compiling = threading.Lock()
 
 
 def compiled(function: F) -> F:
@@ -36,9 +38,10 @@ def _compile(module: str) -> None:
     """Put the compiled functions of a module in the place of those that wait; numba takes long to import."""
     import numba
 
-    for function in _waiting.pop(module, ()):
-        try:
-            ready = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-        except RuntimeError:  # there is nowhere to keep it: it is compiled in every process
-            ready = numba.njit(nogil=True, error_model="numpy")(function)
-        setattr(sys.modules[module], function.__name__, ready)
+    with _compiling:
+        for function in _waiting.pop(module, ()):
+            try:
+                ready = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+            except RuntimeError:  # there is nowhere to keep it: it is compiled in every process
+                ready = numba.njit(nogil=True, error_model="numpy")(function)
+            setattr(sys.modules[module], function.__name__, ready)

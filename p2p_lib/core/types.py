@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import Field, dataclass, fields, is_dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import Any, ClassVar, Protocol, Self, TypeVar
 
+import cv2
 import numpy as np
 
 from p2p_lib.core import se3
@@ -64,6 +66,11 @@ class Frame:
     def shape(self) -> tuple[int, int]:
         """(height, width) in pixels."""
         return self.depth_m.shape
+
+    @cached_property
+    def lab(self) -> np.ndarray:
+        """(H, W, 3) uint8, the colours in CIELAB; converted when first asked for."""
+        return cv2.cvtColor(self.rgb, cv2.COLOR_RGB2LAB)
 
 
 @dataclass(frozen=True, eq=False)

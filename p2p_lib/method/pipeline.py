@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -82,6 +83,7 @@ class Point2Pose:
         self.stopwatch = Stopwatch()
         self._streaming = False
         self._unlocated = _LOCATE_EVERY
+        self._beside = ThreadPoolExecutor(1, "p2p scene")
         self._time_s: float | None = -np.inf  # of the frame before; None once it is said that time runs backwards
         self._status: dict[str, Status] = {}
         self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
@@ -178,12 +180,16 @@ class Point2Pose:
 
     def _advance(self, frame: Frame, masks: Masks, said: dict[str, Prompt]) -> dict[str, PoseEstimate]:
         """Track into a frame, then segment and estimate at the frame that the tracks are of."""
-        tracks = self._track(frame, masks)
         self._waiting.append((frame, masks, said))
-        if len(self._waiting) <= self.tracker.latency_frames:
+        answers = len(self._waiting) > self.tracker.latency_frames
+        locating = self._locate(self._waiting[0][0]) if answers else None
+        tracks = self._track(frame, masks)
+        if not answers:
             return {}
         frame, masks, said = self._waiting.popleft()
-        frame = self._located(frame)
+        if locating is not None:
+            with self.stopwatch("scene"):
+                frame = replace(frame, T_world_cam=locating.result())
         # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
         objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
         self.tracks = tracks
@@ -214,18 +220,17 @@ class Point2Pose:
         elif self._time_s is not None:
             self._time_s = frame.time_s
 
-    def _located(self, frame: Frame) -> Frame:
-        """The frame with the camera's pose, as far as it is known: often while an object is away, else now and then."""
+    def _locate(self, frame: Frame) -> Future[np.ndarray | None] | None:
+        """The camera's pose, sought beside the 2D tracker: often while an object is away, else now and then."""
         self._unlocated += 1
         away = any(obj.away for obj in self.objects.values())
         every = _LOCATE_EVERY_AWAY if away else _LOCATE_EVERY
         if self.scene is None or frame.T_world_cam is not None or self._unlocated < every:
-            return frame
+            return None
         self._unlocated = 0
-        with self.stopwatch("scene"):
-            known = [mask for mask in self.masks.values() if mask is not None]
-            occupied = np.logical_or.reduce(known) if known else None
-            return replace(frame, T_world_cam=self.scene.locate(frame, occupied))
+        known = [mask for mask in self.masks.values() if mask is not None]
+        occupied = np.logical_or.reduce(known) if known else None
+        return self._beside.submit(self.scene.locate, frame, occupied)
 
     def _sightings(self, frame: Frame, masks: Masks, objects: Mapping[str, ObjectTracker]) -> dict[str, Sighting]:
         """Sought objects that show by shape and colour; the tracker looks for their points there."""

@@ -86,7 +86,7 @@ class ImageSearch:
 
     def __init__(self, frame: Frame, camera: Camera, config: DepthConfig):
         self._depth_m, self._camera, self._config = frame.depth_m, camera, config
-        self._lab = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2LAB)
+        self._lab = frame.lab
 
     def about(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
         """The best pose near a proposed one; None where too little of the surface would be in the image."""

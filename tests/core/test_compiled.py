@@ -22,9 +22,11 @@ def norm(v):
         total += square(x)
     return np.sqrt(total)
 '''
-CODE = (
-    "import sys, numpy as np, loops; print('numba' in sys.modules, loops.square.__doc__, loops.norm(np.array([3., 4])))"
-)
+CODE = """
+import sys, numpy as np, loops
+from concurrent.futures import ThreadPoolExecutor
+print('numba' in sys.modules, loops.square.__doc__, *ThreadPoolExecutor(2).map(loops.norm, 2 * [np.array([3.0, 4.0])]))
+"""
 
 
 @pytest.fixture
@@ -40,11 +42,11 @@ def ask(tmp_path):
     return ask
 
 
-def test_a_function_is_compiled_when_it_is_called_and_kept(ask, tmp_path):
-    assert ask() == "False Of x. 5.0"
+def test_a_function_is_compiled_once_when_it_is_called_and_kept(ask, tmp_path):
+    assert ask() == "False Of x. 5.0 5.0"
     assert list((tmp_path / "__pycache__").glob("loops.norm*.nbc"))
 
 
 def test_it_runs_where_nothing_can_be_written(ask):
     nowhere = os.devnull + "/nowhere"
-    assert ask(HOME=nowhere, XDG_CACHE_HOME=nowhere, NUMBA_CACHE_LOCATOR_CLASSES="NoLocator") == "False Of x. 5.0"
+    assert ask(HOME=nowhere, XDG_CACHE_HOME=nowhere, NUMBA_CACHE_LOCATOR_CLASSES="NoLocator") == "False Of x. 5.0 5.0"

@@ -9,7 +9,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.method.pipeline import Point2Pose
-from p2p_lib.method.scene import Scene
+from p2p_lib.method.scene import Scene, two_nearest
 
 CAMERA = Camera(260.0, 260.0, 160.0, 120.0, 320, 240)
 WALL_M = 1.2
@@ -119,3 +119,11 @@ def test_what_lies_still_is_back_when_the_camera_is(with_scene):
         assert np.linalg.norm(se3.transform(last.T_cam_obj, in_object) - centre) < 0.02
     else:
         assert last.T_cam_obj is None
+
+
+def test_the_two_nearest_descriptors():
+    rng = np.random.default_rng(1)
+    ours, others = (rng.integers(0, 256, (n, 32), np.uint8) for n in (40, 70))
+    nearest, distance, second = two_nearest(ours.view(np.uint64), others.view(np.uint64))
+    for m, (first, next_best) in enumerate(cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(ours, others, 2)):
+        assert (nearest[m], distance[m], second[m]) == (first.trainIdx, first.distance, next_best.distance)
