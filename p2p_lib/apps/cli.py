@@ -98,7 +98,7 @@ _DATASET = _arg("dataset", metavar="NAME")
 _POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
 _JSON = _arg("--json", action="store_true", help="JSON instead of a table")
 _QUIET = _arg("--quiet", action="store_true", help="no progress bar")
-_OVERLAY = _arg("--overlay", type=Path, metavar="FILE", help="besides a film of it: .mp4 or .gif (see p2p film)")
+_OVERLAY = _arg("--overlay", type=Path, metavar="FILE", help="besides a film of it: .mp4, .gif or .webp (see p2p film)")
 _NO_BROWSER = _arg("--no-browser", action="store_true", help="only say where the page is")
 _FORCE = _arg("--force", dest="if_exists", action="store_const", const="replace", help="replace an earlier run in DIR")
 _MIN_VISIBLE = _arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
@@ -364,7 +364,7 @@ def _view(a: argparse.Namespace) -> None:
     "film",
     "write a run as a film: boxes, axes, statuses, keypoints, masks",
     _RUN,
-    _arg("--out", type=Path, metavar="FILE", help=".mp4 or .gif (default DIR/film.mp4)"),
+    _arg("--out", type=Path, metavar="FILE", help=".mp4, .gif or .webp (default DIR/film.mp4)"),
     _arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF)"),
 )
 def _film(a: argparse.Namespace) -> None:

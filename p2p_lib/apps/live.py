@@ -70,7 +70,7 @@ def track_live(
     first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
     out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
-    overlay  a film of it, .mp4 or .gif, as the tracker sees it
+    overlay  a film of it, .mp4, .gif or .webp, as the tracker sees it
 
     Closes the camera at the end, whatever ends it. Raises :class:`BadInput` for clicks that do not fit.
     """

@@ -1,4 +1,4 @@
-"""Films: images to MP4 or GIF, and a run as one (``p2p film``)."""
+"""Films: images to MP4, GIF or WebP, and a run as one (``p2p film``)."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.scenes import Scene
 
-SUFFIXES = (".mp4", ".gif")
+SUFFIXES = (".mp4", ".gif", ".webp")
 _CRF = 23  # x264's constant quality: smaller is better and larger
-#: Wider GIFs are larger than what one wants to put on a page, and few programs play more images a second.
-_GIF_PX, _GIF_HZ, _GIF_COLOURS = 480, 15.0, 128
+#: Wider images that move are larger than what one wants to put on a page, and few programs play more a second.
+_PAGE_PX, _PAGE_HZ = 480, 15.0
+#: A quarter of a GIF's size at this quality of WebP.
+_GIF_COLOURS, _WEBP_QUALITY = 128, 60
 _TICK = Fraction(1, 90_000)  # of a film's clock: MPEG's
 
 
 def write_film(run: str | Path, out: str | Path, sequence: Sequence | None = None, width_px: int | None = None) -> Path:
     """A run's folder as a film: boxes, axes, statuses, keypoints, and masks where the run has them; the path written.
 
-    It plays as fast as it was recorded. width_px: of its images (default: the camera's; of a GIF at most 480).
+    It plays as fast as it was recorded. width_px: of its images (default: the camera's; at most 480 but for MP4).
 
     Raises :class:`BadInput` for another kind of file, :class:`MissingData` where the images are gone.
     """
@@ -33,9 +35,9 @@ def write_film(run: str | Path, out: str | Path, sequence: Sequence | None = Non
     if playback.sequence is None:
         where = playback.run.info["path"] or playback.run.info["sequence"]
         raise MissingData(str(where), "no such folder, so there are no images to draw on", "Put it back there.")
-    scene, gif = Scene.of(playback), Path(out).suffix == ".gif"
-    width_px = width_px or min(playback.sequence.camera.width, _GIF_PX if gif else 1 << 16)
-    every = max(1, round(playback.rate_hz / _GIF_HZ)) if gif else 1
+    scene, for_a_page = Scene.of(playback), Path(out).suffix != ".mp4"
+    width_px = width_px or min(playback.sequence.camera.width, _PAGE_PX if for_a_page else 1 << 16)
+    every = max(1, round(playback.rate_hz / _PAGE_HZ)) if for_a_page else 1
     rows = range(0, len(playback), every)
     with Film(out, playback.rate_hz / every) as film:
         for row, image in zip(rows, scene.film(rows, width_px=width_px)):
@@ -46,11 +48,11 @@ def write_film(run: str | Path, out: str | Path, sequence: Sequence | None = Non
 def check_suffix(path: str | Path) -> None:
     """Refuse a film that could not be written, before anyone waits for it."""
     if Path(path).suffix not in SUFFIXES:
-        raise BadInput("film", Path(path).name, f"a name that ends in {' or '.join(SUFFIXES)}")
+        raise BadInput("film", Path(path).name, f"a name that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
 
 
 def write_video(images: Iterable[np.ndarray], path: str | Path, fps: float = 30.0) -> Path:
-    """Write images (H, W, 3) uint8 of one size as H.264 in MP4, or as a GIF that repeats; the path written.
+    """Write images (H, W, 3) uint8 of one size as H.264 in MP4, or as a GIF or WebP that repeats; the path written.
 
     The last row or column of an image of odd size is left out, as MP4's pixel format requires.
     """
@@ -70,7 +72,7 @@ class Film:
         check_suffix(path)
         self.path, self._fps, self._shape = Path(path), fps, None
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._gif: list[tuple[float, Image.Image]] = []  # which is written as a whole
+        self._images: list[tuple[float, Image.Image]] = []  # of what is written as a whole
         self._container = self._stream = None
 
     def add(self, image: np.ndarray, time_s: float) -> None:
@@ -79,8 +81,11 @@ class Film:
         if image.shape != self._shape or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise BadInput("film", f"an image {image.shape} {image.dtype}", "(H, W, 3) uint8, all of one size")
         image = np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
-        if self.path.suffix == ".gif":
-            self._gif.append((time_s, Image.fromarray(image).quantize(_GIF_COLOURS, dither=Image.Dither.NONE)))
+        if self.path.suffix != ".mp4":
+            picture = Image.fromarray(image)
+            if self.path.suffix == ".gif":
+                picture = picture.quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
+            self._images.append((time_s, picture))
             return
         import av
 
@@ -104,11 +109,13 @@ class Film:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None and self._shape is None:
             raise BadInput("film", "no images", "at least one")
-        if self._gif:
-            (_, first), *rest = self._gif
-            times_s = [time_s for time_s, _ in self._gif]
+        if self._images:
+            (_, first), *rest = self._images
+            times_s = [time_s for time_s, _ in self._images]
             shown_ms = np.rint(1000 * np.diff([*times_s, times_s[-1] + 1 / self._fps])).astype(int).tolist()
-            first.save(self.path, save_all=True, append_images=[i for _, i in rest], duration=shown_ms, loop=0)
+            how = {"quality": _WEBP_QUALITY} if self.path.suffix == ".webp" else {}
+            images = [image for _, image in rest]
+            first.save(self.path, save_all=True, append_images=images, duration=shown_ms, loop=0, **how)
         if self._container is not None:
             self._container.mux(self._stream.encode())
             self._container.close()

@@ -67,7 +67,7 @@ def test_shown_films_are_embedded(tmp_path, monkeypatch):
 def test_what_is_no_film_is_refused(tmp_path):
     with pytest.raises(BadInput, match="no images"):
         write_video([], tmp_path / "film.mp4")
-    with pytest.raises(BadInput, match=r"\.mp4 or \.gif"):
+    with pytest.raises(BadInput, match=r"\.mp4, \.gif or \.webp"):
         write_video(images(1), tmp_path / "film.avi")
     with pytest.raises(BadInput, match="all of one size"):
         write_video([*images(1), *images(1, 100, 100)], tmp_path / "film.mp4")
@@ -75,13 +75,16 @@ def test_what_is_no_film_is_refused(tmp_path):
         write_video([np.zeros((8, 8, 3))], tmp_path / "film.mp4")
 
 
-def test_a_gif_reads_back_and_repeats(tmp_path):
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_a_film_for_a_page_reads_back_and_repeats(tmp_path, suffix):
     from PIL import Image
 
-    with Image.open(write_video(images(5), tmp_path / "film.gif", fps=10)) as film:
-        assert (film.n_frames, film.info["duration"], film.info["loop"]) == (5, 100, 0)
+    with Image.open(write_video(images(5), (tmp_path / "film").with_suffix(suffix), fps=10)) as film:
+        assert (film.n_frames, film.info["loop"]) == (5, 0)
         for k, written in enumerate(images(5)):
             film.seek(k)
+            film.load()
+            assert film.info["duration"] == 100
             assert np.abs(np.asarray(film.convert("RGB")).astype(int) - written).mean() < 4
 
 
