@@ -28,7 +28,7 @@ test: setup ## linter and types, then all tests, every notebook included, and th
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
 	@.venv/bin/python tools/docs.py
-	@.venv/bin/python -m pytest --durations=5
+	@.venv/bin/python -m pytest --numprocesses=2 --dist=loadfile --durations=5
 
 docs: setup ## the API reference from the docstrings, pages that work offline, into out/docs
 	@.venv/bin/python tools/docs.py
