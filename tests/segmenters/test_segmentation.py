@@ -237,6 +237,19 @@ def test_where_depth_jumped_the_mask_of_before_says_nothing():
     assert not found[:, :145].any() and iou(found, piece & (np.arange(320) >= 150)) > 0.6
 
 
+def test_what_shows_after_a_gap_in_the_depth_need_not_be_the_object():
+    """Half of a card loses its depth for a frame, and something in its colours has come before it when it is back."""
+    at, follow = (100, 80), segmenter()
+    half = card(at) & (np.arange(320) >= 130)
+    for k, half_m in enumerate((None, 0.0, 0.62, 0.62)):
+        frame = picture(k, [(at, 1)])
+        if half_m is not None:
+            frame.depth_m[half] = half_m
+        found = follow.segment(frame, () if k else on(card=at)) == 1
+        assert k != 1 or found[half].all(), "colours carry it where nothing is measured"
+    assert not found[half].any() and found[card(at) & ~half].all()
+
+
 class Asked(dict):
     """Hints that note who was asked for."""
 
