@@ -6,6 +6,7 @@ import html
 import string
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from pandas import DataFrame, MultiIndex, Series, to_numeric
@@ -99,6 +100,9 @@ _MARKDOWN = _Language(str, "**{}**", " ({})")
 _HTML = _Language(html.escape, "<b>{}</b>", "<sup>{}</sup>")
 _LATEX = _Language(_tex, r"\textbf{{{}}}", r"\textsuperscript{{{}}}")
 
+#: As many columns with heads of several words stand beside each other on a page of 1,280 px.
+_MARKDOWN_COLUMNS = 10
+
 
 @dataclass(frozen=True)
 class Table:
@@ -125,8 +129,12 @@ class Table:
         return dict(zip(found, names, strict=False))
 
     def markdown(self) -> str:
-        """For pages and README files."""
-        table = as_markdown(self._frame(_MARKDOWN, ": "), self.words)
+        """For pages and README files: one table, or where that is wider than a page, one for each group."""
+        whole, groups = self._frame(_MARKDOWN, ": "), [span for _, span in self.groups]
+        columns = [range(len(self.heads))]
+        if groups and len(self.heads) > _MARKDOWN_COLUMNS:
+            columns = [[*range(groups[0]), *range(a, b)] for a, b in pairwise(np.cumsum(groups).tolist())]
+        table = "\n".join(as_markdown(whole.iloc[:, list(at)], self.words) for at in columns)
         said = "".join(f"{line}  \n" for line in self._said("({}) "))
         return f"**{self.title}**\n\n{table}\n" + said.replace("$", r"\$")  # else it is an equation
 

@@ -199,6 +199,14 @@ def test_objects_are_rows_and_methods_columns(tmp_path):
     assert table.rows[4][4].bold and not table.rows[4][3].bold, "41.80 against 12.36"
 
 
+def test_a_page_is_as_wide_as_one_metric_of_many_methods(tmp_path):
+    runs = {("Ours", "x"): [outcome(90)], ("Mine", "x"): [outcome(80)]}
+    table = paper_table(benchmark(tmp_path, runs, paper="tab:ycbmultitrack_syn", kind="objects"))
+    first, second = (line.split(" | ") for line in table.markdown().splitlines() if line.startswith("| Category"))
+    assert len(first) == len(second) == 7 and len(table.heads) == 12
+    assert {head.partition(":")[0] for head in first[2:]} == {"ADD-S (%)"} and second[2].startswith("ADD (%): ")
+
+
 def test_methods_against_each_other(tmp_path):
     runs = {
         ("Proposed", "a"): [outcome(90)],
