@@ -178,7 +178,7 @@ def click_first(
 
 
 def json_line(estimate: PoseEstimate) -> str:
-    """An estimate as one line of JSON: time_s, frame, object, status, confidence, T_cam_obj, covariance, reason.
+    """An estimate as a line of JSON: time_s, frame, object, status, confidence, T_cam_obj, map_id, covariance, reason.
 
     ``T_cam_obj`` (4x4, metres) and ``covariance`` (6x6, [rotation rad, translation m] on the right) are null without
     a pose.
@@ -190,6 +190,7 @@ def json_line(estimate: PoseEstimate) -> str:
         "status": str(estimate.status),
         "confidence": round(estimate.confidence, 4),
         "T_cam_obj": estimate.T_cam_obj,
+        "map_id": estimate.map_id,
         "covariance": estimate.covariance,
         "reason": estimate.reason,
     }

@@ -156,6 +156,7 @@ class PoseEstimate:
     covariance      (6, 6) or None: right tangent of T_cam_obj, [rotation rad, translation m]
     confidence      in [0, 1]; 0 without a pose
     reason          why the status is what it is, in words; empty when tracked
+    map_id          0, and one more for each map that was started anew since: another map has another object frame
     last_T_cam_obj  the newest pose known, and last_seen_s its time: for those who want to guess
     """
 
@@ -172,6 +173,7 @@ class PoseEstimate:
     last_T_cam_obj: np.ndarray | None = None
     last_seen_s: float = float("nan")
     keyframe: bool = False
+    map_id: int = 0
 
     def __post_init__(self) -> None:
         name = f"estimate of {self.object!r} at frame {self.frame_index}"

@@ -199,7 +199,7 @@ class RunWriter:
             return
         self.earlier = _in_words(info)
         if self._if_exists == "resume":
-            self._resumed = load_run(self.path)
+            self._resumed = load_run(self.path, every_map=True)
             self.complete = info["finished"]
             self._check_same(info)
 
@@ -227,8 +227,8 @@ class RunWriter:
 
     def _append_last(self) -> None:
         for name, estimates in self._estimates.items():
-            if name not in self._pose_files:
-                self._write_poses(name)  # of an object that nobody announced
+            if name not in self._pose_files or len({e.map_id for e in estimates[-2:]}) > 1:
+                self._write_poses(name)  # of an object that nobody announced, or with a new map
             else:
                 for line in _tum_lines(estimates[-1:]):
                     append(self._pose_files[name], line)
@@ -277,9 +277,10 @@ def _in_words(info: Mapping[str, Any]) -> str:
     return f"a run of {info['sequence']} ({info['frames']} frames, tracker {tracker}, seed {seed})"
 
 
-def _tum_lines(estimates: Iterable[PoseEstimate]) -> Iterable[str]:
-    """A line for each that has a pose."""
-    return (tum_line(e.time_s, e.T_cam_obj) for e in estimates if e.T_cam_obj is not None)
+def _tum_lines(estimates: list[PoseEstimate]) -> Iterable[str]:
+    """A line for each that has a pose in the map of the last."""
+    of_map = (e for e in estimates if e.map_id == estimates[-1].map_id)
+    return (tum_line(e.time_s, e.T_cam_obj) for e in of_map if e.T_cam_obj is not None)
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:

@@ -6,7 +6,8 @@ It is written into a folder of its own, by one process at a time: nothing is del
 
     config.toml           every parameter
     run.json              what ran on what: sequence, objects, tracker, masks, preset, seed, versions, commit
-    poses/<object>.txt    TUM: time_s tx ty tz qx qy qz qw of T_cam_obj; frames without a pose are left out
+    poses/<object>.txt    TUM: time_s tx ty tz qx qy qz qw of T_cam_obj; frames without a pose are left out,
+                          and so are poses in maps that were given up since (``map_id`` in ``poses.npz``)
     poses.npz             everything of every frame, and the truth where the sequence has it
     meshes/<object>.ply   the reconstructed surface in the object frame, vertex colours (written at the end)
     keypoints.npz         2D tracks and keypoint maps (:mod:`p2p_lib.datasets.keypoint_log`; written at the end)
@@ -18,7 +19,7 @@ It is written into a folder of its own, by one process at a time: nothing is del
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,9 +43,10 @@ class ObjectRun:
 
     frame_index, time_s  (n,) of the sequence
     status               (n,) str, a :class:`~p2p_lib.core.types.Status`
-    T_cam_obj            (n, 4, 4), NaN where there is no pose
+    T_cam_obj            (n, 4, 4), NaN where there is no pose (see :func:`load_run` on poses of several maps)
     confidence           (n,) in [0, 1]; covariance (n, 6, 6), NaN where there is none
     visible_points, inliers, keyframe, reason  (n,) as of the estimates
+    map_id               (n,) int: poses of one map are in one object frame, those of another map in another
     T_cam_model          (n, 4, 4) truth, NaN where there is none
     labelled             (n,) bool: the dataset's visibility labels hold
     visible_px           (n,) pixels of the dataset's own mask, -1 where it has no masks
@@ -59,6 +61,7 @@ class ObjectRun:
     visible_points: np.ndarray
     inliers: np.ndarray
     keyframe: np.ndarray
+    map_id: np.ndarray
     T_cam_model: np.ndarray
     labelled: np.ndarray
     visible_px: np.ndarray
@@ -79,7 +82,7 @@ class ObjectRun:
     def of(cls, name: str, estimates: list[PoseEstimate], sequence: Sequence, visible_px: list) -> ObjectRun:
         """An object's estimates, one a frame, beside its truth and the sequence's ``visible_px`` of these frames."""
         truth = sequence.truth.get(name)
-        same = ("frame_index", "time_s", "confidence", "visible_points", "inliers", "keyframe", "reason")
+        same = ("frame_index", "time_s", "confidence", "visible_points", "inliers", "keyframe", "map_id", "reason")
         columns = {key: np.array([getattr(e, key) for e in estimates]) for key in same}
         at = columns["frame_index"]
         return cls(
@@ -100,6 +103,16 @@ class ObjectRun:
         """(n,) bool."""
         return np.isfinite(self.T_cam_obj).all((1, 2))
 
+    def of_last_map(self) -> ObjectRun:
+        """The same without the poses of maps that were given up, whose object frames were others."""
+        last = self.map_id == self.map_id[-1] if len(self) else np.zeros(0, bool)
+        return replace(
+            self,
+            T_cam_obj=np.where(last[:, None, None], self.T_cam_obj, np.nan),
+            covariance=np.where(last[:, None, None], self.covariance, np.nan),
+            confidence=np.where(last, self.confidence, 0),
+        )
+
     @property
     def has_truth(self) -> np.ndarray:
         """(n,) bool."""
@@ -109,7 +122,7 @@ class ObjectRun:
 #: What ``poses.npz`` holds of an object.
 COLUMNS = tuple(column.name for column in fields(ObjectRun))
 #: NumPy's kinds of value, where they are not floating point.
-_KINDS = dict.fromkeys(("frame_index", "visible_points", "inliers", "visible_px"), "iu")
+_KINDS = dict.fromkeys(("frame_index", "visible_points", "inliers", "map_id", "visible_px"), "iu")
 _KINDS |= {"keyframe": "b", "labelled": "b", "status": "U", "reason": "U"}
 
 
@@ -146,8 +159,11 @@ class Run:
     timings: dict[str, np.ndarray]
 
 
-def load_run(folder: str | Path) -> Run:
+def load_run(folder: str | Path, every_map: bool = False) -> Run:
     """Read what :class:`~p2p_lib.datasets.run_writer.RunWriter` wrote, finished or not.
+
+    Poses are those in the object frame of the map that holds at the end: what was said in a map that has been given up
+    since is no pose, unless ``every_map`` asks for it.
 
     Raises :class:`MissingData` where there is no run, :class:`BadInput` where a file of it is damaged.
     """
@@ -158,10 +174,12 @@ def load_run(folder: str | Path) -> Run:
     arrays, objects = load_arrays(folder / "poses.npz"), {}
     for name in info["objects"] if info["frames"] else ():
         if f"{name}/frame_index" in arrays:
+            arrays.setdefault(f"{name}/map_id", np.zeros(arrays[f"{name}/frame_index"].shape, int))  # an older run
             lacking = [column for column in COLUMNS if f"{name}/{column}" not in arrays]
             if lacking:
                 raise BadInput(str(folder / "poses.npz"), f"no {name}/{lacking[0]}", "what p2p run wrote")
-            objects[name] = ObjectRun(**{column: arrays[f"{name}/{column}"] for column in COLUMNS})
+            obj = ObjectRun(**{column: arrays[f"{name}/{column}"] for column in COLUMNS})
+            objects[name] = obj if every_map else obj.of_last_map()
     if not any(map(len, objects.values())):
         raise MissingData(str(folder), "a run without frames", "It was stopped at once: run it again.")
     if len({len(obj) for obj in objects.values()}) > 1:

@@ -55,7 +55,8 @@ class Lifecycle:
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
     T_world_obj     newest pose in the scene that many points agreed with, where the camera was known; None before
-    start_px        pixels of the newest mask before the first pose; None without a mask
+    start_px        pixels of the newest mask before a map was started; None without a mask
+    lost_frames     frames since the newest pose in which it was in view and had none
     """
 
     status: Status = Status.INITIALISING
@@ -66,6 +67,7 @@ class Lifecycle:
     confirming: int = 0
     T_world_obj: np.ndarray | None = None
     start_px: int | None = None
+    lost_frames: int = 0
 
     @property
     def has_pose(self) -> bool:
@@ -131,19 +133,21 @@ class Lifecycle:
             status=status,
             T_cam_obj=T_cam_obj,
             seen_s=time_s,
+            lost_frames=0,
             T_previous=self.T_cam_obj if self.has_pose else None,
             T_left=self.T_left if self.has_pose else self.T_cam_obj,
             confirming=min(max(self.confirming - 1, 0), longest) if self.has_pose else longest,
         )
 
     def started(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:
-        """The state after the first pose."""
-        return replace(self, status=status, T_cam_obj=T_cam_obj, seen_s=time_s)
+        """The state after the first pose in a map."""
+        return Lifecycle(status, T_cam_obj, time_s, start_px=self.start_px)
 
     def without_pose(self, status: Status) -> Lifecycle:
         """The state after a frame without a pose. A return that was not confirmed is taken back."""
         taken_back = {"T_cam_obj": self.T_left, "confirming": 0} if self.confirming else {}
-        return replace(self, status=status, **taken_back)
+        lost_frames = self.lost_frames + (status is Status.LOST)
+        return replace(self, status=status, lost_frames=lost_frames, **taken_back)
 
 
 def _sighted(life: Lifecycle, evidence: Evidence) -> bool:

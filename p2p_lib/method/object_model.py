@@ -60,6 +60,7 @@ class ObjectModel:
         self.graph = ObjectGraph(config.factor_graph) if config.method.graph else None
         self.views = KeyframeViews()
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
+        self.seen_m2 = 0.0  # the most that a keyframe showed
         self._observer, self._stopwatch = observer, stopwatch
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
         self._since_keyframe, self._next_key = 0, 0
@@ -134,6 +135,7 @@ class ObjectModel:
                 p_cam = np.concatenate([obs.p_cam[agrees], new.p_cam])
                 vertex, T_cam_obj = self._optimise(T_cam_obj, np.concatenate([old_keys, keys]), p_cam, covariance)
         self.views.add(registered)
+        self.seen_m2 = max(self.seen_m2, self._observer.area_m2(obs))
         self._since_keyframe = 0
         self._sample = None
         if self.surface is not None:

@@ -34,6 +34,8 @@ _LOOK_EVERY = 3
 _FEW_KEYPOINTS = 12
 #: An object whose mask grows by more than this factor from frame to frame is still coming into view.
 _GROWTH = 1.1
+#: A map is founded anew where an object has been lost for so many frames and shows more than this of what it knows.
+_PATIENCE, _OUTGROWN = 5, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,7 @@ class ObjectTracker:
         self.name, self.config, self.detector = name, config, detector
         self.observer = Observer(camera, config.depth, config.refinement.max_points if config.method.surface else 0)
         self.model = ObjectModel(config, self.observer, stopwatch)
-        self.life = Lifecycle()
+        self.life, self.map_id = Lifecycle(), 0
         self._gates = tuple(GATES) if config.method.gates == "all" else ()
         self._rng, self._stopwatch = rng, stopwatch
 
@@ -103,7 +105,7 @@ class ObjectTracker:
 
     def step(self, obs: Observation) -> ObjectStep:
         """The object's pose at a frame. The paper selects a hypothesis and refines that one; ours refines all first."""
-        if self.model.empty:
+        if self.model.empty or self._outgrown(obs):
             return self._initialise(obs)
         if self._hidden(obs.mask):
             return self._without_pose(obs, Status.OCCLUDED, f"{np.count_nonzero(obs.mask)} mask pixels")
@@ -261,32 +263,44 @@ class ObjectTracker:
     # -- start, and frames without a pose ------------------------------------------------------
 
     def _initialise(self, obs: Observation) -> ObjectStep:
-        """The first frame: fix the object frame and start the map with the first points."""
+        """The first frame of a map: fix the object frame and start with the first points. What was known is let go."""
         cfg, before = self.config, self.life.start_px
+        without = Status.INITIALISING if self.model.empty else Status.LOST
         pixels = None if obs.mask is None else np.count_nonzero(obs.mask)
         self.life = replace(self.life, start_px=pixels)
         if pixels is None or self._hidden(obs.mask):
-            return self._without_pose(obs, Status.INITIALISING, "not seen yet")
+            return self._without_pose(obs, without, "not seen yet")
         # Points on the first sliver of an object would all be at its rim.
         if self._gates and before is not None and pixels > _GROWTH * before:
-            return self._without_pose(obs, Status.INITIALISING, "still coming into view")
+            return self._without_pose(obs, without, "still coming into view")
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < cfg.lifecycle.min_mask_px:
-            return self._without_pose(obs, Status.INITIALISING, f"only {len(v)} mask pixels with depth")
+            return self._without_pose(obs, without, f"only {len(v)} mask pixels with depth")
         points = self._sample(obs)
         few = len(points) < cfg.registration.min_inliers
         if few and not (self.model.surface is not None and cfg.method.motion):
-            return self._without_pose(obs, Status.INITIALISING, f"only {len(points)} points to start from")
+            return self._without_pose(obs, without, f"only {len(points)} points to start from")
         T_cam_obj = np.eye(4)
         if cfg.method.object_frame == "centroid":
             p_cam = self.observer.camera.unproject(np.stack([u, v], -1), obs.frame.depth_m[v, u])
             T_cam_obj[:3, 3] = np.median(p_cam, 0)
+        verdict, forgotten = Verdict(True, Status.TRACKED), self.map.ids[self.map.ids >= 0]
+        if not self.model.empty:
+            self.model, self.map_id = ObjectModel(cfg, self.observer, self._stopwatch), self.map_id + 1
+            verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
+        if few:
+            verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")
         T_cam_obj, requests = self.model.insert_keyframe(obs, T_cam_obj, points, np.zeros(0, bool))
-        verdict = Verdict(True, Status.DEGRADED if few else Status.TRACKED, f"only {len(points)} points" * few)
         self.life = self.life.started(T_cam_obj, obs.frame.time_s, verdict.status).placed(obs.frame.T_world_cam)
         # The first pose defines the object frame: it is right by definition, whatever the points are worth.
         estimate = self._estimate(obs, verdict, len(self.map), 1.0, self.model.covariance, True)
-        return ObjectStep(estimate, requests)
+        return ObjectStep(estimate, replace(requests, drop=forgotten))
+
+    def _outgrown(self, obs: Observation) -> bool:
+        """Whether an object that stays lost shows much more than its map was ever founded on."""
+        if not self._gates or self.life.lost_frames < _PATIENCE or obs.mask is None:
+            return False
+        return self.observer.area_m2(obs) > _OUTGROWN * self.model.seen_m2
 
     def _hidden(self, mask: np.ndarray | None) -> bool:
         """Whether a mask says that nothing of the object is to be seen."""
@@ -310,6 +324,7 @@ class ObjectTracker:
             last_T_cam_obj=self.life.T_cam_obj,
             last_seen_s=self.life.seen_s,
             keyframe=keyframe,
+            map_id=self.map_id,
         )
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
@@ -323,6 +338,7 @@ class ObjectTracker:
             visible_points=int(obs.seen.sum()),
             last_T_cam_obj=self.life.T_cam_obj,
             last_seen_s=self.life.seen_s,
+            map_id=self.map_id,
         )
         return ObjectStep(estimate)
 

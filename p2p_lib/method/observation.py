@@ -94,6 +94,11 @@ class Observer:
         """(H, W) bool: pixels of the mask with a depth within range."""
         return observation.mask & in_range(observation.frame.depth_m, self.config)
 
+    def area_m2(self, observation: Observation) -> float:
+        """What is measured of the object, as an area across the line of sight."""
+        z = observation.frame.depth_m[self.measured(observation)]
+        return float((z.astype(float) ** 2).sum() / (self.camera.fx * self.camera.fy))
+
     def expected_px(self, obs: Observation, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> np.ndarray:
         """(N, 2) where points p_obj (N, 3) show under a pose.
 

@@ -7,18 +7,20 @@ a side that was seen before. Times are frames of 30 a second.
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.synthetic import shapes
-from p2p_lib.synthetic.motion import eased, look_at, path, standing, through, varied
+from p2p_lib.synthetic.motion import eased, look_at, path, standing, through, turned, varied, wander
 from p2p_lib.synthetic.scene import VGA, Body, Scenario, check, room
 from p2p_lib.synthetic.shapes import Mesh
 from p2p_lib.synthetic.solids import hand
 
 _EYE, _TARGET = np.array([0.0, -0.62, 0.42]), np.array([0.0, 0.03, 0.12])
+_LOW_EYE = np.array([0.0, -0.60, 0.22])
 _FRAMES = 300
 #: How far along the line from the camera to what it hides: there a hand covers 20 cm, a board more.
 _HAND_SHARE, _BOARD_SHARE = 0.42, 0.62
@@ -130,6 +132,49 @@ def moving_camera(seed: int) -> Scenario:
     time = np.arange(_FRAMES)[:, None] / rng.uniform(170, 230, 3) + rng.uniform(0, 1, 3)
     eyes = _EYE + np.array([0.16, 0.05, 0.06]) * np.sin(2 * np.pi * time)
     return _scene(rng, placed, np.stack([look_at(eye, _TARGET) for eye in eyes]))
+
+
+def half_hidden_start(seed: int, models: str = "") -> Scenario:
+    """Two objects that circle each other; at first the near one hides all but 10 to 40 % of the far one.
+
+    ``models`` is a folder of YCB models with the banana and the foam brick; without it a flat tin and a carton.
+    """
+    rng = np.random.default_rng([seed, 1])
+    share = rng.uniform(0.12, 0.38)
+    if models:
+        names = "011_banana", "061_foam_brick"
+        meshes = [shapes.load_mesh(Path(models) / name / "textured.obj") for name in names]
+    else:
+        names, meshes = ("tin", "box"), (shapes.box(rng, (0.10, 0.058, 0.035)), _carton(rng))
+    time, way = np.arange(_FRAMES) / _FRAMES, rng.choice([-1.0, 1.0])
+    bodies = []
+    for name, mesh, ahead in zip(names, meshes, (np.pi / 2, -np.pi / 2), strict=True):
+        middle = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
+        end_on = np.pi / 2 * (np.ptp(mesh.vertices, 0)[:2].argmax() == 0)
+        yaw = end_on * (ahead > 0) + rng.uniform(-0.4, 0.4) - way * 2 * np.pi * time
+        own = turned(wander(rng, _FRAMES, 0.006, 8.0, 200), yaw, np.zeros(3)) @ se3.from_rt(np.eye(3), -middle)
+        bodies.append((name, mesh, ahead, own))
+
+    def scenario(start_rad: float) -> Scenario:
+        placed = []
+        for name, mesh, ahead, own in bodies:
+            angle = ahead + way * (start_rad + 4 * np.pi * time)
+            at = np.stack([0.11 * np.cos(angle), 0.11 * np.sin(angle), np.full(_FRAMES, 0.14)], 1)
+            placed.append(Body(name, mesh, se3.from_rt(np.eye(3), at) @ own))
+        kind = "YCB models" if models else "procedural"
+        return Scenario(VGA, standing(_LOW_EYE, _TARGET, _FRAMES), tuple(placed), walls, objects=kind)
+
+    walls, (low, high) = room(rng), (0.0, np.pi / 3)
+    for _ in range(6):
+        middle = (low + high) / 2
+        low, high = (low, middle) if _first_share(scenario(middle)) > share else (middle, high)
+    return scenario(high)
+
+
+def _first_share(scenario: Scenario) -> float:
+    """Share of the first body's pixels that show at the first frame."""
+    alone = replace(scenario, bodies=scenario.bodies[:1]).rendered(0).label
+    return np.count_nonzero(scenario.rendered(0).label == 1) / max(np.count_nonzero(alone), 1)
 
 
 def _carton(rng: np.random.Generator) -> Mesh:

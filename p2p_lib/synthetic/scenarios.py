@@ -24,6 +24,7 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
         absences.late_object,
         absences.three_objects,
         absences.moving_camera,
+        absences.half_hidden_start,
     )
 }
 SCENARIOS |= {name: partial(paper_subset.paper_sequence, parts=parts) for name, parts in paper_subset.SEQUENCES.items()}

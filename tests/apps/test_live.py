@@ -232,7 +232,7 @@ def test_live_prints_a_line_per_object_and_frame(folder, tmp_path, capsys):
     assert code == 0
     frames, dropped = map(int, re.fullmatch(r"(\d+) frames in .* s \(.* Hz\), (\d+) dropped\n", err).groups())
     assert len(lines) == frames and frames + dropped <= FRAMES
-    keys = {"time_s", "frame", "object", "status", "confidence", "T_cam_obj", "covariance", "reason"}
+    keys = {"time_s", "frame", "object", "status", "confidence", "T_cam_obj", "map_id", "covariance", "reason"}
     assert all(set(line) == keys and line["object"] == "board" for line in lines)
     last = lines[-1]
     assert last["time_s"] == pytest.approx(last["frame"] / 30, abs=1e-6) and last["status"] == "tracked"
@@ -252,6 +252,7 @@ def test_no_pose_is_null_and_the_line_is_strict_json():
         "status": "lost",
         "confidence": 0.0,
         "T_cam_obj": None,
+        "map_id": 0,
         "covariance": None,
         "reason": "",
     }

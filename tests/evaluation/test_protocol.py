@@ -46,7 +46,7 @@ def object_run(T_cam_obj, T_cam_model, **columns):
         "T_cam_obj": T_cam_obj,
         "confidence": posed * 1.0,
         "covariance": np.full((n, 6, 6), np.nan),
-        **{"visible_points": nothing, "inliers": nothing, "keyframe": nothing > 0},
+        **{"visible_points": nothing, "inliers": nothing, "keyframe": nothing > 0, "map_id": nothing},
         "T_cam_model": T_cam_model,
         "labelled": np.ones(n, bool),
         "visible_px": np.full(n, 5000),

@@ -468,6 +468,42 @@ def test_an_object_that_still_comes_into_view_is_not_started():
     assert paper.see(START).estimate.status is Status.TRACKED
 
 
+def stays_lost(first_columns: int, frames: int = 9, **settings) -> tuple[Lump, list[ObjectStep]]:
+    """Started on some columns of its mask, then whole, turned away, and none of its points is found again."""
+    lump, away = Lump(**settings), turned(150)
+    _, whole = render(LUMP, START)
+    sliver = whole.copy()
+    sliver[:, np.flatnonzero(whole.any(0))[first_columns] :] = False
+    lump.see(START, mask=sliver)
+    old = lump.tracker.map.ids.max()
+    return lump, [lump.see(away, hide(lambda tracks: tracks.ids <= old)) for _ in range(frames)]
+
+
+def test_a_map_of_a_sliver_is_founded_anew_where_the_object_stays_lost_in_plain_view():
+    lump, steps = stays_lost(15)
+    maps = [step.estimate.map_id for step in steps]
+    first = maps.index(1)
+    assert 5 <= first <= 7 and maps == [0] * first + [1] * (len(maps) - first)
+    founded = steps[first]
+    assert [step.estimate.status for step in steps[:first]] == [Status.LOST] * first
+    assert (
+        founded.estimate.status is Status.RECOVERED and founded.estimate.reason == "a new map: the old one stays lost"
+    )
+    assert len(founded.requests.drop) and not np.isin(founded.requests.drop, lump.tracker.map.ids).any()
+    assert {step.estimate.status for step in steps[first + 1 :]} == {Status.TRACKED}
+    # It goes on from there, in the frame of the new map.
+    lump.T_first = founded.estimate.T_cam_obj, turned(150)
+    lump.see(turned(153))
+    deg, mm = lump.off(turned(153))
+    assert deg < 0.5 and mm < 1
+
+
+@pytest.mark.parametrize(("columns", "settings"), [(-1, {}), (15, {"method__gates": "none"})])
+def test_a_map_of_all_that_is_seen_is_kept_and_so_is_the_papers(columns, settings):
+    _, steps = stays_lost(columns, 12, **settings)
+    assert {step.estimate.map_id for step in steps} == {0}
+
+
 def test_points_off_the_mask_are_no_observations_and_elsewhere_when_it_is_away():
     lump = settled(begun(), [2])
     _, mask = render(LUMP, turned(4))

@@ -97,3 +97,20 @@ def test_the_camera_does_move():
     assert turn_deg(T[:1, :3, :3], T[:, :3, :3]).max() > 10
     step = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     assert step.max() < 0.01
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_far_one_is_half_hidden_at_first_and_whole_a_second_later(seed):
+    scenario = replace(SCENARIOS["half_hidden_start"](seed), camera=SMALL)
+    room = scenario.empty(0)
+
+    def share(k: int, t: int) -> float:
+        alone = replace(scenario, bodies=scenario.bodies[k - 1 : k]).rendered(t, room).label > 0
+        return (scenario.rendered(t, room).label == k).sum() / alone.sum()
+
+    first = share(1, 0)
+    assert 0.10 <= first <= 0.40 and share(2, 0) == 1
+    assert all(share(k, t) > 0.95 for k in (1, 2) for t in (30, 50))
+    tin, box = (body.T_world_model for body in scenario.bodies)
+    assert turn_deg(tin[:-1, :3, :3], tin[1:, :3, :3]).max() < 4
+    assert np.linalg.norm(tin[:, :3, 3] - box[:, :3, 3], axis=1).min() > 0.15  # they never touch
