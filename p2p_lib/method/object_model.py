@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -51,17 +52,21 @@ class NewPoints:
 
 
 class ObjectModel:
-    """Keypoints, surface and graph of one object; rows of observations are rows of ``map``."""
+    """Keypoints, surface and graph of one object; rows of observations are rows of ``map``.
 
-    def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch):
+    Views are fused ``beside`` whatever comes next, until the surface is asked for.
+    """
+
+    def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch, beside: Executor):
         self.config = config
         self.map = KeypointMap(config.keypoint_map)
-        self.surface = _volume(config) if config.method.surface else None
+        self._surface = _volume(config) if config.method.surface else None
         self.graph = ObjectGraph(config.factor_graph) if config.method.graph else None
         self.views = KeyframeViews()
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
         self.seen_m2 = 0.0  # the most that a keyframe showed
-        self._observer, self._stopwatch = observer, stopwatch
+        self._observer, self._stopwatch, self._beside = observer, stopwatch, beside
+        self._fusing: Future | None = None
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
         self._since_keyframe, self._next_key = 0, 0
         self._sample: SurfaceSample | None = None  # of the surface as it is
@@ -70,6 +75,15 @@ class ObjectModel:
     def empty(self) -> bool:
         """Whether there has been no keyframe yet."""
         return not len(self.views)
+
+    @property
+    def surface(self) -> TsdfVolume | None:
+        """With all that was given to it; None where the configuration wants none."""
+        if self._fusing is not None:
+            with self._stopwatch("fusion"):
+                self._fusing.result()
+            self._fusing = None
+        return self._surface
 
     @property
     def has_surface(self) -> bool:
@@ -139,9 +153,8 @@ class ObjectModel:
         self._since_keyframe = 0
         self._sample = None
         if self.surface is not None:
-            with self._stopwatch("fusion"):
-                measured, frame = self._observer.measured(obs), obs.frame
-                self.surface.integrate(frame.depth_m, frame.rgb, measured, self._observer.camera, T_cam_obj, key=vertex)
+            image = obs.frame.depth_m, obs.frame.rgb, self._observer.measured(obs), self._observer.camera
+            self._fusing = self._beside.submit(self.surface.integrate, *image, T_cam_obj, key=vertex)
         gone, drop = self.map.retire()
         if self.graph is not None:
             self.graph.forget(gone)
@@ -150,9 +163,11 @@ class ObjectModel:
     def settle_surface(self) -> None:
         """Re-integrate the keyframe that the graph has moved farthest: one a frame, so that no frame waits long."""
         if self.surface is not None and self._corrected:
-            with self._stopwatch("fusion"):
-                if not self.surface.move(self._corrected, limit=1):
-                    self._corrected = {}
+            self._fusing = self._beside.submit(self._follow_graph, self.surface, self._corrected)
+
+    def _follow_graph(self, surface: TsdfVolume, corrected: dict[int, np.ndarray]) -> None:
+        if not surface.move(corrected, limit=1):
+            self._corrected = {}
 
     def _optimise(
         self, T_cam_obj: np.ndarray, keys: np.ndarray, p_cam: np.ndarray, covariance: np.ndarray | None

@@ -7,7 +7,9 @@ becomes its pose. Whatever the object wants of the shared tracker it returns as
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -76,10 +78,12 @@ class ObjectTracker:
         detector: Detector,
         rng: np.random.Generator,
         stopwatch: Stopwatch,
+        beside: Executor,
     ):
         self.name, self.config, self.detector = name, config, detector
         self.observer = Observer(camera, config.depth, config.refinement.max_points if config.method.surface else 0)
-        self.model = ObjectModel(config, self.observer, stopwatch)
+        self._new_model = partial(ObjectModel, config, self.observer, stopwatch, beside)
+        self.model = self._new_model()
         self.life, self.map_id = Lifecycle(), 0
         self._gates = tuple(GATES) if config.method.gates == "all" else ()
         self._rng, self._stopwatch = rng, stopwatch
@@ -286,7 +290,7 @@ class ObjectTracker:
             T_cam_obj[:3, 3] = np.median(p_cam, 0)
         verdict, forgotten = Verdict(True, Status.TRACKED), self.map.ids[self.map.ids >= 0]
         if not self.model.empty:
-            self.model, self.map_id = ObjectModel(cfg, self.observer, self._stopwatch), self.map_id + 1
+            self.model, self.map_id = self._new_model(), self.map_id + 1
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:
             verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")

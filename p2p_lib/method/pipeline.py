@@ -83,7 +83,7 @@ class Point2Pose:
         self.stopwatch = Stopwatch()
         self._streaming = False
         self._unlocated = _LOCATE_EVERY
-        self._beside = ThreadPoolExecutor(1, "p2p scene")
+        self._beside = ThreadPoolExecutor(2, "p2p")
         self._time_s: float | None = -np.inf  # of the frame before; None once it is said that time runs backwards
         self._status: dict[str, Status] = {}
         self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
@@ -139,6 +139,7 @@ class Point2Pose:
             self.detector,
             np.random.default_rng([self.config.seed, *name.encode()]),
             self.stopwatch,
+            self._beside,
         )
 
     def remove_object(self, name: str) -> None:

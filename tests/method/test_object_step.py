@@ -1,5 +1,6 @@
 """One object's step on exact depth of an analytic shape, with tracks made up by the test: each mechanism by itself."""
 
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -47,7 +48,7 @@ class Lump:
     def __init__(self, **settings):
         config = preset().with_values({key.replace("__", "."): value for key, value in settings.items()})
         rng = np.random.default_rng(0)
-        self.tracker = ObjectTracker("lump", CAMERA, config, Grid(), rng, Stopwatch())
+        self.tracker = ObjectTracker("lump", CAMERA, config, Grid(), rng, Stopwatch(), ThreadPoolExecutor(1))
         self.p_model, self.steps, self.T_first = np.zeros((0, 3)), [], None
 
     def tracks(self, T_cam_model: np.ndarray) -> Tracks:
@@ -109,6 +110,27 @@ def moved_to(T_wrong, lump: Lump, rows, uncertainty: float = 0.1):
         return replace(tracks, uv_px=uv, uncertainty=np.where(at, uncertainty, tracks.uncertainty))
 
     return spoil
+
+
+class Later(Executor):
+    """Does nothing before somebody asks for it."""
+
+    def submit(self, fn, /, *args, **more):
+        waiting = Future()
+        waiting.result = lambda timeout=None: fn(*args, **more)
+        return waiting
+
+
+def test_it_does_not_matter_when_the_views_are_fused():
+    """A keyframe in every third frame, which the graph moves: the poses are the same to the last bit."""
+    at_once, late = (Lump(keypoint_map__keyframe_angle_deg=5.0) for _ in range(2))
+    late.tracker.model._beside = Later()
+    for deg in range(0, 40, 2):
+        one, other = at_once.see(turned(deg)).estimate, late.see(turned(deg)).estimate
+        assert np.array_equal(one.T_cam_obj, other.T_cam_obj) and one.keyframe == other.keyframe
+    surfaces = at_once.tracker.model.surface.values(), late.tracker.model.surface.values()
+    np.testing.assert_array_equal(*surfaces)
+    assert sum(step.estimate.keyframe for step in late.steps) > 4
 
 
 def visible_first(n: int, last: bool = False):
