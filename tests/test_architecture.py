@@ -13,6 +13,7 @@ PACKAGE = PROJECT / "p2p_lib"
 #: Lowest first; the packages of one layer do not import each other.
 LAYERS = [
     {"core"},
+    {"recovery"},
     {"method", "datasets"},
     {"synthetic"},
     {"trackers", "detectors", "segmenters"},
@@ -114,10 +115,10 @@ MADE = METHOD + "\nfrom p2p_lib import Camera\npipeline.Point2Pose(Camera(300, 3
 
 @pytest.mark.parametrize(("code", "parts"), [(METHOD, 0), (MADE, 3)], ids=["imported", "made with what is built in"])
 def test_the_method_loads_neither_datasets_nor_downloads_nor_drawing(code, parts):
-    allowed = {"core", "method", *("trackers", "detectors", "segmenters")[:parts]}
+    allowed = {"core", "recovery", "method", *("trackers", "detectors", "segmenters")[:parts]}
     loaded = answer(f"import sys\n{code}\nprint(*sys.modules)").split()
     ours = {module.split(".")[1] for module in loaded if module.startswith("p2p_lib.")}
-    assert {"core", "method"} <= ours <= allowed
+    assert {"core", "method", "recovery"} <= ours <= allowed
     unwanted = {"pooch", "requests", "urllib3", "tqdm", "pydantic", "PIL", *LAZY} - {"scipy"}
     assert not unwanted & set(loaded)
 

@@ -52,8 +52,8 @@ class Stage:
 STAGES = {
     "tracking": Stage("track points", "trackers/", "01"),
     "segmentation": Stage("segment", "segmenters/", "10"),
-    "scene": Stage("locate camera", "method/scene.py", "07", True, ("method.scene", False)),
-    "search": Stage("search", "method/search.py", "07", True, ("method.scene", False)),
+    "scene": Stage("locate camera", "recovery/scene.py", "07", True, ("method.scene", False)),
+    "search": Stage("search", "recovery/search.py", "07", True, ("method.scene", False)),
     "observation": Stage("lift to 3D", "method/observation.py", "10"),
     "registration": Stage("register", "method/registration.py", "03"),
     "refinement": Stage("refine", "method/refinement.py", "04", switch=("refinement.residuals", "none")),

@@ -9,11 +9,9 @@ object's step), then at the parts of that step in its order:
   determines;
 - select: ``selection``;
 - judge: ``lifecycle`` holds an object's state and every gate;
-- find again (ours): ``scene`` says how the camera moved and so where an object lies that was left, ``search`` whether
-  its surface shows there by shape and colour;
 - extend: ``object_model`` holds map, surface (``tsdf``, ``tsdf_grid``, ``mesh``) and graph (``factor_graph``,
   ``keyframes``, ``keyframe_views``); ``sampling`` chooses new points; ``confidence`` says how well the pose is known.
 
 The 2D tracker, the detector of candidates and the segmenter are parts that it is given; what it asks of them is in
-:mod:`p2p_lib.core.interfaces`.
+:mod:`p2p_lib.core.interfaces`. Where an absent object may lie it is told by :mod:`p2p_lib.recovery`.
 """

@@ -15,7 +15,7 @@ from p2p_lib.method.factor_graph import ObjectGraph
 from p2p_lib.method.keyframe_views import KeyframeViews
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.observation import Observation, Observer
-from p2p_lib.method.search import SurfaceSample
+from p2p_lib.recovery.search import SurfaceSample
 
 if TYPE_CHECKING:
     from p2p_lib.method.tsdf import TsdfVolume
@@ -94,7 +94,7 @@ class ObjectModel:
     def sample(self) -> SurfaceSample:
         """Points of the surface, for the search by shape and colour."""
         if self._sample is None:
-            self._sample = SurfaceSample.of(self.surface)
+            self._sample = SurfaceSample.of(self.surface.mesh())
         return self._sample
 
     def noise_m(self, p_cam: np.ndarray) -> np.ndarray | None:

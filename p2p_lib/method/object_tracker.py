@@ -28,7 +28,7 @@ from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.refinement import Keypoints, Refinement, surface_distance
 from p2p_lib.method.registration import Hypothesis
 from p2p_lib.method.sampling import choose, usable_region
-from p2p_lib.method.search import ImageSearch, Sighting
+from p2p_lib.recovery.search import ImageSearch, Sighting
 
 #: While an object has a pose, the tracker is asked every so many frames to look for points that are not seen.
 _LOOK_EVERY = 3

@@ -39,8 +39,8 @@ from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method.object_model import NO_IDS, Requests
 from p2p_lib.method.object_tracker import ObjectTracker
 from p2p_lib.method.observation import Observation
-from p2p_lib.method.scene import Scene
-from p2p_lib.method.search import Sighting
+from p2p_lib.recovery.scene import Scene
+from p2p_lib.recovery.search import Sighting
 
 _LOG = logging.getLogger("p2p_lib")
 #: Object to (H, W) bool; None where nobody knows.

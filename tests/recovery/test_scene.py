@@ -9,7 +9,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.method.pipeline import Point2Pose
-from p2p_lib.method.scene import Scene, two_nearest
+from p2p_lib.recovery.scene import Scene, two_nearest
 
 CAMERA = Camera(260.0, 260.0, 160.0, 120.0, 320, 240)
 WALL_M = 1.2

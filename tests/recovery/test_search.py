@@ -11,7 +11,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame
 from p2p_lib.method.lifecycle import SIGHTED
-from p2p_lib.method.search import ImageSearch, SurfaceSample
+from p2p_lib.recovery.search import ImageSearch, SurfaceSample
 
 CAMERA = Camera(300.0, 300.0, 160.0, 120.0, 320, 240)
 RADIUS_M = 0.05

@@ -21,7 +21,7 @@ from p2p_lib.core.image import in_image, nearest_px
 from p2p_lib.core.types import Frame, Rows
 
 if TYPE_CHECKING:
-    from p2p_lib.method.tsdf import TsdfVolume
+    import trimesh
 
 #: Points of the surface that are compared, and the fewest of them in the image that say anything.
 _POINTS, _FEWEST = 300, 40
@@ -58,9 +58,8 @@ class SurfaceSample(Rows):
     lab: np.ndarray
 
     @classmethod
-    def of(cls, surface: TsdfVolume) -> SurfaceSample:
-        """Of what has been reconstructed so far."""
-        mesh = surface.mesh()
+    def of(cls, mesh: trimesh.Trimesh) -> SurfaceSample:
+        """Of what has been reconstructed so far, with colours."""
         at = np.sort(np.random.default_rng(0).permutation(len(mesh.vertices))[:_POINTS])
         rgb = np.asarray(mesh.visual.vertex_colors)[at, :3] if len(at) else np.zeros((0, 3), np.uint8)
         lab = cv2.cvtColor(np.ascontiguousarray(rgb)[None], cv2.COLOR_RGB2LAB)[0] if len(at) else rgb
