@@ -86,32 +86,11 @@ def log(T: np.ndarray) -> np.ndarray:
 
 
 def so3_log(R: np.ndarray) -> np.ndarray:
-    """Rotation vector (..., 3) of rotation matrices (..., 3, 3); stable at angles 0 and pi.
+    """Rotation vector (..., 3) of rotation matrices (..., 3, 3); stable at angles 0 and pi."""
+    from scipy.spatial.transform import Rotation
 
-    Goes through the unit quaternion, picking for each matrix the largest of its four components.
-    """
     R = np.asarray(R, float)
-    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    x, y, z = (R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
-    xy, xz, yz = (R[..., i, j] + R[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
-    squares = np.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], -1)
-    columns = np.stack(
-        [
-            np.stack([squares[..., 0], x, y, z], -1),
-            np.stack([x, squares[..., 1], xy, xz], -1),
-            np.stack([y, xy, squares[..., 2], yz], -1),
-            np.stack([z, xz, yz, squares[..., 3]], -1),
-        ],
-        -2,
-    )
-    best = np.argmax(squares, -1)[..., None, None]
-    q = np.take_along_axis(columns, np.broadcast_to(best, (*best.shape[:-2], 1, 4)), -2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    q = np.where(q[..., :1] < 0, -q, q)
-    s = np.linalg.norm(q[..., 1:], axis=-1)
-    small = s < 1e-9
-    factor = np.where(small, 2.0, 2 * np.arctan2(s, q[..., 0]) / np.where(small, 1.0, s))
-    return factor[..., None] * q[..., 1:]
+    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
 
 
 def angle_rad(T: np.ndarray) -> np.ndarray:
