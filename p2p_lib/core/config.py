@@ -65,15 +65,9 @@ class MethodConfig(_Checked):
         "The object frame starts at the camera (T_cam_obj = I) or at the centroid of the first masked cloud.",
         choices=("camera", "centroid"),
     )
-    motion: bool = _p(
-        True, "The motion so far is evidence: last poses compete, jumps need support, surfaces may track."
-    )
-    redetection: bool = _p(
-        True, "Where few points are seen, their pose tells the tracker where to look for the others."
-    )
-    scene: bool = _p(
-        True, "An absent object is searched for by shape and colour, where the static scene says that it was left."
-    )
+    motion: bool = _p(True, "The motion so far is evidence: last poses compete, jumps need support.")
+    redetection: bool = _p(True, "Where few points are seen, their pose tells where to look for the others.")
+    scene: bool = _p(True, "An absent object is searched for by shape and colour where the scene says it was left.")
     gates: str = _p("all", "A pose has to pass all gates of the life cycle, or none.", choices=("none", "all"))
     noise: str = _p(
         "sensor",
@@ -115,35 +109,23 @@ class DepthConfig(_Checked):
 class TrackingConfig(_Checked):
     """Of the built-in tracker, but for ``forget_after``, which all trackers keep."""
 
-    forget_after: int = _p(
-        0, "SH(n): points are dropped after this many invisible frames; 0 means never.", "frames", low=0
-    )
+    forget_after: int = _p(0, "SH(n): points are dropped after so many invisible frames; 0: never.", "frames", low=0)
     window_px: int = _p(13, "Side of the Lucas-Kanade window.", "px", low=5, high=63)
     templates: int = _p(5, "Templates kept of a point's appearance.", low=2, high=20)
     update_every: int = _p(3, "Templates, segments and landmarks are updated every so many frames.", "frames", low=1)
-    update_scale_change: float = _p(
-        1.35, "A new template is taken when the best one appears scaled by this factor or more.", low=1.01
-    )
-    update_ncc: float = _p(
-        0.85, "A new template is taken when the correlation with the best one is lower.", low=0, high=1
-    )
+    update_scale_change: float = _p(1.35, "A new template is taken when the best one appears scaled by this.", low=1.01)
+    update_ncc: float = _p(0.85, "A new template is taken when the best one correlates less.", low=0, high=1)
     min_ncc: float = _p(0.7, "A followed point keeps at least this correlation with its template.", low=0, high=1)
     return_ncc: float = _p(0.8, "A point that was invisible returns with at least this one.", low=0, high=1)
     max_colour_change: float = _p(12.0, "A larger difference of chroma (CIELAB) means another point.", low=0)
     max_contrast_change: float = _p(2.5, "A larger ratio of contrasts means another point.", low=1)
     search_px: float = _p(8.0, "A point is searched for no farther from its prediction than this.", "px", low=0.5)
-    coast_frames: int = _p(
-        8, "Lucas-Kanade alone carries a point whose appearance changed for at most so many frames.", "frames", low=0
-    )
+    coast_frames: int = _p(8, "Lucas-Kanade alone carries a point of changed looks for so long.", "frames", low=0)
     forward_backward_px: float = _p(
         0.7, "Lucas-Kanade forward and backward may differ by this much for such a point.", "px", low=0.05
     )
-    linger_frames: int = _p(
-        5, "A point or segment that was lost is searched for where it was for so many frames.", "frames", low=0
-    )
-    depth_jump_m: float = _p(
-        0.02, "Depth that differs more from a point's prediction belongs to another surface.", "m", low=1e-3
-    )
+    linger_frames: int = _p(5, "What was lost is searched for where it was for so many frames.", "frames", low=0)
+    depth_jump_m: float = _p(0.02, "Depth farther off a point's prediction is another surface's.", "m", low=1e-3)
     textureless_contrast: float = _p(6.0, "A point with less contrast is not searched for.", "grey levels", low=0)
     max_predicted_sigma_px: float = _p(
         3.0, "A point that is not recognised counts as visible if its segment predicts it this well.", "px", low=0
@@ -151,23 +133,15 @@ class TrackingConfig(_Checked):
     uncertain_px: float = _p(1.5, "A position with this standard deviation has an uncertainty of 1/2.", "px", low=0.01)
     segment_min_points: int = _p(3, "A segment's pose needs so many points, its start twice as many.", "points", low=3)
     segment_reach_m: float = _p(0.04, "Points nearer to each other than this start in one segment.", "m", low=1e-3)
-    segment_inlier_m: float = _p(
-        0.008, "Pairs of points with a smaller residual agree with a motion that is searched for.", "m", low=1e-4
-    )
+    segment_inlier_m: float = _p(0.008, "Pairs with a smaller residual agree with a motion.", "m", low=1e-4)
     split_points: int = _p(8, "So many points that leave a segment together make another one.", "points", low=3)
     split_m: float = _p(0.02, "They do so when they are this far from their segment's motion.", "m", low=1e-3)
     redetect_every: int = _p(2, "Lost segments are searched for everywhere every so many frames.", "frames", low=1)
     corners: int = _p(200, "So many corners of an image are described.", "points", low=10)
-    match_ratio: float = _p(
-        0.85, "A corner matches a landmark if it is nearer than this times the next best place.", low=0.1, high=1
-    )
+    match_ratio: float = _p(0.85, "A match is nearer than this times the next best place.", low=0.1, high=1)
     min_landmark_matches: int = _p(5, "A lost segment is found where so many corners agree.", "points", low=3)
-    reject_frames: int = _p(
-        15, "A segment is not searched for where the caller rejected it for so many frames.", "frames", low=0
-    )
-    landmark_view_deg: float = _p(
-        15.0, "Landmarks are added when a segment is seen from a direction this far from all before.", "deg", low=1
-    )
+    reject_frames: int = _p(15, "A segment is not searched for where it was rejected for so long.", "frames", low=0)
+    landmark_view_deg: float = _p(15.0, "Landmarks are added in views this far from all before.", "deg", low=1)
     max_landmarks: int = _p(2500, "No more landmarks of a segment are kept.", "points", low=100)
 
 
@@ -177,15 +151,10 @@ class OracleConfig(_Checked):
 
     noise_px: float = _p(0.5, "This is the standard deviation of a visible point's position, per axis.", "px", low=0)
     dropout: float = _p(0.0, "This share of the visible points is called invisible in a frame.", low=0, high=1)
-    outliers: float = _p(
-        0.0, "This share of the visible points is reported at a wrong place in a frame.", low=0, high=1
-    )
+    outliers: float = _p(0.0, "This share of the visible points is at a wrong place in a frame.", low=0, high=1)
     outlier_px: float = _p(30.0, "Points at a wrong place are this far off.", "px", low=0)
     slide_px: float = _p(0.0, "This is the standard deviation of the error that lasts, per axis.", "px", low=0)
-    lasting_frames: int = _p(
-        1, "Dropouts and wrong places last so many frames; the error that lasts goes from one to another in as many.",
-        "frames", low=1,
-    )  # fmt: skip
+    lasting_frames: int = _p(1, "Dropouts, wrong places and the error that lasts last so long.", "frames", low=1)
 
 
 @dataclass(frozen=True)
@@ -210,9 +179,7 @@ class SamplingConfig(_Checked):
 
     candidates: int = _p(512, "The detector offers at most N_k candidates.", "points", "release", low=1)
     points: int = _p(30, "At a keyframe K points are chosen.", "points", "release", low=1)
-    max_visible: int = _p(
-        60, "A keyframe adds no more points than are missing to so many visible ones.", "points", low=3
-    )
+    max_visible: int = _p(60, "A keyframe adds what is missing to so many visible points.", "points", low=3)
     score_weight: float = _p(0.3, "This is lambda of the objective.", "", "release", low=0, high=1)
     cluster_weight: float = _p(0.5, "This is beta of the objective.", "", "release", low=0)
     r_ideal_px: float = _p(20.0, "This is r_ideal of the objective, for which the paper gives no value.", "px", low=1)
@@ -230,13 +197,7 @@ class KeypointMapConfig(_Checked):
     cooldown: int = _p(5, "Keyframes asked for by too few points are so many frames apart.", "frames", low=0)
     streak: int = _p(3, "A point is promoted after N_streak verified frames in a row.", "frames", "paper", low=1)
     max_uncertainty: float = _p(0.3, "A more uncertain track verifies nothing.", "", "paper", low=0, high=1)
-    max_scatter_m: float = _p(
-        0.008,
-        "A point is promoted when the median absolute deviation of its observations is smaller.",
-        "m",
-        "paper",
-        low=0,
-    )
+    max_scatter_m: float = _p(0.008, "A point is promoted below this median absolute deviation.", "m", "paper", low=0)
     pending_ttl: int = _p(30, "A point is dropped when it is pending for longer.", "frames", "release", low=1)
     max_points: int = _p(300, "A map keeps at most so many keypoints.", "points", low=10)
 
@@ -312,12 +273,8 @@ class FactorGraphConfig(_Checked):
     bearing_sigma_rad: float = _p(0.0015, "This is the noise of a bearing.", "rad", low=1e-6)
     range_sigma_m: float = _p(0.01, "This is the noise of a range where it is constant.", "m", "release", low=1e-6)
     huber: float = _p(1.345, "This is the Huber threshold in standard deviations.", "", "release", low=0.1)
-    between_sigma_rad: float = _p(
-        0.02, "This is the noise of a relative rotation where it is constant.", "rad", low=1e-6
-    )
-    between_sigma_m: float = _p(
-        0.005, "This is the noise of a relative translation at the object where it is constant.", "m", low=1e-6
-    )
+    between_sigma_rad: float = _p(0.02, "A relative rotation has this noise where it is constant.", "rad", low=1e-6)
+    between_sigma_m: float = _p(0.005, "A relative translation has this noise where it is constant.", "m", low=1e-6)
     iterations: int = _p(5, "Levenberg-Marquardt makes at most so many steps.", low=1)
     max_keyframes: int = _p(30, "Keyframes beyond this number are merged, the most similar first; 0 keeps all.", low=0)
 
@@ -464,24 +421,7 @@ def from_toml(path: str | Path, base: Config | None = None) -> Config:
     return base.with_values(values, source=str(path))
 
 
-#: Keys of version 0.1 that scripts may hold, and what says the same now.
-_RENAMED = {
-    "tsdf.enabled=false": "method.surface=false",
-    "factor_graph.enabled=false": "method.graph=false",
-    "refinement.enabled=false": "refinement.residuals=none",
-    "registration.multi_hypothesis=false": "registration.method=svd",
-    "registration.motion_priors=false": "method.motion=false",
-    "pipeline.object_frame": "method.object_frame",
-    "pipeline.min_mask_px": "lifecycle.min_mask_px",
-    "pipeline.depth_min_m": "depth.min_m",
-    "pipeline.depth_max_m": "depth.max_m",
-}
-
-
 def _unknown(what: str, key: str, known: Any) -> BadInput:
-    for old, new in _RENAMED.items():
-        if old.partition("=")[0] == key:
-            return BadInput(what, repr(key), "a key of this version", f"Instead of {old} say {new}.")
     stage, _, name = str(key).partition(".")
     if name and stage in _STAGES:
         known = [f.name for f in fields(getattr(Config, stage))]
