@@ -23,7 +23,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
-from p2p_lib.datasets.cameras import LiveCamera, Newest, Still, Stream
+from p2p_lib.datasets.cameras import LiveCamera, Newest, Stream
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
@@ -173,7 +173,7 @@ def click_first(
     if image is None:
         raise BadInput(camera.name, "no image", "one to click on")
     with tempfile.TemporaryDirectory() as folder:
-        page = Clicker(Still(camera.name, camera.camera, image), Path(folder) / "prompts.json")
+        page = Clicker(Stream(camera.name, camera.camera, image), Path(folder) / "prompts.json")
         return wait_for_clicks(page, say, open_browser), image
 
 

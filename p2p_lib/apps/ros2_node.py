@@ -21,11 +21,8 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame, PoseEstimate
-
-#: Metres per unit by a depth image's encoding (REP 118).
-DEPTH_SCALE_M = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
+from p2p_lib.datasets.ros_messages import read_depth_m, read_rgb, seconds
 
 
 def camera_of(info: Any) -> Camera:
@@ -33,41 +30,9 @@ def camera_of(info: Any) -> Camera:
     return Camera.from_K(np.reshape(info.k, (3, 3)), info.width, info.height, "camera_info.k")
 
 
-def seconds(stamp: Any) -> float:
-    """A ``builtin_interfaces/Time`` in seconds."""
-    return stamp.sec + 1e-9 * stamp.nanosec
-
-
-def pixels(image: Any, dtype: str, channels: int) -> np.ndarray:
-    """(H, W, channels) of a ``sensor_msgs/Image``: rows may be padded, bytes may be big-endian."""
-    kind = np.dtype(dtype).newbyteorder(">" if image.is_bigendian else "<")
-    width = image.width * channels * kind.itemsize
-    if image.step < width or len(image.data) < image.height * image.step:
-        got = f"{len(image.data)} bytes in rows of {image.step}"
-        raise BadInput(f"image {image.encoding}", got, f"{image.height} rows of at least {width} bytes")
-    rows = np.frombuffer(image.data, np.uint8, image.height * image.step).reshape(image.height, image.step)
-    whole = np.ascontiguousarray(rows[:, :width]).view(kind).reshape(image.height, image.width, channels)
-    return whole.astype(kind.newbyteorder("="), copy=False)
-
-
 def frame_of(index: int, rgb: Any, depth: Any) -> Frame:
     """A frame of two ``sensor_msgs/Image`` taken at one time; :class:`BadInput` for encodings that are not known."""
-    if rgb.encoding not in ("rgb8", "bgr8"):
-        raise BadInput("rgb image", repr(rgb.encoding), "rgb8 or bgr8", "Subscribe to the colour image, not a raw one.")
-    if depth.encoding not in DEPTH_SCALE_M:
-        raise BadInput("depth image", repr(depth.encoding), "one of " + ", ".join(DEPTH_SCALE_M))
-    colour = pixels(rgb, "u1", 3)[..., :: 1 if rgb.encoding == "rgb8" else -1]
-    kind = "f4" if depth.encoding == "32FC1" else "u2"
-    depth_m = pixels(depth, kind, 1)[..., 0].astype(np.float32) * np.float32(DEPTH_SCALE_M[depth.encoding])
-    return Frame(index, seconds(rgb.header.stamp), np.ascontiguousarray(colour), depth_m)
-
-
-def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
-    """x, y, z, w of a rotation (3, 3), as ROS has it."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(R).as_quat()
-    return float(x), float(y), float(z), float(w)
+    return Frame(index, seconds(rgb.header.stamp), read_rgb("rgb image", rgb), read_depth_m("depth image", depth))
 
 
 def covariance_of(estimate: PoseEstimate) -> np.ndarray:
@@ -88,7 +53,7 @@ def fill_pose(message: Any, estimate: PoseEstimate, header: Any) -> Any:
     message.header = header
     at, turn = message.pose.pose.position, message.pose.pose.orientation
     at.x, at.y, at.z = map(float, T[:3, 3])
-    turn.x, turn.y, turn.z, turn.w = quaternion(T[:3, :3])
+    turn.x, turn.y, turn.z, turn.w = map(float, se3.quaternion_xyzw(T))
     message.pose.covariance = covariance_of(estimate).ravel().tolist()
     return message
 
@@ -99,7 +64,7 @@ def fill_transform(message: Any, estimate: PoseEstimate, header: Any) -> Any:
     message.header, message.child_frame_id = header, estimate.object
     at, turn = message.transform.translation, message.transform.rotation
     at.x, at.y, at.z = map(float, T[:3, 3])
-    turn.x, turn.y, turn.z, turn.w = quaternion(T[:3, :3])
+    turn.x, turn.y, turn.z, turn.w = map(float, se3.quaternion_xyzw(T))
     return message
 
 

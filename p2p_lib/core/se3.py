@@ -93,6 +93,13 @@ def so3_log(R: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
 
 
+def quaternion_xyzw(T: np.ndarray) -> np.ndarray:
+    """The unit quaternions (..., 4), scalar last and not negative, of transformations (4, 4) or (N, 4, 4)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(T[..., :3, :3]).as_quat(canonical=True)
+
+
 def angle_rad(T: np.ndarray) -> np.ndarray:
     """Rotation angle (...,) in [0, pi] of (..., 4, 4) or (..., 3, 3)."""
     R = np.asarray(T, float)[..., :3, :3]

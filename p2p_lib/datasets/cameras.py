@@ -39,17 +39,22 @@ class LiveCamera(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """What a run's folder says of a camera that plays no sequence: no frames to read again, no masks, no truth."""
+    """A camera that plays no sequence, as one: no masks, no truth, and no frames but one that is kept to click on."""
 
     name: str
     camera: Camera
+    kept: Frame | None = None
     format: str = "live"
     path: None = None
     objects: tuple[str, ...] = ()
     truth: Mapping[str, ObjectTruth] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return 0
+        return int(self.kept is not None)
+
+    def frame(self, i: int) -> Frame | None:
+        """The frame that is kept, whatever its number."""
+        return self.kept
 
     def visible_px(self, i: int) -> None:
         """Unknown."""
@@ -140,20 +145,3 @@ class Newest:
             with self._changed:
                 self._ended = True
                 self._changed.notify()
-
-
-@dataclass(frozen=True, eq=False)
-class Still:
-    """One frame of a camera as a sequence, to be clicked on (:class:`p2p_lib.apps.click.Clicker`)."""
-
-    name: str
-    camera: Camera
-    still: Frame
-    objects: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return 1
-
-    def frame(self, i: int) -> Frame:
-        """The frame, whatever its number."""
-        return self.still

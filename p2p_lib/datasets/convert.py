@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,8 @@ def convert(
         sequence = open_sequence(source, format, depth_scale)
         folder.write(sequence, out)
         return len(sequence)
-    with _opened(Path(source), colour, depth) as recording, progress_bar(Path(source).name, shown=progress) as bar:
+    recording = _opened(Path(source), colour, depth)
+    with closing(recording), progress_bar(Path(source).name, shown=progress) as bar:
 
         def counted(frames: Iterable[Frame]) -> Iterator[Frame]:
             for frame in frames:
@@ -55,24 +56,17 @@ def convert(
     return len(times_s)
 
 
-@contextmanager
-def _opened(path: Path, colour: str | None, depth: str | None) -> Iterator[Any]:
-    """A recording to iterate over, with its ``camera`` (known after the first frame) and ``unit_m``."""
+def _opened(path: Path, colour: str | None, depth: str | None) -> Any:
+    """A recording to iterate over and to close, with its ``camera`` (known after the first frame) and ``unit_m``."""
     if path.suffix == ".mkv":
-        yield AzureKinectRecording(path)
-    elif path.is_file() and _by_realsense(path):
+        return AzureKinectRecording(path)
+    if path.is_file() and _by_realsense(path):
         from p2p_lib.datasets.realsense import RealSenseCamera
 
-        camera = RealSenseCamera(path, every=True)
-        try:
-            yield camera
-        finally:
-            camera.close()
-    else:
-        from p2p_lib.datasets.rosbag import RosRecording
+        return RealSenseCamera(path, every=True)
+    from p2p_lib.datasets.rosbag import RosRecording
 
-        with RosRecording(path, colour, depth) as recording:
-            yield recording
+    return RosRecording(path, colour, depth)
 
 
 def _by_realsense(path: Path) -> bool:
@@ -109,4 +103,7 @@ class AzureKinectRecording:
                 rgb, depth = np.asarray(images.color), np.asarray(images.depth)
                 yield Frame(index, index / 30, np.ascontiguousarray(rgb), depth * np.float32(self.unit_m))
                 index += 1
+
+    def close(self) -> None:
+        """Close the file."""
         self._reader.close()

@@ -19,7 +19,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageSequence, image_files
+from p2p_lib.datasets.image_sequence import ImageSequence, image_files, without_truth
 from p2p_lib.datasets.sequence import Sequence
 
 #: Depth cameras see no farther; and nearer than 20 mm none does.
@@ -29,16 +29,7 @@ _FARTHEST_M = 20.0
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)
-    found, _ = files.find_masks(masks, [] if masks else [folder / "masks"], some_frames=True)
-    objects = tuple(found.files) if found else ("object",)
-    return ImageSequence(
-        **vars(files),
-        objects=objects,
-        depth_scale=_depth_scale(folder / "depth_scale.txt", files.depth[0]),
-        mask_files=found,
-        own_masks=found,
-        model_places={obj: (folder / "models" / obj,) for obj in objects},
-    )
+    return without_truth(files, masks, _depth_scale(folder / "depth_scale.txt", files.depth[0]))
 
 
 def write(

@@ -135,3 +135,17 @@ class ImageSequence(ImageFiles):
     def _check_index(self, i: int) -> None:
         if not 0 <= i < len(self):
             raise BadInput(f"{self.name}: frame", i, f"a number from 0 to {len(self) - 1}")
+
+
+def without_truth(files: ImageFiles, masks: str | Path | None, depth_scale: float) -> ImageSequence:
+    """The sequence of a layout that has no truth: its objects are those of its masks, which lie in ``masks/``."""
+    found, _ = files.find_masks(masks, [] if masks else [files.path / "masks"], some_frames=True)
+    objects = tuple(found.files) if found else ("object",)
+    return ImageSequence(
+        **vars(files),
+        objects=objects,
+        depth_scale=depth_scale,
+        mask_files=found,
+        own_masks=found,
+        model_places={obj: (files.path / "models" / obj,) for obj in objects},
+    )

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +21,20 @@ from p2p_lib.core import packages
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
+from p2p_lib.datasets.ros_messages import read_depth_m, read_rgb, seconds
 
 #: A colour image goes with the depth image nearest in time, if it is as near as this.
 APART_S = 0.025
-#: What an encoding is made RGB with; depth encodings and what their unit is in metres.
-TO_RGB = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
-DEPTH_M = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
 #: Words in the names of topics whose depth is registered, the best first.
 REGISTERED = ("aligned_depth_to_color", "registered", "aligned")
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO = "sensor_msgs/msg/CameraInfo"
-_COMPRESSED_DEPTH_HEADER = 12  # bytes before the PNG
 #: Distortion that moves no pixel further than this is none.
 LEAST_DISTORTION_PX = 0.1
 
 
 class RosRecording:
-    """Frames of a recording, a context manager.
+    """Frames of a recording, until it is closed.
 
     camera   of the colour images, without distortion; known after the first frame
     unit_m   metres per unit in which depth may be written without loss
@@ -70,12 +68,6 @@ class RosRecording:
                 got = f"topics {', '.join(sorted(of)) or 'none'}"
                 raise BadInput(f"{self.name}: {what}", got, "a topic of it", "Name it: --colour TOPIC --depth TOPIC.")
         self._topics, self._of = {"colour": colour, "depth": depth, "info": info}, of
-
-    def __enter__(self) -> RosRecording:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the file."""
@@ -111,31 +103,21 @@ class RosRecording:
 
     def _pairs(self) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
         """(time_s, rgb, depth_m) of each colour image with a depth image near to it."""
-        waiting: dict[str, deque] = {"colour": deque(), "depth": deque()}
-        colours, depths = waiting["colour"], waiting["depth"]
-        last_s = -np.inf
-        for what, message in self._messages("colour", "depth"):
-            stamp = message.header.stamp
-            waiting[what].append((stamp.sec + 1e-9 * stamp.nanosec, message))
+        colours: deque[tuple[float, Any]] = deque()
+        depths: deque[tuple[float, Any]] = deque()
+        last_s, ended = -np.inf, [("", None)]
+        for what, message in chain(self._messages("colour", "depth"), ended):
+            if message is not None:
+                (colours if what == "colour" else depths).append((seconds(message.header.stamp), message))
             # Until a depth image is later than the colour image, a nearer one may come.
-            while colours and depths and depths[-1][0] >= colours[0][0]:
-                pair = self._pair(colours.popleft(), depths)
-                if pair is not None and pair[0] > last_s:
-                    last_s = pair[0]
-                    yield pair
-        while colours and depths:
-            pair = self._pair(colours.popleft(), depths)
-            if pair is not None and pair[0] > last_s:
-                last_s = pair[0]
-                yield pair
-
-    def _pair(self, colour: tuple[float, Any], depths: deque) -> tuple[float, np.ndarray, np.ndarray] | None:
-        time_s, message = colour
-        while len(depths) > 1 and abs(depths[1][0] - time_s) <= abs(depths[0][0] - time_s):
-            depths.popleft()
-        if abs(depths[0][0] - time_s) > APART_S:
-            return None
-        return time_s, _rgb(self._topics["colour"], message), _depth_m(self._topics["depth"], depths[0][1])
+            while colours and depths and (message is None or depths[-1][0] >= colours[0][0]):
+                time_s, colour = colours.popleft()
+                while len(depths) > 1 and abs(depths[1][0] - time_s) <= abs(depths[0][0] - time_s):
+                    depths.popleft()
+                if abs(depths[0][0] - time_s) <= APART_S and time_s > last_s:
+                    last_s = time_s
+                    depth = depths[0][1]
+                    yield time_s, read_rgb(self._topics["colour"], colour), read_depth_m(self._topics["depth"], depth)
 
 
 class _Lens:
@@ -185,38 +167,3 @@ def _info_of(topic: str | None, infos: list[str]) -> str | None:
     """The CameraInfo of an image topic: the one beside it."""
     parent = (topic or "").removesuffix("/compressed").rpartition("/")[0]
     return next((info for info in infos if info.rpartition("/")[0] == parent), None)
-
-
-def _image(topic: str, message: Any, channels: int, kind: type) -> np.ndarray:
-    """(H, W, channels) of an Image: rows may be padded, bytes of either order."""
-    kind = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
-    used = rows[:, : message.width * channels * kind.itemsize]
-    return np.ascontiguousarray(used).view(kind).reshape(message.height, message.width, channels).astype(kind.type)
-
-
-def _rgb(topic: str, message: Any) -> np.ndarray:
-    if hasattr(message, "format"):
-        bgr = cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_COLOR)
-        if bgr is None:
-            raise BadInput(topic, f"an unreadable image ({message.format})", "JPEG or PNG")
-        return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-    if message.encoding not in TO_RGB:
-        raise BadInput(topic, f"colour as {message.encoding}", f"one of {', '.join(TO_RGB)}", "Name another: --colour.")
-    image = _image(topic, message, 4 if "a" in message.encoding else 3, np.uint8)
-    code = TO_RGB[message.encoding]
-    return image if code is None else cv2.cvtColor(image, code)
-
-
-def _depth_m(topic: str, message: Any) -> np.ndarray:
-    if hasattr(message, "format"):
-        data = bytes(message.data)
-        data = data[_COMPRESSED_DEPTH_HEADER:] if "compressedDepth" in message.format else data
-        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
-            raise BadInput(topic, f"depth as {message.format}", "16-bit PNG, or compressedDepth of 16UC1")
-        return raw * np.float32(DEPTH_M["16UC1"])
-    if message.encoding not in DEPTH_M:
-        raise BadInput(topic, f"depth as {message.encoding}", f"one of {', '.join(DEPTH_M)}", "Name another: --depth.")
-    kind = np.float32 if message.encoding == "32FC1" else np.uint16
-    return _image(topic, message, 1, kind)[..., 0] * np.float32(DEPTH_M[message.encoding])

@@ -26,6 +26,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import file_name, load_arrays, read_text
 from p2p_lib.core.types import PoseEstimate
@@ -211,14 +212,7 @@ def _load_timings(path: Path) -> dict[str, np.ndarray]:
     return dict(zip(header, values.T, strict=True))
 
 
-def quaternion_xyzw(T: np.ndarray) -> np.ndarray:
-    """The unit quaternions (..., 4), scalar last and not negative, of transformations (4, 4) or (N, 4, 4)."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(T[..., :3, :3]).as_quat(canonical=True)
-
-
 def tum_line(time_s: float, T_cam_obj: np.ndarray) -> str:
     """One line of a TUM trajectory: time_s tx ty tz qx qy qz qw, metres, with its line end."""
-    numbers = np.concatenate([T_cam_obj[:3, 3], quaternion_xyzw(T_cam_obj)])
+    numbers = np.concatenate([T_cam_obj[:3, 3], se3.quaternion_xyzw(T_cam_obj)])
     return f"{time_s:.9f} " + " ".join(f"{x:.9f}" for x in numbers) + "\n"

@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for
+from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, without_truth
 
 DEPTH_SCALE = 1 / 5000
 APART_S = 0.02
@@ -42,11 +42,7 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
         camera_for(rgb[0], *_K(folder)),
         rgb_s[pairs],
     )
-    found, _ = files.find_masks(masks, [] if masks else [folder / "masks"], some_frames=True)
-    objects = tuple(found.files) if found else ("object",)
-    return ImageSequence(
-        **vars(files), objects=objects, depth_scale=DEPTH_SCALE, mask_files=found, own_masks=found, depth_invalid=0
-    )
+    return without_truth(files, masks, DEPTH_SCALE)
 
 
 def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:

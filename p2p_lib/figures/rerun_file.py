@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.types import Status
-from p2p_lib.datasets.runs import quaternion_xyzw
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
 from p2p_lib.figures.playback import Playback
@@ -130,7 +130,7 @@ def _log_object(rr: Any, stream: Any, playback: Playback, name: str, i: int) -> 
             stream.log([*_SCENE, name], rr.Clear(recursive=True))
         return
     T_cam_obj = obj.T_cam_obj[i]
-    pose = rr.Transform3D(translation=T_cam_obj[:3, 3], quaternion=quaternion_xyzw(T_cam_obj))
+    pose = rr.Transform3D(translation=T_cam_obj[:3, 3], quaternion=se3.quaternion_xyzw(T_cam_obj))
     stream.log([*_SCENE, name], pose)
     if i == 0 or not has[i - 1]:
         _log_shape(rr, stream, playback, name)

@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.native import load_open3d
-from p2p_lib.datasets.runs import quaternion_xyzw
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
 from p2p_lib.figures.playback import CLOUD_MAX_M, Playback
@@ -113,7 +113,7 @@ class _Scene:
                 f"{at}/keypoints", p_obj, faint, point_size=1.4 * _POINT_M, point_shape="circle", precision="float32"
             )
         rows, T_obj_cam = playback.keyframes(name)
-        wxyz, aspect = quaternion_xyzw(T_obj_cam)[:, [3, 0, 1, 2]], 4 / 3
+        wxyz, aspect = se3.quaternion_xyzw(T_obj_cam)[:, [3, 0, 1, 2]], 4 / 3
         nodes["keyframes"] = [
             scene.add_camera_frustum(
                 f"{at}/keyframes/{playback.frame_index[row]}",
@@ -154,7 +154,7 @@ class _Scene:
             nodes["label"].text = f"{name}: {obj.status[i]}"
         if has:
             T = obj.T_cam_obj[i]
-            x, y, z, w = quaternion_xyzw(T)
+            x, y, z, w = se3.quaternion_xyzw(T)
             nodes["frame"].wxyz, nodes["frame"].position = (w, x, y, z), T[:3, 3]
             nodes["label"].position = T[:3, 3] - [0, 1.5 * _AXES_M, 0]
             if not nodes["label"].visible:

@@ -115,12 +115,10 @@ class Sam2Segmenter:
     def _click(self, prompts: Iterable[Prompt]) -> None:
         """Put clicks into the sessions for the frame to come; an object that has none yet gets one."""
         for prompt in prompts:
-            session = self._sessions[prompt.name]
-            if session is None:
-                session = self._sessions[prompt.name] = self._session()
-                at = session.obj_id_to_idx(_OBJECT)
-            else:  # a correction: what the memory says of this frame counts as well
-                at = session.obj_id_to_idx(_OBJECT)
+            before = self._sessions[prompt.name]
+            session = self._sessions[prompt.name] = before or self._session()
+            at = session.obj_id_to_idx(_OBJECT)
+            if before:  # a correction: what the memory says of this frame counts as well
                 session.frames_tracked_per_obj[at][self._at] = {"reverse": False}
             session.add_point_inputs(at, self._at, self._points(prompt))
             session.obj_with_new_inputs = [_OBJECT]

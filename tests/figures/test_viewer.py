@@ -16,7 +16,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, load_points
-from p2p_lib.datasets.runs import load_run, quaternion_xyzw
+from p2p_lib.datasets.runs import load_run
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.viewer import _thinned, scene_page, show_run, write_page
 
@@ -79,7 +79,7 @@ def test_objects_move_as_they_were_estimated_to(messages, made, name):
     turns = [m["wxyz"] for _, m in told(messages, "SetOrientationMessage", f"/objects/{name}")][-len(rows) :]
     np.testing.assert_allclose([t for t, _ in moves], obj.time_s[rows] - obj.time_s[0], atol=1e-6)
     np.testing.assert_allclose([p for _, p in moves], obj.T_cam_obj[rows, :3, 3], atol=1e-6)
-    np.testing.assert_allclose(np.array(turns)[:, [1, 2, 3, 0]], quaternion_xyzw(obj.T_cam_obj[rows]), atol=1e-6)
+    np.testing.assert_allclose(np.array(turns)[:, [1, 2, 3, 0]], se3.quaternion_xyzw(obj.T_cam_obj[rows]), atol=1e-6)
 
 
 def test_an_object_without_a_pose_is_not_drawn(messages, made):
