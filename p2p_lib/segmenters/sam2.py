@@ -116,9 +116,9 @@ class Sam2Segmenter:
         """Put clicks into the sessions for the frame to come; an object that has none yet gets one."""
         for prompt in prompts:
             before = self._sessions[prompt.name]
-            session = self._sessions[prompt.name] = before or self._session()
+            session = self._sessions[prompt.name] = self._session() if before is None else before
             at = session.obj_id_to_idx(_OBJECT)
-            if before:  # a correction: what the memory says of this frame counts as well
+            if before is not None:  # a correction: what the memory says of this frame counts as well
                 session.frames_tracked_per_obj[at][self._at] = {"reverse": False}
             session.add_point_inputs(at, self._at, self._points(prompt))
             session.obj_with_new_inputs = [_OBJECT]
