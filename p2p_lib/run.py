@@ -223,6 +223,7 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     objects = _chosen([p.name for p in prompts] if told else sequence.objects, options.objects)
     if not told and all(sequence.masks(i) is None for i in frames):
         fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
+        fix = "Leave --masks out: the prompts start the objects." if prompts else fix
         expected = "masks of the first image at least, or clicks"
         raise BadInput("masks", f"none in frames {frames[0]} to {frames[-1]} of {sequence.name}", expected, fix)
     if not told and not masks.every_mask:
@@ -346,7 +347,7 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
     except MissingData as error:
         evaluation, not_scored = None, str(error)
     if not any(obj.has_truth.any() for obj in done.objects.values()):
-        not_scored = "the sequence has no truth"
+        not_scored = "the sequence has no truth (looked for in annotated_poses/ of a folder)"
     tracked = any(obj.has_pose.any() for obj in done.objects.values())
     advice = "" if interrupted else _advice(done, job)
     return RunResult(out, evaluation, not_scored, _summary(done, len(job.frames)), interrupted, advice, tracked)
@@ -359,7 +360,8 @@ def _summary(run: Run, wanted: int) -> tuple[str, ...]:
     lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
-        why = Counter(f"{status}: {reason}" for status, reason in zip(obj.status[lost], obj.reason[lost], strict=True))
+        told = zip(obj.status[lost], obj.reason[lost], strict=True)
+        why = Counter(reason if "out of view" in reason else f"{status}: {reason}" for status, reason in told)
         most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
         lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{most}")
     return tuple(lines)

@@ -26,6 +26,7 @@ from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
+from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.prompts import prompts_by_frame
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.method.sampling import choose, usable_region
@@ -179,6 +180,8 @@ def _times(sequence: Sequence) -> Finding:
         return Finding("times", Level.LOOK, "a single image", "Tracking needs a video.")
     usual_s, widest = float(np.median(steps_s)), int(steps_s.argmax())
     text = f"{1 / usual_s:.3g} images per second, {sequence.times_s[-1] - sequence.times_s[0]:.1f} s"
+    if np.array_equal(sequence.times_s, np.arange(len(sequence)) / DEFAULT_HZ) and not _has_times(sequence):
+        text += "; assumed, since there is no times.txt (seconds, one a line)"
     if not RATES_HZ[0] <= 1 / usual_s <= RATES_HZ[1]:
         unit = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
         guess = next((f" These look like {n}." for k, n in unit.items() if 1 <= k / usual_s <= RATES_HZ[1]), "")
@@ -189,6 +192,10 @@ def _times(sequence: Sequence) -> Finding:
         fix = "Images are missing there: what moved meanwhile has to be found again."
         return Finding("times", Level.LOOK, text, fix)
     return Finding("times", Level.OK, text)
+
+
+def _has_times(sequence: Sequence) -> bool:
+    return sequence.path is None or (sequence.path / "times.txt").is_file()
 
 
 def _scale(pairs: list[tuple[Frame, Frame]]) -> Finding:
@@ -357,7 +364,8 @@ def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Findin
     text = f"places to track in frame {frame.index}: {count}"
     if count < needed:
         fix = "Come nearer, light it better, or begin with a textured side: then its surface alone carries the pose."
-        return Finding(f"{name}: points", Level.WRONG, f"{text}; {needed} are needed to find it again", fix)
+        level = Level.LOOK if count >= config.registration.min_inliers else Level.WRONG
+        return Finding(f"{name}: points", level, f"{text}; {needed} are needed to find it again", fix)
     return Finding(f"{name}: points", Level.OK, text)
 
 

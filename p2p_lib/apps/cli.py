@@ -17,6 +17,8 @@ from dataclasses import asdict, replace
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import fill
 from typing import Any
 
 from p2p_lib import __version__
@@ -221,6 +223,8 @@ def _eval(a: argparse.Namespace) -> None:
             from p2p_lib.evaluation.consistency import consistency
 
             _show(consistency(run), a.json)
+            if not a.json and not (a.run / "masks").is_dir() and run.info["masks"] != "dataset":
+                _warn("p2p eval: no masks were kept, so none is compared with. p2p run --save-masks keeps them.")
 
 
 @_command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, _JSON, _MIN_VISIBLE)
@@ -271,7 +275,9 @@ def _benchmark(a: argparse.Namespace) -> int:
     from p2p_lib.studies.final_tables import paper_table, write_table
 
     if a.list:
-        print("\n".join(readiness(name) for name in plan_names()))
+        wide = get_terminal_size((10_000, 24)).columns  # elsewhere than on a terminal lines stay whole
+        for line in (line for name in plan_names() for line in readiness(name).splitlines()):
+            print(fill(line, wide, subsequent_indent=" " * 6, break_long_words=False, break_on_hyphens=False))
         print("Data and weights are looked for below $P2P_DATA, see p2p data list; with --quick no plan needs any.")
         return 0
     if a.present and not (present := present_plans()):
@@ -329,7 +335,12 @@ def _figures(a: argparse.Namespace) -> None:
     _RUN,
     _arg("--format", required=True, choices=("bop", "tum", "poses"), help="BOP CSV, TUM, or 4x4 files"),
     _arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
-    _arg("--frame", choices=("object", "model"), help="of the tracker, or by truth the model's (default for bop)"),
+    _arg(
+        "--frame",
+        choices=("object", "model"),
+        help="object: of the tracker (default; to be said with bop where there is no truth); "
+        "model: the model's, by the truth (default for bop)",
+    ),
 )
 def _export(a: argparse.Namespace) -> None:
     from p2p_lib.run import export_run

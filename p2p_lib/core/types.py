@@ -14,7 +14,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 
-#: No depth camera measures nearer or farther.
+#: What can be depth in any unit: so wide that ``p2p check`` still tells millimetres that were taken for metres.
 NEAREST_M, FARTHEST_M = 0.001, 1e4
 
 

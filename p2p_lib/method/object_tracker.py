@@ -333,6 +333,7 @@ class ObjectTracker:
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
         self.life = self.life.without_pose(status)
+        reason = f"out of view: {reason}" if status is Status.OCCLUDED and self._left() else reason
         estimate = PoseEstimate(
             self.name,
             obs.frame.index,
@@ -419,6 +420,12 @@ class ObjectTracker:
         if best is None:
             return Hint(gone=self._gone(frame)), requests
         return self._hint(frame, obs.tracks.uv_px[best.inliers], best.T_cam_obj, False), requests
+
+    def _left(self) -> bool:
+        """Whether most keypoints of an absent object lay outside the image at its last pose."""
+        camera, T = self.observer.camera, self.life.T_cam_obj
+        inside = () if T is None else camera.inside(camera.project(se3.transform(T, self.map.p_obj)), -0.5)
+        return 2 * np.count_nonzero(inside) < len(inside)
 
     def _gone(self, frame: Frame) -> bool:
         """Whether nothing of an absent object would show in the image if it has lain still; False if nobody knows."""

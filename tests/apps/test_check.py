@@ -11,6 +11,7 @@ import pytest
 from p2p_lib.apps import check, cli
 from p2p_lib.apps.check import Level, as_lines, check_folder, check_spoilt
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
@@ -184,9 +185,20 @@ def test_what_cannot_be_read_is_a_finding(good, tmp_path, capsys):
 def test_without_masks_it_asks_for_clicks(good, tmp_path):
     folder = shutil.copytree(good, tmp_path / "bare")
     shutil.rmtree(folder / "masks")
+    assert "assumed" not in found(folder, "times").text
+    (folder / "times.txt").unlink()
+    assert found(folder, "times").text.startswith("30 images per second, 0.2 s; assumed, since there is no times.txt")
     (asked,) = alarms(check_folder(folder))
     assert asked.name == "masks" and asked.level is Level.LOOK and "--prompts" in asked.fix
     assert as_lines(check_folder(folder)).endswith("To look at before tracking: masks")
+
+
+def test_points_that_a_pose_can_do_with_are_worth_a_look(good):
+    few = preset().with_values({"lifecycle.return_inliers": 1000})
+    assert {f.name: f.level for f in alarms(check_folder(good, config=few))} == {
+        "box: points": Level.LOOK,
+        "can: points": Level.LOOK,
+    }
 
 
 def test_empty_masks_are_wrong(good, tmp_path):

@@ -296,6 +296,9 @@ def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys
     shutil.rmtree(sequence / "masks")
     assert run(sequence, tmp_path / "none") == 2
     assert "p2p click" in (line := one_line(capsys)) and "--prompts" in line
+    prompts = clicks(tmp_path, ("object", 0, ON_BOARD))
+    assert run(sequence, tmp_path / "none", *prompts, "--masks", "dataset") == 2
+    assert one_line(capsys).endswith("Leave --masks out: the prompts start the objects.\n")
 
 
 def test_a_scenario_is_known_by_the_name_that_run_takes(tmp_path, monkeypatch):
@@ -318,6 +321,11 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     listed = capsys.readouterr().out
     assert "YCBInEOAT (tab:ycb_ineoat)" in listed and "Runtime\n" in listed
     assert "0 of 9 sequences; else: ycbineoat/bleach0" in listed and "p2p data fetch tapir" in listed
+    monkeypatch.setattr("p2p_lib.benchmark.plan_names", lambda: ["ycbineoat"])
+    monkeypatch.setenv("COLUMNS", "72")
+    assert cli.main(["benchmark", "--list"]) == 0
+    plan = capsys.readouterr().out.splitlines()[:-1]
+    assert max(map(len, plan)) <= 72 and " ".join(" ".join(plan).split()) in " ".join(listed.split())
 
 
 # --- what does not: one line, exit code 2 ------------------------------------------------------
@@ -635,6 +643,9 @@ def test_masks_are_scored(sequence, tmp_path, capsys):
 def test_an_object_of_ones_own_is_tracked_without_score(sequence, tmp_path, capsys):
     assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("my board", 0, ON_BOARD))) == 0
     assert "my board: a pose in 8 of 8 frames" in capsys.readouterr().out
+    assert cli.main(["eval", str(tmp_path / "out")]) == 0
+    out, err = capsys.readouterr()
+    assert "my board" in out and err.count("\n") == 1 and "p2p run --save-masks keeps them" in err
 
 
 BAD_CLICKS = {

@@ -273,6 +273,15 @@ def test_without_any_pose_an_object_is_lost_where_its_mask_is_seen_and_else_hidd
     assert lump.tracker.step(unknown).estimate.status is Status.OCCLUDED
 
 
+def test_an_object_that_left_the_image_is_said_to_be_out_of_view():
+    lump, nothing = settled(begun(**NO_SURFACE), [2]), np.zeros((CAMERA.height, CAMERA.width), bool)
+    assert "out of view" not in lump.see(turned(3), mask=nothing).estimate.reason
+    aside = se3.exp(np.array([0, 0, 0, -1.0, 0, 0])) @ lump.tracker.life.T_cam_obj
+    lump.tracker.life = replace(lump.tracker.life, T_cam_obj=aside)
+    estimate = lump.see(turned(3), mask=nothing).estimate
+    assert estimate.status is Status.OCCLUDED and estimate.reason == "out of view: 0 mask pixels"
+
+
 # --- what is believed, kept and asked for ------------------------------------------------------
 
 
