@@ -83,9 +83,9 @@ class Benchmark:
         """The sequence of that run."""
         return open_planned(self._finished(method, sequence)[0])
 
-    def chamfer_cm(self, method: str, sequence: str, object: str, form: str = "BundleSDF") -> float | None:
-        """The Chamfer distance of an object in that run; None where it was not measured."""
-        return self._finished(method, sequence)[1].objects[object].chamfer_cm.get(form)
+    def chamfer_cm(self, method: str, sequence: str, object: str) -> float | None:
+        """The Chamfer distance of an object in that run, BundleSDF's form; None where it was not measured."""
+        return self._finished(method, sequence)[1].objects[object].chamfer_cm.get("BundleSDF")
 
     def write_tables(self) -> None:
         """``results.csv``, ``summary.csv`` and ``timings.csv`` in :attr:`folder`."""
@@ -164,9 +164,7 @@ def load_benchmark(plan: str | Path | Plan, out: str | Path, profile: str = "ful
     return Benchmark(plan, profile, out, tuple(results))
 
 
-def load_or_run_quick(
-    plans: Iterable[str], out: str | Path, profile: str, progress: bool = False
-) -> dict[str, Benchmark]:
+def load_or_run_quick(plans: Iterable[str], out: str | Path, profile: str) -> dict[str, Benchmark]:
     """Plan to the results that ``out`` has of it in full; where it has none, or ``profile`` is quick, its quick form.
 
     So a notebook shows what was run before, and something where nothing was.
@@ -174,7 +172,7 @@ def load_or_run_quick(
     names = list(plans)
     full = {name: load_benchmark(name, out) for name in names} if profile == "full" else {}
     full = {name: benchmark for name, benchmark in full.items() if benchmark.counts()["done"]}
-    quick = run_benchmarks([name for name in names if name not in full], out, "quick", progress=progress)
+    quick = run_benchmarks([name for name in names if name not in full], out, "quick", progress=False)
     return {name: full[name] for name in names if name in full} | {b.plan.name: b for b in quick}
 
 

@@ -174,17 +174,23 @@ def _on_surface(drawn_m: np.ndarray, depth_m: np.ndarray) -> float:
     return float((np.abs(unhidden_m) < ON_M).mean()) if len(unhidden_m) else float("nan")
 
 
+def reprojected(
+    points: ObjectKeypoints, frame: int, camera: Camera, T_cam_obj: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K, 2) where the tracker saw keypoints of the final map in a frame, and (K,) pixels from there to their place.
+
+    T_cam_obj  (4, 4) the pose, estimated or true, by which the map is laid into the image
+    """
+    now, keypoints = points.at(frame), np.flatnonzero(points.promoted)
+    _, seen, known = np.intersect1d(points.track_id[now], points.ids[keypoints], return_indices=True)
+    uv_px = points.uv_px[now][seen].astype(float)
+    placed_px = camera.project(se3.transform(T_cam_obj, points.p_obj[keypoints[known]]))
+    return uv_px, np.linalg.norm(uv_px - placed_px, axis=1)
+
+
 def _reprojection_px(obj: ObjectRun, points: ObjectKeypoints, camera: Camera) -> float:
     """The median over all observations, in frames with a pose, of keypoints that the map still has; NaN without any."""
-    p_obj = dict(zip(points.ids[points.promoted].tolist(), points.p_obj[points.promoted]))
-    row_of = {int(index): row for row, index in enumerate(obj.frame_index) if obj.has_pose[row]}
-    off_px = [np.zeros(0)]
-    for index, row in row_of.items():
-        at = points.at(index)
-        known = [k for k, track in enumerate(points.track_id[at].tolist()) if track in p_obj]
-        if known:
-            p = np.stack([p_obj[track] for track in points.track_id[at][known].tolist()])
-            uv_px = camera.project(se3.transform(obj.T_cam_obj[row], p))
-            off_px.append(np.linalg.norm(uv_px - points.uv_px[at][known], axis=1))
-    off_px = np.concatenate(off_px)
+    posed = zip(obj.frame_index[obj.has_pose].tolist(), obj.T_cam_obj[obj.has_pose], strict=True)
+    off_px = [reprojected(points, frame, camera, T_cam_obj)[1] for frame, T_cam_obj in posed]
+    off_px = np.concatenate([np.zeros(0), *off_px])
     return float(np.median(off_px)) if len(off_px) else float("nan")

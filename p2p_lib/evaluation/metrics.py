@@ -31,7 +31,7 @@ def add_m(T_pred: np.ndarray, T_gt: np.ndarray, points: np.ndarray) -> np.ndarra
     return errors
 
 
-def adds_m(T_pred: np.ndarray, T_gt: np.ndarray, points: np.ndarray, workers: int = 2) -> np.ndarray:
+def adds_m(T_pred: np.ndarray, T_gt: np.ndarray, points: np.ndarray) -> np.ndarray:
     """ADD-S (N,) in metres: the mean distance from each truly placed point to the nearest predicted one.
 
     One-directional, as the field computes it. Poses are rigid, so distances are the same in the predicted
@@ -47,7 +47,7 @@ def adds_m(T_pred: np.ndarray, T_gt: np.ndarray, points: np.ndarray, workers: in
     step = max(1, _CHUNK // len(points))
     for rows in np.split(np.arange(len(usable)), range(step, len(usable), step)):
         moved = se3.transform(T_pred_gt[rows], points)
-        errors[usable[rows]] = tree.query(moved, workers=workers)[0].mean(-1)
+        errors[usable[rows]] = tree.query(moved, workers=2)[0].mean(-1)
     return errors
 
 

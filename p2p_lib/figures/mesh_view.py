@@ -52,10 +52,20 @@ def as_body(mesh: trimesh.Trimesh) -> Mesh:
     return Mesh(vertices, faces, np.repeat(uv[:, None], 3, 1), texture, normals)
 
 
-def portrait(mesh: trimesh.Trimesh, width_px: int, height_px: int, turn_deg: float = 25.0) -> np.ndarray:
-    """A surface from slightly above, filling the image; ``turn_deg`` about the vertical, 0 as it was first seen."""
-    centre = Box.around(mesh.vertices).T_obj_box[:3, 3]
-    radius_m = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+def portrait(
+    mesh: trimesh.Trimesh | Mesh,
+    width_px: int,
+    height_px: int,
+    turn_deg: float = 25.0,
+    filling: np.ndarray | None = None,
+) -> np.ndarray:
+    """A surface from slightly above; ``turn_deg`` about the vertical, 0 as it was first seen.
+
+    filling  (V, 3) what fills the image, by default the surface itself
+    """
+    filling = np.asarray(mesh.vertices if filling is None else filling)
+    centre = Box.around(filling).T_obj_box[:3, 3]
+    radius_m = float(np.linalg.norm(filling - centre, axis=1).max())
     focal_px = 1.4 * min(height_px, width_px)
     camera = Camera(focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, width_px, height_px)
     tilt, turn = se3.exp(np.radians([[25, 0, 0, 0, 0, 0], [0, turn_deg, 0, 0, 0, 0]]))

@@ -78,13 +78,11 @@ def pipeline_diagram(
     config: Config | None = None,
     here: Collection[str] = (),
     pages: Mapping[str, str] | None = None,
-    ms: Mapping[str, float] | None = None,
 ) -> Figure:
     """The stages of a configuration (default: preset ``default``) and what flows between them.
 
     here   stages that are marked: "you are here"
     pages  notebook number to the address that its boxes link to (in SVG and PDF)
-    ms     stage to milliseconds a frame, written into its box
     """
     from matplotlib.figure import Figure
 
@@ -94,7 +92,7 @@ def pipeline_diagram(
     axis = figure.add_axes((0, 0, 1, 1))
     axis.set(xlim=(-0.95, 7.65), ylim=(-0.62, 2.73))
     axis.axis("off")
-    _draw(axis, config or preset(), here, pages or {}, ms or {})
+    _draw(axis, config or preset(), here, pages or {})
     return figure
 
 
@@ -108,7 +106,7 @@ def as_svg(figure: Figure) -> str:
     return svg[svg.index("<svg") :]
 
 
-def _draw(axis: Axes, config: Config, here: Collection[str], pages: Mapping[str, str], ms: Mapping[str, float]) -> None:
+def _draw(axis: Axes, config: Config, here: Collection[str], pages: Mapping[str, str]) -> None:
     names = order(config)
     row = [name for name in names if name in ("observation", "registration", "refinement", "selection", "judging")]
     places = {name: (k, 1.0) for k, name in enumerate(row)}
@@ -117,7 +115,7 @@ def _draw(axis: Axes, config: Config, here: Collection[str], pages: Mapping[str,
     at = {name: (x * _GRID[0], y * _GRID[1]) for name, (x, y) in places.items() if name in names}
     _model(axis, max(at[row[-1]][0], at.get("fusion", (0, 0))[0]) + _BOX[0] / 2)
     for name, (x, y) in at.items():
-        _box(axis, name, x, y, name in here, pages, ms.get(name))
+        _box(axis, name, x, y, name in here, pages)
     _flow(axis, at, row)
 
 
@@ -134,7 +132,7 @@ def _model(axis: Axes, right: float) -> None:
     axis.text(left, -h / 2 - 0.2, words, fontsize=7, color=style.NEUTRAL[0], ha="left", va="center")
 
 
-def _box(axis: Axes, name: str, x: float, y: float, marked: bool, pages: Mapping[str, str], ms: float | None) -> None:
+def _box(axis: Axes, name: str, x: float, y: float, marked: bool, pages: Mapping[str, str]) -> None:
     from matplotlib.patches import FancyBboxPatch
 
     stage, (w, h) = STAGES[name], _BOX
@@ -144,9 +142,8 @@ def _box(axis: Axes, name: str, x: float, y: float, marked: bool, pages: Mapping
     box = FancyBboxPatch(corner, w, h, "round,pad=0,rounding_size=0.06", facecolor=fill, edgecolor="#333333", lw=0.9)
     box.set(linestyle=line, zorder=3, url=pages.get(stage.notebook))
     axis.add_patch(box)
-    small = stage.source if ms is None else f"{ms:.1f} ms"
     axis.text(x, y + 0.07, stage.title, ha="center", va="center", fontsize=8.5, color=ink, zorder=4, weight="bold")
-    axis.text(x, y - 0.12, small, ha="center", va="center", fontsize=6, color=ink, zorder=4, family="monospace")
+    axis.text(x, y - 0.12, stage.source, ha="center", va="center", fontsize=6, color=ink, zorder=4, family="monospace")
     number = {"ha": "right", "va": "top", "fontsize": 6.5, "zorder": 4, "color": ink}
     axis.text(x + w / 2 - 0.04, y + h / 2 - 0.03, stage.notebook, **number)
 

@@ -93,30 +93,30 @@ def status_strip(run: Run) -> Figure:
 
 
 @style.styled
-def accuracy_threshold(evaluation: Evaluation, max_m: float = metrics.MAX_M) -> Figure:
+def accuracy_threshold(evaluation: Evaluation) -> Figure:
     """The fraction of scored frames below a threshold, from 0.1 mm on; the legend has the AUC (exact form)."""
     figure, axes = panels(2, (WIDTH_IN, 2.9), side_by_side=True)
     colours = style.object_colours(evaluation.info.get("objects") or evaluation.objects)
     for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S"))):
         for name, score in evaluation.objects.items():
             errors_m = getattr(score, key)
-            threshold_m, fraction = accuracy_curve(errors_m, max_m)
-            label = f"{name}: {metrics.auc_exact(errors_m, max_m):.1f} %"
+            threshold_m, fraction = accuracy_curve(errors_m)
+            label = f"{name}: {metrics.auc_exact(errors_m):.1f} %"
             axis.step(1e3 * threshold_m, 100 * fraction, where="post", color=colours[name], label=label)
         logarithmic(axis.xaxis)
-        axis.set(xlabel=f"threshold on {title} [mm]", xlim=(0.1, 1e3 * max_m), ylim=(0, 102))
-        axis.set_title(f"{title}: AUC to {100 * max_m:g} cm")
+        axis.set(xlabel=f"threshold on {title} [mm]", xlim=(0.1, 1e3 * metrics.MAX_M), ylim=(0, 102))
+        axis.set_title(f"{title}: AUC to {100 * metrics.MAX_M:g} cm")
         axis.legend(loc="lower right")
     axes[0].set_ylabel("frames below [%]")
     figure.suptitle(evaluation.info.get("sequence"), x=0.01, ha="left", fontsize=9)
     return figure
 
 
-def accuracy_curve(errors_m: np.ndarray, max_m: float = metrics.MAX_M) -> tuple[np.ndarray, np.ndarray]:
+def accuracy_curve(errors_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds and the fraction of errors at or below each: the corners of the accuracy-threshold curve."""
-    below = np.sort(errors_m[errors_m < max_m])
+    below = np.sort(errors_m[errors_m < metrics.MAX_M])
     fraction = np.arange(len(below) + 1) / max(len(errors_m), 1)
-    return np.r_[0.0, below, max_m], np.r_[fraction, fraction[-1]]
+    return np.r_[0.0, below, metrics.MAX_M], np.r_[fraction, fraction[-1]]
 
 
 @style.styled

@@ -124,8 +124,7 @@ def save_table(
     """Write a table as CSV and Markdown, one for papers as LaTeX besides, with its note; ``to`` another folder."""
     target = _target(to or paths.table_dir(), name)
     if isinstance(table, Table):
-        files = {".csv": table.csv(), ".md": table.markdown(), ".tex": table.latex()}
-        page = table.html()
+        files, page = table.files(), table.html()
     else:
         files = {".csv": table.to_csv(index=False, lineterminator="\n"), ".md": as_markdown(table)}
         page = as_html(table)

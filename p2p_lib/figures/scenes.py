@@ -87,21 +87,24 @@ class Scene:
         axes: bool = True,
         trail: int = 30,
         words: bool = True,
+        dots: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
         """The run's ``row``-th frame, cut to a region and scaled to a width; ``words`` are names, statuses, the time.
 
         Estimated boxes are in their object's colour, true ones white and dashed; ``trail`` is how many earlier frames
-        the path goes back.
+        the path goes back; ``dots`` are pixels (K, 2) of the whole image and their colours (K, 3).
         """
         first = next(iter(self.run.objects.values()))
         frame = self.sequence.frame(int(first.frame_index[row]))
-        camera, image = self.sequence.camera, self._with_what_was_seen(frame, row)
-        region_px = region_px or (0, 0, camera.width, camera.height)
-        image, camera = overlay.zoomed(image, camera, region_px, width_px or region_px[2] - region_px[0])
+        whole, image = self.sequence.camera, self._with_what_was_seen(frame, row)
+        region_px = region_px or (0, 0, whole.width, whole.height)
+        image, camera = overlay.zoomed(image, whole, region_px, width_px or region_px[2] - region_px[0])
         labels = []
         for name, obj in self.run.objects.items():
             image = self._draw_object(image, camera, name, obj, row, axes, trail)
             labels.append(self._label(camera, name, obj, row))
+        if dots is not None:
+            image = overlay.draw_points(image, overlay.zoomed_px(dots[0], whole, camera), dots[1], 3)
         if not words:
             return image
         image = overlay.draw_labels(image, [label for label in labels if label is not None])
@@ -181,6 +184,18 @@ class Scene:
         if not np.isfinite(uv).all():
             return None
         return Label(f"{name}: {obj.status[row]}", self.colours[name], (*uv.min(0), *uv.max(0)))
+
+
+def beside(scenes: Mapping[str, Scene], count: int, width_px: int = 300, axes: bool = False) -> np.ndarray:
+    """A line of images for each method under its name: the moments that tell the story of the first."""
+    first = next(iter(scenes.values()))
+    moments, region_px, images = first.moments(count), first.region(), []
+    for name, scene in scenes.items():
+        for row in moments:
+            image = scene.draw(row, region_px, width_px, axes=axes, trail=0)
+            foot = (0, image.shape[0] - 2, 1, image.shape[0] - 1)
+            images.append(overlay.draw_labels(image, [Label(name, "#222222", foot)]))
+    return overlay.montage(images, columns=count)
 
 
 def draw_live(

@@ -161,6 +161,10 @@ class Table:
         table["notes"] = ["; ".join(dict.fromkeys(reasons)) for reasons in noted]
         return table.to_csv(index=False, lineterminator="\n")
 
+    def files(self) -> dict[str, str]:
+        """Suffix to the text of a file."""
+        return {".csv": self.csv(), ".md": self.markdown(), ".tex": self.latex()}
+
     def _frame(self, language: _Language, between: str = "") -> DataFrame:
         """The cells as a format writes them; groups are a level of their own, or stand before ``between`` and head."""
         letters = self.letters()

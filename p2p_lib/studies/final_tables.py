@@ -1,4 +1,4 @@
-"""Notebook 09 and ``p2p benchmark``: a benchmark's tables in the paper's arrangements, and the figures beside them.
+"""Notebook 09 and ``p2p benchmark``: a benchmark's tables in the paper's arrangements.
 
 Ours are exact areas under the curve over 0 to 0.1 m, aligned at the first scored frame, frames without a pose counted
 as 0, mean over seeds ± their standard deviation; every other form is in the benchmark's ``results.csv``. Bold is the
@@ -10,14 +10,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
-from pandas import DataFrame, read_csv
+from pandas import DataFrame
 from scipy import stats
 
 from p2p_lib.benchmark.benchmark import Benchmark
@@ -25,27 +21,18 @@ from p2p_lib.benchmark.jobs import Job
 from p2p_lib.benchmark.outcome import Outcome
 from p2p_lib.benchmark.plan import Method
 from p2p_lib.benchmark.rows import AREAS, MEAN, POOLED, Row, shown_name
-from p2p_lib.core import se3
-from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import MissingData
 from p2p_lib.core.files import replace_text
 from p2p_lib.core.paths import PROJECT
 from p2p_lib.datasets import manifests
-from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
-from p2p_lib.datasets.models import MESHES, find_models, read_mesh
 from p2p_lib.datasets.paper_reported import FAIL, paper_reported
 from p2p_lib.datasets.paper_reported import Table as Reported
-from p2p_lib.datasets.runs import ObjectRun, Run
-from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
+from p2p_lib.datasets.sequence import SYNTHETIC
 from p2p_lib.evaluation import metrics
-from p2p_lib.evaluation.protocol import Evaluation, evaluate
-from p2p_lib.figures import mesh_view, overlay, style
-from p2p_lib.figures.overlay import Label
-from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.provenance import Saved, save_table
-from p2p_lib.figures.scenes import Scene
 from p2p_lib.figures.tables import Cell, Table, emboldened, number
-from p2p_lib.synthetic.shapes import load_mesh
+
+if TYPE_CHECKING:
+    from IPython.display import Markdown
 
 #: The paper's metrics: what the benchmark calls them, their head, and whether more is better.
 METRICS = {
@@ -67,32 +54,28 @@ def paper_table(benchmark: Benchmark) -> Table:
     return KINDS[benchmark.plan.kind](Numbers(benchmark))
 
 
-def shown(benchmark: Benchmark, parameters: Mapping[str, object] | None = None) -> Saved | Shipped:
-    """A benchmark's table for a notebook; where only its quick form was run, the one that the project ships, if any."""
+def shown(benchmark: Benchmark, parameters: Mapping[str, object] | None = None) -> Saved | Markdown:
+    """A benchmark's table for a notebook; where only its quick form was run, the one that the project ships, if any.
+
+    Below a shipped one stands with which commit, seeds and parts it was run.
+    """
     shipped = SHIPPED / f"{benchmark.plan.name}.md"
     if benchmark.profile == "quick" and shipped.is_file():
-        return Shipped(shipped)
+        from IPython.display import Markdown
+
+        text = shipped.read_text(encoding="utf-8")
+        return Markdown(f"*Shipped with the project: nothing newer was run here.*\n\n{text}")
     name = f"final_{benchmark.plan.name}"
     return save_table(paper_table(benchmark), name, sources=[benchmark], parameters=parameters)
-
-
-@dataclass(frozen=True)
-class Shipped:
-    """A table of ``figures/tables/``: below it stands with which commit, seeds and parts it was run."""
-
-    path: Path
-
-    def _repr_markdown_(self) -> str:
-        said = "*Shipped with the project: nothing newer was run here.*"
-        return f"{said}\n\n{self.path.read_text(encoding='utf-8')}"
 
 
 def write_table(benchmark: Benchmark) -> str:
     """``table.md``, ``table.tex`` and ``table.csv`` into the benchmark's folder; gives the first."""
     table = paper_table(benchmark)
-    for suffix, text in (("md", table.markdown()), ("tex", table.latex()), ("csv", table.csv())):
-        replace_text(benchmark.folder / f"table.{suffix}", text)
-    return table.markdown()
+    files = table.files()
+    for suffix, text in files.items():
+        replace_text(benchmark.folder / f"table{suffix}", text)
+    return files[".md"]
 
 
 class Numbers:
@@ -483,167 +466,3 @@ def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
     lost = [sum(obj.lost for obj in o.objects.values()) for o in outcomes]
     frames = sum(len(obj.first["add_m"]) for obj in outcomes[0].objects.values())
     return [*cells, Cell(f"{min(lost)}{f' to {max(lost)}' * (max(lost) > min(lost))} of {frames}")]
-
-
-# --- figures ---------------------------------------------------------------------------------------
-
-
-@style.styled
-def rate_figure(table: Path) -> Figure:
-    """Processor time per frame against objects, tracks, resolution and 2D tracker, from the table ``runtime.csv``."""
-    rows = read_csv(table).set_index("Setting")
-    time_ms = rows["processor, files included (ms)"].dropna().rename(lambda name: name.partition(",")[0])
-    whole = time_ms.iloc[0]
-    panels_of = {
-        "objects": {int(k.split()[0]): v for k, v in time_ms.items() if "object" in k},
-        "tracks an object": {int(k.split()[0]): v for k, v in time_ms.items() if "tracks" in k} | {60: whole},
-        "megapixels": {np.prod([int(n) for n in k.split("x")]) / 1e6: v for k, v in time_ms.items() if "x" in k}
-        | {0.3072: whole},
-        "2D tracker": {k.split()[1]: v for k, v in time_ms.items() if k.startswith("tracker")} | {"builtin": whole},
-    }
-    figure, axes = panels(4, (WIDTH_IN, 2.8), side_by_side=True)
-    for axis, (label, values) in zip(axes, panels_of.items(), strict=True):
-        at = sorted(values, key=lambda k: values[k] if isinstance(k, str) else k)
-        if isinstance(at[0], str):
-            axis.bar(at, [values[k] for k in at], color=style.METHODS[0])
-            axis.tick_params(axis="x", rotation=30)
-        else:
-            axis.plot(at, [values[k] for k in at], "o-", color=style.METHODS[0])
-            axis.set_xlim(0, None)
-        axis.set(xlabel=label, ylim=(0, None))
-    axes[0].set_ylabel("processor time a frame [ms]")
-    return figure
-
-
-#: Errors from a tenth of a millimetre to the ten centimetres at which a frame scores nothing.
-EDGES_MM = np.geomspace(0.1, 100, 31)
-#: Tracks so far off, or farther, have the brightest colour.
-FAR_PX = 4.0
-
-
-def scene_of(benchmark: Benchmark, method: str) -> tuple[Scene, Run, Sequence]:
-    """A method's first finished run on its video, ready to be drawn."""
-    run, video = benchmark.run(method), benchmark.video(method)
-    return Scene(video, run, evaluate(run)), run, video
-
-
-@style.styled
-def error_histograms(benchmark: Benchmark) -> Figure:
-    """ADD and ADD-S of each method over all scored frames, aligned at the first; what has no pose stands apart."""
-    figure, axes = panels(2, (WIDTH_IN, 3.2), side_by_side=True)
-    for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S")), strict=True):
-        errors = defaultdict(list)
-        for job, outcome in benchmark.results:
-            errors[job.method.name] += [1e3 * obj.errors_m("first")[key] for obj in outcome.objects.values()]
-        for colour, name in zip(style.METHODS, filter(errors.get, benchmark.methods), strict=False):
-            errors_mm = np.concatenate(errors[name])
-            weights = np.full(len(errors_mm), 100 / len(errors_mm))
-            percent, _ = np.histogram(np.maximum(errors_mm, EDGES_MM[0]), EDGES_MM, weights=weights)
-            axis.stairs(percent, EDGES_MM, color=colour, label=f"{name} ({len(errors_mm)} frames)")
-            beyond = weights[errors_mm >= EDGES_MM[-1]].sum()
-            axis.plot(1.4 * EDGES_MM[-1], beyond, "x", color=colour, clip_on=False, markersize=5)
-        axis.axvline(EDGES_MM[-1], color=style.NEUTRAL[1], linewidth=0.8)
-        logarithmic(axis.xaxis)
-        axis.set(xlabel=f"{title} [mm]", xlim=(EDGES_MM[0], 2 * EDGES_MM[-1]), ylim=(0, None))
-        axis.set_title(f"{title}; cross: lost, or off by 10 cm or more")
-    axes[0].set_ylabel("frames [%]")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=2, fontsize=8)
-    return figure
-
-
-@style.styled
-def tracks_by_error(benchmark: Benchmark, method: str, count: int = 3) -> Figure:
-    """True boxes (white, dashed), estimated ones, and the 2D tracks of the keypoints coloured by their error.
-
-    The error is the distance in pixels from where the tracker saw a keypoint to the keypoint of the final map projected
-    with the true pose; points that the map has dropped since are not drawn.
-    """
-    scene, run, video = scene_of(benchmark, method)
-    evaluation, keypoints, region_px, width_px = evaluate(run), load_keypoints(run.path), scene.region(), 420
-    seen = np.flatnonzero(np.logical_and.reduce([obj.has_pose & obj.has_truth for obj in run.objects.values()]))
-    seen = seen[seen > 0]  # the first has no tracks yet
-    if not len(seen):
-        raise MissingData(str(run.path), "no frame in which every object has a pose")
-    images = []
-    for row in seen[np.linspace(0, len(seen) - 1, count).round().astype(int)].tolist():
-        image = scene.draw(row, region_px, width_px, axes=False, trail=0)
-        _, camera = overlay.zoomed(video.frame(0).rgb, video.camera, region_px, width_px)
-        for name, score in evaluation.objects.items():
-            uv_px, error_px = _track_errors(video.camera, run.objects[name], keypoints[name], score.T_obj_model, row)
-            colours = overlay.value_colours(error_px, 0, FAR_PX)
-            image = overlay.draw_points(image, overlay.zoomed_px(uv_px, video.camera, camera), colours, 2.5)
-        images.append(image)
-    high_in = WIDTH_IN / count * images[0].shape[0] / images[0].shape[1]
-    figure, axes = panels(count, (WIDTH_IN, high_in + 0.6), side_by_side=True)
-    for axis, image in zip(axes, images, strict=True):
-        axis.imshow(image)
-        axis.set_axis_off()
-    colours = ScalarMappable(Normalize(0, FAR_PX), "cividis")
-    bar = figure.colorbar(colours, ax=axes, location="bottom", aspect=60, pad=0.02, extend="max")
-    bar.set_label("2D track from its keypoint under the true pose [px]")
-    return figure
-
-
-def recovery_strip(benchmark: Benchmark, count: int = 4, width_px: int = 300) -> np.ndarray:
-    """Occlusion and recovery: a line for each method, the same moments below each other."""
-    ran = {job.method.name for job, outcome in benchmark.results if outcome.objects}
-    scenes = {name: scene_of(benchmark, name)[0] for name in benchmark.methods if name in ran}
-    first = next(iter(scenes.values()))
-    moments, region_px, images = first.moments(count), first.region(), []
-    for name, scene in scenes.items():
-        for row in moments:
-            image = scene.draw(row, region_px, width_px, axes=False, trail=0)
-            foot = (0, image.shape[0] - 2, 1, image.shape[0] - 1)
-            images.append(overlay.draw_labels(image, [Label(name, "#222222", foot)]))
-    return overlay.montage(images, columns=count)
-
-
-def reconstruction_sheet(benchmark: Benchmark, method: str) -> np.ndarray:
-    """Each object's reconstruction beside its true surface, seen as in its first frame and turned by 50 degrees."""
-    run, video = benchmark.run(method), benchmark.video(method)
-    evaluation, images = evaluate(run), []
-    for name in evaluation.objects:
-        chamfer_cm = benchmark.chamfer_cm(method, "", name)
-        images += _beside_truth(run, video, evaluation, name, chamfer_cm)
-    if not images:
-        raise MissingData(str(run.path), "no reconstructed surface", "Run with the setting method.surface = true.")
-    return overlay.montage(images, columns=4)
-
-
-def _beside_truth(
-    run: Run, video: Sequence, evaluation: Evaluation, name: str, chamfer_cm: float | None
-) -> list[np.ndarray]:
-    file, model = run.path / "meshes" / f"{name}.ply", find_models(video, MESHES).get(name)
-    if not file.is_file() or model is None:
-        return []
-    surface = read_mesh(file)
-    surface.apply_transform(se3.inverse(evaluation.objects[name].T_obj_model))
-    truth = load_mesh(model)
-    middle = (truth.vertices.max(0) + truth.vertices.min(0)) / 2
-    # The first scored frame's view, with the object's middle in the middle and all of it in sight.
-    front = run.objects[name].T_cam_model[np.flatnonzero(run.objects[name].has_truth)[0]].copy()
-    front[:3, 3] = np.array([0, 0, 4 * np.ptp(truth.vertices, axis=0).max()]) - front[:3, :3] @ middle
-    camera = Camera(930, 930, 149.5, 149.5, 300, 300)
-    turn = se3.exp(np.array([0, 0, np.radians(50), 0, 0, 0]))
-    aside = front @ se3.from_rt(np.eye(3), middle) @ turn @ se3.from_rt(np.eye(3), -middle)
-    kind = "synthetic" if video.name.startswith("synthetic") else "real"
-    distance = "" if chamfer_cm is None else f", CD {10 * chamfer_cm:.1f} mm"
-    shown: list[tuple[trimesh.Trimesh, np.ndarray, str]] = [
-        (truth, front, f"{name}, {kind}: truth"),
-        (surface, front, f"reconstructed{distance}"),
-        (truth, aside, "turned by 50 degrees: truth"),
-        (surface, aside, "reconstructed"),
-    ]
-    return [overlay.draw_caption(mesh_view.draw_mesh(mesh, camera, T), title, scale=0.4) for mesh, T, title in shown]
-
-
-def _track_errors(
-    camera: Camera, obj: ObjectRun, keypoints: ObjectKeypoints, T_obj_model: np.ndarray, row: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """(K, 2) tracks of one object in a frame and (K,) their errors, of the points that its final map still holds."""
-    now = keypoints.at(int(obj.frame_index[row]))
-    _, seen, known = np.intersect1d(keypoints.track_id[now], keypoints.ids, return_indices=True)
-    uv_px = keypoints.uv_px[now].astype(float)[seen]
-    T_cam_obj = obj.T_cam_model[row] @ se3.inverse(T_obj_model)
-    true_px = camera.project(se3.transform(T_cam_obj, keypoints.p_obj[known]))
-    return uv_px, np.linalg.norm(uv_px - true_px, axis=1)

@@ -18,7 +18,6 @@ import numpy as np
 from PIL import Image
 
 from p2p_lib.benchmark.benchmark import Benchmark
-from p2p_lib.core.errors import BadInput
 from p2p_lib.core.paths import PROJECT
 from p2p_lib.datasets.exchange import as_run, read_poses
 from p2p_lib.datasets.models import find_models
@@ -26,17 +25,17 @@ from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.figures import mesh_view, overlay, style
-from p2p_lib.figures.overlay import Label
 from p2p_lib.figures.pipeline_diagram import pipeline_diagram
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.provenance import Saved, save_figure
-from p2p_lib.figures.scenes import Scene
+from p2p_lib.figures.scenes import Scene, beside
 from p2p_lib.run import export_run
-from p2p_lib.studies.final_tables import rate_figure
+from p2p_lib.studies.final_figures import rate_figure, scene_of
 
 PLAN = "paper_figures"
 _OURS, _MESHES, _RIVAL = "Ours", "Ours, YCB meshes", "Ours, SH(10)"
-_AIRPLANE = "synthetic/ycb_airplane_can"
+_AIRPLANE, _HIDDEN = "synthetic/ycb_airplane_can", "synthetic/occlusion"
+_OTHER = "stand-in: rendered, not the paper's sequence"
 
 
 def draw_all(runs: Benchmark, folder: Path, poses: Path | None = None) -> list[Saved]:
@@ -60,14 +59,14 @@ def draw_all(runs: Benchmark, folder: Path, poses: Path | None = None) -> list[S
 
 def three_objects(runs: Benchmark) -> np.ndarray:
     """The paper's first figure: three objects through occlusion, and back."""
-    scene = _scene(*_of(runs, _OURS, "synthetic/three_objects"))
-    return _marked(scene.story(8, 4, 300), "stand-in: rendered, not the paper's sequence")
+    scene = scene_of(runs, _OURS, "synthetic/three_objects")
+    return _marked(scene.story(8, 4, 300), _OTHER)
 
 
 def airplane_and_can(runs: Benchmark) -> np.ndarray:
     """The synthetic qualitative: airplane and tomato can where their meshes are, else solids of their sizes."""
     real = any(j.method.name == _MESHES and o.status == "done" for j, o in runs.results)
-    scene = _scene(*_of(runs, _MESHES if real else _OURS, _AIRPLANE))
+    scene = scene_of(runs, _MESHES if real else _OURS, _AIRPLANE)
     words = (
         "re-creation: the paper's objects on other paths" if real else "stand-in: solids for airplane and tomato can"
     )
@@ -76,20 +75,14 @@ def airplane_and_can(runs: Benchmark) -> np.ndarray:
 
 def return_beside(runs: Benchmark, poses: Path | None = None) -> np.ndarray:
     """A complete occlusion and the return, ours above imported poses."""
-    run, video = _of(runs, _OURS, "synthetic/occlusion")
+    ours = scene_of(runs, _OURS, _HIDDEN)
     with tempfile.TemporaryDirectory() as place:
         if poses is None:
-            export_run(_of(runs, _RIVAL, "synthetic/occlusion")[0].path, "tum", Path(place))
-        rival = imported(poses or Path(place), video)
-    ours, theirs = _scene(run, video), _scene(rival, video)
+            export_run(runs.run(_RIVAL, _HIDDEN).path, "tum", Path(place))
+        rival = imported(poses or Path(place), ours.sequence)
     name = "no long memory (stand-in)" if poses is None else poses.stem
-    images, region_px = [], ours.region()
-    for scene, words in ((ours, "ours"), (theirs, name)):
-        for row in ours.moments(4):
-            image = scene.draw(row, region_px, 300, axes=True, trail=0)
-            foot = (0, image.shape[0] - 2, 1, image.shape[0] - 1)
-            images.append(overlay.draw_labels(image, [Label(words, "#222222", foot)]))
-    return _marked(overlay.montage(images, 4), "stand-in: rendered, not the paper's sequence")
+    scenes = {"ours": ours, name: Scene(ours.sequence, rival, evaluate(rival))}
+    return _marked(beside(scenes, 4, axes=True), _OTHER)
 
 
 def imported(poses: Path, video: Sequence) -> Run:
@@ -101,8 +94,9 @@ def imported(poses: Path, video: Sequence) -> Run:
 
 def framework(runs: Benchmark) -> np.ndarray:
     """The stages as a diagram, and below it one frame: image, depth, masks, tracked points, surfaces, poses."""
-    run, video = _of(runs, _OURS, "synthetic/three_objects")
-    playback, scene = Playback.of(run, video), _scene(run, video)
+    scene = scene_of(runs, _OURS, "synthetic/three_objects")
+    run, video = scene.run, scene.sequence
+    playback = Playback.of(run, video)
     row = len(playback) - 1
     frame, region_px, width_px = video.frame(int(playback.frame_index[row])), scene.region(), 290
     tracked = frame.rgb
@@ -133,14 +127,6 @@ def framework(runs: Benchmark) -> np.ndarray:
         size = strip.shape[1], round(diagram.height * strip.shape[1] / diagram.width)
         diagram = np.array(diagram.resize(size, Image.Resampling.LANCZOS))
     return np.concatenate([diagram, _marked(strip, "one rendered frame")])
-
-
-def _of(runs: Benchmark, method: str, sequence: str) -> tuple[Run, Sequence]:
-    return runs.run(method, sequence), runs.video(method, sequence)
-
-
-def _scene(run: Run, video: Sequence) -> Scene:
-    return Scene(video, run, evaluate(run))
 
 
 def _marked(image: np.ndarray, words: str) -> np.ndarray:
@@ -245,24 +231,3 @@ def _day(commit: str) -> str:
     asked = ["git", "-C", str(PROJECT), "show", "-s", "--format=%cs", commit]
     found = subprocess.run(asked, capture_output=True, text=True, check=False)
     return found.stdout.strip() if commit and found.returncode == 0 else ""
-
-
-def outdated(folder: Path) -> list[str]:
-    """What is wrong with figures and tables that are kept: no note, another content, older than the table it shows."""
-    from p2p_lib.datasets.download import sha256
-
-    if not folder.is_dir():
-        raise BadInput("figures", str(folder), "a folder")
-    found = []
-    for note in sorted([*folder.glob("*.json"), *(folder / "tables").glob("*.json")]):
-        said = json.loads(note.read_text(encoding="utf-8"))
-        for name, digest in said["sha256"].items():
-            if not (note.parent / name).is_file() or sha256(note.parent / name) != digest:
-                found.append(f"{name}: not what its note says")
-        for source in said["sources"]:
-            table = folder / "tables" / source.get("file", "")
-            if "file" in source and table.is_file() and sha256(table) != source["sha256"]:
-                found.append(f"{note.stem}: {source['file']} is newer than what was drawn from it")
-    shown = [path for path in (*folder.glob("*.png"), *folder.glob("tables/*.md")) if path.name != "README.md"]
-    found += [f"{path.name}: no note" for path in shown if not path.with_suffix(".json").is_file()]
-    return found

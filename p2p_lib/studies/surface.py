@@ -34,6 +34,7 @@ from p2p_lib.synthetic.scene import VGA
 #: What stands behind the body: depth there lets the volume carve.
 _BEHIND_M = 1.5
 _UNSEEN = "#C8C8C8"
+_MARGIN_M = 0.012  # of a slice around the surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +129,11 @@ def seen_distance(volume: TsdfVolume, p_obj: np.ndarray) -> np.ndarray:
     return np.where(valid, value, np.nan)
 
 
-def around_surface(volume: TsdfVolume, z_m: float, margin_m: float = 0.012) -> np.ndarray:
+def around_surface(volume: TsdfVolume, z_m: float) -> np.ndarray:
     """(2, 3) corners of the part of the slice at ``z_m`` within the truncation distance of the surface."""
     points = slice_points(volume.corners_m().min(0), volume.corners_m().max(0), z_m, step_m=0.002)
     near = points[np.abs(seen_distance(volume, points)) < 0.98 * volume.tau_m]
-    return np.stack([near.min(0) - margin_m, near.max(0) + margin_m])
+    return np.stack([near.min(0) - _MARGIN_M, near.max(0) + _MARGIN_M])
 
 
 def draw_slice(

@@ -298,12 +298,9 @@ def draw_tracks(
 
     A dot's colour is how far the tracker is from the truth: dark blue is right, yellow :data:`FAR_PX` or more.
     """
-    image = scene.draw(scene.row(index), region_px, width_px, axes=False, trail=0)
-    camera = scene.sequence.camera
-    _, seen_by = overlay.zoomed(scene.sequence.frame(index).rgb, camera, region_px, width_px)
     here = study.tracks[study.tracks.frame == index]
-    uv_px = overlay.zoomed_px(here[["u_px", "v_px"]].to_numpy(), camera, seen_by)
-    return overlay.draw_points(image, uv_px, overlay.value_colours(here.error_px, 0, FAR_PX), 3)
+    dots = here[["u_px", "v_px"]].to_numpy(), overlay.value_colours(here.error_px, 0, FAR_PX)
+    return scene.draw(scene.row(index), region_px, width_px, axes=False, trail=0, dots=dots)
 
 
 @style.styled

@@ -7,13 +7,14 @@ from p2p_lib.benchmark import load_benchmark, load_or_run_quick, read_plan, run_
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.keypoint_log import load_keypoints
+from p2p_lib.evaluation.consistency import reprojected
 from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.figures.provenance import describe
-from p2p_lib.studies import final_tables
+from p2p_lib.studies import final_figures
 
 
 def test_histograms_hold_every_scored_frame_once(whole):
-    figure = final_tables.error_histograms(whole)
+    figure = final_figures.error_histograms(whole)
     for axis in figure.axes:
         # Two sequences of 6 and 5 frames with two seeds.
         assert [t.get_text() for t in figure.legends[0].get_texts()] == [
@@ -26,7 +27,7 @@ def test_histograms_hold_every_scored_frame_once(whole):
 
 
 def test_a_strip_has_a_line_for_each_method(whole):
-    strip = final_tables.recovery_strip(whole, count=3, width_px=120)
+    strip = final_figures.recovery_strip(whole, count=3, width_px=120)
     height = (strip.shape[0] - 4) / 2
     assert strip.shape[1] == 3 * 120 + 2 * 4 and height == int(height)
     first, second = strip[: int(height)], strip[int(height) + 4 :]
@@ -35,25 +36,25 @@ def test_a_strip_has_a_line_for_each_method(whole):
 
 
 def test_a_tracks_error_is_its_distance_from_the_true_keypoint(whole):
-    _, run, video = final_tables.scene_of(whole, "Ours")
+    run, camera = whole.run("Ours"), whole.video("Ours").camera
     T_obj_model = evaluate(run).objects["object"].T_obj_model
-    keypoints, obj = load_keypoints(run.path)["object"], run.objects["object"]
-    uv_px, error_px = final_tables._track_errors(video.camera, obj, keypoints, T_obj_model, 3)
+    keypoints, T_cam_model = load_keypoints(run.path)["object"], run.objects["object"].T_cam_model[3]
+    uv_px, error_px = reprojected(keypoints, 3, camera, T_cam_model @ se3.inverse(T_obj_model))
     assert len(uv_px) == len(error_px) >= 8 and np.median(error_px) < 0.3
     # The board lies 0.5 m before a camera of 200 px: a truth 1 cm off is 4 px off.
     off = T_obj_model @ se3.from_rt(np.eye(3), np.array([0.01, 0, 0]))
-    _, error_px = final_tables._track_errors(video.camera, obj, keypoints, off, 3)
+    _, error_px = reprojected(keypoints, 3, camera, T_cam_model @ se3.inverse(off))
     assert np.median(error_px) == pytest.approx(4, abs=0.3)
 
 
 def test_tracks_are_drawn_where_they_are_known(whole):
-    figure = final_tables.tracks_by_error(whole, "Ours", count=2)
+    figure = final_figures.tracks_by_error(whole, "Ours", count=2)
     assert len(figure.axes) == 3, "two images and the scale"
 
 
 def test_a_reconstruction_that_was_not_made_is_said(whole):
     with pytest.raises(MissingData, match="no reconstructed surface"):
-        final_tables.reconstruction_sheet(whole, "Ours")
+        final_figures.reconstruction_sheet(whole, "Ours")
     with pytest.raises(BadInput, match="expected a method that ran: No multi-hypothesis, Ours"):
         whole.run("Theirs")
 

@@ -4,18 +4,37 @@ import json
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
-import matplotlib.pyplot as plt
 import pytest
+from matplotlib.figure import Figure
 
 from p2p_lib.benchmark import plan_names, read_plan
 from p2p_lib.core.paths import PROJECT
+from p2p_lib.datasets.download import sha256
 from p2p_lib.datasets.paper_reported import paper_reported
 from p2p_lib.figures.provenance import save_figure
-from p2p_lib.studies.final_tables import rate_figure
-from p2p_lib.studies.paper_figures import ITEMS, index, outdated
+from p2p_lib.studies.final_figures import rate_figure
+from p2p_lib.studies.paper_figures import ITEMS, index
 
 FIGURES = PROJECT / "figures"
+
+
+def outdated(folder: Path) -> list[str]:
+    """What is wrong with figures and tables that are kept: no note, another content, older than the table it shows."""
+    found = []
+    for note in sorted([*folder.glob("*.json"), *(folder / "tables").glob("*.json")]):
+        said = json.loads(note.read_text(encoding="utf-8"))
+        for name, digest in said["sha256"].items():
+            if not (note.parent / name).is_file() or sha256(note.parent / name) != digest:
+                found.append(f"{name}: not what its note says")
+        for source in said["sources"]:
+            table = folder / "tables" / source.get("file", "")
+            if "file" in source and table.is_file() and sha256(table) != source["sha256"]:
+                found.append(f"{note.stem}: {source['file']} is newer than what was drawn from it")
+    shown = [path for path in (*folder.glob("*.png"), *folder.glob("tables/*.md")) if path.name != "README.md"]
+    found += [f"{path.name}: no note" for path in shown if not path.with_suffix(".json").is_file()]
+    return found
 
 
 def test_no_committed_figure_is_older_than_the_numbers_it_shows():
@@ -84,7 +103,7 @@ def test_the_rate_figure_shows_every_number_of_its_table(drawn):
 
 def test_a_quick_form_never_takes_the_place_of_a_full_one(tmp_path, monkeypatch):
     monkeypatch.setenv("P2P_FIGURES", str(tmp_path))
-    figure = plt.figure()
+    figure = Figure()
     full = save_figure(figure, "f", parameters={"PROFILE": "full"}).path.read_bytes()
     figure.text(0.5, 0.5, "quick")
     quick = save_figure(figure, "f", parameters={"PROFILE": "quick"})
