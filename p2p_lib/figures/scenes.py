@@ -189,10 +189,11 @@ class Scene:
 def beside(scenes: Mapping[str, Scene], count: int, width_px: int = 300, axes: bool = False) -> np.ndarray:
     """A line of images for each method under its name: the moments that tell the story of the first."""
     first = next(iter(scenes.values()))
-    moments, region_px, images = first.moments(count), first.region(), []
+    frames = next(iter(first.run.objects.values())).frame_index[first.moments(count)]
+    region_px, images = first.region(), []
     for name, scene in scenes.items():
-        for row in moments:
-            image = scene.draw(row, region_px, width_px, axes=axes, trail=0)
+        for index in frames.tolist():
+            image = scene.draw(scene.row(index), region_px, width_px, axes=axes, trail=0)
             foot = (0, image.shape[0] - 2, 1, image.shape[0] - 1)
             images.append(overlay.draw_labels(image, [Label(name, "#222222", foot)]))
     return overlay.montage(images, columns=count)
