@@ -90,9 +90,13 @@ def test_what_may_as_well_have_stood_still_is_no_part():
     assert not parts_that_follow(patch, parts_of(patch.smooth), plate, motions).any()
 
 
-def test_a_camera_that_moves_past_what_lies_still_tells_nothing():
+@pytest.mark.parametrize("wall", ["printed", "plain"])
+def test_a_camera_that_moves_past_what_lies_still_tells_nothing(wall):
+    """A plain wall is in most of its pixels as it was, as if the camera stood still."""
     moved_m = 0.05
     then, now = scene(0, 0.0), scene(30, 0.0, moved_m)
+    for frame in (then, now) if wall == "plain" else ():
+        frame.rgb[frame.depth_m == np.float32(WALL_M)] = 120
     patch, _ = patch_and_plate(now, moved_m)
     motions = motions_of(then, now, moved_m)
     plate = holding(parts_of(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)

@@ -89,7 +89,10 @@ def agrees(
 
 
 def scene_stays(patch: Patch, motions: Motions) -> bool:
-    """Whether what lies around a patch stayed where it was: before a moving camera, all that lies still moves alike."""
+    """Whether what lies around a patch stayed where it was, rather than moved as the object did.
+
+    Before a moving camera all that lies still moves alike; before a slow one, walls of one colour seem to have stayed.
+    """
     frame, then = motions.now, motions.recent.then
     around = np.ones(frame.shape, bool)
     around[patch.box.slices] = False
@@ -98,7 +101,8 @@ def scene_stays(patch: Patch, motions: Motions) -> bool:
     v, u = v[some], u[some]
     p_cam = patch.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
     stayed, _ = agrees(p_cam, frame.rgb[v, u], patch.camera, then, np.eye(4))
-    return len(stayed) >= _FEWEST and stayed.mean() > _STAYS
+    moved, _ = agrees(p_cam, frame.rgb[v, u], patch.camera, then, motions.recent.T_then_now)
+    return len(stayed) >= _FEWEST and stayed.mean() > max(_STAYS, moved.mean())
 
 
 def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
