@@ -35,6 +35,10 @@ class KeyframeViews:
         turned, row = self._nearest(T_cam_obj)
         return turned + self._accumulated_rad[row] if len(self) else 0.0
 
+    def some(self, most: int) -> np.ndarray:
+        """(M, 4, 4) of the views, evenly chosen where there are more than ``most``."""
+        return self.T_cam_obj[np.unique(np.linspace(0, len(self) - 1, min(len(self), most)).astype(int))]
+
     def add(self, T_cam_obj: np.ndarray) -> None:
         """One more view; beyond the cap it replaces the one that it is most like."""
         accumulated = self.accumulated_rad(T_cam_obj)

@@ -38,6 +38,9 @@ _FEW_KEYPOINTS = 12
 _GROWTH = 1.1
 #: A map is founded anew where an object has been lost for so many frames and shows more than this of what it knows.
 _PATIENCE, _OUTGROWN = 5, 1.5
+#: A lost object is looked for in every so many frames, turned as in so many of its keyframes at most. Depth this near
+#: its surface is on it, m.
+_TURN_EVERY, _TURNS, _ON_M = 2, 40, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,8 +395,18 @@ class ObjectTracker:
         with self._stopwatch("search"):
             search = self._search(obs.frame)
             found = [search.about(T_cam_obj, self.model.sample) for T_cam_obj in proposed]
+            if obs.mask is not None and self.life.lost_frames % _TURN_EVERY == 1:
+                found.append(self._turned(obs, search))
             best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
             return best if best is not None and best.share >= SIGHTED else None
+
+    def _turned(self, obs: Observation, search: ImageSearch) -> Sighting | None:
+        """Where a lost object shows in its mask, turned as in one of its keyframes."""
+        found = search.turned(self.model.views.some(_TURNS), obs.cloud, self.model.sample)
+        if found is None:
+            return None
+        distance_m = refinement.surface_distances(self.model.surface, obs.cloud, found.T_cam_obj[None])[0]
+        return found if (distance_m < _ON_M).mean() >= self.config.lifecycle.surface_only_share else None
 
     def points_px(self, obs: Observation, T_cam_obj: np.ndarray) -> np.ndarray:
         """(N, 2) where keypoints show under a pose; NaN where not."""

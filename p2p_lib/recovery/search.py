@@ -39,6 +39,10 @@ _HIDDEN, _SHOWN = 0.5, 0.3
 _STEP_M, _STEPS = 0.03, 2
 #: The search compares every so many points, and so many of its best poses are aligned.
 _COARSE, _TRIED = 3, 3
+#: Of turns, so many are aligned that are so far apart, rad, moved by this step about the depth points, m.
+_TRIED_TURNS, _APART_RAD, _NEAR_M = 6, np.radians(20), 0.015
+#: Another turn, off the best by more than this, rad, is as good from this share on of what the best one shows.
+_OTHER_RAD, _ALIKE = np.radians(10), 0.8
 #: A place is no evidence where the surface, moved by its own size along itself, keeps this much of what it shows.
 _ANYWHERE = 0.7
 #: From this share on a pose is polished: by small motions (rad, m), all at first, then smaller ones about the best.
@@ -93,10 +97,39 @@ class ImageSearch:
             return None
         if not in_image(self._camera.project(se3.transform(T_cam_obj, sample.p_obj)), self._depth_m.shape).any():
             return None
-        poses = _shifted(T_cam_obj)
-        share, _, _ = self._compare(poses, sample.select(np.arange(0, len(sample), _COARSE)), _ROUGH_M)
-        best = [k for k in np.argsort(-share)[:_TRIED] if np.isfinite(share[k])]
-        found = [self.at(self._aligned(poses[k], sample), sample) for k in best]
+        poses = _shifted(T_cam_obj, _STEP_M, _STEPS)
+        share = self._roughly(poses, sample)
+        return self._best(poses[np.argsort(-share)[:_TRIED]], sample)
+
+    def turned(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> Sighting | None:
+        """The best pose of the object that these depth points are of, near the turns of T_cam_obj (V, 4, 4).
+
+        None, too, where another turn fits about as well: an object that looks alike from two sides shows neither.
+        """
+        if len(sample.p_obj) < _FEWEST or not len(cloud) or not len(turns):
+            return None
+        poses = np.concatenate([_shifted(T, _NEAR_M, 1) for T in _laid_on(turns, cloud, sample)])
+        share, distinct = self._roughly(poses, sample), []
+        for k in np.argsort(-share):
+            if np.isfinite(share[k]) and (not distinct or _turned_rad(poses[distinct], poses[k]).min() > _APART_RAD):
+                distinct.append(k)
+            if len(distinct) == _TRIED_TURNS:
+                break
+        best = self._best(poses[distinct], sample)
+        if best is None:
+            return None
+        others = [self.at(self._aligned(poses[k], sample), sample) for k in distinct]
+        others = [s for s in others if s is not None and s.share > _ALIKE * best.share]
+        alike = [_turned_rad(best.T_cam_obj[None], s.T_cam_obj)[0] > _OTHER_RAD for s in others]
+        return None if any(alike) else best
+
+    def _roughly(self, poses: np.ndarray, sample: SurfaceSample) -> np.ndarray:
+        """(H,) shares by some of the points, -inf where unknown."""
+        return self._compare(poses, sample.select(np.arange(0, len(sample), _COARSE)), _ROUGH_M)[0]
+
+    def _best(self, poses: np.ndarray, sample: SurfaceSample) -> Sighting | None:
+        """The best of some poses, aligned and polished; None where it is none."""
+        found = [self.at(self._aligned(T, sample), sample) for T in poses]
         best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
         if best is None or best.share < _PROMISING or not self._distinct(best, sample):
             return None
@@ -206,9 +239,23 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
     return share, found, uv_px
 
 
-def _shifted(T_cam_obj: np.ndarray) -> np.ndarray:
-    """(H, 4, 4) a pose moved by steps along the camera's axes."""
-    steps = _STEP_M * np.arange(-_STEPS, _STEPS + 1)
+def _laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.ndarray:
+    """(V, 4, 4) poses of these turns, the points that face the camera about where the cloud (M, 3) is."""
+    centre, poses = cloud.mean(0), turns.copy()
+    for T in poses:
+        facing = sample.n_obj @ T[:3, :3].T @ centre < 0
+        T[:3, 3] = centre - T[:3, :3] @ sample.p_obj[facing if facing.any() else slice(None)].mean(0)
+    return poses
+
+
+def _turned_rad(poses: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """(H,) angles between poses (H, 4, 4) and another."""
+    return se3.angle_rad(se3.inverse(poses) @ T)
+
+
+def _shifted(T_cam_obj: np.ndarray, step_m: float, count: int) -> np.ndarray:
+    """(H, 4, 4) a pose moved by so many steps to each side along the camera's axes."""
+    steps = step_m * np.arange(-count, count + 1)
     poses = np.repeat(T_cam_obj[None], len(steps) ** 3, 0)
     poses[:, :3, 3] += np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
     return poses

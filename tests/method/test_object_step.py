@@ -602,6 +602,21 @@ def test_a_hint_says_that_what_lay_still_is_outside_the_image_where_the_camera_i
     assert not lump.tracker.hint(frame, hidden)[0].gone, "nobody knows where the camera is"
 
 
+def test_a_lost_object_is_looked_for_turned_as_in_its_keyframes():
+    lump = settled(begun(), range(5, 65, 5))
+    truth = se3.from_rt(np.eye(3), [0.05, 0.03, 0.1]) @ turned(25)
+    unseen = hide(lambda tracks: np.ones(len(tracks), bool))
+    assert lump.see(truth, unseen).estimate.status is Status.LOST
+    obs = lump.observed(truth, unseen)
+    found = lump.tracker.sighted(obs)
+    T_obj_model = se3.inverse(lump.T_first[0]) @ lump.T_first[1]
+    error = se3.inverse(truth) @ found.T_cam_obj @ T_obj_model
+    assert np.degrees(se3.angle_rad(error)) < 6 and np.linalg.norm(error[:3, 3]) < 0.006
+    assert lump.tracker.sighted(replace(obs, mask=None)) is None, "where nobody knows where it is"
+    off_it = obs.cloud + 0.04 * np.array([0, 0, 1]) * np.array([0, 1, 0, -1])[np.arange(len(obs.cloud)) % 4, None]
+    assert lump.tracker.sighted(replace(obs, cloud=off_it)) is None, "half of the depth in the mask is not on it"
+
+
 def test_questions_change_nothing():
     lump, other = settled(begun(), [2]), settled(begun(), [2])
     for _ in range(3):

@@ -11,7 +11,9 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame
 from p2p_lib.method.lifecycle import SIGHTED
+from p2p_lib.method.observation import sample_cloud
 from p2p_lib.recovery.search import ImageSearch, SurfaceSample
+from tests.method import analytic_scene
 
 CAMERA = Camera(300.0, 300.0, 160.0, 120.0, 320, 240)
 RADIUS_M = 0.05
@@ -94,3 +96,39 @@ def test_what_fits_anywhere_proves_nothing():
     plate = replace(sample_of_the_ball(), p_obj=p[:300], n_obj=np.tile([0.0, 0, -1], (300, 1)))
     assert search(flat).at(PLACE, plate).share > 0.9
     assert search(flat).about(PLACE, plate) is None
+
+
+def sample_of(sdf) -> SurfaceSample:
+    """Points of a black shape: of a cloud about it, the nearest on its surface, where its gradient is the normal."""
+    p, h = np.random.default_rng(0).uniform(-0.07, 0.09, (3000, 3)), 1e-5
+    for _ in range(30):
+        gradient = np.stack([(sdf(p + h * e) - sdf(p - h * e)) / (2 * h) for e in np.eye(3)], -1)
+        p = p - sdf(p)[:, None] * gradient
+    on = np.abs(sdf(p)) < 1e-4
+    return SurfaceSample(p[on][:300], gradient[on][:300], np.tile(np.float32([0, 128, 128]), (300, 1)))
+
+
+def turned_to(sdf, T_cam_obj, turns):
+    """What is found of the shape in its exact image; nothing is known but the turns."""
+    depth_m, mask = analytic_scene.render(sdf, T_cam_obj)
+    frame = Frame(0, 0.0, np.zeros((*depth_m.shape, 3), np.uint8), np.where(mask, depth_m, np.float32(WALL_M)))
+    cloud = sample_cloud(frame.depth_m, mask, analytic_scene.CAMERA, 500)
+    seen = ImageSearch(frame, analytic_scene.CAMERA, preset().depth)
+    return seen.turned(np.stack(turns), cloud, sample_of(sdf))
+
+
+def test_a_view_known_before_is_found_wherever_it_is():
+    turns, shift = analytic_scene.around(8), se3.from_rt(np.eye(3), [0.03, -0.04, 0.05])
+    for k in (1, 4):
+        truth = shift @ turns[k] @ se3.exp(np.array([0.05, -0.08, np.radians(12), 0, 0, 0]))
+        found = turned_to(analytic_scene.LUMP, truth, turns)
+        error = se3.inverse(truth) @ found.T_cam_obj
+        assert found.share > SIGHTED and np.degrees(se3.angle_rad(error)) < 8  # it started 13 off
+        assert np.linalg.norm(error[:3, 3]) < 0.006
+
+
+def test_an_object_that_looks_alike_from_two_sides_shows_neither():
+    brick = analytic_scene.box((0, 0, 0), (0.03, 0.02, 0.045))
+    truth, other = analytic_scene.around(8)[1], analytic_scene.around(8)[5]
+    assert turned_to(brick, truth, [truth]).share > 0.9
+    assert turned_to(brick, truth, [truth, other]) is None
