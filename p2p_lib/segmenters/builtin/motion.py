@@ -100,9 +100,13 @@ def scene_stays(patch: Patch, motions: Motions) -> bool:
     some = around[v, u] & (frame.depth_m[v, u] > 0)
     v, u = v[some], u[some]
     p_cam = patch.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
-    stayed, _ = agrees(p_cam, frame.rgb[v, u], patch.camera, then, np.eye(4))
-    moved, _ = agrees(p_cam, frame.rgb[v, u], patch.camera, then, motions.recent.T_then_now)
-    return len(stayed) >= _FEWEST and stayed.mean() > max(_STAYS, moved.mean())
+    both = patch.camera.inside(patch.camera.project(se3.transform(motions.recent.T_then_now, p_cam)), -0.5)
+    p_cam, rgb = p_cam[both], frame.rgb[v, u][both]
+    if len(p_cam) < _FEWEST:
+        return False
+    stayed, _ = agrees(p_cam, rgb, patch.camera, then, np.eye(4))
+    moved, _ = agrees(p_cam, rgb, patch.camera, then, motions.recent.T_then_now)
+    return stayed.mean() > max(_STAYS, moved.mean())
 
 
 def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
