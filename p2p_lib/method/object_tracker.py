@@ -395,13 +395,13 @@ class ObjectTracker:
         with self._stopwatch("search"):
             search = self._search(obs.frame)
             found = [search.about(T_cam_obj, self.model.sample) for T_cam_obj in proposed]
-            if obs.mask is not None and self.life.lost_frames % _TURN_EVERY == 1:
+            if obs.mask is not None and self.life.lost_frames % _TURN_EVERY == 1 and not self.observer.cut_off(obs):
                 found.append(self._turned(obs, search))
             best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
             return best if best is not None and best.share >= SIGHTED else None
 
     def _turned(self, obs: Observation, search: ImageSearch) -> Sighting | None:
-        """Where a lost object shows in its mask, turned as in one of its keyframes."""
+        """Where a lost object shows in its mask, turned as in one of its keyframes. Of a part of it any turn may be."""
         found = search.turned(self.model.views.some(_TURNS), obs.cloud, self.model.sample)
         if found is None:
             return None

@@ -99,6 +99,17 @@ class Observer:
         z = observation.frame.depth_m[self.measured(observation)]
         return float((z.astype(float) ** 2).sum() / (self.camera.fx * self.camera.fy))
 
+    def cut_off(self, observation: Observation) -> bool:
+        """Whether the mask ends where depth does: at the border of the image, or of what of it is registered.
+
+        An object before nothing that is measured does so on all four sides, and is whole.
+        """
+        seen, measured = bounds(self.measured(observation)), bounds(observation.frame.depth_m > 0)
+        both = list(zip(seen, measured, strict=True))
+        sides = [one.start <= whole.start + _BORDER_PX for one, whole in both]
+        sides += [one.stop >= whole.stop - _BORDER_PX for one, whole in both]
+        return any(sides) and not all(sides)
+
     def expected_px(self, obs: Observation, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> np.ndarray:
         """(N, 2) where points p_obj (N, 3) show under a pose.
 

@@ -415,6 +415,7 @@ def test_the_surface_follows_what_the_graph_finds():
     lump, moved = settled(begun(), [5, 12]), []
     lump.tracker.model.surface.move = lambda poses, limit: moved.append((set(poses), limit)) or []
     lump.see(turned(13))
+    assert lump.tracker.model.has_surface, "which waits for it"
     assert moved and moved[0][0] == set(lump.tracker.model.graph.keys) and moved[0][1] == 1
     assert not lump.tracker.model._corrected, "nothing is left to move"
 
@@ -613,6 +614,9 @@ def test_a_lost_object_is_looked_for_turned_as_in_its_keyframes():
     error = se3.inverse(truth) @ found.T_cam_obj @ T_obj_model
     assert np.degrees(se3.angle_rad(error)) < 6 and np.linalg.norm(error[:3, 3]) < 0.006
     assert lump.tracker.sighted(replace(obs, mask=None)) is None, "where nobody knows where it is"
+    depth_m = obs.frame.depth_m.copy()
+    depth_m[0] = 0.9  # a wall above; nothing is measured below the object, of which that may be the upper half
+    assert lump.tracker.sighted(replace(obs, frame=replace(obs.frame, depth_m=depth_m))) is None
     off_it = obs.cloud + 0.04 * np.array([0, 0, 1]) * np.array([0, 1, 0, -1])[np.arange(len(obs.cloud)) % 4, None]
     assert lump.tracker.sighted(replace(obs, cloud=off_it)) is None, "half of the depth in the mask is not on it"
 
