@@ -9,7 +9,6 @@ import re
 import shutil
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -47,9 +46,11 @@ class Check:
 
 
 def run_doctor() -> list[Check]:
-    """Python, required packages (each really imported, in a process of its own), libraries, GPU, backends, data."""
-    with ThreadPoolExecutor(2) as pool:  # torch and open3d take seconds each
-        imports = list(pool.map(_package, required_packages()))
+    """Python, required packages (really imported, in a process of their own), libraries, GPU, backends, data."""
+    required = required_packages()
+    # Together they take seconds; where that fails each is imported by itself, which tells which it is.
+    fine = not _fails("\n".join(map(_loading, required)))
+    imports = [_package(name, "" if fine else None) for name in required]
     libraries = [_library(library, package) for library, package in native.SYSTEM_LIBRARIES.items()]
     optional = [_optional(name, *about) for name, about in OPTIONAL.items()]
     return [_python(), *imports, *libraries, _kernel(), _gpu(), *optional, _cotracker(), _data(), _cache(), _disk()]
@@ -79,13 +80,18 @@ def _python() -> Check:
     return Check("Python", fine, False, found, "Set P2P_PYTHON to a Python 3.11 to 3.13 and run: make setup")
 
 
-def _package(name: str) -> Check:
-    load = f"import {MODULES.get(name, name.replace('-', '_'))}"
+def _loading(name: str) -> str:
+    """Code that imports a distribution's module."""
     if name == "open3d":
-        load = "from p2p_lib.core.native import load_open3d; load_open3d()"
-    elif name == "libusb-package" and native.loads("libusb-1.0.so.0"):
+        return "from p2p_lib.core.native import load_open3d; load_open3d()"
+    return f"import {MODULES.get(name, name.replace('-', '_'))}"
+
+
+def _package(name: str, error: str | None = None) -> Check:
+    """A required package; ``error`` is what ended its import, None where nobody has tried."""
+    if name == "libusb-package" and native.loads("libusb-1.0.so.0"):
         return Check(name, True, True, "not needed: the system has libusb")
-    error = _fails(load)
+    error = _fails(_loading(name)) if error is None else error
     return Check(name, not error, False, error or metadata.version(name), error.partition("Run: ")[2] or "make setup")
 
 
