@@ -6,7 +6,7 @@ Scores a 2D tracker by itself and any method's poses as well, and writes a run i
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -291,10 +291,14 @@ def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path,
         {name: path for name, path in known.items() if name in job.objects},
         if_exists,
     )
-    prompts = [prompt.as_dict() for of_frame in job.prompts.values() for prompt in of_frame]
-    writer.info |= {"detector": method.detector.name, "segmenter": method.segmenter.name}
-    writer.info |= {"prompts": prompts, "options": options.as_dict()}
+    writer.info |= told(method, options, [prompt for of_frame in job.prompts.values() for prompt in of_frame])
     return writer
+
+
+def told(method: Point2Pose, options: RunOptions, prompts: Iterable[Prompt]) -> dict[str, Any]:
+    """What ``run.json`` says of the parts and words with which a run was made."""
+    parts = {"detector": method.detector.name, "segmenter": method.segmenter.name}
+    return {**parts, "prompts": [prompt.as_dict() for prompt in prompts], "options": options.as_dict()}
 
 
 def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None:

@@ -15,7 +15,7 @@ import yaml
 
 import p2p_lib
 from p2p_lib import Point2Pose, preset
-from p2p_lib.apps import cli
+from p2p_lib.apps import cli, command_line  # noqa: F401 - importing cli declares the commands
 from p2p_lib.apps.notebooks import list_notebooks
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame, Status
@@ -87,7 +87,7 @@ def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPars
 
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_commands_and_their_options_are_known(name):
-    known = commands(cli._parser())
+    known = commands(command_line.parser())
     for line in re.findall(r"\bp2p ([a-z][^`\n]*)", read(name)):
         words = line.partition("#")[0].split()
         if words[0] not in known:

@@ -1,122 +1,48 @@
-"""The command line ``p2p``. Each command is declared where it is carried out, by one call into the library."""
+"""The commands of ``p2p``. Each is declared where it is carried out, by one call into the library."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import logging
-import os
 import re
-import signal
 import sys
-import threading
-import traceback
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import fill
 from typing import Any
 
-from p2p_lib import __version__
-from p2p_lib.core.errors import BadInput, Doubt, P2PError
-from p2p_lib.core.options import RunOptions, add_options, names, pairs
+from p2p_lib.apps.command_line import arg, command, main, run_options, warn
+from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.core.options import RunOptions, names, pairs
 
-EXIT_INTERRUPTED = 128  # and the signal's number: 130 for Ctrl-C, 143 for SIGTERM
 #: Options that choose the method and its parameters.
 METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "detector")
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code (0 fine, 2 something to mend, 130 interrupted)."""
-    for library in ("OMP", "OPENBLAS", "MKL"):
-        # The matrices are small: more threads cost time, most of all where other programs run. Set it to override.
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
-    arguments = _parser().parse_args(argv)
-    if arguments.log:
-        logging.basicConfig(format="%(name)s %(levelname)s %(message)s")
-        logging.getLogger("p2p_lib").setLevel(arguments.log.upper())
-    ended_by = [signal.SIGINT]
-
-    def terminated(number: int, frame: object) -> None:
-        ended_by.append(signal.Signals(number))
-        raise KeyboardInterrupt  # SIGTERM ends a command as Ctrl-C does: what is done so far is kept
-
-    in_main = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, terminated) if in_main else None
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = partial(_show_doubt, warnings.showwarning, arguments.name)
-            return arguments.command(arguments) or 0
-    except BrokenPipeError:  # the reader of our output (head, less) has gone
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except (P2PError, OSError) as error:  # OSError: a full disk, a folder that may not be written
-        if arguments.debug:
-            traceback.print_exc()
-        else:
-            _warn(f"p2p {arguments.name}: {error}")
-        return P2PError.exit_code
-    except KeyboardInterrupt:
-        _warn(f"p2p {arguments.name}: interrupted")
-        return EXIT_INTERRUPTED + ended_by[-1]
-    finally:
-        if in_main:
-            signal.signal(signal.SIGTERM, before)
-
-
-# --- how a command is declared -------------------------------------------------------------------
-
-Argument = Callable[[argparse.ArgumentParser], Any]
-_COMMANDS: list[tuple[str, str, tuple[Argument, ...], Callable]] = []  # name, help, arguments, what carries it out
-
-
-def _arg(*flags: str, **how: Any) -> Argument:
-    """What ``add_argument`` takes."""
-    return lambda parser: parser.add_argument(*flags, **how)
-
-
-def _options(*wanted: str, **helps: str) -> Argument:
-    """Options of a run (:class:`RunOptions`) that a command has as well; ``helps`` says what some mean to it."""
-    return lambda parser: add_options(parser, *wanted, **helps)
-
-
-def _command(name: str, help: str, *arguments: Argument) -> Callable:
-    """Declare a command ``p2p NAME``, carried out by the function below it; its value is the exit code, None for 0."""
-
-    def declare(function: Callable[[argparse.Namespace], int | None]) -> Callable:
-        _COMMANDS.append((name, help, arguments, function))
-        return function
-
-    return declare
-
-
-_SEQUENCE = _arg("sequence", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA")
-_RUN = _arg("run", type=Path, metavar="DIR", help="folder written by p2p run")
-_DATASET = _arg("dataset", metavar="NAME")
+_SEQUENCE = arg("sequence", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA")
+_RUN = arg("run", type=Path, metavar="DIR", help="folder written by p2p run")
+_DATASET = arg("dataset", metavar="NAME")
 _POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
-_JSON = _arg("--json", action="store_true", help="JSON instead of a table")
-_QUIET = _arg("--quiet", action="store_true", help="no progress bar")
-_OVERLAY = _arg("--overlay", type=Path, metavar="FILE", help="besides a film of it: .mp4, .gif or .webp (see p2p film)")
-_NO_BROWSER = _arg("--no-browser", action="store_true", help="only say where the page is")
-_FORCE = _arg("--force", dest="if_exists", action="store_const", const="replace", help="replace an earlier run in DIR")
-_MIN_VISIBLE = _arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
+_JSON = arg("--json", action="store_true", help="JSON instead of a table")
+_QUIET = arg("--quiet", action="store_true", help="no progress bar")
+_OVERLAY = arg("--overlay", type=Path, metavar="FILE", help="besides a film of it: .mp4, .gif or .webp (see p2p film)")
+_NO_BROWSER = arg("--no-browser", action="store_true", help="only say where the page is")
+_FORCE = arg("--force", dest="if_exists", action="store_const", const="replace", help="replace an earlier run in DIR")
+_MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
 
 
 # --- tracking ------------------------------------------------------------------------------------
 
 
-@_command(
+@command(
     "run",
     "track the objects of a sequence and write poses, timings, scores",
     _SEQUENCE,
-    _arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
+    arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
     _FORCE,
-    _arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
-    _options(),
+    arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
+    run_options(),
     _OVERLAY,
     _QUIET,
 )
@@ -125,7 +51,7 @@ def _run(a: argparse.Namespace) -> int:
 
     film = _film_wanted(a.overlay)
     options = replace(RunOptions.of_arguments(a), save_masks=a.save_masks or film is not None)
-    how = {"if_exists": a.if_exists or "refuse", "progress": not a.quiet, "say": _warn}
+    how = {"if_exists": a.if_exists or "refuse", "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
     print("\n".join(result.summary))
     if result.evaluation is not None:
@@ -138,17 +64,19 @@ def _run(a: argparse.Namespace) -> int:
     if result.interrupted:
         raise KeyboardInterrupt
     if result.advice:
-        _warn(f"p2p run: {result.advice}")
+        warn(f"p2p run: {result.advice}")
     return 0 if result.tracked else P2PError.exit_code
 
 
-@_command(
+@command(
     "live",
     "track objects before a camera; a line of JSON per object and frame",
-    _arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
-    _arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
-    _options(*METHOD, prompts="clicks; without, the first image is clicked on", masks="segmenter (default: builtin)"),
-    _arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
+    arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
+    arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
+    run_options(
+        *METHOD, prompts="clicks; without, the first image is clicked on", masks="segmenter (default: builtin)"
+    ),
+    arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
     _FORCE,
     _OVERLAY,
     _NO_BROWSER,
@@ -169,7 +97,7 @@ def _live(a: argparse.Namespace) -> None:
     camera = open_camera(a.camera, a.rate)
     try:
         if not prompts:
-            prompts, first = click_first(camera, _warn, not a.no_browser)
+            prompts, first = click_first(camera, warn, not a.no_browser)
         show = partial(print, flush=True)
         keep = {"first": first, "count": count, "out": a.out, "overlay": a.overlay}
         keep["if_exists"] = if_exists
@@ -178,22 +106,22 @@ def _live(a: argparse.Namespace) -> None:
         pass  # how one stops a camera
     finally:
         camera.close()
-    _warn(count)
+    warn(count)
 
 
 # --- scoring -------------------------------------------------------------------------------------
 
 
-@_command(
+@command(
     "eval",
     "score a run against the truth of its sequence; without any, against what the camera saw",
-    _arg("run", type=Path, nargs="?", metavar="DIR", help="folder written by p2p run"),
-    _arg("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)"),
-    _arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
-    _options("start", "stop", "models", format="layout of --sequence (default: recognised)"),
+    arg("run", type=Path, nargs="?", metavar="DIR", help="folder written by p2p run"),
+    arg("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)"),
+    arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
+    run_options("start", "stop", "models", format="layout of --sequence (default: recognised)"),
     _JSON,
-    _arg("--rows", action="store_true", help="every number as a CSV row: all forms, Chamfer, returns"),
-    _arg("--align", choices=("first", "all"), default="first", help="object frame: by the first scored frame, or all"),
+    arg("--rows", action="store_true", help="every number as a CSV row: all forms, Chamfer, returns"),
+    arg("--align", choices=("first", "all"), default="first", help="object frame: by the first scored frame, or all"),
     _MIN_VISIBLE,
 )
 def _eval(a: argparse.Namespace) -> None:
@@ -224,10 +152,10 @@ def _eval(a: argparse.Namespace) -> None:
 
             _show(consistency(run), a.json)
             if not a.json and not (a.run / "masks").is_dir() and run.info["masks"] != "dataset":
-                _warn("p2p eval: no masks were kept, so none is compared with. p2p run --save-masks keeps them.")
+                warn("p2p eval: no masks were kept, so none is compared with. p2p run --save-masks keeps them.")
 
 
-@_command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, _JSON, _MIN_VISIBLE)
+@command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, _JSON, _MIN_VISIBLE)
 def _eval_masks(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.evaluation.mask_score import evaluate_masks
@@ -235,13 +163,13 @@ def _eval_masks(a: argparse.Namespace) -> None:
     _show(evaluate_masks(load_run(a.run), min_visible_px=a.min_visible_px), a.json)
 
 
-@_command(
+@command(
     "eval-tracks",
     "score a 2D point tracker against true tracks",
     _SEQUENCE,
-    _options("settings", "seed", "tracker", "format", "depth_scale", models="meshes; else by measured depth"),
-    _arg("--queries", type=int, default=256, metavar="N", help="points to follow (default 256)"),
-    _arg("--search", choices=("picture", "masks"), default="picture", help="where invisible points are looked for"),
+    run_options("settings", "seed", "tracker", "format", "depth_scale", models="meshes; else by measured depth"),
+    arg("--queries", type=int, default=256, metavar="N", help="points to follow (default 256)"),
+    arg("--search", choices=("picture", "masks"), default="picture", help="where invisible points are looked for"),
     _JSON,
 )
 def _eval_tracks(a: argparse.Namespace) -> None:
@@ -251,20 +179,20 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     _show(evaluate_tracker(a.sequence, options, count=a.queries, search=a.search == "masks"), a.json)
 
 
-@_command(
+@command(
     "benchmark",
     "run methods on sequences with seeds as a plan says; resumes",
-    _arg("plan", nargs="*", metavar="PLAN", help="TOML files, or names that --list shows"),
-    _arg("--list", action="store_true", help="list the plans of the paper's tables and of the README"),
-    _arg("--out", type=Path, metavar="DIR", help="runs, records and tables; several plans may share it"),
-    _arg("--quick", action="store_true", help="a few frames of bundled data instead of the plan in full"),
-    _arg("--jobs", type=int, metavar="N", help="runs at a time on this machine (default: one a core)"),
-    _arg(
+    arg("plan", nargs="*", metavar="PLAN", help="TOML files, or names that --list shows"),
+    arg("--list", action="store_true", help="list the plans of the paper's tables and of the README"),
+    arg("--out", type=Path, metavar="DIR", help="runs, records and tables; several plans may share it"),
+    arg("--quick", action="store_true", help="a few frames of bundled data instead of the plan in full"),
+    arg("--jobs", type=int, metavar="N", help="runs at a time on this machine (default: one a core)"),
+    arg(
         "--scheduler", metavar="tcp://HOST:PORT", help="of a Dask cluster whose workers see DIR; trust who can reach it"
     ),
-    _arg("--retry", action="store_true", help="try again what failed before"),
-    _arg("--present", action="store_true", help="instead of plans: all whose data is there, at least in part"),
-    _arg("--tables", type=Path, metavar="DIR", help="tables with notes of what they are of go here, too"),
+    arg("--retry", action="store_true", help="try again what failed before"),
+    arg("--present", action="store_true", help="instead of plans: all whose data is there, at least in part"),
+    arg("--tables", type=Path, metavar="DIR", help="tables with notes of what they are of go here, too"),
     _QUIET,
 )
 def _benchmark(a: argparse.Namespace) -> int:
@@ -281,14 +209,14 @@ def _benchmark(a: argparse.Namespace) -> int:
         print("Data and weights are looked for below $P2P_DATA, see p2p data list; with --quick no plan needs any.")
         return 0
     if a.present and not (present := present_plans()):
-        _warn("p2p benchmark: no dataset of a plan is below $P2P_DATA (see p2p data list), so there is nothing to run")
+        warn("p2p benchmark: no dataset of a plan is below $P2P_DATA (see p2p data list), so there is nothing to run")
         return 0
     a.plan = present if a.present else a.plan
     if not a.plan or a.out is None:
         raise BadInput("benchmark", "no plan or no --out", "PLAN --out DIR; p2p benchmark --list names the plans")
     if not a.quick and data_dir() is None and (lacking := [str(plan) for plan in a.plan if read_plan(plan).data]):
         what = f"{', '.join(lacking)}: $P2P_DATA is not set, so what needs data will not run"
-        _warn(f"p2p benchmark: {what}. Set it (see p2p data list), or add --quick.")
+        warn(f"p2p benchmark: {what}. Set it (see p2p data list), or add --quick.")
     options = {"jobs": a.jobs, "scheduler": a.scheduler, "retry": a.retry, "progress": not a.quiet}
     benchmarks = run_benchmarks(a.plan, a.out, "quick" if a.quick else "full", **options)
     for benchmark in benchmarks:
@@ -305,15 +233,15 @@ def _benchmark(a: argparse.Namespace) -> int:
         raise KeyboardInterrupt
     if any(benchmark.counts()["done"] for benchmark in benchmarks):
         return 0
-    _warn("p2p benchmark: nothing ran; the tables say why")
+    warn("p2p benchmark: nothing ran; the tables say why")
     return P2PError.exit_code
 
 
-@_command(
+@command(
     "figures",
     "draw the paper's qualitative figures and write the index of all its figures and tables",
-    _arg("--out", type=Path, metavar="DIR", help="runs, found again the next time (default out/benchmark)"),
-    _arg("--poses", type=Path, metavar="PATH", help="a competitor's on synthetic/occlusion, drawn beside ours"),
+    arg("--out", type=Path, metavar="DIR", help="runs, found again the next time (default out/benchmark)"),
+    arg("--poses", type=Path, metavar="PATH", help="a competitor's on synthetic/occlusion, drawn beside ours"),
     _QUIET,
 )
 def _figures(a: argparse.Namespace) -> None:
@@ -329,13 +257,13 @@ def _figures(a: argparse.Namespace) -> None:
 # --- looking and handing on ----------------------------------------------------------------------
 
 
-@_command(
+@command(
     "export",
     "write a run's poses as BOP, TUM or a dataset keeps them",
     _RUN,
-    _arg("--format", required=True, choices=("bop", "tum", "poses"), help="BOP CSV, TUM, or 4x4 files"),
-    _arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
-    _arg(
+    arg("--format", required=True, choices=("bop", "tum", "poses"), help="BOP CSV, TUM, or 4x4 files"),
+    arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
+    arg(
         "--frame",
         choices=("object", "model"),
         help="object: of the tracker (default; to be said with bop where there is no truth); "
@@ -349,12 +277,12 @@ def _export(a: argparse.Namespace) -> None:
         print(path)
 
 
-@_command(
+@command(
     "view",
     "look at a run in 3D with a time slider, in the browser",
     _RUN,
-    _arg("--out", type=Path, metavar="FILE", help="the page (default DIR/view.html); it needs nothing else"),
-    _arg("--rerun", type=Path, metavar="FILE", help="instead: a Rerun recording, with video and tracks"),
+    arg("--out", type=Path, metavar="FILE", help="the page (default DIR/view.html); it needs nothing else"),
+    arg("--rerun", type=Path, metavar="FILE", help="instead: a Rerun recording, with video and tracks"),
     _NO_BROWSER,
 )
 def _view(a: argparse.Namespace) -> None:
@@ -371,28 +299,28 @@ def _view(a: argparse.Namespace) -> None:
     print(f"Written to {page}" + ("" if opened else ". Open it in a browser."))
 
 
-@_command(
+@command(
     "film",
     "write a run as a film: boxes, axes, statuses, keypoints, masks",
     _RUN,
-    _arg("--out", type=Path, metavar="FILE", help=".mp4, .gif or .webp (default DIR/film.mp4)"),
-    _arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF)"),
+    arg("--out", type=Path, metavar="FILE", help=".mp4, .gif or .webp (default DIR/film.mp4)"),
+    arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF)"),
 )
 def _film(a: argparse.Namespace) -> None:
     from p2p_lib.figures.film import write_film
 
     print(f"Written to {write_film(a.run, a.out or a.run / 'film.mp4', width_px=a.width)}")
     if not (a.run / "masks").is_dir():
-        _warn("p2p film: no masks were kept, so none is outlined. p2p run --save-masks keeps them.")
+        warn("p2p film: no masks were kept, so none is outlined. p2p run --save-masks keeps them.")
 
 
-@_command(
+@command(
     "notebooks",
     "run the notebooks headless and collect their results",
-    _arg("--profile", choices=("quick", "full"), default="quick", help="size of the job (default quick)"),
-    _arg("--only", metavar="00,03", help="only these notebooks"),
-    _arg("--jobs", type=int, default=1, metavar="N", help="notebooks at a time"),
-    _arg("--parameter", action="append", metavar="NAME=VALUE", help="change a notebook parameter; repeatable"),
+    arg("--profile", choices=("quick", "full"), default="quick", help="size of the job (default quick)"),
+    arg("--only", metavar="00,03", help="only these notebooks"),
+    arg("--jobs", type=int, default=1, metavar="N", help="notebooks at a time"),
+    arg("--parameter", action="append", metavar="NAME=VALUE", help="change a notebook parameter; repeatable"),
 )
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.apps.notebooks import run_notebooks
@@ -404,15 +332,15 @@ def _notebooks(a: argparse.Namespace) -> None:
 # --- data ----------------------------------------------------------------------------------------
 
 
-@_command(
+@command(
     "click",
     "collect clicks on objects in the browser, for p2p run --prompts",
     _SEQUENCE,
-    _arg("--out", type=Path, required=True, metavar="FILE", help="the prompts; what it holds is shown first"),
-    _arg("--frame", type=int, default=0, metavar="I", help="frame to begin with (default 0)"),
-    _arg("--port", type=int, default=0, metavar="N", help="of the page (default: a free one)"),
+    arg("--out", type=Path, required=True, metavar="FILE", help="the prompts; what it holds is shown first"),
+    arg("--frame", type=int, default=0, metavar="I", help="frame to begin with (default 0)"),
+    arg("--port", type=int, default=0, metavar="N", help="of the page (default: a free one)"),
     _NO_BROWSER,
-    _options("format", "depth_scale", seed="of a synthetic sequence (default 0)"),
+    run_options("format", "depth_scale", seed="of a synthetic sequence (default 0)"),
 )
 def _click(a: argparse.Namespace) -> None:
     from p2p_lib.apps.click import Clicker, check_writable, wait_for_clicks
@@ -425,11 +353,11 @@ def _click(a: argparse.Namespace) -> None:
     print(f"{len(prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --out DIR")
 
 
-@_command(
+@command(
     "check",
     "look at data of your own: what is wrong with it and what to do",
-    _arg("sequence", metavar="FOLDER", help="rgb/ depth/ cam_K.txt masks/, or any sequence"),
-    _options("format", "depth_scale", prompts="clicks, where there are no masks"),
+    arg("sequence", metavar="FOLDER", help="rgb/ depth/ cam_K.txt masks/, or any sequence"),
+    run_options("format", "depth_scale", prompts="clicks, where there are no masks"),
     _JSON,
 )
 def _check(a: argparse.Namespace) -> int:
@@ -442,14 +370,14 @@ def _check(a: argparse.Namespace) -> int:
     return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
 
 
-@_command(
+@command(
     "convert",
     "make a folder for p2p run of a recording (ROS, RealSense, Azure Kinect) or of another layout",
-    _arg("source", type=Path, metavar="SOURCE", help=".bag, .db3, .mcap, .mkv, a ROS 2 folder, or any sequence"),
-    _arg("--out", type=Path, required=True, metavar="DIR", help="a new folder"),
-    _arg("--colour", metavar="TOPIC", help="of a ROS recording (default: the likeliest)"),
-    _arg("--depth", metavar="TOPIC", help="of a ROS recording, registered to colour (default: the likeliest)"),
-    _options("format", "depth_scale"),
+    arg("source", type=Path, metavar="SOURCE", help=".bag, .db3, .mcap, .mkv, a ROS 2 folder, or any sequence"),
+    arg("--out", type=Path, required=True, metavar="DIR", help="a new folder"),
+    arg("--colour", metavar="TOPIC", help="of a ROS recording (default: the likeliest)"),
+    arg("--depth", metavar="TOPIC", help="of a ROS recording, registered to colour (default: the likeliest)"),
+    run_options("format", "depth_scale"),
     _QUIET,
 )
 def _convert(a: argparse.Namespace) -> None:
@@ -459,16 +387,16 @@ def _convert(a: argparse.Namespace) -> None:
     print(f"{count} frames in {a.out}. Next: p2p check {a.out}")
 
 
-@_command(
+@command(
     "synth",
     "render a synthetic sequence in the YCBMultiTrack layout, with exact truth",
-    _arg("scenario", nargs="?", metavar="SCENARIO", help="what happens; --list shows all"),
-    _arg("--list", action="store_true", help="list the scenarios"),
-    _arg("--out", type=Path, metavar="DIR", help="a new folder for the sequence"),
-    _arg("--seed", type=int, default=0, metavar="N", help="of labels, paths and noise (default 0)"),
-    _arg("--noise", default="realsense", metavar="NAME", help="exact, realsense (default) or hard"),
-    _arg("--models", type=Path, metavar="DIR", help="YCB models for the ycb_ scenarios (default: stand-ins)"),
-    _arg("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop"),
+    arg("scenario", nargs="?", metavar="SCENARIO", help="what happens; --list shows all"),
+    arg("--list", action="store_true", help="list the scenarios"),
+    arg("--out", type=Path, metavar="DIR", help="a new folder for the sequence"),
+    arg("--seed", type=int, default=0, metavar="N", help="of labels, paths and noise (default 0)"),
+    arg("--noise", default="realsense", metavar="NAME", help="exact, realsense (default) or hard"),
+    arg("--models", type=Path, metavar="DIR", help="YCB models for the ycb_ scenarios (default: stand-ins)"),
+    arg("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop"),
 )
 def _synth(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.sequence import SYNTHETIC, unknown_scenario
@@ -485,25 +413,25 @@ def _synth(a: argparse.Namespace) -> None:
     print(f"Written to {out}. Next: p2p run {out} --out RUN")
 
 
-@_command("data list", "list every dataset and checkpoint that is known")
+@command("data list", "list every dataset and checkpoint that is known")
 def _data_list(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.inventory import overview
 
     print(overview())
 
 
-@_command("data info", "say what a dataset is, its licence and how to get it", _DATASET)
+@command("data info", "say what a dataset is, its licence and how to get it", _DATASET)
 def _data_info(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.inventory import describe, manifest
 
     print(describe(manifest(a.dataset)))
 
 
-@_command(
+@command(
     "data fetch",
     "download into $P2P_DATA, check and unpack; unpack what was had by hand",
     _DATASET,
-    _arg("--only", metavar="PART,PART", help="only the files whose names contain one of these"),
+    arg("--only", metavar="PART,PART", help="only the files whose names contain one of these"),
     _QUIET,
 )
 def _data_fetch(a: argparse.Namespace) -> None:
@@ -513,11 +441,11 @@ def _data_fetch(a: argparse.Namespace) -> None:
         print(line, flush=True)
 
 
-@_command(
+@command(
     "data verify",
     "check what is on disk: checksums, sequences, frames, truth",
     _DATASET,
-    _arg("--every-frame", action="store_true", help="read every image, not only the first and the last"),
+    arg("--every-frame", action="store_true", help="read every image, not only the first and the last"),
 )
 def _data_verify(a: argparse.Namespace) -> int:
     from p2p_lib.datasets.inventory import manifest, verify
@@ -529,14 +457,14 @@ def _data_verify(a: argparse.Namespace) -> int:
     return 0 if good else P2PError.exit_code
 
 
-@_command(
+@command(
     "data record-truth",
     "add truth by motion capture to a folder of one's own",
-    _arg("folder", type=Path, metavar="FOLDER", help="rgb/ depth/ cam_K.txt times.txt, and masks/ if any"),
-    _arg("--object", required=True, metavar="NAME", help="the object's name, as of its masks"),
-    _arg("--mocap", type=Path, required=True, metavar="LOG", help=f"its marker body in the world: {_POSE_LOG}"),
-    _arg("--camera", type=Path, required=True, metavar="LOG", help="the model in the camera, at image times"),
-    _arg("--model", type=Path, metavar="FILE", help="its model, which says when it is in the image"),
+    arg("folder", type=Path, metavar="FOLDER", help="rgb/ depth/ cam_K.txt times.txt, and masks/ if any"),
+    arg("--object", required=True, metavar="NAME", help="the object's name, as of its masks"),
+    arg("--mocap", type=Path, required=True, metavar="LOG", help=f"its marker body in the world: {_POSE_LOG}"),
+    arg("--camera", type=Path, required=True, metavar="LOG", help="the model in the camera, at image times"),
+    arg("--model", type=Path, metavar="FILE", help="its model, which says when it is in the image"),
 )
 def _data_record_truth(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.recording import record_truth
@@ -545,19 +473,19 @@ def _data_record_truth(a: argparse.Namespace) -> None:
     print(f"clocks {found.offset_s:.4f} s apart, known to {found.std_s * 1000:.1f} ms. Truth in {a.folder}")
 
 
-@_command("data where", "print the folder of a dataset, checkpoint or sequence", _DATASET)
+@command("data where", "print the folder of a dataset, checkpoint or sequence", _DATASET)
 def _data_where(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.inventory import where
 
     print(where(a.dataset))
 
 
-@_command(
+@command(
     "config",
     "list and explain the parameters, or how the presets differ",
-    _arg("--stage", metavar="STAGE", help="only this one: registration, tsdf, ..."),
-    _arg("--diff", action="store_true", help="only those in which the presets paper and default differ"),
-    _options("preset", "config_file", "settings"),
+    arg("--stage", metavar="STAGE", help="only this one: registration, tsdf, ..."),
+    arg("--diff", action="store_true", help="only those in which the presets paper and default differ"),
+    run_options("preset", "config_file", "settings"),
     _JSON,
 )
 def _config(a: argparse.Namespace) -> None:
@@ -578,74 +506,13 @@ def _config(a: argparse.Namespace) -> None:
     print(f"In brackets, whose value the default is: {whose}. Change one with --set KEY=VALUE.")
 
 
-@_command("doctor", "check this installation and say how to mend it")
+@command("doctor", "check this installation and say how to mend it")
 def _doctor(a: argparse.Namespace) -> int:
     from p2p_lib.apps.doctor import format_checks, run_doctor
 
     checks = run_doctor()
     print(format_checks(checks))
     return 0 if all(check.ok or check.optional for check in checks) else P2PError.exit_code
-
-
-# --- the parser ----------------------------------------------------------------------------------
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="p2p",
-        description="Point2Pose: 6D tracking and reconstruction of several unknown rigid objects in RGB-D video.",
-        epilog="Start with: p2p run synthetic/crossing --out out/crossing",
-    )
-    parser.add_argument("--version", action="version", version=__version__)
-    parser.set_defaults(debug=False, log=None)
-    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
-    data = commands.add_parser("data", help="datasets and checkpoints: what they are, where, whether whole")
-    actions = data.add_subparsers(metavar="ACTION", required=True, parser_class=_Parser)
-    for name, help, arguments, function in _COMMANDS:
-        group, word = (actions, name.removeprefix("data ")) if name.startswith("data ") else (commands, name)
-        command = group.add_parser(word, help=help, description=help[0].upper() + help[1:] + ".")
-        for argument in arguments:
-            argument(command)
-        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        command.add_argument("--log", choices=("info", "debug"), help="say on standard error what becomes of objects")
-        command.set_defaults(command=function, parser=command, name=name)
-    return parser
-
-
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with the words of a command in one line, and what was meant."""
-
-    def parse_known_args(self, args=None, namespace=None):
-        if args is not None and self._subparsers is None:  # before argparse misses --out where --ouput was given
-            known = list(self._option_string_actions)
-            for word in args[: args.index("--") if "--" in args else None]:
-                name = word.partition("=")[0]
-                if re.match("--[a-z]", name) and not any(option.startswith(name) for option in known):
-                    self.error(f"there is no option {name}{_meant(name, known)}")
-        return super().parse_known_args(args, namespace)
-
-    def error(self, message: str):
-        if choice := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
-            message += _meant(choice[1], re.findall(r"[\w-]+", choice[2]))
-        _warn(f"{self.prog}: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See {self.prog} --help")
-        raise SystemExit(2)
-
-
-def _meant(word: str, known: list[str]) -> str:
-    near = get_close_matches(word, known, n=1, cutoff=0.6)
-    return f". Did you mean {near[0]}?" if near else ""
-
-
-def _warn(line: object) -> None:
-    """Standard output is for results."""
-    print(line, file=sys.stderr)
-
-
-def _show_doubt(others: Callable, name: str, message: Any, category: type, *where: Any) -> None:
-    if issubclass(category, Doubt):
-        _warn(f"p2p {name}: {message}")
-    else:
-        others(message, category, *where)
 
 
 def _film_wanted(path: Path | None) -> Callable[..., Path] | None:

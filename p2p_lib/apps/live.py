@@ -28,7 +28,7 @@ from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
 from p2p_lib.method.pipeline import Point2Pose
-from p2p_lib.run import Keeper
+from p2p_lib.run import Keeper, told
 
 
 @dataclass
@@ -146,8 +146,7 @@ def _kept(
     sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
     objects = tuple(dict.fromkeys(prompt.name for prompt in prompts))
     writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, if_exists=if_exists)
-    writer.info |= {"detector": method.detector.name, "segmenter": method.segmenter.name, "options": options.as_dict()}
-    writer.info |= {"prompts": [prompt.as_dict() for prompt in prompts]}
+    writer.info |= told(method, options, prompts)
     keeper, stopped = Keeper(writer, method, options.save_masks), None
 
     def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:

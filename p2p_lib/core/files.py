@@ -69,9 +69,9 @@ def read_bytes(path: Path, expected: str, largest: int = LARGEST_FILE, fix: str 
         raise MissingData(str(path), f"cannot be read ({error.strerror}), expected {expected}", fix) from None
 
 
-def read_text(path: Path, expected: str, largest: int = LARGEST_TEXT, fix: str = "") -> str:
+def read_text(path: Path, expected: str, fix: str = "") -> str:
     """A file of UTF-8 by :func:`read_bytes`; bytes that are none become question marks."""
-    return read_bytes(path, expected, largest, fix).decode("utf-8", "replace")
+    return read_bytes(path, expected, LARGEST_TEXT, fix).decode("utf-8", "replace")
 
 
 def parse_json(text: str | bytes, name: str, expected: str) -> Any:

@@ -36,26 +36,22 @@ def fit_rigid(p_b: np.ndarray, p_a: np.ndarray, weights: np.ndarray | None = Non
 
 
 def fit_rigid_inertia(
-    p_b: np.ndarray, p_a: np.ndarray, weights: np.ndarray | None = None, R_prior: np.ndarray | None = None
+    p_b: np.ndarray, p_a: np.ndarray, weights: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`fit_rigid`, and the inertia (...,) in m^2 of the points about their long axis.
-
-    R_prior  (3, 3) the rotation to keep where the points leave it free
-    """
+    """As :func:`fit_rigid`, and the inertia (...,) in m^2 of the points about their long axis."""
     p_b, p_a = np.asarray(p_b, float), np.asarray(p_a, float)
     w = np.ones(p_b.shape[:-1]) if weights is None else np.asarray(weights, float)
-    prior = np.zeros((3, 3)) if R_prior is None else _PRIOR_INERTIA_M2 * R_prior
     several, (n, _) = p_b.shape[:-2], p_b.shape[-2:]
     p_a, w = np.broadcast_to(p_a, p_b.shape), np.broadcast_to(w, p_b.shape[:-1])
-    T, inertia_m2 = _fits(p_b.reshape(-1, n, 3), p_a.reshape(-1, n, 3), w.reshape(-1, n), prior)
+    T, inertia_m2 = _fits(p_b.reshape(-1, n, 3), p_a.reshape(-1, n, 3), w.reshape(-1, n))
     return T.reshape(*several, 4, 4), inertia_m2.reshape(several)
 
 
 @compiled
-def _fits(p_b: np.ndarray, p_a: np.ndarray, w: np.ndarray, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    T, inertia_m2 = np.zeros((len(p_b), 4, 4)), np.zeros(len(p_b))
+def _fits(p_b: np.ndarray, p_a: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    T, inertia_m2, nothing = np.zeros((len(p_b), 4, 4)), np.zeros(len(p_b)), np.zeros((3, 3))
     for n in range(len(p_b)):
-        inertia_m2[n] = _fit(p_b[n], p_a[n], w[n], prior, T[n])
+        inertia_m2[n] = _fit(p_b[n], p_a[n], w[n], nothing, T[n])
     return T, inertia_m2
 
 
@@ -179,7 +175,8 @@ def refit(
     """Refits on the inliers, weights (N,), until they stay the same; None if fewer than min_inliers remain.
 
     Fitting and choosing inliers in turn lowers the truncated cost, sum of w min(r, limit)^2, at each step.
-    among  (N,) bool: pairs that may be inliers
+    among    (N,) bool: pairs that may be inliers
+    R_prior  (3, 3) the rotation to keep where the points leave it free
     """
     prior = np.zeros((3, 3)) if R_prior is None else _PRIOR_INERTIA_M2 * R_prior
     arrays = [*(np.ascontiguousarray(a, float) for a in (T_a_b, p_b, p_a, limit_m, weights)), min_inliers, among, prior]

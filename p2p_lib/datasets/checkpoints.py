@@ -63,9 +63,9 @@ def has_gpu() -> bool:
     return torch.cuda.is_available()
 
 
-def device_of(device: str | None) -> str:
-    """The device asked for; by default CUDA where torch has it, else the CPU."""
-    return device or ("cuda" if has_gpu() else "cpu")
+def device() -> str:
+    """Where networks run: CUDA where torch has it, else the CPU."""
+    return "cuda" if has_gpu() else "cpu"
 
 
 def _fetch(name: str) -> str:

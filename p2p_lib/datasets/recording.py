@@ -25,7 +25,7 @@ from p2p_lib.datasets.ycbmultitrack import LABELS
 
 # A longer gap in a log is not bridged: at 0.3 m/s a hand has moved 3 cm by then.
 MAX_GAP_S = 0.1
-STEP_S = 0.02  # of the grid of offsets: near enough for the refinement
+SEARCH_S, STEP_S = 1.0, 0.02  # of the grid of offsets: near enough for the refinement
 SIGMA = np.repeat([0.01, 0.003], 3)  # rad and m: what a pose from an image is off by, as the scale of residuals
 # Below this the motion turns about one axis only, and the shift along it is anyone's guess.
 MIN_TURN_RAD = np.deg2rad(5.0)
@@ -106,20 +106,20 @@ def record_truth(folder: Path, name: str, camera: Path, mocap: Path, model: Path
     return found
 
 
-def calibrate(camera: PoseLog, mocap: PoseLog, search_s: float = 1.0) -> Calibration:
-    """The offset of the clocks within +-``search_s``, and the two constants.
+def calibrate(camera: PoseLog, mocap: PoseLog) -> Calibration:
+    """The offset of the clocks within +-:data:`SEARCH_S`, and the two constants.
 
     Raises :class:`BadInput` where the motion is too little to tell, or the two do not belong together.
     """
     from scipy.optimize import least_squares
 
-    offsets_s = np.arange(-search_s, search_s + STEP_S / 2, STEP_S)
+    offsets_s = np.arange(-SEARCH_S, SEARCH_S + STEP_S / 2, STEP_S)
     fits = [_constants(camera.T, mocap.at(camera.times_s + offset_s)) for offset_s in offsets_s]
     misfits = np.array([fit[2] for fit in fits])
     best = int(np.argmin(misfits))
     if best in (0, len(fits) - 1) or not misfits[best] < 0.5 * np.median(misfits):
         fix = "Is it the same object, does it turn back and forth, do the clocks differ by less than the search?"
-        raise BadInput("clocks", f"no clear optimum within {search_s:g} s", "one offset that fits best", fix)
+        raise BadInput("clocks", f"no clear optimum within {SEARCH_S:g} s", "one offset that fits best", fix)
     X0, Y0, _ = fits[best]
     # Frames at the rim of a gap would come and go with the offset; those inside stay.
     nearby = [mocap.at(camera.times_s + offsets_s[best] + d) for d in (-STEP_S, 0, STEP_S)]

@@ -57,7 +57,7 @@ class UniformDetector:
     name = "uniform"
 
     def __init__(self, config: SamplingConfig, rng: np.random.Generator | None = None):
-        self._limit, self._rng = config.candidates, _generator(rng)
+        self._limit, self._rng = config.candidates, rng or np.random.default_rng(0)
 
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Random pixels of the mask."""
@@ -71,7 +71,7 @@ class FarthestDetector:
     name = "farthest"
 
     def __init__(self, config: SamplingConfig, rng: np.random.Generator | None = None):
-        self._limit, self._rng = config.candidates, _generator(rng)
+        self._limit, self._rng = config.candidates, rng or np.random.default_rng(0)
 
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Pixels of the mask from the one nearest to its middle outwards."""
@@ -119,7 +119,3 @@ def _cropped(frame: Frame, mask: np.ndarray, margin_px: int) -> tuple[np.ndarray
 def _pixels(mask: np.ndarray) -> np.ndarray:
     """(N, 2) u, v of a mask's pixels."""
     return np.argwhere(mask)[:, ::-1].astype(float)
-
-
-def _generator(rng: np.random.Generator | None) -> np.random.Generator:
-    return rng if rng is not None else np.random.default_rng(0)

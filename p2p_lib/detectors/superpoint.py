@@ -26,15 +26,13 @@ _CELL_PX = 8
 _MARGIN_PX = 64
 
 
-def load(
-    config: SamplingConfig, rng: np.random.Generator | None = None, device: str | None = None
-) -> SuperPointDetector:
+def load(config: SamplingConfig, rng: np.random.Generator | None = None) -> SuperPointDetector:
     """The detector with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
     folder = checkpoints.checked_files("superpoint")[0].parent
     module = packages.load("transformers", "superpoint", "transformers")
     # safetensors hold tensors and nothing else; local_files_only: nothing is downloaded here.
     model = module.SuperPointForKeypointDetection.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-    return SuperPointDetector(model, config, checkpoints.device_of(device))
+    return SuperPointDetector(model, config, checkpoints.device())
 
 
 class SuperPointDetector:

@@ -36,15 +36,13 @@ _READ_ONCE = ("pred_masks", "high_res_masks")
 _SPATIAL = ("maskmem_features", "maskmem_pos_enc")
 
 
-def load(
-    camera: Camera, config: SegmentationConfig, rng: np.random.Generator | None = None, device: str | None = None
-) -> Sam2Segmenter:
+def load(camera: Camera, config: SegmentationConfig, rng: np.random.Generator | None = None) -> Sam2Segmenter:
     """The segmenter with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
     transformers = packages.load("transformers", "sam2", "transformers")
     folder = checkpoints.checked_files("sam2")[0].parent
     # Nothing but tensors is in a file of this kind, and nothing is fetched from elsewhere.
     model = transformers.Sam2VideoModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-    return Sam2Segmenter(model, camera, checkpoints.device_of(device))
+    return Sam2Segmenter(model, camera, checkpoints.device())
 
 
 class Sam2Segmenter:

@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 _ITERATIONS, _VISIBLE = 6, 0.6
 
 
-def load(config: TrackingConfig, rng: np.random.Generator | None = None, device: str | None = None) -> RolloutTracker:
+def load(config: TrackingConfig, rng: np.random.Generator | None = None) -> RolloutTracker:
     """The tracker with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
     weights = checkpoints.load_weights("cotracker3")
     predictor = new_predictor()
     checkpoints.fill(predictor.model, "cotracker3", weights)
-    return RolloutTracker(CoTrackerModel(predictor, checkpoints.device_of(device)))
+    return RolloutTracker(CoTrackerModel(predictor, checkpoints.device()))
 
 
 def new_predictor() -> torch.nn.Module:

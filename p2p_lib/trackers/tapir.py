@@ -29,12 +29,12 @@ SIZE_PX, VISIBLE = 480, 0.5
 _CHUNK = 64
 
 
-def load(config: TrackingConfig, rng: np.random.Generator | None = None, device: str | None = None) -> TapirTracker:
+def load(config: TrackingConfig, rng: np.random.Generator | None = None) -> TapirTracker:
     """The tracker with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
     weights = checkpoints.load_weights("tapir")
     model = new_model()
     checkpoints.fill(model, "tapir", weights)
-    return TapirTracker(model, checkpoints.device_of(device))
+    return TapirTracker(model, checkpoints.device())
 
 
 def new_model() -> torch.nn.Module:

@@ -25,13 +25,13 @@ SIZE_PX = 256
 _NEAR_PX = 8
 
 
-def load(config: TrackingConfig, rng: np.random.Generator | None = None, device: str | None = None) -> RolloutTracker:
+def load(config: TrackingConfig, rng: np.random.Generator | None = None) -> RolloutTracker:
     """The tracker with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
     weights = checkpoints.load_weights("tapnextpp")
     model = new_model()
     # The trainer's prefix, where the checkpoint still has it.
     checkpoints.fill(model, "tapnextpp", {key.removeprefix("tapnext."): value for key, value in weights.items()})
-    return RolloutTracker(TapNextModel(model, checkpoints.device_of(device)))
+    return RolloutTracker(TapNextModel(model, checkpoints.device()))
 
 
 def new_model() -> torch.nn.Module:

@@ -732,13 +732,19 @@ def p2p(*words: str, **more) -> subprocess.Popen:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **more)
 
 
+@pytest.fixture(scope="module")
+def long(tmp_path_factory) -> Path:
+    """Nobody writes to it, and nobody comes to its end."""
+    return write_sequence(tmp_path_factory.mktemp("cli") / "long", frames=600)
+
+
 @pytest.mark.parametrize(("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
-def test_signals(how, code, tmp_path):
+def test_signals(how, code, long, tmp_path):
     """The real thing: a process, a signal, what is on disk, and that it goes on from there."""
-    sequence, out = write_sequence(tmp_path / "long", frames=600), tmp_path / "out"
+    out = tmp_path / "out"
     # A shell that runs its jobs in the background has them ignore the signal, and they hand that on.
     heed = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
-    process = p2p("run", str(sequence), "--out", str(out), *POINTS_ALONE, **heed)
+    process = p2p("run", str(long), "--out", str(out), *POINTS_ALONE, **heed)
     deadline = time.monotonic() + 60
     timings = out / "timings.csv"
     while not (timings.is_file() and timings.read_text().count("\n") > 10):

@@ -1,0 +1,143 @@
+"""How the command line ``p2p`` works: commands are declared, words are read, and what goes wrong is one line."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import re
+import signal
+import sys
+import threading
+import traceback
+import warnings
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
+from functools import partial
+from typing import Any
+
+from p2p_lib import __version__
+from p2p_lib.core.errors import Doubt, P2PError
+from p2p_lib.core.options import add_options
+
+EXIT_INTERRUPTED = 128  # and the signal's number: 130 for Ctrl-C, 143 for SIGTERM
+
+Argument = Callable[[argparse.ArgumentParser], Any]
+_COMMANDS: list[tuple[str, str, tuple[Argument, ...], Callable]] = []  # name, help, arguments, what carries it out
+
+
+def arg(*flags: str, **how: Any) -> Argument:
+    """What ``add_argument`` takes."""
+    return lambda parser: parser.add_argument(*flags, **how)
+
+
+def run_options(*wanted: str, **helps: str) -> Argument:
+    """Options of a run (:class:`RunOptions`) that a command has as well; ``helps`` says what some mean to it."""
+    return lambda parser: add_options(parser, *wanted, **helps)
+
+
+def command(name: str, help: str, *arguments: Argument) -> Callable:
+    """Declare a command ``p2p NAME``, carried out by the function below it; its value is the exit code, None for 0."""
+
+    def declare(function: Callable[[argparse.Namespace], int | None]) -> Callable:
+        _COMMANDS.append((name, help, arguments, function))
+        return function
+
+    return declare
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code (0 fine, 2 something to mend, 130 interrupted)."""
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        # The matrices are small: more threads cost time, most of all where other programs run. Set it to override.
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    arguments = parser().parse_args(argv)
+    if arguments.log:
+        logging.basicConfig(format="%(name)s %(levelname)s %(message)s")
+        logging.getLogger("p2p_lib").setLevel(arguments.log.upper())
+    ended_by = [signal.SIGINT]
+
+    def terminated(number: int, frame: object) -> None:
+        ended_by.append(signal.Signals(number))
+        raise KeyboardInterrupt  # SIGTERM ends a command as Ctrl-C does: what is done so far is kept
+
+    in_main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, terminated) if in_main else None
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = partial(_show_doubt, warnings.showwarning, arguments.name)
+            return arguments.command(arguments) or 0
+    except BrokenPipeError:  # the reader of our output (head, less) has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (P2PError, OSError) as error:  # OSError: a full disk, a folder that may not be written
+        if arguments.debug:
+            traceback.print_exc()
+        else:
+            warn(f"p2p {arguments.name}: {error}")
+        return P2PError.exit_code
+    except KeyboardInterrupt:
+        warn(f"p2p {arguments.name}: interrupted")
+        return EXIT_INTERRUPTED + ended_by[-1]
+    finally:
+        if in_main:
+            signal.signal(signal.SIGTERM, before)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Knows the words of every command that has been declared."""
+    parser = _Parser(
+        prog="p2p",
+        description="Point2Pose: 6D tracking and reconstruction of several unknown rigid objects in RGB-D video.",
+        epilog="Start with: p2p run synthetic/crossing --out out/crossing",
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    parser.set_defaults(debug=False, log=None)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+    data = commands.add_parser("data", help="datasets and checkpoints: what they are, where, whether whole")
+    actions = data.add_subparsers(metavar="ACTION", required=True, parser_class=_Parser)
+    for name, help, arguments, function in _COMMANDS:
+        group, word = (actions, name.removeprefix("data ")) if name.startswith("data ") else (commands, name)
+        command = group.add_parser(word, help=help, description=help[0].upper() + help[1:] + ".")
+        for argument in arguments:
+            argument(command)
+        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        command.add_argument("--log", choices=("info", "debug"), help="say on standard error what becomes of objects")
+        command.set_defaults(command=function, parser=command, name=name)
+    return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the words of a command in one line, and what was meant."""
+
+    def parse_known_args(self, args=None, namespace=None):
+        if args is not None and self._subparsers is None:  # before argparse misses --out where --ouput was given
+            known = list(self._option_string_actions)
+            for word in args[: args.index("--") if "--" in args else None]:
+                name = word.partition("=")[0]
+                if re.match("--[a-z]", name) and not any(option.startswith(name) for option in known):
+                    self.error(f"there is no option {name}{_meant(name, known)}")
+        return super().parse_known_args(args, namespace)
+
+    def error(self, message: str):
+        if choice := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
+            message += _meant(choice[1], re.findall(r"[\w-]+", choice[2]))
+        warn(f"{self.prog}: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See {self.prog} --help")
+        raise SystemExit(2)
+
+
+def _meant(word: str, known: list[str]) -> str:
+    near = get_close_matches(word, known, n=1, cutoff=0.6)
+    return f". Did you mean {near[0]}?" if near else ""
+
+
+def warn(line: object) -> None:
+    """Standard output is for results."""
+    print(line, file=sys.stderr)
+
+
+def _show_doubt(others: Callable, name: str, message: Any, category: type, *where: Any) -> None:
+    if issubclass(category, Doubt):
+        warn(f"p2p {name}: {message}")
+    else:
+        others(message, category, *where)
