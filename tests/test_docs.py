@@ -4,6 +4,7 @@ import argparse
 import ast
 import doctest
 import importlib
+import json
 import re
 import subprocess
 import tomllib
@@ -27,7 +28,9 @@ PLACES = ("", "p2p_lib", *(str(p.relative_to(PROJECT)) for p in sorted((PROJECT 
 
 
 def read(name: str) -> str:
-    return (PROJECT / name).read_text(encoding="utf-8")
+    """A document; of a notebook its cells."""
+    text = (PROJECT / name).read_text(encoding="utf-8")
+    return "\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"]) if name.endswith(".ipynb") else text
 
 
 @pytest.mark.parametrize("name", ["CONTRIBUTING.md"])
@@ -85,7 +88,7 @@ def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPars
     return dict(groups[0].choices) if groups else {}
 
 
-@pytest.mark.parametrize("name", DOCUMENTS)
+@pytest.mark.parametrize("name", [*DOCUMENTS, *(f"notebooks/{path.name}" for path in list_notebooks())])
 def test_commands_and_their_options_are_known(name):
     known = commands(command_line.parser())
     for line in re.findall(r"\bp2p ([a-z][^`\n]*)", read(name)):
@@ -94,7 +97,8 @@ def test_commands_and_their_options_are_known(name):
             assert not re.match(r"[a-z-]+$", words[0]) or words[0] in ("on", "does"), f"p2p {words[0]}"
             continue
         parser = known[words[0]]
-        if commands(parser) and len(words) > 1 and words[1] in commands(parser):
+        if commands(parser) and len(words) > 1:
+            assert words[1] in commands(parser), f"p2p {line}"
             parser = commands(parser)[words[1]]
         options = {option for action in parser._actions for option in action.option_strings}
         for word in words[1:]:
