@@ -35,7 +35,7 @@ class Lesson:
             "</nav>"
             f"<details><summary>All notebooks</summary><ul style='list-style:none'>{contents}</ul></details>"
             f"<p><b>In the paper:</b> {html.escape(self.paper)}.</p>{diagram(*self.stages)}"
-            f"<p>The pipeline of preset <code>default</code>. {about} A number leads to the notebook about a box.</p>"
+            f"<p>The pipeline of preset <code>default</code>. {about} The number in a box links to its notebook.</p>"
         )
 
 
@@ -104,7 +104,7 @@ LESSONS = (
         "10_your_own_data",
         "Your own data",
         'figure "Overview of the framework", from the clicks to the mesh',
-        "from a folder of one's own to poses and a mesh: what to hand over, what goes wrong, how to tell that it works",
+        "from a folder of your own to poses and a mesh: what to provide, what goes wrong, how to tell that it works",
     ),
 )
 
