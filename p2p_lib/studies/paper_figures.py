@@ -199,8 +199,9 @@ def index(folder: Path, day_of: Callable[[str], str] | None = None) -> str:
         "",
         "Written by `p2p figures`. *Made on* says whether what is here is of the paper's data, of a re-creation of it,",
         "or of a stand-in, which carries the word in the picture. Tables of data that was not there hold the paper's",
-        "numbers and, for ours, dashes with the reason. `make figures` makes all of it from what is on disk;",
-        "`p2p benchmark --list` says what can run here.",
+        "numbers and, for ours, dashes with the reason: what was measured on such data before is in the project's",
+        "[README](../README.md). `make figures` makes all of it from what is on disk; `p2p benchmark --list` says what",
+        "can run here.",
         "",
         f"| {heads} |",
         "|" + " --- |" * (heads.count("|") + 1),
@@ -221,7 +222,7 @@ def _made(file: Path, on: str, day_of: Callable[[str], str]) -> tuple[str, str, 
     said = json.loads(note.read_text(encoding="utf-8"))
     asked = said["parameters"]
     if asked.get("runs", "").startswith("0 of"):
-        return "-", "-", "not run: the data was not there"
+        return "-", "-", "not run for this table: its data was not there"
     commit = asked.get("commit") or said.get("commit") or ""
     part = f", {asked['runs']} runs" if "runs" in asked else ""
     return str(asked.get("seeds", "0")), f"{commit[:7]} {day_of(commit)}".strip() or "-", on + part
