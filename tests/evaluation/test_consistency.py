@@ -38,15 +38,19 @@ def run(made, tmp_path_factory):
     return run
 
 
+@pytest.fixture(scope="module")
+def good(made, run):
+    return consistency(run, made.sequence).objects
+
+
 def put_off(run, xi):
     T = se3.exp(np.array(xi, float))
     return replace(run, objects={k: replace(obj, T_cam_obj=obj.T_cam_obj @ T) for k, obj in run.objects.items()})
 
 
-def test_a_good_run_agrees_with_what_was_seen(made, run):
-    found = consistency(run, made.sequence).objects
+def test_a_good_run_agrees_with_what_was_seen(run, good):
     for name, obj in run.objects.items():
-        numbers = found[name]
+        numbers = good[name]
         assert numbers["pose"] == pytest.approx(100 * obj.has_pose.mean())
         assert numbers["depth_on_surface"] > 90 and numbers["mask_iou"] > 90, name
         assert numbers["reprojection_px"] == pytest.approx(OFF_PX, abs=0.05), "of points that the truth moves"
@@ -55,8 +59,8 @@ def test_a_good_run_agrees_with_what_was_seen(made, run):
 
 
 @pytest.mark.parametrize("xi", [(0, np.radians(10), 0, 0, 0, 0), (0, 0, 0, 0.02, 0, 0)], ids=["turned", "shifted"])
-def test_poses_put_off_on_purpose_are_told_by_every_number(made, run, xi):
-    good, bad = (consistency(which, made.sequence).objects for which in (run, put_off(run, xi)))
+def test_poses_put_off_on_purpose_are_told_by_every_number(made, run, good, xi):
+    bad = consistency(put_off(run, xi), made.sequence).objects
     for name in run.objects:
         assert bad[name]["pose"] == good[name]["pose"]
         assert bad[name]["depth_on_surface"] < good[name]["depth_on_surface"] - 10

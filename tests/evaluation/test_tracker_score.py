@@ -15,11 +15,6 @@ from p2p_lib.evaluation.tracker_score import TrackTask, run_tracker
 from p2p_lib.evaluation.true_tracks import TrueScene, draw_queries
 
 
-@pytest.fixture(scope="module")
-def crossing():
-    return open_sequence("synthetic/crossing")
-
-
 class Recorder:
     """A tracker that keeps every query where it was, and a diary."""
 
@@ -45,17 +40,18 @@ class Recorder:
 
 
 @pytest.fixture(scope="module")
-def queries(crossing):
-    return draw_queries(TrueScene(crossing, find_models(crossing, MESHES)), np.random.default_rng(0), 16)
+def queries(made):
+    scene = TrueScene(made.sequence, find_models(made.sequence, MESHES))
+    return draw_queries(scene, np.random.default_rng(0), 16)
 
 
-def test_all_queries_in_one_pass_each_at_its_frame(crossing, queries):
+def test_all_queries_in_one_pass_each_at_its_frame(made, queries):
     tracker = Recorder()
-    run = run_tracker(tracker, crossing, queries)
+    run = run_tracker(tracker, made.sequence, queries)
     adds = [k for k, entry in enumerate(tracker.diary) if entry[0] == "add"]
     assert [tracker.diary[k] for k in adds] == [("add", 4)] * 4
-    assert [tracker.diary[k - 1][:2] for k in adds] == [("start", 0), ("track", 75), ("track", 150), ("track", 225)]
-    assert [entry[2] for entry in tracker.diary if entry[0] == "track"] == [None] * 299
+    assert [tracker.diary[k - 1][:2] for k in adds] == [("start", 0), ("track", 10), ("track", 20), ("track", 30)]
+    assert [entry[2] for entry in tracker.diary if entry[0] == "track"] == [None] * 39
     for k, first in enumerate(queries.frame):
         assert not run.visible[: first + 1, k].any() and run.visible[first + 1 :, k].all()
         np.testing.assert_array_equal(run.uv_px[first + 1, k], queries.uv_px[k] + first + 1)
@@ -63,29 +59,30 @@ def test_all_queries_in_one_pass_each_at_its_frame(crossing, queries):
     assert np.isfinite(run.cpu_ms).all()
 
 
-def test_search_is_the_union_of_the_masks(crossing, queries):
+def test_search_is_the_union_of_the_masks(made, queries):
     tracker = Recorder()
-    run_tracker(tracker, crossing, queries, search=True)
+    run_tracker(tracker, made.sequence, queries, search=True)
     told = {entry[1]: entry[2] for entry in tracker.diary if entry[0] == "track"}
-    for t in (1, 140, 299):
-        assert told[t] == np.logical_or.reduce(list(crossing.masks(t).values())).sum()
+    for t in (1, 20, 39):
+        assert told[t] == np.logical_or.reduce(list(made.sequence.masks(t).values())).sum()
 
 
-def test_a_late_answer_belongs_to_an_earlier_frame(crossing, queries):
+def test_a_late_answer_belongs_to_an_earlier_frame(made, queries):
     tracker = Recorder(late=3)
-    run = run_tracker(tracker, crossing, queries)
-    # Queries of frame 75 are added once the tracker has answered that frame.
+    run = run_tracker(tracker, made.sequence, queries)
+    # Queries of frame 10 are added once the tracker has answered that frame.
     adds = [k for k, entry in enumerate(tracker.diary) if entry[0] == "add"]
-    assert [tracker.diary[k - 1][1] for k in adds] == [3, 78, 153, 228]
+    assert [tracker.diary[k - 1][1] for k in adds] == [3, 13, 23, 33]
     for k, first in enumerate(queries.frame):
         np.testing.assert_array_equal(run.uv_px[first + 1, k], queries.uv_px[k] + first + 4)
         assert not run.visible[: first + 1, k].any() and run.visible[first + 1 :, k].all()
     # The last picture is shown three times more.
-    assert [entry[1] for entry in tracker.diary[-4:]] == [299] * 4
+    assert [entry[1] for entry in tracker.diary[-4:]] == [39] * 4
 
 
-def test_plain_lk_scores_as_lucas_kanade_does(crossing):
+def test_plain_lk_scores_as_lucas_kanade_does():
     """It follows well and finds nothing again."""
+    crossing = open_sequence("synthetic/crossing")
     score = TrackTask.of(crossing, 1, count=48).score(make_tracker("lk", TrackingConfig()))
     plain = score.as_dict()
     assert 0.2 < plain["aj"] < plain["delta_avg"] < 0.6 and plain["jaccard"]["16_px"] > plain["jaccard"]["1_px"]
@@ -97,8 +94,9 @@ def test_plain_lk_scores_as_lucas_kanade_does(crossing):
 # --- p2p eval-tracks ----------------------------------------------------------------------------
 
 
-def test_the_command_prints_one_json_object(capsys):
-    assert cli.main("eval-tracks synthetic/crossing --tracker lk --queries 8 --seed 2 --json".split()) == 0
+def test_the_command_prints_one_json_object(made, capsys):
+    words = f"eval-tracks {made.sequence.path} --tracker lk --queries 8 --seed 2 --json"
+    assert cli.main(words.split()) == 0
     plain = json.loads(capsys.readouterr().out)
     assert plain["tracker"] == "lk" and plain["queries"] == 8 and plain["seed"] == 2
     assert plain["search"] == "whole picture" and plain["truth"] == "box: mesh, can: mesh"
@@ -108,15 +106,15 @@ def test_the_command_prints_one_json_object(capsys):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ("synthetic/crossing --tracker lkk", "tracker: got 'lkk', expected one of builtin, builtin2d, lk"),
-        ("synthetic/crossing --models tin=x.obj", "model: got the name 'tin', expected one of the objects: box, can"),
-        ("synthetic/crossing --models can=nowhere.obj", "nowhere.obj: no such model"),
+        ("SEQUENCE --tracker lkk", "tracker: got 'lkk', expected one of builtin, builtin2d, lk"),
+        ("SEQUENCE --models tin=x.obj", "model: got the name 'tin', expected one of the objects: box, can"),
+        ("SEQUENCE --models can=nowhere.obj", "nowhere.obj: no such model"),
         ("nowhere", "nowhere: no such folder"),
-        ("synthetic/crossing --set tracking.windo=3", "Did you mean 'tracking.window_px'"),
+        ("SEQUENCE --set tracking.windo=3", "Did you mean 'tracking.window_px'"),
     ],
 )
-def test_what_does_not_fit_is_said_in_one_line(capsys, words, complaint):
-    assert cli.main(["eval-tracks", *words.split()]) == 2
+def test_what_does_not_fit_is_said_in_one_line(made, capsys, words, complaint):
+    assert cli.main(["eval-tracks", *words.replace("SEQUENCE", str(made.sequence.path)).split()]) == 2
     err = capsys.readouterr().err
     assert err.startswith("p2p eval-tracks: ") and complaint in err and err.count("\n") == 1
 

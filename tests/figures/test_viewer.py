@@ -126,8 +126,8 @@ def test_the_legend_names_objects_and_statuses(page):
 
 def test_a_browser_draws_it(page, browser, tmp_path):
     (tmp_path / "view.html").write_text(page)
-    image = browser.screenshot(tmp_path / "view.html", tmp_path / "shot.png", wait_ms=4000)
-    middle = image[100:600, 200:800]
+    image = browser.screenshot(tmp_path / "view.html", tmp_path / "shot.png", (700, 490), wait_ms=1000)
+    middle = image[70:420, 140:560]
     red = (middle[..., 0] > 120) & (middle[..., 1] < 90) & (middle[..., 2] < 90)
     assert red.sum() > 200, "the box's surface, which is red"
     assert (np.ptp(middle, axis=-1) > 40).mean() > 0.01

@@ -1,6 +1,7 @@
 """The sequence synthetic/crossing: what its folder holds is true, and the scenario has the events it promises."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -216,18 +217,31 @@ def tree(folder):
     return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
-def test_same_seed_same_bytes_other_seed_other_images(tmp_path, monkeypatch):
-    made = []
-    for k, seed in enumerate((4, 4, 5)):
-        monkeypatch.setenv("P2P_CACHE", str(tmp_path / str(k)))
-        made.append(tree(scenario_dir("crossing", seed=seed, frames=3)))
-    assert made[0] == made[1]
+@pytest.fixture(scope="module")
+def two_frames(tmp_path_factory):
+    """A cache that holds the first two frames of seed 0; nobody writes to it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("P2P_CACHE", str(tmp_path_factory.mktemp("two_frames")))
+        return scenario_dir("crossing", frames=2).parents[1]
+
+
+@pytest.fixture
+def cache(two_frames, tmp_path, monkeypatch):
+    """A copy of it to write to, as the cache."""
+    monkeypatch.setenv("P2P_CACHE", str(tmp_path / "cache"))
+    return shutil.copytree(two_frames, tmp_path / "cache")
+
+
+def test_same_seed_same_bytes_other_seed_other_images(cache, tmp_path, monkeypatch):
+    once = tree(scenario_dir("crossing", frames=2))
+    other = tree(scenario_dir("crossing", frames=2, seed=5))
+    monkeypatch.setenv("P2P_CACHE", str(tmp_path / "again"))
+    assert tree(scenario_dir("crossing", frames=2)) == once
     for name in ("rgb/000001.jpg", "depth/000001.png", "annotated_poses/box/000001.txt", "models/can/texture_map.png"):
-        assert made[0][name] != made[2][name], name
+        assert once[name] != other[name], name
 
 
-def test_parameters_make_their_own_folders(tmp_path, monkeypatch):
-    monkeypatch.setenv("P2P_CACHE", str(tmp_path))
+def test_parameters_make_their_own_folders(cache):
     plain = scenario_dir("crossing", frames=2)
     faded = scenario_dir("crossing", frames=2, contrast=0.2)
     clean = scenario_dir("crossing", frames=2, **{k: getattr(PERFECT, k) for k in ("axial_per_m", "baseline_m")})
@@ -240,8 +254,7 @@ def test_parameters_make_their_own_folders(tmp_path, monkeypatch):
     assert found[1] < 0.6 * found[0]
 
 
-def test_finished_folders_are_used_and_unfinished_ones_never(tmp_path, monkeypatch):
-    monkeypatch.setenv("P2P_CACHE", str(tmp_path))
+def test_finished_folders_are_used_and_unfinished_ones_never(cache):
     folder = scenario_dir("crossing", frames=2)
     stamp = (folder / "rgb/000000.jpg").stat().st_mtime_ns
     assert scenario_dir("crossing", frames=2) == folder
