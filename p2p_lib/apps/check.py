@@ -180,7 +180,8 @@ def _times(sequence: Sequence) -> Finding:
         return Finding("times", Level.LOOK, "a single image", "Tracking needs a video.")
     usual_s, widest = float(np.median(steps_s)), int(steps_s.argmax())
     text = f"{1 / usual_s:.3g} images per second, {sequence.times_s[-1] - sequence.times_s[0]:.1f} s"
-    if np.array_equal(sequence.times_s, np.arange(len(sequence)) / DEFAULT_HZ) and not _has_times(sequence):
+    own = sequence.path is None or (sequence.path / "times.txt").is_file()
+    if not own and np.array_equal(sequence.times_s, np.arange(len(sequence)) / DEFAULT_HZ):
         text += "; assumed, since there is no times.txt (seconds, one a line)"
     if not RATES_HZ[0] <= 1 / usual_s <= RATES_HZ[1]:
         unit = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
@@ -192,10 +193,6 @@ def _times(sequence: Sequence) -> Finding:
         fix = "Images are missing there: what moved meanwhile has to be found again."
         return Finding("times", Level.LOOK, text, fix)
     return Finding("times", Level.OK, text)
-
-
-def _has_times(sequence: Sequence) -> bool:
-    return sequence.path is None or (sequence.path / "times.txt").is_file()
 
 
 def _scale(pairs: list[tuple[Frame, Frame]]) -> Finding:

@@ -187,9 +187,7 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     arg("--out", type=Path, metavar="DIR", help="runs, records and tables; several plans may share it"),
     arg("--quick", action="store_true", help="a few frames of bundled data instead of the plan in full"),
     arg("--jobs", type=int, metavar="N", help="runs at a time on this machine (default: one a core)"),
-    arg(
-        "--scheduler", metavar="tcp://HOST:PORT", help="of a Dask cluster whose workers see DIR; trust who can reach it"
-    ),
+    arg("--scheduler", metavar="tcp://HOST:PORT", help="of a Dask cluster that sees DIR; trust who can reach it"),
     arg("--retry", action="store_true", help="try again what failed before"),
     arg("--present", action="store_true", help="instead of plans: all whose data is there, at least in part"),
     arg("--tables", type=Path, metavar="DIR", help="tables with notes of what they are of go here, too"),
@@ -264,10 +262,7 @@ def _figures(a: argparse.Namespace) -> None:
     arg("--format", required=True, choices=("bop", "tum", "poses"), help="BOP CSV, TUM, or 4x4 files"),
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
     arg(
-        "--frame",
-        choices=("object", "model"),
-        help="object: of the tracker (default; to be said with bop where there is no truth); "
-        "model: the model's, by the truth (default for bop)",
+        "--frame", choices=("object", "model"), help="tracker's (say so for bop without truth), or the model's by truth"
     ),
 )
 def _export(a: argparse.Namespace) -> None:

@@ -153,14 +153,9 @@ def _likeliest(topics: list[str], kind: str) -> str | None:
         chosen = zip(rank, ["ompressed" in topic for topic in of_depth], of_depth)
     else:
         others = [topic for topic in topics if topic not in of_depth and "infra" not in topic and "/ir/" not in topic]
-        named = [not _says_colour(topic) for topic in others]
+        named = [not any(word in topic for word in ("color", "colour", "rgb")) for topic in others]
         chosen = zip(named, ["rect" not in topic for topic in others], ["ompressed" in t for t in others], others)
     return min(chosen, default=(None,))[-1]
-
-
-def _says_colour(topic: str) -> bool:
-    """Whether a topic's name says that it is of colour."""
-    return any(word in topic for word in ("color", "colour", "rgb"))
 
 
 def _info_of(topic: str | None, infos: list[str]) -> str | None:
