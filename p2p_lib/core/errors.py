@@ -58,6 +58,11 @@ def doubt(name: str, got: object, fix: str) -> None:
     warnings.warn(Doubt(_sentence(f"{name}: {got}", fix)), stacklevel=3)
 
 
+def in_a_line(error: BaseException) -> str:
+    """The first 160 letters of what a library says, or what kind of error it is where it says nothing."""
+    return " ".join(str(error).split())[:160] or type(error).__name__
+
+
 def _sentence(what: str, fix: str) -> str:
     """One line, whatever line breaks the parts have."""
     return " ".join((f"{what}. {fix}" if fix else what).split())

@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
-from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.errors import MissingBackend, in_a_line
 from p2p_lib.core.paths import PROJECT
 
 PIP = "{uv} pip install --python {python} "
@@ -65,7 +65,7 @@ def load(module: str, backend: str, package: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         fix = f"Run: {command(INSTALL[package])}"
-        missing = f"the package {package} cannot be loaded ({' '.join(str(error).split())[:120]})"
+        missing = f"the package {package} cannot be loaded ({in_a_line(error)})"
         raise MissingBackend(backend, missing, fix) from error
 
 

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, in_a_line
 from p2p_lib.core.files import UNPACKED_BYTES, UNPACKED_RATIO, UNREADABLE
 
 #: What a member costs however small it is.
@@ -61,9 +61,8 @@ def unpack(archive: str | Path, folder: str | Path, progress: Callable[[int], ob
     except UNREADABLE as error:
         if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):  # the disk's, not the archive's
             raise
-        reason = " ".join(str(error).split())[:100]
         fix = "Fetch it again: p2p data fetch replaces an archive whose checksum is wrong."
-        raise BadInput(str(archive), f"a damaged archive ({reason})", "a whole one", fix) from None
+        raise BadInput(str(archive), f"a damaged archive ({in_a_line(error)})", "a whole one", fix) from None
     return written
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, in_a_line
 from p2p_lib.core.paths import data_dir
 from p2p_lib.datasets.inventory import require
 from p2p_lib.datasets.manifests import manifest
@@ -39,8 +39,7 @@ def load_weights(name: str) -> dict[str, torch.Tensor]:
         read = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
         what = "more than tensors" if isinstance(error, pickle.UnpicklingError) else "an unreadable file"
-        reason = " ".join(str(error).split())[:120]
-        raise BadInput(str(path), f"{what} ({reason})", "a checkpoint of tensors", _fetch(name)) from None
+        raise BadInput(str(path), f"{what} ({in_a_line(error)})", "a checkpoint of tensors", _fetch(name)) from None
     weights = read.get("state_dict", read.get("model", read)) if isinstance(read, dict) else read
     if not isinstance(weights, dict) or not all(isinstance(value, torch.Tensor) for value in weights.values()):
         raise BadInput(str(path), f"a {type(weights).__name__} of other values", "a dictionary of tensors")
@@ -52,8 +51,8 @@ def fill(model: torch.nn.Module, name: str, weights: dict[str, torch.Tensor]) ->
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:
-        reason = " ".join(str(error).split())[:200]
-        raise BadInput(f"checkpoint {name}", reason, f"the weights of {type(model).__name__}", _fetch(name)) from None
+        expected = f"the weights of {type(model).__name__}"
+        raise BadInput(f"checkpoint {name}", in_a_line(error), expected, _fetch(name)) from None
 
 
 def has_gpu() -> bool:

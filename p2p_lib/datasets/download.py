@@ -11,7 +11,7 @@ import os
 import shutil
 from pathlib import Path
 
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, in_a_line
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.manifests import RemoteFile
 
@@ -42,9 +42,8 @@ def download(file: RemoteFile, folder: Path, known_sha256: str | None, progress:
     try:
         _fetch(file.url, part, progress)
     except requests.RequestException as error:
-        reason = " ".join(str(error).split())[:160]
         fix = "Run the command again: it goes on where it stopped."
-        raise MissingData(file.url, f"cannot be fetched ({reason})", fix) from None
+        raise MissingData(file.url, f"cannot be fetched ({in_a_line(error)})", fix) from None
     _mark(part).unlink(missing_ok=True)
     size, digest = part.stat().st_size, sha256(part)
     if file.bytes in (None, size) and known_sha256 in (None, digest):

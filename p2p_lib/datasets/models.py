@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, in_a_line
 from p2p_lib.core.files import UNREADABLE, read_bytes
 from p2p_lib.datasets.sequence import Sequence
 
@@ -77,8 +77,7 @@ def load_points(path: str | Path) -> np.ndarray:
     try:
         points = readers[path.suffix.lower()](data) * unit_m(path)
     except UNREADABLE as error:
-        reason = " ".join(str(error).split())[:80]
-        raise BadInput(str(path), f"an unreadable model ({reason})", "x y z of each vertex") from None
+        raise BadInput(str(path), f"an unreadable model ({in_a_line(error)})", "x y z of each vertex") from None
     if points.ndim != 2 or points.shape[1:] != (3,) or len(points) < 1 or not np.isfinite(points).all():
         got = "no vertices" if points.size == 0 else f"{points.shape} values, some not finite"
         raise BadInput(str(path), got, "at least one vertex of three finite coordinates")
@@ -110,8 +109,7 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
         mesh = trimesh.load(BytesIO(data), file_type=kind, process=False, force="mesh", skip_materials=True)
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces).reshape(-1, 3)
     except UNREADABLE as error:
-        reason = " ".join(str(error).split())[:80]
-        raise BadInput(str(path), f"an unreadable mesh ({reason})", "vertices and faces") from None
+        raise BadInput(str(path), f"an unreadable mesh ({in_a_line(error)})", "vertices and faces") from None
     if not np.isfinite(vertices).all():
         raise BadInput(str(path), "vertices that are not finite", "finite coordinates")
     if faces.size and not (0 <= faces.min() and faces.max() < len(vertices)):

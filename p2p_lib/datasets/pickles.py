@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, in_a_line
 from p2p_lib.core.files import LARGEST_PICKLE, MOST_VALUES, UNREADABLE, read_bytes
 
 EXPECTED = "a pickle of NumPy arrays and plain values"
@@ -111,8 +111,7 @@ def load_plain(path: str | Path) -> Any:
         # latin1: HO-3D's files were written by Python 2, whose strings are bytes.
         return _Plain().value(_ArraysOnly(io.BytesIO(data), encoding="latin1").load(), 0)
     except UNREADABLE as error:
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise BadInput(str(path), f"an unreadable or unsafe pickle ({reason})", EXPECTED) from None
+        raise BadInput(str(path), f"an unreadable or unsafe pickle ({in_a_line(error)})", EXPECTED) from None
 
 
 class _Plain:

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, in_a_line
 from p2p_lib.core.types import Frame
 
 WAIT_MS = 200
@@ -96,8 +96,7 @@ class RealSenseCamera:
             self._pipeline.start(config)
         except RuntimeError as error:
             fix = "Plug a depth camera into USB 3, and close the RealSense Viewer."
-            said = " ".join(str(error).split())[:120]
-            raise MissingData(self.name, f"no camera of colour and depth answers ({said})", fix) from None
+            raise MissingData(self.name, f"no camera of colour and depth answers ({in_a_line(error)})", fix) from None
 
     def _play(self, recording: Path, every: bool) -> Any:
         """Play a recording from its first image on; the playback."""
@@ -106,8 +105,7 @@ class RealSenseCamera:
             config.enable_device_from_file(str(recording), repeat_playback=False)
             profile = self._pipeline.start(config)
         except RuntimeError as error:
-            said = " ".join(str(error).split())[:120]
-            raise BadInput(self.name, f"an unreadable recording ({said})", "a .bag") from None
+            raise BadInput(self.name, f"an unreadable recording ({in_a_line(error)})", "a .bag") from None
         kinds = {stream.stream_type() for stream in profile.get_streams()}
         if not {rs.stream.color, rs.stream.depth} <= kinds:
             self._pipeline.stop()

@@ -19,7 +19,7 @@ import numpy as np
 
 from p2p_lib.core import packages
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, in_a_line
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.ros_messages import read_depth_m, read_rgb, seconds
 
@@ -55,8 +55,8 @@ class RosRecording:
             self._reader = self._open.enter_context(reader)
         except Exception as error:  # noqa: BLE001 - whatever the package says of a damaged file
             self.close()
-            said = " ".join(str(error).split())[:120]
-            raise BadInput(self.name, f"an unreadable recording ({said})", "a whole bag of ROS 1 or 2") from None
+            got = f"an unreadable recording ({in_a_line(error)})"
+            raise BadInput(self.name, got, "a whole bag of ROS 1 or 2") from None
         of = {c.topic: c for c in self._reader.connections}
         pictures = [topic for topic, c in of.items() if c.msgtype in _IMAGES]
         depth = depth or _likeliest(pictures, "depth")
