@@ -15,10 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pandas import DataFrame
 from PIL import Image
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core.paths import PROJECT
+from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.exchange import as_run, read_poses
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.runs import Run
@@ -191,27 +193,27 @@ ITEMS = (
 )  # fmt: skip
 
 
+_INDEX = """# The paper's figures and tables
+
+Written by `p2p figures`. *Made on* says whether what is here is of the paper's data, of a re-creation of it,
+or of a stand-in, which carries the word in the picture. Tables of data that was not there hold the paper's
+numbers and, for ours, dashes with the reason: what was measured on such data before is in the project's
+[README](../README.md). `make figures` makes all of it from what is on disk; `p2p benchmark --list` says what
+can run here.
+
+"""
+
+
 def index(folder: Path, day_of: Callable[[str], str] | None = None) -> str:
     """``README.md`` of the figures: every item of the paper, what is here in its place, and how it was made."""
-    heads = "paper | what it shows | here | made on | seeds | commit, date | command | notebook | the paper's data"
-    lines = [
-        "# The paper's figures and tables",
-        "",
-        "Written by `p2p figures`. *Made on* says whether what is here is of the paper's data, of a re-creation of it,",
-        "or of a stand-in, which carries the word in the picture. Tables of data that was not there hold the paper's",
-        "numbers and, for ours, dashes with the reason: what was measured on such data before is in the project's",
-        "[README](../README.md). `make figures` makes all of it from what is on disk; `p2p benchmark --list` says what",
-        "can run here.",
-        "",
-        f"| {heads} |",
-        "|" + " --- |" * (heads.count("|") + 1),
-    ]
+    rows = []
     for item in ITEMS:
         seeds, made, on = _made(folder / item.file, item.on, day_of or _day)
-        here = f"[{item.file}]({item.file})" if (folder / item.file).is_file() else "not made yet"
-        cells = [item.paper, item.shows, here, on, seeds, made, f"`{item.command}`", item.notebook, item.data]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        row = {"paper": item.paper, "what it shows": item.shows}
+        row["here"] = f"[{item.file}]({item.file})" if (folder / item.file).is_file() else "not made yet"
+        row |= {"made on": on, "seeds": seeds, "commit, date": made, "command": f"`{item.command}`"}
+        rows.append(row | {"notebook": item.notebook, "the paper's data": item.data})
+    return _INDEX + as_markdown(DataFrame(rows))
 
 
 def _made(file: Path, on: str, day_of: Callable[[str], str]) -> tuple[str, str, str]:
