@@ -185,8 +185,8 @@ def depth_image(depth_m: np.ndarray) -> np.ndarray:
 
 
 def draw_trail(image: np.ndarray, uv_px: np.ndarray, colour: str, width_px: int = 2) -> np.ndarray:
-    """A path (N, 2) through the image; NaN interrupts it."""
-    pairs = np.stack([uv_px[:-1], uv_px[1:]], 1)
+    """Paths (..., N, 2) through the image; NaN interrupts one."""
+    pairs = np.stack([uv_px[..., :-1, :], uv_px[..., 1:, :]], -2).reshape(-1, 2, 2)
     return _stroke(image, pairs[np.isfinite(pairs).all((1, 2))], colour, width_px, rim=0)
 
 
@@ -305,8 +305,9 @@ def _rimmed(
 ) -> np.ndarray:
     """``draw(image, rgb, thickness)`` first for a dark rim, then in colour, each as opaque as it says."""
     for paint, thickness, opacity in ((_RIM, width_px + 2, rim), (colour, width_px, strength)):
-        drawn = draw(image.copy(), style.rgb(paint), thickness)
-        image = cv2.addWeighted(drawn, opacity, image, 1 - opacity, 0)
+        if opacity:
+            drawn = draw(image.copy(), style.rgb(paint), thickness)
+            image = cv2.addWeighted(drawn, opacity, image, 1 - opacity, 0)
     return image
 
 

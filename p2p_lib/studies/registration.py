@@ -185,8 +185,7 @@ def draw_tracks(moment: Moment, width_px: int = 720) -> np.ndarray:
     now, before = (overlay.zoomed_px(uv, moment.camera, camera) for uv in (moment.uv_px, moment.uv_before_px))
     known = np.isfinite(moment.p_cam).all(1)
     for rows, colour in ((known & ~moment.right, _STRAYS), (known & moment.right, _FOLLOWS)):
-        for pair in np.stack([before, now], 1)[rows]:
-            image = overlay.draw_trail(image, pair, colour, 2)
+        image = overlay.draw_trail(image, np.stack([before, now], 1)[rows], colour, 2)
     image = overlay.draw_crosses(image, now[known & ~moment.right], _STRAYS, 4)
     image = overlay.draw_points(image, now[known & moment.right], _FOLLOWS, 3)
     return overlay.draw_caption(image, f"synthetic: mug turned by {moment.turned_deg:.0f} degrees")

@@ -100,8 +100,7 @@ class TrackScene:
             right, missed, wrong = (points & (came == k) for k in (Outcome.RIGHT, Outcome.MISSED, Outcome.WRONG))
             was_right = run.visible & (self.outcomes == Outcome.RIGHT)
             paths = np.where(was_right[..., None], uv_px, np.nan)[first : index + 1, right]
-            for path in paths.transpose(1, 0, 2):
-                image = overlay.draw_trail(image, path, self._colours[name], 1)
+            image = overlay.draw_trail(image, paths.transpose(1, 0, 2), self._colours[name], 1)
             image = overlay.draw_points(image, true_px[index, missed], style.OUTCOMES[Outcome.MISSED], 0.7)
             image = overlay.draw_points(image, uv_px[index, right], self._colours[name], 2.5)
             image = overlay.draw_points(image, uv_px[index, wrong], style.OUTCOMES[Outcome.WRONG], 4, filled=False)
