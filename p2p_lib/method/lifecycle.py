@@ -19,6 +19,10 @@ from p2p_lib.core.types import WITH_POSE, Status
 CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES = 5, 15
 #: Shape and colour have found an object where this share of its surface shows.
 SIGHTED, SIGHTED_STILL = 0.5, 0.3
+#: A longer time between two frames is a pause, s, if it is so many times what it was before, too.
+_PAUSE_S, _PAUSE = 0.25, 5
+#: Shape and colour tell a turn from all others by this lead.
+TELLING = 0.25
 
 
 @dataclass(frozen=True)
@@ -28,11 +32,13 @@ class Evidence:
     support        keypoints that agree with it
     surface_share  share of the depth points that lie on the surface under it; None where no surface was asked
     sighting       share of the surface that shows in the image where and as it should; None where nobody has looked
+    lead           share of that which is more than where it is turned otherwise; None where nobody has compared
     """
 
     support: int
     surface_share: float | None
     sighting: float | None = None
+    lead: float | None = None
 
 
 @dataclass(frozen=True)
@@ -51,22 +57,26 @@ class Lifecycle:
     status          of the newest frame
     T_cam_obj       newest pose, of whatever frame; None before the first
     seen_s          its time
+    pace_s          time between the newest two frames that followed each other with poses; infinite before
     T_previous      pose of the frame before it; None after a gap
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
     T_world_obj     newest pose in the scene that many points agreed with, where the camera was known; None before
     start_px        pixels of the newest mask before a map was started; None without a mask
+    doubted         since a gap nothing has told its turn from others that look alike
     lost_frames     frames since the newest pose in which it was in view and had none
     """
 
     status: Status = Status.INITIALISING
     T_cam_obj: np.ndarray | None = None
     seen_s: float = float("nan")
+    pace_s: float = float("inf")
     T_previous: np.ndarray | None = None
     T_left: np.ndarray | None = None
     confirming: int = 0
     T_world_obj: np.ndarray | None = None
     start_px: int | None = None
+    doubted: bool = False
     lost_frames: int = 0
 
     @property
@@ -83,6 +93,11 @@ class Lifecycle:
     def sought(self) -> bool:
         """Whether it is absent, or back by shape and colour alone."""
         return not self.has_pose or (self.confirming > 0 and self.status is Status.DEGRADED)
+
+    def at(self, time_s: float) -> Lifecycle:
+        """The state before a frame at this time: after a pause in the stream the object may be anywhere."""
+        paused = self.has_pose and time_s - self.seen_s > max(_PAUSE_S, _PAUSE * self.pace_s)
+        return replace(self, status=Status.LOST) if paused else self
 
     def motion_priors(self) -> dict[str, np.ndarray]:
         """Where the object is if it stays or moves on evenly: origin to T_cam_obj; empty after a gap."""
@@ -125,15 +140,17 @@ class Lifecycle:
         confirming = not self.has_pose or self.confirming > 1
         return Verdict(True, Status.RECOVERED if confirming else Status.TRACKED)
 
-    def with_pose(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:
-        """The state after a frame with an accepted pose."""
+    def with_pose(self, T_cam_obj: np.ndarray, time_s: float, status: Status, lead: float | None = None) -> Lifecycle:
+        """The state after a frame with an accepted pose, and the lead by which it was."""
         longest = CONFIRM_SIGHTED_FRAMES if status is Status.DEGRADED else CONFIRM_FRAMES
         return replace(
             self,
             status=status,
             T_cam_obj=T_cam_obj,
             seen_s=time_s,
+            pace_s=time_s - self.seen_s if self.has_pose else self.pace_s,
             lost_frames=0,
+            doubted=self.doubted if lead is None else lead < TELLING,
             T_previous=self.T_cam_obj if self.has_pose else None,
             T_left=self.T_left if self.has_pose else self.T_cam_obj,
             confirming=min(max(self.confirming - 1, 0), longest) if self.has_pose else longest,

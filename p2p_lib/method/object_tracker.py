@@ -22,7 +22,7 @@ from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method import refinement, registration, selection
 from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import GATES, SIGHTED, Evidence, Lifecycle, Verdict
+from p2p_lib.method.lifecycle import GATES, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
 from p2p_lib.method.object_model import NewPoints, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.refinement import Keypoints, Refinement, surface_distance
@@ -38,6 +38,8 @@ _FEW_KEYPOINTS = 12
 _GROWTH = 1.1
 #: A map is founded anew where an object has been lost for so many frames and shows more than this of what it knows.
 _PATIENCE, _OUTGROWN = 5, 1.5
+#: A pose that nothing has told from others since a gap is compared again every so many frames. Its confidence at most.
+_COMPARE_EVERY, _DOUBTED = 5, 0.5
 #: A lost object is looked for in every so many frames, turned as in so many of its keyframes at most. Depth this near
 #: its surface is on it, m.
 _TURN_EVERY, _TURNS, _ON_M = 2, 40, 0.01
@@ -45,11 +47,12 @@ _TURN_EVERY, _TURNS, _ON_M = 2, 40, 0.01
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A hypothesis, its pose refined on the surface, and how much of the surface shows there, once they are known."""
+    """A hypothesis, its pose refined on the surface, and what of the surface shows there, once they are known."""
 
     hypothesis: Hypothesis
     refined: Refinement | None = None
     sighting: float | None = None
+    lead: float | None = None
 
     @property
     def T_cam_obj(self) -> np.ndarray:
@@ -59,7 +62,8 @@ class Candidate:
     @property
     def evidence(self) -> Evidence:
         """What speaks for it."""
-        return Evidence(self.hypothesis.support, self.refined.inliers if self.refined.refined else None, self.sighting)
+        share = self.refined.inliers if self.refined.refined else None
+        return Evidence(self.hypothesis.support, share, self.sighting, self.lead)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +120,7 @@ class ObjectTracker:
             return self._initialise(obs)
         if self._hidden(obs.mask):
             return self._without_pose(obs, Status.OCCLUDED, f"{np.count_nonzero(obs.mask)} mask pixels")
+        self.life = self.life.at(obs.frame.time_s)
         candidates = [Candidate(hypothesis) for hypothesis in self._register(obs)]
         if self.config.selection.rule == "support":
             candidates = self._look_again(obs, self._refine(obs, candidates))
@@ -125,6 +130,7 @@ class ObjectTracker:
             return self._without_pose(obs, Status.OCCLUDED if nothing else Status.LOST, reason)
         if best.refined is None:
             (best,) = self._refine(obs, [best])
+        best = self._compared(obs, best)
         verdict = self.life.judge(best.evidence, self._gates, self.config.lifecycle)
         if not verdict.accepted:
             return self._without_pose(obs, verdict.status, verdict.reason)
@@ -210,6 +216,31 @@ class ObjectTracker:
         found = [search.at(c.T_cam_obj, self.model.sample) for c in candidates]
         return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
 
+    def _compared(self, obs: Observation, best: Candidate) -> Candidate:
+        """The pose of a return with its lead over the best that is turned otherwise, or that one, where it shows more.
+
+        Asked again now and then until a lead tells. Where no other turn is known, points have to agree with this one.
+        """
+        due = self.life.unconfirmed or (self.life.doubted and not obs.frame.index % _COMPARE_EVERY)
+        if not (due and self._searches and self._gates):
+            return best
+        with self._stopwatch("search"):
+            search, views = self._search(obs.frame), self.model.views.some(_TURNS)
+            own = search.at(best.T_cam_obj, self.model.sample)
+            other = search.otherwise(best.T_cam_obj, views, obs.cloud, self.model.sample)
+        if own is None or other is None:
+            return replace(best, lead=0.0 if own is None else self._agreement(obs, best))
+        lead = (own.share - other.share) / max(own.share, other.share, 1e-6)
+        if lead > -TELLING or other.share < SIGHTED:
+            return replace(best, lead=lead)
+        (turned,) = self._refine(obs, [Candidate(*self._surface_only({"other turn": other.T_cam_obj}))])
+        return replace(turned, sighting=other.share, lead=0.0)
+
+    def _agreement(self, obs: Observation, best: Candidate) -> float:
+        """The keypoints seen that agree, less those that do not, as a share of all."""
+        keypoints = obs.seen & self.map.promoted
+        return float(np.where(best.hypothesis.inliers[keypoints], 1, -1).mean()) if keypoints.any() else 0.0
+
     @property
     def _searches(self) -> bool:
         """Whether shape and colour have a say in a return."""
@@ -223,24 +254,24 @@ class ObjectTracker:
     def _extend(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
         """Take an accepted frame into the model, with a keyframe where one is due."""
         T_cam_obj, agrees, model = best.T_cam_obj, best.hypothesis.inliers, self.model
-        life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict.status)
+        life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict.status, best.lead)
         used = obs.seen & self.map.promoted
         requests = Requests(reject=self.map.ids[used & ~agrees])
         # Before a keyframe changes the map's rows.
         agreeing, agreement = self.map.confidence[agrees].sum(), (agrees & used).sum() / max(used.sum(), 1)
-        of_frame = self._covariance(obs, best)
+        of_frame, most = self._covariance(obs, best), _DOUBTED if life.doubted else 1.0
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
             keyframe = not life.confirming and model.keyframe_due(obs, T_cam_obj, agrees)
         model.settle_surface()
         if keyframe:
-            sure = confidence(self._of_pose(T_cam_obj, of_frame, best), agreeing, agreement)
+            sure = min(confidence(self._of_pose(T_cam_obj, of_frame, best), agreeing, agreement), most)
             good = obs.seen & (agrees | ~self.map.promoted)
             T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, self._sample(obs), good, of_frame, sure)
             requests = replace(asked, reject=requests.reject)
         self.life = replace(life, T_cam_obj=T_cam_obj).placed(obs.frame.T_world_cam)
         of_pose = self._of_pose(T_cam_obj, of_frame, best)
-        sure = confidence(of_pose, agreeing, agreement)
+        sure = min(confidence(of_pose, agreeing, agreement), most)
         return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, of_pose, keyframe), requests)
 
     def _covariance(self, obs: Observation, best: Candidate) -> np.ndarray:

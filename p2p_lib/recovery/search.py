@@ -41,8 +41,6 @@ _STEP_M, _STEPS = 0.03, 2
 _COARSE, _TRIED = 3, 3
 #: Of turns, so many are aligned that are so far apart, rad, moved by this step about the depth points, m.
 _TRIED_TURNS, _APART_RAD, _NEAR_M = 6, np.radians(20), 0.015
-#: Another turn, off the best by more than this, rad, is as good from this share on of what the best one shows.
-_OTHER_RAD, _ALIKE = np.radians(10), 0.8
 #: A place is no evidence where the surface, moved by its own size along itself, keeps this much of what it shows.
 _ANYWHERE = 0.7
 #: From this share on a pose is polished: by small motions (rad, m), all at first, then smaller ones about the best.
@@ -99,15 +97,24 @@ class ImageSearch:
             return None
         poses = _shifted(T_cam_obj, _STEP_M, _STEPS)
         share = self._roughly(poses, sample)
-        return self._best(poses[np.argsort(-share)[:_TRIED]], sample)
+        return self._best(self._all_aligned(poses[np.argsort(-share)[:_TRIED]], sample), sample)
 
     def turned(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> Sighting | None:
-        """The best pose of the object that these depth points are of, near the turns of T_cam_obj (V, 4, 4).
+        """The best pose of the object that these depth points (M, 3) are of, near the turns of T_cam_obj (V, 4, 4)."""
+        return self._best(self._turns(turns, cloud, sample), sample)
 
-        None, too, where another turn fits about as well: an object that looks alike from two sides shows neither.
-        """
+    def otherwise(
+        self, T_cam_obj: np.ndarray, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample
+    ) -> Sighting | None:
+        """As :meth:`turned`, the best of those that differ from a pose by their turn."""
+        found = self._turns(turns, cloud, sample)
+        other = [s for s in found if _turned_rad(T_cam_obj[None], s.T_cam_obj)[0] > _APART_RAD]
+        return max(other, key=lambda s: s.share, default=None)
+
+    def _turns(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> list[Sighting]:
+        """The best poses near some turns that differ, aligned."""
         if len(sample.p_obj) < _FEWEST or not len(cloud) or not len(turns):
-            return None
+            return []
         poses = np.concatenate([_shifted(T, _NEAR_M, 1) for T in _laid_on(turns, cloud, sample)])
         share, distinct = self._roughly(poses, sample), []
         for k in np.argsort(-share):
@@ -115,22 +122,19 @@ class ImageSearch:
                 distinct.append(k)
             if len(distinct) == _TRIED_TURNS:
                 break
-        best = self._best(poses[distinct], sample)
-        if best is None:
-            return None
-        others = [self.at(self._aligned(poses[k], sample), sample) for k in distinct]
-        others = [s for s in others if s is not None and s.share > _ALIKE * best.share]
-        alike = [_turned_rad(best.T_cam_obj[None], s.T_cam_obj)[0] > _OTHER_RAD for s in others]
-        return None if any(alike) else best
+        return self._all_aligned(poses[distinct], sample)
+
+    def _all_aligned(self, poses: np.ndarray, sample: SurfaceSample) -> list[Sighting]:
+        found = [self.at(self._aligned(T, sample), sample) for T in poses]
+        return [sighting for sighting in found if sighting is not None]
 
     def _roughly(self, poses: np.ndarray, sample: SurfaceSample) -> np.ndarray:
         """(H,) shares by some of the points, -inf where unknown."""
         return self._compare(poses, sample.select(np.arange(0, len(sample), _COARSE)), _ROUGH_M)[0]
 
-    def _best(self, poses: np.ndarray, sample: SurfaceSample) -> Sighting | None:
-        """The best of some poses, aligned and polished; None where it is none."""
-        found = [self.at(self._aligned(T, sample), sample) for T in poses]
-        best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
+    def _best(self, found: list[Sighting], sample: SurfaceSample) -> Sighting | None:
+        """The best of some, polished; None where it is none."""
+        best = max(found, key=lambda s: s.share, default=None)
         if best is None or best.share < _PROMISING or not self._distinct(best, sample):
             return None
         return self.at(self._polished(best, sample), sample)

@@ -8,7 +8,7 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.config import LifecycleConfig
 from p2p_lib.core.types import WITH_POSE, Status
-from p2p_lib.method.lifecycle import CONFIRM_FRAMES, GATES, SIGHTED, Evidence, Lifecycle
+from p2p_lib.method.lifecycle import CONFIRM_FRAMES, GATES, SIGHTED, TELLING, Evidence, Lifecycle
 
 CFG = LifecycleConfig()
 ALL = tuple(GATES)
@@ -100,6 +100,27 @@ def test_what_was_left_is_kept_through_the_frames_of_an_absence():
     lives = lived(GOOD, GOOD, Status.LOST, Status.OCCLUDED, Status.LOST)
     for life in lives[3:]:
         np.testing.assert_array_equal(life.T_cam_obj, pose(2))
+
+
+def test_a_return_is_doubted_until_its_turn_is_told_from_others():
+    life = lived(Status.OCCLUDED)[-1]
+    for k, (lead, doubted) in enumerate([(0.1, True), (None, True), (TELLING, False), (None, False)]):
+        life = life.with_pose(pose(k), k, Status.RECOVERED, lead)
+        assert life.doubted == doubted
+    assert not lived(GOOD, GOOD)[-1].doubted
+
+
+def test_after_a_pause_in_the_stream_an_object_may_be_anywhere():
+    life = Lifecycle().started(pose(0), 0.0, Status.TRACKED).with_pose(pose(1), 0.03, Status.TRACKED)
+    assert life.at(0.06).motion_priors() and life.at(0.2).motion_priors(), "a few frames are dropped"
+    paused = life.at(1.0)
+    assert (
+        paused.motion_priors() == {}
+        and paused.unconfirmed
+        and paused.with_pose(pose(2), 1.0, Status.RECOVERED).confirming
+    )
+    slow = Lifecycle().started(pose(0), 0.0, Status.TRACKED).with_pose(pose(1), 1.0, Status.TRACKED)
+    assert slow.at(2.0).motion_priors(), "a frame a second is no pause"
 
 
 # -- the scene -------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.method import refinement
 from p2p_lib.method.object_tracker import Candidate, ObjectStep, ObjectTracker
+from p2p_lib.recovery.search import ImageSearch
 from tests.method.analytic_scene import CAMERA, LUMP, look_from, render
 
 START = look_from((1.0, 0.2, 0.5))
@@ -606,7 +607,6 @@ def test_a_hint_says_that_what_lay_still_is_outside_the_image_where_the_camera_i
 def test_a_lost_object_is_looked_for_turned_as_in_its_keyframes():
     lump = settled(begun(), range(5, 65, 5))
     truth = se3.from_rt(np.eye(3), [0.05, 0.03, 0.1]) @ turned(25)
-    unseen = hide(lambda tracks: np.ones(len(tracks), bool))
     assert lump.see(truth, unseen).estimate.status is Status.LOST
     obs = lump.observed(truth, unseen)
     found = lump.tracker.sighted(obs)
@@ -619,6 +619,31 @@ def test_a_lost_object_is_looked_for_turned_as_in_its_keyframes():
     assert lump.tracker.sighted(replace(obs, frame=replace(obs.frame, depth_m=depth_m))) is None
     off_it = obs.cloud + 0.04 * np.array([0, 0, 1]) * np.array([0, 1, 0, -1])[np.arange(len(obs.cloud)) % 4, None]
     assert lump.tracker.sighted(replace(obs, cloud=off_it)) is None, "half of the depth in the mask is not on it"
+
+
+NOTHING = np.zeros((CAMERA.height, CAMERA.width), bool)
+
+
+def unseen(tracks: Tracks) -> Tracks:
+    return replace(tracks, visible=np.zeros(len(tracks), bool))
+
+
+def test_what_would_show_more_turned_otherwise_is_turned():
+    """All points come back where they agree on a wrong turn; depth says that it is another one."""
+    lump = settled(begun(), range(5, 65, 5))
+    assert lump.see(turned(60), mask=NOTHING).estimate.status is Status.OCCLUDED
+    step = lump.see(turned(10), moved_to(turned(60), lump, lambda tracks: tracks.ids >= 0))
+    assert step.estimate.confidence <= 0.5 and step.estimate.inliers == 0
+    assert lump.off(turned(10))[0] < 2 and lump.off(turned(10))[1] < 2
+
+
+def test_a_return_is_not_sure_while_another_turn_shows_as_much(monkeypatch):
+    lump = settled(begun(), range(5, 65, 5))
+    lump.see(turned(60), mask=NOTHING)
+    monkeypatch.setattr(ImageSearch, "otherwise", lambda self, T, turns, cloud, sample: self.at(T, sample))
+    assert max(lump.see(turned(60)).estimate.confidence for _ in range(12)) == 0.5
+    monkeypatch.setattr(ImageSearch, "otherwise", lambda *_: None)  # only points are left to tell
+    assert max(lump.see(turned(60)).estimate.confidence for _ in range(5)) > 0.7
 
 
 def test_questions_change_nothing():
