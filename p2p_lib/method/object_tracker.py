@@ -231,7 +231,7 @@ class ObjectTracker:
         if own is None or other is None:
             return replace(best, lead=0.0 if own is None else self._agreement(obs, best))
         lead = (own.share - other.share) / max(own.share, other.share, 1e-6)
-        if lead > -TELLING or other.share < SIGHTED:
+        if lead > -TELLING or other.share < SIGHTED or self.observer.cut_off(obs):
             return replace(best, lead=lead)
         (turned,) = self._refine(obs, [Candidate(*self._surface_only({"other turn": other.T_cam_obj}))])
         return replace(turned, sighting=other.share, lead=0.0)
