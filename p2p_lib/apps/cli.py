@@ -261,9 +261,7 @@ def _figures(a: argparse.Namespace) -> None:
     _RUN,
     arg("--format", required=True, choices=("bop", "tum", "poses"), help="BOP CSV, TUM, or 4x4 files"),
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
-    arg(
-        "--frame", choices=("object", "model"), help="tracker's (say so for bop without truth), or the model's by truth"
-    ),
+    arg("--frame", choices=("object", "model"), help="the tracker's (bop without truth needs it) or the model's"),
 )
 def _export(a: argparse.Namespace) -> None:
     from p2p_lib.run import export_run
