@@ -210,6 +210,8 @@ class _Job:
 def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> _Job:
     """Whatever can be wrong with the options is said here, before anything is tracked."""
     config, prompts, source = options.config(), options.prompts, str(sequence)
+    if options.depth_scale is not None:
+        source += f" --depth-scale {options.depth_scale:g}"
     if isinstance(prompts, str | Path):
         source += f" --prompts {prompts}"
         prompts = load_prompts(prompts)
@@ -357,6 +359,10 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
     return RunResult(out, evaluation, not_scored, _summary(done, len(job.frames)), interrupted, advice, tracked)
 
 
+#: A pose of less confidence is rather wrong than right.
+_DOUBTED = 0.5
+
+
 def _summary(run: Run, wanted: int) -> tuple[str, ...]:
     """How far the run came; per object how many frames have a pose and what mostly kept it from the others."""
     count = len(next(iter(run.objects.values())))
@@ -367,7 +373,9 @@ def _summary(run: Run, wanted: int) -> tuple[str, ...]:
         told = zip(obj.status[lost], obj.reason[lost], strict=True)
         why = Counter(reason if "out of view" in reason else f"{status}: {reason}" for status, reason in told)
         most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
-        lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{most}")
+        doubted = int((obj.has_pose & (obj.confidence < _DOUBTED)).sum())
+        doubts = f", {doubted} of them doubted (confidence below {_DOUBTED:g})" if doubted else ""
+        lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}")
     return tuple(lines)
 
 

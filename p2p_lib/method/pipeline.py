@@ -47,6 +47,8 @@ _LOG = logging.getLogger("p2p_lib")
 Masks = dict[str, np.ndarray | None]
 #: The camera is located every so many frames: while all objects have poses, while one is away.
 _LOCATE_EVERY, _LOCATE_EVERY_AWAY = 5, 2
+#: Few depth cameras see half of their pixels farther than this, m.
+_FAR_M = 50.0
 NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
@@ -314,6 +316,7 @@ class Point2Pose:
         """All objects' points in a single pass of the 2D tracker."""
         with self.stopwatch("tracking"):
             if not self._streaming:
+                _check_unit(frame)
                 self.tracker.start(frame, self.camera)
                 self._streaming = True
                 return NOTHING_TRACKED
@@ -321,6 +324,13 @@ class Point2Pose:
             search = np.logical_or.reduce(known) if len(known) == len(masks) > 0 else None
             urgent = any(obj.awaited(masks[name]) for name, obj in self.objects.items())
             return self.tracker.track(frame, search, urgent)
+
+
+def _check_unit(frame: Frame) -> None:
+    """Warn of depth that is hardly in metres."""
+    measured = frame.depth_m[frame.depth_m > 0]
+    if len(measured) and (middle_m := float(np.median(measured))) > _FAR_M:
+        doubt(f"depth of frame {frame.index}", f"{middle_m:.0f} m in the middle", "Is it in millimetres? Give metres.")
 
 
 class _Hints(Mapping[str, Hint]):

@@ -175,6 +175,12 @@ def test_the_configuration_may_be_a_presets_name():
         Point2Pose(CAMERA, {"preset": "paper"})
 
 
+def test_depth_in_millimetres_is_said():
+    frame, _ = film()[0]
+    with pytest.warns(Doubt, match=r"depth of frame 0: \d+ m in the middle. Is it in millimetres\?"):
+        Point2Pose(CAMERA).step(replace(frame, depth_m=1000 * frame.depth_m))
+
+
 def test_time_that_runs_backwards_is_said_once_and_statuses_are_logged(caplog):
     caplog.set_level("INFO", "p2p_lib")
     frames = [film()[k] for k in (0, 1, 2, 1, 0, 3)]
