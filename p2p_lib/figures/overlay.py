@@ -199,9 +199,12 @@ class Label:
     around_px: tuple[float, float, float, float]
 
 
-def draw_labels(image: np.ndarray, labels: Iterable[Label]) -> np.ndarray:
-    """Labels beside their rectangles, so that none covers another: above, else below, right or left."""
-    image, taken = image.copy(), []
+def draw_labels(image: np.ndarray, labels: Iterable[Label], caption: str = "") -> np.ndarray:
+    """Labels beside their rectangles, so that none covers another or the caption: above, else below, right or left."""
+    image, taken = draw_caption(image, caption) if caption else image.copy(), []
+    if caption:
+        (w, h), base = cv2.getTextSize(caption, _FONT, _SCALE, 1)
+        taken.append((0, 0, w + 12, h + base + 6))
     for label in labels:
         (w, h), base = cv2.getTextSize(label.text, _FONT, _SCALE, 1)
         w, h = w + 10, h + base + 4

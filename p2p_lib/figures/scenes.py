@@ -107,8 +107,8 @@ class Scene:
             image = overlay.draw_points(image, overlay.zoomed_px(dots[0], whole, camera), dots[1], 3)
         if not words:
             return image
-        image = overlay.draw_labels(image, [label for label in labels if label is not None])
-        return overlay.draw_caption(image, f"{self.sequence.name}  {frame.time_s - first.time_s[0]:.2f} s")
+        caption = f"{self.sequence.name}  {frame.time_s - first.time_s[0]:.2f} s"
+        return overlay.draw_labels(image, [label for label in labels if label is not None], caption)
 
     def film(self, rows: Iterable[int] | None = None, **drawing) -> Iterator[np.ndarray]:
         """The images of these rows (default: all) one after the other; ``drawing`` as of :meth:`draw`."""
@@ -228,5 +228,4 @@ def draw_live(
         image = overlay.draw_axes(image, method.camera, T_cam_obj, 0.06)
         low, high = np.nanmin(uv_px, 0), np.nanmax(uv_px, 0)
         labels.append(Label(f"{name}: {estimate.status}", colours[name], (*low, *high)))
-    image = overlay.draw_labels(image, labels)
-    return overlay.draw_caption(image, f"{title}  {frame.time_s - start_s:.2f} s".strip())
+    return overlay.draw_labels(image, labels, f"{title}  {frame.time_s - start_s:.2f} s".strip())
