@@ -31,6 +31,7 @@ from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
+from p2p_lib.method.confidence import DOUBTED
 from p2p_lib.method.mesh import save as save_mesh
 from p2p_lib.method.pipeline import Point2Pose
 
@@ -356,14 +357,10 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
         not_scored = "the sequence has no truth (looked for in annotated_poses/ of a folder)"
     tracked = any(obj.has_pose.any() for obj in done.objects.values())
     advice = "" if interrupted else _advice(done, job)
-    return RunResult(out, evaluation, not_scored, _summary(done, len(job.frames)), interrupted, advice, tracked)
+    return RunResult(out, evaluation, not_scored, summary(done, len(job.frames)), interrupted, advice, tracked)
 
 
-#: A pose of less confidence is rather wrong than right.
-_DOUBTED = 0.5
-
-
-def _summary(run: Run, wanted: int) -> tuple[str, ...]:
+def summary(run: Run, wanted: int) -> tuple[str, ...]:
     """How far the run came; per object how many frames have a pose and what mostly kept it from the others."""
     count = len(next(iter(run.objects.values())))
     hz, _ = rate(run.timings)
@@ -373,8 +370,8 @@ def _summary(run: Run, wanted: int) -> tuple[str, ...]:
         told = zip(obj.status[lost], obj.reason[lost], strict=True)
         why = Counter(reason if "out of view" in reason else f"{status}: {reason}" for status, reason in told)
         most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
-        doubted = int((obj.has_pose & (obj.confidence < _DOUBTED)).sum())
-        doubts = f", {doubted} of them doubted (confidence below {_DOUBTED:g})" if doubted else ""
+        doubted = int((obj.has_pose & (obj.confidence <= DOUBTED)).sum())
+        doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""
         lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}")
     return tuple(lines)
 

@@ -203,8 +203,7 @@ def draw_labels(image: np.ndarray, labels: Iterable[Label], caption: str = "") -
     """Labels beside their rectangles, so that none covers another or the caption: above, else below, right or left."""
     image, taken = draw_caption(image, caption) if caption else image.copy(), []
     if caption:
-        (w, h), base = cv2.getTextSize(caption, _FONT, _SCALE, 1)
-        taken.append((0, 0, w + 12, h + base + 6))
+        taken.append((0, 0, *_caption_size(caption, _SCALE)))
     for label in labels:
         (w, h), base = cv2.getTextSize(label.text, _FONT, _SCALE, 1)
         w, h = w + 10, h + base + 4
@@ -218,12 +217,17 @@ def draw_labels(image: np.ndarray, labels: Iterable[Label], caption: str = "") -
 
 def draw_caption(image: np.ndarray, text: str, scale: float = _SCALE) -> np.ndarray:
     """White words on a dark ground in the upper left corner."""
-    image = image.copy()
-    (w, h), base = cv2.getTextSize(text, _FONT, scale, 1)
-    ground = image[: h + base + 6, : w + 12]
+    image, (w, h) = image.copy(), _caption_size(text, scale)
+    ground = image[:h, :w]
     ground[:] = (ground * 0.35).astype(np.uint8)
-    cv2.putText(image, text, (6, h + 4), _FONT, scale, (255, 255, 255), 1, cv2.LINE_AA)
+    at = (6, 4 + cv2.getTextSize(text, _FONT, scale, 1)[0][1])
+    cv2.putText(image, text, at, _FONT, scale, (255, 255, 255), 1, cv2.LINE_AA)
     return image
+
+
+def _caption_size(text: str, scale: float) -> tuple[int, int]:
+    (w, h), base = cv2.getTextSize(text, _FONT, scale, 1)
+    return w + 12, h + base + 6
 
 
 def zoomed(

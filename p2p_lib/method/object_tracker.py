@@ -20,7 +20,7 @@ from p2p_lib.core.interfaces import Detector, Hint
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method import refinement, registration, selection
-from p2p_lib.method.confidence import confidence, pose_covariance
+from p2p_lib.method.confidence import DOUBTED, confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.lifecycle import GATES, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
 from p2p_lib.method.object_model import NewPoints, ObjectModel, Requests
@@ -38,8 +38,8 @@ _FEW_KEYPOINTS = 12
 _GROWTH = 1.1
 #: A map is founded anew where an object has been lost for so many frames and shows more than this of what it knows.
 _PATIENCE, _OUTGROWN = 5, 1.5
-#: A pose that nothing has told from others since a gap is compared again every so many frames. Its confidence at most.
-_COMPARE_EVERY, _DOUBTED = 5, 0.5
+#: A pose that nothing has told from others since a gap is compared again every so many frames.
+_COMPARE_EVERY = 5
 #: A lost object is looked for in every so many frames, turned as in so many of its keyframes at most. Depth this near
 #: its surface is on it, m.
 _TURN_EVERY, _TURNS, _ON_M = 2, 40, 0.01
@@ -259,7 +259,7 @@ class ObjectTracker:
         requests = Requests(reject=self.map.ids[used & ~agrees])
         # Before a keyframe changes the map's rows.
         agreeing, agreement = self.map.confidence[agrees].sum(), (agrees & used).sum() / max(used.sum(), 1)
-        of_frame, most = self._covariance(obs, best), _DOUBTED if life.doubted else 1.0
+        of_frame, most = self._covariance(obs, best), DOUBTED if life.doubted else 1.0
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
             keyframe = not life.confirming and model.keyframe_due(obs, T_cam_obj, agrees)
@@ -467,14 +467,16 @@ class ObjectTracker:
 
     def _left(self) -> bool:
         """Whether most keypoints of an absent object lay outside the image at its last pose."""
-        camera, T = self.observer.camera, self.life.T_cam_obj
-        inside = () if T is None else camera.inside(camera.project(se3.transform(T, self.map.p_obj)), -0.5)
-        return 2 * np.count_nonzero(inside) < len(inside)
+        return self.life.T_cam_obj is not None and self._inside(self.life.T_cam_obj).mean() < 0.5
 
     def _gone(self, frame: Frame) -> bool:
         """Whether nothing of an absent object would show in the image if it has lain still; False if nobody knows."""
-        camera, poses = self.observer.camera, self.life.scene_prior(frame.T_world_cam).values()
-        return any(not camera.inside(camera.project(se3.transform(T, self.map.p_obj)), -0.5).any() for T in poses)
+        return any(not self._inside(T).any() for T in self.life.scene_prior(frame.T_world_cam).values())
+
+    def _inside(self, T_cam_obj: np.ndarray) -> np.ndarray:
+        """(N,) bool: the keypoints that a pose puts into the image, whatever may hide them."""
+        camera = self.observer.camera
+        return camera.inside(camera.project(se3.transform(T_cam_obj, self.map.p_obj)), -0.5)
 
     def _hint(self, frame: Frame, uv_px: np.ndarray, T_cam_obj: np.ndarray, sighted: bool) -> Hint:
         """The hint of a pose, with the distances from the surface under it."""

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ from p2p_lib.core.errors import MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.run import summary
 from tests.fixtures.sliding_board import DEPTH_M, H, K, W, write_sequence
 
 FRAMES = 8
@@ -289,6 +291,8 @@ def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys
     assert "Next: p2p view" not in out and err.count("\n") == 1
     assert "object never had a pose (only 0 mask pixels with depth)" in err and "--depth-scale" in err
     assert err.endswith(f"Next: p2p check {sequence}\n")
+    assert run(sequence, tmp_path / "out", "--depth-scale", "0.001", "--force") == 2
+    assert capsys.readouterr().err.endswith(f"Next: p2p check {sequence} --depth-scale 0.001\n")
     for path in (sequence / "masks").iterdir():
         cv2.imwrite(str(path), np.zeros((H, W), np.uint8))
     assert run(sequence, tmp_path / "empty") == 2
@@ -589,6 +593,17 @@ def test_masks_of_some_frames_count_where_they_are_and_corrections_between_them(
     assert all(iou(kept[k], truth(k)) > 0.9 for k in (0, 1, 2, 5, 6, 7))
     info = load_run(out).info
     assert (info["masks"], [p["frame"] for p in info["prompts"]]) == ("drawn", [5])
+
+
+def test_a_run_says_how_many_poses_it_doubts(made):
+    name, obj = next(iter(made.run.objects.items()))
+    sure, posed = np.ones(len(obj)), np.flatnonzero(obj.has_pose)
+    doubtful = sure.copy()
+    doubtful[posed[:3]] = 0.5, 0.5, 0.1
+    for confidence, words in ((sure, f"{len(obj)} frames"), (doubtful, "3 of them doubted (confidence at most 0.5)")):
+        doubted = replace(made.run, objects={name: replace(obj, confidence=confidence)})
+        _, line = summary(doubted, len(obj))
+        assert words in line and ("doubted" in line) == (confidence is doubtful)
 
 
 def test_a_folder_of_ones_own_may_have_masks_of_some_images(sequence, tmp_path, capsys):

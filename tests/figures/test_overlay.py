@@ -195,6 +195,15 @@ def test_montage_puts_pictures_in_their_places():
         overlay.montage([images[0], images[1][:-1]], 2)
 
 
+def test_a_label_keeps_clear_of_the_caption():
+    label = Label("box: tracked", "#0072B2", (10.0, 30.0, 120.0, 200.0))  # above it is the caption
+    plain, captioned = (
+        overlay.draw_labels(picture(), [label], caption) for caption in ("", "synthetic/crossing 1.00 s")
+    )
+    count = [(image == style.rgb(label.colour)).all(2).sum() for image in (plain, captioned)]
+    assert count[0] == count[1] > 500
+
+
 def test_labels_do_not_cover_each_other():
     where = (300.0, 200.0, 400.0, 300.0)
     labels = [Label(f"object {k}: tracked", style.OBJECTS[k], where) for k in range(5)]
