@@ -6,10 +6,13 @@ file: the cache of one file does not know when another changes.
 
 from __future__ import annotations
 
+import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
+from types import FrameType
 from typing import TypeVar, cast
 
 F = TypeVar("F", bound=Callable)
@@ -45,3 +48,31 @@ def _compile(module: str) -> None:
             except RuntimeError:  # there is nowhere to keep it: it is compiled in every process
                 ready = numba.njit(nogil=True, error_model="numpy")(function)
             setattr(sys.modules[module], function.__name__, ready)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ctrl-C and SIGTERM that come within are answered at its end, and a second one at once.
+
+    A compiled function cannot be interrupted: it raises SystemError in the place of KeyboardInterrupt. Only the main
+    thread hears signals; in another this does nothing.
+    """
+    came: list[int] = []
+
+    def hold(number: int, at: FrameType | None) -> None:
+        came.append(number)
+        if len(came) > 1:
+            answers[number](number, at)
+
+    in_main = threading.current_thread() is threading.main_thread()
+    found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM) if in_main}
+    answers = {number: answer for number, answer in found.items() if callable(answer)}
+    for number in answers:
+        signal.signal(number, hold)
+    try:
+        yield
+    finally:
+        for number, answer in answers.items():
+            signal.signal(number, answer)
+        if came:
+            answers[came[0]](came[0], None)

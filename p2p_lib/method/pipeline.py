@@ -30,6 +30,7 @@ from p2p_lib.core.backends import (
     make_tracker,
 )
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.compiled import uninterrupted
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.interfaces import Hint, PointTracker, Segmenter
@@ -181,6 +182,7 @@ class Point2Pose:
                 yield estimates
         self._waiting.clear()
 
+    @uninterrupted()
     def _advance(self, frame: Frame, masks: Masks, said: dict[str, Prompt]) -> dict[str, PoseEstimate]:
         """Track into a frame, then segment and estimate at the frame that the tracks are of."""
         self._waiting.append((frame, masks, said))

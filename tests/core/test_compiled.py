@@ -1,10 +1,14 @@
 """Compiled functions: the same as in Python, of whatever else is compiled in their file, and wherever the file lies."""
 
 import os
+import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+
+from p2p_lib.core.compiled import uninterrupted
 
 FILE = '''
 import numpy as np
@@ -50,3 +54,33 @@ def test_a_function_is_compiled_once_when_it_is_called_and_kept(ask, tmp_path):
 def test_it_runs_where_nothing_can_be_written(ask):
     nowhere = os.devnull + "/nowhere"
     assert ask(HOME=nowhere, XDG_CACHE_HOME=nowhere, NUMBA_CACHE_LOCATOR_CLASSES="NoLocator") == "False Of x. 5.0 5.0"
+
+
+def test_what_is_uninterrupted_hears_the_signal_at_its_end():
+    before, done = signal.getsignal(signal.SIGINT), []
+    with pytest.raises(KeyboardInterrupt):
+        with uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+            done.append("all of it")
+    assert done and signal.getsignal(signal.SIGINT) is before
+
+
+def test_who_insists_is_heard_at_once():
+    with pytest.raises(KeyboardInterrupt), uninterrupted():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("it went on")
+
+
+def test_a_signal_that_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_another_thread_hears_no_signals():
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(uninterrupted()(lambda: 3)).result() == 3

@@ -1,5 +1,6 @@
 """The whole loop on a small rendered scene whose poses are known exactly: cartons before a printed wall."""
 
+import signal
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -755,3 +756,21 @@ def test_clicks_without_depth_are_refused_before_anything_is_done():
     other.add_object("left", clicks=clicks)
     # A frame with depth is taken as if nothing had been.
     assert_same([method.step(f) for f, _ in film()[:4]], [other.step(f) for f, _ in film()[:4]])
+
+
+def test_ctrl_c_in_the_middle_of_a_frame_is_heard_after_it(monkeypatch):
+    """Compiled functions that are interrupted raise another error, and half a frame would be no state to go on from."""
+    method = Point2Pose(CAMERA, quick())
+    method.add_object("left")
+    follow = method.tracker.track
+    steps = []
+    for frame, masks in film()[:6]:
+        with monkeypatch.context() as m:
+            if frame.index == 3:
+                m.setattr(method.tracker, "track", lambda *now: (signal.raise_signal(signal.SIGINT), follow(*now))[1])
+                with pytest.raises(KeyboardInterrupt):
+                    method.step(frame, {"left": masks["left"]})
+            else:
+                steps.append(method.step(frame, {"left": masks["left"]}))
+    whole = track(film()[:6], ["left"])
+    assert_same(steps, whole[:3] + whole[4:])
