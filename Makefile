@@ -16,7 +16,7 @@ setup: ## set up .venv (about a minute the first time, instant when nothing has 
 	@$(PYTHON) tools/bootstrap.py
 
 reproduce: setup ## run every notebook on bundled data into out/quick (profile quick: CPU, no downloads)
-	@.venv/bin/p2p notebooks --profile quick
+	@.venv/bin/p2p notebooks --profile quick --jobs 2
 
 figures: setup ## every table and figure of the paper from the data and backends present; goes on where it was stopped
 	@.venv/bin/p2p benchmark --present --out out/benchmark --tables out/full/tables
