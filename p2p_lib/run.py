@@ -18,7 +18,7 @@ from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt
 from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.types import Frame, PoseEstimate
+from p2p_lib.core.types import Frame, PoseEstimate, status_text
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import moving_scale
 from p2p_lib.datasets.exchange import as_run, export, read_poses
@@ -367,8 +367,7 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
-        told = zip(obj.status[lost], obj.reason[lost], strict=True)
-        why = Counter(reason if "out of view" in reason else f"{status}: {reason}" for status, reason in told)
+        why = Counter(map(status_text, obj.status[lost], obj.reason[lost]))
         most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
         doubted = int((obj.has_pose & (obj.confidence <= DOUBTED)).sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""

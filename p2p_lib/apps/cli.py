@@ -70,7 +70,7 @@ def _run(a: argparse.Namespace) -> int:
 
 @command(
     "live",
-    "track objects before a camera; a line of JSON per object and frame",
+    "track objects before a camera; a line of JSON per object and frame, on a terminal with --out a readable one",
     arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
     arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
     run_options(
@@ -82,7 +82,7 @@ def _run(a: argparse.Namespace) -> int:
     _NO_BROWSER,
 )
 def _live(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.live import LiveCount, click_first, json_line, track_live
+    from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
     from p2p_lib.datasets.cameras import open_camera
     from p2p_lib.datasets.prompts import load_prompts
     from p2p_lib.datasets.run_writer import look_into
@@ -90,18 +90,16 @@ def _live(a: argparse.Namespace) -> None:
     options, count, first = RunOptions.of_arguments(a), LiveCount(), None
     options.config()  # what does not fit is said before the camera starts
     _film_wanted(a.overlay)
-    if_exists = a.if_exists or "refuse"
+    keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
     if a.out is not None:
-        look_into(a.out, if_exists)  # before anyone clicks
+        look_into(a.out, keep["if_exists"])  # before anyone clicks
     prompts = load_prompts(a.prompts) if a.prompts else ()
     camera = open_camera(a.camera, a.rate)
     try:
         if not prompts:
             prompts, first = click_first(camera, warn, not a.no_browser)
-        show = partial(print, flush=True)
-        keep = {"first": first, "count": count, "out": a.out, "overlay": a.overlay}
-        keep["if_exists"] = if_exists
-        track_live(camera, prompts, lambda estimate: show(json_line(estimate)), options, **keep)
+        line = text_line if a.out is not None and sys.stdout.isatty() else json_line
+        track_live(camera, prompts, lambda estimate: print(line(estimate), flush=True), options, first=first, **keep)
     except KeyboardInterrupt:
         pass  # how one stops a camera
     finally:
@@ -152,7 +150,11 @@ def _eval(a: argparse.Namespace) -> None:
 
             _show(consistency(run), a.json)
             if not a.json and not (a.run / "masks").is_dir() and run.info["masks"] != "dataset":
-                warn("p2p eval: no masks were kept, so none is compared with. p2p run --save-masks keeps them.")
+                again = f"p2p run {run.info['path'] or run.info['sequence']} --out {a.run} --force --save-masks"
+                if prompts := (run.info.get("options") or {}).get("prompts"):
+                    again += f" --prompts {prompts}"
+                empty = "where seen and mask IoU are empty, because no masks were kept"
+                warn(f"p2p eval: {empty}. Next, with any other options of the run: {again}")
 
 
 @command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, _JSON, _MIN_VISIBLE)

@@ -22,7 +22,7 @@ from p2p_lib.core.backends import SEGMENTERS
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.types import Frame, PoseEstimate
+from p2p_lib.core.types import Frame, PoseEstimate, status_text
 from p2p_lib.datasets.cameras import LiveCamera, Newest, Stream
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.figures.film import Film
@@ -174,6 +174,15 @@ def click_first(
     with tempfile.TemporaryDirectory() as folder:
         page = Clicker(Stream(camera.name, camera.camera, image), Path(folder) / "prompts.json")
         return wait_for_clicks(page, say, open_browser), image
+
+
+def text_line(estimate: PoseEstimate) -> str:
+    """An estimate as a line for people: time, object, status; its place in the camera's frame, or why it has none."""
+    said = f"{estimate.time_s:.2f} s  {estimate.object}: "
+    if estimate.T_cam_obj is None:
+        return said + status_text(estimate.status, estimate.reason)
+    x, y, z = estimate.T_cam_obj[:3, 3]
+    return f"{said}{estimate.status}  {x:.3f} {y:.3f} {z:.3f} m  confidence {estimate.confidence:.2f}"
 
 
 def json_line(estimate: PoseEstimate) -> str:

@@ -144,6 +144,15 @@ class Status(StrEnum):
     RECOVERED = "recovered"  # the first frames after occluded or lost
 
 
+#: How the reason of an occlusion begins where the object has left the image.
+OUT_OF_VIEW = "out of view"
+
+
+def status_text(status: str, reason: str) -> str:
+    """``STATUS: REASON`` as people are told it: nothing occludes an object that has left the image."""
+    return reason if reason.startswith(OUT_OF_VIEW) else f"{status}: {reason}"
+
+
 #: Statuses that carry a pose of this very frame.
 WITH_POSE = frozenset({Status.TRACKED, Status.DEGRADED, Status.RECOVERED})
 

@@ -53,18 +53,14 @@ class Judged:
 
 
 def pose_error(obj: ObjectRun, score: ObjectScore) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation error (n,) in radians and translation error (n,) in metres of the model's frame; NaN without a pose."""
-    T_error = se3.inverse(obj.T_cam_model) @ (obj.T_cam_obj @ score.T_obj_model)
-    known = np.isfinite(T_error).all((1, 2))
-    angle_rad = np.full(len(known), np.nan)
-    angle_rad[known] = se3.angle_rad(T_error[known])
-    return angle_rad, np.linalg.norm(T_error[:, :3, 3], axis=1)
+    """Rotation error (n,) in degrees and translation error (n,) in mm of the model's frame; NaN without a pose."""
+    return se3.error_deg_mm(obj.T_cam_obj @ score.T_obj_model, obj.T_cam_model)
 
 
 def right_poses(obj: ObjectRun, score: ObjectScore) -> np.ndarray:
     """(n,) bool: frames with a pose within 2 cm and 5 degrees of the truth."""
-    angle_rad, apart_m = pose_error(obj, score)
-    return (np.degrees(angle_rad) <= MAX_DEG) & (apart_m <= MAX_M)
+    deg, mm = pose_error(obj, score)
+    return (deg <= MAX_DEG) & (mm <= 1e3 * MAX_M)
 
 
 def judge(run: Run, evaluation: Evaluation) -> dict[str, Judged]:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from p2p_lib.core import tables
+from p2p_lib.core import se3, tables
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.models import given_models, load_points
 from p2p_lib.datasets.runs import NO_MASKS, ObjectRun, Run
@@ -138,7 +138,7 @@ def evaluate(
         if not obj.has_truth.any():
             left_out[name] = "the sequence has no truth for it"
         elif name not in points:
-            left_out[name] = f"no model: give --models {name}=PATH"
+            left_out[name] = f"no model for ADD (give --models {name}=PATH){_apart(obj, at & obj.has_pose)}"
         elif not at.any():
             left_out[name] = f"in no frame it has truth and {min_visible_px} visible pixels"
         else:
@@ -171,6 +171,16 @@ def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) ->
         lost=int((~has_pose).sum()),
     )
     return replace(scores, returns=tuple(recovery_events(obj, scores)))
+
+
+def _apart(obj: ObjectRun, at: np.ndarray) -> str:
+    """What can be said without a model: how far the poses of frames (n,) bool are from the truth; "" without any."""
+    if not at.any():
+        return ""
+    T_cam_obj, T_cam_model = obj.T_cam_obj[at], obj.T_cam_model[at]
+    deg, mm = se3.error_deg_mm(T_cam_obj @ align_first(T_cam_obj, T_cam_model), T_cam_model)
+    off = f"{np.median(deg):.1f}° and {np.median(mm):.1f} mm"
+    return f"; its poses are {off} off the truth (medians of {len(deg)} frames, aligned at the first)"
 
 
 def model_frames(run: Run) -> dict[str, np.ndarray]:

@@ -148,10 +148,9 @@ def stage_timings(run: Run) -> Figure:
 def _draw_errors(axes: list[Axes], name: str, obj: ObjectRun, score: ObjectScore, colour: str) -> None:
     """One object's three lines over all frames; what is not scored is left out."""
     rows = np.searchsorted(obj.frame_index, score.frame_index)
-    angle_rad, apart_m = pose_error(obj, score)
     add_m, scored = np.full(len(obj), np.nan), np.zeros(len(obj), bool)
     add_m[rows], scored[rows] = np.where(np.isfinite(score.add_m), score.add_m, np.nan), True
-    for axis, values in zip(axes, (1e3 * add_m, np.degrees(angle_rad), 1e3 * apart_m)):
+    for axis, values in zip(axes, (1e3 * add_m, *pose_error(obj, score))):
         # The frame of the alignment has no error at all, which a logarithm cannot show: below a micrometre is none.
         shown = np.where(scored & (values > 1e-3), values, np.nan)
         axis.plot(obj.time_s, shown, color=colour, marker=".", markersize=2.5, label=name)

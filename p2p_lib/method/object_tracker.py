@@ -18,7 +18,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config
 from p2p_lib.core.interfaces import Detector, Hint
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
+from p2p_lib.core.types import OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method import refinement, registration, selection
 from p2p_lib.method.confidence import DOUBTED, confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
@@ -367,7 +367,7 @@ class ObjectTracker:
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
         self.life = self.life.without_pose(status)
-        reason = f"out of view: {reason}" if status is Status.OCCLUDED and self._left() else reason
+        reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self._left() else reason
         estimate = PoseEstimate(
             self.name,
             obs.frame.index,

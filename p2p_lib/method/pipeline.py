@@ -276,6 +276,9 @@ class Point2Pose:
 
     def _given(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> Masks:
         """Every object's checked mask in this frame; None for one that the segmenter has to find."""
+        if not isinstance(frame, Frame):
+            got = f"{type(frame).__name__} {getattr(frame, 'shape', '')}".strip()
+            raise BadInput("frame", got, "Frame(index, time_s, rgb, depth_m)", "Colour needs its depth and its time.")
         if frame.shape != (self.camera.height, self.camera.width):
             got = f"{frame.shape[1]}x{frame.shape[0]}"
             raise BadInput(f"frame {frame.index}", got, f"{self.camera.width}x{self.camera.height} as the camera")

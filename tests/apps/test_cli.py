@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -660,7 +661,13 @@ def test_an_object_of_ones_own_is_tracked_without_score(sequence, tmp_path, caps
     assert "my board: a pose in 8 of 8 frames" in capsys.readouterr().out
     assert cli.main(["eval", str(tmp_path / "out")]) == 0
     out, err = capsys.readouterr()
-    assert "my board" in out and err.count("\n") == 1 and "p2p run --save-masks keeps them" in err
+    assert "my board" in out and err.count("\n") == 1 and "where seen and mask IoU are empty" in err
+    again = shlex.split(err.partition("of the run: p2p ")[2])
+    assert cli.main([*again, *POINTS_ALONE]) == 0
+    capsys.readouterr()
+    assert cli.main(["eval", str(tmp_path / "out")]) == 0
+    out, err = capsys.readouterr()
+    assert err == "" and "mask IoU" in out
 
 
 BAD_CLICKS = {

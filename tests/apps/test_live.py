@@ -4,6 +4,7 @@ import json
 import queue
 import re
 import shutil
+import sys
 import threading
 import time
 from urllib.request import Request, urlopen
@@ -14,12 +15,12 @@ import numpy as np
 import pytest
 
 from p2p_lib.apps import cli
-from p2p_lib.apps.live import json_line, track_live
+from p2p_lib.apps.live import json_line, text_line, track_live
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.types import Frame, Status
+from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.prompts import save_prompts
@@ -241,9 +242,27 @@ def test_live_prints_a_line_per_object_and_frame(folder, tmp_path, capsys):
     assert np.shape(last["covariance"]) == (6, 6)
 
 
-def test_no_pose_is_null_and_the_line_is_strict_json():
-    from p2p_lib.core.types import PoseEstimate
+def test_on_a_terminal_a_run_that_is_kept_is_told_in_short_lines(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    prompts = save_prompts(tmp_path / "p.json", PROMPTS)
+    live = ["live", "--camera", f"folder:{folder}", "--rate", "40", "--prompts", str(prompts), *WORDS]
+    assert cli.main([*live, "--out", str(tmp_path / "run")]) == 0
+    *_, last = capsys.readouterr().out.splitlines()
+    obj = load_run(tmp_path / "run").objects["board"]
+    x, y, z = obj.T_cam_obj[-1, :3, 3]
+    assert (
+        last
+        == f"{obj.time_s[-1]:.2f} s  board: tracked  {x:.3f} {y:.3f} {z:.3f} m  confidence {obj.confidence[-1]:.2f}"
+    )
+    assert cli.main(live) == 0 and capsys.readouterr().out.startswith("{"), "nothing else keeps it"
 
+
+def test_a_line_for_people_says_why_there_is_no_pose():
+    gone = PoseEstimate("mug", 3, 0.1, Status.OCCLUDED, reason="out of view: 0 mask pixels")
+    assert text_line(gone) == "0.10 s  mug: out of view: 0 mask pixels"
+
+
+def test_no_pose_is_null_and_the_line_is_strict_json():
     line = json_line(PoseEstimate("mug", 3, 0.1, Status.LOST, reason='says "no"'))
     assert json.loads(line) | {"reason": ""} == {
         "time_s": 0.1,

@@ -241,12 +241,28 @@ def test_objects_that_cannot_be_scored_are_left_out_with_the_reason():
     assert list(evaluation.objects) == ["cup"] and set(evaluation.as_dict()["objects"]) == {"cup"}
     assert evaluation.left_out == {
         "lid": "the sequence has no truth for it",
-        "jar": "no model: give --models jar=PATH",
+        "jar": f"no model for ADD (give --models jar=PATH); its poses are 0.0° and 0.0 mm off the truth "
+        f"(medians of {N} frames, aligned at the first)",
         "pen": "in no frame it has truth and 300 visible pixels",
     }
     assert "jar: not scored, no model" in evaluation.as_table()
-    with pytest.raises(MissingData, match=r"nothing to score: jar: no model: give --models jar=PATH"):
+    with pytest.raises(MissingData, match=r"nothing to score: jar: no model for ADD \(give --models jar=PATH\)"):
         evaluate(a_run(jar=objects["jar"], points={}))
+
+
+def test_without_a_model_the_poses_are_still_compared_with_the_truth():
+    """Whatever the object frame: two thirds of the poses are off by 4 degrees and 30 mm, one frame has none."""
+    truth = motion(np.random.default_rng(2))
+    poses = truth @ se3.exp(np.array([0.4, -1.0, 2.0, 0.1, -0.2, 0.3]))
+    off = se3.from_rt(se3.exp(np.array([0, np.radians(4), 0, 0, 0, 0]))[:3, :3], np.array([0.03, 0, 0]))
+    wrong = truth @ off @ se3.inverse(truth) @ poses
+    poses[N // 3 :] = wrong[N // 3 :]
+    poses[1] = np.nan
+    with pytest.raises(MissingData, match=rf"4\.0° and 30\.0 mm off the truth \(medians of {N - 1} frames, aligned"):
+        evaluate(a_run(jar=object_run(poses, truth), points={}))
+    never = a_run(jar=object_run(np.full_like(truth, np.nan), truth), points={})
+    with pytest.raises(MissingData, match=r"jar=PATH\)$"):
+        evaluate(never)
 
 
 def test_models_given_to_the_evaluation(tmp_path):

@@ -55,6 +55,16 @@ def test_a_hidden_object_has_only_its_true_box(made, scene):
         assert in_colour(plain, style.TRUTH, uv) < 0.1
 
 
+def test_the_label_of_what_left_the_image_does_not_say_occluded(made, scene):
+    obj = made.run.objects["box"]
+    row = gaps(obj)[0][0]
+    gone, words = {"status": np.full(len(obj), "occluded")}, []
+    for reason in ("0 mask pixels", "out of view: 0 mask pixels"):
+        gone["reason"] = np.full(len(obj), reason)
+        words.append(scene._label(made.sequence.camera, "box", replace(obj, **gone), row).text)
+    assert words == ["box: occluded", "box: out of view"]
+
+
 def test_a_wrong_pose_is_drawn_where_it_is(made, scene):
     """The truth in white beside the estimate: 2 cm are about 20 pixels here."""
     image = scene.draw(6, axes=False, trail=0)

@@ -534,6 +534,10 @@ def test_refusals_name_what_came_and_what_is_known():
     small = Frame(3, 0.0, frame.rgb[:200, :300], frame.depth_m[:200, :300])
     with pytest.raises(BadInput, match="frame 3: got 300x200, expected 400x300 as the camera"):
         method.step(small, {})
+    with pytest.raises(
+        BadInput, match=r"frame: got ndarray \(300, 400, 3\), expected Frame\(index, time_s, rgb, depth_m\)"
+    ):
+        method.step(frame.rgb)
     with pytest.raises(BadInput, match=r"add_object: got 'left', expected a name not in use. In use: left"):
         method.add_object("left")
     with pytest.raises(BadInput, match="remove_object: got 'cup', expected one of left"):
