@@ -65,7 +65,7 @@ class MethodConfig(_Checked):
         "The object frame starts at the camera (T_cam_obj = I) or at the centroid of the first masked cloud.",
         choices=("camera", "centroid"),
     )
-    motion: bool = _p(True, "The motion so far is evidence: last poses compete, jumps need support.")
+    motion: bool = _p(True, "Motion is evidence: last poses compete, jumps need support, keypoints have moved along.")
     redetection: bool = _p(True, "Where few points are seen, their pose tells where to look for the others.")
     scene: bool = _p(True, "An absent object is searched for by shape and colour where the scene says it was left.")
     gates: str = _p("all", "A pose has to pass all gates of the life cycle, or none.", choices=("none", "all"))

@@ -3,6 +3,9 @@
 New points are pending until they have proved themselves over several frames in a row; promoted ones
 are keypoints p_n in the object frame that frames are registered to. Where the main text (a score
 within a time window) and the appendix (a streak of consecutive frames) differ, this follows the appendix.
+
+Ours beyond the paper: a point has to move with the object. What is mirrored in a turning object stands still before
+the camera, and is tight enough for a keypoint for as long as the object turns slowly.
 """
 
 from __future__ import annotations
@@ -34,28 +37,36 @@ class KeypointMap:
         self.confidence = np.zeros(0)
         self._streak, self._age = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._agreed, self._disagreed = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        self._history = np.zeros((0, _HISTORY, 3))
+        self._in_object, self._in_camera = np.zeros((0, _HISTORY, 3)), np.zeros((0, _HISTORY, 3))
         self._observations = np.zeros(0, np.int64)
 
     def __len__(self) -> int:
         return len(self.keys)
 
-    def add(self, keys: np.ndarray, p_obj: np.ndarray, promoted: bool = False, confidence: float = 1.0) -> None:
+    def add(
+        self,
+        keys: np.ndarray,
+        p_obj: np.ndarray,
+        promoted: bool = False,
+        confidence: float = 1.0,
+        p_cam: np.ndarray | None = None,
+    ) -> None:
         """New points (N,) at p_obj (N, 3), with larger keys than all before. The first frame's are promoted at once.
 
-        They define the map. ``confidence`` is that of the pose that places them. Their ids are unknown until
-        :meth:`assign`.
+        They define the map. ``confidence`` is that of the pose that places them, ``p_cam`` (N, 3) where the camera
+        sees them. Their ids are unknown until :meth:`assign`.
         """
         n = len(keys)
-        history = np.full((n, _HISTORY, 3), np.nan)
-        history[:, 0] = p_obj
+        histories = np.full((2, n, _HISTORY, 3), np.nan)
+        histories[0, :, 0], histories[1, :, 0] = p_obj, p_obj if p_cam is None else p_cam
         new = {
             "keys": np.asarray(keys, np.int64),
             "ids": np.full(n, -1),
             "p_obj": p_obj,
             "promoted": np.full(n, promoted),
             "confidence": np.full(n, float(confidence)),
-            "_history": history,
+            "_in_object": histories[0],
+            "_in_camera": histories[1],
             "_observations": np.ones(n, np.int64),
         }
         nothing = np.zeros(n, np.int64)
@@ -68,27 +79,34 @@ class KeypointMap:
         self.ids[np.searchsorted(self.keys, keys[there])] = ids[there]
         return ids[~there]
 
-    def observe(self, p_obj: np.ndarray, uncertainty: np.ndarray, stable: bool) -> np.ndarray:
+    def observe(
+        self, p_obj: np.ndarray, uncertainty: np.ndarray, stable: bool, p_cam: np.ndarray | None = None
+    ) -> np.ndarray:
         """Take in one frame's observations of all points; returns the keys promoted by it.
 
         p_obj        (N, 3) in the object frame at the frame's pose; NaN where a point was not visible
                      in the mask with depth
         uncertainty  (N,) of the tracks
         stable       the pose moved little since the last frame ("Pose Stability")
+        p_cam        (N, 3) where the camera sees them: those that are stiller there than in the object are not
+                     promoted. None: nothing is asked of it
         """
         cfg = self.config
         self._age += 1
         passed = stable & np.isfinite(p_obj[:, 0]) & (uncertainty < cfg.max_uncertainty) & ~self.promoted
         self._streak = np.where(passed, self._streak + 1, 0)
         at = np.flatnonzero(passed)
-        self._history[at, self._observations[at] % _HISTORY] = p_obj[at]
+        self._in_object[at, self._observations[at] % _HISTORY] = p_obj[at]
+        if p_cam is not None:
+            self._in_camera[at, self._observations[at] % _HISTORY] = p_cam[at]
         self._observations[at] += 1
         ready = np.flatnonzero(passed & (self._streak >= cfg.streak))
         if not len(ready):
             return np.zeros(0, np.int64)
-        centre = np.nanmedian(self._history[ready], 1)
-        scatter_m = np.nanmedian(np.linalg.norm(self._history[ready] - centre[:, None], axis=-1), 1)
+        centre, scatter_m = _scatter(self._in_object[ready])
         tight = scatter_m < cfg.max_scatter_m
+        if p_cam is not None:  # noise is the same in both, so that the smaller one tells, however small they are
+            tight &= scatter_m < _scatter(self._in_camera[ready])[1]
         rows = ready[tight]
         self.p_obj[rows], self.promoted[rows], self._age[rows] = centre[tight], True, 0
         return self.keys[rows]
@@ -125,3 +143,9 @@ class KeypointMap:
 
     def _columns(self) -> list[str]:
         return [name for name, value in vars(self).items() if isinstance(value, np.ndarray)]
+
+
+def _scatter(history_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of observations (N, K, 3), NaN where there are fewer: their median (N, 3), the median distance from it (N,)."""
+    centre = np.nanmedian(history_m, 1)
+    return centre, np.nanmedian(np.linalg.norm(history_m - centre[:, None], axis=-1), 1)

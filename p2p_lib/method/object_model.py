@@ -110,7 +110,9 @@ class ObjectModel:
         """
         stable = moved is not None and moved[0] < _STABLE_M and moved[1] < _STABLE_DEG
         self.map.count(obs.seen & self.map.promoted, agrees)
-        self.map.observe(se3.transform(se3.inverse(T_cam_obj), obs.p_cam), obs.tracks.uncertainty, stable)
+        p_obj = se3.transform(se3.inverse(T_cam_obj), obs.p_cam)
+        p_cam = obs.p_cam if self.config.method.motion else None
+        self.map.observe(p_obj, obs.tracks.uncertainty, stable, p_cam)
         self._since_keyframe += 1
 
     def keyframe_due(self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray) -> bool:
@@ -142,7 +144,7 @@ class ObjectModel:
         old_keys = self.map.keys[agrees]
         keys = self._next_key + np.arange(len(new))
         self._next_key += len(new)
-        self.map.add(keys, p_obj, promoted=self.empty, confidence=confidence)
+        self.map.add(keys, p_obj, self.empty, confidence, new.p_cam)
         vertex, registered = None, T_cam_obj
         if self.graph is not None:
             with self._stopwatch("graph"):

@@ -389,3 +389,37 @@ def test_every_point_keeps_the_confidence_it_came_with():
         points.observe(np.full((3, 3), np.nan), np.ones(3), stable=True)
     assert points.retire()[0].tolist() == [9]
     assert points.confidence.tolist() == [1.0, 1.0]
+
+
+# --- a point has to move with the object -------------------------------------------------------
+
+
+def turned(points: KeypointMap, in_object: np.ndarray, in_camera: np.ndarray, noise_m: np.ndarray) -> list[int]:
+    """Each point's promotions while it is observed, frame by frame, with the same noise in both frames."""
+    promoted = []
+    for p_obj, p_cam, noise in zip(in_object, in_camera, noise_m):
+        promoted += points.observe(p_obj + noise, np.zeros(len(p_obj)), True, p_cam + noise).tolist()
+    return promoted
+
+
+def test_a_reflection_is_no_keypoint_and_a_print_is():
+    """On a mug of 4 cm that turns by a degree a frame before a noisy camera."""
+    rng, frames = np.random.default_rng(0), np.radians(np.arange(1, 21.0))
+    still = np.array([0.0, 0.0, -0.04])
+    moves = 0.04 * np.stack([np.sin(frames), 0 * frames, -np.cos(frames)], -1)
+    back = 0.04 * np.stack([-np.sin(frames), 0 * frames, -np.cos(frames)], -1)
+    points = KeypointMap(CFG)
+    points.add(np.array([1, 2]), np.stack([still, still]), p_cam=np.stack([still, still]))
+    in_object = np.stack([np.broadcast_to(still, (20, 3)), back], 1)
+    in_camera = np.stack([moves, np.broadcast_to(still, (20, 3))], 1)
+    noise_m = rng.normal(0, 0.0003, (20, 2, 3))
+    assert turned(points, in_object, in_camera, noise_m) == [1]
+    # The appendix asks for no more than to be tight.
+    plain = pending(2, at=still)
+    assert 11 in [key for p, n in zip(in_object, noise_m) for key in plain.observe(p + n, np.zeros(2), True).tolist()]
+
+
+def test_where_nothing_moves_nothing_is_promoted():
+    points = KeypointMap(CFG)
+    points.add(np.array([1]), HERE[None], p_cam=HERE[None])
+    assert turned(points, np.full((20, 1, 3), HERE), np.full((20, 1, 3), HERE), np.zeros((20, 1, 3))) == []
