@@ -66,7 +66,7 @@ def uninterrupted() -> Iterator[None]:
 
     in_main = threading.current_thread() is threading.main_thread()
     found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM) if in_main}
-    answers = {number: answer for number, answer in found.items() if callable(answer)}
+    answers: dict[int, Callable] = {number: answer for number, answer in found.items() if callable(answer)}
     for number in answers:
         signal.signal(number, hold)
     try:
