@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 from collections import Counter
 from pathlib import Path
@@ -48,6 +49,14 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"test data not present at {folder} (set P2P_SHARED_DATA)")
     return folder
+
+
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C interrupts, also where a shell that runs its jobs in the background has them ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 class Browser:

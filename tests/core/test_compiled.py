@@ -56,7 +56,7 @@ def test_it_runs_where_nothing_can_be_written(ask):
     assert ask(HOME=nowhere, XDG_CACHE_HOME=nowhere, NUMBA_CACHE_LOCATOR_CLASSES="NoLocator") == "False Of x. 5.0 5.0"
 
 
-def test_what_is_uninterrupted_hears_the_signal_at_its_end():
+def test_what_is_uninterrupted_hears_the_signal_at_its_end(ctrl_c):
     before, done = signal.getsignal(signal.SIGINT), []
     with pytest.raises(KeyboardInterrupt):
         with uninterrupted():
@@ -65,7 +65,7 @@ def test_what_is_uninterrupted_hears_the_signal_at_its_end():
     assert done and signal.getsignal(signal.SIGINT) is before
 
 
-def test_who_insists_is_heard_at_once():
+def test_who_insists_is_heard_at_once(ctrl_c):
     with pytest.raises(KeyboardInterrupt), uninterrupted():
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)

@@ -762,7 +762,7 @@ def test_clicks_without_depth_are_refused_before_anything_is_done():
     assert_same([method.step(f) for f, _ in film()[:4]], [other.step(f) for f, _ in film()[:4]])
 
 
-def test_ctrl_c_in_the_middle_of_a_frame_is_heard_after_it(monkeypatch):
+def test_ctrl_c_in_the_middle_of_a_frame_is_heard_after_it(monkeypatch, ctrl_c):
     """Compiled functions that are interrupted raise another error, and half a frame would be no state to go on from."""
     method = Point2Pose(CAMERA, quick())
     method.add_object("left")
