@@ -16,6 +16,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Detector, Hint
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
@@ -397,9 +398,16 @@ class ObjectTracker:
         """Whether the object was hidden or lost until now and its mask says that it is back."""
         return self.away and mask is not None and not self._hidden(mask)
 
-    def misplaced(self, obs: Observation) -> Requests:
-        """Tracks that an absent object has outside its mask, on a look-alike perhaps: to be looked for elsewhere."""
-        return Requests() if self.life.has_pose else Requests(reject=self.map.ids[obs.outside_mask()])
+    def misplaced(self, obs: Observation, taken: np.ndarray | None = None) -> Requests:
+        """Tracks that an absent object has outside its mask, on a look-alike perhaps: to be looked for elsewhere.
+
+        taken  (H, W) bool, where the segmenter found nothing of it: it went by these very tracks, so that only those
+               on other objects, which this is the mask of, are known to be wrong
+        """
+        if self.life.has_pose:
+            return Requests()
+        wrong = obs.outside_mask() if taken is None else obs.tracks.visible & in_mask(obs.tracks.uv_px, taken)
+        return Requests(reject=self.map.ids[wrong])
 
     def expected_px(self, obs: Observation) -> np.ndarray | None:
         """(N, 2) where keypoints show under the best hypothesis, NaN where not: what guided re-detection looks for.
@@ -455,7 +463,8 @@ class ObjectTracker:
         best, requests = max(self._register(obs), key=lambda h: h.support, default=None), Requests()
         if self.sought:
             agrees = np.zeros(len(self.map), bool) if best is None else best.inliers
-            requests = Requests(reject=self.map.ids[obs.tracks.visible & ~agrees])
+            certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)
+            requests = Requests(reject=self.map.ids[certain & ~agrees])
             enough = best is not None and best.support >= self.config.lifecycle.return_inliers
             if sighting is not None and not enough:
                 uv_px = np.concatenate([obs.tracks.uv_px[agrees], sighting.uv_px])

@@ -204,7 +204,10 @@ class Point2Pose:
             name: obj.observe(frame, self.masks[name], self.tracks, sightings.get(name))
             for name, obj in objects.items()
         }
-        self._apply({name: obj.misplaced(seen[name]) for name, obj in objects.items()})
+        taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *(m for m in self.masks.values() if m is not None)])
+        unfound = {name for name in objects if masks[name] is None and not np.any(self.masks[name])}
+        misplaced = {n: obj.misplaced(seen[n], taken if n in unfound else None) for n, obj in objects.items()}
+        self._apply(misplaced)
         seen |= self._redetect(seen)
         steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
         self._apply({name: step.requests for name, step in steps.items()})
@@ -220,7 +223,11 @@ class Point2Pose:
         """Warn, once, of frames that come in another order than they were taken."""
         if self._time_s is not None and frame.time_s <= self._time_s:
             got = f"{frame.time_s:.6f} s after {self._time_s:.6f} s"
-            doubt(f"time of frame {frame.index}", got, "Time runs backwards: give frames as they were taken.")
+            doubt(
+                f"time of frame {frame.index}",
+                got,
+                "Time stands still or runs backwards: give frames as they were taken.",
+            )
             self._time_s = None
         elif self._time_s is not None:
             self._time_s = frame.time_s

@@ -552,6 +552,17 @@ def test_points_off_the_mask_are_no_observations_and_elsewhere_when_it_is_away()
     )
 
 
+def test_where_the_segmenter_finds_nothing_only_tracks_on_others_are_misplaced():
+    lump, nothing = settled(begun(), [2]), np.zeros((CAMERA.height, CAMERA.width), bool)
+    lump.see(turned(4), mask=nothing)
+    away, other = lump.observed(turned(4), mask=nothing), nothing.copy()
+    u = away.tracks.uv_px[away.tracks.visible, 0]
+    other[:, : int(np.median(u))] = True
+    rejected = lump.tracker.misplaced(away, other).reject
+    assert 0 < len(rejected) < away.tracks.visible.sum() == len(lump.tracker.misplaced(away).reject)
+    assert not len(lump.tracker.misplaced(away, nothing).reject)
+
+
 def test_an_object_is_awaited_from_when_its_mask_is_back():
     lump, nothing = settled(begun(), [2]), np.zeros((CAMERA.height, CAMERA.width), bool)
     full = ~nothing
@@ -588,7 +599,18 @@ def test_a_hint_rejects_what_agrees_on_no_pose_only_while_it_is_away():
     few = replace(few, visible=few.visible & (np.cumsum(few.visible) <= 12))
     back, requests = lump.tracker.hint(frame, few)
     assert not len(back.uv_px), "six points are no return"
-    assert set(requests.reject.tolist()) >= set(few.ids[visible_first(6)(few)].tolist())
+    lifted = lump.tracker.map.ids[lump.tracker.observe(frame, None, few).seen]
+    assert set(requests.reject.tolist()) >= set(few.ids[visible_first(6)(few)].tolist()) & set(lifted.tolist()) != set()
+
+
+def test_a_hint_leaves_doubtful_tracks_to_the_tracker():
+    """An object that comes out from behind another: its points are found before they are certain."""
+    lump = settled(begun(), [2])
+    lump.see(turned(3), mask=np.zeros((CAMERA.height, CAMERA.width), bool))
+    tracks = lump.tracks(turned(4))
+    doubtful = replace(tracks, uncertainty=np.full(len(tracks), 0.9))
+    hint, requests = lump.tracker.hint(lump.observed(turned(4)).frame, doubtful)
+    assert not len(hint.uv_px) and not len(requests.reject)
 
 
 def test_a_hint_says_that_what_lay_still_is_outside_the_image_where_the_camera_is_known():
