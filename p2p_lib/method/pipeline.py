@@ -226,7 +226,7 @@ class Point2Pose:
             doubt(
                 f"time of frame {frame.index}",
                 got,
-                "Time stands still or runs backwards: give frames as they were taken.",
+                "It did not go on: give frames as they were taken.",
             )
             self._time_s = None
         elif self._time_s is not None:

@@ -189,7 +189,7 @@ def test_time_that_runs_backwards_is_said_once_and_statuses_are_logged(caplog):
         estimates = track(frames, names=("left",))
     about_time = [str(of.message) for of in said if "time of frame" in str(of.message)]
     assert about_time == [
-        "time of frame 1: 0.033333 s after 0.066667 s. Time stands still or runs backwards: give frames as they were taken."
+        "time of frame 1: 0.033333 s after 0.066667 s. It did not go on: give frames as they were taken."
     ]
     first = estimates[0]["left"].status
     assert caplog.messages[0].startswith(f"frame 0: left is {first}")
