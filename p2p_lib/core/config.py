@@ -346,7 +346,9 @@ def parameters(config: Config, stage: str | None = None) -> list[dict[str, Any]]
     Raises :class:`BadInput` for an unknown stage.
     """
     if stage is not None and stage not in _STAGES:
-        near = difflib.get_close_matches(stage, _STAGES, n=1)
+        # The key of a parameter, or a slip of the pen.
+        near = [s for s in _STAGES if stage in {f.name for f in fields(getattr(Config, s))}]
+        near = near or difflib.get_close_matches(stage, _STAGES, n=1)
         fix = f"Did you mean {near[0]}?" if near else ""
         raise BadInput("stage", repr(stage), f"one of {', '.join(_STAGES)}", fix)
     return [

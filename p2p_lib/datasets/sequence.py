@@ -194,16 +194,19 @@ def _not_a_folder(path: Path) -> BadInput:
 
 def recognise(folder: Path) -> str:
     """The name of a folder's layout; :class:`BadInput` where no layout fits."""
-    for name, patterns in FORMATS.items():
-        if any(next(folder.glob(pattern), None) for pattern in patterns):
-            return name
+    if layout := _layout(folder):
+        return layout
     holds = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())[:8]) or "nothing"
     if not (folder / "rgb").is_dir() and ((folder / "depth").is_dir() or (folder / "cam_K.txt").is_file()):
         fix = "rgb/ is missing: put the colour images there, one for each depth image."
         raise BadInput(str(folder), f"a folder with {holds}", "rgb/, depth/ and cam_K.txt", fix)
-    raise BadInput(
-        str(folder),
-        f"a folder with {holds}",
-        "rgb/, depth/ and cam_K.txt (and masks/, annotated_poses/ where there are any)",
-        f"Name the layout with --format ({', '.join(FORMATS)}).",
-    )
+    fix = f"Name the layout with --format ({', '.join(FORMATS)})."
+    if _layout(folder.parent):
+        fix = f"Give the folder that it is in: {folder.parent}"
+    expected = "rgb/, depth/ and cam_K.txt (and masks/, annotated_poses/ where there are any)"
+    raise BadInput(str(folder), f"a folder with {holds}", expected, fix)
+
+
+def _layout(folder: Path) -> str | None:
+    found = (name for name, patterns in FORMATS.items() if any(next(folder.glob(p), None) for p in patterns))
+    return next(found, None)

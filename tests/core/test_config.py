@@ -374,3 +374,8 @@ def test_files_that_cannot_be_read(tmp_path):
         from_toml(tmp_path / "binary.toml")
     with pytest.raises(MissingData, match="cannot be read"):
         from_toml(tmp_path)
+
+
+def test_a_key_given_for_a_stage_names_its_stage():
+    with pytest.raises(BadInput, match="Did you mean method[?]"):
+        config.parameters(preset(), "gates")

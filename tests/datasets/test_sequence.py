@@ -251,6 +251,12 @@ def test_every_format_recognises_its_own(ycbineoat, ycbmultitrack, tmp_path):
     assert found == {"ycbineoat", "ycbmultitrack", "folder"} <= set(FORMATS)
 
 
+def test_a_folder_of_a_sequence_names_the_one_that_it_is_in(tmp_path):
+    mine = write_pictures(tmp_path / "mine")
+    with pytest.raises(BadInput, match=f"Give the folder that it is in: {mine}$"):
+        open_sequence(mine / "rgb")
+
+
 def test_synthetic_sequences_open_by_name_with_their_seed(ycbmultitrack, monkeypatch):
     asked = []
     import p2p_lib.synthetic as synthetic

@@ -160,7 +160,7 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
     if plane is not None and inside.any():
         height = np.median(np.abs(plane_heights(patch, plane)[inside]) / patch.sigma_m[inside])
         if height < _FLAT:
-            got = f"{mask.mean():.0%} of the image, flat in what is around it, as a table or a wall is"
+            got = f"{np.count_nonzero(mask)} pixels, flat in what is around it, as a table or a wall is"
             return doubt(who, got, "If it is not the object, click in the object's middle.")
     alone = np.zeros(frame.shape, bool)
     box, x = replace(cutter, others_px=np.zeros((0, 2)), rng=np.random.default_rng(0)).start()
