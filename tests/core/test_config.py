@@ -377,5 +377,5 @@ def test_files_that_cannot_be_read(tmp_path):
 
 
 def test_a_key_given_for_a_stage_names_its_stage():
-    with pytest.raises(BadInput, match="Did you mean method[?]"):
+    with pytest.raises(BadInput, match=r"Did you mean method\?"):
         config.parameters(preset(), "gates")
