@@ -4,7 +4,6 @@ import ast
 import math
 import os
 import re
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -22,7 +21,6 @@ from p2p_lib.apps.notebooks import (
     notebook_parameters,
     read_result,
     run_notebooks,
-    write_gallery,
 )
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.figures.course import LESSONS
@@ -151,15 +149,9 @@ def suite_out(request, tmp_path_factory) -> Path:
     out, copies = tmp_path_factory.mktemp("suite"), tmp_path_factory.mktemp("copies")
     asked = [i for i in request.session.items if i.originalname == test_notebook_runs_in_the_quick_profile.__name__]
     names = [with_answers(item.callspec.params["path"], copies).stem for item in asked]
-
-    def run_one(name: str) -> None:
-        with suppress(NotebookFailed):  # what failed is read back
-            run_notebooks("quick", [name], out, folder=copies, say=lambda line: None)
-
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(run_one, sorted(names, reverse=True)))  # the longest are among the last
     if names:
-        write_gallery(out, "quick")
+        with suppress(NotebookFailed):  # what failed is read back
+            run_notebooks("quick", names, out, folder=copies, say=lambda line: None, jobs=2)
     return out
 
 
