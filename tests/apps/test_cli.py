@@ -407,7 +407,8 @@ def test_bad_files_are_named_in_one_line(case, sequence, tmp_path, capsys):
 BAD_WORDS = {
     "no such folder": (["run", "{seq}x", "--out", "{out}"], ["slidex", "no such folder", "synthetic/crossing"]),
     "a file for a folder": (["run", "{seq}/cam_K.txt", "--out", "{out}"], ["cam_K.txt", "got a file, expected"]),
-    "nothing known": (["run", "{seq}/rgb", "--out", "{out}"], ["slide/rgb", "0000.png", "--format"]),
+    "a folder within": (["run", "{seq}/rgb", "--out", "{out}"], ["slide/rgb", "0000.png", "folder that it is in"]),
+    "nothing known": (["run", "{done}/poses", "--out", "{out}"], ["poses", "object.txt", "--format"]),
     "unknown synthetic": (["run", "synthetic/corssing", "--out", "{out}"], ["corssing", "crossing"]),
     "unknown object": (["run", "{seq}", "--out", "{out}", "--objects", "mug"], ["objects: got 'mug'", "object"]),
     "object twice": (["run", "{seq}", "--out", "{out}", "--objects", "object,object"], ["'object'"]),
