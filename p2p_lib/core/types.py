@@ -148,9 +148,14 @@ class Status(StrEnum):
 OUT_OF_VIEW = "out of view"
 
 
+def status_word(status: str, reason: str) -> str:
+    """A status as people are told it: nothing occludes an object that has left the image."""
+    return OUT_OF_VIEW if reason.startswith(OUT_OF_VIEW) else str(status)
+
+
 def status_text(status: str, reason: str) -> str:
-    """``STATUS: REASON`` as people are told it: nothing occludes an object that has left the image."""
-    return reason if reason.startswith(OUT_OF_VIEW) else f"{status}: {reason}"
+    """The same with the reason behind it."""
+    return f"{status_word(status, reason)}: {reason.removeprefix(f'{OUT_OF_VIEW}: ')}"
 
 
 #: Statuses that carry a pose of this very frame.

@@ -9,7 +9,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.types import Frame, PoseEstimate, status_text
+from p2p_lib.core.types import Frame, PoseEstimate, status_word
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import Evaluation
@@ -183,8 +183,9 @@ class Scene:
         uv = camera.project(box.corners(T_cam_obj) if box else T_cam_obj[None, :3, 3])
         if not np.isfinite(uv).all():
             return None
-        word, *_ = status_text(obj.status[row], obj.reason[row]).split(":")
-        return Label(f"{name}: {word}", self.colours[name], (*uv.min(0), *uv.max(0)))
+        return Label(
+            f"{name}: {status_word(obj.status[row], obj.reason[row])}", self.colours[name], (*uv.min(0), *uv.max(0))
+        )
 
 
 def beside(scenes: Mapping[str, Scene], count: int, width_px: int = 300, axes: bool = False) -> np.ndarray:

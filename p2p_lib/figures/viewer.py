@@ -16,7 +16,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.native import load_open3d
-from p2p_lib.core.types import status_text
+from p2p_lib.core.types import status_word
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
 from p2p_lib.figures.playback import CLOUD_MAX_M, Playback
@@ -151,8 +151,7 @@ class _Scene:
         has = bool(obj.has_pose[i])
         if before is None or has != obj.has_pose[before]:
             nodes["frame"].visible = has
-        word, *_ = status_text(obj.status[i], obj.reason[i]).split(":")
-        nodes["label"].text = f"{name}: {word}"
+        nodes["label"].text = f"{name}: {status_word(obj.status[i], obj.reason[i])}"
         if has:
             T = obj.T_cam_obj[i]
             x, y, z, w = se3.quaternion_xyzw(T)

@@ -58,7 +58,9 @@ class KeypointMap:
         """
         n = len(keys)
         histories = np.full((2, n, _HISTORY, 3), np.nan)
-        histories[0, :, 0], histories[1, :, 0] = p_obj, p_obj if p_cam is None else p_cam
+        histories[0, :, 0] = p_obj
+        if p_cam is not None:
+            histories[1, :, 0] = p_cam
         new = {
             "keys": np.asarray(keys, np.int64),
             "ids": np.full(n, -1),

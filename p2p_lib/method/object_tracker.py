@@ -398,16 +398,14 @@ class ObjectTracker:
         """Whether the object was hidden or lost until now and its mask says that it is back."""
         return self.away and mask is not None and not self._hidden(mask)
 
-    def misplaced(self, obs: Observation, taken: np.ndarray | None = None) -> Requests:
-        """Tracks that an absent object has outside its mask, on a look-alike perhaps: to be looked for elsewhere.
+    def misplaced(self, obs: Observation, within: np.ndarray | None) -> Requests:
+        """Tracks that an absent object has elsewhere, on a look-alike perhaps: to be looked for anew.
 
-        taken  (H, W) bool, where the segmenter found nothing of it: it went by these very tracks, so that only those
-               on other objects, which this is the mask of, are known to be wrong
+        within  (H, W) bool, where they may be; None: anywhere
         """
-        if self.life.has_pose:
+        if self.life.has_pose or within is None:
             return Requests()
-        wrong = obs.outside_mask() if taken is None else obs.tracks.visible & in_mask(obs.tracks.uv_px, taken)
-        return Requests(reject=self.map.ids[wrong])
+        return Requests(reject=self.map.ids[obs.tracks.visible & ~in_mask(obs.tracks.uv_px, within)])
 
     def expected_px(self, obs: Observation) -> np.ndarray | None:
         """(N, 2) where keypoints show under the best hypothesis, NaN where not: what guided re-detection looks for.

@@ -46,12 +46,6 @@ class Observation:
         """(N,) bool: points with a 3D observation."""
         return np.isfinite(self.p_cam[:, 0])
 
-    def outside_mask(self) -> np.ndarray:
-        """(N,) bool: visible tracks that lie outside the mask; none where no mask is known."""
-        if self.mask is None:
-            return np.zeros(len(self.tracks), bool)
-        return self.tracks.visible & ~in_mask(self.tracks.uv_px, self.mask)
-
 
 class Observer:
     """Makes observations with one camera.

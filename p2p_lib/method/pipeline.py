@@ -204,10 +204,7 @@ class Point2Pose:
             name: obj.observe(frame, self.masks[name], self.tracks, sightings.get(name))
             for name, obj in objects.items()
         }
-        taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *(m for m in self.masks.values() if m is not None)])
-        unfound = {name for name in objects if masks[name] is None and not np.any(self.masks[name])}
-        misplaced = {n: obj.misplaced(seen[n], taken if n in unfound else None) for n, obj in objects.items()}
-        self._apply(misplaced)
+        self._apply(self._misplaced(seen, masks))
         seen |= self._redetect(seen)
         steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
         self._apply({name: step.requests for name, step in steps.items()})
@@ -223,11 +220,7 @@ class Point2Pose:
         """Warn, once, of frames that come in another order than they were taken."""
         if self._time_s is not None and frame.time_s <= self._time_s:
             got = f"{frame.time_s:.6f} s after {self._time_s:.6f} s"
-            doubt(
-                f"time of frame {frame.index}",
-                got,
-                "It did not go on: give frames as they were taken.",
-            )
+            doubt(f"time of frame {frame.index}", got, "It did not go on: give frames as they were taken.")
             self._time_s = None
         elif self._time_s is not None:
             self._time_s = frame.time_s
@@ -260,6 +253,18 @@ class Point2Pose:
             for name, uv_px in expected_px.items():
                 found = self.tracker.suggest(self.objects[name].map.ids, uv_px)
                 self.tracks = self.tracks if found is None else found
+
+    def _misplaced(self, seen: Mapping[str, Observation], given: Masks) -> dict[str, Requests]:
+        """Tracks of absent objects that are on something else.
+
+        Where the segmenter finds nothing of an object it went by these very tracks: only other objects are elsewhere.
+        """
+        others = np.logical_or.reduce([mask for mask in self.masks.values() if mask is not None])
+        nowhere = {
+            name for name, obs in seen.items() if given[name] is None and obs.mask is not None and not obs.mask.any()
+        }
+        within = {name: ~others if name in nowhere else obs.mask for name, obs in seen.items()}
+        return {name: self.objects[name].misplaced(obs, within[name]) for name, obs in seen.items()}
 
     def _redetect(self, seen: Mapping[str, Observation]) -> dict[str, Observation]:
         """Guided re-detection: the tracker looks for points where their objects expect them; what is seen then."""

@@ -778,3 +778,26 @@ def test_ctrl_c_in_the_middle_of_a_frame_is_heard_after_it(monkeypatch, ctrl_c):
                 steps.append(method.step(frame, {"left": masks["left"]}))
     whole = track(film()[:6], ["left"])
     assert_same(steps, whole[:3] + whole[4:])
+
+
+def test_where_the_segmenter_finds_nothing_only_tracks_on_others_are_misplaced():
+    """An object that comes out from behind another has tracks before it has a mask."""
+    method, nothing = Point2Pose(CAMERA, quick()), np.zeros((CAMERA.height, CAMERA.width), bool)
+    for name in TRUTH:
+        method.add_object(name)
+    for frame, masks in film()[:4]:
+        method.step(frame, masks)
+    method.objects["left"].life = method.objects["left"].life.without_pose(Status.OCCLUDED)
+    seen = {
+        name: obj.observe(frame, nothing if name == "left" else masks[name], method.tracks)
+        for name, obj in method.objects.items()
+    }
+    ids = method.objects["left"].map.ids[seen["left"].tracks.visible]
+    for found, given, rejected in (
+        (masks["right"], None, 0),  # its tracks lie where nobody else is
+        (masks["left"], None, len(ids)),  # on another
+        (masks["right"], nothing, len(ids)),  # it is said to be hidden
+    ):
+        method.masks = {"left": nothing, "right": found}
+        requests = method._misplaced(seen, {"left": given, "right": masks["right"]})
+        assert len(np.intersect1d(requests["left"].reject, ids)) == rejected and len(ids) > 10
