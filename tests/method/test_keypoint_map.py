@@ -419,6 +419,12 @@ def test_a_reflection_is_no_keypoint_and_a_print_is():
     assert 11 in [key for p, n in zip(in_object, noise_m) for key in plain.observe(p + n, np.zeros(2), True).tolist()]
 
 
+def test_where_it_was_at_its_keyframe_counts():
+    points = KeypointMap(replace(CFG, streak=1))
+    points.add(np.array([1]), HERE[None], p_cam=HERE[None])
+    assert turned(points, HERE[None, None], HERE[None, None] + 0.01, np.zeros((1, 1, 3))) == [1]
+
+
 def test_where_nothing_moves_nothing_is_promoted():
     points = KeypointMap(CFG)
     points.add(np.array([1]), HERE[None], p_cam=HERE[None])

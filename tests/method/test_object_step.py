@@ -188,6 +188,28 @@ def test_pending_points_have_no_say_while_keypoints_suffice():
     assert step.estimate.inliers <= (~pending).sum()
 
 
+@pytest.mark.parametrize(
+    ("mirrored", "motion", "become_keypoints"), [(False, True, True), (True, True, False), (True, False, True)]
+)
+def test_what_stands_still_on_a_turning_object_is_no_keypoint(mirrored, motion, become_keypoints):
+    """The paper asks of a point to be tight in the object, which a reflection is while the object turns slowly."""
+    lump, _ = pending_and_promoted(method__motion=motion)
+    before, keys = lump.tracks(turned(11)).uv_px, lump.steps[-1].requests.keys
+    assert len(keys) > 10, "new points"
+
+    def stay(tracks: Tracks) -> Tracks:
+        ids = lump.tracker.map.ids[np.isin(lump.tracker.map.keys, keys)]
+        at = np.isin(tracks.ids, ids) & (tracks.ids < len(before))
+        uv = np.where(at[:, None], before[np.minimum(tracks.ids, len(before) - 1)], tracks.uv_px)
+        return replace(tracks, uv_px=uv)
+
+    for deg in np.arange(11.5, 14.1, 0.5):
+        lump.see(turned(deg), stay if mirrored else None)
+    promoted = lump.tracker.map.promoted[np.isin(lump.tracker.map.keys, keys)]
+    # The depth under a few that stay where they are changes by more than they should have moved.
+    assert (promoted.mean() > 0.9) if become_keypoints else promoted.mean() < 0.2
+
+
 def test_pending_points_help_where_few_keypoints_are_seen():
     lump, pending = pending_and_promoted()
     few = lambda tracks: ~pending & (np.cumsum(~pending & tracks.visible) > 6)  # noqa: E731
