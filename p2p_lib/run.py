@@ -18,7 +18,7 @@ from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt
 from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.types import Frame, PoseEstimate, status_text
+from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate, status_text
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import moving_scale
 from p2p_lib.datasets.exchange import as_run, export, read_poses
@@ -31,7 +31,6 @@ from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
-from p2p_lib.method.confidence import DOUBTED
 from p2p_lib.method.mesh import save as save_mesh
 from p2p_lib.method.pipeline import Point2Pose
 
@@ -369,7 +368,7 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
         lost = ~obj.has_pose
         why = Counter(map(status_text, obj.status[lost], obj.reason[lost]))
         most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
-        doubted = int((obj.has_pose & (obj.confidence <= DOUBTED)).sum())
+        doubted = int(obj.doubted.sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""
         lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}")
     return tuple(lines)

@@ -74,7 +74,10 @@ def _run(a: argparse.Namespace) -> int:
     arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
     arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
     run_options(
-        *METHOD, prompts="clicks; without, the first image is clicked on", masks="segmenter (default: builtin)"
+        *METHOD,
+        prompts="clicks; without, the first image is clicked on",
+        masks="segmenter (default: builtin)",
+        stop="end before the camera's J-th image (default: Ctrl-C)",
     ),
     arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
     _FORCE,

@@ -66,7 +66,7 @@ def track_live(
 
     prompts  clicks, boxes, masks; those of frame k start their object, or correct its mask, at the camera's k-th image,
              which is not dropped
-    options  the method and its parameters; ``masks`` names the segmenter
+    options  the method and its parameters; ``masks`` names the segmenter, ``stop`` the image before which it ends
     first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
     out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
@@ -98,7 +98,7 @@ def track_live(
         start_s = monotonic()
         newest = kept.enter_context(Newest(camera, keep={p.frame for p in prompts}))
         frame = first or newest.take()
-        while frame is not None:
+        while frame is not None and (frame is first or options.stop is None or frame.index < options.stop):
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))
             waiting.append(frame)

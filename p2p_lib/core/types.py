@@ -162,6 +162,10 @@ def status_text(status: str, reason: str) -> str:
 WITH_POSE = frozenset({Status.TRACKED, Status.DEGRADED, Status.RECOVERED})
 
 
+#: A pose of no more confidence is doubted; one that nothing has told from others that look alike has no more.
+DOUBTED = 0.5
+
+
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """One object's pose at one frame, or the absence of it.

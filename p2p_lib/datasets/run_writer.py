@@ -22,6 +22,7 @@ from p2p_lib.datasets.runs import COLUMNS, NO_POSE, ObjectRun, Run, load_run, re
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
 
 IfExists = Literal["refuse", "replace", "resume"]
+_ANEW = "--force, in Python if_exists='replace'"
 #: What of ``run.json`` may be otherwise when a run is resumed: how far it came, and what made it, which poses tell.
 _MAY_DIFFER = {"frames", "finished", "stopped_by", "versions", "commit", "modified"}
 
@@ -205,7 +206,7 @@ class RunWriter:
 
     def _check_same(self, earlier: Mapping[str, Any]) -> None:
         """That what is to be resumed was asked for in the same words."""
-        mine, fix = json.loads(json.dumps(self.info)), "Ask for the same, or run it anew with --force."
+        mine, fix = json.loads(json.dumps(self.info)), f"Ask for the same, or run it anew: {_ANEW}."
         for key, value in mine.items():
             # Objects may have come later.
             theirs = earlier.get(key) if key != "objects" else earlier[key][: len(value)]
@@ -221,7 +222,7 @@ class RunWriter:
             pose = NO_POSE if now.T_cam_obj is None else now.T_cam_obj
             same = (obj.frame_index[k], obj.status[k]) == (now.frame_index, now.status)
             if not same or not np.array_equal(pose, obj.T_cam_obj[k], equal_nan=True):
-                fix = "Was it made with another version, or has the data changed? Run it anew with --force."
+                fix = f"Was it made with another version, or has the data changed? Run it anew: {_ANEW}."
                 got = f"{now.status} with another pose of {name!r} in frame {now.frame_index}"
                 raise BadInput(str(self.path), got, f"what it came to before, {obj.status[k]}", fix)
 
@@ -267,7 +268,7 @@ def look_into(out: Path, if_exists: IfExists) -> dict[str, Any] | None:
             raise BadInput(str(out), got, "a new or empty folder, or that of a run", "Name another one.")
         return None
     if info["frames"] and if_exists == "refuse":
-        fix = "Name another folder, replace it (--force) or go on with it (--resume)."
+        fix = f"Name another folder, replace it ({_ANEW}) or go on with it (--resume, in Python if_exists='resume')."
         raise BadInput(str(out), _in_words(info), "a new or empty folder", fix)
     return info if info["frames"] else None
 

@@ -29,7 +29,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import file_name, load_arrays, read_text
-from p2p_lib.core.types import PoseEstimate
+from p2p_lib.core.types import DOUBTED, PoseEstimate
 from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import Sequence
 
@@ -103,6 +103,11 @@ class ObjectRun:
     def has_pose(self) -> np.ndarray:
         """(n,) bool."""
         return np.isfinite(self.T_cam_obj).all((1, 2))
+
+    @property
+    def doubted(self) -> np.ndarray:
+        """(n,) bool: a pose, of confidence :data:`~p2p_lib.core.types.DOUBTED` at most."""
+        return self.has_pose & (self.confidence <= DOUBTED)
 
     def of_last_map(self) -> ObjectRun:
         """The same without the poses of maps that were given up, whose object frames were others."""

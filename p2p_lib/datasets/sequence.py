@@ -162,16 +162,20 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
         raise _not_a_folder(folder)
     if folder.is_dir():
         return folder, format
-    from p2p_lib.datasets.manifests import find_sequence
+    from p2p_lib.datasets.manifests import find_sequence, names
 
-    found = find_sequence(str(path_or_name))
+    name = str(path_or_name)
+    found = find_sequence(name)
     below = home / folder if (home := data_dir()) else None
     if found is None and below is not None and below.is_dir():
         return below, format
     if found is None:
+        dataset = name.partition("/")[0]
+        if dataset in names("dataset"):
+            raise MissingData(name, "not below $P2P_DATA", f"See p2p data info {dataset}.")
         fix = f"Give a folder, a bundled sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
         where = "$P2P_DATA is not set" if data_dir() is None else f"no sequence of this name below {data_dir()}"
-        raise MissingData(str(path_or_name), f"no such folder, and {where}", fix)
+        raise MissingData(name, f"no such folder, and {where}", fix)
     return found[0], format or found[1].format
 
 

@@ -17,6 +17,7 @@ from p2p_lib.core import se3, tables
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import P2PError
 from p2p_lib.core.raycasting import cast, ray_scene
+from p2p_lib.core.types import DOUBTED
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.masks import masks_of_run
 from p2p_lib.datasets.models import load_mesh
@@ -34,6 +35,7 @@ LOOKS = 60
 #: What the numbers are called, what they say, and which way is good.
 HEADS = {
     "pose": ("pose [%]", "frames with a pose"),
+    "doubted": ("doubted [%]", f"of these poses, those of confidence {DOUBTED:g} at most: 0 is best"),
     "pose_where_seen": ("where seen [%]", f"the same of frames whose mask has {MIN_VISIBLE_PX} pixels: 100 is best"),
     "depth_on_surface": (
         "depth on surface [%]",
@@ -101,6 +103,8 @@ def consistency(run: Run, sequence: Sequence | None = None) -> Consistency:
     objects = {}
     for name, obj in run.objects.items():
         numbers = dict.fromkeys(HEADS, float("nan")) | {"pose": 100 * float(obj.has_pose.mean())}
+        if obj.has_pose.any():
+            numbers["doubted"] = 100 * float(obj.doubted.sum() / obj.has_pose.sum())
         if sequence is not None:
             numbers |= _seen(run, name, sequence)
             if name in keypoints:

@@ -9,7 +9,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.types import Frame, PoseEstimate, status_word
+from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate, status_word
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import Evaluation
@@ -183,9 +183,8 @@ class Scene:
         uv = camera.project(box.corners(T_cam_obj) if box else T_cam_obj[None, :3, 3])
         if not np.isfinite(uv).all():
             return None
-        return Label(
-            f"{name}: {status_word(obj.status[row], obj.reason[row])}", self.colours[name], (*uv.min(0), *uv.max(0))
-        )
+        text = _status(name, obj.status[row], obj.reason[row], obj.doubted[row])
+        return Label(text, self.colours[name], (*uv.min(0), *uv.max(0)))
 
 
 def beside(scenes: Mapping[str, Scene], count: int, width_px: int = 300, axes: bool = False) -> np.ndarray:
@@ -229,5 +228,11 @@ def draw_live(
         image = overlay.draw_box(image, method.camera, T_cam_obj @ box.T_obj_box, box.size_m, colours[name])
         image = overlay.draw_axes(image, method.camera, T_cam_obj, 0.06)
         low, high = np.nanmin(uv_px, 0), np.nanmax(uv_px, 0)
-        labels.append(Label(f"{name}: {estimate.status}", colours[name], (*low, *high)))
+        text = _status(name, estimate.status, estimate.reason, estimate.confidence <= DOUBTED)
+        labels.append(Label(text, colours[name], (*low, *high)))
     return overlay.draw_labels(image, labels, f"{title}  {frame.time_s - start_s:.2f} s".strip())
+
+
+def _status(name: str, status: str, reason: str, doubted: bool) -> str:
+    """What a label says of an object."""
+    return f"{name}: {status_word(status, reason)}" + ", doubted" * bool(doubted)

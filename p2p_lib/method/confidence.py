@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-#: A pose of no more confidence is doubted; one that nothing has told from others that look alike has no more.
-DOUBTED = 0.5
 #: The noise of points is set for a poor sensor; what is left of the covariance, measured on ``synthetic/crossing``.
 _COVARIANCE_SCALE = 0.55
 #: Points on a round body drift along it by this share of its accumulated rotation.

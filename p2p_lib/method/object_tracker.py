@@ -19,9 +19,9 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Detector, Hint
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
+from p2p_lib.core.types import DOUBTED, OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method import refinement, registration, selection
-from p2p_lib.method.confidence import DOUBTED, confidence, pose_covariance
+from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.lifecycle import GATES, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
 from p2p_lib.method.object_model import NewPoints, ObjectModel, Requests

@@ -50,6 +50,8 @@ Masks = dict[str, np.ndarray | None]
 _LOCATE_EVERY, _LOCATE_EVERY_AWAY = 5, 2
 #: Few depth cameras see half of their pixels farther than this, m.
 _FAR_M = 50.0
+#: The share of pixels among which the nearest may be wild.
+_NEAREST = 0.05
 NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
@@ -344,10 +346,16 @@ class Point2Pose:
 
 
 def _check_unit(frame: Frame) -> None:
-    """Warn of depth that is hardly in metres."""
+    """Refuse depth that cannot be in metres, since nothing is near; warn of what hardly is."""
     measured = frame.depth_m[frame.depth_m > 0]
-    if len(measured) and (middle_m := float(np.median(measured))) > _FAR_M:
-        doubt(f"depth of frame {frame.index}", f"{middle_m:.0f} m in the middle", "Is it in millimetres? Give metres.")
+    if not len(measured):
+        return
+    near_m, middle_m = np.quantile(measured, [_NEAREST, 0.5]).tolist()
+    what, fix = f"depth of frame {frame.index}", "Is it in millimetres? Give metres."
+    if near_m > _FAR_M:
+        raise BadInput(what, f"{near_m:.0f} m and more", f"objects nearer than {_FAR_M:g} m", fix)
+    if middle_m > _FAR_M:
+        doubt(what, f"{middle_m:.0f} m in the middle", fix)
 
 
 class _Hints(Mapping[str, Hint]):

@@ -20,7 +20,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.types import Frame, PoseEstimate, Status
+from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.prompts import save_prompts
@@ -167,6 +167,12 @@ def test_live_estimates_are_those_of_a_run(folder, tmp_path):
     assert [str(e.status) for e in got] == wanted["board/status"].tolist()
 
 
+def test_a_camera_without_an_end_is_stopped_before_an_image(folder):
+    got = []
+    track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, got.append, RunOptions(settings=SETTINGS, stop=4))
+    assert 0 <= got[-1].frame_index < 4 and got[0].frame_index == 0
+
+
 def test_a_prompt_starts_its_object_in_its_frame(folder):
     sequence, got = open_sequence(folder), []
     count = track_live(
@@ -236,7 +242,7 @@ def test_live_prints_a_line_per_object_and_frame(folder, tmp_path, capsys):
     keys = {"time_s", "frame", "object", "status", "confidence", "T_cam_obj", "map_id", "covariance", "reason"}
     assert all(set(line) == keys and line["object"] == "board" for line in lines)
     last = lines[-1]
-    assert last["time_s"] == pytest.approx(last["frame"] / 30, abs=1e-6) and last["status"] == "tracked"
+    assert last["time_s"] == pytest.approx(last["frame"] / 30, abs=1e-6) and last["status"] in WITH_POSE
     moved = np.array(last["T_cam_obj"])[:3, 3] - np.array(lines[0]["T_cam_obj"])[:3, 3]
     np.testing.assert_allclose(moved, last["frame"] * np.array([2, 1, 0]) / 200 * 0.5, atol=1e-3)
     assert np.shape(last["covariance"]) == (6, 6)
@@ -250,10 +256,8 @@ def test_on_a_terminal_a_run_that_is_kept_is_told_in_short_lines(folder, tmp_pat
     *_, last = capsys.readouterr().out.splitlines()
     obj = load_run(tmp_path / "run").objects["board"]
     x, y, z = obj.T_cam_obj[-1, :3, 3]
-    assert (
-        last
-        == f"{obj.time_s[-1]:.2f} s  board: tracked  {x:.3f} {y:.3f} {z:.3f} m  confidence {obj.confidence[-1]:.2f}"
-    )
+    status = f"board: {obj.status[-1]}"  # on a busy machine many frames are dropped before it
+    assert last == f"{obj.time_s[-1]:.2f} s  {status}  {x:.3f} {y:.3f} {z:.3f} m  confidence {obj.confidence[-1]:.2f}"
     assert cli.main(live) == 0 and capsys.readouterr().out.startswith("{"), "nothing else keeps it"
 
 

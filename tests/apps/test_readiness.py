@@ -21,6 +21,12 @@ def test_a_plan_says_which_rows_can_run(nothing):
     )
 
 
+def test_missing_data_is_said_in_few_words(nothing, tmp_path, monkeypatch):
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    _, ours, _ = readiness("ho3d").splitlines()
+    assert ours == "  Ours: 0 of 13 sequences; else: ho3d_v3/AP10: not below $P2P_DATA. See p2p data info ho3d_v3."
+
+
 def test_what_is_missing_names_sequences_frames_size_and_command(nothing, tmp_path):
     (line,) = what_to_fetch(load_benchmark("ycbineoat", tmp_path))
     assert "ycbineoat/mustard0 (737 frames)" in line and "about 22 GB" in line

@@ -83,7 +83,9 @@ def test_a_folder_that_no_run_made_is_never_touched(folder, tmp_path, if_exists)
 
 def test_an_earlier_run_stays_unless_it_is_to_be_replaced(folder, tmp_path):
     before = contents(write(tmp_path / "run", folder, 5))
-    with pytest.raises(BadInput, match=r"got a run of own \(5 frames, tracker lk, seed 0\).*--force.*--resume"):
+    with pytest.raises(
+        BadInput, match=r"got a run of own \(5 frames, tracker lk, seed 0\).*--force.*'replace'.*--resume.*'resume'"
+    ):
         writer(tmp_path / "run", folder).__enter__()
     with writer(tmp_path / "run", folder, "replace"):
         pass  # it never came to a frame

@@ -68,12 +68,21 @@ def test_poses_put_off_on_purpose_are_told_by_every_number(made, run, good, xi):
         assert bad[name]["reprojection_px"] > good[name]["reprojection_px"] + 1
 
 
+def test_how_many_of_the_poses_are_doubted(made, run):
+    for name, obj in run.objects.items():
+        confidence = np.full(len(obj), 0.9)
+        confidence[np.flatnonzero(obj.has_pose)[:3]] = 0.5
+        halved = replace(run, objects={name: replace(obj, confidence=confidence)})
+        said = consistency(halved, made.sequence).objects[name]["doubted"]
+        assert said == pytest.approx(300 / obj.has_pose.sum())
+
+
 def test_what_cannot_be_said_is_not(made, run, tmp_path):
-    """Neither surfaces nor keypoints nor masks were kept: only how often there was a pose."""
+    """Neither surfaces nor keypoints nor masks were kept: only how often there was a pose, and a doubted one."""
     bare = replace(run, path=tmp_path, info=run.info | {"masks": "clicks"})
     said = consistency(bare, made.sequence)
     for name, numbers in said.objects.items():
-        assert {key for key, value in numbers.items() if np.isfinite(value)} == {"pose"}
+        assert {key for key, value in numbers.items() if np.isfinite(value)} == {"pose", "doubted"}
         assert said.as_dict()["objects"][name]["mask_iou"] is None
     for head, says in HEADS.values():
         assert head in said.as_table() and says in said.as_table()

@@ -65,6 +65,15 @@ def test_the_label_of_what_left_the_image_does_not_say_occluded(made, scene):
     assert words == ["box: occluded", "box: out of view"]
 
 
+def test_the_label_of_a_doubted_pose_says_so(made, scene):
+    obj, words = made.run.objects["box"], []
+    row = int(np.flatnonzero(obj.has_pose)[0])
+    for confidence in (0.5, 0.51):
+        said = replace(obj, confidence=np.full(len(obj), confidence))
+        words.append(scene._label(made.sequence.camera, "box", said, row).text)
+    assert words == [f"box: {obj.status[row]}, doubted", f"box: {obj.status[row]}"]
+
+
 def test_a_wrong_pose_is_drawn_where_it_is(made, scene):
     """The truth in white beside the estimate: 2 cm are about 20 pixels here."""
     image = scene.draw(6, axes=False, trail=0)

@@ -176,10 +176,14 @@ def test_the_configuration_may_be_a_presets_name():
         Point2Pose(CAMERA, {"preset": "paper"})
 
 
-def test_depth_in_millimetres_is_said():
+def test_depth_in_millimetres_is_refused_and_a_far_background_doubted():
     frame, _ = film()[0]
-    with pytest.warns(Doubt, match=r"depth of frame 0: \d+ m in the middle. Is it in millimetres\?"):
+    with pytest.raises(BadInput, match=r"depth of frame 0: got \d+ m and more, expected .* Is it in millimetres\?"):
         Point2Pose(CAMERA).step(replace(frame, depth_m=1000 * frame.depth_m))
+    depth_m = frame.depth_m.copy()
+    depth_m[: len(depth_m) * 6 // 10] = 400.0
+    with pytest.warns(Doubt, match=r"depth of frame 0: 400 m in the middle. Is it in millimetres\?"):
+        Point2Pose(CAMERA).step(replace(frame, depth_m=depth_m))
 
 
 def test_time_that_runs_backwards_is_said_once_and_statuses_are_logged(caplog):
