@@ -64,7 +64,7 @@ def _poses(job: Job, out: Path) -> Outcome:
         if result.interrupted:
             raise KeyboardInterrupt
         done = load_run(unfinished)
-        outcome = scored(done, sequence if job.chamfer else None, job.models, job.key)
+        outcome = scored(done, sequence if job.chamfer or job.sequence.fault else None, job.models, job.key)
         times = _times(done, cpu_s) | {"width_px": sequence.camera.width}
         outcome = outcome.model_copy(update={"times": times, "ran": outcome.ran | {"library": library_version()}})
         shutil.rmtree(run_path(out, job.key), ignore_errors=True)

@@ -26,6 +26,7 @@ from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets import checkpoints, manifests
+from p2p_lib.datasets.faulty import Faulty
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.resized import Resized
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
@@ -92,7 +93,7 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
     lacking = {method.name: _lacking(method) for method in methods}
     known: dict[tuple, str] = {}  # of this call alone: files may change until the next
     jobs = []
-    for planned in scope.sequence:
+    for planned in scope.planned:
         for sequence, missing in _present(planned):
             for method in (m for m in methods if not m.only or planned.name in m.only):
                 for measure in measures:
@@ -115,6 +116,9 @@ def open_planned(job: Job) -> Sequence:
         sequence = replace(open_sequence(folder, "ycbmultitrack", masks=masks), name=planned.name)
     else:
         sequence = open_sequence(planned.name, masks=masks)
+    if planned.fault is not None:
+        fault, (start, stop) = planned.fault, planned.during
+        sequence = Faulty(sequence, fault.name, fault.severity, start, min(stop, len(sequence)), job.seed)
     return Resized(sequence, method.scale) if method.scale != 1 else sequence
 
 
@@ -139,6 +143,7 @@ def _keyed(job: Job, known: dict[tuple, str]) -> Job:
             "method": method.model_dump(include={"tracker", "detector", "masks", "scale", "count"}),
             "sequence": _fingerprint(job, known),
             "cut": [planned.start, planned.stop, planned.objects],
+            "fault": planned.fault and [planned.fault.model_dump(), planned.during],
             "clicks": planned.clicks if uses_clicks(method) else {},
             "chamfer": job.chamfer,
         }
@@ -230,6 +235,7 @@ def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
 
 def _files_hash(job: Job) -> str:
     """Content of the truth, of the models, of the first image and its masks; names and sizes of everything else."""
+    job = replace(job, sequence=job.sequence.model_copy(update={"fault": None}))
     sequence, start = open_planned(job), job.sequence.start
     first = sequence.frame(start)
     parts = [("rgb", first.rgb.tobytes()), ("depth", first.depth_m.tobytes())]

@@ -60,6 +60,23 @@ class Method(_Strict):
     only: list[Text] = []
 
 
+class PlannedFault(_Strict):
+    """A fault of :data:`p2p_lib.datasets.faulty.FAULTS`.
+
+    severity  in the unit that it says
+    frames    from, to, in the sequence; None: where the sequence says
+    """
+
+    name: Text
+    severity: float = 1.0
+    frames: list[Count] | None = Field(None, min_length=2, max_length=2)
+
+    @property
+    def shown(self) -> str:
+        """What tables call it."""
+        return self.name if "severity" not in self.model_fields_set else f"{self.name}, {self.severity:g}"
+
+
 class PlannedSequence(_Strict):
     """One sequence to run on.
 
@@ -70,6 +87,7 @@ class PlannedSequence(_Strict):
     models     object to model file or folder, relative to ``$P2P_DATA``, where the layout has none
     clicks     object to pixels [u, v] in frame ``start``, for methods that start from clicks
     column     of the paper's table; with several objects, ``columns`` has one for each
+    fault      what goes wrong in it, and in which frames, from and to, where the fault does not say that
     """
 
     name: Text
@@ -82,6 +100,13 @@ class PlannedSequence(_Strict):
     clicks: dict[str, list[list[float]]] = {}
     column: str = ""
     columns: dict[str, str] = {}
+    fault: PlannedFault | None = None
+    fault_frames: list[Count] = Field([30, 60], min_length=2, max_length=2)
+
+    @property
+    def during(self) -> list[int]:
+        """The frames of its fault, from and to."""
+        return (self.fault and self.fault.frames) or self.fault_frames
 
     def column_of(self, object: str) -> str:
         """The column of the paper's table that this object belongs to, "" for none."""
@@ -94,6 +119,7 @@ class Scope(_Strict):
     methods  the names of some of them, none for all
     tracks   whether 2D trackers are scored by themselves, where the plan wants it
     alone    one run at a time, since times are measured
+    fault    faults with each of which every sequence is run, none for once without any
     """
 
     seeds: Annotated[list[Count], Field(min_length=1)]
@@ -101,6 +127,14 @@ class Scope(_Strict):
     methods: list[str] = []
     tracks: bool = True
     alone: bool = False
+    fault: list[PlannedFault] = []
+
+    @property
+    def planned(self) -> list[PlannedSequence]:
+        """The sequences, with each fault."""
+        if not self.fault:
+            return self.sequence
+        return [s.model_copy(update={"fault": fault}) for fault in self.fault for s in self.sequence]
 
 
 class Plan(_Strict):
@@ -116,7 +150,7 @@ class Plan(_Strict):
     name: Annotated[str, AfterValidator(lambda name: file_name("name", name))]
     title: Text
     paper: str = ""
-    kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs", "pairs"] = "methods"
+    kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs", "pairs", "faults"] = "methods"
     chamfer: bool = False
     tracks: bool = False
     method: Annotated[list[Method], Field(min_length=1)]

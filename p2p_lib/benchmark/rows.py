@@ -30,6 +30,9 @@ MEAN, POOLED = "mean over sequences", "pooled over frames"
 #: What MEAN is called where all of it is of one sequence (:func:`p2p_lib.benchmark.scoring.run_rows`).
 MEAN_OF_ONE = "mean over objects"
 
+#: Of what a fault does.
+UNITS = {"mesh_off": "share"}
+
 #: The columns, in order. ``column`` is the paper's; ``key`` names the run's record; ``reason`` why there is no value.
 COLUMNS = (
     "plan profile method sequence object column seed metric form failures align value unit frames lost sequences "
@@ -88,6 +91,11 @@ def returns(frames_to_recovery: Sequence[int | None]) -> list[Number]:
     recovered = recovered_within(frames_to_recovery)
     counts = {"all": len(frames_to_recovery)} | {f"recovered within {n} frames": k for n, k in recovered.items()}
     return [Number("returns", form, "-", "first", "events", count) for form, count in counts.items()]
+
+
+def fault(scores: Mapping[str, float]) -> list[Number]:
+    """What a fault did to an object."""
+    return [Number("fault", form, "-", "first", UNITS.get(form, "frames"), value) for form, value in scores.items()]
 
 
 def mean(numbers: Iterable[Number], failed: int = 0) -> list[Number]:
@@ -172,10 +180,10 @@ def as_csv(rows: Iterable[Row], columns: Sequence[str]) -> str:
 
 
 def shown_name(job: Job) -> str:
-    """What a row calls a job's sequence: its name, and the frames where these are not all."""
+    """What a row calls a job's sequence: its name, the frames where these are not all, and its fault."""
     start, stop = job.sequence.start, job.sequence.stop
     frames = f"[{start}:{'' if stop is None else stop}]" if start or stop is not None else ""
-    return job.sequence.name + frames
+    return job.sequence.name + frames + (f" with {job.sequence.fault.shown}" if job.sequence.fault else "")
 
 
 def _over_sequences(plan: Plan, profile: str, group: Results) -> list[Row]:
@@ -204,7 +212,7 @@ def _over_sequences(plan: Plan, profile: str, group: Results) -> list[Row]:
 
 def _numbers(obj: ObjectOutcome) -> list[Number]:
     found = [number for align in ALIGNMENTS for number in areas(obj.errors_m(align), align)]
-    return [*found, *chamfer(obj.chamfer_cm), *returns(obj.returns)]
+    return [*found, *chamfer(obj.chamfer_cm), *returns(obj.returns), *fault(obj.fault)]
 
 
 def _head(plan: Plan, profile: str, job: Job, outcome: Outcome) -> Row:

@@ -14,10 +14,12 @@ from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, Scope
 from p2p_lib.benchmark.rows import MEAN, MEAN_OF_ONE, Row, result_rows
 from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingData
+from p2p_lib.datasets.faulty import Faulty
 from p2p_lib.datasets.models import MESHES, find_models, given_models, read_mesh
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.evaluation import reconstruction
+from p2p_lib.evaluation.faults import fault_score, mesh_off_share
 from p2p_lib.evaluation.protocol import ObjectScore, evaluate
 
 #: What of ``run.json`` an outcome repeats.
@@ -26,9 +28,11 @@ Models = Mapping[str, str | Path]
 
 
 def scored(done: Run, sequence: Sequence | None, models: Models, key: str = "") -> Outcome:
-    """A run's errors by both alignments, its returns, and with a sequence the Chamfer distance of its surfaces.
+    """A run's errors by both alignments, its returns, and with a sequence what is said of its surfaces.
 
     models  object to model file, over those that the run was made with
+
+    Of a sequence with a fault that is what the fault did, else the Chamfer distance.
     """
     first, over_all = (evaluate(done, models, align) for align in ("first", "all"))
     objects = {}
@@ -38,7 +42,7 @@ def scored(done: Run, sequence: Sequence | None, models: Models, key: str = "") 
             first=_errors(score),
             all=_errors(over_all.objects[name]),
             returns=[event.frames_to_recovery for event in score.returns],
-            **(_chamfer(done, sequence, models, name, score) if sequence else {}),
+            **(_reconstruction(done, sequence, models, name, score) if sequence else {}),
         )
     ran = {key: done.info.get(key) for key in RAN}
     return Outcome(key=key, status="done", ran=ran, objects=objects, left_out=first.left_out)
@@ -69,19 +73,29 @@ def _errors(score: ObjectScore) -> dict[str, list[float]]:
     return {"adds_m": score.adds_m.tolist(), "add_m": score.add_m.tolist()}
 
 
-def _chamfer(done: Run, sequence: Sequence, models: Models, name: str, score: ObjectScore) -> dict[str, Any]:
+def _reconstruction(done: Run, sequence: Sequence, models: Models, name: str, score: ObjectScore) -> dict[str, Any]:
     """The fields of an outcome on the reconstruction."""
-    mesh = done.path / "meshes" / f"{name}.ply"
-    if not mesh.is_file():
-        return {"no_chamfer": "no surface was reconstructed"}
-    if not np.isfinite(score.T_obj_model).all():
-        return {"no_chamfer": "no pose, so no model frame"}
+    mesh, posed = done.path / "meshes" / f"{name}.ply", np.isfinite(score.T_obj_model).all()
+    surface = read_mesh(mesh) if mesh.is_file() and posed else None
+    if isinstance(sequence, Faulty):
+        off = float("nan")
+        if surface is not None:
+            true = reconstruction.dense(_true_model(done, sequence, models, name))
+            off = mesh_off_share(surface, score.T_obj_model, true)
+        found = fault_score(done.objects[name], score.T_obj_model, done.points[name], sequence.during, off)
+        return {"fault": found.as_dict()}
+    if surface is None:
+        return {"no_chamfer": "no pose, so no model frame" if mesh.is_file() else "no surface was reconstructed"}
+    model = _true_model(done, sequence, models, name)
+    truth, reference = reconstruction.seen_surface(sequence, name, model, score.frame_index)
+    chamfer_cm = reconstruction.chamfer_cm(surface, se3.inverse(score.T_obj_model), truth)
+    return {"chamfer_cm": chamfer_cm, "reference": reference, "no_chamfer": "" if chamfer_cm else "nothing near it"}
+
+
+def _true_model(done: Run, sequence: Sequence, models: Models, name: str) -> Path | np.ndarray:
+    """The mesh of an object where one is known, else the points of its model."""
     folder = Path(done.info.get("path") or ".")
     made_with = {name: folder / where for name, where in (done.info.get("models") or {}).items()}
     made_with = {name: path for name, path in made_with.items() if path.is_file()}
     known = find_models(sequence, MESHES) | made_with | given_models(models, sequence.objects, MESHES)
-    model = known[name] if name in known and known[name].suffix != ".xyz" else done.points[name]
-    truth, reference = reconstruction.seen_surface(sequence, name, model, score.frame_index)
-    surface = read_mesh(mesh)
-    chamfer_cm = reconstruction.chamfer_cm(surface, se3.inverse(score.T_obj_model), truth)
-    return {"chamfer_cm": chamfer_cm, "reference": reference, "no_chamfer": "" if chamfer_cm else "nothing near it"}
+    return known[name] if name in known and known[name].suffix != ".xyz" else done.points[name]

@@ -82,7 +82,7 @@ def seen_surface(sequence: Sequence, name: str, model: Path | np.ndarray, frames
     given = sequence.path / "visible_mesh.ply" if sequence.path else None
     if given and given.is_file():
         return _sampled(given), "visible_mesh.ply"
-    points = _sampled(model) if isinstance(model, Path) else model
+    points = dense(model)
     seen = np.zeros(len(points), bool)
     for k in np.unique(frames[np.linspace(0, len(frames) - 1, min(_VIEWS, len(frames))).astype(int)]):
         T_cam_model, depth_m = sequence.truth[name].T_cam_model[k], sequence.frame(int(k)).depth_m
@@ -92,6 +92,11 @@ def seen_surface(sequence: Sequence, name: str, model: Path | np.ndarray, frames
         u, v = np.where(inside, uv_px.T, 0).round().astype(int)
         seen |= inside & (np.abs(depth_m[v, u] - p_cam[:, 2]) < _AGREES_M)
     return points[seen], f"seen part of {model.name if isinstance(model, Path) else 'the model points'}"
+
+
+def dense(model: Path | np.ndarray) -> np.ndarray:
+    """(M, 3) points of a model: sampled densely where it is a mesh, else as they are."""
+    return _sampled(model) if isinstance(model, Path) else model
 
 
 def _sampled(path: Path) -> np.ndarray:

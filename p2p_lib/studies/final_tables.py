@@ -135,7 +135,7 @@ class Numbers:
         if not done:
             return "Nothing was run"
         ran = {key: [str(o.ran.get(key)) for _, o in done] for key in ("tracker", "detector", "masks")}
-        ran["sequences"] = [shown_name(job) for job, _ in done]
+        ran["sequences"] = [shown_name(job).partition(" with ")[0] for job, _ in done]
         ran["commit"] = [str(o.ran.get("commit") or "unknown")[:7] for _, o in done]
         return "Ran: " + "; ".join(f"{key} {', '.join(dict.fromkeys(values))}" for key, values in ran.items())
 
@@ -398,6 +398,32 @@ def by_pair(numbers: Numbers) -> Table:
     return Table(numbers.plan.title, heads, lines, groups, words=2, rules=rules, notes=notes)
 
 
+def by_fault(numbers: Numbers) -> Table:
+    """A row per method and fault, over sequences, seeds and objects: failed runs, lies, what is left behind."""
+    found: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
+    for job, outcome in numbers.benchmark.results:
+        found[job.method.name, job.sequence.fault.shown if job.sequence.fault else "-"].append(outcome)
+    lines = []
+    for (method, fault), outcomes in found.items():
+        scores = DataFrame([obj.fault for outcome in outcomes for obj in outcome.objects.values() if obj.fault])
+        runs = sum(outcome.status != "not run" for outcome in outcomes)
+        about = [Cell(method)] * (len(numbers.methods) > 1) + [Cell(fault), Cell(str(runs))]
+        if scores.empty:
+            lines.append([*about, *[Cell(note=outcomes[0].reason.rstrip("."))] * 8])
+            continue
+        lies = [scores.frames.sum(), scores.lies_in.sum(), scores.lies_after.sum(), scores.longest.max()]
+        off = 100 * scores.mesh_off
+        cells = [sum(outcome.status == "failed" for outcome in outcomes), *map(int, lies)]
+        again = [f"{x:g}" if np.isfinite(x) else "never" for x in (scores.until_good.median(), scores.until_good.max())]
+        lines.append([*about, *(Cell(str(c)) for c in (*cells, *again)), number(off.mean(), digits=1)])
+    heads = ["Method"] * (len(numbers.methods) > 1) + ["Fault", "runs", "failed", "frames", "lies in it", "lies after"]
+    heads += ["longest", "good again", "worst", "mesh off (%)"]
+    notes = ["Frames of all objects since a fault began. Lies: confidence above 0.5, ADD above 5 cm; longest stretch"]
+    notes += ["Good again: frames in view after the fault's end until ADD < 2 cm, median and worst over objects"]
+    notes += ["Mesh off: vertices more than 1 cm off the true surface at the end of the run", numbers.what_ran()]
+    return Table(numbers.plan.title, heads, lines, words=len(heads) - 9, notes=notes)
+
+
 #: Of fewer differences the bootstrap's interval is too narrow to call one proven.
 _ENOUGH = 8
 
@@ -423,6 +449,7 @@ KINDS: dict[str, Callable[[Numbers], Table]] = {
     "rates": by_rate,
     "runs": by_run,
     "pairs": by_pair,
+    "faults": by_fault,
 }
 
 

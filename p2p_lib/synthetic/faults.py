@@ -1,7 +1,7 @@
 """What goes wrong when one records one's own data, put into a good folder on purpose.
 
 For the tests of ``p2p check`` and for the notebook on own data: each fault of :data:`FAULTS` changes a folder as
-:func:`p2p_lib.datasets.folder.write` makes it, in place.
+:func:`p2p_lib.datasets.folder.write` makes it, in place. What fails for a while is in :mod:`p2p_lib.datasets.faulty`.
 """
 
 from __future__ import annotations

@@ -285,3 +285,15 @@ def test_a_few_frames_crown_nobody(tmp_path):
         assert not any(c.bold for row in quick.rows for c in row) and "rate (Hz)" not in quick.heads
         full = paper_table(replace(made, profile="full"))
         assert any(c.bold for row in full.rows for c in row) or "rate (Hz)" in full.heads
+
+
+def test_a_row_is_a_fault(tmp_path):
+    def one(lies_in, longest, until_good, mesh_off):
+        score = {"frames": 100, "lies_in": lies_in, "lies_after": 0, "longest": longest}
+        return outcome(50, fault={**score, "until_good": until_good, "mesh_off": mesh_off})
+
+    failed = Outcome(key="k", status="failed", reason="ValueError: no")
+    outcomes = [one(3, 2, 0, 0.1), one(1, 1, 7, 0.3), one(0, 0, float("inf"), float("nan")), failed]
+    made = benchmark(tmp_path, {("Ours", "mustard0"): outcomes}, seeds=(0, 1, 2, 3), kind="faults")
+    (row,) = [[cell.text for cell in row] for row in paper_table(made).rows]
+    assert row == ["-", "4", "1", "300", "4", "0", "2", "7", "never", "20.0"]
