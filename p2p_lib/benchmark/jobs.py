@@ -117,8 +117,9 @@ def open_planned(job: Job) -> Sequence:
     else:
         sequence = open_sequence(planned.name, masks=masks)
     if planned.fault is not None:
-        fault, (start, stop) = planned.fault, planned.during
-        sequence = Faulty(sequence, fault.name, fault.severity, start, min(stop, len(sequence)), job.seed)
+        fault, during = planned.fault, planned.during
+        severity = 1.0 if fault.severity is None else fault.severity
+        sequence = Faulty(sequence, fault.name, severity, *during, seed=job.seed)
     return Resized(sequence, method.scale) if method.scale != 1 else sequence
 
 

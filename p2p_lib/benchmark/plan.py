@@ -64,17 +64,18 @@ class PlannedFault(_Strict):
     """A fault of :data:`p2p_lib.datasets.faulty.FAULTS`.
 
     severity  in the unit that it says
-    frames    from, to, in the sequence; None: where the sequence says
+    when      in the frames that the sequence says, in all, or in the first one
     """
 
     name: Text
-    severity: float = 1.0
-    frames: list[Count] | None = Field(None, min_length=2, max_length=2)
+    severity: float | None = None
+    when: Literal["for a while", "always", "at first"] = "for a while"
 
     @property
     def shown(self) -> str:
         """What tables call it."""
-        return self.name if "severity" not in self.model_fields_set else f"{self.name}, {self.severity:g}"
+        said = "" if self.when == "for a while" else self.when
+        return ", ".join(filter(None, (self.name, "" if self.severity is None else f"{self.severity:g}", said)))
 
 
 class PlannedSequence(_Strict):
@@ -87,7 +88,7 @@ class PlannedSequence(_Strict):
     models     object to model file or folder, relative to ``$P2P_DATA``, where the layout has none
     clicks     object to pixels [u, v] in frame ``start``, for methods that start from clicks
     column     of the paper's table; with several objects, ``columns`` has one for each
-    fault      what goes wrong in it, and in which frames, from and to, where the fault does not say that
+    fault      what goes wrong in it, and in which frames, from and to, where that is for a while
     """
 
     name: Text
@@ -104,9 +105,10 @@ class PlannedSequence(_Strict):
     fault_frames: list[Count] = Field([30, 60], min_length=2, max_length=2)
 
     @property
-    def during(self) -> list[int]:
-        """The frames of its fault, from and to."""
-        return (self.fault and self.fault.frames) or self.fault_frames
+    def during(self) -> list[int | None]:
+        """The frames of its fault, from and to; None: to the end."""
+        when = self.fault.when if self.fault else ""
+        return {"always": [0, None], "at first": [self.start, self.start + 1]}.get(when, self.fault_frames)
 
     def column_of(self, object: str) -> str:
         """The column of the paper's table that this object belongs to, "" for none."""

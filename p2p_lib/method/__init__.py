@@ -8,7 +8,8 @@ object's step), then at the parts of that step in its order:
 - refine: ``refinement`` moves poses onto the surface of ``tsdf``; ``observability`` says which motions its shape
   determines;
 - select: ``selection``;
-- judge: ``lifecycle`` holds an object's state and every gate;
+- judge: ``lifecycle`` holds an object's state, every gate and every doubt; ``agreement`` says whether camera and masks
+  agree with themselves;
 - extend: ``object_model`` holds map, surface (``tsdf``, ``tsdf_grid``, ``mesh``) and graph (``factor_graph``,
   ``keyframes``, ``keyframe_views``); ``sampling`` chooses new points; ``confidence`` says how well the pose is known.
 

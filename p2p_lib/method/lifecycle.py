@@ -21,6 +21,10 @@ CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES = 5, 15
 SIGHTED, SIGHTED_STILL = 0.5, 0.3
 #: A longer time between two frames is a pause, s, if it is so many times what it was before, too.
 _PAUSE_S, _PAUSE = 0.25, 5
+#: Another size is one that is off by this and so many standard deviations.
+_SIZE, _SIZE_SIGMAS = 0.05, 3.0
+#: A mask that takes in so much background is doubted. One that stays so for this many frames is taken for right.
+_BACKGROUND, _LONGEST_DOUBT = 0.2, 60
 #: Shape and colour tell a turn from all others by this lead.
 TELLING = 0.25
 
@@ -33,21 +37,29 @@ class Evidence:
     surface_share  share of the depth points that lie on the surface under it; None where no surface was asked
     sighting       share of the surface that shows in the image where and as it should; None where nobody has looked
     lead           share of that which is more than where it is turned otherwise; None where nobody has compared
+    size           times as large as its keypoint map it is measured, and the standard deviation; None: few are seen
+    background     pixels that its mask took in although nothing changed there, as a share of the mask
     """
 
     support: int
     surface_share: float | None
     sighting: float | None = None
     lead: float | None = None
+    size: tuple[float, float] | None = None
+    background: float = 0.0
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a pose stands, with the status that it gives the object and the reason in words."""
+    """Whether a pose stands, with the status that it gives the object and the reason in words.
+
+    doubted  whether what it rests on contradicts itself: a pose that nothing is learnt from
+    """
 
     accepted: bool
     status: Status
     reason: str = ""
+    doubted: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +77,7 @@ class Lifecycle:
     start_px        pixels of the newest mask before a map was started; None without a mask
     doubted         since a gap nothing has told its turn from others that look alike
     lost_frames     frames since the newest pose in which it was in view and had none
+    doubted_frames  newest frames in a row whose pose was doubted by one of :data:`DOUBTS`
     """
 
     status: Status = Status.INITIALISING
@@ -78,11 +91,17 @@ class Lifecycle:
     start_px: int | None = None
     doubted: bool = False
     lost_frames: int = 0
+    doubted_frames: int = 0
 
     @property
     def has_pose(self) -> bool:
         """Whether the newest frame has a pose."""
         return self.status in WITH_POSE
+
+    @property
+    def followed(self) -> bool:
+        """Whether two frames that followed each other ever had poses: else the map may be of something else."""
+        return self.pace_s < float("inf")
 
     @property
     def unconfirmed(self) -> bool:
@@ -135,13 +154,18 @@ class Lifecycle:
         for name in gates:
             if reason := GATES[name](self, evidence, config):
                 return Verdict(False, Status.LOST, reason)
+        for name in gates and DOUBTS:
+            if reason := DOUBTS[name](self, evidence):
+                return Verdict(True, Status.DEGRADED, reason, doubted=True)
         if evidence.support < config.return_inliers:
             return Verdict(True, Status.DEGRADED, f"only {evidence.support} points agree")
         confirming = not self.has_pose or self.confirming > 1
         return Verdict(True, Status.RECOVERED if confirming else Status.TRACKED)
 
-    def with_pose(self, T_cam_obj: np.ndarray, time_s: float, status: Status, lead: float | None = None) -> Lifecycle:
-        """The state after a frame with an accepted pose, and the lead by which it was."""
+    def with_pose(
+        self, T_cam_obj: np.ndarray, time_s: float, status: Status, lead: float | None = None, doubted: bool = False
+    ) -> Lifecycle:
+        """The state after a frame with an accepted pose, the lead by which it was, and whether it is doubted."""
         longest = CONFIRM_SIGHTED_FRAMES if status is Status.DEGRADED else CONFIRM_FRAMES
         return replace(
             self,
@@ -150,6 +174,7 @@ class Lifecycle:
             seen_s=time_s,
             pace_s=time_s - self.seen_s if self.has_pose else self.pace_s,
             lost_frames=0,
+            doubted_frames=self.doubted_frames + 1 if doubted else 0,
             doubted=self.doubted if lead is None else lead < TELLING,
             T_previous=self.T_cam_obj if self.has_pose else None,
             T_left=self.T_left if self.has_pose else self.T_cam_obj,
@@ -181,6 +206,23 @@ def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: Life
     nothing = not evidence.support and off and not _sighted(life, evidence)
     return "too few points, and the surface does not fit either" if nothing else ""
 
+
+def _mask_on_background(life: Lifecycle, evidence: Evidence) -> str:
+    on = evidence.background > _BACKGROUND and life.doubted_frames < _LONGEST_DOUBT
+    return f"its mask took in {100 * evidence.background:.0f} % more where nothing changed" if on else ""
+
+
+def _another_size(life: Lifecycle, evidence: Evidence) -> str:
+    ratio, sigma = evidence.size or (1.0, 0.0)
+    another = abs(ratio - 1) > _SIZE + _SIZE_SIGMAS * sigma
+    return f"its depth shows it {ratio:.2f} times as large as before" if another else ""
+
+
+#: Every reason to doubt a pose that no gate refuses: what camera and masks say contradicts itself.
+DOUBTS: dict[str, Callable[[Lifecycle, Evidence], str]] = {
+    "size": _another_size,
+    "background": _mask_on_background,
+}
 
 #: Every reason to refuse a pose, in the order in which they are asked: state, evidence and bounds to words, or "".
 GATES: dict[str, Callable[[Lifecycle, Evidence, LifecycleConfig], str]] = {

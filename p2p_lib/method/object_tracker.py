@@ -21,6 +21,7 @@ from p2p_lib.core.interfaces import Detector, Hint
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import DOUBTED, OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method import refinement, registration, selection
+from p2p_lib.method.agreement import background_share, size_ratio
 from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.lifecycle import GATES, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
@@ -39,6 +40,8 @@ _FEW_KEYPOINTS = 12
 _GROWTH = 1.1
 #: A map is founded anew where an object has been lost for so many frames and shows more than this of what it knows.
 _PATIENCE, _OUTGROWN = 5, 1.5
+#: A smaller share of background in a mask is nothing to look into.
+_SOME = 0.05
 #: A pose that nothing has told from others since a gap is compared again every so many frames.
 _COMPARE_EVERY = 5
 #: A lost object is looked for in every so many frames, turned as in so many of its keyframes at most. Depth this near
@@ -93,6 +96,7 @@ class ObjectTracker:
         self._new_model = partial(ObjectModel, config, self.observer, stopwatch, beside)
         self.model = self._new_model()
         self.life, self.map_id = Lifecycle(), 0
+        self._trusted: Observation | None = None  # the newest without a doubt; None after a frame without a pose
         self._gates = tuple(GATES) if config.method.gates == "all" else ()
         self._rng, self._stopwatch = rng, stopwatch
 
@@ -132,9 +136,11 @@ class ObjectTracker:
         if best.refined is None:
             (best,) = self._refine(obs, [best])
         best = self._compared(obs, best)
-        verdict = self.life.judge(best.evidence, self._gates, self.config.lifecycle)
+        verdict = self.life.judge(self._evidence(obs, best), self._gates, self.config.lifecycle)
         if not verdict.accepted:
             return self._without_pose(obs, verdict.status, verdict.reason)
+        if not verdict.doubted:
+            self._trusted = obs
         return self._extend(obs, best, verdict)
 
     # -- register ------------------------------------------------------------------------------
@@ -237,6 +243,21 @@ class ObjectTracker:
         (turned,) = self._refine(obs, [Candidate(*self._surface_only({"other turn": other.T_cam_obj}))])
         return replace(turned, sighting=other.share, lead=0.0)
 
+    def _evidence(self, obs: Observation, best: Candidate) -> Evidence:
+        """What speaks for a pose, and whether camera and masks agree with themselves."""
+        keypoints, before = obs.seen & self.map.promoted, self._trusted
+        agreeing = keypoints & best.hypothesis.inliers
+        sized = agreeing if 2 * agreeing.sum() > keypoints.sum() else keypoints
+        p_cam = obs.p_cam[sized]
+        size = size_ratio(self.map.p_obj[sized], p_cam, self.observer.noise_m(p_cam))
+        if obs.mask is None or before is None or before.mask is None:
+            return replace(best.evidence, size=size)
+        background = background_share(obs.frame, obs.mask, before.frame, before.mask)
+        # At the image's border a mask grows with what comes into view.
+        if background > _SOME and (self.observer.cut_off(obs) or self.observer.cut_off(before)):
+            background = 0.0
+        return replace(best.evidence, size=size, background=background)
+
     def _agreement(self, obs: Observation, best: Candidate) -> float:
         """The keypoints seen that agree, less those that do not, as a share of all."""
         keypoints = obs.seen & self.map.promoted
@@ -254,26 +275,40 @@ class ObjectTracker:
 
     def _extend(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
         """Take an accepted frame into the model, with a keyframe where one is due."""
+        if verdict.doubted:
+            return self._doubted(obs, best, verdict)
         T_cam_obj, agrees, model = best.T_cam_obj, best.hypothesis.inliers, self.model
         life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict.status, best.lead)
         used = obs.seen & self.map.promoted
         requests = Requests(reject=self.map.ids[used & ~agrees])
-        # Before a keyframe changes the map's rows.
-        agreeing, agreement = self.map.confidence[agrees].sum(), (agrees & used).sum() / max(used.sum(), 1)
+        agreeing = self._agreeing(obs, best)  # before a keyframe changes the map's rows
         of_frame, most = self._covariance(obs, best), DOUBTED if life.doubted else 1.0
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
             keyframe = not life.confirming and model.keyframe_due(obs, T_cam_obj, agrees)
         model.settle_surface()
         if keyframe:
-            sure = min(confidence(self._of_pose(T_cam_obj, of_frame, best), agreeing, agreement), most)
+            sure = min(confidence(self._of_pose(T_cam_obj, of_frame, best), *agreeing), most)
             good = obs.seen & (agrees | ~self.map.promoted)
             T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, self._sample(obs), good, of_frame, sure)
             requests = replace(asked, reject=requests.reject)
         self.life = replace(life, T_cam_obj=T_cam_obj).placed(obs.frame.T_world_cam)
         of_pose = self._of_pose(T_cam_obj, of_frame, best)
-        sure = min(confidence(of_pose, agreeing, agreement), most)
+        sure = min(confidence(of_pose, *agreeing), most)
         return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, of_pose, keyframe), requests)
+
+    def _agreeing(self, obs: Observation, best: Candidate) -> tuple[float, float]:
+        """The keypoints that agree, by the confidence of the pose that placed each, and their share of those seen."""
+        keypoints, agrees = obs.seen & self.map.promoted, best.hypothesis.inliers
+        return self.map.confidence[agrees].sum(), (agrees & keypoints).sum() / max(keypoints.sum(), 1)
+
+    def _doubted(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
+        """A pose from what contradicts itself: neither map nor surface learns from it, and no track is rejected."""
+        self.life = self.life.with_pose(best.T_cam_obj, obs.frame.time_s, verdict.status, best.lead, doubted=True)
+        self.model.settle_surface()
+        of_pose = self._of_pose(best.T_cam_obj, self._covariance(obs, best), best)
+        sure = min(confidence(of_pose, *self._agreeing(obs, best)), DOUBTED)
+        return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, of_pose, False))
 
     def _covariance(self, obs: Observation, best: Candidate) -> np.ndarray:
         """(6, 6) of the pose relative to the map, right tangent of T_cam_obj."""
@@ -331,15 +366,16 @@ class ObjectTracker:
             verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")
         T_cam_obj, requests = self.model.insert_keyframe(obs, T_cam_obj, points, np.zeros(0, bool))
         self.life = self.life.started(T_cam_obj, obs.frame.time_s, verdict.status).placed(obs.frame.T_world_cam)
+        self._trusted = obs
         # The first pose defines the object frame: it is right by definition, whatever the points are worth.
         estimate = self._estimate(obs, verdict, len(self.map), 1.0, self.model.covariance, True)
         return ObjectStep(estimate, replace(requests, drop=forgotten))
 
     def _outgrown(self, obs: Observation) -> bool:
-        """Whether an object that stays lost shows much more than its map was ever founded on."""
+        """Whether an object that stays lost shows much more than its map was ever founded on, or never was followed."""
         if not self._gates or self.life.lost_frames < _PATIENCE or obs.mask is None:
             return False
-        return self.observer.area_m2(obs) > _OUTGROWN * self.model.seen_m2
+        return not self.life.followed or self.observer.area_m2(obs) > _OUTGROWN * self.model.seen_m2
 
     def _hidden(self, mask: np.ndarray | None) -> bool:
         """Whether a mask says that nothing of the object is to be seen."""
@@ -367,7 +403,7 @@ class ObjectTracker:
         )
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
-        self.life = self.life.without_pose(status)
+        self.life, self._trusted = self.life.without_pose(status), None
         reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self._left() else reason
         estimate = PoseEstimate(
             self.name,

@@ -243,17 +243,17 @@ def test_a_record_with_lost_frames_is_read_back_as_it_was(tmp_path):
 
 def test_every_sequence_is_run_with_every_fault_and_a_row_says_what_it_did(slides, plan, tmp_path):
     known = read_plan(plan)
-    scaled = {"name": "depth scaled", "severity": 1.3, "frames": [2, 4]}
+    scaled = {"name": "depth scaled", "severity": 1.3, "when": "at first"}
     scope = {"seeds": [0], "sequence": [{"name": str(slides[0]), "fault_frames": [3, 5]}]}
     scope["fault"] = [{"name": "none"}, scaled, {"name": "frames dropped"}]
     faults = Plan(name="f", title="Faults", kind="faults", method=known.method[:1], quick=scope, full=scope)
     run = run_benchmark(faults, tmp_path / "out", "quick", jobs=1, progress=False)
     assert run.counts() == {"done": 3, "failed": 0, "not run": 0}
     known = {row["sequence"].partition(" with ")[2] for row in run.rows if row["metric"] == "fault"}
-    assert known >= {"none", "depth scaled, 1.3", "frames dropped"}
+    assert known >= {"none", "depth scaled, 1.3, at first", "frames dropped"}
     assert len({job.key for job, _ in run.results}) == 3, "a fault is part of what decides a result"
     frames = [outcome.objects["object"].fault["frames"] for _, outcome in run.results]
-    assert frames == [3, 4, 1], "with truth, from the fault's first on"
+    assert frames == [3, 6, 1], "with truth, from the fault's first on"
     rows = paper_table(run).rows
-    assert [row[0].text for row in rows] == ["none", "depth scaled, 1.3", "frames dropped"]
+    assert [row[0].text for row in rows] == ["none", "depth scaled, 1.3, at first", "frames dropped"]
     assert [row[2].text for row in rows] == ["0"] * 3

@@ -166,3 +166,28 @@ def test_a_return_without_points_is_sought_until_points_confirm_it():
         life = life.with_pose(pose(4 + k), 4.0 + k, Status.DEGRADED)
     confirmed = life.with_pose(pose(20), 20.0, Status.RECOVERED)
     assert not confirmed.sought and confirmed.confirming <= CONFIRM_FRAMES
+
+
+@pytest.mark.parametrize(
+    ("contradiction", "doubted"),
+    [
+        ({}, False),
+        ({"size": (1.03, 0.0), "background": 0.1}, False),
+        ({"size": (1.1, 0.01)}, True),
+        ({"size": (0.9, 0.01)}, True),
+        ({"size": (1.1, 0.02)}, False),
+        ({"background": 0.3}, True),
+    ],
+)
+def test_what_contradicts_itself_is_doubted_and_the_paper_doubts_nothing(contradiction, doubted):
+    life, evidence = lived(GOOD)[-1], dataclasses.replace(GOOD, **contradiction)
+    verdict = life.judge(evidence, ALL, CFG)
+    assert verdict.accepted and verdict.doubted == doubted == bool(verdict.reason)
+    assert verdict.status is (Status.DEGRADED if doubted else Status.TRACKED)
+    assert not life.judge(evidence, (), CFG).doubted
+
+
+def test_a_mask_that_stays_as_wide_is_taken_for_right_in_the_end():
+    long, wide = dataclasses.replace(lived(GOOD)[-1], doubted_frames=60), dataclasses.replace(GOOD, background=0.3)
+    assert not long.judge(wide, ALL, CFG).doubted
+    assert long.judge(dataclasses.replace(GOOD, size=(1.2, 0.0)), ALL, CFG).doubted, "an object has one size"

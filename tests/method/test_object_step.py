@@ -3,6 +3,7 @@
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -524,13 +525,14 @@ def test_an_object_that_still_comes_into_view_is_not_started():
     assert paper.see(START).estimate.status is Status.TRACKED
 
 
-def stays_lost(first_columns: int, frames: int = 9, **settings) -> tuple[Lump, list[ObjectStep]]:
+def stays_lost(first_columns: int, frames: int = 9, followed: bool = True, **settings) -> tuple[Lump, list[ObjectStep]]:
     """Started on some columns of its mask, then whole, turned away, and none of its points is found again."""
     lump, away = Lump(**settings), turned(150)
     _, whole = render(LUMP, START)
     sliver = whole.copy()
     sliver[:, np.flatnonzero(whole.any(0))[first_columns] :] = False
-    lump.see(START, mask=sliver)
+    for _ in range(1 + followed):
+        lump.see(START, mask=sliver)
     old = lump.tracker.map.ids.max()
     return lump, [lump.see(away, hide(lambda tracks: tracks.ids <= old)) for _ in range(frames)]
 
@@ -558,6 +560,77 @@ def test_a_map_of_a_sliver_is_founded_anew_where_the_object_stays_lost_in_plain_
 def test_a_map_of_all_that_is_seen_is_kept_and_so_is_the_papers(columns, settings):
     _, steps = stays_lost(columns, 12, **settings)
     assert {step.estimate.map_id for step in steps} == {0}
+
+
+def test_a_map_in_which_nothing_ever_was_followed_is_founded_anew():
+    _, steps = stays_lost(-1, 12, followed=False)
+    assert [step.estimate.map_id for step in steps] == [0] * 5 + [1] * 7
+
+
+def learnt(lump: Lump) -> list[np.ndarray]:
+    """All that a frame may change of what is known of the object."""
+    model = lump.tracker.model
+    counts = [model.map.p_obj, model.map.promoted, model.map.confidence]
+    return [*(value.copy() for value in counts), model.surface.values(), model.surface.weights()]
+
+
+def doubtful(lump: Lump, depth=lambda depth_m: depth_m, mask=lambda mask: mask) -> ObjectStep:
+    """A turn by which a keyframe is due, with other depth and another mask than the object has."""
+    T_cam_model = turned(15)
+    depth_m, seen = render(LUMP, T_cam_model)
+    rgb = np.full((*depth_m.shape, 3), 9, np.uint8)
+    frame = Frame(len(lump.steps), len(lump.steps) / 30, rgb, depth(np.where(seen, depth_m, np.float32(0.8))))
+    return lump.tracker.step(lump.tracker.observe(frame, mask(seen), lump.tracks(T_cam_model)))
+
+
+def before_a_wall(**settings) -> Lump:
+    """Followed for a while before a wall that depth shows, too."""
+    lump = begun(**settings)
+    for deg in (3, 6, 9):
+        depth_m, seen = render(LUMP, turned(deg))
+        frame = Frame(len(lump.steps), len(lump.steps) / 30, np.zeros((*seen.shape, 3), np.uint8), depth_m)
+        frame = replace(frame, depth_m=np.where(seen, depth_m, np.float32(0.8)))
+        lump.steps.append(lump.tracker.step(lump.tracker.observe(frame, seen, lump.tracks(turned(deg)))))
+    assert lump.steps[-1].estimate.status is Status.TRACKED and lump.steps[-1].estimate.confidence > 0.5
+    return lump
+
+
+def dilated(mask: np.ndarray) -> np.ndarray:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((31, 31))) > 0
+
+
+@pytest.mark.parametrize(
+    ("fault", "word"),
+    [
+        ({"depth": lambda depth_m: 1.2 * depth_m}, "1.20 times as large"),
+        ({"depth": lambda depth_m: depth_m + np.float32(0.1)}, "times as large"),
+        ({"mask": dilated}, "more where nothing changed"),
+    ],
+)
+def test_nothing_is_learnt_from_what_contradicts_itself(fault, word):
+    lump = before_a_wall()
+    before = learnt(lump)
+    for _ in range(2):  # doubted as long as it lasts
+        step = doubtful(lump, **fault)
+        assert step.estimate.status is Status.DEGRADED and word in step.estimate.reason
+        assert 0 < step.estimate.confidence <= 0.5 and not step.estimate.keyframe
+        assert not len(step.requests.reject) and not len(step.requests.keys)
+    for was, now in zip(before, learnt(lump), strict=True):
+        np.testing.assert_array_equal(was, now)
+    good = doubtful(lump).estimate
+    assert good.status is Status.TRACKED and good.keyframe and good.confidence > 0.5, "all is well again"
+
+
+def test_a_mask_at_the_border_grows_with_what_comes_into_view():
+    step = doubtful(before_a_wall(), mask=lambda mask: mask | mask.any(0))
+    assert step.estimate.status is Status.TRACKED
+
+
+@pytest.mark.parametrize(("settings", "fault"), [({}, {}), ({"method__gates": "none"}, {"mask": dilated})])
+def test_what_agrees_is_learnt_and_the_paper_doubts_nothing(settings, fault):
+    lump = before_a_wall(**settings)
+    step = doubtful(lump, **fault)
+    assert step.estimate.keyframe and step.estimate.status is Status.TRACKED
 
 
 def test_points_off_the_mask_are_no_observations_and_elsewhere_when_it_is_away():

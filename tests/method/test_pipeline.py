@@ -477,6 +477,19 @@ def test_depth_may_fail_for_a_while():
     assert set(statuses(estimates, "right")) == {"tracked"}
 
 
+def test_depth_that_stands_counts_as_missing():
+    standing = film()[9][0].depth_m
+    frames = [(replace(f, depth_m=standing) if f.index in range(10, 16) else f, masks) for f, masks in film()[:20]]
+    with pytest.warns(Doubt, match="the same image again"):
+        estimates = track(frames)
+    # A camera may deliver depth more seldom than colour: for less than a tenth of a second it serves.
+    assert [e["left"].T_cam_obj is not None for e in estimates] == [True] * 12 + [False] * 4 + [True] * 4
+    deg, mm = errors(estimates, "left")
+    assert deg[-4:].max() < 1 and mm[-4:].max() < 3
+    paper = track(frames, config=quick("paper"))
+    assert paper[14]["left"].T_cam_obj is not None, "the paper doubts nothing"
+
+
 def test_nan_depth_is_no_depth():
     rng = np.random.default_rng(0)
     holes = rng.random((300, 400)) < 0.2

@@ -1,0 +1,55 @@
+"""Does what camera and masks say agree with itself: three measures, from values alone (not in the paper).
+
+They know no truth. What follows of an object is in :data:`p2p_lib.method.lifecycle.DOUBTS`; depth that stands still is
+taken for none in :mod:`p2p_lib.method.pipeline`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from p2p_lib.core.image import bounds
+from p2p_lib.core.types import Frame
+
+#: Keypoints nearer to each other say little of the size, m; so many are needed.
+_APART_M, _KEYPOINTS = 0.02, 8
+#: What has changed by less is the same thing: depth in m, each of red, green and blue in grey levels.
+_SAME_M, _SAME_GREY = 0.01, 12
+#: Pixels between those that are compared first.
+_STEP = 8
+
+
+def size_ratio(p_obj: np.ndarray, p_cam: np.ndarray, noise_m: np.ndarray) -> tuple[float, float] | None:
+    """How many times as large as in the map (N, 3) the object is measured (N, 3), with the standard deviation of that.
+
+    A rigid object has one size. Depth that is scaled or offset changes it; a wrong pose or a few wrong points do not:
+    the median over pairs of keypoints. ``noise_m`` (N,) is that of the points; None where too few keypoints are seen.
+    """
+    a, b = np.triu_indices(len(p_obj), 1)
+    known_m, measured_m = (np.linalg.norm(p[a] - p[b], axis=1) for p in (p_obj, p_cam))
+    apart = known_m > _APART_M
+    if len(p_obj) < _KEYPOINTS or apart.sum() < _KEYPOINTS:
+        return None
+    sigma = np.sqrt(2 / len(p_obj)) * np.median(noise_m) / np.median(known_m[apart])
+    return float(np.median(measured_m[apart] / known_m[apart])), float(sigma)
+
+
+def background_share(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.ndarray) -> float:
+    """Pixels that a mask has taken in although nothing has changed there, as a share of the mask (H, W) before.
+
+    What an object moves onto changes, and what comes out from behind something does, too.
+    """
+    cut = bounds(mask)
+    taken = mask[cut] & ~mask_before[cut]
+    now_m, then_m = (of.depth_m[cut][taken] for of in (frame, before))
+    now, then = (of.rgb[cut][taken].astype(int) for of in (frame, before))
+    same = (now_m > 0) & (then_m > 0) & (np.abs(now_m - then_m) < _SAME_M) & (np.abs(now - then) < _SAME_GREY).all(1)
+    return float(np.count_nonzero(same) / max(np.count_nonzero(mask_before), 1))
+
+
+def depth_stands(frame: Frame, before: Frame) -> bool:
+    """Whether all depth is that of a frame before, to the last bit, while colour goes on: no sensor measures so."""
+    some = np.s_[::_STEP, ::_STEP]
+    if not np.array_equal(frame.depth_m[some], before.depth_m[some]) or not frame.depth_m.any():
+        return False
+    return np.array_equal(frame.depth_m, before.depth_m) and not np.array_equal(frame.rgb, before.rgb)

@@ -1,0 +1,69 @@
+"""What says that camera and masks contradict themselves, on made-up values."""
+
+import numpy as np
+import pytest
+
+from p2p_lib.core import se3
+from p2p_lib.core.types import Frame
+from p2p_lib.method.agreement import background_share, depth_stands, size_ratio
+
+RNG = np.random.default_rng(0)
+P_OBJ = RNG.uniform(-0.05, 0.05, (30, 3))
+T = se3.exp(np.array([0.4, -0.3, 0.8, 0.1, 0.05, 0.7]))
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.0, 1.2])
+def test_the_size_is_that_of_the_depth_wherever_the_object_is(scale):
+    p_cam = scale * se3.transform(T, P_OBJ) + RNG.normal(0, 5e-4, P_OBJ.shape)
+    p_cam[:6] += RNG.normal(0, 0.05, (6, 3))  # wrong points
+    ratio, sigma = size_ratio(P_OBJ, p_cam, np.full(30, 5e-4))
+    assert ratio == pytest.approx(scale, abs=0.02) and sigma < 0.01
+
+
+def test_depth_that_is_offset_shows_it_larger():
+    facing = P_OBJ * [1, 1, 0] + [0, 0, 0.7]
+    ratio, _ = size_ratio(P_OBJ * [1, 1, 0], facing * (1 + 0.15 / 0.7), np.zeros(30))
+    assert ratio == pytest.approx(1 + 0.15 / 0.7)
+
+
+def test_noise_spreads_the_size_by_as_much_as_it_says():
+    noisy = [size_ratio(P_OBJ, P_OBJ + RNG.normal(0, 2e-3, P_OBJ.shape), np.full(30, 2e-3)) for _ in range(200)]
+    ratio, sigma = np.transpose(noisy)
+    assert 0.5 * sigma[0] < ratio.std() < 2 * sigma[0]
+
+
+def test_few_points_or_points_in_one_place_have_no_size():
+    assert size_ratio(P_OBJ[:7], P_OBJ[:7], np.zeros(7)) is None
+    assert size_ratio(0.1 * P_OBJ, P_OBJ, np.zeros(30)) is None
+
+
+def scene(left: int, grey: int = 100, wall_m: float = 0.9) -> tuple[Frame, np.ndarray]:
+    """A square of 20 px at 0.5 m before a wall, and its mask."""
+    mask = np.zeros((40, 80), bool)
+    mask[10:30, left : left + 20] = True
+    depth_m = np.where(mask, 0.5, wall_m).astype(np.float32)
+    return Frame(0, 0.0, np.full((40, 80, 3), grey, np.uint8), depth_m), mask
+
+
+def test_a_mask_takes_in_background_that_an_object_that_moves_does_not():
+    (before, mask_before), (frame, mask) = scene(20), scene(30)
+    assert background_share(frame, mask, before, mask_before) == 0, "there it has moved"
+    wide = mask.copy()
+    wide[10:30, 50:55] = True
+    assert background_share(frame, wide, before, mask_before) == pytest.approx(5 / 20)
+    nearer, brighter = scene(30, wall_m=0.7)[0], scene(30, grey=130)[0]  # something passes, in depth or in colour
+    assert background_share(nearer, wide, before, mask_before) == 0
+    assert background_share(brighter, wide, before, mask_before) == 0
+    assert background_share(frame, mask_before & mask, before, mask_before) == 0, "what it leaves out is no background"
+
+
+def test_depth_stands_where_it_is_the_same_while_colour_goes_on():
+    (before, _), (moved, _), (later, _) = scene(20), scene(21), scene(20, grey=101)
+    assert depth_stands(later, before)
+    assert not depth_stands(moved, before), "depth goes on"
+    noisy = later.depth_m.copy()
+    noisy[3, 5] += 1e-4
+    assert not depth_stands(Frame(1, 0.1, later.rgb, noisy), before), "to the last bit"
+    assert not depth_stands(before, before), "the same image twice tells nothing"
+    nothing = np.zeros_like(later.depth_m)
+    assert not depth_stands(Frame(1, 0.1, later.rgb, nothing), Frame(0, 0.0, before.rgb, nothing))
