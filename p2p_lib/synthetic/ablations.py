@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from p2p_lib.synthetic import shapes, solids
@@ -45,6 +47,28 @@ def weak_texture(seed: int, frames: int = 240, contrast: float = 0.05) -> Scenar
     yaw = np.radians(75) * np.sin(2 * np.pi * np.arange(frames) / 260 + rng.uniform(0, 2 * np.pi))
     T = turned(wander(rng, frames, 0.04, 15.0, 180), yaw, _CENTRE)
     return _on_the_table(rng, Body("block", mesh, T), (0.0, -0.36, 0.42))
+
+
+def plain(seed: int, frames: int = 240) -> Scenario:
+    """Three shapes in one colour each, without print: a leaning block, a mug (round but for its handle), a round tin.
+
+    How far the tin has turned about its own axis, nothing tells.
+    """
+    check("plain", frames=(frames, 2, np.inf))
+    rng = np.random.default_rng([seed, 1])
+    meshes = {
+        "block": shapes.block(rng, 0.05 * rng.uniform(0.95, 1.05), 0.10),
+        "mug": solids.mug(rng, 0.042 * rng.uniform(0.95, 1.05), 0.095, reflectance=0.0, marks=0),
+        "tin": shapes.can(rng, 0.038 * rng.uniform(0.95, 1.05), 0.105),
+    }
+    bodies = []
+    for k, (name, mesh) in enumerate(meshes.items()):
+        paint = np.broadcast_to(rng.integers(90, 230, 3).astype(np.uint8), mesh.texture.shape)
+        # The handle stays to the side, in view.
+        yaw = rng.choice([0, np.pi]) + np.radians(40) * np.sin(2 * np.pi * np.arange(frames) / 170 + rng.uniform(0, 6))
+        T = turned(wander(rng, frames, 0.02, 10.0, 150), yaw, np.array([0.17 * (k - 1), 0.0, 0.11]))
+        bodies.append(Body(name, replace(mesh, texture=np.ascontiguousarray(paint)), T))
+    return Scenario(VGA, standing(np.array([0.0, -0.52, 0.36]), _CENTRE, frames), tuple(bodies), room(rng))
 
 
 def fading_label(seed: int, frames: int = 180, contrast: float = 1.0) -> Scenario:

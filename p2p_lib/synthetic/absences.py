@@ -1,7 +1,8 @@
 """Absence and return: hidden by a hand or a board, out of the image, look-alikes, a late object, a moving camera.
 
-In each, an object that is away moves by more than 10 cm and turns by more than 30 degrees, and comes back showing
-a side that was seen before. Times are frames of 30 a second.
+An object that is away moves by more than 10 cm and turns by more than 30 degrees, and comes back showing a side that
+was seen before; what :func:`other_side`, :func:`look_away` and :func:`half_hidden_start` do, they say. Times are
+frames of 30 a second.
 """
 
 from __future__ import annotations
@@ -60,6 +61,21 @@ _EXIT = [
     (245, 0.05, 0.0, 0.14, -25, -4, -3),
     (299, -0.02, 0.03, 0.16, 35, 4, 4),
 ]
+#: Of ``other_side``: front and right side, hidden, back and left side, then around in view to the front again.
+_OTHER_SIDE = [
+    (0, -0.10, 0.00, 0.19, 10, 0, 0),
+    (40, -0.10, 0.01, 0.20, 34, 2, -2),
+    (81, -0.10, 0.00, 0.19, 12, -2, 2),
+    (99, -0.10, 0.00, 0.19, 12, -2, 2),
+    (131, 0.03, 0.03, 0.20, 191, 1, -1),
+    (150, 0.03, 0.03, 0.19, 192, 1, -1),
+    (190, 0.04, 0.02, 0.20, 214, -2, 2),
+    (225, 0.03, 0.00, 0.19, 196, 2, 2),
+    (325, -0.02, 0.00, 0.19, 378, -2, -2),
+    (359, -0.02, 0.00, 0.20, 390, 0, 2),
+]
+#: Of ``look_away``: the camera's distance (m), height, place about the table before and after, and pan away (degrees).
+_AWAY_M, _AWAY_HEIGHT, _AWAY_PLACES, _AWAY_PAN = 0.68, 33.0, (-20.0, 30.0), 78.0
 
 
 def crossing(seed: int, frames: int = _FRAMES, contrast: float = 1.0) -> Scenario:
@@ -132,6 +148,61 @@ def moving_camera(seed: int) -> Scenario:
     time = np.arange(_FRAMES)[:, None] / rng.uniform(170, 230, 3) + rng.uniform(0, 1, 3)
     eyes = _EYE + np.array([0.16, 0.05, 0.06]) * np.sin(2 * np.pi * time)
     return _scene(rng, placed, np.stack([look_at(eye, _TARGET) for eye in eyes]))
+
+
+def other_side(seed: int) -> Scenario:
+    """A flat carton returns from behind a hand with a side never seen; later it turns to the one that was."""
+    rng = np.random.default_rng([seed, 1])
+    mesh = shapes.box(rng, tuple(np.array([0.105, 0.035, 0.14]) * rng.uniform(0.95, 1.05, 3)))
+    T = path(varied(rng, _OTHER_SIDE, mirrored=rng.choice([-1.0, 1.0])), 360)
+    return _scene(rng, [(Body("box", mesh, T), (97, 133))], standing(_LOW_EYE, _TARGET, 360))
+
+
+def look_away(seed: int) -> Scenario:
+    """A carried camera looks away from four objects on a table and returns from another side; one was moved meanwhile.
+
+    The others never move.
+    """
+    rng = np.random.default_rng([seed, 1])
+    meshes = {"box": _carton(rng), "can": _tin(rng), "block": shapes.block(rng, 0.045, 0.09)}
+    meshes["pack"] = shapes.box(rng, (0.09, 0.06, 0.05))
+    moved, way = rng.integers(4), rng.choice([-1.0, 1.0])
+    bodies = []
+    for k, (name, mesh) in enumerate(meshes.items()):
+        place = np.array([0.13 * k - 0.195, 0.065 * (-1) ** k, 0]) + np.r_[rng.uniform(-0.01, 0.01, 2), 0]
+        T = np.repeat(_standing(mesh, place, rng.uniform(-0.4, 0.4))[None], _FRAMES, 0)
+        if k == moved:
+            place[1] -= 0.13 * (-1) ** k
+            T[150:] = _standing(mesh, place, rng.choice([-1, 1]) * rng.uniform(0.7, 1.2))
+        bodies.append(Body(name, mesh, T))
+    return Scenario(VGA, _panned(rng, way), tuple(bodies), room(rng))
+
+
+def _standing(mesh: Mesh, place: np.ndarray, yaw_rad: float) -> np.ndarray:
+    """T_world_model of a mesh that stands on the table."""
+    up = np.array([0, 0, -mesh.vertices[:, 2].min()])
+    return turned(se3.IDENTITY[None], np.array([yaw_rad]), place + up)[0]
+
+
+def _panned(rng: np.random.Generator, way: float) -> np.ndarray:
+    """T_world_cam (300, 4, 4) in a hand: at the table, at its side, at the table again from another side."""
+    frames = np.arange(_FRAMES)
+    before, after = _AWAY_PLACES
+    place = through(
+        [0, 50, 95, 118, 178, 200, 250, 299],
+        [before, before + 8, before, before, *[after] * 2, after - 8, after],
+        frames,
+        4,
+    )
+    pan = through([0, 95, 132, 164, 201, 299], [0, 0, _AWAY_PAN, _AWAY_PAN, 0, 0], frames, 3)
+    middle, height = np.array([0.0, 0.0, 0.04]), np.radians(_AWAY_HEIGHT)
+    about = np.radians(way * place)
+    eyes = middle + _AWAY_M * np.stack(
+        [np.sin(about) * np.cos(height), -np.cos(about) * np.cos(height), np.sin(height) + 0 * about], 1
+    )
+    T = np.stack([look_at(eye, middle) for eye in eyes])
+    T[:, :3, :3] = se3.exp(np.radians(way * pan)[:, None] * np.array([0, 0, 1.0, 0, 0, 0]))[:, :3, :3] @ T[:, :3, :3]
+    return T @ wander(rng, _FRAMES, 0.008, 1.5, 45)
 
 
 def half_hidden_start(seed: int, models: str = "") -> Scenario:

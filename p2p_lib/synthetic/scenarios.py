@@ -15,6 +15,7 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
         absences.crossing,
         ablations.mug,
         ablations.weak_texture,
+        ablations.plain,
         ablations.fading_label,
         ablations.long_turning,
         ablations.eight_objects,
@@ -25,6 +26,8 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
         absences.three_objects,
         absences.moving_camera,
         absences.half_hidden_start,
+        absences.other_side,
+        absences.look_away,
     )
 }
 SCENARIOS |= {name: partial(paper_subset.paper_sequence, parts=parts) for name, parts in paper_subset.SEQUENCES.items()}

@@ -186,3 +186,24 @@ def test_long_turning_turns_several_times_and_comes_back(seed):
 def test_bad_parameters_are_named(name, overrides, message):
     with pytest.raises(BadInput, match=message):
         SCENARIOS[name](0, **overrides)
+
+
+def test_plain_shapes_have_no_print_and_one_two_or_all_turns_that_fit():
+    from scipy.spatial import cKDTree
+
+    scenario = made("plain", 1)
+    assert all(np.ptp(body.mesh.texture.reshape(-1, 3), axis=0).max() == 0 for body in scenario.bodies)
+    off_mm = {}
+    for body in scenario.bodies:
+        points, _ = body.mesh.sample(20000, np.random.default_rng(0))
+        turns = se3.exp(np.radians(np.arange(20, 360, 20))[:, None] * np.array([0, 0, 1.0, 0, 0, 0]))
+        tree = cKDTree(points)
+        distance_m = np.stack([tree.query(se3.transform(T, points))[0] for T in turns])
+        off_mm[body.name] = 1e3 * distance_m.mean(1).min(), 1e3 * distance_m.max(1).min()
+    mean, largest = zip(*(off_mm[name] for name in ("block", "mug", "tin")), strict=True)
+    assert mean[0] > 2.5 and mean[1] < 2.5 and mean[2] < 1.2  # the points are 1 mm apart
+    assert largest[1] > 20 and largest[2] < 4  # but for the handle
+    T_cam_world = se3.inverse(scenario.T_world_cam[0])
+    for body in scenario.bodies:
+        uv = scenario.camera.project(se3.transform(T_cam_world @ body.T_world_model[::10], body.mesh.vertices))
+        assert scenario.camera.inside(uv).all(), body.name

@@ -114,3 +114,41 @@ def test_the_far_one_is_half_hidden_at_first_and_whole_a_second_later(seed):
     tin, box = (body.T_world_model for body in scenario.bodies)
     assert turn_deg(tin[:-1, :3, :3], tin[1:, :3, :3]).max() < 4
     assert np.linalg.norm(tin[:, :3, 3] - box[:, :3, 3], axis=1).min() > 0.15  # they never touch
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_other_side_was_never_seen_and_the_first_one_comes_back(seed):
+    scenario = replace(SCENARIOS["other_side"](seed), camera=SMALL)
+    times = np.arange(0, scenario.frames, STEP)
+    px, seen = watch(scenario, times)["box"]
+    ((a, b),) = absences(px)
+    assert (b - a) * STEP > 25
+    known, back = seen[:a].any(0), seen[b + 3 : 215 // STEP]
+    assert len(back) * STEP > 60 and (back & known).sum() < 0.1 * back.sum()  # two seconds of what is not known
+    last = seen[-20:]
+    assert (last & known).sum(1).min() > 0.7 * last.sum(1).max()
+    assert px[b + 3 :].min() > 0.3 * np.median(px)  # in plain view from then on
+    R = scenario.bodies[0].T_world_model[b * STEP :, :3, :3]
+    assert turn_deg(R[1:], R[:-1]).max() < 4
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_camera_looks_away_from_all_and_one_is_elsewhere_when_it_returns(seed):
+    scenario = replace(SCENARIOS["look_away"](seed), camera=SMALL)
+    seen = watch(scenario, range(0, scenario.frames, STEP))
+    px = np.stack([px for px, _ in seen.values()])
+    assert (px[:, :40] > 60).all() and (px[:, 108:] > 60).all()  # of a sixteenth of the pixels
+    away = np.flatnonzero((px == 0).all(0))
+    assert len(away) * STEP >= 20 and (np.diff(away) == 1).all()
+    for _, shows in seen.values():
+        assert (shows[:40].any(0) & shows[110]).sum() > 0.3 * shows[110].sum()
+    ends = np.stack([body.T_world_model for body in scenario.bodies])
+    changed = np.flatnonzero(np.abs(np.diff(ends, axis=1)).max((0, 2, 3)))
+    assert len(changed) == 1 and changed[0] // STEP in away
+    moved = np.linalg.norm(ends[:, -1, :3, 3] - ends[:, 0, :3, 3], axis=1)
+    assert (moved > 0).sum() == 1 and moved.max() > 0.1
+    apart = np.linalg.norm(ends[:, None, -1, :2, 3] - ends[None, :, -1, :2, 3], axis=-1)
+    assert apart[np.triu_indices(4, 1)].min() > 0.1  # nothing stands in another
+    # From another side: by more than 35 degrees about the table, as seen from above.
+    azimuth = np.degrees(np.arctan2(scenario.T_world_cam[:, 0, 3], -scenario.T_world_cam[:, 1, 3]))
+    assert np.abs(azimuth[220:] - azimuth[:80].mean()).min() > 35
