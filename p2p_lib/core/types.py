@@ -174,7 +174,9 @@ class PoseEstimate:
     covariance      (6, 6) or None: right tangent of T_cam_obj, [rotation rad, translation m]
     confidence      in [0, 1]; 0 without a pose
     reason          why the status is what it is, in words; empty when tracked
-    map_id          0, and one more for each map that was started anew since: another map has another object frame
+    map_id          0, and one more for each map that was started since: another map has another object frame
+    joined          (id, T_obj_joined) of a map that became part of this one at this frame, else None: a point of its
+                    object frame is T_obj_joined times it in this one
     last_T_cam_obj  the newest pose known, and last_seen_s its time: for those who want to guess
     """
 
@@ -192,6 +194,7 @@ class PoseEstimate:
     last_seen_s: float = float("nan")
     keyframe: bool = False
     map_id: int = 0
+    joined: tuple[int, np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         name = f"estimate of {self.object!r} at frame {self.frame_index}"

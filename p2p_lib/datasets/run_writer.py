@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -230,9 +230,8 @@ class RunWriter:
         for name, estimates in self._estimates.items():
             if name not in self._pose_files or len({e.map_id for e in estimates[-2:]}) > 1:
                 self._write_poses(name)  # of an object that nobody announced, or with a new map
-            else:
-                for line in _tum_lines(estimates[-1:]):
-                    append(self._pose_files[name], line)
+            elif (T_cam_obj := estimates[-1].T_cam_obj) is not None:
+                append(self._pose_files[name], tum_line(estimates[-1].time_s, T_cam_obj))
         row = self._timings[-1]
         if row.keys() - set(self._timing_columns):
             self._write_timings()  # with a stage that had not run before
@@ -252,7 +251,9 @@ class RunWriter:
 
     def _write_poses(self, name: str) -> None:
         self._pose_files[name] = self.path / "poses" / f"{name}.txt"
-        replace_text(self._pose_files[name], "".join(_tum_lines(self._estimates[name])))
+        run = ObjectRun.of(name, self._estimates[name], self._sequence, self._visible_px).of_last_map()
+        lines = map(tum_line, run.time_s[run.has_pose].tolist(), run.T_cam_obj[run.has_pose])
+        replace_text(self._pose_files[name], "".join(lines))
 
 
 def look_into(out: Path, if_exists: IfExists) -> dict[str, Any] | None:
@@ -276,12 +277,6 @@ def look_into(out: Path, if_exists: IfExists) -> dict[str, Any] | None:
 def _in_words(info: Mapping[str, Any]) -> str:
     tracker, seed = info["tracker"], info["seed"]
     return f"a run of {info['sequence']} ({info['frames']} frames, tracker {tracker}, seed {seed})"
-
-
-def _tum_lines(estimates: list[PoseEstimate]) -> Iterable[str]:
-    """A line for each that has a pose in the map of the last."""
-    of_map = (e for e in estimates if e.map_id == estimates[-1].map_id)
-    return (tum_line(e.time_s, e.T_cam_obj) for e in of_map if e.T_cam_obj is not None)
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:

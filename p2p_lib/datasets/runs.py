@@ -7,8 +7,9 @@ It is written into a folder of its own, by one process at a time: nothing is del
     config.toml           every parameter
     run.json              what ran on what: sequence, objects, tracker, masks, preset, seed, versions, commit
     poses/<object>.txt    TUM: time_s tx ty tz qx qy qz qw of T_cam_obj; frames without a pose are left out,
-                          and so are poses in maps that were given up since (``map_id`` in ``poses.npz``)
-    poses.npz             everything of every frame, and the truth where the sequence has it
+                          and so are poses in maps that were given up since (``map_id`` in ``poses.npz``); poses in a
+                          map that became part of the last one since are in its frame
+    poses.npz             everything of every frame as it was said then, and the truth where the sequence has it
     meshes/<object>.ply   the reconstructed surface in the object frame, vertex colours (written at the end)
     keypoints.npz         2D tracks and keypoint maps (:mod:`p2p_lib.datasets.keypoint_log`; written at the end)
     models.npz            the models' points, so that a run can be scored by itself
@@ -48,6 +49,8 @@ class ObjectRun:
     confidence           (n,) in [0, 1]; covariance (n, 6, 6), NaN where there is none
     visible_points, inliers, keyframe, reason  (n,) as of the estimates
     map_id               (n,) int: poses of one map are in one object frame, those of another map in another
+    joined_map           (n,) int, the map that became part of this one at this frame; -1: none
+    T_obj_joined         (n, 4, 4) from that map's frame to this one's, NaN where none
     T_cam_model          (n, 4, 4) truth, NaN where there is none
     labelled             (n,) bool: the dataset's visibility labels hold
     visible_px           (n,) pixels of the dataset's own mask, -1 where it has no masks
@@ -63,13 +66,15 @@ class ObjectRun:
     inliers: np.ndarray
     keyframe: np.ndarray
     map_id: np.ndarray
+    joined_map: np.ndarray
+    T_obj_joined: np.ndarray
     T_cam_model: np.ndarray
     labelled: np.ndarray
     visible_px: np.ndarray
     reason: np.ndarray
 
     def __post_init__(self) -> None:
-        of_a_frame = {"T_cam_obj": (4, 4), "covariance": (6, 6), "T_cam_model": (4, 4)}
+        of_a_frame = {"T_cam_obj": (4, 4), "covariance": (6, 6), "T_cam_model": (4, 4), "T_obj_joined": (4, 4)}
         if self.frame_index.ndim != 1:
             raise BadInput("run: frame_index", f"shape {self.frame_index.shape}", "one number for each frame")
         for column in COLUMNS:
@@ -91,6 +96,8 @@ class ObjectRun:
             status=np.array([str(e.status) for e in estimates]),
             T_cam_obj=np.array([NO_POSE if e.T_cam_obj is None else e.T_cam_obj for e in estimates]),
             covariance=np.array([NO_COVARIANCE if e.covariance is None else e.covariance for e in estimates]),
+            joined_map=np.array([-1 if e.joined is None else e.joined[0] for e in estimates]),
+            T_obj_joined=np.array([NO_POSE if e.joined is None else e.joined[1] for e in estimates]),
             T_cam_model=truth.T_cam_model[at] if truth else np.tile(NO_POSE, (len(at), 1, 1)),
             labelled=truth.labelled[at] if truth else np.zeros(len(at), bool),
             visible_px=np.array([NO_MASKS if seen is None else seen.get(name, 0) for seen in visible_px]),
@@ -110,12 +117,17 @@ class ObjectRun:
         return self.has_pose & (self.confidence <= DOUBTED)
 
     def of_last_map(self) -> ObjectRun:
-        """The same without the poses of maps that were given up, whose object frames were others."""
-        last = self.map_id == self.map_id[-1] if len(self) else np.zeros(0, bool)
+        """The same in the frame of the last map: without the poses of maps that are no part of it."""
+        map_id, T_cam_obj, covariance = self.map_id.copy(), self.T_cam_obj.copy(), self.covariance.copy()
+        for k in np.flatnonzero(self.joined_map >= 0):
+            rows, T, A = map_id == self.joined_map[k], self.T_obj_joined[k], se3.adjoint(self.T_obj_joined[k])
+            map_id[rows], T_cam_obj[rows] = self.map_id[k], T_cam_obj[rows] @ se3.inverse(T)
+            covariance[rows] = A @ covariance[rows] @ A.T
+        last = map_id == map_id[-1] if len(self) else np.zeros(0, bool)
         return replace(
             self,
-            T_cam_obj=np.where(last[:, None, None], self.T_cam_obj, np.nan),
-            covariance=np.where(last[:, None, None], self.covariance, np.nan),
+            T_cam_obj=np.where(last[:, None, None], T_cam_obj, np.nan),
+            covariance=np.where(last[:, None, None], covariance, np.nan),
             confidence=np.where(last, self.confidence, 0),
         )
 
@@ -128,7 +140,7 @@ class ObjectRun:
 #: What ``poses.npz`` holds of an object.
 COLUMNS = tuple(column.name for column in fields(ObjectRun))
 #: NumPy's kinds of value, where they are not floating point.
-_KINDS = dict.fromkeys(("frame_index", "visible_points", "inliers", "map_id", "visible_px"), "iu")
+_KINDS = dict.fromkeys(("frame_index", "visible_points", "inliers", "map_id", "joined_map", "visible_px"), "iu")
 _KINDS |= {"keyframe": "b", "labelled": "b", "status": "U", "reason": "U"}
 
 
@@ -168,8 +180,8 @@ class Run:
 def load_run(folder: str | Path, every_map: bool = False) -> Run:
     """Read what :class:`~p2p_lib.datasets.run_writer.RunWriter` wrote, finished or not.
 
-    Poses are those in the object frame of the map that holds at the end: what was said in a map that has been given up
-    since is no pose, unless ``every_map`` asks for it.
+    Poses are those in the object frame of the map that holds at the end: what was said in maps that became part of it
+    since is in its frame too, what was said in a map that has been given up is no pose. ``every_map``: as they were.
 
     Raises :class:`MissingData` where there is no run, :class:`BadInput` where a file of it is damaged.
     """
@@ -180,7 +192,14 @@ def load_run(folder: str | Path, every_map: bool = False) -> Run:
     arrays, objects = load_arrays(folder / "poses.npz"), {}
     for name in info["objects"] if info["frames"] else ():
         if f"{name}/frame_index" in arrays:
-            arrays.setdefault(f"{name}/map_id", np.zeros(arrays[f"{name}/frame_index"].shape, int))  # an older run
+            n = len(np.atleast_1d(arrays[f"{name}/frame_index"]))
+            older = {
+                "map_id": np.zeros(n, int),
+                "joined_map": np.full(n, -1),
+                "T_obj_joined": np.tile(NO_POSE, (n, 1, 1)),
+            }
+            for column, values in older.items():
+                arrays.setdefault(f"{name}/{column}", values)  # an older run
             lacking = [column for column in COLUMNS if f"{name}/{column}" not in arrays]
             if lacking:
                 raise BadInput(str(folder / "poses.npz"), f"no {name}/{lacking[0]}", "what p2p run wrote")

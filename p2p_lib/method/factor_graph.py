@@ -11,7 +11,7 @@ State is kept as plain arrays, so that a solve that fails leaves nothing behind.
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,11 @@ class ObjectGraph:
         """The keyframes that are held, oldest first: those that were merged into others are not."""
         return tuple(sorted(self._keyframes))
 
+    @property
+    def next_key(self) -> int:
+        """The key of the keyframe to be added next."""
+        return self._next_key
+
     def add_keyframe(
         self,
         T_cam_obj: np.ndarray,
@@ -128,6 +133,23 @@ class ObjectGraph:
         self._new.append(key)
         self._next_key += 1
         return key
+
+    def join(self, other: ObjectGraph, T_obj_other: np.ndarray, point_shift: int) -> None:
+        """Take in another graph of the same object, whose frame maps to this one's by T_obj_other (4, 4).
+
+        Ids of its points grow by ``point_shift``. A relative pose ties its first keyframe to the newest one here, as
+        if registered; keyframes to come that see points of both tie them better.
+        """
+        shift, p_obj = self._next_key, se3.transform(T_obj_other, np.array([*other._points.values()]).reshape(-1, 3))
+        for key, k in other._keyframes.items():
+            T_obj_cam, link = T_obj_other @ k.T_obj_cam, k.link
+            if link is None:
+                link = self._link(T_obj_cam, p_obj, None)
+            else:
+                link = replace(link, previous=link.previous + shift)
+            self._keyframes[key + shift] = Keyframe(T_obj_cam, k.ids + point_shift, k.p_cam, k.sigma, link)
+        self._points |= {i + point_shift: p for i, p in zip(other._points, p_obj, strict=True)}
+        self._next_key += other._next_key
 
     def forget(self, point_ids: np.ndarray) -> None:
         """Takes points and all their observations out of the graph (a keypoint that the map retired)."""

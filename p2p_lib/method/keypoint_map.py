@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.config import KeypointMapConfig
 
 _HISTORY = 16  # observations kept of a pending point
@@ -74,6 +75,14 @@ class KeypointMap:
         nothing = np.zeros(n, np.int64)
         for name in self._columns():
             setattr(self, name, np.concatenate([getattr(self, name), new.get(name, nothing)]))
+
+    def join(self, other: KeypointMap, T_obj_other: np.ndarray, shift: int) -> None:
+        """Take in another map's points, behind its own, with keys larger by ``shift``; T_obj_other (4, 4) of frames."""
+        moved = {"keys": other.keys + shift, "p_obj": se3.transform(T_obj_other, other.p_obj)}
+        moved["_in_object"] = se3.transform(T_obj_other, other._in_object)
+        for name in self._columns():
+            more = moved.get(name, getattr(other, name))
+            setattr(self, name, np.concatenate([getattr(self, name), more]))
 
     def assign(self, keys: np.ndarray, ids: np.ndarray) -> np.ndarray:
         """Set the tracker's ids of points by key; returns the ids of points that are gone already."""

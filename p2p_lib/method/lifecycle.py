@@ -133,6 +133,11 @@ class Lifecycle:
             return {}
         return {"scene": se3.orthonormalised(se3.inverse(T_world_cam) @ self.T_world_obj)}
 
+    def in_frame(self, T_old_new: np.ndarray) -> Lifecycle:
+        """The same in another object frame; T_old_new (4, 4) maps it to the one so far."""
+        poses = {name: getattr(self, name) for name in ("T_cam_obj", "T_previous", "T_left", "T_world_obj")}
+        return replace(self, **{name: None if T is None else T @ T_old_new for name, T in poses.items()})
+
     def placed(self, T_world_cam: np.ndarray | None) -> Lifecycle:
         """The state with the newest pose's place in the scene, once a return has been confirmed.
 

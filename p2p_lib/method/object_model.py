@@ -101,6 +101,23 @@ class ObjectModel:
         """(N,) standard deviation of measured points by the sensor's model; None where one noise is assumed for all."""
         return self._observer.noise_m(p_cam) if self.config.method.noise == "sensor" else None
 
+    def join(self, other: ObjectModel, T_obj_other: np.ndarray) -> None:
+        """Take in what another model knows of the same object; T_obj_other (4, 4) maps its frame to this one's.
+
+        Its points come behind the map's own.
+        """
+        self.map.join(other.map, T_obj_other, self._next_key)
+        vertices = 0 if self.graph is None else self.graph.next_key
+        if self.graph is not None:
+            self.graph.join(other.graph, T_obj_other, self._next_key)
+        if self.surface is not None:
+            self._fusing = self._beside.submit(self.surface.join, other.surface, T_obj_other, vertices)
+        for T_cam_obj in other.views.T_cam_obj @ se3.inverse(T_obj_other):
+            self.views.add(T_cam_obj)
+        self.seen_m2 = max(self.seen_m2, other.seen_m2)
+        self._next_key += other._next_key
+        self._sample = None
+
     def observe(
         self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray, moved: tuple[float, float] | None
     ) -> None:

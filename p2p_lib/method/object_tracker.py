@@ -7,6 +7,7 @@ becomes its pose. Whatever the object wants of the shared tracker it returns as
 
 from __future__ import annotations
 
+import copy
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -25,11 +26,12 @@ from p2p_lib.method.agreement import background_share, size_ratio
 from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.lifecycle import GATES, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
-from p2p_lib.method.object_model import NewPoints, ObjectModel, Requests
+from p2p_lib.method.object_model import NO_IDS, NewPoints, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.refinement import Keypoints, Refinement, surface_distance
 from p2p_lib.method.registration import Hypothesis
 from p2p_lib.method.sampling import choose, usable_region
+from p2p_lib.method.two_maps import Relation, agreeing_together, seen_together
 from p2p_lib.recovery.search import ImageSearch, Sighting
 
 #: While an object has a pose, the tracker is asked every so many frames to look for points that are not seen.
@@ -42,6 +44,9 @@ _GROWTH = 1.1
 _PATIENCE, _OUTGROWN = 5, 1.5
 #: A smaller share of background in a mask is nothing to look into.
 _SOME = 0.05
+#: A known object that has been lost for so many frames and shows this share of the most that was ever seen of it is
+#: turned to a side that nobody knows: a second map is begun.
+_STAYS_LOST, _IN_PLAIN_VIEW = 12, 0.4
 #: A pose that nothing has told from others since a gap is compared again every so many frames.
 _COMPARE_EVERY = 5
 #: A lost object is looked for in every so many frames, turned as in so many of its keyframes at most. Depth this near
@@ -79,7 +84,10 @@ class ObjectStep:
 
 
 class ObjectTracker:
-    """State and step of one object: what it has been through (``life``) and what is known of it (``model``)."""
+    """State and step of one object: what it has been through (``life``) and what is known of it (``model``).
+
+    A second map is put ``aside`` as a tracker of its own, which is asked whether it knows the object again.
+    """
 
     def __init__(
         self,
@@ -97,6 +105,8 @@ class ObjectTracker:
         self.model = self._new_model()
         self.life, self.map_id = Lifecycle(), 0
         self._trusted: Observation | None = None  # the newest without a doubt; None after a frame without a pose
+        self.aside: ObjectTracker | None = None
+        self._relation = Relation()  # of the map aside to this one
         self._gates = tuple(GATES) if config.method.gates == "all" else ()
         self._rng, self._stopwatch = rng, stopwatch
 
@@ -105,43 +115,72 @@ class ObjectTracker:
         """The keypoint map."""
         return self.model.map
 
+    @property
+    def ids(self) -> np.ndarray:
+        """The tracker's ids of all points, those of the map aside too."""
+        return self.map.ids if self.aside is None else np.concatenate([self.map.ids, self.aside.map.ids])
+
     # -- the step ------------------------------------------------------------------------------
 
     def observe(
-        self, frame: Frame, mask: np.ndarray | None, tracks: Tracks, sighting: Sighting | None = None
+        self,
+        frame: Frame,
+        mask: np.ndarray | None,
+        tracks: Tracks,
+        sighting: Sighting | None = None,
+        given: bool = True,
     ) -> Observation:
         """The object's share of a frame; mask (H, W) bool, None where it is not known, and everybody's tracks."""
         with self._stopwatch("observation"):
             sighted = None if sighting is None else sighting.T_cam_obj
-            return self.observer.observe(frame, mask, tracks.select(self.map.ids), sighted)
+            obs = replace(self.observer.observe(frame, mask, tracks.select(self.map.ids), sighted), given=given)
+            return self._with_aside(obs, tracks)
 
     def seen_anew(self, obs: Observation, tracks: Tracks) -> Observation:
         """The observation again, with tracks that have been added to."""
-        return self.observer.with_tracks(obs, tracks.select(self.map.ids))
+        return self._with_aside(self.observer.with_tracks(obs, tracks.select(self.map.ids)), tracks)
+
+    def _with_aside(self, obs: Observation, tracks: Tracks) -> Observation:
+        if self.aside is None:
+            return obs
+        same = replace(obs, sighted=None, aside=None)
+        return replace(obs, aside=self.observer.with_tracks(same, tracks.select(self.aside.map.ids)))
 
     def step(self, obs: Observation) -> ObjectStep:
-        """The object's pose at a frame. The paper selects a hypothesis and refines that one; ours refines all first."""
-        if self.model.empty or self._outgrown(obs):
+        """The object's pose at a frame."""
+        if self.model.empty or self._outgrown(obs) or self._turned_over(obs):
             return self._initialise(obs)
         if self._hidden(obs.mask):
             return self._without_pose(obs, Status.OCCLUDED, f"{np.count_nonzero(obs.mask)} mask pixels")
         self.life = self.life.at(obs.frame.time_s)
-        candidates = [Candidate(hypothesis) for hypothesis in self._register(obs)]
+        best, verdict = self._pose(obs, self._register(obs))
+        known = None if self.aside is None or obs.aside is None else self.aside.known_again(obs.aside)
+        if known is not None and not verdict.accepted:
+            obs, (best, verdict) = self._exchanged(obs), known
+        elif known is not None and not verdict.doubted:
+            T_obj_aside = se3.inverse(best.T_cam_obj) @ known[0].T_cam_obj
+            self._relation = self._relation.with_frame(T_obj_aside, self.aside.map.p_obj)
+            if self._relation.certain:
+                return self._joined(obs, best, known[0])
+        if best is None or not verdict.accepted:
+            return self._without_pose(obs, verdict.status, verdict.reason)
+        if not verdict.doubted:
+            self._trusted = obs
+        return self._extend(obs, best, verdict)
+
+    def _pose(self, obs: Observation, hypotheses: list[Hypothesis]) -> tuple[Candidate | None, Verdict]:
+        """The best of some hypotheses, judged. The paper selects one and refines that one; ours refines all first."""
+        candidates = [Candidate(hypothesis) for hypothesis in hypotheses]
         if self.config.selection.rule == "support":
             candidates = self._look_again(obs, self._refine(obs, candidates))
         best, reason = self._select(obs, candidates)
         if best is None:
             nothing = obs.mask is None and not obs.seen.any()
-            return self._without_pose(obs, Status.OCCLUDED if nothing else Status.LOST, reason)
+            return None, Verdict(False, Status.OCCLUDED if nothing else Status.LOST, reason)
         if best.refined is None:
             (best,) = self._refine(obs, [best])
         best = self._compared(obs, best)
-        verdict = self.life.judge(self._evidence(obs, best), self._gates, self.config.lifecycle)
-        if not verdict.accepted:
-            return self._without_pose(obs, verdict.status, verdict.reason)
-        if not verdict.doubted:
-            self._trusted = obs
-        return self._extend(obs, best, verdict)
+        return best, self.life.judge(self._evidence(obs, best), self._gates, self.config.lifecycle)
 
     # -- register ------------------------------------------------------------------------------
 
@@ -273,7 +312,7 @@ class ObjectTracker:
 
     # -- extend --------------------------------------------------------------------------------
 
-    def _extend(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
+    def _extend(self, obs: Observation, best: Candidate, verdict: Verdict, due: bool = False) -> ObjectStep:
         """Take an accepted frame into the model, with a keyframe where one is due."""
         if verdict.doubted:
             return self._doubted(obs, best, verdict)
@@ -285,7 +324,7 @@ class ObjectTracker:
         of_frame, most = self._covariance(obs, best), DOUBTED if life.doubted else 1.0
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
-            keyframe = not life.confirming and model.keyframe_due(obs, T_cam_obj, agrees)
+            keyframe = due or (not life.confirming and model.keyframe_due(obs, T_cam_obj, agrees))
         model.settle_surface()
         if keyframe:
             sure = min(confidence(self._of_pose(T_cam_obj, of_frame, best), *agreeing), most)
@@ -337,7 +376,10 @@ class ObjectTracker:
     # -- start, and frames without a pose ------------------------------------------------------
 
     def _initialise(self, obs: Observation) -> ObjectStep:
-        """The first frame of a map: fix the object frame and start with the first points. What was known is let go."""
+        """The first frame of a map: fix the object frame and start with the first points.
+
+        What was known is put aside, or let go where it was known from a sliver alone.
+        """
         cfg, before = self.config, self.life.start_px
         without = Status.INITIALISING if self.model.empty else Status.LOST
         pixels = None if obs.mask is None else np.count_nonzero(obs.mask)
@@ -358,9 +400,13 @@ class ObjectTracker:
         if cfg.method.object_frame == "centroid":
             p_cam = self.observer.camera.unproject(np.stack([u, v], -1), obs.frame.depth_m[v, u])
             T_cam_obj[:3, 3] = np.median(p_cam, 0)
-        verdict, forgotten = Verdict(True, Status.TRACKED), self.map.ids[self.map.ids >= 0]
+        verdict, forgotten = Verdict(True, Status.TRACKED), NO_IDS
         if not self.model.empty:
-            self.model, self.map_id = self._new_model(), self.map_id + 1
+            if self._outgrown(obs):
+                forgotten = self.map.ids[self.map.ids >= 0]
+            else:
+                self.aside = self._put_aside()
+            self.model, self.map_id, self._relation = self._new_model(), self.map_id + 1, Relation()
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:
             verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")
@@ -376,6 +422,55 @@ class ObjectTracker:
         if not self._gates or self.life.lost_frames < _PATIENCE or obs.mask is None:
             return False
         return not self.life.followed or self.observer.area_m2(obs) > _OUTGROWN * self.model.seen_m2
+
+    def _turned_over(self, obs: Observation) -> bool:
+        """Whether a known object stays lost in plain view: it shows a side that nobody knows, in a mask that is given.
+
+        What the segmenter takes for an object that agrees with nothing known of it may be anything.
+        """
+        known = self._gates and self.aside is None and self.life.lost_frames >= _STAYS_LOST
+        if not known or obs.mask is None or not obs.given or self.observer.cut_off(obs):
+            return False
+        return self.observer.area_m2(obs) >= _IN_PLAIN_VIEW * self.model.seen_m2
+
+    # -- two maps ------------------------------------------------------------------------------
+
+    def _put_aside(self) -> ObjectTracker:
+        """This map as a tracker of its own, to which the object is lost."""
+        other = copy.copy(self)
+        other.aside, other.life, other._trusted = None, self.life.without_pose(Status.LOST), None
+        return other
+
+    def known_again(self, obs: Observation) -> tuple[Candidate, Verdict] | None:
+        """The pose in a map that was put aside, where points and surface say that it is this object; else None."""
+        cfg = self.config.lifecycle
+        found = [h for h in self._register(obs) if h.support >= cfg.return_inliers]
+        best, verdict = self._pose(obs, found) if found else (None, None)
+        if best is None or not verdict.accepted or verdict.doubted or self._agreement(obs, best) < 0:
+            return None
+        share = best.evidence.surface_share
+        return None if share is not None and share < cfg.surface_only_share else (best, verdict)
+
+    def _exchanged(self, obs: Observation) -> Observation:
+        """Go on in the map that was put aside, with its observation; this one is put aside instead."""
+        other, aside = self._put_aside(), self.aside
+        self.model, self.life, self.map_id, self.aside = aside.model, aside.life, aside.map_id, other
+        self._relation = Relation()
+        return replace(obs.aside, aside=replace(obs, aside=None))
+
+    def _joined(self, obs: Observation, best: Candidate, known: Candidate) -> ObjectStep:
+        """Two maps that fit this frame become one, in the frame of the older; a keyframe ties what both have seen."""
+        T_obj_aside = self._relation.mean
+        if self.aside.map_id < self.map_id:
+            life = self.life.in_frame(T_obj_aside)
+            obs, best, known = self._exchanged(obs), known, best
+            self.life, T_obj_aside = life, se3.inverse(T_obj_aside)
+        gone, self.aside, self._relation = self.aside, None, Relation()
+        self.model.join(gone.model, T_obj_aside)
+        both = replace(best, hypothesis=agreeing_together(best.hypothesis, known.hypothesis))
+        verdict = Verdict(True, Status.RECOVERED, f"maps {self.map_id} and {gone.map_id} are one")
+        step = self._extend(seen_together(obs, obs.aside), both, verdict, due=True)
+        return replace(step, estimate=replace(step.estimate, joined=(gone.map_id, T_obj_aside)))
 
     def _hidden(self, mask: np.ndarray | None) -> bool:
         """Whether a mask says that nothing of the object is to be seen."""

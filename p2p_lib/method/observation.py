@@ -32,6 +32,8 @@ class Observation:
     p_cam    (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
     cloud    (M, 3) depth points in the mask, camera frame
     sighted  (4, 4) T_cam_obj where an absent object was found by shape and colour; None where it was not
+    given    whether the caller vouches for the mask; else the segmenter made it
+    aside    the same of a second map of the object, which is put aside; None where there is none
     """
 
     frame: Frame
@@ -40,6 +42,8 @@ class Observation:
     p_cam: np.ndarray
     cloud: np.ndarray
     sighted: np.ndarray | None = None
+    given: bool = True
+    aside: Observation | None = None
 
     @property
     def seen(self) -> np.ndarray:

@@ -155,7 +155,7 @@ class Point2Pose:
         """Stop following an object; its points are dropped from the tracker."""
         if name not in self.objects:
             raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        if len(ids := self.objects.pop(name).map.ids):
+        if len(ids := self.objects.pop(name).ids):
             self.tracker.drop(ids)
         self._said.pop(name, None)
         if name in self.segmenter.names:
@@ -207,7 +207,7 @@ class Point2Pose:
         sightings = self._sightings(frame, masks, objects)
         self.masks = self._segment(frame, masks, said, sightings)
         seen = {
-            name: obj.observe(frame, self.masks[name], self.tracks, sightings.get(name))
+            name: obj.observe(frame, self.masks[name], self.tracks, sightings.get(name), masks[name] is not None)
             for name, obj in objects.items()
         }
         self._apply(self._misplaced(seen, masks))

@@ -216,9 +216,21 @@ class TsdfVolume:
             self._move_one(known[i], T_new[i])
         return [known[i] for i in order[:limit]]
 
+    def join(self, other: TsdfVolume, T_obj_other: np.ndarray, shift: int) -> None:
+        """Fuse what another volume keeps, whose frame maps to this one's by T_obj_other (4, 4), its keys + ``shift``.
+
+        What it has let go of is not in there.
+        """
+        for key, view in other._views.items():
+            self._put(key + shift, view, view.T_cam_obj @ se3.inverse(T_obj_other))
+
     def _move_one(self, key: int, T_cam_obj: np.ndarray) -> None:
         view = self._views[key]
         self._fuse(view, -view.weight)
+        self._put(key, view, T_cam_obj)
+
+    def _put(self, key: int, view: _View, T_cam_obj: np.ndarray) -> None:
+        """Fuse and keep a view at a pose."""
         moved = replace(view, T_cam_obj=T_cam_obj)
         self._grow(moved)
         lo, hi = self._frustum_box(moved)

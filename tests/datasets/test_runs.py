@@ -145,6 +145,28 @@ def test_poses_are_of_one_map_the_last_unless_all_are_asked_for(table, tmp_path)
     np.testing.assert_array_equal(last.T_cam_obj[3:], every.T_cam_obj[3:])
 
 
+def test_poses_in_a_map_that_became_part_of_the_last_are_in_its_frame_and_kept_as_they_were(table, tmp_path):
+    T_in_first = se3.exp(np.random.default_rng(3).normal(0, 0.3, (7, 6)))
+    T_first_second = se3.exp(np.array([0.3, -0.2, 1.0, 0.1, 0.2, -0.1]))
+    covariance = np.diag([4e-4, 1e-4, 9e-4, 1e-6, 4e-6, 1e-6])
+    with RunWriter(tmp_path / "run", open_sequence(table), preset(), "lk", "dataset") as w:
+        for i, map_id in enumerate([0, 0, 1, 1, 1, 0, 0]):
+            T = T_in_first[i] @ T_first_second if map_id else T_in_first[i]
+            joined = (1, T_first_second) if i == 5 else None
+            told = PoseEstimate("box", i, i / 30, Status.TRACKED, T, 0.9, covariance, map_id=map_id, joined=joined)
+            w.add(frame_at(i), {"box": told}, 5)
+    rows = np.loadtxt(tmp_path / "run/poses/box.txt")
+    np.testing.assert_allclose(rows[:, 1:4], T_in_first[:, :3, 3], atol=1e-8)
+    last, every = (load_run(tmp_path / "run", every_map=every).objects["box"] for every in (False, True))
+    np.testing.assert_allclose(last.T_cam_obj, T_in_first, atol=1e-9)
+    np.testing.assert_allclose(every.T_cam_obj[2:5], T_in_first[2:5] @ T_first_second, atol=1e-12)
+    np.testing.assert_array_equal(every.joined_map, [-1, -1, -1, -1, -1, 1, -1])
+    # The same noise, told in the other frame: by finite samples.
+    noise = np.random.default_rng(4).multivariate_normal(np.zeros(6), covariance, 20000)
+    moved = se3.inverse(T_in_first[3]) @ (every.T_cam_obj[3] @ se3.exp(noise)) @ se3.inverse(T_first_second)
+    np.testing.assert_allclose(np.cov(se3.log(moved).T), last.covariance[3], atol=0.05 * last.covariance[3].max())
+
+
 def test_times_of_nanosecond_names_keep_their_digits(table, tmp_path):
     with RunWriter(tmp_path / "run", open_sequence(table), preset(), "lk", "dataset") as w:
         frame = Frame(0, 1581120424.100262102, frame_at(0).rgb, frame_at(0).depth_m)

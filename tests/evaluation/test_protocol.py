@@ -47,6 +47,8 @@ def object_run(T_cam_obj, T_cam_model, **columns):
         "confidence": posed * 1.0,
         "covariance": np.full((n, 6, 6), np.nan),
         **{"visible_points": nothing, "inliers": nothing, "keyframe": nothing > 0, "map_id": nothing},
+        "joined_map": nothing - 1,
+        "T_obj_joined": np.full((n, 4, 4), np.nan),
         "T_cam_model": T_cam_model,
         "labelled": np.ones(n, bool),
         "visible_px": np.full(n, 5000),

@@ -22,7 +22,8 @@ def standing(visible, found, wrong=(), first_frame=0):
     return ObjectRun(
         frame_index=np.arange(n) + first_frame, time_s=np.arange(n) / 30, status=np.full(n, "tracked"),
         T_cam_obj=poses, confidence=np.ones(n), covariance=np.full((n, 6, 6), np.nan), visible_points=zeros,
-        inliers=zeros, keyframe=zeros > 0, map_id=zeros, T_cam_model=truth, labelled=np.ones(n, bool),
+        inliers=zeros, keyframe=zeros > 0, map_id=zeros, joined_map=zeros - 1,
+        T_obj_joined=np.full((n, 4, 4), np.nan), T_cam_model=truth, labelled=np.ones(n, bool),
         visible_px=np.where(visible, 900, 50), reason=np.full(n, ""),
     )  # fmt: skip
 

@@ -56,7 +56,7 @@ class Lump:
 
     def tracks(self, T_cam_model: np.ndarray) -> Tracks:
         """Perfect tracks of the map's points."""
-        ids = self.tracker.map.ids
+        ids = np.sort(self.tracker.ids)
         p_cam = se3.transform(T_cam_model, self.p_model[ids])
         uv = CAMERA.project(p_cam)
         depth, mask = render(LUMP, T_cam_model)
@@ -631,6 +631,76 @@ def test_what_agrees_is_learnt_and_the_paper_doubts_nothing(settings, fault):
     lump = before_a_wall(**settings)
     step = doubtful(lump, **fault)
     assert step.estimate.keyframe and step.estimate.status is Status.TRACKED
+
+
+def about(deg: float) -> np.ndarray:
+    """The pose turned about the object's z axis alone: it stays in view all around."""
+    return START @ se3.exp(np.array([0, 0, np.radians(deg), 0, 0, 0]))
+
+
+def turned_over(**settings) -> tuple[Lump, np.ndarray, list[ObjectStep]]:
+    """Known from one side, then seen from another, where none of its points is found; the ids of those."""
+    lump = settled(begun(**settings), [2, 4])
+    old = lump.tracker.map.ids.copy()
+    return lump, old, [lump.see(about(150), hide(lambda tracks: np.isin(tracks.ids, old))) for _ in range(16)]
+
+
+def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_both_become_one():
+    lump, old, steps = turned_over()
+    maps = [step.estimate.map_id for step in steps]
+    first = maps.index(1)
+    assert 12 <= first <= 14 and maps[first:] == [1] * (16 - first)
+    assert [step.estimate.status for step in steps[:first]] == [Status.LOST] * first
+    assert not len(steps[first].requests.drop) and set(old) <= set(lump.tracker.ids), "nothing is let go"
+    for deg in range(153, 250, 4):  # in view, around to where it is known
+        step = lump.see(about(deg), hide(lambda tracks: np.isin(tracks.ids, old)))
+    assert step.estimate.map_id == 1 and step.estimate.joined is None
+    second, p_second = lump.tracker.map.ids.copy(), lump.tracker.model.seen_m2
+    T_in_second, met = step.estimate.T_cam_obj, []
+    while not met or (met[-1].estimate.joined is None and len(met) < 40):
+        deg += 4
+        met.append(lump.see(about(deg)))
+    joined = met[-1].estimate
+    assert joined.map_id == 0 and joined.status is Status.RECOVERED and "0 and 1 are one" in joined.reason
+    assert [step.estimate.map_id for step in met] == [1] * (len(met) - 1) + [0]
+    # What was said in the second map is right in the first one's frame, by the relation that is told.
+    gone, T_obj_joined = joined.joined
+    T_obj_model = se3.inverse(lump.T_first[0]) @ lump.T_first[1]
+    error = se3.inverse(about(249)) @ T_in_second @ se3.inverse(T_obj_joined) @ T_obj_model
+    assert gone == 1 and np.degrees(se3.angle_rad(error)) < 1 and np.linalg.norm(error[:3, 3]) < 0.002
+    model = lump.tracker.model
+    assert lump.tracker.aside is None and model.seen_m2 >= p_second
+    assert {0} == {step.estimate.map_id for step in settled(lump, [deg + 2, deg + 4]).steps[-2:]}
+    # Both sides are known now: with the points of the second map alone, and its surface.
+    lump.see(about(deg), mask=np.zeros((CAMERA.height, CAMERA.width), bool))
+    back = lump.see(about(152), hide(lambda tracks: ~np.isin(tracks.ids, second)))
+    assert back.estimate.status is Status.RECOVERED and back.estimate.map_id == 0
+    deg_off, mm_off = lump.off(about(152))
+    assert deg_off < 2 and mm_off < 2  # the second map was made over 250 degrees
+    query = se3.transform(se3.inverse(back.estimate.T_cam_obj), lump.observed(about(152)).cloud)
+    distance_m, valid = model.surface.query(query)
+    assert valid.mean() > 0.9 and np.median(np.abs(distance_m[valid])) < 0.002
+
+
+def test_where_the_first_map_fits_again_and_the_second_does_not_the_first_one_goes_on():
+    lump, old, _ = turned_over()
+    second = lump.tracker.map.ids.copy()
+    assert not np.isin(second, old).any()
+    lump.see(START, mask=np.zeros((CAMERA.height, CAMERA.width), bool))
+    back = lump.see(about(3), hide(lambda tracks: np.isin(tracks.ids, second)))
+    assert back.estimate.map_id == 0 and back.estimate.status is Status.RECOVERED
+    deg, mm = lump.off(about(3))
+    assert deg < 1 and mm < 1 and lump.tracker.aside.map_id == 1
+
+
+def test_no_second_map_of_what_only_the_segmenter_takes_for_the_object():
+    lump = settled(begun(), [2, 4])
+    old = lump.tracker.map.ids.copy()
+    for _ in range(16):
+        obs = lump.observed(about(150), hide(lambda tracks: np.isin(tracks.ids, old)))
+        step = lump.tracker.step(replace(obs, given=False))
+        lump.steps.append(step)
+    assert step.estimate.status is Status.LOST and step.estimate.map_id == 0
 
 
 def test_points_off_the_mask_are_no_observations_and_elsewhere_when_it_is_away():
