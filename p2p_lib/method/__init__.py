@@ -13,6 +13,8 @@ object's step), then at the parts of that step in its order:
 - extend: ``object_model`` holds map, surface (``tsdf``, ``tsdf_grid``, ``mesh``) and graph (``factor_graph``,
   ``keyframes``, ``keyframe_views``); ``sampling`` chooses new points; ``confidence`` says how well the pose is known.
 
+An object that shows a side never seen has two maps for a while: ``two_maps`` says when they are one.
+
 The 2D tracker, the detector of candidates and the segmenter are parts that it is given; what it asks of them is in
 :mod:`p2p_lib.core.interfaces`. Where an absent object may lie it is told by :mod:`p2p_lib.recovery`.
 """

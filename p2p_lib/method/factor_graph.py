@@ -27,6 +27,8 @@ _X, _P = ord("x") << 56, ord("p") << 56
 _ANCHORING_POINTS = 3
 # Noise of the prior on the first pose (rad, m): it defines the object frame, so there is next to none.
 _PRIOR_SIGMA = 1e-4
+# Noise of the relative pose that ties a graph to the one it joins (rad, m): next to none beside what points say.
+_JOINED_SIGMAS = np.repeat([0.05, 0.01], 3)
 # Levenberg-Marquardt's first lambda. (The release starts at 0.1 and makes more steps, to the same minimum.)
 _LAMBDA = 1e-4
 # A smaller relative decrease of the loss ends Levenberg-Marquardt.
@@ -78,6 +80,7 @@ class ObjectGraph:
         self._points: dict[int, np.ndarray] = {}
         self._new: list[int] = []  # added since the last solve that went well
         self._next_key = 0
+        self._joined: set[int] = set()  # keyframes of graphs that it has taken in
         self._last: _Solution | None = None
         self._anchor = se3.IDENTITY
         importlib.import_module("gtsam")  # takes a second that no frame should wait for
@@ -137,18 +140,19 @@ class ObjectGraph:
     def join(self, other: ObjectGraph, T_obj_other: np.ndarray, point_shift: int) -> None:
         """Take in another graph of the same object, whose frame maps to this one's by T_obj_other (4, 4).
 
-        Ids of its points grow by ``point_shift``. A relative pose ties its first keyframe to the newest one here, as
-        if registered; keyframes to come that see points of both tie them better.
+        Ids of its points grow by ``point_shift``. A loose relative pose ties its first keyframe to the newest one here;
+        keyframes to come that see points of both tie them well.
         """
         shift, p_obj = self._next_key, se3.transform(T_obj_other, np.array([*other._points.values()]).reshape(-1, 3))
         for key, k in other._keyframes.items():
             T_obj_cam, link = T_obj_other @ k.T_obj_cam, k.link
             if link is None:
-                link = self._link(T_obj_cam, p_obj, None)
+                link = self._link(T_obj_cam, p_obj, _about(p_obj, _JOINED_SIGMAS))
             else:
                 link = replace(link, previous=link.previous + shift)
             self._keyframes[key + shift] = Keyframe(T_obj_cam, k.ids + point_shift, k.p_cam, k.sigma, link)
         self._points |= {i + point_shift: p for i, p in zip(other._points, p_obj, strict=True)}
+        self._joined |= {key + shift for key in other._keyframes}
         self._next_key += other._next_key
 
     def forget(self, point_ids: np.ndarray) -> None:
@@ -198,11 +202,10 @@ class ObjectGraph:
     def _link(self, T_obj_cam: np.ndarray, p_obj: np.ndarray, covariance: np.ndarray | None) -> Link:
         """The relative pose to the newest keyframe; its noise moved from the object to X's right tangent."""
         if not _is_covariance(covariance):
-            about = se3.from_rt(np.eye(3), p_obj.mean(0) if len(p_obj) else np.zeros(3))
             sigmas = np.repeat([self.config.between_sigma_rad, self.config.between_sigma_m], 3)
-            A = se3.adjoint(about)
-            covariance = A @ np.diag(sigmas**2) @ A.T
-        previous = max(self._keyframes)
+            covariance = _about(p_obj, sigmas)
+        # A new pose is one in this graph's frame, of which a graph that has just been joined knows little.
+        previous = max(self._keyframes.keys() - self._joined)
         relative = se3.inverse(self._keyframes[previous].T_obj_cam) @ T_obj_cam
         A = se3.adjoint(se3.inverse(T_obj_cam))
         return Link(previous, relative, A @ covariance @ A.T)
@@ -243,6 +246,12 @@ class ObjectGraph:
             last.error_before if last else 0.0,
             last.error_after if last else 0.0,
         )
+
+
+def _about(p_obj: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+    """(6, 6) covariance of a motion with sigmas (6,) about the middle of points p_obj (N, 3)."""
+    A = se3.adjoint(se3.from_rt(np.eye(3), p_obj.mean(0) if len(p_obj) else np.zeros(3)))
+    return A @ np.diag(sigmas**2) @ A.T
 
 
 def _is_covariance(covariance: np.ndarray | None) -> bool:
