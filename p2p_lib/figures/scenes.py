@@ -88,18 +88,21 @@ class Scene:
         trail: int = 30,
         words: bool = True,
         dots: tuple[np.ndarray, np.ndarray] | None = None,
+        note: str = "",
     ) -> np.ndarray:
         """The run's ``row``-th frame, cut to a region and scaled to a width; ``words`` are names, statuses, the time.
 
         Estimated boxes are in their object's colour, true ones white and dashed; ``trail`` is how many earlier frames
-        the path goes back; ``dots`` are pixels (K, 2) of the whole image and their colours (K, 3).
+        the path goes back; ``dots`` are pixels (K, 2) of the whole image and their colours (K, 3); ``note`` stands in
+        the lower left corner.
         """
         first = next(iter(self.run.objects.values()))
         frame = self.sequence.frame(int(first.frame_index[row]))
         whole, image = self.sequence.camera, self._with_what_was_seen(frame, row)
         region_px = region_px or (0, 0, whole.width, whole.height)
         image, camera = overlay.zoomed(image, whole, region_px, width_px or region_px[2] - region_px[0])
-        labels = []
+        foot = (0, image.shape[0] - 2, 1, image.shape[0] - 1)
+        labels = [Label(note, "#222222", foot)] if note else []
         for name, obj in self.run.objects.items():
             image = self._draw_object(image, camera, name, obj, row, axes, trail)
             labels.append(self._label(camera, name, obj, row))
@@ -194,9 +197,7 @@ def beside(scenes: Mapping[str, Scene], count: int, width_px: int = 300, axes: b
     region_px, images = first.region(), []
     for name, scene in scenes.items():
         for index in frames.tolist():
-            image = scene.draw(scene.row(index), region_px, width_px, axes=axes, trail=0)
-            foot = (0, image.shape[0] - 2, 1, image.shape[0] - 1)
-            images.append(overlay.draw_labels(image, [Label(name, "#222222", foot)]))
+            images.append(scene.draw(scene.row(index), region_px, width_px, axes=axes, trail=0, note=name))
     return overlay.montage(images, columns=count)
 
 
