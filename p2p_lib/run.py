@@ -189,6 +189,10 @@ def export_run(folder: str | Path, format: str, out: str | Path, frame: str | No
     return export(run, out, format, model_frames(run) if in_model else None, sequence)
 
 
+#: Two frames that take longer did more than track.
+_LONG_START_S = 3.0
+
+
 @dataclass(frozen=True, eq=False)
 class _Job:
     """A run whose options have been checked.
@@ -320,8 +324,7 @@ def _track(job: _Job, keeper: Keeper, progress: bool) -> None:
             for frame, estimates in _estimates(method, job):
                 keeper.add(frame, estimates)
                 now = ", ".join(f"{name} {estimate.status}" for name, estimate in estimates.items())
-                total_ms = max(method.stopwatch.last_ms["total"], 1e-3)
-                bar.set_postfix_str(f"{1e3 / total_ms:.0f} Hz, {now}", refresh=False)
+                bar.set_postfix_str(now, refresh=False)
                 bar.update()
             if not writer.begun:
                 writer.begin()  # all frames were on disk, the maps were not
@@ -364,6 +367,8 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     count = len(next(iter(run.objects.values())))
     hz, _ = rate(run.timings)
     lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
+    if (start_s := float(run.timings.get("total_ms", np.empty(0))[:2].sum()) / 1000) > _LONG_START_S:
+        lines[0] += f", after {start_s:.0f} s for the first two, in which loops are compiled (once on a machine)"
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
         why = Counter(map(status_text, obj.status[lost], obj.reason[lost]))

@@ -110,6 +110,7 @@ def check_folder(
     findings += [_times(sequence), _repeated(pairs), depth, _scale(pairs), _registered(frames)]
     if depth.level is Level.WRONG:
         return findings  # nothing that follows would mean anything
+    findings.append(_truth(sequence))
     if not firsts:
         return [*findings, _no_masks(sequence, any(masks), config)]
     if beyond := _all_beyond(firsts, config):
@@ -200,7 +201,13 @@ def _scale(pairs: list[tuple[Frame, Frame]]) -> Finding:
     if text := moving_scale(pairs):
         fix = "Nothing rigid does that: take what a depth camera measured, in one unit, not scaled image by image."
         return Finding("scale", Level.WRONG, text, fix)
-    return Finding("scale", Level.OK, "depth has one scale throughout")
+    return Finding("scale", Level.OK, "depth keeps its scale from image to image")
+
+
+def _truth(sequence: Sequence) -> Finding:
+    """Whether there is anything to score a run against."""
+    seen = [f"{name} in {np.isfinite(of.T_cam_model).all((1, 2)).sum()} images" for name, of in sequence.truth.items()]
+    return Finding("truth", Level.OK, ", ".join(seen) or "none, so that a run is not scored")
 
 
 def _repeated(pairs: list[tuple[Frame, Frame]]) -> Finding:

@@ -151,7 +151,7 @@ def _eval(a: argparse.Namespace) -> None:
         else:
             from p2p_lib.evaluation.consistency import consistency
 
-            _show(consistency(run), a.json)
+            _show(consistency(run, progress=not a.json), a.json)
             if not a.json and not (a.run / "masks").is_dir() and run.info["masks"] != "dataset":
                 again = f"p2p run {run.info['path'] or run.info['sequence']} --out {a.run} --force --save-masks"
                 if prompts := (run.info.get("options") or {}).get("prompts"):
@@ -207,9 +207,10 @@ def _benchmark(a: argparse.Namespace) -> int:
 
     if a.list:
         wide = get_terminal_size((10_000, 24)).columns  # elsewhere than on a terminal lines stay whole
-        for line in (line for name in plan_names() for line in readiness(name).splitlines()):
+        where = "Data and weights are looked for below $P2P_DATA (export P2P_DATA=DIR), see p2p data list; with --quick"
+        last = f"{where} no plan needs any. p2p doctor says which packages networks need besides."
+        for line in [*(line for name in plan_names() for line in readiness(name).splitlines()), last]:
             print(fill(line, wide, subsequent_indent=" " * 6, break_long_words=False, break_on_hyphens=False))
-        print("Data and weights are looked for below $P2P_DATA, see p2p data list; with --quick no plan needs any.")
         return 0
     if a.present and not (present := present_plans()):
         warn("p2p benchmark: no dataset of a plan is below $P2P_DATA (see p2p data list), so there is nothing to run")
@@ -307,7 +308,7 @@ def _view(a: argparse.Namespace) -> None:
 def _film(a: argparse.Namespace) -> None:
     from p2p_lib.figures.film import write_film
 
-    print(f"Written to {write_film(a.run, a.out or a.run / 'film.mp4', width_px=a.width)}")
+    print(f"Written to {write_film(a.run, a.out or a.run / 'film.mp4', width_px=a.width, progress=True)}")
     if not (a.run / "masks").is_dir():
         warn("p2p film: no masks were kept, so none is outlined. p2p run --save-masks keeps them.")
 

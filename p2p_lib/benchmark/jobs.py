@@ -197,9 +197,8 @@ def _lacking(method: Method) -> str:
         except BadInput as error:
             return str(error)
     if missing:
-        where = "" if data_dir() else "export P2P_DATA=DIR; "
         commands = "; ".join(f"p2p data fetch {name}" for name in missing)
-        return f"no weights of {', '.join(missing)}. Run: {where}{commands}"
+        return f"no weights of {', '.join(missing)}. Run: {commands}"
     slow = method.gpu and not checkpoints.has_gpu()
     return "no GPU here, and on a CPU its networks take seconds a frame" if slow else ""
 

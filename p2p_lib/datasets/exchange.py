@@ -14,6 +14,7 @@ A frame for which there is nothing, or a matrix of zeros or NaN, is lost, and lo
 from __future__ import annotations
 
 import csv
+import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -58,7 +59,7 @@ def export(
     frames = dict.fromkeys(run.objects, np.eye(4)) if T_obj_frame is None else T_obj_frame
     poses = {name: run.objects[name].T_cam_obj @ T for name, T in frames.items()}
     if format == "bop":
-        return [_write_bop(out, run, poses, sequence)]
+        return _write_bop(out, run, poses, sequence)
     written = []
     for name, T in poses.items():
         obj = run.objects[name]
@@ -83,7 +84,7 @@ def _new(path: Path) -> Path:
     return path
 
 
-def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: Sequence | None) -> Path:
+def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: Sequence | None) -> list[Path]:
     known = sequence is not None and set(poses) <= set(sequence.objects)  # a folder without masks knows no names
     numbers = _obj_ids(sequence.objects if known else tuple(run.objects))
     total_ms = run.timings.get("total_ms", np.empty(0))
@@ -100,8 +101,10 @@ def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: S
     # METHOD_DATASET-SPLIT.csv, as the BOP toolkit takes names apart.
     dataset = re.sub(r"[^A-Za-z0-9]+", "", str(run.info.get("sequence", "run"))) or "run"
     path = _new(out / f"p2p_{dataset}-test.csv")
+    ids = path.with_name(f"{path.stem}_obj_ids.json")
     replace_text(path, "\n".join(lines) + "\n")
-    return path
+    replace_text(ids, json.dumps({name: numbers[name] for name in poses}, indent=1) + "\n")
+    return [path, ids]
 
 
 def read_poses(path: str | Path, sequence: Sequence) -> dict[str, np.ndarray]:

@@ -95,7 +95,8 @@ def prompts_by_frame(
     for prompt in sorted(prompts, key=lambda p: p.frame):
         who = f"prompt of {prompt.name!r}"
         if prompt.frame not in frames:
-            raise BadInput(who, f"frame {prompt.frame}", f"a frame from {frames[0]} to {frames[-1]}")
+            fix = "Click in one of these, or take the run's first frame from there."
+            raise BadInput(who, f"frame {prompt.frame}", f"a frame from {frames[0]} to {frames[-1]}", fix)
         check_prompt(prompt, camera)
         check_apart(found.setdefault(prompt.frame, ()), prompt)
         found[prompt.frame] += (prompt,)

@@ -172,9 +172,10 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
     if found is None:
         dataset = name.partition("/")[0]
         if dataset in names("dataset"):
-            raise MissingData(name, "not below $P2P_DATA", f"See p2p data info {dataset}.")
+            where = "not below $P2P_DATA" + ", which is not set" * (home is None)
+            raise MissingData(name, where, f"See p2p data info {dataset}.")
         fix = f"Give a folder, a bundled sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
-        where = "$P2P_DATA is not set" if data_dir() is None else f"no sequence of this name below {data_dir()}"
+        where = "$P2P_DATA is not set" if home is None else f"no sequence of this name below {home}"
         raise MissingData(name, f"no such folder, and {where}", fix)
     return found[0], format or found[1].format
 
@@ -207,6 +208,8 @@ def recognise(folder: Path) -> str:
     fix = f"Name the layout with --format ({', '.join(FORMATS)})."
     if _layout(folder.parent):
         fix = f"Give the folder that it is in: {folder.parent}"
+    elif inside := next((path for path in sorted(folder.iterdir()) if path.is_dir() and _layout(path)), None):
+        fix = f"Give a folder that is in it: {inside}"
     expected = "rgb/, depth/ and cam_K.txt (and masks/, annotated_poses/ where there are any)"
     raise BadInput(str(folder), f"a folder with {holds}", expected, fix)
 

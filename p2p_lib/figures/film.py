@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.scenes import Scene
@@ -23,7 +24,13 @@ _GIF_COLOURS, _WEBP_QUALITY = 128, 60
 _TICK = Fraction(1, 90_000)  # of a film's clock: MPEG's
 
 
-def write_film(run: str | Path, out: str | Path, sequence: Sequence | None = None, width_px: int | None = None) -> Path:
+def write_film(
+    run: str | Path,
+    out: str | Path,
+    sequence: Sequence | None = None,
+    width_px: int | None = None,
+    progress: bool = False,
+) -> Path:
     """A run's folder as a film: boxes, axes, statuses, keypoints, and masks where the run has them; the path written.
 
     It plays as fast as it was recorded. width_px: of its images (default: the camera's; at most 480 but for MP4).
@@ -39,9 +46,10 @@ def write_film(run: str | Path, out: str | Path, sequence: Sequence | None = Non
     width_px = width_px or min(playback.sequence.camera.width, _PAGE_PX if for_a_page else 1 << 16)
     every = max(1, round(playback.rate_hz / _PAGE_HZ)) if for_a_page else 1
     rows = range(0, len(playback), every)
-    with Film(out, playback.rate_hz / every) as film:
+    with Film(out, playback.rate_hz / every) as film, progress_bar(film.path.name, len(rows), shown=progress) as bar:
         for row, image in zip(rows, scene.film(rows, width_px=width_px)):
             film.add(image, playback.times_s[row])
+            bar.update()
     return film.path
 
 

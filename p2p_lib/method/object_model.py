@@ -13,6 +13,7 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.method.factor_graph import ObjectGraph
 from p2p_lib.method.keyframe_views import KeyframeViews
+from p2p_lib.method.keyframes import misfit
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.recovery.search import SurfaceSample
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 NO_IDS = np.zeros(0, np.int64)
 #: A frame with a larger move or turn verifies no point (appendix, "Point Promotion Strategy").
 _STABLE_M, _STABLE_DEG = 0.01, 2.0
+#: No noise explains an observation that is off by more standard deviations, poses a little off included.
+_LARGEST_MISFIT = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +134,16 @@ class ObjectModel:
         p_cam = obs.p_cam if self.config.method.motion else None
         self.map.observe(p_obj, obs.tracks.uncertainty, stable, p_cam)
         self._since_keyframe += 1
+
+    def explained(self, obs: Observation, T_cam_obj: np.ndarray) -> np.ndarray:
+        """(N,) bool: points of the map that are seen where a pose has them, as far as noise can say.
+
+        Others would bend the graph, whose robust loss never lets go of them: what is mirrored in an object slides over
+        it, a little from keyframe to keyframe, and takes poses and keypoints along.
+        """
+        sigma_m = self._observer.noise_m(obs.p_cam)
+        sigma = np.stack([np.full_like(sigma_m, self.config.factor_graph.bearing_sigma_rad), sigma_m], -1)
+        return misfit(se3.transform(T_cam_obj, self.map.p_obj), obs.p_cam, sigma) <= _LARGEST_MISFIT
 
     def keyframe_due(self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray) -> bool:
         """The appendix's "Sampling Criteria": a new view of the object, or too few points left."""

@@ -25,7 +25,7 @@ from p2p_lib.method import refinement, registration, selection
 from p2p_lib.method.agreement import background_share, size_ratio
 from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import GATES, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
+from p2p_lib.method.lifecycle import GATES, MAPPED, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
 from p2p_lib.method.object_model import NO_IDS, NewPoints, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.refinement import Keypoints, Refinement, surface_distance
@@ -322,13 +322,16 @@ class ObjectTracker:
         requests = Requests(reject=self.map.ids[used & ~agrees])
         agreeing = self._agreeing(obs, best)  # before a keyframe changes the map's rows
         of_frame, most = self._covariance(obs, best), DOUBTED if life.doubted else 1.0
+        sure = min(confidence(self._of_pose(T_cam_obj, of_frame, best), *agreeing), most)
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
-            keyframe = due or (not life.confirming and model.keyframe_due(obs, T_cam_obj, agrees))
+            trusted = not life.confirming and (sure >= MAPPED or not self._gates)
+            keyframe = due or (trusted and model.keyframe_due(obs, T_cam_obj, agrees))
         model.settle_surface()
         if keyframe:
-            sure = min(confidence(self._of_pose(T_cam_obj, of_frame, best), *agreeing), most)
             good = obs.seen & (agrees | ~self.map.promoted)
+            if self._gates and not due:  # two maps that become one lie to each other as well as poses tell
+                good &= model.explained(obs, T_cam_obj)
             T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, self._sample(obs), good, of_frame, sure)
             requests = replace(asked, reject=requests.reject)
         self.life = replace(life, T_cam_obj=T_cam_obj).placed(obs.frame.T_world_cam)

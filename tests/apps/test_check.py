@@ -55,10 +55,15 @@ def alarms(findings):
     return [f for f in findings if f.level is not Level.OK]
 
 
+def test_whether_there_is_truth_is_said(good):
+    assert found("synthetic/crossing", "truth").text == "box in 300 images, can in 300 images"
+    assert found(good, "truth").text == "none, so that a run is not scored"
+
+
 def test_a_good_folder_raises_no_alarm(good):
     findings = check_folder(good)
     assert alarms(findings) == []
-    names = ["files", "camera", "times", "motion", "depth", "scale", "registration"]
+    names = ["files", "camera", "times", "motion", "depth", "scale", "registration", "truth"]
     assert [f.name for f in findings] == names + [
         f"{o}: {w}" for o in ("box", "can") for w in ("depth", "mask", "points")
     ]

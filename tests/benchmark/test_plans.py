@@ -74,10 +74,10 @@ def test_what_is_not_there_says_why_and_costs_nothing(monkeypatch):
     monkeypatch.delenv("P2P_DATA", raising=False)
     jobs = jobs_of(read_plan("ycbineoat"), "full")
     assert len(jobs) == 2 * 27 and not any(job.key for job in jobs)
-    assert {"$P2P_DATA is not set" in job.reason for job in jobs if job.method.name == "Ours"} == {True}
+    assert {"below $P2P_DATA, which is not set" in job.reason for job in jobs if job.method.name == "Ours"} == {True}
     fetch = "; ".join(f"p2p data fetch {name}" for name in ("sam2", "superpoint", "tapir"))
     asked = {job.reason for job in jobs if job.method.name == "paper_full"}
-    assert asked == {f"no weights of sam2, superpoint, tapir. Run: export P2P_DATA=DIR; {fetch}"}
+    assert asked == {f"no weights of sam2, superpoint, tapir. Run: {fetch}"}
     (real,) = {job.reason for job in jobs_of(read_plan("ycbmultitrack_real"), "full")}
     assert "P2P_DATA" in real
 

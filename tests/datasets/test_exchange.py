@@ -1,5 +1,6 @@
 """Poses out and in again: every form keeps every pose, and a lost frame stays lost; faults name the line."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -139,7 +140,9 @@ def test_bop_of_own_data_numbers_the_objects_of_the_run(table, tmp_path, capsys)
     words = ["export", str(tmp_path / "run"), "--format", "bop", "--out", str(tmp_path / "out")]
     assert main(words) == 2 and "--frame object" in capsys.readouterr().err
     assert main([*words, "--frame", "object"]) == 0
-    rows = Path(capsys.readouterr().out.strip()).read_text().splitlines()[1:]
+    path, ids = map(Path, capsys.readouterr().out.split())
+    assert json.loads(ids.read_text()) == {"mug": 1, "bowl": 2}
+    rows = path.read_text().splitlines()[1:]
     numbers = [row.split(",")[2] for row in rows]
     assert (numbers.count("1"), numbers.count("2"), len(rows)) == (N, N // 2, N + N // 2)
 
@@ -156,7 +159,7 @@ def test_tum_as_scipy_reads_it(table, tmp_path):
 
 def test_bop_csv_as_its_page_says(scene, tmp_path):
     run = run_on(scene, tmp_path / "run")
-    [path] = export_run(tmp_path / "run", "bop", tmp_path / "out")
+    path, _ = export_run(tmp_path / "run", "bop", tmp_path / "out")
     assert path.name == "p2p_000007-test.csv"
     lines = path.read_text().splitlines()
     assert lines[0] == "scene_id,im_id,obj_id,score,R,t,time" and len(lines) == 1 + 2 * N - 4

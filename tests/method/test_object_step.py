@@ -319,6 +319,28 @@ def test_tracks_that_contradict_the_motion_are_rejected():
     assert set(step.requests.reject.tolist()) == set(wrong.tolist()) != set()
 
 
+@pytest.mark.parametrize("gates", [True, False])
+def test_what_slides_over_the_object_does_not_enter_the_graph(gates):
+    """As a reflection does, from keyframe to keyframe: the pose may be right, and yet the graph would follow it."""
+    lump, pending = pending_and_promoted(method__graph=True, method__gates="all" if gates else "none")
+    keys = lump.tracker.map.keys
+    slide = moved_to(turned(35), lump, lambda tracks: pending & tracks.visible & (keys % 2 == 0))
+    seen = keys[pending & lump.observed(turned(23), slide).seen]
+    assert lump.see(turned(23), slide).estimate.keyframe
+    graph = lump.tracker.model.graph
+    held = np.isin(seen, graph._keyframes[max(graph.keys)].ids)
+    assert held[seen % 2 == 1].mean() > 0.9 and held[seen % 2 == 0].any() != gates
+
+
+@pytest.mark.parametrize("gates", [True, False])
+def test_a_pose_that_is_hardly_believed_makes_no_keyframe(gates, monkeypatch):
+    lump = settled(begun(method__gates="all" if gates else "none"), [2])
+    monkeypatch.setattr("p2p_lib.method.object_tracker.confidence", lambda *_: 0.09)
+    assert not any(lump.see(turned(deg)).estimate.keyframe for deg in (5, 8, 11, 14)) == gates
+    monkeypatch.undo()
+    assert lump.see(turned(26)).estimate.keyframe
+
+
 def test_pending_points_are_not_rejected_and_enter_the_graph():
     """They took no part in registration, so that they agree with nothing."""
     lump, pending = pending_and_promoted(method__graph=True)

@@ -161,7 +161,9 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
         height = np.median(np.abs(plane_heights(patch, plane)[inside]) / patch.sigma_m[inside])
         if height < _FLAT:
             got = f"{np.count_nonzero(mask)} pixels, flat in what is around it, as a table or a wall is"
-            return doubt(who, got, "If it is not the object, click in the object's middle.")
+            return doubt(
+                who, got, "If it is not the object, click in the object's middle; else see that depth is in metres."
+            )
     alone = np.zeros(frame.shape, bool)
     box, x = replace(cutter, others_px=np.zeros((0, 2)), rng=np.random.default_rng(0)).start()
     alone[box.slices] = x > 0.5
