@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from p2p_lib.core import se3
 from p2p_lib.core.types import DOUBTED
@@ -71,5 +70,7 @@ def longest_run(flags: np.ndarray) -> int:
 
 def mesh_off_share(mesh: trimesh.Trimesh, T_obj_model: np.ndarray, surface: np.ndarray) -> float:
     """The share of a mesh's vertices, in the object frame, that are off the true surface (M, 3) in the model's."""
+    from scipy.spatial import cKDTree
+
     p_model = se3.transform(se3.inverse(T_obj_model), np.asarray(mesh.vertices))
     return float((cKDTree(surface).query(p_model)[0] > OFF_M).mean())

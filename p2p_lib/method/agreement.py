@@ -25,10 +25,13 @@ def size_ratio(p_obj: np.ndarray, p_cam: np.ndarray, noise_m: np.ndarray) -> tup
     A rigid object has one size. Depth that is scaled or offset changes it; a wrong pose or a few wrong points do not:
     the median over pairs of keypoints. ``noise_m`` (N,) is that of the points; None where too few keypoints are seen.
     """
-    a, b = np.triu_indices(len(p_obj), 1)
-    known_m, measured_m = (np.linalg.norm(p[a] - p[b], axis=1) for p in (p_obj, p_cam))
+    from scipy.spatial.distance import pdist
+
+    if len(p_obj) < _KEYPOINTS:
+        return None
+    known_m, measured_m = pdist(p_obj), pdist(p_cam)
     apart = known_m > _APART_M
-    if len(p_obj) < _KEYPOINTS or apart.sum() < _KEYPOINTS:
+    if apart.sum() < _KEYPOINTS:
         return None
     sigma = np.sqrt(2 / len(p_obj)) * np.median(noise_m) / np.median(known_m[apart])
     return float(np.median(measured_m[apart] / known_m[apart])), float(sigma)
