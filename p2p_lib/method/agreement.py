@@ -1,7 +1,7 @@
 """Does what camera and masks say agree with itself: three measures, from values alone (not in the paper).
 
-They know no truth. What follows of an object is in :data:`p2p_lib.method.lifecycle.DOUBTS`; depth that stands still is
-taken for none in :mod:`p2p_lib.method.pipeline`.
+They know no truth. What follows of an object is in :data:`p2p_lib.method.lifecycle.DOUBTS`; depth and colour that are
+not of one moment are left out in :mod:`p2p_lib.method.pipeline`.
 """
 
 from __future__ import annotations
@@ -50,9 +50,12 @@ def background_share(frame: Frame, mask: np.ndarray, before: Frame, mask_before:
     return float(np.count_nonzero(same) / max(np.count_nonzero(mask_before), 1))
 
 
-def depth_stands(frame: Frame, before: Frame) -> bool:
-    """Whether all depth is that of a frame before, to the last bit, while colour goes on: no sensor measures so."""
-    some = np.s_[::_STEP, ::_STEP]
-    if not np.array_equal(frame.depth_m[some], before.depth_m[some]) or not frame.depth_m.any():
-        return False
-    return np.array_equal(frame.depth_m, before.depth_m) and not np.array_equal(frame.rgb, before.rgb)
+def half_stands(frame: Frame, before: Frame) -> bool:
+    """Whether of depth and colour one is that of a frame before, to the last bit, while the other goes on.
+
+    No sensor measures so: the two are not of one moment. A whole image that comes again tells nothing.
+    """
+    some, depth_m, rgb = np.s_[::_STEP, ::_STEP], frame.depth_m, frame.rgb
+    depth = np.array_equal(depth_m[some], before.depth_m[some]) and np.array_equal(depth_m, before.depth_m)
+    colour = np.array_equal(rgb[some], before.rgb[some]) and np.array_equal(rgb, before.rgb)
+    return depth != colour and bool(depth_m.any() and rgb.any())

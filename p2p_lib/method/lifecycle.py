@@ -24,7 +24,7 @@ _PAUSE_S, _PAUSE = 0.25, 5
 #: Another size is one that is off by this and so many standard deviations.
 _SIZE, _SIZE_SIGMAS = 0.05, 3.0
 #: A mask that takes in so much background is doubted. One that stays so for this many frames is taken for right.
-_BACKGROUND, _LONGEST_DOUBT = 0.2, 60
+BACKGROUND, _LONGEST_DOUBT = 0.2, 60
 #: A pose of less confidence makes no keyframe: what it places agrees with it for ever after.
 MAPPED = 0.1
 #: Shape and colour tell a turn from all others by this lead.
@@ -215,7 +215,7 @@ def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: Life
 
 
 def _mask_on_background(life: Lifecycle, evidence: Evidence) -> str:
-    on = evidence.background > _BACKGROUND and life.doubted_frames < _LONGEST_DOUBT
+    on = evidence.background > BACKGROUND and life.doubted_frames < _LONGEST_DOUBT
     return f"its mask took in {100 * evidence.background:.0f} % more where nothing changed" if on else ""
 
 

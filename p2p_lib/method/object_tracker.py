@@ -25,7 +25,7 @@ from p2p_lib.method import refinement, registration, selection
 from p2p_lib.method.agreement import background_share, size_ratio
 from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import GATES, MAPPED, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
+from p2p_lib.method.lifecycle import BACKGROUND, GATES, MAPPED, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
 from p2p_lib.method.object_model import NO_IDS, NewPoints, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.refinement import Keypoints, Refinement, surface_distance
@@ -104,7 +104,7 @@ class ObjectTracker:
         self._new_model = partial(ObjectModel, config, self.observer, stopwatch, beside)
         self.model = self._new_model()
         self.life, self.map_id = Lifecycle(), 0
-        self._trusted: Observation | None = None  # the newest without a doubt; None after a frame without a pose
+        self._trusted: Observation | None = None  # the newest without a doubt; None once it was hidden since
         self.aside: ObjectTracker | None = None
         self._relation = Relation()  # of the map aside to this one
         self._gates = tuple(GATES) if config.method.gates == "all" else ()
@@ -284,18 +284,22 @@ class ObjectTracker:
 
     def _evidence(self, obs: Observation, best: Candidate) -> Evidence:
         """What speaks for a pose, and whether camera and masks agree with themselves."""
-        keypoints, before = obs.seen & self.map.promoted, self._trusted
+        keypoints = obs.seen & self.map.promoted
         agreeing = keypoints & best.hypothesis.inliers
         sized = agreeing if 2 * agreeing.sum() > keypoints.sum() else keypoints
         p_cam = obs.p_cam[sized]
         size = size_ratio(self.map.p_obj[sized], p_cam, self.observer.noise_m(p_cam))
+        return replace(best.evidence, size=size, background=self._background(obs))
+
+    def _background(self, obs: Observation) -> float:
+        """What the mask has taken in of the background, as a share of itself when nothing was doubted last."""
+        before = self._trusted
         if obs.mask is None or before is None or before.mask is None:
-            return replace(best.evidence, size=size)
-        background = background_share(obs.frame, obs.mask, before.frame, before.mask)
+            return 0.0
+        share = background_share(obs.frame, obs.mask, before.frame, before.mask)
         # At the image's border a mask grows with what comes into view.
-        if background > _SOME and (self.observer.cut_off(obs) or self.observer.cut_off(before)):
-            background = 0.0
-        return replace(best.evidence, size=size, background=background)
+        cut_off = share > _SOME and (self.observer.cut_off(obs) or self.observer.cut_off(before))
+        return 0.0 if cut_off else share
 
     def _agreement(self, obs: Observation, best: Candidate) -> float:
         """The keypoints seen that agree, less those that do not, as a share of all."""
@@ -424,7 +428,8 @@ class ObjectTracker:
         """Whether an object that stays lost shows much more than its map was ever founded on, or never was followed."""
         if not self._gates or self.life.lost_frames < _PATIENCE or obs.mask is None:
             return False
-        return not self.life.followed or self.observer.area_m2(obs) > _OUTGROWN * self.model.seen_m2
+        more = self.observer.area_m2(obs) > _OUTGROWN * self.model.seen_m2
+        return not self.life.followed or (more and self._background(obs) <= BACKGROUND)
 
     def _turned_over(self, obs: Observation) -> bool:
         """Whether a known object stays lost in plain view: it shows a side that nobody knows, in a mask that is given.
@@ -434,7 +439,8 @@ class ObjectTracker:
         known = self._gates and self.aside is None and self.life.lost_frames >= _STAYS_LOST
         if not known or obs.mask is None or not obs.given or self.observer.cut_off(obs):
             return False
-        return self.observer.area_m2(obs) >= _IN_PLAIN_VIEW * self.model.seen_m2
+        plain = self.observer.area_m2(obs) >= _IN_PLAIN_VIEW * self.model.seen_m2
+        return plain and self._background(obs) <= BACKGROUND
 
     # -- two maps ------------------------------------------------------------------------------
 
@@ -501,7 +507,7 @@ class ObjectTracker:
         )
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
-        self.life, self._trusted = self.life.without_pose(status), None
+        self.life, self._trusted = self.life.without_pose(status), self._trusted if status is Status.LOST else None
         reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self._left() else reason
         estimate = PoseEstimate(
             self.name,

@@ -37,7 +37,7 @@ from p2p_lib.core.interfaces import Hint, PointTracker, Segmenter
 from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_mask, check_not_on, check_prompt
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
-from p2p_lib.method.agreement import depth_stands
+from p2p_lib.method.agreement import half_stands
 from p2p_lib.method.object_model import NO_IDS, Requests
 from p2p_lib.method.object_tracker import ObjectTracker
 from p2p_lib.method.observation import Observation
@@ -49,7 +49,7 @@ _LOG = logging.getLogger("p2p_lib")
 Masks = dict[str, np.ndarray | None]
 #: The camera is located every so many frames: while all objects have poses, while one is away.
 _LOCATE_EVERY, _LOCATE_EVERY_AWAY = 5, 2
-#: Depth may be that of a frame before for so long, s: some cameras deliver it more seldom than colour.
+#: Depth or colour may be that of a frame before for so long, s: some cameras deliver one more seldom.
 _STANDS_S = 0.08
 #: Few depth cameras see half of their pixels farther than this, m.
 _FAR_M = 50.0
@@ -93,7 +93,7 @@ class Point2Pose:
         self._unlocated = _LOCATE_EVERY
         self._beside = ThreadPoolExecutor(2, "p2p")
         self._time_s: float | None = -np.inf  # of the frame before; None once it is said that time runs backwards
-        self._fresh: Frame | None = None  # the newest whose depth was another one than before
+        self._fresh: Frame | None = None  # the newest of which both depth and colour were new, or neither
         self._status: dict[str, Status] = {}
         self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
         self._waiting: deque[tuple[Frame, Masks, dict[str, Prompt]]] = deque()  # frames without an answer yet
@@ -223,12 +223,13 @@ class Point2Pose:
         return estimates
 
     def _measured(self, frame: Frame) -> Frame:
-        """The frame, without its depth where that has been the same for a while: points know how to wait for it."""
-        if self._fresh is None or not depth_stands(frame, self._fresh) or self.config.method.gates == "none":
+        """The frame, without its depth where that or colour has stood still for a while: points can wait for depth."""
+        if self._fresh is None or not half_stands(frame, self._fresh) or self.config.method.gates == "none":
             self._fresh = frame
         if frame.time_s - self._fresh.time_s <= _STANDS_S:
             return frame
-        doubt("depth", "the same image again and again while colour goes on", "Until it goes on it counts as missing.")
+        got = "one is the same image again and again while the other goes on"
+        doubt("depth and colour", got, "Until both go on, depth counts as missing.")
         return replace(frame, depth_m=np.zeros_like(frame.depth_m))
 
     def _check_time(self, frame: Frame) -> None:

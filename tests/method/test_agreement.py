@@ -5,7 +5,7 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.types import Frame
-from p2p_lib.method.agreement import background_share, depth_stands, size_ratio
+from p2p_lib.method.agreement import background_share, half_stands, size_ratio
 
 RNG = np.random.default_rng(0)
 P_OBJ = RNG.uniform(-0.05, 0.05, (30, 3))
@@ -57,13 +57,14 @@ def test_a_mask_takes_in_background_that_an_object_that_moves_does_not():
     assert background_share(frame, mask_before & mask, before, mask_before) == 0, "what it leaves out is no background"
 
 
-def test_depth_stands_where_it_is_the_same_while_colour_goes_on():
+def test_half_an_image_stands_where_the_other_half_goes_on():
     (before, _), (moved, _), (later, _) = scene(20), scene(21), scene(20, grey=101)
-    assert depth_stands(later, before)
-    assert not depth_stands(moved, before), "depth goes on"
+    assert half_stands(later, before) and half_stands(moved, before), "depth stands, colour stands"
     noisy = later.depth_m.copy()
     noisy[3, 5] += 1e-4
-    assert not depth_stands(Frame(1, 0.1, later.rgb, noisy), before), "to the last bit"
-    assert not depth_stands(before, before), "the same image twice tells nothing"
+    assert not half_stands(Frame(1, 0.1, later.rgb, noisy), before), "to the last bit"
+    assert not half_stands(before, before), "the same image twice tells nothing"
     nothing = np.zeros_like(later.depth_m)
-    assert not depth_stands(Frame(1, 0.1, later.rgb, nothing), Frame(0, 0.0, before.rgb, nothing))
+    assert not half_stands(Frame(1, 0.1, later.rgb, nothing), Frame(0, 0.0, before.rgb, nothing))
+    black = np.zeros_like(before.rgb)
+    assert not half_stands(Frame(1, 0.1, black, moved.depth_m), Frame(0, 0.0, black, before.depth_m))

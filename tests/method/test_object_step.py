@@ -589,6 +589,20 @@ def test_a_map_in_which_nothing_ever_was_followed_is_founded_anew():
     assert [step.estimate.map_id for step in steps] == [0] * 5 + [1] * 7
 
 
+def test_no_map_is_founded_on_the_background():
+    lump, (depth_m, seen) = before_a_wall(), render(LUMP, turned(9))
+    depth_m = np.where(seen, depth_m, np.float32(0.8))
+    beside = np.roll(seen, 60, axis=1) & ~seen
+    for _ in range(16):
+        lump.steps.append(None)
+        frame = Frame(len(lump.steps), len(lump.steps) / 30, np.zeros((*seen.shape, 3), np.uint8), depth_m)
+        estimate = lump.tracker.step(lump.tracker.observe(frame, beside, lump.tracks(turned(9)))).estimate
+        assert estimate.status is Status.LOST and estimate.map_id == 0
+    assert lump.tracker.observer.area_m2(lump.tracker.observe(frame, beside, lump.tracks(turned(9)))) > (
+        2 * lump.tracker.model.seen_m2
+    ), "it looks larger than the object, being farther away"
+
+
 def learnt(lump: Lump) -> list[np.ndarray]:
     """All that a frame may change of what is known of the object."""
     model = lump.tracker.model

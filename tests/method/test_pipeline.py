@@ -477,12 +477,13 @@ def test_depth_may_fail_for_a_while():
     assert set(statuses(estimates, "right")) == {"tracked"}
 
 
-def test_depth_that_stands_counts_as_missing():
-    standing = film()[9][0].depth_m
-    frames = [(replace(f, depth_m=standing) if f.index in range(10, 16) else f, masks) for f, masks in film()[:20]]
+@pytest.mark.parametrize("half", ["depth_m", "rgb"])
+def test_depth_and_colour_of_different_moments_are_no_measurement(half):
+    standing = {half: getattr(film()[9][0], half)}
+    frames = [(replace(f, **standing) if f.index in range(10, 16) else f, masks) for f, masks in film()[:20]]
     with pytest.warns(Doubt, match="the same image again"):
         estimates = track(frames)
-    # A camera may deliver depth more seldom than colour: for less than a tenth of a second it serves.
+    # A camera may deliver one more seldom than the other: for less than a tenth of a second it serves.
     assert [e["left"].T_cam_obj is not None for e in estimates] == [True] * 12 + [False] * 4 + [True] * 4
     deg, mm = errors(estimates, "left")
     assert deg[-4:].max() < 1 and mm[-4:].max() < 3
