@@ -1,4 +1,4 @@
-"""Does what camera and masks say agree with itself: three measures, from values alone (not in the paper).
+"""Does what camera and masks say agree with itself: four measures, from values alone (not in the paper).
 
 They know no truth. What follows of an object is in :data:`p2p_lib.method.lifecycle.DOUBTS`; depth and colour that are
 not of one moment are left out in :mod:`p2p_lib.method.pipeline`.
@@ -15,6 +15,8 @@ from p2p_lib.core.types import Frame
 _APART_M, _KEYPOINTS = 0.02, 8
 #: What has changed by less is the same thing: depth in m, each of red, green and blue in grey levels.
 _SAME_M, _SAME_GREY = 0.01, 12
+#: So much of an image has to look the same before it tells of the scene.
+_LOOKS_THE_SAME = 0.2
 #: Pixels between those that are compared first.
 _STEP = 8
 
@@ -35,6 +37,18 @@ def size_ratio(p_obj: np.ndarray, p_cam: np.ndarray, noise_m: np.ndarray) -> tup
         return None
     sigma = np.sqrt(2 / len(p_obj)) * np.median(noise_m) / np.median(known_m[apart])
     return float(np.median(measured_m[apart] / known_m[apart])), float(sigma)
+
+
+def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.ndarray) -> float:
+    """How many times as far as in a frame before what looks the same beside an object is measured: the median.
+
+    1 where too little looks the same, as before a moving camera: nothing is said then.
+    """
+    some = np.s_[::_STEP, ::_STEP]
+    now_m, then_m, now, then = (of[some] for of in (frame.depth_m, before.depth_m, frame.rgb, before.rgb))
+    same = (now_m > 0) & (then_m > 0) & ~(mask[some] | mask_before[some])
+    same &= (np.abs(now.astype(int) - then) < _SAME_GREY).all(-1)
+    return float(np.median(now_m[same] / then_m[same])) if same.mean() > _LOOKS_THE_SAME else 1.0
 
 
 def background_share(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.ndarray) -> float:

@@ -221,8 +221,12 @@ def _mask_on_background(life: Lifecycle, evidence: Evidence) -> str:
 
 def _another_size(life: Lifecycle, evidence: Evidence) -> str:
     ratio, sigma = evidence.size or (1.0, 0.0)
-    another = abs(ratio - 1) > _SIZE + _SIZE_SIGMAS * sigma
-    return f"its depth shows it {ratio:.2f} times as large as before" if another else ""
+    return f"its depth shows it {ratio:.2f} times as large as before" if off_size(ratio, sigma) else ""
+
+
+def off_size(ratio: float, sigma: float = 0.0) -> bool:
+    """Whether something is measured so many times as large as before that it is not the same."""
+    return abs(ratio - 1) > _SIZE + _SIZE_SIGMAS * sigma
 
 
 #: Every reason to doubt a pose that no gate refuses: what camera and masks say contradicts itself.

@@ -22,10 +22,10 @@ from p2p_lib.core.interfaces import Detector, Hint
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import DOUBTED, OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method import refinement, registration, selection
-from p2p_lib.method.agreement import background_share, size_ratio
+from p2p_lib.method.agreement import background_share, scene_ratio, size_ratio
 from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import BACKGROUND, GATES, MAPPED, SIGHTED, TELLING, Evidence, Lifecycle, Verdict
+from p2p_lib.method.lifecycle import BACKGROUND, GATES, MAPPED, SIGHTED, TELLING, Evidence, Lifecycle, Verdict, off_size
 from p2p_lib.method.object_model import NO_IDS, NewPoints, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.refinement import Keypoints, Refinement, surface_distance
@@ -284,12 +284,23 @@ class ObjectTracker:
 
     def _evidence(self, obs: Observation, best: Candidate) -> Evidence:
         """What speaks for a pose, and whether camera and masks agree with themselves."""
+        return replace(best.evidence, size=self._size(obs, best), background=self._background(obs))
+
+    def _size(self, obs: Observation, best: Candidate) -> tuple[float, float] | None:
+        """How large it is measured, where the scene beside it is measured otherwise than before, too; else None.
+
+        Points that slide over an object change its size alone.
+        """
+        before = self._trusted
+        if obs.mask is None or before is None or before.mask is None:
+            return None
+        if not off_size(scene_ratio(obs.frame, obs.mask, before.frame, before.mask)):
+            return None
         keypoints = obs.seen & self.map.promoted
         agreeing = keypoints & best.hypothesis.inliers
         sized = agreeing if 2 * agreeing.sum() > keypoints.sum() else keypoints
         p_cam = obs.p_cam[sized]
-        size = size_ratio(self.map.p_obj[sized], p_cam, self.observer.noise_m(p_cam))
-        return replace(best.evidence, size=size, background=self._background(obs))
+        return size_ratio(self.map.p_obj[sized], p_cam, self.observer.noise_m(p_cam))
 
     def _background(self, obs: Observation) -> float:
         """What the mask has taken in of the background, as a share of itself when nothing was doubted last."""

@@ -1,11 +1,13 @@
 """What says that camera and masks contradict themselves, on made-up values."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.types import Frame
-from p2p_lib.method.agreement import background_share, half_stands, size_ratio
+from p2p_lib.method.agreement import background_share, half_stands, scene_ratio, size_ratio
 
 RNG = np.random.default_rng(0)
 P_OBJ = RNG.uniform(-0.05, 0.05, (30, 3))
@@ -43,6 +45,15 @@ def scene(left: int, grey: int = 100, wall_m: float = 0.9) -> tuple[Frame, np.nd
     mask[10:30, left : left + 20] = True
     depth_m = np.where(mask, 0.5, wall_m).astype(np.float32)
     return Frame(0, 0.0, np.full((40, 80, 3), grey, np.uint8), depth_m), mask
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.2])
+def test_a_camera_that_measures_otherwise_does_so_beside_the_object_too(factor):
+    (before, mask_before), (frame, mask) = scene(20), scene(30)
+    other = replace(frame, depth_m=np.where(mask, 2.0, factor) * frame.depth_m)
+    assert scene_ratio(other, mask, before, mask_before) == pytest.approx(factor), "whatever the object does"
+    moving = replace(other, rgb=other.rgb + np.uint8(40))
+    assert scene_ratio(moving, mask, before, mask_before) == 1, "nothing looks the same"
 
 
 def test_a_mask_takes_in_background_that_an_object_that_moves_does_not():

@@ -310,6 +310,19 @@ def test_an_object_that_left_the_image_is_said_to_be_out_of_view():
 # --- what is believed, kept and asked for ------------------------------------------------------
 
 
+def test_what_shrinks_an_object_alone_is_no_fault_of_the_camera():
+    """Points that slide over it do."""
+    lump = settled(begun(), [2])
+    obs = lump.observed(turned(3))
+    depth_m = np.where(obs.mask, obs.frame.depth_m, 1.2).astype(np.float32)
+    obs = lump.tracker._trusted = replace(obs, frame=replace(obs.frame, depth_m=depth_m))
+    middle = np.nanmean(obs.p_cam, 0)
+    shrunk, best = replace(obs, p_cam=middle + 0.85 * (obs.p_cam - middle)), Candidate(lump.tracker._register(obs)[0])
+    assert lump.tracker._size(shrunk, best) is None
+    everywhere = replace(shrunk, frame=replace(obs.frame, depth_m=0.85 * depth_m))
+    assert lump.tracker._size(everywhere, best)[0] == pytest.approx(0.85, abs=0.01)
+
+
 def test_tracks_that_contradict_the_motion_are_rejected():
     lump = settled(begun(), [2])
     spoilt = moved_to(turned(18), lump, visible_first(8))
