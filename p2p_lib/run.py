@@ -174,11 +174,15 @@ def evaluate_poses(
     return evaluate(run, None, align, min_visible_px)
 
 
-def export_run(folder: str | Path, format: str, out: str | Path, frame: str | None = None) -> list[Path]:
+def export_run(
+    folder: str | Path, format: str, out: str | Path, frame: str | None = None, min_confidence: float = 0.0
+) -> list[Path]:
     """Write a run's poses in another tool's form; what ``p2p export`` does.
 
     frame  "object": T_cam_obj, the tracker's own frame; "model": T_cam_model, by the truth of the first scored frame
            as scoring fixes it. By default the model's for ``bop``, which knows no other, else the object's
+
+    Poses of less than ``min_confidence`` are left out.
     """
     if frame not in (None, "object", "model"):
         raise BadInput("frame", repr(frame), "object or model")
@@ -186,7 +190,9 @@ def export_run(folder: str | Path, format: str, out: str | Path, frame: str | No
     in_model = (frame or ("model" if format == "bop" else "object")) == "model"
     path = run.info.get("path")
     sequence = sequences.open_sequence(path, run.info["format"]) if path and Path(path).is_dir() else None
-    return export(run, out, format, model_frames(run) if in_model else None, sequence)
+    frames = model_frames(run) if in_model else None
+    sure = {name: obj.of_confidence(min_confidence) for name, obj in run.objects.items()}
+    return export(replace(run, objects=sure), out, format, frames, sequence)
 
 
 #: Two frames that take longer did more than track.

@@ -10,7 +10,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,10 @@ def check_folder(
         masks = [sequence.masks(i) or {} for i in chosen]
         with warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", Doubt)
-            firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
+            try:
+                firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
+            except BadInput as error:
+                return [replace(_unreadable(error), name="clicks" if prompts else "masks")]
     except P2PError as error:
         return [_unreadable(error)]
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
@@ -367,7 +370,7 @@ def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Findin
     count, needed = int((contrast >= config.tracking.textureless_contrast).sum()), config.lifecycle.return_inliers
     text = f"places to track in frame {frame.index}: {count}"
     if count < needed:
-        fix = "Come nearer, light it better, or begin with a textured side: then its surface alone carries the pose."
+        fix = "Its surface alone carries the pose; expect doubts. Come nearer, light it better, show a textured side."
         level = Level.LOOK if count >= config.registration.min_inliers else Level.WRONG
         return Finding(f"{name}: points", level, f"{text}; {needed} are needed to find it again", fix)
     return Finding(f"{name}: points", Level.OK, text)

@@ -15,7 +15,7 @@ from textwrap import fill
 from typing import Any
 
 from p2p_lib.apps.command_line import arg, command, main, run_options, warn
-from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.options import RunOptions, names, pairs
 
 #: Options that choose the method and its parameters.
@@ -146,12 +146,20 @@ def _eval(a: argparse.Namespace) -> None:
         from p2p_lib.evaluation.protocol import evaluate
 
         run = load_run(a.run)
-        if any(obj.has_truth.any() for obj in run.objects.values()):
-            _show(evaluate(run, options.models, a.align, a.min_visible_px), a.json)
+        score: Any = None
+        try:
+            if any(obj.has_truth.any() for obj in run.objects.values()):
+                score = evaluate(run, options.models, a.align, a.min_visible_px)
+        except MissingData as error:
+            if run.points or options.models:
+                raise
+            warn(f"p2p eval: {error}")
+        if score is not None:
+            _show(score, a.json)
         else:
             from p2p_lib.evaluation.consistency import consistency
 
-            _show(consistency(run, progress=not a.json), a.json)
+            _show(consistency(run), a.json)
             if not a.json and not (a.run / "masks").is_dir() and run.info["masks"] != "dataset":
                 again = f"p2p run {run.info['path'] or run.info['sequence']} --out {a.run} --force --save-masks"
                 if prompts := (run.info.get("options") or {}).get("prompts"):
@@ -268,11 +276,12 @@ def _figures(a: argparse.Namespace) -> None:
     arg("--format", required=True, choices=("bop", "tum", "poses"), help="BOP CSV, TUM, or 4x4 files"),
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
     arg("--frame", choices=("object", "model"), help="the tracker's (bop without truth needs it) or the model's"),
+    arg("--min-confidence", type=float, default=0.0, metavar="C", help="leave less confident poses out (default 0)"),
 )
 def _export(a: argparse.Namespace) -> None:
     from p2p_lib.run import export_run
 
-    for path in export_run(a.run, a.format, a.out, a.frame):
+    for path in export_run(a.run, a.format, a.out, a.frame, a.min_confidence):
         print(path)
 
 

@@ -116,6 +116,10 @@ class ObjectRun:
         """(n,) bool: a pose, of confidence :data:`~p2p_lib.core.types.DOUBTED` at most."""
         return self.has_pose & (self.confidence <= DOUBTED)
 
+    def of_confidence(self, least: float) -> ObjectRun:
+        """The same without the poses of less confidence."""
+        return replace(self, T_cam_obj=np.where((self.confidence >= least)[:, None, None], self.T_cam_obj, np.nan))
+
     def of_last_map(self) -> ObjectRun:
         """The same in the frame of the last map: without the poses of maps that are no part of it."""
         map_id, T_cam_obj, covariance = self.map_id.copy(), self.T_cam_obj.copy(), self.covariance.copy()

@@ -16,7 +16,6 @@ import numpy as np
 from p2p_lib.core import se3, tables
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import P2PError
-from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.raycasting import cast, ray_scene
 from p2p_lib.core.types import DOUBTED
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
@@ -90,7 +89,7 @@ class Consistency:
         return "\n".join([title, tables.as_text(self.as_frame()), *told, SCALE, *hz, ran])
 
 
-def consistency(run: Run, sequence: Sequence | None = None, progress: bool = False) -> Consistency:
+def consistency(run: Run, sequence: Sequence | None = None) -> Consistency:
     """What can be said of a run without truth; of its images where they can still be had.
 
     sequence  that the run was made on (default: opened as the run says)
@@ -102,7 +101,7 @@ def consistency(run: Run, sequence: Sequence | None = None, progress: bool = Fal
             sequence = None
     keypoints = load_keypoints(run.path)
     objects = {}
-    for name, obj in progress_bar("objects", unit="object", shown=progress, iterable=run.objects.items()):
+    for name, obj in run.objects.items():
         numbers = dict.fromkeys(HEADS, float("nan")) | {"pose": 100 * float(obj.has_pose.mean())}
         if obj.has_pose.any():
             numbers["doubted"] = 100 * float(obj.doubted.sum() / obj.has_pose.sum())

@@ -25,7 +25,8 @@ _PAUSE_S, _PAUSE = 0.25, 5
 _SIZE, _SIZE_SIGMAS = 0.05, 3.0
 #: A mask that takes in so much background is doubted. One that stays so for this many frames is taken for right.
 BACKGROUND, _LONGEST_DOUBT = 0.2, 60
-#: A pose of less confidence makes no keyframe: what it places agrees with it for ever after.
+#: A pose of less confidence makes no keyframe: what it places agrees with it for ever after. One that the surface
+#: alone determines well has more.
 MAPPED = 0.1
 #: Shape and colour tell a turn from all others by this lead.
 TELLING = 0.25

@@ -625,7 +625,8 @@ class ObjectTracker:
 
     def _left(self) -> bool:
         """Whether most keypoints of an absent object lay outside the image at its last pose."""
-        return self.life.T_cam_obj is not None and self._inside(self.life.T_cam_obj).mean() < 0.5
+        inside = np.ones(1, bool) if self.life.T_cam_obj is None else self._inside(self.life.T_cam_obj)
+        return bool(len(inside)) and inside.mean() < 0.5
 
     def _gone(self, frame: Frame) -> bool:
         """Whether nothing of an absent object would show in the image if it has lain still; False if nobody knows."""

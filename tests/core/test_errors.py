@@ -2,9 +2,12 @@
 
 import pickle
 
+import numpy as np
 import pytest
 
-from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
+from p2p_lib.core.errors import BadInput, Doubt, MissingBackend, MissingData, P2PError
+from p2p_lib.core.types import Frame
+from p2p_lib.method.pipeline import _check_unit
 
 EVERY = [
     BadInput("depth", "3x2", "640x480", "Register it first."),
@@ -23,6 +26,13 @@ def test_everything_that_can_be_mended_is_one_family(error):
 def test_each_is_also_what_python_calls_it():
     for error, kind in zip(EVERY, (ValueError, FileNotFoundError, ImportError)):
         assert isinstance(error, kind)
+
+
+def test_a_doubt_names_the_line_that_called_the_library():
+    frame = Frame(0, 0.0, np.zeros((8, 8, 3), np.uint8), np.where(np.arange(64) < 20, 1, 99).reshape(8, 8) / 1.0)
+    with pytest.warns(Doubt) as said:
+        _check_unit(frame)
+    assert said[0].filename == __file__
 
 
 def test_bad_input_says_name_got_expected_fix():

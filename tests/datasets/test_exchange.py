@@ -147,6 +147,17 @@ def test_bop_of_own_data_numbers_the_objects_of_the_run(table, tmp_path, capsys)
     assert (numbers.count("1"), numbers.count("2"), len(rows)) == (N, N // 2, N + N // 2)
 
 
+def test_poses_of_little_confidence_are_left_out_where_that_is_asked(table, tmp_path):
+    run = run_on(table, tmp_path / "run")
+    confidence = run.objects["can"].confidence
+    least = float(np.median(confidence[confidence > 0]))
+    for asked in (0.0, least, 1.1):
+        path, *_ = export_run(tmp_path / "run", "tum", tmp_path / f"{asked}", min_confidence=asked)
+        kept = run.objects[path.stem]
+        lines = path.read_text().splitlines()
+        assert len(lines) == (kept.has_pose & (kept.confidence >= asked)).sum()
+
+
 def test_tum_as_scipy_reads_it(table, tmp_path):
     run = run_on(table, tmp_path / "run")
     export(run, tmp_path / "out", "tum")

@@ -22,6 +22,7 @@ def run_with(off_m: dict[int, float], confidence: float = 0.9, lost: tuple[int, 
         frame_index=np.arange(frames), time_s=np.arange(frames) / 30, status=np.full(frames, "tracked"),
         T_cam_obj=T_cam_obj, confidence=np.full(frames, confidence), covariance=np.full((frames, 6, 6), np.nan),
         visible_points=zeros, inliers=zeros, keyframe=zeros > 0, map_id=zeros, T_cam_model=truth,
+        joined_map=zeros - 1, T_obj_joined=np.full((frames, 4, 4), np.nan),
         labelled=np.ones(frames, bool), visible_px=zeros + 900, reason=np.full(frames, ""),
     )  # fmt: skip
 
