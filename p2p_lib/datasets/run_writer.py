@@ -64,6 +64,7 @@ class RunWriter:
         # Of each object one estimate for every frame so far.
         self._estimates: dict[str, list[PoseEstimate]] = {file_name("object name", name): [] for name in names}
         self._pose_files: dict[str, Path] = {}  # those that have been written
+        self._several_maps: set[str] = set()
         self._frames: list[tuple[int, float]] = []  # index and time of every frame so far
         self._visible_px: list[Mapping[str, int] | None] = []
         self._timing_columns = ["frame_index", "time_s", "total_ms", "keyframe"]
@@ -139,8 +140,10 @@ class RunWriter:
         replace_text(self.path / "config.toml", self._config.to_toml())
         if self._points:
             _save_arrays(self.path / "models.npz", self._points)
-        for name in self._estimates:
+        for name, estimates in self._estimates.items():
             self._write_poses(name)
+            if len({e.map_id for e in estimates}) > 1:
+                self._several_maps.add(name)
         self._write_timings()
         self.begun = True
         self.flush()
@@ -167,6 +170,8 @@ class RunWriter:
             for name, estimates in self._estimates.items():
                 run = ObjectRun.of(name, estimates, self._sequence, self._visible_px)
                 arrays |= {f"{name}/{column}": getattr(run, column) for column in COLUMNS}
+                if name in self._several_maps:
+                    self._write_poses(name)
             _save_arrays(self.path / "poses.npz", arrays)
         self.info |= {"frames": n, "objects": list(self._estimates)}
         self._write_info()
@@ -228,8 +233,12 @@ class RunWriter:
 
     def _append_last(self) -> None:
         for name, estimates in self._estimates.items():
-            if name not in self._pose_files or len({e.map_id for e in estimates[-2:]}) > 1:
-                self._write_poses(name)  # of an object that nobody announced, or with a new map
+            if len({e.map_id for e in estimates[-2:]}) > 1:
+                self._several_maps.add(name)
+            if name not in self._pose_files:
+                self._write_poses(name)  # of an object that nobody announced
+            elif name in self._several_maps:
+                pass  # which map has the most poses is seen at the next flush
             elif (T_cam_obj := estimates[-1].T_cam_obj) is not None:
                 append(self._pose_files[name], tum_line(estimates[-1].time_s, T_cam_obj))
         row = self._timings[-1]
@@ -251,7 +260,7 @@ class RunWriter:
 
     def _write_poses(self, name: str) -> None:
         self._pose_files[name] = self.path / "poses" / f"{name}.txt"
-        run = ObjectRun.of(name, self._estimates[name], self._sequence, self._visible_px).of_last_map()
+        run = ObjectRun.of(name, self._estimates[name], self._sequence, self._visible_px).of_one_map()
         lines = map(tum_line, run.time_s[run.has_pose].tolist(), run.T_cam_obj[run.has_pose])
         replace_text(self._pose_files[name], "".join(lines))
 

@@ -120,19 +120,20 @@ class ObjectRun:
         """The same without the poses of less confidence."""
         return replace(self, T_cam_obj=np.where((self.confidence >= least)[:, None, None], self.T_cam_obj, np.nan))
 
-    def of_last_map(self) -> ObjectRun:
-        """The same in the frame of the last map: without the poses of maps that are no part of it."""
+    def of_one_map(self) -> ObjectRun:
+        """The same in the frame of the map with the most poses: without those of maps that are no part of it."""
         map_id, T_cam_obj, covariance = self.map_id.copy(), self.T_cam_obj.copy(), self.covariance.copy()
         for k in np.flatnonzero(self.joined_map >= 0):
             rows, T, A = map_id == self.joined_map[k], self.T_obj_joined[k], se3.adjoint(self.T_obj_joined[k])
             map_id[rows], T_cam_obj[rows] = self.map_id[k], T_cam_obj[rows] @ se3.inverse(T)
             covariance[rows] = A @ covariance[rows] @ A.T
-        last = map_id == map_id[-1] if len(self) else np.zeros(0, bool)
+        poses = np.bincount(map_id[self.has_pose], minlength=1)
+        kept = map_id == poses.argmax()
         return replace(
             self,
-            T_cam_obj=np.where(last[:, None, None], T_cam_obj, np.nan),
-            covariance=np.where(last[:, None, None], covariance, np.nan),
-            confidence=np.where(last, self.confidence, 0),
+            T_cam_obj=np.where(kept[:, None, None], T_cam_obj, np.nan),
+            covariance=np.where(kept[:, None, None], covariance, np.nan),
+            confidence=np.where(kept, self.confidence, 0),
         )
 
     @property
@@ -208,7 +209,7 @@ def load_run(folder: str | Path, every_map: bool = False) -> Run:
             if lacking:
                 raise BadInput(str(folder / "poses.npz"), f"no {name}/{lacking[0]}", "what p2p run wrote")
             obj = ObjectRun(**{column: arrays[f"{name}/{column}"] for column in COLUMNS})
-            objects[name] = obj if every_map else obj.of_last_map()
+            objects[name] = obj if every_map else obj.of_one_map()
     if not any(map(len, objects.values())):
         raise MissingData(str(folder), "a run without frames", "It was stopped at once: run it again.")
     if len({len(obj) for obj in objects.values()}) > 1:
