@@ -18,7 +18,7 @@ from p2p_lib.core import se3
 # adds to it. Measured: without, the covariance after much merging is too sure by half.
 _MOVED_SIGMA = 1.25
 # Observations off by more standard deviations are left out when keyframes merge: later, a mean hides them.
-_LARGEST_MISFIT = 4.0
+_KEPT_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ def _merge(kept: Keyframe, gone: Keyframe, points: dict[int, np.ndarray]) -> Non
     if not len(ids):
         return
     p_obj = np.array([points[i] for i in ids.tolist()])
-    stays = misfit(se3.transform(se3.inverse(kept.T_obj_cam), p_obj), p_cam, sigma) <= _LARGEST_MISFIT
+    stays = misfit(se3.transform(se3.inverse(kept.T_obj_cam), p_obj), p_cam, sigma) <= _KEPT_SIGMAS
     merged, row = np.unique(ids[stays], return_inverse=True)
     information = sigma[stays] ** -2
     total = _sums(row, information)

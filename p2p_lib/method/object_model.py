@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +11,12 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
+from p2p_lib.core.types import Status
 from p2p_lib.method.factor_graph import ObjectGraph
 from p2p_lib.method.keyframe_views import KeyframeViews
 from p2p_lib.method.keyframes import misfit
 from p2p_lib.method.keypoint_map import KeypointMap
+from p2p_lib.method.lifecycle import Lifecycle
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.recovery.search import SurfaceSample
 
@@ -25,7 +27,7 @@ NO_IDS = np.zeros(0, np.int64)
 #: A frame with a larger move or turn verifies no point (appendix, "Point Promotion Strategy").
 _STABLE_M, _STABLE_DEG = 0.01, 2.0
 #: No noise explains an observation that is off by more standard deviations, poses a little off included.
-_LARGEST_MISFIT = 8.0
+_STRAY_SIGMAS = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +145,7 @@ class ObjectModel:
         """
         sigma_m = self._observer.noise_m(obs.p_cam)
         sigma = np.stack([np.full_like(sigma_m, self.config.factor_graph.bearing_sigma_rad), sigma_m], -1)
-        return misfit(se3.transform(T_cam_obj, self.map.p_obj), obs.p_cam, sigma) <= _LARGEST_MISFIT
+        return misfit(se3.transform(T_cam_obj, self.map.p_obj), obs.p_cam, sigma) <= _STRAY_SIGMAS
 
     def keyframe_due(self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray) -> bool:
         """The appendix's "Sampling Criteria": a new view of the object, or too few points left."""
@@ -227,6 +229,28 @@ class ObjectModel:
             self.covariance = result.covariance
         self._corrected = dict(zip(result.keys.tolist(), result.T_cam_obj, strict=True))
         return vertex, result.T_cam_obj[-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of an object in one object frame: a model, and what it has been through since that was begun."""
+
+    model: ObjectModel
+    life: Lifecycle = field(default_factory=Lifecycle)
+    map_id: int = 0
+
+    @property
+    def map(self) -> KeypointMap:
+        """The keypoint map."""
+        return self.model.map
+
+    def keypoints(self, obs: Observation) -> np.ndarray:
+        """(N,) bool: the promoted points that are seen."""
+        return obs.seen & self.map.promoted
+
+    def lost(self) -> Known:
+        """The same after a frame in which the object was not found by it."""
+        return replace(self, life=self.life.without_pose(Status.LOST))
 
 
 def _volume(config: Config) -> TsdfVolume:

@@ -7,7 +7,6 @@ becomes its pose. Whatever the object wants of the shared tracker it returns as
 
 from __future__ import annotations
 
-import copy
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,23 +20,21 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Detector, Hint
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import DOUBTED, OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
-from p2p_lib.method import refinement, registration, selection
+from p2p_lib.method import registration
 from p2p_lib.method.agreement import background_share, scene_ratio, size_ratio
 from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import BACKGROUND, GATES, MAPPED, SIGHTED, TELLING, Evidence, Lifecycle, Verdict, off_size
-from p2p_lib.method.object_model import NO_IDS, NewPoints, ObjectModel, Requests
+from p2p_lib.method.lifecycle import BACKGROUND, GATES, MAPPED, Lifecycle, Verdict, off_size
+from p2p_lib.method.object_model import NO_IDS, Known, NewPoints, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
-from p2p_lib.method.refinement import Keypoints, Refinement, surface_distance
-from p2p_lib.method.registration import Hypothesis
+from p2p_lib.method.pose_finder import Candidate, PoseFinder
+from p2p_lib.method.refinement import surface_distance
 from p2p_lib.method.sampling import choose, usable_region
 from p2p_lib.method.two_maps import Relation, agreeing_together, seen_together
-from p2p_lib.recovery.search import ImageSearch, Sighting
+from p2p_lib.recovery.search import Sighting
 
 #: While an object has a pose, the tracker is asked every so many frames to look for points that are not seen.
 _LOOK_EVERY = 3
-#: With fewer visible keypoints, pending ones help to register (the release's).
-_FEW_KEYPOINTS = 12
 #: An object whose mask grows by more than this factor from frame to frame is still coming into view.
 _GROWTH = 1.1
 #: A map is founded anew where an object has been lost for so many frames and shows more than this of what it knows.
@@ -47,32 +44,6 @@ _SOME = 0.05
 #: A known object that has been lost for so many frames and shows this share of the most that was ever seen of it is
 #: turned to a side that nobody knows: a second map is begun.
 _STAYS_LOST, _IN_PLAIN_VIEW = 12, 0.4
-#: A pose that nothing has told from others since a gap is compared again every so many frames.
-_COMPARE_EVERY = 5
-#: A lost object is looked for in every so many frames, turned as in so many of its keyframes at most. Depth this near
-#: its surface is on it, m.
-_TURN_EVERY, _TURNS, _ON_M = 2, 40, 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A hypothesis, its pose refined on the surface, and what of the surface shows there, once they are known."""
-
-    hypothesis: Hypothesis
-    refined: Refinement | None = None
-    sighting: float | None = None
-    lead: float | None = None
-
-    @property
-    def T_cam_obj(self) -> np.ndarray:
-        """(4, 4) the best pose known of it."""
-        return (self.refined or self.hypothesis).T_cam_obj
-
-    @property
-    def evidence(self) -> Evidence:
-        """What speaks for it."""
-        share = self.refined.inliers if self.refined.refined else None
-        return Evidence(self.hypothesis.support, share, self.sighting, self.lead)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +55,7 @@ class ObjectStep:
 
 
 class ObjectTracker:
-    """State and step of one object: what it has been through (``life``) and what is known of it (``model``).
-
-    A second map is put ``aside`` as a tracker of its own, which is asked whether it knows the object again.
-    """
+    """State and step of one object: what is ``known`` of it, and what was put ``aside`` since it shows another side."""
 
     def __init__(
         self,
@@ -102,18 +70,37 @@ class ObjectTracker:
         self.name, self.config, self.detector = name, config, detector
         self.observer = Observer(camera, config.depth, config.refinement.max_points if config.method.surface else 0)
         self._new_model = partial(ObjectModel, config, self.observer, stopwatch, beside)
-        self.model = self._new_model()
-        self.life, self.map_id = Lifecycle(), 0
+        self.finder = PoseFinder(self.observer, config, rng, stopwatch)
+        self.known = Known(self._new_model())
+        self.aside: Known | None = None  # a second map, which is asked whether it knows the object again
         self._trusted: Observation | None = None  # the newest without a doubt; None once it was hidden since
-        self.aside: ObjectTracker | None = None
         self._relation = Relation()  # of the map aside to this one
         self._gates = tuple(GATES) if config.method.gates == "all" else ()
-        self._rng, self._stopwatch = rng, stopwatch
+        self._stopwatch = stopwatch
+
+    @property
+    def model(self) -> ObjectModel:
+        """The map in which the object is followed."""
+        return self.known.model
 
     @property
     def map(self) -> KeypointMap:
-        """The keypoint map."""
-        return self.model.map
+        """Its keypoints."""
+        return self.known.map
+
+    @property
+    def map_id(self) -> int:
+        """Its number."""
+        return self.known.map_id
+
+    @property
+    def life(self) -> Lifecycle:
+        """What the object has been through in it."""
+        return self.known.life
+
+    @life.setter
+    def life(self, life: Lifecycle) -> None:
+        self.known = replace(self.known, life=life)
 
     @property
     def ids(self) -> np.ndarray:
@@ -153,8 +140,10 @@ class ObjectTracker:
         if self._hidden(obs.mask):
             return self._without_pose(obs, Status.OCCLUDED, f"{np.count_nonzero(obs.mask)} mask pixels")
         self.life = self.life.at(obs.frame.time_s)
-        best, verdict = self._pose(obs, self._register(obs))
-        known = None if self.aside is None or obs.aside is None else self.aside.known_again(obs.aside)
+        found = self.finder.register(obs, self.known)
+        best, reason = self.finder.refine_and_select(obs, self.known, found)
+        verdict = self._judge(obs, best, reason)
+        known = None if self.aside is None or obs.aside is None else self._known_again(obs.aside, self.aside)
         if known is not None and not verdict.accepted:
             obs, (best, verdict) = self._exchanged(obs), known
         elif known is not None and not verdict.doubted:
@@ -168,135 +157,30 @@ class ObjectTracker:
             self._trusted = obs
         return self._extend(obs, best, verdict)
 
-    def _pose(self, obs: Observation, hypotheses: list[Hypothesis]) -> tuple[Candidate | None, Verdict]:
-        """The best of some hypotheses, judged. The paper selects one and refines that one; ours refines all first."""
-        candidates = [Candidate(hypothesis) for hypothesis in hypotheses]
-        if self.config.selection.rule == "support":
-            candidates = self._look_again(obs, self._refine(obs, candidates))
-        best, reason = self._select(obs, candidates)
+    # -- judge ---------------------------------------------------------------------------------
+
+    def _judge(self, obs: Observation, best: Candidate | None, reason: str) -> Verdict:
+        """Whether the pose stands, by what speaks for it and by whether camera and masks agree with themselves."""
         if best is None:
             nothing = obs.mask is None and not obs.seen.any()
-            return None, Verdict(False, Status.OCCLUDED if nothing else Status.LOST, reason)
-        if best.refined is None:
-            (best,) = self._refine(obs, [best])
-        best = self._compared(obs, best)
-        return best, self.life.judge(self._evidence(obs, best), self._gates, self.config.lifecycle)
+            return Verdict(False, Status.OCCLUDED if nothing else Status.LOST, reason)
+        evidence = replace(best.evidence, size=self._size(obs, best), background=self._background(obs))
+        return self.life.judge(evidence, self._gates, self.config.lifecycle)
 
-    # -- register ------------------------------------------------------------------------------
-
-    def _register(self, obs: Observation) -> list[Hypothesis]:
-        """Candidate poses from the keypoints seen; with motion, from the last poses too."""
-        cfg, with_motion = self.config.registration, self.config.method.motion
-        with self._stopwatch("registration"):
-            certain = obs.seen & (obs.tracks.uncertainty <= cfg.max_uncertainty)
-            use = certain & self.map.promoted
-            if use.sum() < _FEW_KEYPOINTS:
-                use = certain
-            priors = self.life.motion_priors() if with_motion else {}
-            if obs.sighted is not None:
-                priors = {"sighting": obs.sighted, **priors}
-            found = self._hypotheses(obs, use, priors)
-            most = max((h.support for h in found), default=0)
-            if priors and cfg.method != "svd" and most < cfg.contradicted * use.sum():
-                # Most points are wrong, whichever: pending ones may tell, or those that agree with the surface.
-                found = self._hypotheses(obs, certain, priors) + self._along_surface(obs, certain, priors)
-            return found or self._surface_only(priors)
-
-    def _hypotheses(self, obs: Observation, use: np.ndarray, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
-        """Hypotheses from the points ``use`` (N,) alone."""
-        p_cam = np.where(use[:, None], obs.p_cam, np.nan)
-        cfg, sigma_m = self.config.registration, self.model.noise_m(p_cam)
-        return registration.register(self.map.p_obj, p_cam, cfg, self._rng, sigma_m=sigma_m, priors=priors)
-
-    def _along_surface(self, obs: Observation, use: np.ndarray, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
-        """The hypothesis that grows from where the surface alone leads."""
-        start = self._refined(obs, list(priors.values())[-1])
-        if not start.refined:
-            return []
-        p_cam = np.where(use[:, None], obs.p_cam, np.nan)
-        cfg, sigma_m = self.config.registration, self.model.noise_m(p_cam)
-        return registration.refit(start.T_cam_obj, "surface", self.map.p_obj, p_cam, cfg, sigma_m)
-
-    def _surface_only(self, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
-        """Too few points to register: the surface may track from where the object should be."""
-        no_inliers, no_residual = np.zeros(len(self.map), bool), np.full(len(self.map), np.inf)
-        return [Hypothesis(T_cam_obj, no_inliers, no_residual, name) for name, T_cam_obj in priors.items()]
-
-    # -- refine and select ---------------------------------------------------------------------
-
-    def _refine(self, obs: Observation, candidates: list[Candidate]) -> list[Candidate]:
-        with self._stopwatch("refinement"):
-            return [replace(c, refined=self._refined(obs, c.T_cam_obj, c.hypothesis.inliers)) for c in candidates]
-
-    def _refined(self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None) -> Refinement:
-        """The pose refined on the surface, with the keypoints that agree (N,) where the configuration says so."""
-        cfg = self.config.refinement
-        if cfg.residuals == "none" or not self.model.has_surface or not len(obs.cloud):
-            return Refinement(T_cam_obj, reason="no surface")
-        keypoints = None
-        if agrees is not None:
-            p_cam = obs.p_cam[agrees]
-            keypoints = Keypoints(self.map.p_obj[agrees], p_cam, self.observer.noise_m(p_cam))
-        return refinement.refine(T_cam_obj, obs.cloud, self.model.surface, cfg, keypoints=keypoints)
-
-    def _select(self, obs: Observation, candidates: list[Candidate]) -> tuple[Candidate | None, str]:
-        """The candidate to go on with, and why."""
-        with self._stopwatch("selection"):
-            few = max((c.hypothesis.support for c in candidates), default=0) < self.config.lifecycle.return_inliers
-            if few and any(c.sighting is not None for c in candidates):
-                return max(candidates, key=lambda c: c.sighting or 0.0), "most of the surface shows"
-            poses, distance_m, weight = [c.T_cam_obj for c in candidates], None, None
-            if len(poses) > 1 and self.model.has_surface and len(obs.cloud):
-                distance_m = refinement.surface_distances(self.model.surface, obs.cloud, np.stack(poses))
-            if self.config.method.motion:
-                weight = selection.motion_weight(poses, list(self.life.motion_priors().values()))
-            hypotheses = [c.hypothesis for c in candidates]
-            row, reason = selection.select(hypotheses, distance_m, self.config.selection, weight)
-            return (None if row is None else candidates[row]), reason
-
-    def _look_again(self, obs: Observation, candidates: list[Candidate]) -> list[Candidate]:
-        """Candidates for a return, with how much of the surface shows in the image under each."""
-        if not (self.life.unconfirmed and self._searches):
-            return candidates
-        search = self._search(obs.frame)
-        found = [search.at(c.T_cam_obj, self.model.sample) for c in candidates]
-        return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
-
-    def _compared(self, obs: Observation, best: Candidate) -> Candidate:
-        """The pose of a return with its lead over the best that is turned otherwise, or that one, where it shows more.
-
-        Asked again now and then until a lead tells. Where no other turn is known, points have to agree with this one.
-        """
-        due = self.life.unconfirmed or (self.life.doubted and not obs.frame.index % _COMPARE_EVERY)
-        if not (due and self._searches and self._gates):
-            return best
-        with self._stopwatch("search"):
-            search, views = self._search(obs.frame), self.model.views.some(_TURNS)
-            own = search.at(best.T_cam_obj, self.model.sample)
-            other = search.otherwise(best.T_cam_obj, views, obs.cloud, self.model.sample)
-        if own is None or other is None:
-            return replace(best, lead=0.0 if own is None else self._agreement(obs, best))
-        lead = (own.share - other.share) / max(own.share, other.share, 1e-6)
-        if lead > -TELLING or other.share < SIGHTED or self.observer.cut_off(obs):
-            return replace(best, lead=lead)
-        (turned,) = self._refine(obs, [Candidate(*self._surface_only({"other turn": other.T_cam_obj}))])
-        return replace(turned, sighting=other.share, lead=0.0)
-
-    def _evidence(self, obs: Observation, best: Candidate) -> Evidence:
-        """What speaks for a pose, and whether camera and masks agree with themselves."""
-        return replace(best.evidence, size=self._size(obs, best), background=self._background(obs))
+    def _before(self, obs: Observation) -> Observation | None:
+        """The newest frame in which nothing was doubted, where its mask and this one's can be compared."""
+        before = self._trusted
+        return None if obs.mask is None or before is None or before.mask is None else before
 
     def _size(self, obs: Observation, best: Candidate) -> tuple[float, float] | None:
         """How large it is measured, where the scene beside it is measured otherwise than before, too; else None.
 
         Points that slide over an object change its size alone.
         """
-        before = self._trusted
-        if obs.mask is None or before is None or before.mask is None:
+        before = self._before(obs)
+        if before is None or not off_size(scene_ratio(obs.frame, obs.mask, before.frame, before.mask)):
             return None
-        if not off_size(scene_ratio(obs.frame, obs.mask, before.frame, before.mask)):
-            return None
-        keypoints = obs.seen & self.map.promoted
+        keypoints = self.known.keypoints(obs)
         agreeing = keypoints & best.hypothesis.inliers
         sized = agreeing if 2 * agreeing.sum() > keypoints.sum() else keypoints
         p_cam = obs.p_cam[sized]
@@ -304,26 +188,13 @@ class ObjectTracker:
 
     def _background(self, obs: Observation) -> float:
         """What the mask has taken in of the background, as a share of itself when nothing was doubted last."""
-        before = self._trusted
-        if obs.mask is None or before is None or before.mask is None:
+        before = self._before(obs)
+        if before is None:
             return 0.0
         share = background_share(obs.frame, obs.mask, before.frame, before.mask)
         # At the image's border a mask grows with what comes into view.
         cut_off = share > _SOME and (self.observer.cut_off(obs) or self.observer.cut_off(before))
         return 0.0 if cut_off else share
-
-    def _agreement(self, obs: Observation, best: Candidate) -> float:
-        """The keypoints seen that agree, less those that do not, as a share of all."""
-        keypoints = obs.seen & self.map.promoted
-        return float(np.where(best.hypothesis.inliers[keypoints], 1, -1).mean()) if keypoints.any() else 0.0
-
-    @property
-    def _searches(self) -> bool:
-        """Whether shape and colour have a say in a return."""
-        return self.config.method.scene and self.model.has_surface
-
-    def _search(self, frame: Frame) -> ImageSearch:
-        return ImageSearch(frame, self.observer.camera, self.config.depth)
 
     # -- extend --------------------------------------------------------------------------------
 
@@ -333,8 +204,7 @@ class ObjectTracker:
             return self._doubted(obs, best, verdict)
         T_cam_obj, agrees, model = best.T_cam_obj, best.hypothesis.inliers, self.model
         life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict.status, best.lead)
-        used = obs.seen & self.map.promoted
-        requests = Requests(reject=self.map.ids[used & ~agrees])
+        requests = Requests(reject=self.map.ids[self.known.keypoints(obs) & ~agrees])
         agreeing = self._agreeing(obs, best)  # before a keyframe changes the map's rows
         of_frame, most = self._covariance(obs, best), DOUBTED if life.doubted else 1.0
         sure = min(confidence(self._of_pose(T_cam_obj, of_frame, best), *agreeing), most)
@@ -356,7 +226,7 @@ class ObjectTracker:
 
     def _agreeing(self, obs: Observation, best: Candidate) -> tuple[float, float]:
         """The keypoints that agree, by the confidence of the pose that placed each, and their share of those seen."""
-        keypoints, agrees = obs.seen & self.map.promoted, best.hypothesis.inliers
+        keypoints, agrees = self.known.keypoints(obs), best.hypothesis.inliers
         return self.map.confidence[agrees].sum(), (agrees & keypoints).sum() / max(keypoints.sum(), 1)
 
     def _doubted(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
@@ -423,8 +293,8 @@ class ObjectTracker:
             if self._outgrown(obs):
                 forgotten = self.map.ids[self.map.ids >= 0]
             else:
-                self.aside = self._put_aside()
-            self.model, self.map_id, self._relation = self._new_model(), self.map_id + 1, Relation()
+                self.aside = self.known.lost()
+            self.known, self._relation = Known(self._new_model(), self.life, self.map_id + 1), Relation()
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:
             verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")
@@ -455,27 +325,20 @@ class ObjectTracker:
 
     # -- two maps ------------------------------------------------------------------------------
 
-    def _put_aside(self) -> ObjectTracker:
-        """This map as a tracker of its own, to which the object is lost."""
-        other = copy.copy(self)
-        other.aside, other.life, other._trusted = None, self.life.without_pose(Status.LOST), None
-        return other
-
-    def known_again(self, obs: Observation) -> tuple[Candidate, Verdict] | None:
-        """The pose in a map that was put aside, where points and surface say that it is this object; else None."""
+    def _known_again(self, obs: Observation, aside: Known) -> tuple[Candidate, Verdict] | None:
+        """The pose by what was put aside, where points and surface say that it is this object; else None."""
         cfg = self.config.lifecycle
-        found = [h for h in self._register(obs) if h.support >= cfg.return_inliers]
-        best, verdict = self._pose(obs, found) if found else (None, None)
-        if best is None or not verdict.accepted or verdict.doubted or self._agreement(obs, best) < 0:
+        found = [h for h in self.finder.register(obs, aside) if h.support >= cfg.return_inliers]
+        best = self.finder.refine_and_select(obs, aside, found)[0] if found else None
+        if best is None or best.agreement(aside.keypoints(obs)) < 0:
             return None
-        share = best.evidence.surface_share
-        return None if share is not None and share < cfg.surface_only_share else (best, verdict)
+        verdict, share = aside.life.judge(best.evidence, self._gates, cfg), best.evidence.surface_share
+        fits = verdict.accepted and (share is None or share >= cfg.surface_only_share)
+        return (best, verdict) if fits else None
 
     def _exchanged(self, obs: Observation) -> Observation:
         """Go on in the map that was put aside, with its observation; this one is put aside instead."""
-        other, aside = self._put_aside(), self.aside
-        self.model, self.life, self.map_id, self.aside = aside.model, aside.life, aside.map_id, other
-        self._relation = Relation()
+        self.known, self.aside, self._relation = self.aside, self.known.lost(), Relation()
         return replace(obs.aside, aside=replace(obs, aside=None))
 
     def _joined(self, obs: Observation, best: Candidate, known: Candidate) -> ObjectStep:
@@ -566,35 +429,17 @@ class ObjectTracker:
         """
         if not self.config.method.redetection or self.model.empty or obs.mask is None or self._hidden(obs.mask):
             return None
-        enough = (obs.seen & self.map.promoted).sum() >= self.config.keypoint_map.keyframe_min_points
+        enough = self.known.keypoints(obs).sum() >= self.config.keypoint_map.keyframe_min_points
         if self.life.has_pose and (enough or obs.frame.index % _LOOK_EVERY):
             return None
-        best = max(self._register(obs), key=lambda h: h.support, default=None)
-        if best is None:
-            return None
-        return self.points_px(obs, best.T_cam_obj)
+        best = max(self.finder.register(obs, self.known), key=lambda h: h.support, default=None)
+        return None if best is None else self.points_px(obs, best.T_cam_obj)
 
     def sighted(self, obs: Observation) -> Sighting | None:
-        """Where a sought object shows by shape and colour, near where the scene says or it was found a frame ago."""
-        if not (self.sought and self._searches) or (obs.mask is not None and self._hidden(obs.mask)):
+        """Where a sought object shows by shape and colour."""
+        if not (self.sought and self.finder.shape.knows(self.known)) or self._hidden(obs.mask):
             return None
-        proposed = [*self.life.scene_prior(obs.frame.T_world_cam).values()]
-        proposed += [self.life.T_cam_obj] if self.life.has_pose else []
-        with self._stopwatch("search"):
-            search = self._search(obs.frame)
-            found = [search.about(T_cam_obj, self.model.sample) for T_cam_obj in proposed]
-            if obs.mask is not None and self.life.lost_frames % _TURN_EVERY == 1 and not self.observer.cut_off(obs):
-                found.append(self._turned(obs, search))
-            best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
-            return best if best is not None and best.share >= SIGHTED else None
-
-    def _turned(self, obs: Observation, search: ImageSearch) -> Sighting | None:
-        """Where a lost object shows in its mask, turned as in one of its keyframes. Of a part of it any turn may be."""
-        found = search.turned(self.model.views.some(_TURNS), obs.cloud, self.model.sample)
-        if found is None:
-            return None
-        distance_m = refinement.surface_distances(self.model.surface, obs.cloud, found.T_cam_obj[None])[0]
-        return found if (distance_m < _ON_M).mean() >= self.config.lifecycle.surface_only_share else None
+        return self.finder.shape.sighted(obs, self.known)
 
     def points_px(self, obs: Observation, T_cam_obj: np.ndarray) -> np.ndarray:
         """(N, 2) where keypoints show under a pose; NaN where not."""
@@ -609,7 +454,8 @@ class ObjectTracker:
         if self.model.empty:
             return Hint(), Requests()
         obs = self.observe(frame, None, tracks, sighting)
-        best, requests = max(self._register(obs), key=lambda h: h.support, default=None), Requests()
+        found, requests = self.finder.register(obs, self.known), Requests()
+        best = max(found, key=lambda h: h.support, default=None)
         if self.sought:
             agrees = np.zeros(len(self.map), bool) if best is None else best.inliers
             certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)

@@ -14,7 +14,8 @@ from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.method import refinement
-from p2p_lib.method.object_tracker import Candidate, ObjectStep, ObjectTracker
+from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
+from p2p_lib.method.pose_finder import Candidate
 from p2p_lib.recovery.search import ImageSearch
 from tests.method.analytic_scene import CAMERA, LUMP, look_from, render
 
@@ -69,6 +70,10 @@ class Lump:
         frame = Frame(len(self.steps), len(self.steps) / 30, np.zeros((*depth.shape, 3), np.uint8), depth)
         tracks = self.tracks(T_cam_model)
         return self.tracker.observe(frame, seen if mask is None else mask, tracks if spoil is None else spoil(tracks))
+
+    def registered(self, obs) -> list:
+        """Its candidate poses."""
+        return self.tracker.finder.register(obs, self.tracker.known)
 
     def see(self, T_cam_model: np.ndarray, spoil=None, mask: np.ndarray | None = None) -> ObjectStep:
         """One frame at a true pose; ``spoil`` changes the tracks."""
@@ -231,7 +236,7 @@ def test_where_keypoints_contradict_each_other_pending_points_and_the_surface_pr
     obs = full.observed(turned(4), moved_to(turned(-20), full, visible_first(14)))
     use = obs.seen & full.tracker.map.promoted
     assert 14 < 0.7 * use.sum(), "the largest consensus is a minority"
-    assert "surface" in {h.origin for h in full.tracker._register(obs)}
+    assert "surface" in {h.origin for h in full.registered(obs)}
 
 
 def test_what_moved_evenly_is_expected_to_go_on():
@@ -250,9 +255,9 @@ def test_last_poses_compete_with_what_samples_find():
     lump = settled(begun(**NO_SURFACE), [1, 2])
     obs = lump.observed(turned(3))
     empty = replace(lump.tracker.config.registration, iterations=1, sample_size=20)
-    lump.tracker.config = replace(lump.tracker.config, registration=empty)
+    lump.tracker.finder.config = replace(lump.tracker.config, registration=empty)
     spoilt = moved_to(turned(40), lump, visible_first(int(obs.seen.sum()) // 2))
-    found = {h.origin: h.support for h in lump.tracker._register(lump.observed(turned(3), spoilt))}
+    found = {h.origin: h.support for h in lump.registered(lump.observed(turned(3), spoilt))}
     assert max(found.get("last pose", 0), found.get("constant velocity", 0)) > 5
 
 
@@ -317,7 +322,7 @@ def test_what_shrinks_an_object_alone_is_no_fault_of_the_camera():
     depth_m = np.where(obs.mask, obs.frame.depth_m, 1.2).astype(np.float32)
     obs = lump.tracker._trusted = replace(obs, frame=replace(obs.frame, depth_m=depth_m))
     middle = np.nanmean(obs.p_cam, 0)
-    shrunk, best = replace(obs, p_cam=middle + 0.85 * (obs.p_cam - middle)), Candidate(lump.tracker._register(obs)[0])
+    shrunk, best = replace(obs, p_cam=middle + 0.85 * (obs.p_cam - middle)), Candidate(lump.registered(obs)[0])
     assert lump.tracker._size(shrunk, best) is None
     everywhere = replace(shrunk, frame=replace(obs.frame, depth_m=0.85 * depth_m))
     assert lump.tracker._size(everywhere, best)[0] == pytest.approx(0.85, abs=0.01)
@@ -527,7 +532,7 @@ def test_points_that_a_doubtful_pose_placed_count_less():
 def test_the_covariance_of_refinement_goes_before_that_of_the_keypoints():
     lump = settled(begun(), [2])
     obs, known = lump.observed(turned(3)), np.diag([1.0, 2, 3, 4, 5, 6])
-    best = max(lump.tracker._register(obs), key=lambda h: h.support)
+    best = max(lump.registered(obs), key=lambda h: h.support)
     refined = refinement.Refinement(best.T_cam_obj, covariance=known)
     np.testing.assert_array_equal(lump.tracker._covariance(obs, Candidate(best, refined)), known)
     by_keypoints = lump.tracker._covariance(obs, Candidate(best, refinement.Refinement(best.T_cam_obj)))
