@@ -120,19 +120,23 @@ class ObjectRun:
         """The same without the poses of less confidence."""
         return replace(self, T_cam_obj=np.where((self.confidence >= least)[:, None, None], self.T_cam_obj, np.nan))
 
-    def of_one_map(self) -> ObjectRun:
-        """The same in the frame of the map with the most poses: without those of maps that are no part of it."""
+    def in_joined_maps(self) -> ObjectRun:
+        """The same with what was said in maps that became part of another since in the frame of that one."""
         map_id, T_cam_obj, covariance = self.map_id.copy(), self.T_cam_obj.copy(), self.covariance.copy()
         for k in np.flatnonzero(self.joined_map >= 0):
             rows, T, A = map_id == self.joined_map[k], self.T_obj_joined[k], se3.adjoint(self.T_obj_joined[k])
             map_id[rows], T_cam_obj[rows] = self.map_id[k], T_cam_obj[rows] @ se3.inverse(T)
             covariance[rows] = A @ covariance[rows] @ A.T
-        poses = np.bincount(map_id[self.has_pose], minlength=1)
-        kept = map_id == poses.argmax()
+        return replace(self, map_id=map_id, T_cam_obj=T_cam_obj, covariance=covariance)
+
+    def of_one_map(self) -> ObjectRun:
+        """The same in the frame of the map with the most poses: without those of maps that are no part of it."""
+        joined = self.in_joined_maps()
+        kept = joined.map_id == np.bincount(joined.map_id[self.has_pose], minlength=1).argmax()
         return replace(
-            self,
-            T_cam_obj=np.where(kept[:, None, None], T_cam_obj, np.nan),
-            covariance=np.where(kept[:, None, None], covariance, np.nan),
+            joined,
+            T_cam_obj=np.where(kept[:, None, None], joined.T_cam_obj, np.nan),
+            covariance=np.where(kept[:, None, None], joined.covariance, np.nan),
             confidence=np.where(kept, self.confidence, 0),
         )
 

@@ -16,7 +16,7 @@ from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.masks import masks_of_run
 from p2p_lib.datasets.models import read_mesh
-from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
 from p2p_lib.figures import style
@@ -32,6 +32,7 @@ CLOUD_MAX_M = 2.5
 class Playback:
     """One run over its frames; rows i are those of the run, whatever frame of the sequence they are.
 
+    run       as :func:`load_run` gives it, in one map of each object; ``objects`` have the poses of all maps
     sequence  None where its folder is gone: then there are no images, points and masks
     """
 
@@ -50,6 +51,17 @@ class Playback:
 
     def __len__(self) -> int:
         return len(self.frame_index)
+
+    @cached_property
+    def objects(self) -> dict[str, ObjectRun]:
+        """What is drawn: poses as they were said, in maps that were given up since as well."""
+        said = load_run(self.run.path, every_map=True).objects
+        return {name: obj.in_joined_maps() for name, obj in said.items()}
+
+    def of_kept_map(self, name: str) -> np.ndarray:
+        """(n,) bool: rows whose pose is in the frame of the surface and the keypoints in the folder: the last map's."""
+        map_id = self.objects[name].map_id
+        return map_id == map_id[-1]
 
     @cached_property
     def frame_index(self) -> np.ndarray:
@@ -88,15 +100,15 @@ class Playback:
 
     def path(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(k, 3) positions of the object at rows with a pose, and (k, 3) uint8 colours of its status then."""
-        obj = self.run.objects[name]
+        obj = self.objects[name]
         has = obj.has_pose
         fills = [style.rgb(style.STATUS[Status(status)][0]) for status in obj.status[has]]
         return obj.T_cam_obj[has, :3, 3], np.array(fills, np.uint8).reshape(-1, 3)
 
     def keyframes(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (K,) that added a keyframe, and its T_obj_cam (K, 4, 4) as estimated then."""
-        obj = self.run.objects[name]
-        rows = np.flatnonzero(obj.keyframe & obj.has_pose)
+        """Rows (K,) that added a keyframe to the map that is kept, and its T_obj_cam (K, 4, 4) as estimated then."""
+        obj = self.objects[name]
+        rows = np.flatnonzero(obj.keyframe & obj.has_pose & self.of_kept_map(name))
         return rows, se3.inverse(obj.T_cam_obj[rows])
 
     def frame(self, i: int) -> Frame | None:

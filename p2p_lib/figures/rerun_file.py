@@ -113,8 +113,9 @@ def _log_images(rr: Any, stream: Any, playback: Playback, i: int) -> None:
 
 def _log_object(rr: Any, stream: Any, playback: Playback, name: str, i: int) -> None:
     """One object at row i: where it is, what is known of it, how good that is."""
-    obj, colour = playback.run.objects[name], style.rgb(playback.colours[name])
-    has = obj.has_pose
+    obj, colour = playback.objects[name], style.rgb(playback.colours[name])
+    has, whole = obj.has_pose, playback.of_kept_map(name)
+    changed = not i or (has[i], whole[i]) != (has[i - 1], whole[i - 1])
     if i == 0 or obj.status[i] != obj.status[i - 1]:
         stream.log(["status", name], rr.StateChange(state=str(obj.status[i])))
     stream.log(["confidence", name], rr.Scalars(float(obj.confidence[i])))
@@ -125,25 +126,27 @@ def _log_object(rr: Any, stream: Any, playback: Playback, name: str, i: int) -> 
     if points is not None:
         seen = points.at(int(playback.frame_index[i]))
         stream.log([*_IMAGE, "tracks", name], rr.Points2D(points.uv_px[seen], colors=colour, radii=2.5))
+    if i and changed:
+        stream.log([*_SCENE, name], rr.Clear(recursive=True))
     if not has[i]:
-        if i and has[i - 1]:
-            stream.log([*_SCENE, name], rr.Clear(recursive=True))
         return
     T_cam_obj = obj.T_cam_obj[i]
     pose = rr.Transform3D(translation=T_cam_obj[:3, 3], quaternion=se3.quaternion_xyzw(T_cam_obj))
     stream.log([*_SCENE, name], pose)
-    if i == 0 or not has[i - 1]:
-        _log_shape(rr, stream, playback, name)
-    if obj.keyframe[i]:
+    if changed:
+        _log_shape(rr, stream, playback, name, whole[i])
+    if obj.keyframe[i] and whole[i]:
         rows, T_obj_cam = playback.keyframes(name)
         at = T_obj_cam[rows <= i, :3, 3]
         stream.log([*_SCENE, name, "keyframes"], rr.Points3D(at, colors=colour, radii=2 * _KEYPOINT_M))
 
 
-def _log_shape(rr: Any, stream: Any, playback: Playback, name: str) -> None:
-    """What an object looks like in its own frame, whenever it appears: axes, surface, keypoints."""
+def _log_shape(rr: Any, stream: Any, playback: Playback, name: str, whole: bool) -> None:
+    """What an object looks like in its own frame, whenever it appears: axes, and of the map that is kept the rest."""
     at, axes = [*_SCENE, name], np.eye(3) * _AXES_M
     stream.log([*at, "axes"], rr.Arrows3D(vectors=axes, colors=[style.rgb(colour) for colour in style.AXES]))
+    if not whole:
+        return
     if name in playback.meshes:
         mesh = playback.meshes[name]
         surface = rr.Mesh3D(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -64,7 +65,8 @@ class Scene:
     def of(cls, playback: Playback) -> Scene:
         """With all that the run's folder holds: keypoints, masks, and a box around each reconstructed surface."""
         boxes = {name: overlay.tight_box(mesh) for name, mesh in playback.meshes.items()}
-        scene = cls(playback.sequence, playback.run, boxes=boxes, truth=False)
+        run = replace(playback.run, objects=playback.objects)
+        scene = cls(playback.sequence, run, boxes=boxes, truth=False)
         scene._playback = playback
         return scene
 
@@ -139,7 +141,7 @@ class Scene:
         """The rectangle of the objects over the whole run, with a margin (a fraction of the image's width)."""
         camera, uv = self.sequence.camera, [np.zeros((0, 2))]
         for name, obj in self.run.objects.items():
-            estimated = self._boxes.get(name), obj.T_cam_obj[obj.has_pose]
+            estimated = self._boxes.get(name), obj.T_cam_obj[obj.has_pose & self._boxed(name)]
             true = self._model_boxes.get(name), obj.T_cam_model[obj.has_truth]
             uv += [camera.project(box.corners(T)).reshape(-1, 2) for box, T in (estimated, true) if box]
         uv = np.concatenate(uv)
@@ -148,6 +150,12 @@ class Scene:
             return 0, 0, camera.width, camera.height
         margin_px = round(margin * camera.width)
         return overlay.region_around(uv, camera, (margin_px, margin_px))
+
+    def _boxed(self, name: str) -> np.ndarray:
+        """(n,) bool: rows whose pose is in the frame of the object's box, where it has one."""
+        if self._playback is None or name not in self._boxes:
+            return np.full(len(self), name in self._boxes)
+        return self._playback.of_kept_map(name)
 
     def _with_what_was_seen(self, frame: Frame, row: int) -> np.ndarray:
         """The image with the masks and keypoints of the row, where the run's folder has them."""
@@ -161,14 +169,17 @@ class Scene:
     def _draw_object(
         self, image: np.ndarray, camera: Camera, name: str, obj: ObjectRun, row: int, axes: bool, trail: int
     ) -> np.ndarray:
-        colour, box, true_box = self.colours[name], self._boxes.get(name), self._model_boxes.get(name)
+        colour, true_box = self.colours[name], self._model_boxes.get(name)
+        box = self._boxes[name] if self._boxed(name)[row] else None
         if true_box and obj.has_truth[row]:
             T_cam_box = obj.T_cam_model[row] @ true_box.T_obj_box
             image = overlay.draw_box(image, camera, T_cam_box, true_box.size_m, style.TRUTH, 1, dashed=True)
         if not obj.has_pose[row]:
             return image
-        T_cam_box = obj.T_cam_obj[max(row - trail, 0) : row + 1] @ (box.T_obj_box if box else se3.IDENTITY)
-        image = overlay.draw_trail(image, camera.project(T_cam_box[:, :3, 3]), colour)
+        past = slice(max(row - trail, 0), row + 1)
+        T_cam_box = obj.T_cam_obj[past] @ (box.T_obj_box if box else se3.IDENTITY)
+        centres = np.where((obj.map_id[past] == obj.map_id[row])[:, None], T_cam_box[:, :3, 3], np.nan)
+        image = overlay.draw_trail(image, camera.project(centres), colour)
         if box:
             image = overlay.draw_box(image, camera, T_cam_box[-1], box.size_m, colour)
         length_m = 0.45 * float(np.max(box.size_m)) if box else 0.05
@@ -176,10 +187,11 @@ class Scene:
 
     def _label(self, camera: Camera, name: str, obj: ObjectRun, row: int) -> Label | None:
         """The object's name and status, at its estimated box, else its true one, else where it was last seen."""
-        box, before = self._boxes.get(name), np.flatnonzero(obj.has_pose[: row + 1])
+        before = np.flatnonzero(obj.has_pose[: row + 1])
         if not obj.has_pose[row] and name in self._model_boxes and obj.has_truth[row]:
             box, T_cam_obj = self._model_boxes[name], obj.T_cam_model[row]
         elif len(before):
+            box = self._boxes[name] if self._boxed(name)[before[-1]] else None
             T_cam_obj = obj.T_cam_obj[before[-1]]
         else:
             return None

@@ -2,7 +2,8 @@
 
 In camera coordinates: what the camera saw as points, its image, and each object where it was estimated to be: axes,
 reconstructed surface, keypoints (those seen at the moment are bright), the keyframes as the small cameras they were
-taken from. An object without a pose is not drawn; its path stays, coloured by status. The page is made with viser.
+taken from; in a map that is not kept, axes alone. An object without a pose is not drawn; its path stays, coloured by
+status. The page is made with viser.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class _Scene:
     def __init__(self, server: Any, playback: Playback, points: int):
         self._playback, self._points, self._scene = playback, points, server.scene
         server.scene.set_up_direction("-y")
-        objects = playback.run.objects.values()
+        objects = playback.objects.values()
         places = np.concatenate([obj.T_cam_obj[obj.has_pose, :3, 3] for obj in objects])
         middle = np.median(places, 0) if len(places) else np.array([0.0, 0.0, 0.7])
         server.initial_camera.position = tuple(middle + middle[2] * np.array([0.35, -0.5, -1.0]))
@@ -104,20 +105,26 @@ class _Scene:
         scene, playback, colour = self._scene, self._playback, style.rgb(self._playback.colours[name])
         at = f"/objects/{name}"
         nodes = {"frame": scene.add_frame(at, axes_length=_AXES_M, axes_radius=_AXES_M / 25, visible=False)}
+        nodes["map"] = scene.add_frame(f"{at}/map", show_axes=False)
         nodes["label"] = scene.add_label(f"/labels/{name}", name, visible=False, anchor="bottom-center")
         if name in playback.meshes:
-            scene.add_mesh_trimesh(f"{at}/surface", _thinned(playback.meshes[name]))
+            scene.add_mesh_trimesh(f"{at}/map/surface", _thinned(playback.meshes[name]))
         if name in playback.keypoints and len(playback.keypoints[name].ids):
             p_obj = playback.keypoints[name].p_obj
             faint = np.tile(np.array(style.rgb(style.NEUTRAL[1]), np.uint8), (len(p_obj), 1))
             nodes["keypoints"] = scene.add_point_cloud(
-                f"{at}/keypoints", p_obj, faint, point_size=1.4 * _POINT_M, point_shape="circle", precision="float32"
+                f"{at}/map/keypoints",
+                p_obj,
+                faint,
+                point_size=1.4 * _POINT_M,
+                point_shape="circle",
+                precision="float32",
             )
         rows, T_obj_cam = playback.keyframes(name)
         wxyz, aspect = se3.quaternion_xyzw(T_obj_cam)[:, [3, 0, 1, 2]], 4 / 3
         nodes["keyframes"] = [
             scene.add_camera_frustum(
-                f"{at}/keyframes/{playback.frame_index[row]}",
+                f"{at}/map/keyframes/{playback.frame_index[row]}",
                 fov=0.8,
                 aspect=aspect,
                 scale=_KEYFRAME_M,
@@ -147,10 +154,11 @@ class _Scene:
             self._camera.image = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
 
     def _show_object(self, name: str, nodes: dict[str, Any], i: int, before: int | None) -> None:
-        obj = self._playback.run.objects[name]
+        obj = self._playback.objects[name]
         has = bool(obj.has_pose[i])
-        if before is None or has != obj.has_pose[before]:
-            nodes["frame"].visible = has
+        for node, shown in (("frame", obj.has_pose), ("map", self._playback.of_kept_map(name))):
+            if before is None or shown[i] != shown[before]:
+                nodes[node].visible = bool(shown[i])
         nodes["label"].text = f"{name}: {status_word(obj.status[i], obj.reason[i])}"
         if has:
             T = obj.T_cam_obj[i]

@@ -4,14 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from p2p_lib.core import se3
+from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import PoseEstimate, Status
+from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box
+from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import gaps
 from p2p_lib.figures.scenes import Scene, draw_live
+from p2p_lib.figures.viewer import scene_page
 from p2p_lib.method.pipeline import Point2Pose
+from tests.figures.test_viewer import told, unpacked
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +131,41 @@ def test_a_run_on_other_data_is_refused(made):
         Scene(made.sequence, replace(made.run, objects={**made.run.objects, "can": moved}))
     with pytest.raises(BadInput, match="mustard0"):
         Scene(made.sequence, replace(made.run, info={**made.run.info, "sequence": "mustard0"}))
+
+
+def test_every_map_is_drawn_and_the_surface_only_where_it_is_of_that_map(made, tmp_path, monkeypatch):
+    """Two maps of the box: most poses are in the first, the surface is of the second."""
+    T_map_model = se3.exp(np.array([[0.3, -0.2, 0.5, 0.02, -0.01, 0.03], [1.5, 0.4, 0.0, 0.0, 0.0, 0.1]]))
+    truth, points = made.sequence.truth["box"].T_cam_model, made.run.points["box"]
+    map_id = np.repeat([0, 1], [24, 16])
+    with RunWriter(tmp_path / "run", made.sequence, preset(), "lk", "dataset", objects=("box",)) as writer:
+        for i, k in enumerate(map_id.tolist()):
+            T, frame = truth[i] @ se3.inverse(T_map_model[k]), made.sequence.frame(i)
+            estimate = PoseEstimate("box", i, frame.time_s, Status.TRACKED, T, 0.9, keyframe=i % 8 == 0, map_id=k)
+            writer.add(frame, {"box": estimate}, 5)
+    box = Box.around(points, T_map_model[1])
+    surface = trimesh.creation.box(box.size_m, box.T_obj_box)
+    surface.visual.vertex_colors = np.tile([200, 40, 40, 255], (len(surface.vertices), 1))
+    (tmp_path / "run/meshes").mkdir()
+    surface.export(tmp_path / "run/meshes/box.ply")
+
+    monkeypatch.setattr(Playback, "masks", lambda *_: {})  # whose outlines are where boxes may be
+    playback = Playback.of(tmp_path / "run", made.sequence)
+    scene = Scene.of(playback)
+    assert in_colour(scene.draw(30, axes=False), scene.colours["box"], box_edges(made, "box", 30)) > 0.8
+    assert in_colour(scene.draw(10, axes=False), scene.colours["box"], box_edges(made, "box", 10)) < 0.3
+    T_cam_obj = truth[10] @ se3.inverse(T_map_model[0])
+    for k, colour in enumerate(style.AXES):
+        along = np.linspace(0.4, 0.9, 8)[:, None] * 0.05 * np.eye(3)[k]
+        uv_px = made.sequence.camera.project(se3.transform(T_cam_obj, along))
+        assert in_colour(scene.draw(10, trail=0, words=False), colour, uv_px) > 0.8
+    assert playback.keyframes("box")[0].tolist() == [24, 32]
+
+    messages = unpacked(scene_page(playback, points=100))
+    shown = told(messages, "SetSceneNodeVisibilityMessage", "/objects/box/map")
+    assert [(round(30 * t), m["visible"]) for t, m in shown][-2:] == [(0, False), (24, True)]
+    moves = [m["position"] for _, m in told(messages, "SetPositionMessage", "/objects/box")][-40:]
+    np.testing.assert_allclose(moves, (truth @ se3.inverse(T_map_model[map_id]))[:, :3, 3], atol=1e-6)
 
 
 def test_live_view_shows_the_keypoints(made):

@@ -93,8 +93,8 @@ def test_an_object_without_a_pose_is_not_drawn(messages, made):
 
 def test_everything_has_its_place(messages):
     names = {m["name"] for _, m in messages["messages"] if "name" in m}
-    assert {"/camera", "/points", "/objects/box/surface", "/objects/box/keypoints", "/paths/can"} <= names
-    assert "/objects/can/surface" not in names and "/objects/can/keypoints" not in names
+    assert {"/camera", "/points", "/objects/box/map/surface", "/objects/box/map/keypoints", "/paths/can"} <= names
+    assert "/objects/can/map/surface" not in names and "/objects/can/map/keypoints" not in names
 
 
 def test_points_and_objects_are_of_the_same_frames(folder, made):
