@@ -8,7 +8,7 @@ export MKL_NUM_THREADS := $(THREADS)
 # ROS and others put packages of another Python there.
 unexport PYTHONPATH PYTHONHOME
 
-.PHONY: help setup reproduce test test-backends docs mutants seeds lab figures lock
+.PHONY: help setup reproduce test test-backends docs mutants seeds bench lab figures lock
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 22
 
@@ -41,6 +41,9 @@ seeds: setup ## run every notebook on seeds 1 to 4 (an hour and more)
 
 mutants: setup ## switch every mechanism off in turn and see its test fail (minutes)
 	@.venv/bin/python tools/mutants.py
+
+bench: setup ## what it costs as it grows, beside its peers, into benchmarks/README.md (ten minutes on two quiet cores)
+	@.venv/bin/python benchmarks/scale.py
 
 lab: setup ## open JupyterLab on the notebooks
 	@P2P_FIGURES="$(CURDIR)/out/lab/figures" .venv/bin/jupyter lab $(if $(filter 0,$(shell id -u)),--allow-root) --log-level=WARN --notebook-dir=. notebooks/00_quickstart.ipynb

@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 
 import numpy as np
+from common import squared_errors
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
@@ -60,15 +61,11 @@ def judged(told: dict[str, list]) -> Judged:
     return Judged(np.array([pose[2] for pose in poses]), right)
 
 
-def squared_errors(told: dict[str, list]) -> np.ndarray:
+def tracked_errors(told: dict[str, list]) -> np.ndarray:
     """(N, 2) normalised squared error of rotation and of translation in the tracked frames."""
-    rows = []
-    for many in told.values():
-        for off, covariance, _, status in many:
-            if status == Status.TRACKED:
-                blocks = ((off[s], covariance[s, s]) for s in (slice(0, 3), slice(3, 6)))
-                rows.append([e @ np.linalg.solve(C, e) for e, C in blocks])
-    return np.array(rows).reshape(-1, 2)
+    tracked = [pose for many in told.values() for pose in many if pose[3] == Status.TRACKED]
+    off, covariance = (np.array([pose[k] for pose in tracked]) for k in (0, 1))
+    return squared_errors(off.reshape(-1, 6), covariance.reshape(-1, 6, 6))
 
 
 def line(label: str, one: Judged) -> None:
@@ -92,13 +89,10 @@ def main(seeds: list[int]) -> None:
     total = []
     for name in AS_THEY_ARE:
         for seed in seeds:
-            off = squared_errors(tracked(open_sequence(scenario_dir(name, seed)), seed))
-            print(
-                f"{name + ' ' + str(seed):44} {len(off):6}  {off[:, 0].mean():6.2f} {off[:, 1].mean():6.2f}", flush=True
-            )
+            off = tracked_errors(tracked(open_sequence(scenario_dir(name, seed)), seed))
+            errors_line(f"{name} {seed}", off)
             total.append(off)
-    off = np.concatenate(total)
-    print(f"{'pooled':44} {len(off):6}  {off[:, 0].mean():6.2f} {off[:, 1].mean():6.2f}")
+    errors_line("pooled", np.concatenate(total))
 
 
 if __name__ == "__main__":

@@ -1,27 +1,31 @@
-"""Cost and worth of the keyframe graph: ``python benchmarks/bench_graph.py [keyframes]``.
+"""Cost and worth of the keyframe graph, beside the full batch Levenberg-Marquardt and GTSAM's incremental smoothers.
 
-An object turns on the spot, ten degrees a keyframe, 45 of its 300 points seen in each; every new
-keyframe is registered to the map as it stands and the graph solved. Compared: the paper's way (the
-whole graph, 20 steps), ours without and with a bound on the keyframes, and GTSAM's incremental
-smoothers. Prints CPU milliseconds per keyframe (covariance included) over the last ten keyframes, their ratio to
-the paper's way, the map's error after alignment, and the newest pose's normalised squared error.
-The bar is 60 ms at 100 keyframes.
+An object turns on the spot, ten degrees a keyframe, 45 of its 300 points seen in each; every new keyframe is
+registered to the map as it stands and the graph solved, covariance included. All ways take each keyframe in turn.
 """
 
 from __future__ import annotations
 
-import sys
-import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
+from common import Section, Times, compared
+from matplotlib.figure import Figure
+from pandas import DataFrame
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig, preset
 from p2p_lib.core.robust import fit_rigid
+from p2p_lib.figures import style
+from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.method.factor_graph import ObjectGraph
 
+PEER = "batch: whole graph, 20 steps"
+#: Numbers of keyframes at which they are compared, each over the last ten.
+SIZES, LAST = (10, 25, 50, 100), 10
+SEEDS = (0, 1)
 SIGMA_RAD, SIGMA_M = 0.0015, 0.003
 
 
@@ -114,52 +118,84 @@ class Smoother:
         return dict(self.points), se3.inverse(X), covariance
 
 
-def run(world: World, graph: Ours | Smoother) -> tuple[np.ndarray, float, float]:
-    """CPU ms of each keyframe, root mean square error of the map (m), normalised squared error of the last pose."""
-    known, times = {}, []
-    for truth, ids, p_cam in world.keyframes:
-        shared = [k for k, i in enumerate(ids.tolist()) if i in known]
-        T = fit_rigid(np.array([known[ids[k]] for k in shared]), p_cam[shared]) if known else truth
-        start = time.process_time()
-        known, T_last, covariance = graph.add(T, ids, p_cam)
-        times.append(1e3 * (time.process_time() - start))
-    rows = np.array(sorted(known))
-    estimate, truth = np.array([known[i] for i in rows]), world.p_obj[rows]
-    error = se3.transform(fit_rigid(truth, estimate), truth) - estimate
-    off = se3.log(se3.inverse(T_last) @ world.keyframes[-1][0])
-    nees = np.nan if covariance is None else off @ np.linalg.solve(covariance, off)
-    return np.array(times), float(np.sqrt(np.mean(np.sum(error**2, 1)))), float(nees)
+_DEFAULT, _PAPER = preset("default").factor_graph, preset("paper").factor_graph
+_PHYSICAL = replace(_PAPER, bearing_sigma_rad=SIGMA_RAD, range_sigma_m=SIGMA_M)
+#: Each keeps the graph solved in its way.
+WAYS: dict[str, Callable[[], Ours | Smoother]] = {
+    PEER: lambda: Ours(_PAPER),
+    "the same, physical noise": lambda: Ours(_PHYSICAL),
+    "whole graph, 5 warm steps": lambda: Ours(replace(_DEFAULT, max_keyframes=0)),
+    f"ours: merged to {_DEFAULT.max_keyframes} keyframes": lambda: Ours(_DEFAULT),
+    "merged to 20 keyframes": lambda: Ours(replace(_DEFAULT, max_keyframes=20)),
+    "merged to 60 keyframes": lambda: Ours(replace(_DEFAULT, max_keyframes=60)),
+    "ISAM2": lambda: Smoother(_DEFAULT),
+    "fixed lag of 15": lambda: Smoother(_DEFAULT, 15),
+    "fixed lag of 40": lambda: Smoother(_DEFAULT, 40),
+}
 
 
-def main() -> None:
-    """One line for each way to keep the graph solved."""
-    keyframes, seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 100, (0, 1)
-    default, paper = preset("default").factor_graph, preset("paper").factor_graph
-    physical = replace(paper, bearing_sigma_rad=SIGMA_RAD, range_sigma_m=SIGMA_M)
-    bounds = sorted({20, default.max_keyframes, 60})
-    ways = {
-        "paper: whole graph, 20 steps": lambda: Ours(paper),
-        "the same, physical noise": lambda: Ours(physical),
-        "whole graph, 5 warm steps": lambda: Ours(replace(default, max_keyframes=0)),
-        **{f"merged to {k} keyframes": lambda k=k: Ours(replace(default, max_keyframes=k)) for k in bounds},
-        "ISAM2": lambda: Smoother(default),
-        "fixed lag of 15": lambda: Smoother(default, 15),
-        "fixed lag of 40": lambda: Smoother(default, 40),
-    }
-    worlds = [turntable(keyframes, seed) for seed in seeds]
-    print(f"{keyframes} keyframes; default merges to {default.max_keyframes}")
-    print(f"{'':30} {'last ten':>10} {'worst':>10} {'ratio':>6} {'map':>8} {'error^2/6':>9}")
-    reference = None
-    for name, make in ways.items():
-        times, error_m, nees = zip(*(run(world, make()) for world in worlds), strict=True)
-        late = float(np.median([t[-10:] for t in times]))
-        reference = reference or late
-        print(
-            f"{name:30} {late:7.1f} ms {np.max(times):7.1f} ms {late / reference:6.2f}"
-            f" {1e3 * np.mean(error_m):5.2f} mm {np.mean(nees) / 6:9.2f}",
-            flush=True,
-        )
+@dataclass
+class Course:
+    """One way to keep the graph solved, in one world: known points, newest pose T_cam_obj and its covariance."""
+
+    graph: Ours | Smoother
+    known: dict[int, np.ndarray] = field(default_factory=dict)
+    T_last: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+
+    def add(self, keyframe: tuple[np.ndarray, np.ndarray, np.ndarray], spent: Times) -> None:
+        """A keyframe (truth, ids, p_cam), registered to what is known; the first one where it truly is."""
+        T, ids, p_cam = keyframe
+        if self.known:
+            shared = [k for k, i in enumerate(ids.tolist()) if i in self.known]
+            T = fit_rigid(np.array([self.known[ids[k]] for k in shared]), p_cam[shared])
+        self.known, self.T_last, self.covariance = spent.run(lambda: self.graph.add(T, ids, p_cam))
+
+    def errors(self, world: World) -> tuple[float, float]:
+        """Root mean square error of the map in mm after alignment; normalised squared error of the pose over six."""
+        rows = np.array(sorted(self.known))
+        estimate, truth = np.array([self.known[i] for i in rows]), world.p_obj[rows]
+        error = se3.transform(fit_rigid(truth, estimate), truth) - estimate
+        off = se3.log(se3.inverse(self.T_last) @ world.keyframes[-1][0])
+        nees = np.nan if self.covariance is None else off @ np.linalg.solve(self.covariance, off)
+        return 1e3 * float(np.sqrt(np.mean(np.sum(error**2, 1)))), float(nees) / len(off)
 
 
-if __name__ == "__main__":
-    main()
+def sections(quick: bool) -> Iterator[Section]:
+    """By the number of keyframes."""
+    sizes, seeds = (SIZES[:1], SEEDS[:1]) if quick else (SIZES, SEEDS)
+    worlds = [turntable(sizes[-1], seed) for seed in seeds]
+    spent, courses = {name: Times() for name in WAYS}, []
+    for world in worlds:
+        courses.append({name: Course(make()) for name, make in WAYS.items()})
+        for keyframe in world.keyframes:
+            for name, course in courses[-1].items():
+                course.add(keyframe, spent[name])
+    tables = {}
+    for size in sizes:
+        last = [w * sizes[-1] + k for w in range(len(worlds)) for k in range(size - LAST, size)]
+        tables[f"{size} keyframes"] = compared({name: times.at(last) for name, times in spent.items()}, PEER)
+    error = {n: np.mean([of[n].errors(w) for of, w in zip(courses, worlds, strict=True)], 0) for n in WAYS}
+    last = tables[f"{sizes[-1]} keyframes"]
+    last["map's error (mm)"], last["pose's squared error (expected 1)"] = np.round(np.array([*error.values()]).T, 2)
+    words = (
+        "One new keyframe, over the last ten up to that number. The peer is the full batch Levenberg-Marquardt, which "
+        "is also the paper's way: all keyframes, from the last solution, 20 steps at most."
+    )
+    yield Section("keyframes", "Factor graph by keyframes", words, tables, plot(tables))
+
+
+@style.styled
+def plot(tables: dict[str, DataFrame]) -> Figure:
+    """Median milliseconds against the number of keyframes."""
+    figure, (axis,) = panels(1, (WIDTH_IN, 3.2))
+    sizes = [int(caption.split()[0]) for caption in tables]
+    for k, name in enumerate(WAYS):
+        medians = [table["median (ms)"][k] for table in tables.values()]
+        again, colour = divmod(k, len(style.METHODS))
+        axis.plot(sizes, medians, ("o-", "o:")[again], color=style.METHODS[colour], label=name)
+    logarithmic(axis.xaxis, axis.yaxis)
+    axis.set_xticks(sizes)
+    axis.set(xlabel="keyframes", ylabel="a new keyframe [ms]")
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside right upper", fontsize=7)
+    return figure

@@ -28,6 +28,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from common import squared_errors
+
+from p2p_lib.core.tables import as_markdown
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "tools"))
@@ -36,7 +39,6 @@ from mutants import read_mechanisms, switch_off  # noqa: E402
 UNCHANGED = "unchanged"
 #: A claim, and an error that belies it.
 CONFIDENT, FAR_M = 0.5, 0.05
-RIGHT_M, RIGHT_DEG = 0.02, 5.0
 MIN_VISIBLE_PX = 300
 MODEL_POINTS = 2000
 SUMS = ["frames", "lost", "confidently_wrong"]
@@ -104,6 +106,7 @@ def score_object(
     """The numbers of one object over its scored frames; poses (n, 4, 4) are NaN where there is none."""
     from p2p_lib.core import se3
     from p2p_lib.evaluation import metrics
+    from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M
 
     posed = np.flatnonzero(np.isfinite(T_cam_obj).all((1, 2)))
     if not len(posed):
@@ -115,18 +118,15 @@ def score_object(
     judged = posed[1:]  # the first is right by alignment
     off = se3.log(se3.inverse(T_true[judged]) @ T_cam_obj[judged])  # right tangent of T_cam_obj, as the covariance
     turned_deg = np.degrees(np.linalg.norm(off[:, :3], axis=1))
-    right = (turned_deg <= RIGHT_DEG) & (apart_m[judged] <= RIGHT_M)
-    error2 = [
-        np.einsum("ni,nij,nj->n", off[:, s], np.linalg.inv(covariance[judged][:, s, s]), off[:, s])
-        for s in (slice(0, 3), slice(3, 6))
-    ]
+    right = (turned_deg <= MAX_DEG) & (apart_m[judged] <= MAX_M)
+    error2 = np.median(squared_errors(off, covariance[judged]), axis=0)
     wrong = (add_m[posed] > FAR_M) | (apart_m[posed] > FAR_M)
     return {
         "add": metrics.auc_exact(add_m),
         "adds": metrics.auc_exact(metrics.adds_m(T_pred, T_cam_model, points, workers=1)),
         "brier": float(np.mean((confidence[judged] - right) ** 2)),
-        "rotation_error2": float(np.median(error2[0])),
-        "translation_error2": float(np.median(error2[1])),
+        "rotation_error2": float(error2[0]),
+        "translation_error2": float(error2[1]),
         "frames": len(T_cam_obj),
         "lost": len(T_cam_obj) - len(posed),
         "confidently_wrong": int((wrong & (confidence[posed] > CONFIDENT)).sum()),
@@ -175,13 +175,6 @@ def compare(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows).set_index("mechanism").sort_values("ADD", ascending=False) if rows else pd.DataFrame()
 
 
-def as_markdown(table: pd.DataFrame) -> str:
-    """A table for people."""
-    shown = table.reset_index().map(lambda cell: f"{cell:+.3f}" if isinstance(cell, float) else str(cell))
-    rows = [list(shown), ["---"] * shown.shape[1], *shown.to_numpy().tolist()]
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("out", type=Path, metavar="OUT")
@@ -207,7 +200,8 @@ def main() -> None:
             print(json.dumps(runs[-1]), flush=True)
     table = compare(pd.DataFrame(runs))
     table.to_csv(asked.out / "table.csv")
-    (asked.out / "table.md").write_text(as_markdown(table))
+    shown = table.reset_index().map(lambda cell: f"{cell:+.3f}" if isinstance(cell, float) else str(cell))
+    (asked.out / "table.md").write_text(as_markdown(shown))
 
 
 if __name__ == "__main__":

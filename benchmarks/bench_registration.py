@@ -1,27 +1,24 @@
-"""Cost of registration per object and frame, beside Open3D's: ``python benchmarks/bench_registration.py``.
-
-Prints CPU milliseconds (median and 95th percentile over seeds; the clock on the wall says more about
-who else is on the machine), hypotheses found, and how often the true pose is among them within 3 degrees.
-Open3D's RANSAC on the same correspondences gives one pose; the last column is its median time over ours.
-The bar is 6 ms.
-"""
+"""Registration of one object in one frame, beside Open3D's RANSAC over the same correspondences."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
+from common import Section, Times, beside, rounded
+from pandas import DataFrame
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import RegistrationConfig, preset
 from p2p_lib.core.native import load_open3d
-from p2p_lib.core.robust import fit_rigid
-from p2p_lib.method.registration import covariance, register
+from p2p_lib.method.registration import register
 
-SEEDS = 40
+PEER = "Open3D's RANSAC"
+SEEDS, WARM_UP = 40, 2
+SIZES, OUTLIERS = (60, 150), (0.0, 0.3, 0.5, 0.7)
 #: Open3D counts correspondences nearer than this as inliers: about three standard deviations of the noise below.
 INLIER_M = 0.008
+RIGHT_DEG = 3.0
 #: What makes poses (4, 4) of p_obj, p_cam, the true pose (for priors alone) and a generator.
 Method = Callable[[np.ndarray, np.ndarray, np.ndarray, np.random.Generator], list[np.ndarray]]
 
@@ -37,14 +34,7 @@ def scene(rng: np.random.Generator, n: int, outliers: float) -> tuple[np.ndarray
     return p_obj, p_cam, T
 
 
-def cpu_ms(run: Callable[[], object]) -> tuple[float, object]:
-    """CPU time of one call in ms, and what it returned."""
-    start = time.process_time()
-    result = run()
-    return 1e3 * (time.process_time() - start), result
-
-
-def open3d_ransac(p_obj: np.ndarray, p_cam: np.ndarray) -> list[np.ndarray]:
+def open3d_ransac(p_obj: np.ndarray, p_cam: np.ndarray, T: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
     """T_cam_obj by Open3D's RANSAC over given correspondences, as one-element list."""
     o3d = load_open3d()
     reg, cloud = o3d.pipelines.registration, o3d.geometry.PointCloud
@@ -60,24 +50,6 @@ def open3d_ransac(p_obj: np.ndarray, p_cam: np.ndarray) -> list[np.ndarray]:
     return [np.array(found.transformation)]
 
 
-def measure(name: str, method: Method, n: int, outliers: float, ours_ms: float | None = None) -> float:
-    """Prints a row of the table; returns the median in milliseconds."""
-    times, found, right = [], [], []
-    for seed in range(SEEDS):
-        p_obj, p_cam, T = scene(np.random.default_rng(seed), n, outliers)
-        ms, poses = cpu_ms(lambda: method(p_obj, p_cam, T, np.random.default_rng(seed)))  # noqa: B023
-        off = [se3.angle_rad(se3.inverse(T) @ pose) for pose in poses]
-        times.append(ms)
-        found.append(len(poses))
-        right.append(bool(off) and min(off) < np.radians(3))
-    ratio = f" {np.median(times) / ours_ms:5.1f}x ours" if ours_ms else ""
-    print(
-        f"{name:8} {n:6} {outliers:6.0%} {np.median(times):5.2f} ms {np.percentile(times, 95):5.2f} ms"
-        f" {np.mean(found):6.1f} {np.mean(right):6.0%}{ratio}"
-    )
-    return float(np.median(times))
-
-
 def registering(config: RegistrationConfig) -> Method:
     """The method's registration, with the priors it has in a sequence."""
 
@@ -88,25 +60,42 @@ def registering(config: RegistrationConfig) -> Method:
     return run
 
 
-def main() -> None:
-    """Every preset and Open3D, over numbers of points and shares of outliers."""
-    variants = {name: preset(name).registration for name in ("default", "paper")}
-    register(*scene(np.random.default_rng(0), 60, 0.1)[:2], variants["default"], np.random.default_rng(0))
-    open3d_ransac(*scene(np.random.default_rng(0), 60, 0.1)[:2])
-    print(f"{'variant':8} {'points':>6} {'wrong':>6} {'median':>8} {'p95':>8} {'found':>6} {'right':>6}")
-    for n in (60, 100, 150):
-        for outliers in (0.0, 0.1, 0.3, 0.5, 0.7):
-            ours = {name: measure(name, registering(config), n, outliers) for name, config in variants.items()}
-            measure("Open3D", lambda p_obj, p_cam, T, rng: open3d_ransac(p_obj, p_cam), n, outliers, ours["default"])
-    p_obj, p_cam, _ = scene(np.random.default_rng(0), 100, 0.0)
-    (best, *_) = register(p_obj, p_cam, variants["default"], np.random.default_rng(0))
-    samples = np.random.default_rng(0).normal(size=(2, 100, 4, 3))
-    for what, run in {
-        "fit_rigid, 100 samples of 4": lambda: [fit_rigid(*samples) for _ in range(20)],
-        "covariance, 100 points": lambda: [covariance(best, p_obj, p_cam, 0.002) for _ in range(20)],
-    }.items():
-        print(f"{what:28} {min(cpu_ms(run)[0] for _ in range(5)) / 20:.2f} ms")
+METHODS: dict[str, Method] = {
+    "preset default": registering(preset("default").registration),
+    "preset paper": registering(preset("paper").registration),
+    PEER: open3d_ransac,
+}
 
 
-if __name__ == "__main__":
-    main()
+def measure(n: int, outliers: float, seeds: int) -> tuple[dict[str, Times], dict[str, float], dict[str, float]]:
+    """Per method what each scene took; how many poses it found in the mean; the share where one of them is right."""
+    times = {name: Times() for name in METHODS}
+    found, right = {name: [] for name in METHODS}, {name: [] for name in METHODS}
+    for seed in range(-WARM_UP, seeds):
+        p_obj, p_cam, T = scene(np.random.default_rng(seed + WARM_UP), n, outliers)
+        for name, method in METHODS.items():
+            poses = times[name].run(lambda: method(p_obj, p_cam, T, np.random.default_rng(seed + WARM_UP)))  # noqa: B023
+            off_deg = [np.degrees(se3.angle_rad(se3.inverse(T) @ pose)) for pose in poses]
+            found[name].append(len(poses))
+            right[name].append(min(off_deg, default=np.inf) < RIGHT_DEG)
+    spent = {name: t.at(range(WARM_UP, WARM_UP + seeds)) for name, t in times.items()}
+    return spent, {name: np.mean(k) for name, k in found.items()}, {name: np.mean(k) for name, k in right.items()}
+
+
+def sections(quick: bool) -> Iterator[Section]:
+    """By points and share of wrong ones."""
+    rows = {name: [] for name in METHODS if name != PEER}
+    for n in SIZES[:1] if quick else SIZES:
+        for outliers in OUTLIERS[1:2] if quick else OUTLIERS:
+            times, found, right = measure(n, outliers, 3 if quick else SEEDS)
+            for name in rows:
+                scored = {"poses found": rounded(found[name])}
+                scored |= {"right (%)": 100 * right[name], "peer, right (%)": 100 * right[PEER]}
+                where = {"points": n, "wrong ones": f"{outliers:.0%}"}
+                rows[name].append(where | beside(times[name], times[PEER]) | scored)
+    words = (
+        f"Correspondences of one object with 1.5 mm noise, {SEEDS} scenes of each kind. The peer is Open3D's RANSAC, "
+        "up to 1000 samples, which gives one pose. Right: a pose within "
+        f"{RIGHT_DEG:g} degrees is among those found."
+    )
+    yield Section("registration", "Registration by points", words, {name: DataFrame(r) for name, r in rows.items()})
