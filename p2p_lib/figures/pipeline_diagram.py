@@ -1,4 +1,4 @@
-"""The pipeline as one diagram: its stages in the order in which a configuration runs them, and where each is kept.
+"""The pipeline of preset ``default`` as one diagram: its stages in the order of a run, and where each is kept.
 
 The paper's figure "Overview of the framework", drawn from :data:`STAGES`: the names under which the pipeline takes its
 times.
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.figures import style
 
@@ -29,57 +28,40 @@ class Stage:
     """One box.
 
     title     what it does; ``source``, the module or package that does
-    notebook  number of the notebook about it, empty where it has none
+    notebook  number of the notebook about it
+    at        its column and row
     ours      whether the paper does without it
-    switch    the key of the configuration that switches it, with the value that leaves it out
     """
 
     title: str
     source: str
-    notebook: str = ""
+    notebook: str
+    at: tuple[float, float]
     ours: bool = False
-    switch: tuple[str, object] | None = None
-
-    def runs(self, config: Config) -> bool:
-        """Whether a configuration has this stage."""
-        if self.switch is None:
-            return True
-        (section, name), left_out = self.switch[0].split("."), self.switch[1]
-        return getattr(getattr(config, section), name) != left_out
 
 
-#: By the name that the pipeline's stopwatch and ``timings.csv`` have for it; judging takes no time worth a name.
+#: By the name that the pipeline's stopwatch and ``timings.csv`` have for it; judging takes no time worth a name. In the
+#: order in which a frame that becomes a keyframe meets them.
 STAGES = {
-    "tracking": Stage("track points", "trackers/", "01"),
-    "segmentation": Stage("segment", "segmenters/", "10"),
-    "scene": Stage("locate camera", "recovery/scene.py", "07", True, ("method.scene", False)),
-    "search": Stage("search", "recovery/search.py", "07", True, ("method.scene", False)),
-    "observation": Stage("lift to 3D", "method/observation.py", "10"),
-    "registration": Stage("register", "method/registration.py", "03"),
-    "refinement": Stage("refine", "method/refinement.py", "04", switch=("refinement.residuals", "none")),
-    "selection": Stage("select", "method/selection.py", "03"),
-    "judging": Stage("judge", "method/lifecycle.py", "07", True, ("method.gates", "none")),
-    "sampling": Stage("sample points", "method/sampling.py", "02"),
-    "map": Stage("keypoint map", "method/keypoint_map.py", "02"),
-    "fusion": Stage("TSDF surface", "method/tsdf.py", "06", switch=("method.surface", False)),
-    "graph": Stage("factor graph", "method/factor_graph.py", "05", switch=("method.graph", False)),
+    "tracking": Stage("track points", "trackers/", "01", (1, 2)),
+    "scene": Stage("locate camera", "recovery/scene.py", "07", (4, 2), True),
+    "search": Stage("search", "recovery/search.py", "07", (3, 2), True),
+    "segmentation": Stage("segment", "segmenters/", "10", (2, 2)),
+    "observation": Stage("lift to 3D", "method/observation.py", "10", (0, 1)),
+    "registration": Stage("register", "method/registration.py", "03", (1, 1)),
+    "refinement": Stage("refine", "method/refinement.py", "04", (2, 1)),
+    "selection": Stage("select", "method/selection.py", "03", (3, 1)),
+    "judging": Stage("judge", "method/lifecycle.py", "07", (4, 1), True),
+    "map": Stage("keypoint map", "method/keypoint_map.py", "02", (1, 0)),
+    "sampling": Stage("sample points", "method/sampling.py", "02", (0, 0)),
+    "graph": Stage("factor graph", "method/factor_graph.py", "05", (2.15, 0)),
+    "fusion": Stage("TSDF surface", "method/tsdf.py", "06", (3.25, 0)),
 }
 
 
-def order(config: Config) -> list[str]:
-    """The stages that a configuration runs, in the order in which a frame that becomes a keyframe meets them."""
-    choose = ["refinement", "selection"] if config.selection.rule == "support" else ["selection", "refinement"]
-    names = ["tracking", "scene", "search", "segmentation", "observation", "registration", *choose, "judging"]
-    return [name for name in [*names, "map", "sampling", "graph", "fusion"] if STAGES[name].runs(config)]
-
-
 @style.styled
-def pipeline_diagram(
-    config: Config | None = None,
-    here: Collection[str] = (),
-    pages: Mapping[str, str] | None = None,
-) -> Figure:
-    """The stages of a configuration (default: preset ``default``) and what flows between them.
+def pipeline_diagram(here: Collection[str] = (), pages: Mapping[str, str] | None = None) -> Figure:
+    """The stages and what flows between them.
 
     here   stages that are marked: "you are here"
     pages  notebook number to the address that its boxes link to (in SVG and PDF)
@@ -92,7 +74,11 @@ def pipeline_diagram(
     axis = figure.add_axes((0, 0, 1, 1))
     axis.set(xlim=(-0.95, 7.65), ylim=(-0.62, 2.73))
     axis.axis("off")
-    _draw(axis, config or preset(), here, pages or {})
+    at = {name: (stage.at[0] * _GRID[0], stage.at[1] * _GRID[1]) for name, stage in STAGES.items()}
+    _model(axis, at["judging"][0] + _BOX[0] / 2)
+    for name, (x, y) in at.items():
+        _box(axis, name, x, y, name in here, pages or {})
+    _flow(axis, at)
     return figure
 
 
@@ -104,19 +90,6 @@ def as_svg(figure: Figure) -> str:
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
         svg = text.getvalue()
     return svg[svg.index("<svg") :]
-
-
-def _draw(axis: Axes, config: Config, here: Collection[str], pages: Mapping[str, str]) -> None:
-    names = order(config)
-    row = [name for name in names if name in ("observation", "registration", "refinement", "selection", "judging")]
-    places = {name: (k, 1.0) for k, name in enumerate(row)}
-    places |= {"tracking": (1, 2), "segmentation": (2, 2), "search": (3, 2), "scene": (4, 2)}
-    places |= {"sampling": (0, 0), "map": (1, 0), "graph": (2.15, 0), "fusion": (3.25, 0)}
-    at = {name: (x * _GRID[0], y * _GRID[1]) for name, (x, y) in places.items() if name in names}
-    _model(axis, max(at[row[-1]][0], at.get("fusion", (0, 0))[0]) + _BOX[0] / 2)
-    for name, (x, y) in at.items():
-        _box(axis, name, x, y, name in here, pages)
-    _flow(axis, at, row)
 
 
 def _model(axis: Axes, right: float) -> None:
@@ -148,7 +121,7 @@ def _box(axis: Axes, name: str, x: float, y: float, marked: bool, pages: Mapping
     axis.text(x + w / 2 - 0.04, y + h / 2 - 0.03, stage.notebook, **number)
 
 
-def _flow(axis: Axes, at: Mapping[str, tuple[float, float]], row: list[str]) -> None:
+def _flow(axis: Axes, at: Mapping[str, tuple[float, float]]) -> None:
     """The arrows: along the step, to the model and back, and the words at its ends."""
     w, h = _BOX[0] / 2, _BOX[1] / 2
 
@@ -163,28 +136,23 @@ def _flow(axis: Axes, at: Mapping[str, tuple[float, float]], row: list[str]) -> 
     arrow((ox + w, ty), (tx - w, ty))
     arrow((tx + w, ty), (sx - w, ty))
     arrow((sx, ty - h), (sx, (ty + oy) / 2), (ox, (ty + oy) / 2), (ox, oy + h))
-    if "search" in at:
-        arrow((at["scene"][0] - w, ty), (at["search"][0] + w, ty))
-        arrow((at["search"][0] - w, ty), (sx + w, ty))
-    for a, b in pairwise(row):
+    arrow((at["scene"][0] - w, ty), (at["search"][0] + w, ty))
+    arrow((at["search"][0] - w, ty), (sx + w, ty))
+    for a, b in pairwise(("observation", "registration", "refinement", "selection", "judging")):
         arrow((at[a][0] + w, oy), (at[b][0] - w, oy))
-    last = at[row[-1]][0]
+    last = at["judging"][0]
     arrow((last + w, oy), (last + w + 0.22, oy))
     axis.text(last + w + 0.28, oy, "pose $T^C_O$,\nstatus,\nconfidence", ha="left", **said)
     arrow((last + 0.4, oy - h), (last + 0.4, h + 0.12))
 
-    (mx, my), (px, _) = at["map"], at["sampling"]
+    (mx, my), (px, _), (gx, _), (fx, _) = at["map"], at["sampling"], at["graph"], at["fusion"]
     arrow((mx, my + h), (mx, oy - h))
     arrow((px + w, my), (mx - w, my))
     arrow((px - w, my), (-0.8, my), (-0.8, ty + h + 0.2), (tx, ty + h + 0.2), (tx, ty + h))
     axis.text(-0.88, oy, "new points", rotation=90, ha="center", **said)
-    if "graph" in at:
-        arrow((at["graph"][0] - w, my), (mx + w, my), look="<|-|>")
-    if "fusion" in at:
-        if "graph" in at:
-            arrow((at["graph"][0] + w, my), (at["fusion"][0] - w, my))
-        for name in ("refinement", "selection"):
-            x = min(at[name][0] + 0.25, at["fusion"][0] + 0.1) if name in at else None
-            if x is not None:
-                arrow((at["fusion"][0] + (x - at["fusion"][0]) / 4, my + h), (x, oy - h))
+    arrow((gx - w, my), (mx + w, my), look="<|-|>")
+    arrow((gx + w, my), (fx - w, my))
+    for name in ("refinement", "selection"):
+        x = min(at[name][0] + 0.25, fx + 0.1)
+        arrow((fx + (x - fx) / 4, my + h), (x, oy - h))
     axis.text(7.6, -0.56, "dashed: ours beyond the paper", ha="right", fontsize=6.5, color=style.NEUTRAL[0])

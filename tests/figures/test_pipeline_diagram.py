@@ -5,10 +5,9 @@ import ast
 import pytest
 
 from p2p_lib.apps.notebooks import list_notebooks
-from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.paths import PROJECT
-from p2p_lib.figures.pipeline_diagram import STAGES, as_svg, order, pipeline_diagram
+from p2p_lib.figures.pipeline_diagram import STAGES, as_svg, pipeline_diagram
 from p2p_lib.method.pipeline import Point2Pose
 from tests.method.test_pipeline import CAMERA, film
 
@@ -33,10 +32,8 @@ def test_every_box_names_what_is_there():
         assert (PROJECT / "p2p_lib" / stage.source).exists() and stage.notebook in numbers
 
 
-@pytest.mark.parametrize("name", ["default", "paper"])
-def test_the_order_is_that_of_a_run(name):
-    config = preset(name)
-    method = Point2Pose(CAMERA, config)
+def test_the_order_is_that_of_a_run():
+    method = Point2Pose(CAMERA)
     method.add_object("left")
     for frame, masks in film():
         estimate = method.step(frame, {"left": masks["left"]})["left"]
@@ -44,16 +41,8 @@ def test_the_order_is_that_of_a_run(name):
             break
     beside = {"fusion", "scene"}  # what waits for them is what a frame meets of them
     met = [stage for stage in method.stopwatch.last_ms if stage not in {"total", *beside}]
-    drawn = order(config)
-    assert [stage for stage in drawn if stage in met] == met
-    assert set(drawn) - set(met) <= {*beside, "search", "judging"}, "these take no time here, or none worth a name"
-    assert ("judging" in drawn) == (name == "default")
-
-
-def test_what_a_configuration_leaves_out_is_not_drawn():
-    config = preset("default").with_values({"method.graph": False, "method.scene": False})
-    svg = as_svg(pipeline_diagram(config))
-    assert "factor graph" not in svg and "locate camera" not in svg and "register" in svg
+    assert [stage for stage in STAGES if stage in met] == met
+    assert set(STAGES) - set(met) <= {*beside, "search", "judging"}, "these take no time here, or none worth a name"
 
 
 def test_boxes_lead_to_their_notebooks_and_the_same_work_gives_the_same_text():
