@@ -32,7 +32,6 @@ from p2p_lib.figures import course, equations
 
 if TYPE_CHECKING:
     from nbformat import NotebookNode
-    from pandas import DataFrame
 
 #: ``quick``: bundled data, CPU. ``full``: the data and backends that are present. Each with what it takes on two cores.
 PROFILES = {"quick": "some minutes", "full": "half an hour without data of yours, hours with it"}
@@ -117,9 +116,10 @@ def check(*claims: Claim) -> None:
     """Show and keep what a notebook's ``checks`` cell claims; AssertionError names every claim that does not hold."""
     from IPython import get_ipython
     from IPython.display import publish_display_data
+    from pandas import DataFrame
 
     if get_ipython() is not None:
-        table = _claims_table(claims)
+        table = DataFrame([claim.row for claim in claims])
         kept = [asdict(claim) for claim in claims]
         publish_display_data({CHECKS_MIME: kept, "text/html": as_html(table, words=4), "text/plain": as_text(table)})
     failed = [f"{claim.what}: {_shown(claim.value)}, not {claim.bar} ({claim.means})" for claim in claims if not claim]
@@ -387,12 +387,6 @@ def _failing_line(source: str, error: Mapping[str, Any]) -> str:
     plain = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(error["traceback"]))
     at = re.search(r"(?m)^-+> +(\d+) ", plain)
     return lines[min(int(at[1]), len(lines)) - 1 if at else 0].strip()
-
-
-def _claims_table(claims: Sequence[Claim]) -> DataFrame:
-    from pandas import DataFrame
-
-    return DataFrame([claim.row for claim in claims])
 
 
 def _shown(value: Value) -> str:

@@ -47,8 +47,8 @@ def write_film(
     every = max(1, round(playback.rate_hz / _PAGE_HZ)) if for_a_page else 1
     rows = range(0, len(playback), every)
     with Film(out, playback.rate_hz / every) as film, progress_bar(film.path.name, len(rows), shown=progress) as bar:
-        for row, image in zip(rows, scene.film(rows, width_px=width_px)):
-            film.add(image, playback.times_s[row])
+        for row in rows:
+            film.add(scene.draw(row, width_px=width_px), playback.times_s[row])
             bar.update()
     return film.path
 

@@ -45,9 +45,6 @@ class Saved:
     shown: tuple[dict[str, Any], dict[str, Any]]
     caption: str = ""
 
-    def _repr_mimebundle_(self, include=None, exclude=None):
-        return self.shown
-
     def _ipython_display_(self) -> None:
         from IPython.display import publish_display_data
 

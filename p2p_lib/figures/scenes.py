@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -51,14 +51,13 @@ class Scene:
         self.sequence, self.run = sequence, run
         known = set(run.objects) <= set(sequence.objects)  # a folder without masks knows no names
         self.colours = style.object_colours(sequence.objects if known else run.objects)
-        self._T_obj_model = {k: s.T_obj_model for k, s in evaluation.objects.items()} if evaluation else {}
         self._model_boxes = {name: Box.around(points) for name, points in run.points.items()} if truth else {}
+        scored = evaluation.objects if evaluation else {}
         self._boxes = {
-            name: Box.around(run.points[name], T)
-            for name, T in self._T_obj_model.items()
-            if name in run.points and np.isfinite(T).all()
+            name: Box.around(run.points[name], score.T_obj_model)
+            for name, score in scored.items()
+            if name in run.points and np.isfinite(score.T_obj_model).all()
         } | dict(boxes or {})
-
         self._playback: Playback | None = None
 
     @classmethod
@@ -114,10 +113,6 @@ class Scene:
             return image
         caption = f"{self.sequence.name}  {frame.time_s - first.time_s[0]:.2f} s"
         return overlay.draw_labels(image, [label for label in labels if label is not None], caption)
-
-    def film(self, rows: Iterable[int] | None = None, **drawing) -> Iterator[np.ndarray]:
-        """The images of these rows (default: all) one after the other; ``drawing`` as of :meth:`draw`."""
-        return (self.draw(row, **drawing) for row in (range(len(self)) if rows is None else rows))
 
     def story(self, count: int = 6, columns: int = 3, width_px: int = 360) -> np.ndarray:
         """One sheet of ``count`` frames that tell what happened, cut to where the objects are."""

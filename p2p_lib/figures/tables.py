@@ -54,12 +54,12 @@ class Cell:
     note: str = ""
 
 
-def number(value: float | None, spread: float | None = None, digits: int = 2, note: str = "") -> Cell:
+def number(value: float | None, spread: float | None = None, digits: int = 2) -> Cell:
     """A number with its spread behind a ±; a dash where there is none."""
     if value is None or value != value:
-        return Cell(note=note)
+        return Cell()
     shown = f"{value:.{digits}f}" + (f" ± {spread:.{digits}f}" if spread is not None else "")
-    return Cell(shown, note=note)
+    return Cell(shown)
 
 
 def emboldened(cells: Sequence[Cell], more_is_better: bool) -> list[Cell]:

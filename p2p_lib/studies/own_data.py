@@ -120,11 +120,6 @@ def masks_image(frame: Frame, masks: Mapping[str, np.ndarray], width_px: int = 4
     return overlay.montage([image[:height_px] for image in images], columns=len(images))
 
 
-def widened(mask: np.ndarray, by_px: int) -> np.ndarray:
-    """A mask (H, W) bool drawn too wide."""
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by_px + 1,) * 2, np.uint8)) > 0
-
-
 @style.styled
 def fit_plot(playback: Playback, fits: Mapping[str, Mapping[str, Series]]) -> Figure:
     """The fraction of each surface on which depth was measured, over time; the confidence below.

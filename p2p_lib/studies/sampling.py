@@ -328,14 +328,9 @@ def _draw_choice(situation: Situation, uv_px: np.ndarray, words: str, width_px: 
     return overlay.draw_caption(image, words, 0.5)
 
 
-def choice_table(scores: DataFrame) -> DataFrame:
-    """Means over the situations, a row per way to choose."""
-    return scores.drop(columns="uv_px").groupby("choice", sort=False, as_index=False).mean().round(3)
-
-
 @style.styled
 def choice_plot(table: DataFrame) -> Figure:
-    """The table as dots: more is better left and right, less in the middle."""
+    """Means by ``choice`` as dots: more is better left and right, less in the middle."""
     senses = {"covered [%]": "more", "pose error [mm]": "less", "still tracked [%]": "more"}
     colours = [_TERM_COLOURS[0] if label == "J" else style.NEUTRAL[0] for label in table["choice"]]
     figure, axes = panels(3, (WIDTH_IN, 2.6), side_by_side=True)

@@ -270,11 +270,6 @@ def errors_over_keyframes(counts: Sequence[int], errors_m: np.ndarray, bar_mm: f
 # --- refinement against the surface ----------------------------------------------------------------
 
 
-def random_starts(count: int, degrees: float, millimetres: float, seed: int = 0) -> np.ndarray:
-    """(count, 2) how far starts are off, uniform up to so many degrees and millimetres."""
-    return np.random.default_rng([seed, 6]).uniform(0, [degrees, millimetres], (count, 2))
-
-
 def basin_of_convergence(
     volume: TsdfVolume,
     p_cam: np.ndarray,

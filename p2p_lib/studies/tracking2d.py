@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -111,10 +111,6 @@ class TrackScene:
     def story(self, count: int = 6, columns: int = 3, width_px: int = 400) -> np.ndarray:
         """One sheet of frames: before, while and after all points of an object are hidden."""
         return overlay.montage([self.draw(i, width_px) for i in self.moments(count)], columns)
-
-    def film(self, frames: Iterable[int]) -> Iterator[np.ndarray]:
-        """The images of these frames, one after the other."""
-        return map(self.draw, frames)
 
     def absences(self) -> list[tuple[str, int, int]]:
         """Objects and spans [start, stop) of frames in which truth sees none of their points, by their start."""

@@ -115,14 +115,14 @@ def test_picture_is_written_as_it_is_and_shown_as_written(folders):
     assert saved.path == folder / "figures" / "picture.png"
     with Image.open(saved.path) as read:
         assert (np.asarray(read) == image()).all()
-    data, metadata = saved._repr_mimebundle_()
+    data, metadata = saved.shown
     assert b64decode(data["image/png"]) == saved.path.read_bytes() and metadata["image/png"]["width"] == 60
 
 
 def test_film_is_shown_embedded(folders):
     folders("out")
     saved = save_video([image()] * 3, "film", fps=5)
-    assert "base64" in saved._repr_mimebundle_()[0]["text/html"]
+    assert "base64" in saved.shown[0]["text/html"]
 
 
 def test_saving_leaves_matplotlib_as_it_was(made, folders):
@@ -143,7 +143,7 @@ def test_table_reads_back(folders):
     assert pandas.read_csv(saved.path).equals(table)
     lines = saved.path.with_suffix(".md").read_text().splitlines()
     assert lines == ["| object | ADD [%] | frames |", "| --- | ---: | ---: |", "| a\\|b | 91.25 | 3 |", "| c | - | 4 |"]
-    assert "<table" in saved._repr_mimebundle_()[0]["text/html"]
+    assert "<table" in saved.shown[0]["text/html"]
 
 
 def test_a_file_as_source_is_named_without_its_folder(tmp_path):

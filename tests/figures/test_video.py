@@ -60,7 +60,7 @@ def test_shown_films_are_embedded(tmp_path, monkeypatch):
 
     monkeypatch.setenv("P2P_FIGURES", str(tmp_path))
     saved = save_video(images(3), "film")
-    page = saved._repr_mimebundle_()[0]["text/html"]
+    page = saved.shown[0]["text/html"]
     assert base64.b64encode(saved.path.read_bytes()).decode() in page and "autoplay" in page
 
 

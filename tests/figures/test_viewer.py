@@ -134,7 +134,7 @@ def test_a_browser_draws_it(page, browser, tmp_path):
 
 
 def test_inside_a_notebook_it_is_the_same_page(folder, made):
-    shown, _ = show_run(folder, made.sequence)._repr_mimebundle_()
+    shown, _ = show_run(folder, made.sequence).shown
     inside = html.unescape(re.search(r'srcdoc="([^"]*)"', shown["text/html"])[1])
     assert inside == (folder / "view.html").read_text() and shown["text/plain"] == "<view.html>"
 

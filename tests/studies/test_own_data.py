@@ -20,7 +20,7 @@ from p2p_lib.studies.surface import carton
 from p2p_lib.synthetic.render import render
 
 V, U = np.mgrid[:120, :160]
-DISC = np.hypot(U - 80, V - 60) <= 30
+DISC, WIDE = (np.hypot(U - 80, V - 60) <= radius for radius in (30, 38))
 FRAME = Frame(0, 0.0, np.full((120, 160, 3), 128, np.uint8), np.where(DISC, 0.6, 1.0).astype(np.float32))
 
 
@@ -38,11 +38,11 @@ def test_a_rim_on_the_background_is_vermillion():
     lost = style.STATUS[Status.LOST][0]
     good, bad = (
         own_data.mask_image(FRAME, DISC, "good"),
-        own_data.mask_image(FRAME, own_data.widened(DISC, 8), "bad"),
+        own_data.mask_image(FRAME, WIDE, "bad"),
     )
     near = [np.abs(image.astype(int) - style.rgb(lost)).sum(-1).min() for image in (good, bad)]
     assert near[0] > 60 > near[1]
-    sheet = own_data.masks_image(FRAME, {"a": DISC, "b": own_data.widened(DISC, 8)}, width_px=200)
+    sheet = own_data.masks_image(FRAME, {"a": DISC, "b": WIDE}, width_px=200)
     assert sheet.shape[1] == 404
 
 
