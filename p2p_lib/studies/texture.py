@@ -8,8 +8,9 @@ sequence or window of frames, by label: the contrast of a print, or the name of 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import cycle
+from typing import Any
 
 import cv2
 import matplotlib
@@ -41,7 +42,7 @@ FAR_PX = 8.0
 LEGEND = "contrast of the print, synthetic"
 _TEXTURE = "mean Sobel gradient in the mask [grey levels / px]"
 _TRACK, _ADD = "median 2D track error [px]", "ADD AUC [%]"
-#: Columns of the table of measures.
+#: What is measured, and its head in a table: AUC in the exact form over 0 to 0.1 m, failures as zero.
 _HEADS = {
     "frames": "scored frames",
     "texture": "Sobel [grey levels/px]",
@@ -112,29 +113,6 @@ class RecordedTracker:
         return {name: rows[rows.owner == k].drop(columns="owner") for k, name in enumerate(scene.objects)}
 
 
-@dataclass(frozen=True)
-class Measure:
-    """One object over some frames of a sequence.
-
-    start, stop   frames [start, stop) of the sequence, of which ``frames`` are scored
-    texture       mean Sobel gradient magnitude in the mask, grey levels per pixel
-    track_px      median error of its 2D tracks; NaN where there was none
-    tracks        tracks per scored frame
-    add_auc, adds_auc  percent, exact form over 0 to 0.1 m, failures as zero
-    """
-
-    sequence: str
-    object: str
-    start: int
-    stop: int
-    frames: int
-    texture: float
-    track_px: float
-    tracks: float
-    add_auc: float
-    adds_auc: float
-
-
 @dataclass(frozen=True, eq=False)
 class ObjectTexture:
     """One object of a run, over its scored frames.
@@ -149,32 +127,29 @@ class ObjectTexture:
     frames: DataFrame
     tracks: DataFrame
 
-    def measure(self, start: int = 0, stop: int | None = None) -> Measure:
-        """Over the frames [start, stop); :class:`MissingData` where none of them is scored."""
+    def measure(self, start: int = 0, stop: int | None = None) -> dict[str, Any]:
+        """What :data:`_HEADS` names, over the frames [start, stop); :class:`MissingData` where none is scored."""
         stop = int(self.frames.frame.max()) + 1 if stop is None else stop
         rows = self.frames[self.frames.frame.between(start, stop, inclusive="left")]
         if not len(rows):
             raise MissingData(f"{self.object} of {self.sequence}", f"no scored frame from {start} to {stop}")
         error_px = self.tracks.error_px[self.tracks.frame.isin(rows.frame)]
-        return Measure(
-            self.sequence,
-            self.object,
-            start,
-            stop,
-            frames=len(rows),
-            texture=float(rows.texture.mean()),
-            track_px=float(error_px.median()),
-            tracks=len(error_px) / len(rows),
-            add_auc=metrics.auc_exact(rows.add_m.to_numpy()),
-            adds_auc=metrics.auc_exact(rows.adds_m.to_numpy()),
-        )
+        measured = {
+            "frames": len(rows),
+            "texture": rows.texture.mean(),
+            "track_px": error_px.median(),
+            "tracks": len(error_px) / len(rows),
+            "add_auc": metrics.auc_exact(rows.add_m.to_numpy()),
+            "adds_auc": metrics.auc_exact(rows.adds_m.to_numpy()),
+        }
+        return {"sequence": self.sequence, "object": self.object, "start": start, "stop": stop, **measured}
 
-    def windows(self, size: int = 15) -> list[Measure]:
-        """One measure per window of ``size`` frames; those with fewer than half of them scored are left out."""
-        first = int(self.frames.frame.min())
+    def windows(self, size: int = 15) -> DataFrame:
+        """A measure per window of ``size`` frames; those with fewer than half of them scored are left out."""
+        first, columns = int(self.frames.frame.min()), ["sequence", "object", "start", "stop", *_HEADS]
         scored = ((self.frames.frame - first) // size).value_counts().sort_index()
         starts = [first + size * int(k) for k in scored.index[2 * scored >= size]]
-        return [self.measure(start, start + size) for start in starts]
+        return DataFrame([self.measure(start, start + size) for start in starts], columns=columns)
 
 
 def sobel_magnitude(rgb: np.ndarray) -> np.ndarray:
@@ -264,27 +239,26 @@ def rank_correlation(
     return RankCorrelation(rho(np.arange(count)), float(interval.low), float(interval.high), len(x), count)
 
 
-def correlate(windows: Sequence[Measure], seed: int = 0) -> tuple[RankCorrelation, RankCorrelation]:
+def correlate(windows: DataFrame, seed: int = 0) -> tuple[RankCorrelation, RankCorrelation]:
     """Texture with track error, and texture with ADD AUC, over windows; those of one object belong together."""
-    table = DataFrame(windows)
-    groups = (table.sequence + ": " + table.object).to_list()
-    return tuple(rank_correlation(table.texture, table[key], groups, seed) for key in ("track_px", "add_auc"))
+    groups = windows.sequence + ": " + windows.object
+    return tuple(rank_correlation(windows.texture, windows[key], groups, seed) for key in ("track_px", "add_auc"))
 
 
-def correlation_table(windows: Mapping[str, Sequence[Measure]], seed: int = 0) -> DataFrame:
+def correlation_table(windows: Mapping[str, DataFrame], seed: int = 0) -> DataFrame:
     """A row per label: texture's rho with track error and with ADD AUC; a dash for fewer than three objects."""
     rows = []
     for label, many in windows.items():
-        objects = len({(w.sequence, w.object) for w in many})
+        objects = many.groupby(["sequence", "object"]).ngroups
         track, add = map(str, correlate(many, seed)) if objects > 2 else (None, None)
         row = {"": label, "windows": len(many), "sequences or objects": objects}
         rows.append(row | {"texture and track error": track, "texture and ADD AUC": add})
     return DataFrame(rows)
 
 
-def measure_table(measures: Mapping[str, Measure | str], head: str = LEGEND) -> DataFrame:
+def measure_table(measures: Mapping[str, Mapping[str, Any] | str], head: str = LEGEND) -> DataFrame:
     """A row per label: what it shows, how it was tracked, how right its pose was; or dashes and the reason."""
-    table = DataFrame([{"why not": m} if isinstance(m, str) else asdict(m) for m in measures.values()])
+    table = DataFrame([{"why not": m} if isinstance(m, str) else dict(m) for m in measures.values()])
     reasons = table.get("why not", Series("", table.index)).fillna("")
     table = table.reindex(columns=_HEADS).round(2).rename(columns=_HEADS)
     table.insert(0, head, list(measures))
@@ -304,7 +278,7 @@ def draw_tracks(
 
 
 @style.styled
-def texture_story(images: Mapping[str, np.ndarray], measures: Mapping[str, Sequence[Measure]], title: str) -> Figure:
+def texture_story(images: Mapping[str, np.ndarray], measures: Mapping[str, DataFrame], title: str) -> Figure:
     """The page's one figure: images side by side, and below them track error and ADD against visible texture."""
     high = WIDTH_IN / len(images) * max(image.shape[0] / image.shape[1] for image in images.values())
     figure = Figure((WIDTH_IN, high + 3.3), layout="constrained")
@@ -325,50 +299,50 @@ def extremes_story(scenes: Mapping[str, Scene], studies: Mapping[str, ObjectText
 
     scenes  label to the scene of each study; two labels at least
     """
-    least, *_, most = sorted(studies, key=lambda label: studies[label].measure().texture)
+    least, *_, most = sorted(studies, key=lambda label: studies[label].measure()["texture"])
     images, measures = {}, {label: study.windows(windows) for label, study in studies.items()}
     for label in (least, most):
         frames = studies[label].frames
         middle, measure = int(frames.frame.iloc[len(frames) // 2]), studies[label].measure()
-        title = (
-            f"{label}: {measure.texture:.1f} levels/px, tracks off {measure.track_px:.1f} px, ADD {measure.add_auc:.0f}"
-        )
+        title = f"{label}: {{texture:.1f}} levels/px, tracks off {{track_px:.1f}} px, ADD {{add_auc:.0f}}"
+        title = title.format(**measure)
         images[title] = draw_tracks(scenes[label], studies[label], middle, scenes[label].region(0.03), 330)
     return texture_story(images, measures, "least and most texture; below, a point per window of frames")
 
 
 @style.styled
 def windows_against_texture(
-    windows: Mapping[str, Sequence[Measure]],
+    windows: Mapping[str, DataFrame],
     correlations: Sequence[RankCorrelation] = (),
-    synthetic: Sequence[Measure] = (),
+    synthetic: DataFrame | None = None,
 ) -> Figure:
     """Every window of every study; above the panels the rank correlations with track error and with ADD AUC.
 
     synthetic  windows that are drawn in grey behind those of real objects
     """
     figure, axes = panels(2, (WIDTH_IN, 3.4), side_by_side=True)
-    if synthetic:
+    real = synthetic is not None
+    if real:
         _against_texture(axes, {"synthetic": synthetic} | dict(windows), 16, [style.NEUTRAL[1], *style.OBJECTS])
     else:
         _against_texture(axes, windows, 16, _colours(len(windows)))
     for axis, found in zip(axes, correlations):
         axis.set_title(f"Spearman {found.rho:+.2f}, 95 % [{found.low:+.2f}, {found.high:+.2f}], n = {found.pairs}")
-    entries, title = axes[0].get_legend_handles_labels(), None if synthetic else LEGEND
-    figure.legend(*entries, loc="outside lower center", ncols=3 if synthetic else 9, fontsize=8, title=title)
+    entries, title = axes[0].get_legend_handles_labels(), None if real else LEGEND
+    figure.legend(*entries, loc="outside lower center", ncols=3 if real else 9, fontsize=8, title=title)
     return figure
 
 
 @style.styled
-def same_frames(windows: Mapping[str, Sequence[Measure]]) -> Figure:
+def same_frames(windows: Mapping[str, DataFrame]) -> Figure:
     """One line per window of frames, through all contrasts; of several sequences the first is drawn."""
     figure, axes = panels(2, (WIDTH_IN, 3.3), side_by_side=True)
-    spans = sorted({(w.start, w.stop) for many in windows.values() for w in many})
-    for span, colour in zip(spans, matplotlib.colormaps["viridis"](np.linspace(0, 0.9, len(spans)))):
-        line = [next((w for w in many if (w.start, w.stop) == span), None) for many in windows.values()]
+    spans = concat(windows).droplevel(1).groupby(["start", "stop"])
+    colours = matplotlib.colormaps["viridis"](np.linspace(0, 0.9, spans.ngroups))
+    for ((start, stop), rows), colour in zip(spans, colours):
+        line = rows[~rows.index.duplicated()].reindex(list(windows))
         for axis, key in zip(axes, ("track_px", "add_auc")):
-            values = [getattr(w, key, np.nan) for w in line]
-            axis.plot(values, "o-", ms=3.5, color=colour, label=f"frames {span[0]} to {span[1] - 1}")
+            axis.plot(line[key].to_numpy(), "o-", ms=3.5, color=colour, label=f"frames {start} to {stop - 1}")
     for axis, label in zip(axes, (_TRACK, _ADD)):
         axis.set_xticks(range(len(windows)), windows)
         axis.set(xlabel=LEGEND, ylabel=label)
@@ -392,14 +366,12 @@ def track_errors(studies: Mapping[str, ObjectTexture]) -> Figure:
     return figure
 
 
-def _against_texture(
-    axes: Sequence[Axes], measures: Mapping[str, Sequence[Measure]], size: float, colours: Iterable
-) -> None:
+def _against_texture(axes: Sequence[Axes], measures: Mapping[str, DataFrame], size: float, colours: Iterable) -> None:
     """Track error and ADD AUC over texture, a colour per label."""
     for (label, many), colour in zip(measures.items(), cycle(colours)):
         for axis, key in zip(axes, ("track_px", "add_auc")):
-            x, y = ([getattr(m, name) for m in many] for name in ("texture", key))
-            axis.scatter(x, y, size, color=[colour], edgecolors="#333333", linewidths=0.5, label=label)
+            edge = {"edgecolors": "#333333", "linewidths": 0.5}
+            axis.scatter(many.texture, many[key], size, color=[colour], label=label, **edge)
     for axis, label in zip(axes, (_TRACK, _ADD)):
         axis.set(xlabel=_TEXTURE, ylabel=label)
         logarithmic(axis.xaxis)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pandas import DataFrame
+from pandas import DataFrame, Series
 from scipy import stats
 
 from p2p_lib import Point2Pose, preset
@@ -131,7 +131,7 @@ def test_a_study_joins_texture_tracks_and_pose(video, tmp_path):
     record = RecordedTracker(make_tracker("builtin", preset().tracking))
     result = run(video, tmp_path / "run", tracker=record, progress=False)
     study = texture.study(video, result.evaluation, record)["tin"]
-    whole, score = study.measure(), result.evaluation.objects["tin"].as_dict()
+    whole, score = Series(study.measure()), result.evaluation.objects["tin"].as_dict()
     assert (whole.frames, whole.add_auc) == (FRAMES, score["add_auc"])
     assert whole.texture == pytest.approx(np.mean([texture.visible_texture(video.frame(t).rgb, video.masks(t)["tin"])
                                                    for t in range(FRAMES)]))  # fmt: skip
@@ -153,7 +153,7 @@ def made(frame_index, error_px, add_m):
 
 def test_a_measure_is_of_its_own_frames():
     study = made([0, 1, 2, 5, 6, 7], [1.0, 2.0, 9.0], [0.0, 0.01, 0.02, 0.05, np.inf, 0.2])
-    first, last = study.measure(0, 3), study.measure(5)
+    first, last = (Series(study.measure(*span)) for span in ((0, 3), (5,)))
     assert (first.frames, first.texture, first.track_px, first.tracks) == (3, 1.0, 2.0, 3.0)
     assert first.add_auc == pytest.approx(90) and first.adds_auc == pytest.approx(95)
     assert last.add_auc == pytest.approx(100 * 0.5 / 3), "a frame without a pose counts as zero"
@@ -163,7 +163,7 @@ def test_a_measure_is_of_its_own_frames():
 
 def test_windows_cover_the_scored_frames_and_leave_out_the_sparse():
     study = made([*range(10, 20), 21, *range(30, 38)], [1.0], np.zeros(19))
-    assert [(w.start, w.stop, w.frames) for w in study.windows(10)] == [(10, 20, 10), (30, 40, 8)]
+    assert [(w.start, w.stop, w.frames) for w in study.windows(10).itertuples()] == [(10, 20, 10), (30, 40, 8)]
 
 
 # Rank correlation

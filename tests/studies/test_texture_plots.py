@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pandas import DataFrame, concat
 
 from p2p_lib.core.backends import make_tracker
 from p2p_lib.core.config import preset
@@ -43,12 +44,13 @@ def test_dots_lie_on_the_tracks_in_the_colour_of_their_error(told):
 def test_the_story_has_a_image_and_a_point_per_label(told):
     scene, study = told
     image = texture.draw_tracks(scene, study, 10, (100, 60, 500, 420), 200)
-    measures = {"1": [study.measure()], "0.3": [study.measure(0, 7), study.measure(7)]}
+    whole, halves = DataFrame([study.measure()]), study.windows(7)
+    measures = {"1": whole, "0.3": halves}
     figure = texture.texture_story({"1": image, "0.3": image}, measures, "synthetic")
     top, bottom = figure.subfigs
     assert [a.get_title(loc="left") for a in top.axes] == ["1", "0.3"]
     points = [c.get_offsets() for c in bottom.axes[0].collections]
-    np.testing.assert_allclose(points[0][0], [study.measure().texture, study.measure().track_px])
+    np.testing.assert_allclose(points[0], whole[["texture", "track_px"]])
     assert [len(p) for p in points] == [1, 2]
 
 
@@ -60,7 +62,7 @@ def test_the_least_and_the_most_textured_stand_side_by_side(told):
     top, bottom = texture.extremes_story(dict.fromkeys(studies, scene), studies, 7).subfigs
     titles = [axis.get_title(loc="left") for axis in top.axes]
     assert [title.partition(":")[0] for title in titles] == ["faint", "full"]
-    assert f"{study.measure().texture:.1f} levels/px" in titles[1]
+    assert f"{study.measure()['texture']:.1f} levels/px" in titles[1]
     assert [len(points.get_offsets()) for points in bottom.axes[0].collections] == [2, 2, 2]
 
 
@@ -70,9 +72,9 @@ def test_windows_are_joined_across_labels_by_their_frames(told):
     figure = texture.same_frames(windows)
     lines = figure.axes[1].get_lines()
     assert [line.get_label() for line in lines] == ["frames 0 to 6", "frames 7 to 13"]
-    first, last = study.windows(7)
-    np.testing.assert_allclose(lines[0].get_ydata(), [first.add_auc] * 2)
-    np.testing.assert_allclose(lines[1].get_ydata(), [last.add_auc, np.nan])
+    first, last = study.windows(7).add_auc
+    np.testing.assert_allclose(lines[0].get_ydata(), [first] * 2)
+    np.testing.assert_allclose(lines[1].get_ydata(), [last, np.nan])
     found = texture.RankCorrelation(-0.5, -0.8, 0.1, 3, 3)
     titled = texture.windows_against_texture(windows, [found, found])
     assert titled.axes[0].get_title(loc="left") == "Spearman -0.50, 95 % [-0.80, +0.10], n = 3"
@@ -93,16 +95,16 @@ def test_what_was_not_run_is_a_dash_with_its_reason(told):
 
 def test_correlations_need_three_sequences(told):
     windows = told[1].windows(2)
-    others = [replace(w, sequence=f"other {k}") for k in range(2) for w in windows]
-    table = texture.correlation_table({"one": windows, "three": [*windows, *others], "none": []})
+    every = concat([windows, *(windows.assign(sequence=f"other {k}") for k in range(2))])
+    table = texture.correlation_table({"one": windows, "three": every, "none": windows[:0]})
     assert table["sequences or objects"].tolist() == [1, 3, 0] and table["windows"].tolist() == [7, 21, 0]
     assert table["texture and ADD AUC"].isna().tolist() == [True, False, True]
-    rho = texture.correlate([*windows, *others])[1].rho
+    rho = texture.correlate(every)[1].rho
     assert table["texture and ADD AUC"][1].startswith(f"{rho:+.2f} [")
 
 
 def test_real_windows_stand_before_the_synthetic_ones(told):
     windows = told[1].windows(7)
-    figure = texture.windows_against_texture({"mustard": windows[:1]}, synthetic=[*windows, *windows])
+    figure = texture.windows_against_texture({"mustard": windows[:1]}, synthetic=concat([windows, windows]))
     assert [len(c.get_offsets()) for c in figure.axes[0].collections] == [4, 1]
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["synthetic", "mustard"]
