@@ -175,39 +175,26 @@ def open_views(video: Video, count: int, frames_on: int) -> list[Situation]:
 
 @dataclass(frozen=True, eq=False)
 class MapHistory:
-    """One object's map over the first T frames; rows of points by id, frames counted from the first.
+    """One object's map over the first T frames, which are counted from the first.
 
-    born, promoted, gone  (N,) frame in which a point came, became a keypoint, was retired; T where it never did
-    p_born, p_promoted    (N, 3) its place in the object frame then; NaN where it never was
-    p_true                (N, 3) the true surface point behind its first pixel; NaN where the ray meets none
-    keyframe              (T,) bool
-    T_cam_obj             (T, 4, 4); NaN without a pose
+    points              a row by id: the frames in which it was ``born``, ``promoted`` to a keypoint and ``gone``, T
+                        where it never was; ``born_error_m`` and ``promoted_error_m``, how far it lay then from the
+                        true surface point behind its first pixel, NaN where that is unknown
+    p_born, p_promoted  (N, 3) its place in the object frame then; NaN where it never was
+    keyframe            (T,) bool; T_cam_obj (T, 4, 4), NaN without a pose
     """
 
     name: str
-    born: np.ndarray
-    promoted: np.ndarray
-    gone: np.ndarray
+    points: DataFrame
     p_born: np.ndarray
     p_promoted: np.ndarray
-    p_true: np.ndarray
     keyframe: np.ndarray
     T_cam_obj: np.ndarray
 
     @property
-    def late(self) -> np.ndarray:
-        """(N,) bool: points that were promoted, without those of the first frame, which are keypoints at once."""
-        return (self.born > 0) & (self.promoted < len(self.keyframe))
-
-    @property
-    def born_error_m(self) -> np.ndarray:
-        """(N,) distance from the true surface point when lifted from a single frame."""
-        return np.linalg.norm(self.p_born - self.p_true, axis=1)
-
-    @property
-    def promoted_error_m(self) -> np.ndarray:
-        """(N,) the same at promotion, from all observations until then; NaN where there was none."""
-        return np.linalg.norm(self.p_promoted - self.p_true, axis=1)
+    def late(self) -> DataFrame:
+        """The points that were promoted, without those of the first frame, which are keypoints at once."""
+        return self.points[(self.points.born > 0) & (self.points.promoted < len(self.keyframe))]
 
 
 def follow_map(sequence: Video, name: str, frames: int, tracker: str = "builtin", seed: int = 0) -> MapHistory:
@@ -234,8 +221,10 @@ def follow_map(sequence: Video, name: str, frames: int, tracker: str = "builtin"
         uv_px = sequence.camera.project(se3.transform(poses[t], p_born[rows]))
         object = np.full(len(rows), tuple(sequence.truth).index(name))
         p_true[rows] = se3.transform(T_obj_model, scene.lift(sequence.frame(t), object, uv_px).p_model)
-    when = (born["frame"].to_numpy(), promoted["frame"].fillna(frames).to_numpy(int), gone.to_numpy())
-    return MapHistory(name, *when, p_born, p_promoted, p_true, keyframe, poses)
+    points = DataFrame({"born": born["frame"], "promoted": promoted["frame"].fillna(frames).astype(int), "gone": gone})
+    points["born_error_m"] = np.linalg.norm(p_born - p_true, axis=1)
+    points["promoted_error_m"] = np.linalg.norm(p_promoted - p_true, axis=1)
+    return MapHistory(name, points, p_born, p_promoted, keyframe, poses)
 
 
 @style.styled
@@ -349,9 +338,9 @@ def choice_plot(table: DataFrame) -> Figure:
 def life_lines(history: MapHistory, video: Video) -> Figure:
     """Every point of a map as a line of time: hollow while pending, filled as a keypoint, ended when retired."""
     colour, lost = style.object_colours(video.objects)[history.name], style.STATUS[Status.LOST][0]
-    order, total = np.lexsort([history.promoted, history.born]), len(history.keyframe)
-    born, gone = history.born[order], history.gone[order]
-    keypoint, rows = np.minimum(history.promoted[order], gone), np.arange(len(order))
+    points, total = history.points.sort_values(["born", "promoted"], kind="stable"), len(history.keyframe)
+    born, promoted, gone = points[["born", "promoted", "gone"]].to_numpy().T
+    keypoint, rows = np.minimum(promoted, gone), np.arange(len(points))
     pending = {"facecolor": style.STATUS[Status.INITIALISING][0], "edgecolor": "#333333", "linewidth": 0.3}
     figure, (axis,) = panels(1, (WIDTH_IN, 4.2))
     axis.barh(rows, keypoint - born, 1.0, born, **pending)
@@ -359,9 +348,9 @@ def life_lines(history: MapHistory, video: Video) -> Figure:
     axis.plot(gone[gone < total], rows[gone < total], "x", color=lost, markersize=3)
     for t in np.flatnonzero(history.keyframe):
         axis.axvline(t, color=style.NEUTRAL[1], lw=0.7, zorder=0)
-    axis.set(xlabel="frame", ylabel="points by birth", xlim=(0, total), ylim=(len(order), -1))
+    axis.set(xlabel="frame", ylabel="points by birth", xlim=(0, total), ylim=(len(points), -1))
     axis.grid(visible=False)
-    axis.set_title(f"Life of the map of {history.name}, {video.name}: {len(order)} points")
+    axis.set_title(f"Life of the map of {history.name}, {video.name}: {len(points)} points")
     handles = [
         Patch(**pending, label="pending"),
         Patch(facecolor=colour, label="keypoint"),
@@ -374,24 +363,24 @@ def life_lines(history: MapHistory, video: Video) -> Figure:
 
 def promotion_moments(history: MapHistory) -> list[int]:
     """Frames from the keyframe that brought most points which were promoted, until nine in ten of them were."""
-    births, counts = np.unique(history.born[history.late], return_counts=True)
-    start = int(births[counts.argmax()])
-    end = int(np.quantile(history.promoted[history.late & (history.born == start)], 0.9))
+    late = history.late
+    start = int(late.born.mode()[0])
+    end = int(late.promoted[late.born == start].quantile(0.9))
     return np.unique(np.linspace(start, max(end, start + 3), 4).astype(int)).tolist()
 
 
 def promotion_sheet(video: Video, history: MapHistory, frames: Sequence[int]) -> np.ndarray:
     """The part of the map in sight at a few frames of the video: pending points are rings, keypoints dots."""
-    colour = style.object_colours(video.objects)[history.name]
+    colour, points = style.object_colours(video.objects)[history.name], history.points
     box = overlay.region_around(np.any([video.masks(t)[history.name] for t in frames], axis=0), video.camera)
     images = []
     for t in frames:
-        frame, promoted = video.frame(t), history.promoted <= t
+        frame, promoted = video.frame(t), (points.promoted <= t).to_numpy()
         image, seen_by = overlay.zoomed(frame.rgb, video.camera, box, 300)
         p_obj = np.where(promoted[:, None], history.p_promoted, history.p_born)
         p_cam = se3.transform(history.T_cam_obj[t], p_obj)
         u, v = nearest_px(video.camera.project(p_cam), frame.shape)
-        alive = (history.born <= t) & (t < history.gone) & (np.abs(frame.depth_m[v, u] - p_cam[:, 2]) < _IN_SIGHT_M)
+        alive = points.eval("born <= @t < gone").to_numpy() & (np.abs(frame.depth_m[v, u] - p_cam[:, 2]) < _IN_SIGHT_M)
         uv_px = seen_by.project(p_cam)
         image = overlay.draw_points(image, uv_px[alive & promoted], colour, 3)
         image = overlay.draw_points(image, uv_px[alive & ~promoted], style.TRUTH, 4, filled=False)
@@ -403,14 +392,11 @@ def promotion_sheet(video: Video, history: MapHistory, frames: Sequence[int]) ->
 @style.styled
 def error_plot(history: MapHistory) -> Figure:
     """How far points lay from the true surface point when they were born, and when they were promoted."""
-    known = history.late & np.isfinite(history.promoted_error_m + history.born_error_m)
+    errors_m = history.late[["born_error_m", "promoted_error_m"]].dropna()
     figure, (axis,) = panels(1, (WIDTH_IN, 2.8))
-    for errors_m, line, when in (
-        (history.born_error_m, "--", "when born"),
-        (history.promoted_error_m, "-", "when promoted"),
-    ):
-        label = f"{history.name}, {when}"
-        axis.ecdf(1e3 * errors_m[known], linestyle=line, color=style.OBJECTS[0], label=label)
+    for when, line in (("born", "--"), ("promoted", "-")):
+        label = f"{history.name}, when {when}"
+        axis.ecdf(1e3 * errors_m[f"{when}_error_m"], linestyle=line, color=style.OBJECTS[0], label=label)
     axis.set(xlabel="distance from the true point [mm]", ylabel="share of points below", xlim=(0, None))
     axis.legend(loc="lower right", fontsize=8)
     axis.set_title("Points that were promoted")

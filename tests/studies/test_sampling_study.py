@@ -97,14 +97,14 @@ def test_views_are_of_objects_in_sight(crossing):
 
 def test_the_life_of_a_map_follows_the_rules_of_promotion(crossing):
     history, cfg = follow_map(crossing, "box", 30), CONFIG.keypoint_map
-    late = history.born > 0
-    assert history.keyframe[0] and set(history.born) == set(np.flatnonzero(history.keyframe))
-    assert (history.promoted[~late] == 0).all()
-    waited = (history.promoted - history.born)[late & (history.promoted < 30)]
+    points = history.points
+    late = points.born > 0
+    assert history.keyframe[0] and set(points.born) == set(np.flatnonzero(history.keyframe))
+    assert (points.promoted[~late] == 0).all()
+    waited = (points.promoted - points.born)[late & (points.promoted < 30)]
     assert len(waited) > 5 and waited.min() >= cfg.streak
-    np.testing.assert_array_equal(np.isfinite(history.p_promoted[:, 0]), history.promoted < 30)
-    known = np.isfinite(history.p_true[:, 0])
-    assert known.mean() > 0.9 and np.median(history.born_error_m[known]) < 0.004
+    np.testing.assert_array_equal(np.isfinite(history.p_promoted[:, 0]), points.promoted < 30)
+    assert points.born_error_m.notna().mean() > 0.9 and points.born_error_m.median() < 0.004
 
 
 def test_maps_show_the_terms_and_the_next_choice(crossing):
@@ -136,7 +136,8 @@ def history():
     p = np.zeros((5, 3))
     later = np.where((promoted < 10)[:, None], p, np.nan)
     keyframe, poses = np.isin(np.arange(10), [0, 4]), np.tile(np.eye(4), (10, 1, 1))
-    return MapHistory("box", born, promoted, gone, p, later, p, keyframe, poses)
+    points = DataFrame({"born": born, "promoted": promoted, "gone": gone})
+    return MapHistory("box", points, p, later, keyframe, poses)
 
 
 def test_lives_are_bars_of_the_right_length(history, crossing):
@@ -146,6 +147,6 @@ def test_lives_are_bars_of_the_right_length(history, crossing):
 
 
 def test_the_moments_of_promotion(history):
-    assert history.late.tolist() == [False, False, True, True, False]
+    assert history.late.index.tolist() == [2, 3]
     moments = sampling.promotion_moments(history)
     assert moments[0] == 4 and moments[-1] == 7 and len(moments) == 4
