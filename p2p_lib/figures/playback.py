@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pandas import Series
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import P2PError
@@ -130,9 +131,7 @@ class Playback:
 
     def add_m(self, name: str) -> np.ndarray:
         """(n,) ADD in metres, NaN where there is no pose or no truth."""
-        errors = np.full(len(self), np.nan)
-        if self.evaluation is not None and name in self.evaluation.objects:
-            score = self.evaluation.objects[name]
-            found = np.isfinite(score.add_m)
-            errors[np.searchsorted(self.frame_index, score.frame_index[found])] = score.add_m[found]
-        return errors
+        if self.evaluation is None or name not in self.evaluation.objects:
+            return np.full(len(self), np.nan)
+        score = self.evaluation.objects[name]
+        return Series(score.add_m, score.frame_index).reindex(self.frame_index).replace(np.inf, np.nan).to_numpy()

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pandas import Series
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Status
@@ -147,19 +148,17 @@ def stage_timings(run: Run) -> Figure:
 
 def _draw_errors(axes: list[Axes], name: str, obj: ObjectRun, score: ObjectScore, colour: str) -> None:
     """One object's three lines over all frames; what is not scored is left out."""
-    rows = np.searchsorted(obj.frame_index, score.frame_index)
-    add_m, scored = np.full(len(obj), np.nan), np.zeros(len(obj), bool)
-    add_m[rows], scored[rows] = np.where(np.isfinite(score.add_m), score.add_m, np.nan), True
-    for axis, values in zip(axes, (1e3 * add_m, *pose_error(obj, score))):
+    add_mm = 1e3 * Series(score.add_m, score.frame_index).reindex(obj.frame_index).to_numpy()
+    failed = np.isinf(add_mm)
+    for axis, values in zip(axes, (np.where(failed, np.nan, add_mm), *pose_error(obj, score))):
         # The frame of the alignment has no error at all, which a logarithm cannot show: below a micrometre is none.
-        shown = np.where(scored & (values > 1e-3), values, np.nan)
+        shown = np.where(~np.isnan(add_mm) & (values > 1e-3), values, np.nan)
         axis.plot(obj.time_s, shown, color=colour, marker=".", markersize=2.5, label=name)
         for start, stop in gaps(obj):
             axis.axvspan(*_span_s(obj, start, stop), color=colour, alpha=0.13, lw=0)
-    failed = obj.time_s[rows[~np.isfinite(score.add_m)]]
-    if len(failed):  # an empty line would claim the figure's corner for itself
-        edge = axes[0].get_xaxis_transform()
-        axes[0].plot(failed, np.full(len(failed), 0.97), "x", color=colour, markersize=4, transform=edge, clip_on=False)
+    if failed.any():  # an empty line would claim the figure's corner for itself
+        look = {"color": colour, "markersize": 4, "transform": axes[0].get_xaxis_transform(), "clip_on": False}
+        axes[0].plot(obj.time_s[failed], np.full(failed.sum(), 0.97), "x", **look)
 
 
 def _at_least_a_decade(axis: Axes) -> None:

@@ -11,7 +11,6 @@ import json
 import subprocess
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -144,39 +143,23 @@ def _save(image: np.ndarray, name: str, runs: Benchmark, caption: str) -> Saved:
 # --- the index -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Item:
-    """A figure, table or statement of the paper, and where it is found here.
-
-    file  below ``figures/``; on: what it is of where ``file`` was made; data: what the paper's own form needs
-    """
-
-    paper: str
-    shows: str
-    file: str
-    command: str
-    notebook: str
-    data: str
-    on: str
-
-
-def _table(paper: str, shows: str, plan: str, notebook: str, data: str, on: str) -> Item:
+def _table(paper: str, shows: str, plan: str, notebook: str, data: str, on: str) -> tuple[str, ...]:
     command = f"p2p benchmark {plan} --out DIR --tables figures/tables"
-    return Item(paper, shows, f"tables/{plan}.md", command, notebook, data, on)
+    return paper, shows, f"tables/{plan}.md", command, notebook, data, on
 
 
 _STAND_IN, _BUNDLED = "stand-in, rendered", "bundled sequences"
-ITEMS = (
-    Item("Figure 1", "three objects through occlusion", "fig1_three_objects.png", "p2p figures", "07",
-         "ycbmultitrack_real", _STAND_IN),
-    Item("Figure 2", "the framework: stages and one frame", "fig2_framework.png", "p2p figures", "00", "-",
-         "drawn from the code, a rendered frame"),
-    Item("Figure 3", "synthetic sequence: airplane and tomato can", "fig3_synthetic.png", "p2p figures", "09",
-         "ycb_models", _STAND_IN),
-    Item("Figure 4", "texture: tracks on low and high texture, Sobel gradient against track error and ADD",
-         "texture.png", "p2p notebooks --profile full --only 08", "08", "ho3d_v3", _STAND_IN),
-    Item("Figure 5", "a return beside a competitor's poses", "fig5_return.png", "p2p figures --poses PATH", "07",
-         "ycbmultitrack_real, a competitor's poses", _STAND_IN),
+_ROWS = (
+    ("Figure 1", "three objects through occlusion", "fig1_three_objects.png", "p2p figures", "07",
+     "ycbmultitrack_real", _STAND_IN),
+    ("Figure 2", "the framework: stages and one frame", "fig2_framework.png", "p2p figures", "00", "-",
+     "drawn from the code, a rendered frame"),
+    ("Figure 3", "synthetic sequence: airplane and tomato can", "fig3_synthetic.png", "p2p figures", "09",
+     "ycb_models", _STAND_IN),
+    ("Figure 4", "texture: tracks on low and high texture, Sobel gradient against track error and ADD",
+     "texture.png", "p2p notebooks --profile full --only 08", "08", "ho3d_v3", _STAND_IN),
+    ("Figure 5", "a return beside a competitor's poses", "fig5_return.png", "p2p figures --poses PATH", "07",
+     "ycbmultitrack_real, a competitor's poses", _STAND_IN),
     _table("Table 1", "HO3D", "ho3d", "09", "ho3d_v3", "the paper's data"),
     _table("Table 2", "YCBInEOAT", "ycbineoat", "09", "ycbineoat", "the paper's data"),
     _table("Table 3 (a)", "YCBMultiTrack-Synthetic", "ycbmultitrack_synthetic", "09", "ycb_models", "re-creation"),
@@ -187,11 +170,13 @@ ITEMS = (
     _table("Table 5", "ablation of sampling", "sampling", "09", "ho3d_v3", "the paper's data"),
     _table("", "the same on bundled sequences", "sampling_embedded", "09", "-", _BUNDLED),
     _table("Section 4.4, runtime", "2 to 10 Hz", "runtime", "09", "-", _BUNDLED),
-    Item("", "the same as a plot", "runtime.png", "p2p figures", "09", "-", _BUNDLED),
+    ("", "the same as a plot", "runtime.png", "p2p figures", "09", "-", _BUNDLED),
     _table("Section 4.5, long range", "5 of 5 returns against 0 of 5", "long_range", "07, 09", "ycbmultitrack_real",
            _BUNDLED),
 )  # fmt: skip
-
+#: The paper's figures, tables and statements: where each is found here (``file``, below ``figures/``), what that is made
+#: ``on``, and what ``data`` the paper's own form needs.
+ITEMS = DataFrame(_ROWS, columns=["paper", "shows", "file", "command", "notebook", "data", "on"])
 
 _INDEX = """# The paper's figures and tables
 
@@ -207,7 +192,7 @@ can run here.
 def index(folder: Path, day_of: Callable[[str], str] | None = None) -> str:
     """``README.md`` of the figures: every item of the paper, what is here in its place, and how it was made."""
     rows = []
-    for item in ITEMS:
+    for item in ITEMS.itertuples():
         seeds, made, on = _made(folder / item.file, item.on, day_of or _day)
         row = {"paper": item.paper, "what it shows": item.shows}
         row["here"] = f"[{item.file}]({item.file})" if (folder / item.file).is_file() else "not made yet"

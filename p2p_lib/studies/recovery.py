@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from pandas import DataFrame
+from pandas import DataFrame, Series
 
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M, Judged, reliability, right_poses
@@ -73,8 +73,7 @@ def around_return(
     sight.fill_between(since, first.run.objects[name].visible_px[at], color=style.NEUTRAL[1])
     for (label, scene), colour in zip(scenes.items(), style.METHODS):
         obj, score = scene.run.objects[name], evaluations[label].objects[name]
-        adds_m = dict(zip(score.frame_index.tolist(), score.adds_m.tolist()))
-        adds_mm = 1e3 * np.array([adds_m.get(i, np.nan) for i in index.tolist()])
+        adds_mm = 1e3 * Series(score.adds_m, score.frame_index).reindex(index).to_numpy()
         line = {"color": colour, "marker": ".", "ms": 4, "label": label}
         agreeing.plot(since, np.where(obj.has_pose, obj.inliers, 0)[at], **line)
         adds.plot(since, np.where(np.isfinite(adds_mm), adds_mm, np.nan), **line)

@@ -53,16 +53,16 @@ def test_committed_figures_are_small():
         pytest.skip("not a git checkout")
     kept = [PROJECT / line for line in listed.stdout.split()]
     assert FIGURES / "README.md" in kept and FIGURES / "tables/ablation_trackers.md" in kept
-    assert {FIGURES / item.file for item in ITEMS if (FIGURES / item.file).is_file()} <= set(kept)
+    assert {FIGURES / file for file in ITEMS.file if (FIGURES / file).is_file()} <= set(kept)
     for path in kept:
         assert path.stat().st_size < 1 << 20, path.name
 
 
 def test_every_table_of_the_paper_is_in_the_index():
-    listed = {item.file.removeprefix("tables/").removesuffix(".md") for item in ITEMS}
+    listed = {file.removeprefix("tables/").removesuffix(".md") for file in ITEMS.file}
     assert listed >= {name for name in plan_names() if read_plan(name).paper}
-    assert len([item for item in ITEMS if item.paper.startswith("Figure")]) == 5
-    assert len([item for item in ITEMS if item.paper.startswith("Table")]) == len(paper_reported().tables)
+    assert ITEMS.paper.str.startswith("Figure").sum() == 5
+    assert ITEMS.paper.str.startswith("Table").sum() == len(paper_reported().tables)
 
 
 @pytest.fixture
