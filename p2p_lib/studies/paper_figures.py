@@ -174,7 +174,7 @@ _ROWS = (
     _table("Section 4.5, long range", "5 of 5 returns against 0 of 5", "long_range", "07, 09", "ycbmultitrack_real",
            _BUNDLED),
 )  # fmt: skip
-#: The paper's figures, tables and statements: where each is found here (``file``, below ``figures/``), what that is made
+#: The paper's figures, tables and statements: where each is found (``file``, below ``figures/``), what that is made
 #: ``on``, and what ``data`` the paper's own form needs.
 ITEMS = DataFrame(_ROWS, columns=["paper", "shows", "file", "command", "notebook", "data", "on"])
 
