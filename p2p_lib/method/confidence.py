@@ -11,8 +11,9 @@ import numpy as np
 
 #: The noise of points is set for a poor sensor; what is left of the covariance, measured on ``synthetic/crossing``.
 _COVARIANCE_SCALE = 0.55
-#: Points on a round body drift along it by this share of its accumulated rotation.
-_DRIFT_SHARE = 0.03
+#: Points on a round body drift along it by this share of its accumulated rotation. Where nothing on it is seen to turn,
+#: its turn is known to this, rad: the error of plain bodies in turning scenes.
+_DRIFT_SHARE, _UNTOLD_RAD = 0.03, 1.0
 #: Weights of the log odds: constant, logarithm of the largest standard deviation of rotation in degrees, logarithm of
 #: the agreeing keypoints + 1, their share of those seen. Fitted on ``fading_label``, ``weak_texture`` and ``crossing``,
 #: degraded until half of the poses were wrong; ``benchmarks/bench_confidence.py`` judges them on other seeds.
@@ -20,7 +21,7 @@ _CONSTANT, _LOG_SIGMA, _LOG_INLIERS, _AGREEMENT = -2.0, -0.75, 1.1, 0.9
 
 
 def pose_covariance(
-    of_frame: np.ndarray, of_map: np.ndarray, free_rotations: np.ndarray, accumulated_rad: float
+    of_frame: np.ndarray, of_map: np.ndarray, free_rotations: np.ndarray, accumulated_rad: float, told: bool = True
 ) -> np.ndarray:
     """(6, 6) covariance of a pose in the object frame, right tangent of T_cam_obj, rotation first.
 
@@ -28,8 +29,10 @@ def pose_covariance(
     of_map           (6, 6) of the newest keyframe, by the graph
     free_rotations   (K, 6) tangents of one radian each that the shape leaves free
     accumulated_rad  how far the object has turned, view by view, since its first keyframe
+    told             whether its texture tells the turns that the shape leaves free
     """
-    drift = (_DRIFT_SHARE * accumulated_rad) ** 2 * free_rotations.T @ free_rotations
+    free_rad = np.hypot(_DRIFT_SHARE * accumulated_rad, 0.0 if told else _UNTOLD_RAD)
+    drift = free_rad**2 * free_rotations.T @ free_rotations
     return _COVARIANCE_SCALE * (of_frame + of_map + drift)
 
 

@@ -7,6 +7,7 @@ becomes its pose. Whatever the object wants of the shared tracker it returns as
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -26,6 +27,7 @@ from p2p_lib.method.confidence import confidence, pose_covariance
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.lifecycle import BACKGROUND, GATES, MAPPED, Lifecycle, Verdict, off_size
 from p2p_lib.method.object_model import NO_IDS, Known, NewPoints, ObjectModel, Requests
+from p2p_lib.method.observability import contrast_along
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.pose_finder import Candidate, PoseFinder
 from p2p_lib.method.refinement import surface_distance
@@ -44,6 +46,12 @@ _SOME = 0.05
 #: A known object that has been lost for so many frames and shows this share of the most that was ever seen of it is
 #: turned to a side that nobody knows: a second map is begun.
 _STAYS_LOST, _IN_PLAIN_VIEW = 12, 0.4
+
+
+#: Why a pose is degraded that nothing contradicts.
+_UNTOLD = "its shape leaves a turn free, and too little texture tells it"
+#: A pose (4, 4) to its covariance (6, 6), with what the map may be wrong by, and its confidence.
+Belief = Callable[[np.ndarray], tuple[np.ndarray, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,9 +213,9 @@ class ObjectTracker:
         T_cam_obj, agrees, model = best.T_cam_obj, best.hypothesis.inliers, self.model
         life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict.status, best.lead)
         requests = Requests(reject=self.map.ids[self.known.keypoints(obs) & ~agrees])
-        agreeing = self._agreeing(obs, best)  # before a keyframe changes the map's rows
-        of_frame, most = self._covariance(obs, best), DOUBTED if life.doubted else 1.0
-        sure = min(confidence(self._of_pose(T_cam_obj, of_frame, best), *agreeing), most)
+        told = self._told(obs, best)
+        belief = self._belief(obs, best, told, DOUBTED if life.doubted else 1.0)
+        covariance, sure = belief(T_cam_obj)
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
             trusted = not life.confirming and (sure >= MAPPED or not self._gates)
@@ -217,36 +225,51 @@ class ObjectTracker:
             good = obs.seen & (agrees | ~self.map.promoted)
             if self._gates and not due:  # two maps that become one lie to each other as well as poses tell
                 good &= model.explained(obs, T_cam_obj)
+            of_frame = self._covariance(obs, best)
             T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, self._sample(obs), good, of_frame, sure)
             requests = replace(asked, reject=requests.reject)
+            covariance, sure = belief(T_cam_obj)
         self.life = replace(life, T_cam_obj=T_cam_obj).placed(obs.frame.T_world_cam)
-        of_pose = self._of_pose(T_cam_obj, of_frame, best)
-        sure = min(confidence(of_pose, *agreeing), most)
-        return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, of_pose, keyframe), requests)
-
-    def _agreeing(self, obs: Observation, best: Candidate) -> tuple[float, float]:
-        """The keypoints that agree, by the confidence of the pose that placed each, and their share of those seen."""
-        keypoints, agrees = self.known.keypoints(obs), best.hypothesis.inliers
-        return self.map.confidence[agrees].sum(), (agrees & keypoints).sum() / max(keypoints.sum(), 1)
+        if not told and verdict.status is Status.TRACKED:
+            verdict = replace(verdict, status=Status.DEGRADED, reason=_UNTOLD)
+        return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, keyframe), requests)
 
     def _doubted(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
         """A pose from what contradicts itself: neither map nor surface learns from it, and no track is rejected."""
         self.life = self.life.with_pose(best.T_cam_obj, obs.frame.time_s, verdict.status, best.lead, doubted=True)
         self.model.settle_surface()
-        of_pose = self._of_pose(best.T_cam_obj, self._covariance(obs, best), best)
-        sure = min(confidence(of_pose, *self._agreeing(obs, best)), DOUBTED)
-        return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, of_pose, False))
+        covariance, sure = self._belief(obs, best, self._told(obs, best), DOUBTED)(best.T_cam_obj)
+        return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, False))
+
+    def _belief(self, obs: Observation, best: Candidate, told: bool, most: float) -> Belief:
+        """What a pose is worth that rests on this; asked before a keyframe changes the rows of the map.
+
+        most  the confidence at most
+        """
+        keypoints, agrees, free = self.known.keypoints(obs), best.hypothesis.inliers, best.refined.free_rotations
+        of_frame, support = self._covariance(obs, best), self.map.confidence[agrees].sum()
+        agreement = (agrees & keypoints).sum() / max(keypoints.sum(), 1)
+
+        def belief(T_cam_obj: np.ndarray) -> tuple[np.ndarray, float]:
+            accumulated_rad = self.model.views.accumulated_rad(T_cam_obj)
+            covariance = pose_covariance(of_frame, self.model.covariance, free, accumulated_rad, told)
+            return covariance, min(confidence(covariance, support, agreement), most)
+
+        return belief
+
+    def _told(self, obs: Observation, best: Candidate) -> bool:
+        """Whether the texture at the points that agree tells every turn that the shape leaves free."""
+        p_cam, camera = obs.p_cam[best.hypothesis.inliers], self.observer.camera
+        least, needed = self.config.tracking.textureless_contrast, self.config.lifecycle.return_inliers
+        turns = best.refined.free_rotations
+        found = [contrast_along(obs.frame, camera, best.T_cam_obj, p_cam, turn) >= least for turn in turns]
+        return not self._gates or all(textured.sum() >= needed for textured in found)
 
     def _covariance(self, obs: Observation, best: Candidate) -> np.ndarray:
         """(6, 6) of the pose relative to the map, right tangent of T_cam_obj."""
         if best.refined.covariance is not None:
             return best.refined.covariance
         return registration.covariance(best.hypothesis, self.map.p_obj, obs.p_cam, self.observer.noise_m(obs.p_cam))
-
-    def _of_pose(self, T_cam_obj: np.ndarray, of_frame: np.ndarray, best: Candidate) -> np.ndarray:
-        """(6, 6) of the pose, with what the map itself may be wrong by."""
-        accumulated_rad = self.model.views.accumulated_rad(T_cam_obj)
-        return pose_covariance(of_frame, self.model.covariance, best.refined.free_rotations, accumulated_rad)
 
     def _sample(self, obs: Observation) -> NewPoints:
         """New points where the objective wants them."""

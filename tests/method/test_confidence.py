@@ -55,6 +55,14 @@ def test_drift_is_a_share_of_the_accumulated_rotation_along_what_is_free():
     assert not pose_covariance(nothing, nothing, np.zeros((0, 6)), 3.0).any()
 
 
+def test_a_turn_that_neither_shape_nor_texture_tells_is_hardly_known():
+    spin, nothing = np.array([[0, 0, 1.0, 0.05, 0, 0]]), np.zeros((6, 6))
+    known = 1e-4 * np.eye(6)
+    told, untold = (pose_covariance(known, nothing, spin, 0.0, told) for told in (True, False))
+    assert np.degrees(np.sqrt(untold[2, 2])) > 30 and confidence(untold, 20, 1.0) < 0.5 < confidence(told, 20, 1.0)
+    np.testing.assert_allclose(untold[:2, :2], told[:2, :2])
+
+
 def test_frame_and_map_add_up():
     frame, of_map = np.diag([1.0, 2, 3, 4, 5, 6]), np.diag([6.0, 5, 4, 3, 2, 1])
     together = pose_covariance(frame, of_map, np.zeros((0, 6)), 0.0)

@@ -529,6 +529,20 @@ def test_points_that_a_doubtful_pose_placed_count_less():
     assert one.see(turned(3)).estimate.confidence > other.see(turned(3)).estimate.confidence + 0.02
 
 
+def test_a_turn_that_neither_shape_nor_texture_tells_is_said(monkeypatch):
+    """As of a plain tin: its pose is degraded and hardly sure, and goes on all the same. A print tells the turn."""
+    lump, inner = settled(begun(), [2]), refinement.refine
+    spin = np.array([[0, 0, 1.0, 0, 0, 0]])
+    monkeypatch.setattr(refinement, "refine", lambda *a, **k: replace(inner(*a, **k), free_rotations=spin))
+    plain = lump.see(turned(3)).estimate
+    assert plain.status is Status.DEGRADED and "turn" in plain.reason and plain.confidence < 0.5
+    assert np.degrees(np.sqrt(plain.covariance[2, 2])) > 30
+    obs = lump.observed(turned(4))
+    printed = np.random.default_rng(0).integers(0, 255, obs.frame.rgb.shape, np.uint8)
+    told = lump.tracker.step(replace(obs, frame=replace(obs.frame, rgb=printed))).estimate
+    assert told.status is Status.TRACKED and told.confidence > 0.8
+
+
 def test_the_covariance_of_refinement_goes_before_that_of_the_keypoints():
     lump = settled(begun(), [2])
     obs, known = lump.observed(turned(3)), np.diag([1.0, 2, 3, 4, 5, 6])
