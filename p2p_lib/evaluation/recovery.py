@@ -1,7 +1,8 @@
 """Recovery after complete occlusion, as the paper's recovery experiment counts it.
 
 An event is a stretch of at least ten frames in which an object that was seen before is not visible, followed
-by one in which it is. The object is recovered at the first visible frame whose ADD-S is at most 2 cm.
+by one in which it is. The object is recovered at the first visible frame whose ADD-S is at most 2 cm. What has not been
+right before is not recovered: a map that was begun after the absence says nothing of how the object has moved since.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def recovery_events(obj: ObjectRun, score: ObjectScore) -> list[RecoveryEvent]:
     ends = np.append(after[1:], len(obj))
     events = []
     for last, first, end in zip(before, after, ends):
-        good = np.flatnonzero(adds_m[first:end] <= MAX_ADDS_M)
+        good = np.flatnonzero(adds_m[first:end] <= MAX_ADDS_M) if (adds_m[:first] <= MAX_ADDS_M).any() else ()
         returned = int(obj.frame_index[first])
         delay = int(obj.frame_index[first + good[0]]) - returned if len(good) else None
         events.append(RecoveryEvent(int(obj.frame_index[last]) + 1, returned, delay))

@@ -70,6 +70,13 @@ def test_a_wrong_pose_is_no_recovery():
     assert events_of(visible, visible, wrong=range(40, 46))[0].frames_to_recovery == 6
 
 
+def test_what_was_never_right_before_is_not_recovered():
+    """Two absences, and an object whose map begins after the first: that one is no recovery, the second is."""
+    visible = spans(120, (20, 40), (80, 95))
+    found = visible & (np.arange(120) >= 40)
+    assert delays(events_of(visible, found)) == [None, 0]
+
+
 def test_first_sight_and_last_sight_are_no_returns():
     visible = spans(60, (0, 20), (45, 60))
     assert events_of(visible, visible) == []
