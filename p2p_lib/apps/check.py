@@ -6,14 +6,11 @@ milliseconds, masks that hold the table too, objects without anything to track.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -30,7 +27,6 @@ from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.prompts import prompts_by_frame
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.method.sampling import choose, usable_region
-from p2p_lib.synthetic.faults import spoil
 
 #: Frames that are looked at, evenly spread.
 FRAMES = 12
@@ -128,13 +124,6 @@ def check_folder(
         findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in own]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
     return findings
-
-
-def check_spoilt(folder: str | Path, fault: str, **options: Any) -> list[Finding]:
-    """What :func:`check_folder` finds in a copy of a folder with a fault of :mod:`p2p_lib.synthetic.faults` put in."""
-    with tempfile.TemporaryDirectory() as home:
-        copy = shutil.copytree(folder, Path(home) / Path(folder).name)
-        return check_folder(spoil(copy, fault), **options)
 
 
 def as_lines(findings: Iterable[Finding]) -> str:

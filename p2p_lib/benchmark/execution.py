@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from multiprocessing.connection import wait
 from multiprocessing.context import BaseContext
 from pathlib import Path
@@ -21,7 +22,7 @@ import numpy as np
 
 from p2p_lib.benchmark.jobs import Job, library_version, open_planned
 from p2p_lib.benchmark.outcome import Outcome, run_path
-from p2p_lib.benchmark.scoring import scored
+from p2p_lib.benchmark.scoring import chamfer, fault_done, scored
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
 from p2p_lib.core.files import replace_text
 from p2p_lib.core.packages import PIP, command
@@ -64,7 +65,8 @@ def _poses(job: Job, out: Path) -> Outcome:
         if result.interrupted:
             raise KeyboardInterrupt
         done = load_run(unfinished)
-        outcome = scored(done, sequence if job.chamfer or job.sequence.fault else None, job.models, job.key)
+        judge = fault_done if job.sequence.fault else chamfer if job.chamfer else None
+        outcome = scored(done, job.models, judge and partial(judge, done, sequence, job.models), job.key)
         times = _times(done, cpu_s) | {"width_px": sequence.camera.width}
         outcome = outcome.model_copy(update={"times": times, "ran": outcome.ran | {"library": library_version()}})
         shutil.rmtree(run_path(out, job.key), ignore_errors=True)

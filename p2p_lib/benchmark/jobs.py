@@ -26,10 +26,10 @@ from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets import checkpoints, manifests
-from p2p_lib.datasets.faulty import Faulty
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.resized import Resized
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
+from p2p_lib.synthetic.faults import Faulty
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 # What only shows results cannot change them.

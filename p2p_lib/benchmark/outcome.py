@@ -23,7 +23,7 @@ class ObjectOutcome(_Record):
     first, all  ``add_m`` and ``adds_m`` in metres by either alignment, infinite where there was no pose
     returns     frames from each return after complete occlusion to a good pose; None where it never came
     chamfer_cm  by form; empty with the reason where there is none. ``reference`` says against which surface
-    fault       what a fault did (:class:`p2p_lib.evaluation.faults.FaultScore`); empty where the plan has none
+    fault       what a fault did (:mod:`p2p_lib.evaluation.faults`); empty where the plan has none
     """
 
     lost: int

@@ -61,7 +61,7 @@ class Method(_Strict):
 
 
 class PlannedFault(_Strict):
-    """A fault of :data:`p2p_lib.datasets.faulty.FAULTS`.
+    """A fault of :data:`p2p_lib.synthetic.faults.FAULTS`.
 
     severity  in the unit that it says
     when      in the frames that the sequence says, in all, or in the first one

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,25 +15,30 @@ from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, Scope
 from p2p_lib.benchmark.rows import MEAN, MEAN_OF_ONE, Row, result_rows
 from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingData
-from p2p_lib.datasets.faulty import Faulty
 from p2p_lib.datasets.models import MESHES, find_models, given_models, read_mesh
 from p2p_lib.datasets.runs import Run, load_run
-from p2p_lib.datasets.sequence import Sequence, open_sequence
+from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation import reconstruction
 from p2p_lib.evaluation.faults import fault_score, mesh_off_share
 from p2p_lib.evaluation.protocol import ObjectScore, evaluate
 
+if TYPE_CHECKING:
+    import trimesh
+
+    from p2p_lib.synthetic.faults import Faulty
+
 #: What of ``run.json`` an outcome repeats.
 RAN = ("tracker", "detector", "masks", "segmenter", "preset", "frames", "commit", "modified", "versions")
 Models = Mapping[str, str | Path]
+#: Fields of the outcome of an object of this name and score.
+Judge = Callable[[str, ObjectScore], dict[str, Any]]
 
 
-def scored(done: Run, sequence: Sequence | None, models: Models, key: str = "") -> Outcome:
-    """A run's errors by both alignments, its returns, and with a sequence what is said of its surfaces.
+def scored(done: Run, models: Models, judge: Judge | None, key: str = "") -> Outcome:
+    """A run's errors by both alignments, its returns, and what ``judge`` says of each object besides.
 
     models  object to model file, over those that the run was made with
-
-    Of a sequence with a fault that is what the fault did, else the Chamfer distance.
+    judge   :func:`chamfer` or :func:`fault_done` of the run
     """
     first, over_all = (evaluate(done, models, align) for align in ("first", "all"))
     objects = {}
@@ -42,7 +48,7 @@ def scored(done: Run, sequence: Sequence | None, models: Models, key: str = "") 
             first=_errors(score),
             all=_errors(over_all.objects[name]),
             returns=[event.frames_to_recovery for event in score.returns],
-            **(_reconstruction(done, sequence, models, name, score) if sequence else {}),
+            **(judge(name, score) if judge else {}),
         )
     ran = {key: done.info.get(key) for key in RAN}
     return Outcome(key=key, status="done", ran=ran, objects=objects, left_out=first.left_out)
@@ -56,12 +62,10 @@ def run_rows(folder: str | Path, models: Models | None = None) -> list[Row]:
     done, models = load_run(folder), models or {}
     name, seed = done.info["sequence"], done.info["seed"]
     try:
-        sequence = open_sequence(done.info.get("path") or name, done.info["format"], seed=seed)
-        outcome = scored(done, sequence, models)
+        outcome = scored(done, models, partial(chamfer, done, reopen(done.info), models))
     except MissingData as error:
-        outcome = scored(done, None, models)
-        objects = {n: o.model_copy(update={"no_chamfer": str(error)}) for n, o in outcome.objects.items()}
-        outcome = outcome.model_copy(update={"objects": objects})
+        gone = {"no_chamfer": str(error)}
+        outcome = scored(done, models, lambda name, score: gone)
     method = Method(name=str(done.info["tracker"]))
     scope = Scope(seeds=[seed], sequence=[PlannedSequence(name=name)])
     plan = Plan(name="run", title="one run", method=[method], quick=scope, full=scope)
@@ -69,27 +73,35 @@ def run_rows(folder: str | Path, models: Models | None = None) -> list[Row]:
     return [row | {"sequence": MEAN_OF_ONE} if row["sequence"] == MEAN else row for row in rows]
 
 
-def _errors(score: ObjectScore) -> dict[str, list[float]]:
-    return {"adds_m": score.adds_m.tolist(), "add_m": score.add_m.tolist()}
-
-
-def _reconstruction(done: Run, sequence: Sequence, models: Models, name: str, score: ObjectScore) -> dict[str, Any]:
-    """The fields of an outcome on the reconstruction."""
-    mesh, posed = done.path / "meshes" / f"{name}.ply", np.isfinite(score.T_obj_model).all()
-    surface = read_mesh(mesh) if mesh.is_file() and posed else None
-    if isinstance(sequence, Faulty):
-        off = float("nan")
-        if surface is not None:
-            true = reconstruction.dense(_true_model(done, sequence, models, name))
-            off = mesh_off_share(surface, score.T_obj_model, true)
-        found = fault_score(done.objects[name], score.T_obj_model, done.points[name], sequence.during, off)
-        return {"fault": found.as_dict()}
-    if surface is None:
-        return {"no_chamfer": "no pose, so no model frame" if mesh.is_file() else "no surface was reconstructed"}
+def chamfer(done: Run, sequence: Sequence, models: Models, name: str, score: ObjectScore) -> dict[str, Any]:
+    """The Chamfer distance of an object's surface, or why there is none."""
+    surface = _surface(done, name)
+    posed = np.isfinite(score.T_obj_model).all()
+    if surface is None or not posed:
+        return {"no_chamfer": "no surface was reconstructed" if surface is None else "no pose, so no model frame"}
     model = _true_model(done, sequence, models, name)
     truth, reference = reconstruction.seen_surface(sequence, name, model, score.frame_index)
     chamfer_cm = reconstruction.chamfer_cm(surface, se3.inverse(score.T_obj_model), truth)
     return {"chamfer_cm": chamfer_cm, "reference": reference, "no_chamfer": "" if chamfer_cm else "nothing near it"}
+
+
+def fault_done(done: Run, sequence: Faulty, models: Models, name: str, score: ObjectScore) -> dict[str, Any]:
+    """What the fault of a sequence did to an object, and to its surface: NaN without one."""
+    surface, off = _surface(done, name), float("nan")
+    if surface is not None and np.isfinite(score.T_obj_model).all():
+        true = reconstruction.dense(_true_model(done, sequence, models, name))
+        off = mesh_off_share(surface, score.T_obj_model, true)
+    found = fault_score(done.objects[name], score.T_obj_model, done.points[name], sequence.during)
+    return {"fault": found | {"mesh_off": off}}
+
+
+def _errors(score: ObjectScore) -> dict[str, list[float]]:
+    return {"adds_m": score.adds_m.tolist(), "add_m": score.add_m.tolist()}
+
+
+def _surface(done: Run, name: str) -> trimesh.Trimesh | None:
+    mesh = done.path / "meshes" / f"{name}.ply"
+    return read_mesh(mesh) if mesh.is_file() else None
 
 
 def _true_model(done: Run, sequence: Sequence, models: Models, name: str) -> Path | np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,35 +21,16 @@ FAR_M = 0.05
 GOOD_M, OFF_M = 0.02, 0.01
 
 
-@dataclass(frozen=True)
-class FaultScore:
-    """What a fault did to one object.
-
-    frames       with truth, from the fault's first on: lies are counted over all of them, hidden or not
-    lies_in      of them in the fault, and lies_after
-    longest      the longest stretch of lies
-    until_good   frames in view from the fault's end until a pose is good; infinite where none is
-    mesh_off     share of the mesh's vertices that are off the true surface; NaN without a mesh
-    """
-
-    frames: int
-    lies_in: int
-    lies_after: int
-    longest: int
-    until_good: float
-    mesh_off: float = float("nan")
-
-    def as_dict(self) -> dict[str, float]:
-        """Plain values."""
-        return asdict(self)
-
-
 def fault_score(
-    obj: ObjectRun, T_obj_model: np.ndarray, points: np.ndarray, during: tuple[int, int], mesh_off: float = float("nan")
-) -> FaultScore:
-    """The score of an object in a run with a fault in its frames from, to (``during``); points (V, 3) of its model.
+    obj: ObjectRun, T_obj_model: np.ndarray, points: np.ndarray, during: tuple[int, int]
+) -> dict[str, float]:
+    """What a fault in the frames from, to (``during``) did to an object; points (V, 3) of its model.
 
     T_obj_model  (4, 4) where the model lies in the object frame; NaN where there was never a pose
+
+    ``frames`` with truth, from the fault's first on: ``lies_in`` the fault and ``lies_after`` are counted over all of
+    them, hidden or not; ``longest`` stretch of lies; ``until_good``, frames in view from the fault's end until a pose
+    is good: infinite where none is.
     """
     add_m = metrics.add_m(obj.T_cam_obj @ T_obj_model, obj.T_cam_model, points)
     since, after = obj.frame_index >= during[0], obj.frame_index >= during[1]
@@ -58,8 +38,13 @@ def fault_score(
     in_view = after & scored_frames(obj)
     good = np.flatnonzero(add_m[in_view] < GOOD_M)
     until_good = float(good[0]) if len(good) else float("inf" if in_view.any() else "nan")
-    counts = int((since & obj.has_truth).sum()), int((lies & ~after).sum()), int((lies & after).sum())
-    return FaultScore(*counts, longest_run(lies), until_good, mesh_off)
+    return {
+        "frames": int((since & obj.has_truth).sum()),
+        "lies_in": int((lies & ~after).sum()),
+        "lies_after": int((lies & after).sum()),
+        "longest": longest_run(lies),
+        "until_good": until_good,
+    }
 
 
 def longest_run(flags: np.ndarray) -> int:

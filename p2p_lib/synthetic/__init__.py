@@ -4,7 +4,7 @@
 at :mod:`~p2p_lib.synthetic.scenarios`: every scenario by name. One is made in ``absences``, ``ablations`` or
 ``paper_subset`` of ``scene`` (bodies, room, camera), ``shapes``, ``solids`` and ``labels`` (meshes and their print) and
 ``motion`` (paths). ``render`` draws it with ``texture`` and ``environment``, ``noise`` is what a real sensor makes of
-that, ``generate`` writes the folder. ``faults`` spoils a recorded folder, for ``p2p check``.
+that, ``generate`` writes the folder. ``faults`` are what goes wrong in any sequence, recorded or not.
 """
 
 from p2p_lib.synthetic.generate import scenario_dir, write_sequence

@@ -1,108 +1,331 @@
-"""What goes wrong when one records one's own data, put into a good folder on purpose.
+"""A sequence in which something goes wrong, for a while or throughout: camera, depth or masks fail.
 
-For the tests of ``p2p check`` and for the notebook on own data: each fault of :data:`FAULTS` changes a folder as
-:func:`p2p_lib.datasets.folder.write` makes it, in place. What fails for a while is in :mod:`p2p_lib.datasets.faulty`.
+For what tracking is worth then, and for what ``p2p check`` finds. Each fault of :data:`FAULTS` is a function of what a
+camera and a segmenter deliver, with a severity in the unit that its line says; equal seeds give equal faults.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.sequence import ObjectTruth, Sequence
+
+Masks = dict[str, np.ndarray]
+#: Readings that no depth camera should give.
+_WILD_M = np.array([1e15, 9e3, 30.0, 0.05, -1.0, np.inf, np.nan])
+#: A board passes at this share of the way to the nearest object.
+_BOARD_SHARE = 0.7
+#: After a cut to a turned view so many frames are left.
+_LEFT = 60
 
 
-def spoil(folder: str | Path, fault: str) -> Path:
-    """Put a fault of :data:`FAULTS` into a folder; :class:`BadInput` for an unknown one."""
-    if fault not in FAULTS:
-        raise BadInput("fault", repr(fault), "one of " + ", ".join(FAULTS))
-    FAULTS[fault](Path(folder))
-    return Path(folder)
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """When a fault acts: at frame ``index`` of the original, within its frames ``start`` to ``stop``."""
+
+    original: Sequence
+    index: int
+    start: int
+    stop: int
+    severity: float
+    seed: int
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Another one for each frame."""
+        return np.random.default_rng([self.seed, self.index])
+
+    @property
+    def before(self) -> int:
+        """The frame before all of it."""
+        return max(self.start - 1, 0)
 
 
-def _images(pattern: str, change: Callable[[np.ndarray, list[np.ndarray]], np.ndarray]) -> Callable[[Path], None]:
-    """Rewrites the images that fit a pattern, each as a function of itself and of its frame's masks."""
+@dataclass(frozen=True)
+class Fault:
+    """What a fault changes: images and time, masks (copies of the frame's), the camera, or which frames there are.
 
-    def spoil(folder: Path) -> None:
-        for path in folder.glob(pattern):
-            masks = [_read(mask) for mask in (folder / "masks").glob(f"*/{path.name}")]
-            cv2.imwrite(str(path), change(_read(path), masks))
+    shown     the frame whose images and masks are delivered
+    left_out  the frames that are not there, (K,) indices: of the sequence, start, stop and severity
+    """
 
-    return spoil
-
-
-def _numbers(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
-    """Rewrites a text file of numbers as a function of them."""
-    return lambda folder: np.savetxt(folder / name, change(np.loadtxt(folder / name)), fmt="%.6f")
-
-
-def _read(path: Path) -> np.ndarray:
-    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    frame: Callable[[Frame, Moment], Frame] | None = None
+    masks: Callable[[Masks, Moment], Masks] | None = None
+    camera: Callable[[Camera, float], Camera] | None = None
+    shown: Callable[[Moment], int] = lambda at: at.index
+    left_out: Callable[[Sequence, int, int, float], np.ndarray] | None = None
 
 
-def _scaled(depth: np.ndarray, _: list[np.ndarray]) -> np.ndarray:
-    factor = np.random.default_rng(int(depth.sum())).uniform(0.85, 1.15)  # another one in every image
-    return np.rint(depth * factor).astype(depth.dtype)
+@dataclass(frozen=True, eq=False)
+class Faulty:
+    """A :class:`~p2p_lib.datasets.sequence.Sequence` with a fault in its frames ``start`` to ``stop`` (None: the end).
+
+    Truth and ``visible_px`` stay the original's, so that the same frames are scored. Where frames are left out, those
+    that remain are counted anew.
+    """
+
+    original: Sequence
+    fault: str
+    severity: float = 1.0
+    start: int = 0
+    stop: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.fault not in FAULTS:
+            raise BadInput("fault", repr(self.fault), "one of " + ", ".join(FAULTS))
+        stop = len(self.original) if self.stop is None else self.stop
+        if not 0 <= self.start < stop <= len(self.original):
+            raise BadInput("frames of a fault", f"{self.start} to {stop}", f"some of {len(self.original)}")
+        object.__setattr__(self, "stop", stop)
+
+    @cached_property
+    def kept(self) -> np.ndarray:
+        """The original's frames that are there."""
+        every, left_out = np.arange(len(self.original)), FAULTS[self.fault].left_out
+        if left_out is None:
+            return every
+        return np.setdiff1d(every, left_out(self.original, self.start, self.stop, self.severity))
+
+    @property
+    def during(self) -> tuple[int, int]:
+        """The frames of the fault, from and to, as they are counted here; none of them where all are left out."""
+        first, end = np.searchsorted(self.kept, (self.start, self.stop))
+        return int(first), int(end)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera as it is said to be."""
+        change = FAULTS[self.fault].camera
+        return change(self.original.camera, self.severity) if change else self.original.camera
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """Of the frames that are there."""
+        return self.original.times_s[self.kept]
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Of the frames that are there."""
+        return tuple(self.original.frame_names[i] for i in self.kept)
+
+    @property
+    def truth(self) -> dict[str, ObjectTruth]:
+        """The original's, of the frames that are there."""
+        known = self.original.truth.items()
+        return {name: ObjectTruth(of.T_cam_model[self.kept], of.labelled[self.kept]) for name, of in known}
+
+    def frame(self, i: int) -> Frame:
+        """The i-th image with the fault, where it acts."""
+        at, fault = self._moment(i)
+        frame = self.original.frame(fault.shown(at))
+        frame = replace(frame, index=i, time_s=float(self.original.times_s[at.index]))
+        return fault.frame(frame, at) if fault.frame else frame
+
+    def masks(self, i: int) -> Masks | None:
+        """The masks at frame i with the fault, where it acts."""
+        at, fault = self._moment(i)
+        masks = self.original.masks(fault.shown(at))
+        return fault.masks(masks, at) if fault.masks and masks is not None else masks
+
+    def visible_px(self, i: int) -> dict[str, int] | None:
+        """The original's."""
+        return self.original.visible_px(int(self.kept[i]))
+
+    def _moment(self, i: int) -> tuple[Moment, Fault]:
+        """What frame i is of the original, and the fault that acts there."""
+        at = Moment(self.original, int(self.kept[i]), self.start, self.stop, self.severity, self.seed)
+        return at, FAULTS[self.fault if self.start <= at.index < self.stop else "none"]
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
+    def __getattr__(self, name: str) -> Any:
+        """The original's name, objects and models."""
+        return getattr(self.original, name)
 
 
-def _repeated(folder: Path) -> None:
-    for kind in ("rgb", "depth"):
-        files = sorted((folder / kind).iterdir())
-        for a, b in zip(files[::2], files[1::2]):
-            b.write_bytes(a.read_bytes())
+def _depth(change: Callable[[np.ndarray, Moment], np.ndarray]) -> Fault:
+    """Changes depth (H, W) in metres."""
+
+    def faulty(frame: Frame, at: Moment) -> Frame:
+        return replace(frame, depth_m=change(frame.depth_m, at).astype(np.float32))
+
+    return Fault(frame=faulty)
 
 
-def _wider(depth: np.ndarray, _: list[np.ndarray]) -> np.ndarray:
-    h, w = depth.shape
+def _colour(change: Callable[[np.ndarray, Moment], np.ndarray]) -> Fault:
+    """Changes colour (H, W, 3), 0 to 255."""
+
+    def faulty(frame: Frame, at: Moment) -> Frame:
+        return replace(frame, rgb=np.clip(np.rint(change(frame.rgb, at)), 0, 255).astype(np.uint8))
+
+    return Fault(frame=faulty)
+
+
+def _mask(change: Callable[[np.ndarray, Moment], np.ndarray]) -> Fault:
+    """Changes each object's mask (H, W) bool."""
+    return Fault(masks=lambda masks, at: {name: change(mask, at) for name, mask in masks.items()})
+
+
+def _time(change: Callable[[float, Moment], float]) -> Fault:
+    return Fault(frame=lambda frame, at: replace(frame, time_s=change(frame.time_s, at)))
+
+
+def _where_measured(depth_m: np.ndarray, new_m: np.ndarray | float) -> np.ndarray:
+    return np.where(depth_m > 0, new_m, 0)
+
+
+def _wild(depth_m: np.ndarray, at: Moment) -> np.ndarray:
+    rng = at.rng
+    return np.where(rng.random(depth_m.shape) < at.severity, rng.choice(_WILD_M, depth_m.shape), depth_m)
+
+
+def _wider(depth_m: np.ndarray, at: Moment) -> np.ndarray:
+    h, w = depth_m.shape
     seen = np.array([[0.75, 0, 0.125 * w + 12], [0, 0.75, 0.125 * h]])
-    return cv2.warpAffine(depth, seen, (w, h), flags=cv2.INTER_NEAREST)
+    return cv2.warpAffine(depth_m, seen, (w, h), flags=cv2.INTER_NEAREST)
 
 
-def _plain(image: np.ndarray, masks: list[np.ndarray]) -> np.ndarray:
-    rng = np.random.default_rng(int(image.sum()))  # noise that differs from frame to frame
-    for mask in filter(np.any, masks):
-        wide = cv2.dilate(mask, np.ones((9, 9))) > 0
-        colour = np.median(image[mask > 0], 0) + rng.normal(0, 2.5, (int(wide.sum()), 3))
-        image[wide] = np.clip(colour, 0, 255)
-    return image
+def _plain(rgb: np.ndarray, at: Moment) -> np.ndarray:
+    """Each object in the median of its colours, with noise."""
+    rgb, rng = rgb.astype(float), at.rng
+    for mask in (at.original.masks(at.index) or {}).values():
+        wide = _grown(mask, replace(at, severity=4))
+        if mask.any():
+            rgb[wide] = np.median(rgb[mask], 0) + rng.normal(0, at.severity, (int(wide.sum()), 3))
+    return rgb
 
 
-def _hidden(depth: np.ndarray, masks: list[np.ndarray]) -> np.ndarray:
-    return np.where(np.any(masks, axis=0), 0, depth).astype(depth.dtype)
+def _on_objects(at: Moment) -> np.ndarray:
+    """(H, W) bool: the masks of all objects."""
+    camera = at.original.camera
+    nothing = np.zeros((camera.height, camera.width), bool)
+    return np.logical_or.reduce([nothing, *(at.original.masks(at.index) or {}).values()])
 
 
-#: Fault to what puts it into a folder.
-FAULTS: dict[str, Callable[[Path], None]] = {
-    # Depth in millimetres that is taken for metres.
-    "depth unit": lambda folder: (folder / "depth_scale.txt").write_text("1\n"),
-    # Depth that is right up to a factor, another one in every image: that of a network for single images.
-    "a moving scale": _images("depth/*", _scaled),
-    # Depth in tenths of a millimetre that is taken for millimetres.
-    "ten times as far": _images("depth/*", lambda depth, _: depth * np.uint16(10)),
-    # Depth as a D435's depth camera sees it: a wider view, and 15 mm beside the colour camera.
-    "depth not registered": _images("depth/*", _wider),
-    # Depth and colour of one size and view, 18 px apart.
-    "depth shifted": _images("depth/*", lambda depth, _: np.roll(depth, 18, axis=1)),
-    # The camera matrix of images twice as large.
-    "K of another resolution": _numbers("cam_K.txt", lambda K: K * [[2], [2], [1]]),
-    # The camera matrix of 1280x720, where the images are narrower.
-    "K of another aspect": _numbers("cam_K.txt", lambda K: [[K[0, 0], 0, 639.5], [0, K[1, 1], 359.5], K[2]]),
-    "times in milliseconds": _numbers("times.txt", lambda s: s * 1000),
-    # As those of two recordings put together.
-    "times jump back": _numbers("times.txt", lambda s: np.r_[s[: len(s) // 2], s[len(s) // 2 :] - s[len(s) // 2]]),
-    # Three seconds in which nothing was recorded.
-    "a gap": _numbers("times.txt", lambda s: s + 3 * (np.arange(len(s)) >= len(s) // 2)),
-    # Every frame twice: a recorder that was faster than its camera.
-    "pictures twice": _repeated,
-    # Objects of one plain colour, with the noise of a camera.
-    "no texture": _images("rgb/*", _plain),
-    # Masks drawn 6 px too wide.
-    "wide masks": _images(
-        "masks/*/*.png", lambda mask, _: cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (13, 13)))
+def _shifted(image: np.ndarray, px: float) -> np.ndarray:
+    """An image (H, W) of numbers moved to the right; what comes in is 0."""
+    return cv2.warpAffine(image, np.array([[1.0, 0, px], [0, 1, 0]]), image.shape[::-1], flags=cv2.INTER_NEAREST)
+
+
+def _moved(mask: np.ndarray, at: Moment) -> np.ndarray:
+    return _shifted(mask.astype(np.uint8), at.severity) > 0
+
+
+def _grown(mask: np.ndarray, at: Moment) -> np.ndarray:
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(at.severity) + 1,) * 2)
+    return cv2.dilate(mask.astype(np.uint8), disk) > 0
+
+
+def _left_part(mask: np.ndarray, at: Moment) -> np.ndarray:
+    """Without a share of its columns, the right ones."""
+    columns = np.flatnonzero(mask.any(0))
+    return mask & (np.arange(mask.shape[1]) < np.quantile(columns, 1 - at.severity)) if len(columns) else mask
+
+
+def _flickering(mask: np.ndarray, at: Moment) -> np.ndarray:
+    return mask & bool((at.index - at.start) % 2)
+
+
+def _board(frame: Frame, at: Moment) -> Frame:
+    """A board as wide as a share of the image, before the objects, from the left to the right; no mask knows of it."""
+    h, w = frame.shape
+    objects = _on_objects(at)
+    behind = frame.depth_m[(objects if objects.any() else True) & (frame.depth_m > 0)]
+    near_m = _BOARD_SHARE * np.percentile(behind, 5) if len(behind) else 0.3
+    wide = max(int(at.severity * w), 1)
+    left = round((at.index - at.start + 0.5) / (at.stop - at.start) * (w + wide)) - wide
+    grain = np.random.default_rng(at.seed).integers(90, 170, (h // 8 + 1, wide // 8 + 1, 3), np.uint8)
+    texture = cv2.resize(grain, (wide, h))
+    seen = np.arange(max(left, 0), min(left + wide, w))
+    rgb, depth_m = frame.rgb.copy(), frame.depth_m.copy()
+    rgb[:, seen], depth_m[:, seen] = texture[:, seen - left], near_m
+    return replace(frame, rgb=rgb, depth_m=depth_m)
+
+
+def _until_turned(sequence: Sequence, start: int, stop: int, severity: float) -> np.ndarray:
+    """The frames from ``start`` to where the first object with a truth is turned most, of those with 60 after them."""
+    for truth in sequence.truth.values():
+        seen = truth.labelled & np.isfinite(truth.T_cam_model).all((1, 2))
+        seen[: start + 1], seen[max(len(sequence) - _LEFT, 0) :] = False, False
+        if seen.any():
+            T_last = truth.T_cam_model[max(start - 1, 0)]
+            turned_rad = se3.angle_rad(se3.inverse(T_last) @ truth.T_cam_model[seen])
+            return np.arange(start, np.flatnonzero(seen)[turned_rad.argmax()])
+    return np.arange(start, stop)
+
+
+#: Fault to what it does, with the unit of its severity where it has one.
+FAULTS: dict[str, Fault] = {
+    "none": Fault(),
+    # Depth as it was before all of it.
+    "depth frozen": _depth(lambda depth_m, at: at.original.frame(at.before).depth_m),
+    # A factor.
+    "depth scaled": _depth(lambda depth_m, at: depth_m * at.severity),
+    # Another factor in every image, which differs from 1 by so much at most: a network for single images.
+    "depth scaled anew": _depth(lambda depth_m, at: depth_m * at.rng.uniform(1 - at.severity, 1 + at.severity)),
+    # Metres.
+    "depth offset": _depth(lambda depth_m, at: _where_measured(depth_m, np.maximum(depth_m + at.severity, 0))),
+    # Pixels to the right.
+    "depth misaligned": _depth(lambda depth_m, at: _shifted(depth_m, at.severity)),
+    # As a D435's depth camera sees it: a wider view, and 15 mm beside the colour camera.
+    "depth not registered": _depth(_wider),
+    # Standard deviation, metres.
+    "depth noise": _depth(lambda z, at: _where_measured(z, np.abs(z + at.rng.normal(0, at.severity, z.shape)))),
+    # A share of the pixels.
+    "depth holes": _depth(lambda z, at: np.where(at.rng.random(z.shape) < at.severity, 0, z)),
+    "depth wild": _depth(_wild),
+    # Dark, shiny, transparent.
+    "depth missing on objects": _depth(lambda depth_m, at: np.where(_on_objects(at), 0, depth_m)),
+    "colour frozen": _colour(lambda rgb, at: at.original.frame(at.before).rgb),
+    "colour black": _colour(lambda rgb, at: np.zeros_like(rgb)),
+    # Standard deviation of the blur, pixels.
+    "colour blurred": _colour(lambda rgb, at: cv2.GaussianBlur(rgb, (0, 0), at.severity)),
+    # Standard deviation, grey levels.
+    "colour noise": _colour(lambda rgb, at: rgb + at.rng.normal(0, at.severity, rgb.shape)),
+    # Grey levels of red more and of blue less.
+    "colour cast": _colour(lambda rgb, at: rgb + at.severity * np.array([1.0, 0, -1])),
+    # Standard deviation of a camera's noise on objects of one colour, grey levels.
+    "colour plain on objects": _colour(_plain),
+    # A factor.
+    "exposure": _colour(lambda rgb, at: rgb * at.severity),
+    # Pixels to all sides.
+    "mask wide": _mask(_grown),
+    "mask whole image": _mask(lambda mask, at: np.ones_like(mask)),
+    "mask empty": _mask(lambda mask, at: np.zeros_like(mask)),
+    # Empty in every second frame.
+    "mask flickers": _mask(_flickering),
+    # Pixels to the right.
+    "mask misplaced": _mask(_moved),
+    # The share that is missing.
+    "mask cut": _mask(_left_part),
+    # The share of the image that the board is wide.
+    "board unmasked": Fault(frame=_board),
+    "frames black": Fault(
+        frame=lambda frame, at: replace(frame, rgb=np.zeros_like(frame.rgb), depth_m=np.zeros_like(frame.depth_m))
     ),
-    # Objects that the depth camera does not see: dark, shiny, transparent.
-    "no depth on the objects": _images("depth/*", _hidden),
+    "frames frozen": Fault(shown=lambda at: at.before),
+    # Each frame twice: a recorder that was faster than its camera.
+    "frames twice": Fault(shown=lambda at: at.index - (at.index - at.start) % 2),
+    "frames dropped": Fault(left_out=lambda sequence, start, stop, severity: np.arange(start, stop)),
+    # The share of the frames that is missing, evenly.
+    "frames thinned": Fault(left_out=lambda sequence, start, stop, by: np.arange(start, stop, 1 / by).astype(int)),
+    # Until the object shows another side.
+    "frames dropped, turned": Fault(left_out=_until_turned),
+    # Seconds.
+    "time shifted": _time(lambda time_s, at: time_s + at.severity),
+    "time standing": _time(lambda time_s, at: float(at.original.times_s[at.before])),
+    # A factor of both focal lengths; of the whole run, wherever the fault acts.
+    "focal length off": Fault(camera=lambda camera, by: replace(camera, fx=camera.fx * by, fy=camera.fy * by)),
 }

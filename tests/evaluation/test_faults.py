@@ -33,23 +33,23 @@ def score(obj, during=(5, 10)):
 
 def test_a_lie_is_sure_and_far_off():
     found = score(run_with({6: 0.06, 7: 0.06, 10: 0.07, 12: 0.04}))
-    assert (found.lies_in, found.lies_after, found.longest, found.frames) == (2, 1, 2, 15)
-    assert score(run_with({6: 0.06}, confidence=0.5)).lies_in == 0, "who doubts does not lie"
-    assert score(run_with({2: 0.5})).lies_in == 0, "before the fault"
-    assert score(run_with({6: 0.06, 7: 0.06, 8: 0.06}, lost=(7,))).longest == 1
+    assert found == {"frames": 15, "lies_in": 2, "lies_after": 1, "longest": 2, "until_good": 1}
+    assert score(run_with({6: 0.06}, confidence=0.5))["lies_in"] == 0, "who doubts does not lie"
+    assert score(run_with({2: 0.5}))["lies_in"] == 0, "before the fault"
+    assert score(run_with({6: 0.06, 7: 0.06, 8: 0.06}, lost=(7,)))["longest"] == 1
 
 
 def test_good_again_counts_frames_in_view():
-    assert score(run_with({})).until_good == 0
-    assert score(run_with(dict.fromkeys(range(5, 14), 0.03))).until_good == 4
-    assert score(run_with({}, lost=tuple(range(5, 13)))).until_good == 3
-    assert score(run_with(dict.fromkeys(range(5, 20), 0.03))).until_good == np.inf
-    assert np.isnan(score(run_with({}), during=(0, 20)).until_good), "nothing comes after it"
+    assert score(run_with({}))["until_good"] == 0
+    assert score(run_with(dict.fromkeys(range(5, 14), 0.03)))["until_good"] == 4
+    assert score(run_with({}, lost=tuple(range(5, 13))))["until_good"] == 3
+    assert score(run_with(dict.fromkeys(range(5, 20), 0.03)))["until_good"] == np.inf
+    assert np.isnan(score(run_with({}), during=(0, 20))["until_good"]), "nothing comes after it"
 
 
 def test_never_a_pose_is_no_lie():
     found = fault_score(run_with({}, lost=tuple(range(20))), np.full((4, 4), np.nan), POINTS, (5, 10))
-    assert (found.lies_in, found.lies_after, found.until_good) == (0, 0, np.inf)
+    assert (found["lies_in"], found["lies_after"], found["until_good"]) == (0, 0, np.inf)
 
 
 @pytest.mark.parametrize(("flags", "longest"), [([], 0), ([0, 0], 0), ([1, 1, 0, 1, 1, 1], 3), ([1], 1)])

@@ -1,12 +1,13 @@
 """Each fault does what it says, within its frames alone, and the same for the same seed."""
 
+import cv2
 import numpy as np
 import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
-from p2p_lib.datasets.faulty import FAULTS, Faulty
 from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.synthetic.faults import FAULTS, Faulty
 from tests.fixtures.sliding_board import write_sequence
 
 START, STOP, FRAMES = 3, 6, 10
@@ -14,7 +15,7 @@ START, STOP, FRAMES = 3, 6, 10
 SEVERITY = {"colour blurred": 3.0, "colour noise": 20.0, "colour cast": 40.0, "mask wide": 6.0, "mask misplaced": 10.0}
 SEVERITY |= {"depth scaled": 1.2, "depth offset": 0.1, "depth misaligned": 7.0, "depth noise": 0.02, "depth holes": 0.9}
 SEVERITY |= {"depth wild": 0.5, "exposure": 0.5, "mask cut": 0.5, "board unmasked": 0.4, "frames thinned": 0.5}
-SEVERITY |= {"time shifted": -10.0, "focal length off": 1.15}
+SEVERITY |= {"time shifted": -10.0, "focal length off": 1.15, "depth scaled anew": 0.15, "colour plain on objects": 2.5}
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +55,25 @@ def test_depth(good):
     np.testing.assert_allclose(at["depth scaled"], 1.2 * now, rtol=1e-6)
     np.testing.assert_allclose(at["depth offset"], now + 0.1, rtol=1e-6)
     np.testing.assert_array_equal(at["depth misaligned"][:, 7:], now[:, :-7])
+    factor = at["depth scaled anew"] / now
+    assert 0.85 <= factor.mean() <= 1.15 and np.ptp(factor) < 1e-6 and factor.mean() != pytest.approx(1, abs=1e-3)
+    assert (at["depth missing on objects"] == np.where(good.masks(4)["object"], 0, now)).all()
+    wider = at["depth not registered"]
+    np.testing.assert_array_equal(wider[15:105:3, 32:128:3], now[::4, ::4][:30, :32])
+    assert (wider[:15] == 0).all() and (wider[:, :32] == 0).all()
     assert np.std(at["depth noise"] - now) == pytest.approx(0.02, rel=0.05)
     assert (at["depth holes"] == 0).mean() == pytest.approx(0.9, abs=0.01)
     assert (at["depth wild"] != now).mean() == pytest.approx(0.5, abs=0.02)
     assert np.isfinite(at["depth wild"]).all(), "what no camera measures is no measurement"
+
+
+def test_plain_objects_are_of_one_colour(good):
+    now, mask = good.frame(4).rgb, good.masks(4)["object"]
+    plain = faulty(good, "colour plain on objects").frame(4).rgb
+    np.testing.assert_allclose(plain[mask].mean(0), np.median(now[mask], 0), atol=0.5)
+    assert plain[mask].std(0).max() < 3 < now[mask].std(0).min()
+    away = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
+    np.testing.assert_array_equal(plain[away], now[away])
 
 
 def test_masks(good):
