@@ -64,7 +64,6 @@ class RunWriter:
         # Of each object one estimate for every frame so far.
         self._estimates: dict[str, list[PoseEstimate]] = {file_name("object name", name): [] for name in names}
         self._pose_files: dict[str, Path] = {}  # those that have been written
-        self._several_maps: set[str] = set()
         self._frames: list[tuple[int, float]] = []  # index and time of every frame so far
         self._visible_px: list[Mapping[str, int] | None] = []
         self._timing_columns = ["frame_index", "time_s", "total_ms", "keyframe"]
@@ -140,10 +139,8 @@ class RunWriter:
         replace_text(self.path / "config.toml", self._config.to_toml())
         if self._points:
             _save_arrays(self.path / "models.npz", self._points)
-        for name, estimates in self._estimates.items():
+        for name in self._estimates:
             self._write_poses(name)
-            if len({e.map_id for e in estimates}) > 1:
-                self._several_maps.add(name)
         self._write_timings()
         self.begun = True
         self.flush()
@@ -170,7 +167,7 @@ class RunWriter:
             for name, estimates in self._estimates.items():
                 run = ObjectRun.of(name, estimates, self._sequence, self._visible_px)
                 arrays |= {f"{name}/{column}": getattr(run, column) for column in COLUMNS}
-                if name in self._several_maps:
+                if self._several_maps(name):
                     self._write_poses(name)
             _save_arrays(self.path / "poses.npz", arrays)
         self.info |= {"frames": n, "objects": list(self._estimates)}
@@ -233,19 +230,20 @@ class RunWriter:
 
     def _append_last(self) -> None:
         for name, estimates in self._estimates.items():
-            if len({e.map_id for e in estimates[-2:]}) > 1:
-                self._several_maps.add(name)
+            T_cam_obj = estimates[-1].T_cam_obj
             if name not in self._pose_files:
                 self._write_poses(name)  # of an object that nobody announced
-            elif name in self._several_maps:
-                pass  # which map has the most poses is seen at the next flush
-            elif (T_cam_obj := estimates[-1].T_cam_obj) is not None:
+            elif T_cam_obj is not None and not self._several_maps(name):
                 append(self._pose_files[name], tum_line(estimates[-1].time_s, T_cam_obj))
         row = self._timings[-1]
         if row.keys() - set(self._timing_columns):
             self._write_timings()  # with a stage that had not run before
         else:
             append(self.path / "timings.csv", self._csv_line(row))
+
+    def _several_maps(self, name: str) -> bool:
+        """Whether poses of an object are in several maps: which has the most is seen when all are written."""
+        return len({estimate.map_id for estimate in self._estimates[name]}) > 1
 
     def _csv_line(self, row: Mapping[str, str]) -> str:
         return ",".join(row.get(key, "") for key in self._timing_columns) + "\n"

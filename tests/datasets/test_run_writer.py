@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -267,6 +268,18 @@ def test_a_run_goes_on_to_what_it_would_have_been(folder, tmp_path):
     differ = {"run.json", "poses.npz"}  # which hold times of writing
     assert mine.keys() == theirs.keys() and all(mine[name] == theirs[name] for name in mine.keys() - differ)
     assert load_run(out).info["finished"] and load_run(out).info["stopped_by"] is None
+
+
+def test_a_run_that_goes_on_still_knows_its_earlier_map(folder, tmp_path):
+    maps, image = [0, 0, 0, 1, 1, 1, 1, 1], (np.zeros((H, W, 3), np.uint8), np.zeros((H, W), np.float32))
+    for frames, if_exists in ((4, "refuse"), (8, "resume")):
+        with writer(tmp_path / "run", folder, if_exists, objects=("box",)) as made:
+            for i in range(frames):
+                told = replace(estimates(i)["box"], map_id=maps[i])
+                made.add(Frame(i, i / 30, *image), {"box": told}, 10.0)
+            made.info["stopped_by"] = "KeyboardInterrupt" if frames < 8 else None
+        rows = np.loadtxt(tmp_path / "run" / "poses" / "box.txt")
+        np.testing.assert_allclose(rows[:, 0] * 30, [0, 1, 2] if frames < 8 else [3, 4, 5, 6, 7], atol=1e-6)
 
 
 def test_where_it_comes_out_otherwise_nothing_is_lost(folder, tmp_path):
