@@ -36,6 +36,8 @@ from p2p_lib.method.pipeline import Point2Pose
 
 #: So many clicks an object are drawn from its first mask.
 CLICKS = 3
+#: Two frames that take longer did more than track.
+_LONG_START_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -149,8 +151,7 @@ def evaluate_tracker(
     """
     options = replace(options or RunOptions(), **changes)
     config = options.config()
-    if isinstance(sequence, str | Path):
-        sequence = sequences.open_sequence(sequence, options.format, options.depth_scale)
+    sequence = sequences.open_sequence(sequence, options.format, options.depth_scale)
     task = TrackTask.of(sequence, config.seed, options.models, count)
     return task.score(task.tracker(options.tracker, config), search)
 
@@ -166,8 +167,7 @@ def evaluate_poses(
     stop: int | None = None,
 ) -> Evaluation:
     """Score any method's poses (:mod:`p2p_lib.datasets.exchange`) by the rules of a run of ours over these frames."""
-    if isinstance(sequence, str | Path):
-        sequence = sequences.open_sequence(sequence, format)
+    sequence = sequences.open_sequence(sequence, format)
     known = find_models(sequence) | given_models(models or {}, sequence.objects)
     frames = _frame_range(len(sequence), start, stop)
     run = as_run(read_poses(poses, sequence), sequence, known, path=Path(poses), frames=frames)
@@ -193,10 +193,6 @@ def export_run(
     frames = model_frames(run) if in_model else None
     sure = {name: obj.of_confidence(min_confidence) for name, obj in run.objects.items()}
     return export(replace(run, objects=sure), out, format, frames, sequence)
-
-
-#: Two frames that take longer did more than track.
-_LONG_START_S = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,9 +223,8 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
         prompts = load_prompts(prompts)
     prompts = tuple(prompts or ())
     masks = options.mask_source()
-    if isinstance(sequence, str | Path):
-        how = options.format, options.depth_scale, config.seed
-        sequence = sequences.open_sequence(sequence, *how, masks=masks.folder)
+    how = options.format, options.depth_scale, config.seed
+    sequence = sequences.open_sequence(sequence, *how, masks=masks.folder)
     frames = _frame_range(len(sequence), options.start, options.stop)
     told = masks.name == "clicks" and bool(prompts)  # all that is known of the objects
     objects = _chosen([p.name for p in prompts] if told else sequence.objects, options.objects)

@@ -89,8 +89,7 @@ def check_folder(
     """
     config = config or preset()
     try:
-        if isinstance(sequence, str | Path):
-            sequence = open_sequence(sequence, format, depth_scale)
+        sequence = open_sequence(sequence, format, depth_scale)
         chosen = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist()
         frames = [sequence.frame(i) for i in chosen]
         masks = [sequence.masks(i) or {} for i in chosen]

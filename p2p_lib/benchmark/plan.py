@@ -9,12 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_TRACKER
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import file_name, read_toml
 from p2p_lib.core.options import RunOptions
+from p2p_lib.datasets.schema import Strict, first_fault
 from p2p_lib.datasets.sequence import SYNTHETIC
 
 PROFILES = ("quick", "full")
@@ -25,12 +26,7 @@ Text = Annotated[str, Field(min_length=1)]
 Count = Annotated[int, Field(ge=0)]
 
 
-class _Strict(BaseModel):
-    # Values as written: no unknown key, no conversion, no change afterwards.
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-
-class Method(_Strict):
+class Method(Strict):
     """One way to run: a row or column of the table.
 
     paper     the method of the paper's table that it stands beside ("Ours", "No SDF refinement"), "" for none
@@ -60,7 +56,7 @@ class Method(_Strict):
     only: list[Text] = []
 
 
-class PlannedFault(_Strict):
+class PlannedFault(Strict):
     """A fault of :data:`p2p_lib.synthetic.faults.FAULTS`.
 
     severity  in the unit that it says
@@ -78,7 +74,7 @@ class PlannedFault(_Strict):
         return ", ".join(filter(None, (self.name, "" if self.severity is None else f"{self.severity:g}", said)))
 
 
-class PlannedSequence(_Strict):
+class PlannedSequence(Strict):
     """One sequence to run on.
 
     name       as ``p2p run`` takes it; ``DATASET/*`` stands for every sequence of a dataset that is present
@@ -115,7 +111,7 @@ class PlannedSequence(_Strict):
         return self.columns.get(object, self.column)
 
 
-class Scope(_Strict):
+class Scope(Strict):
     """What the methods run on.
 
     methods  the names of some of them, none for all
@@ -139,7 +135,7 @@ class Scope(_Strict):
         return [s.model_copy(update={"fault": fault}) for fault in self.fault for s in self.sequence]
 
 
-class Plan(_Strict):
+class Plan(Strict):
     """A benchmark.
 
     name     of its file
@@ -211,9 +207,7 @@ def read_plan(plan: str | Path) -> Plan:
     try:
         return Plan.model_validate({"name": path.stem, **content})
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        raise BadInput(f"plan {path.name}", f"{where}: {first['msg']}", expected) from None
+        raise BadInput(f"plan {path.name}", first_fault(error), expected) from None
 
 
 def uses_clicks(method: Method) -> bool:

@@ -21,7 +21,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
 from p2p_lib.datasets.models import load_points
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.datasets.ycbmultitrack import LABELS
+from p2p_lib.datasets.ycbmultitrack import write_truth
 
 # A longer gap in a log is not bridged: at 0.3 m/s a hand has moved 3 cm by then.
 MAX_GAP_S = 0.1
@@ -96,13 +96,7 @@ def record_truth(folder: Path, name: str, camera: Path, mocap: Path, model: Path
         visible[i] = counts is None or counts.get(name, 1) > 0
         in_image[i] = sequence.camera.inside(sequence.camera.project(se3.transform(T[i], points))).any()
     last = np.maximum.accumulate(np.where(seen, np.arange(len(T)), np.argmax(seen)))
-    poses = folder / "annotated_poses" / name
-    poses.mkdir(parents=True, exist_ok=True)
-    for frame, pose in zip(sequence.frame_names, T[last]):
-        np.savetxt(poses / f"{frame}.txt", pose, fmt="%.12g")
-    for (kind, file), label in zip(LABELS.items(), (visible, in_image)):
-        (folder / kind / name).mkdir(parents=True, exist_ok=True)
-        np.save(folder / kind / name / file, label)
+    write_truth(folder, name, sequence.frame_names, T[last], visible, in_image)
     return found
 
 

@@ -24,7 +24,11 @@ def read_json(path: Path, schema: Any, what: str) -> Any:
         return TypeAdapter(schema).validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        got = f"{where or 'the file'}: {first['msg']}"
-        got = f"unreadable JSON ({first['msg']})" if first["type"] == "json_invalid" else got
+        got = f"unreadable JSON ({first['msg']})" if first["type"] == "json_invalid" else first_fault(error)
         raise BadInput(str(path), got, what) from None
+
+
+def first_fault(error: ValidationError) -> str:
+    """Where the first value is that does not fit, and why."""
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc'])) or 'the file'}: {first['msg']}"

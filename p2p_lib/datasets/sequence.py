@@ -6,9 +6,8 @@ A layout is one module with ``load(folder, masks)``, and one line in :data:`FORM
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
@@ -103,13 +102,15 @@ class Sequence(Protocol):
 
 
 def open_sequence(
-    path_or_name: str | Path,
+    path_or_name: str | Path | Sequence,
     format: str | None = None,
     depth_scale: float | None = None,
     seed: int = 0,
     masks: str | Path | None = None,
 ) -> Sequence:
     """A sequence from a folder, the bundled ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
+
+    One that is open already is given back as it is.
 
     Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one; any
     other folder by its path below ``$P2P_DATA``.
@@ -121,6 +122,8 @@ def open_sequence(
 
     Raises :class:`MissingData` where files are not there and :class:`BadInput` where they do not fit.
     """
+    if not isinstance(path_or_name, str | Path):
+        return path_or_name
     if depth_scale is not None and not 0 < depth_scale <= 1:
         fix = "Millimetres are 0.001, metres are 1."
         raise BadInput("depth_scale", depth_scale, "metres per raw unit, above 0 and at most 1", fix)
@@ -128,10 +131,8 @@ def open_sequence(
         raise BadInput("format", repr(format), "one of " + ", ".join(FORMATS))
     name = str(path_or_name)
     if name.startswith(SYNTHETIC):
-        synthetic = import_module(_GENERATOR)
-        if near := unknown_scenario(name, synthetic.SCENARIOS):
-            raise near
-        folder, format = synthetic.scenario_dir(name.removeprefix(SYNTHETIC), seed), format or "ycbmultitrack"
+        render = import_module(_GENERATOR).scenario_dir
+        folder, format = render(name.removeprefix(SYNTHETIC), seed), format or "ycbmultitrack"
     else:
         folder, format = _find(path_or_name, format)
         name = os.path.basename(os.path.abspath(folder))
@@ -143,16 +144,6 @@ def open_sequence(
 def reopen(info: Mapping[str, Any]) -> Sequence:
     """The sequence that a run was made on, as its ``run.json`` says; raises as :func:`open_sequence`."""
     return open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
-
-
-def unknown_scenario(name: str, known: Iterable[str]) -> BadInput | None:
-    """What to say of a synthetic sequence that does not exist, naming the nearest that does; None where it does."""
-    known, scenario = sorted(known), name.removeprefix(SYNTHETIC)
-    if scenario in known:
-        return None
-    near = get_close_matches(scenario, known, n=1)
-    fix = f"Did you mean {SYNTHETIC}{near[0]}?" if near else ""
-    return BadInput("synthetic sequence", repr(scenario), "one of " + ", ".join(SYNTHETIC + k for k in known), fix)
 
 
 def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:

@@ -10,6 +10,7 @@ The recorded truth is held constant while an object is occluded: it counts only 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,18 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
         read_truth=read_truth,
         model_places={obj: tuple(root / "models" / obj for root in roots) for obj in objects},
     )
+
+
+def write_truth(
+    folder: Path, obj: str, names: Iterable[str], T_cam_model: np.ndarray, visible: np.ndarray, in_image: np.ndarray
+) -> None:
+    """An object's poses (N, 4, 4) and labels (N,) bool; ``names`` are those of the images, without their ending."""
+    for kind in ("annotated_poses", *LABELS):
+        (folder / kind / obj).mkdir(parents=True, exist_ok=True)
+    for name, T in zip(names, T_cam_model, strict=True):
+        np.savetxt(folder / "annotated_poses" / obj / f"{name}.txt", T, fmt="%.9f")
+    for (kind, file), label in zip(LABELS.items(), (visible, in_image), strict=True):
+        np.save(folder / kind / obj / file, label)
 
 
 def read_labels(folder: Path, obj: str, n: int) -> np.ndarray:

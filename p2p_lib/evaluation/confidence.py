@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.core.types import joined
+from p2p_lib.core.types import Rows, joined
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation.protocol import Evaluation, ObjectScore
 
@@ -25,14 +25,11 @@ MAX_M, MAX_DEG = 0.02, 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Judged(Rows):
     """Poses of scored frames: confidence (m,) in [0, 1], and whether each is right (m,) bool."""
 
     confidence: np.ndarray
     right: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.right)
 
     @property
     def calibration_error(self) -> float:
@@ -43,13 +40,12 @@ class Judged:
     @property
     def auroc(self) -> float:
         """Area under the ROC curve; ties count half; NaN where all are right or all are wrong."""
-        from scipy.stats import rankdata
+        from scipy.stats import mannwhitneyu
 
-        n_right, n_wrong = int(self.right.sum()), int((~self.right).sum())
-        if not n_right or not n_wrong:
+        right, wrong = self.confidence[self.right], self.confidence[~self.right]
+        if not len(right) or not len(wrong):
             return float("nan")
-        ranks = rankdata(self.confidence)[self.right].sum()
-        return float((ranks - n_right * (n_right + 1) / 2) / (n_right * n_wrong))
+        return float(mannwhitneyu(right, wrong).statistic / (len(right) * len(wrong)))
 
 
 def pose_error(obj: ObjectRun, score: ObjectScore) -> tuple[np.ndarray, np.ndarray]:

@@ -119,19 +119,20 @@ class Evaluation:
 
 def evaluate(
     run: Run,
-    models: Mapping[str, str | Path | np.ndarray] | None = None,
+    models: Mapping[str, str | Path] | None = None,
     align: str = "first",
     min_visible_px: int = MIN_VISIBLE_PX,
 ) -> Evaluation:
     """Score every object of a run that has truth and a model.
 
-    models  object to model file or to (V, 3) points, over those that the run was made with
+    models  object to model file, over those that the run was made with
 
     Raises :class:`BadInput` for an unknown alignment or object, :class:`MissingData` where nothing can be scored.
     """
     if align not in ALIGNMENTS:
         raise BadInput("align", repr(align), "one of " + ", ".join(ALIGNMENTS))
-    points = run.points | _points(models or {}, tuple(run.objects))
+    given = given_models(models or {}, run.objects)
+    points = run.points | {name: load_points(path) for name, path in given.items()}
     scores, left_out = {}, {}
     for name, obj in run.objects.items():
         at = scored_frames(obj, min_visible_px)
@@ -209,9 +210,3 @@ def rate(timings: Mapping[str, np.ndarray]) -> tuple[float | None, float | None]
         return None, None
     after = total_ms[2:] if total_ms[2:].sum() > 0 else total_ms
     return float(1000 * len(after) / after.sum()), float(np.percentile(after, 95))
-
-
-def _points(models: Mapping[str, str | Path | np.ndarray], objects: tuple[str, ...]) -> dict[str, np.ndarray]:
-    given = {name: model for name, model in models.items() if isinstance(model, np.ndarray)}
-    paths = {name: model for name, model in models.items() if not isinstance(model, np.ndarray)}
-    return given | {name: load_points(path) for name, path in given_models(paths, objects).items()}

@@ -62,9 +62,9 @@ def chamfer_cm(mesh: trimesh.Trimesh, T_model_obj: np.ndarray, reference: np.nda
     return {form: 100 * float(m) for form, m in zip(FORMS, apart_m, strict=True)}
 
 
-def thinned(points: np.ndarray, grid_m: float = GRID_M) -> np.ndarray:
+def thinned(points: np.ndarray) -> np.ndarray:
     """One point per cell of a grid: the mean of the (N, 3) points in it."""
-    cells = np.floor(points / grid_m).astype(np.int64)
+    cells = np.floor(points / GRID_M).astype(np.int64)
     _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(cell.ravel(), points[:, k], len(count)) for k in range(3)], 1)
     return sums / count[:, None]

@@ -184,15 +184,12 @@ class TrueScene:
 
 
 @dataclass(frozen=True, eq=False)
-class Queries:
+class Queries(Rows):
     """Query points of a sequence: frame (N,), uv_px (N, 2) and the surface points behind them, by frame."""
 
     frame: np.ndarray
     uv_px: np.ndarray
     points: SurfacePoints
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
 
 def draw_queries(scene: TrueScene, rng: np.random.Generator, count: int = 256, at: int = 4) -> Queries:

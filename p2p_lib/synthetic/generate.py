@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, fields
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
@@ -23,15 +24,16 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import cache_dir
 from p2p_lib.datasets.bop import write_models, write_scene
-from p2p_lib.datasets.sequence import SYNTHETIC, open_sequence, unknown_scenario
+from p2p_lib.datasets.sequence import SYNTHETIC, open_sequence
+from p2p_lib.datasets.ycbmultitrack import write_truth
 from p2p_lib.synthetic.noise import NOISE, Sensor, kept_frames, measured_colour, measured_depth, measured_mask
 from p2p_lib.synthetic.render import Rendering
 from p2p_lib.synthetic.scenarios import SCENARIOS
-from p2p_lib.synthetic.scene import FPS, Body, Scenario
+from p2p_lib.synthetic.scene import FPS, Scenario
 from p2p_lib.synthetic.shapes import Mesh
 
 _MODEL_POINTS = 6000
-_PER_OBJECT = ("masks", "annotated_poses", "is_mask_visible", "is_obj_in_image_labels", "models")
+_PER_OBJECT = ("masks", "models")
 _DONE = "scenario.json"
 
 
@@ -72,7 +74,10 @@ def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, 
     np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
     np.savetxt(folder / "times.txt", frames / FPS, fmt="%.6f")
     for k, body in labelled.items():
-        _write_truth(folder, scenario, body, frames, np.array([k in labels for labels in visible]))
+        T_cam_model = se3.inverse(scenario.T_world_cam[frames]) @ body.T_world_model[frames]
+        uv_px = scenario.camera.project(se3.transform(T_cam_model, body.mesh.vertices))
+        labels = np.array([k in seen for seen in visible]), scenario.camera.inside(uv_px).any(1)
+        write_truth(folder, body.name, [f"{t:06d}" for t in frames], T_cam_model, *labels)
         points, _ = body.mesh.sample(_MODEL_POINTS, np.random.default_rng(k))
         np.savetxt(folder / f"models/{body.name}/points.xyz", points, fmt="%.6f")
         _write_obj(folder / f"models/{body.name}", body.mesh)
@@ -90,11 +95,11 @@ def write_sequence(
     ``scenario.json`` says what it is made of. Raises :class:`BadInput` for what does not fit.
     """
     out = Path(out).expanduser()
+    own, _ = _settings(name, seed, {"models": str(models)} if models else {})
     if noise not in NOISE:
         raise BadInput("noise", repr(noise), "one of " + ", ".join(NOISE))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise BadInput(str(out), "has files in it", "a new or empty folder")
-    own, _ = _settings(name, seed, {"models": str(models)} if models else {})
     scenario = SCENARIOS[name](seed, **own)
     write_scenario(out, scenario, NOISE[noise], seed, f"rendering {name}")
     made = {"name": name, "seed": seed, "noise": noise, "sensor": asdict(NOISE[noise]), "objects": scenario.objects}
@@ -151,17 +156,6 @@ def _save(path: Path, image: np.ndarray, options: list[int]) -> None:
         raise OSError(f"{path} could not be written: is the disk full?")
 
 
-def _write_truth(folder: Path, scenario: Scenario, body: Body, frames: np.ndarray, visible: np.ndarray) -> None:
-    """A body's pose and labels at every frame written."""
-    T_cam_model = se3.inverse(scenario.T_world_cam[frames]) @ body.T_world_model[frames]
-    for t, T in zip(frames, T_cam_model, strict=True):
-        np.savetxt(folder / f"annotated_poses/{body.name}/{t:06d}.txt", T, fmt="%.9f")
-    uv = scenario.camera.project(se3.transform(T_cam_model, body.mesh.vertices))
-    in_image = scenario.camera.inside(uv).any(1)
-    np.save(folder / f"is_obj_in_image_labels/{body.name}/is_obj_in_image.npy", in_image)
-    np.save(folder / f"is_mask_visible/{body.name}/is_mask_visible.npy", visible)
-
-
 def _write_obj(folder: Path, mesh: Mesh) -> None:
     """``textured.obj`` with its material and texture."""
     import trimesh
@@ -176,8 +170,10 @@ def _write_obj(folder: Path, mesh: Mesh) -> None:
 
 def _settings(name: str, seed: int, overrides: dict) -> tuple[dict, Sensor]:
     """The scenario's own parameters and the sensor; unknown names and keys are refused."""
-    if unknown := unknown_scenario(name, SCENARIOS):
-        raise unknown
+    if name not in SCENARIOS:
+        near = get_close_matches(name, SCENARIOS, n=1)
+        known = "one of " + ", ".join(SYNTHETIC + k for k in sorted(SCENARIOS))
+        raise BadInput("synthetic sequence", repr(name), known, f"Did you mean {SYNTHETIC}{near[0]}?" if near else "")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise BadInput(f"{SYNTHETIC}{name} seed", repr(seed), "a whole number, 0 or above")
     taken = list(inspect.signature(SCENARIOS[name]).parameters.values())[1:]

@@ -1,6 +1,7 @@
 """The protocol: which frames count, what alignment absorbs, how failures are counted."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -271,12 +272,12 @@ def test_models_given_to_the_evaluation(tmp_path):
     truth = motion(np.random.default_rng(15))
     np.savetxt(tmp_path / "mug.xyz", POINTS)
     run = a_run(mug=object_run(noisy(truth, np.random.default_rng(15)), truth), points={})
-    by_path, by_array = (evaluate(run, {"mug": m}).objects["mug"] for m in (tmp_path / "mug.xyz", POINTS))
-    np.testing.assert_allclose(by_path.add_m, by_array.add_m, atol=1e-12)
+    given, kept = evaluate(run, {"mug": tmp_path / "mug.xyz"}), evaluate(replace(run, points={"mug": POINTS}))
+    np.testing.assert_allclose(given.objects["mug"].add_m, kept.objects["mug"].add_m, atol=1e-12)
     with pytest.raises(BadInput, match=r"model: got the name 'cup', expected one of the objects: mug"):
         evaluate(run, {"cup": tmp_path / "mug.xyz"})
     with pytest.raises(BadInput, match=r"align: got 'best', expected one of first, all"):
-        evaluate(run, {"mug": POINTS}, align="best")
+        evaluate(run, {"mug": tmp_path / "mug.xyz"}, align="best")
 
 
 def test_a_real_sequence_through_disk(shared_data, tmp_path):
