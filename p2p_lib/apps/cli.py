@@ -135,37 +135,32 @@ def _eval(a: argparse.Namespace) -> None:
         from p2p_lib.benchmark.rows import COLUMNS, as_csv
         from p2p_lib.benchmark.scoring import run_rows
 
-        print(as_csv(run_rows(a.run, options.models), COLUMNS), end="")
-    elif a.poses is not None:
+        return print(as_csv(run_rows(a.run, options.models), COLUMNS), end="")
+    if a.poses is not None:
         from p2p_lib.run import evaluate_poses
 
         how = {"format": options.format, "start": options.start, "stop": options.stop}
-        _show(evaluate_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how), a.json)
-    else:
-        from p2p_lib.datasets.runs import load_run
-        from p2p_lib.evaluation.protocol import evaluate
+        return _show(evaluate_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how), a.json)
+    from p2p_lib.datasets.runs import load_run
+    from p2p_lib.evaluation.consistency import consistency
+    from p2p_lib.evaluation.protocol import evaluate
 
-        run = load_run(a.run)
-        score: Any = None
+    run = load_run(a.run)
+    if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
-            if any(obj.has_truth.any() for obj in run.objects.values()):
-                score = evaluate(run, options.models, a.align, a.min_visible_px)
-        except MissingData as error:
+            return _show(evaluate(run, options.models, a.align, a.min_visible_px), a.json)
+        except MissingData as error:  # without a model it goes on as without truth
             if run.points or options.models:
                 raise
             warn(f"p2p eval: {error}")
-        if score is not None:
-            _show(score, a.json)
-        else:
-            from p2p_lib.evaluation.consistency import consistency
-
-            _show(consistency(run), a.json)
-            if not a.json and not (a.run / "masks").is_dir() and run.info["masks"] != "dataset":
-                again = f"p2p run {run.info['path'] or run.info['sequence']} --out {a.run} --force --save-masks"
-                if prompts := (run.info.get("options") or {}).get("prompts"):
-                    again += f" --prompts {prompts}"
-                empty = "where seen and mask IoU are empty, because no masks were kept"
-                warn(f"p2p eval: {empty}. Next, with any other options of the run: {again}")
+    _show(consistency(run), a.json)
+    if not a.json and not (a.run / "masks").is_dir() and run.info["masks"] != "dataset":
+        again = f"p2p run {run.info['path'] or run.info['sequence']} --out {a.run} --force --save-masks"
+        if prompts := (run.info.get("options") or {}).get("prompts"):
+            again += f" --prompts {prompts}"
+        empty = "where seen and mask IoU are empty, because no masks were kept"
+        warn(f"p2p eval: {empty}. Next, with any other options of the run: {again}")
+    return None
 
 
 @command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, _JSON, _MIN_VISIBLE)

@@ -49,23 +49,23 @@ def covariance_of(estimate: PoseEstimate) -> np.ndarray:
 
 def fill_pose(message: Any, estimate: PoseEstimate, header: Any) -> Any:
     """A ``geometry_msgs/PoseWithCovarianceStamped`` from an estimate that has a pose, in the frame of ``header``."""
-    T = se3.check("estimate", estimate.T_cam_obj)
     message.header = header
-    at, turn = message.pose.pose.position, message.pose.pose.orientation
-    at.x, at.y, at.z = map(float, T[:3, 3])
-    turn.x, turn.y, turn.z, turn.w = map(float, se3.quaternion_xyzw(T))
+    _fill(message.pose.pose.position, message.pose.pose.orientation, estimate)
     message.pose.covariance = covariance_of(estimate).ravel().tolist()
     return message
 
 
 def fill_transform(message: Any, estimate: PoseEstimate, header: Any) -> Any:
     """A ``geometry_msgs/TransformStamped`` from the camera's frame to one that is called as the object."""
-    T = se3.check("estimate", estimate.T_cam_obj)
     message.header, message.child_frame_id = header, estimate.object
-    at, turn = message.transform.translation, message.transform.rotation
+    _fill(message.transform.translation, message.transform.rotation, estimate)
+    return message
+
+
+def _fill(at: Any, turn: Any, estimate: PoseEstimate) -> None:
+    T = se3.check("estimate", estimate.T_cam_obj)
     at.x, at.y, at.z = map(float, T[:3, 3])
     turn.x, turn.y, turn.z, turn.w = map(float, se3.quaternion_xyzw(T))
-    return message
 
 
 class TrackingNode:

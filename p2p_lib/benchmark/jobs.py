@@ -199,7 +199,7 @@ def _lacking(method: Method) -> str:
     if missing:
         commands = "; ".join(f"p2p data fetch {name}" for name in missing)
         return f"no weights of {', '.join(missing)}. Run: {commands}"
-    slow = method.gpu and not checkpoints.has_gpu()
+    slow = method.gpu and checkpoints.device() == "cpu"
     return "no GPU here, and on a CPU its networks take seconds a frame" if slow else ""
 
 

@@ -55,16 +55,11 @@ def fill(model: torch.nn.Module, name: str, weights: dict[str, torch.Tensor]) ->
         raise BadInput(f"checkpoint {name}", in_a_line(error), expected, _fetch(name)) from None
 
 
-def has_gpu() -> bool:
-    """Whether torch has a CUDA device."""
-    import torch
-
-    return torch.cuda.is_available()
-
-
 def device() -> str:
     """Where networks run: CUDA where torch has it, else the CPU."""
-    return "cuda" if has_gpu() else "cpu"
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def _fetch(name: str) -> str:

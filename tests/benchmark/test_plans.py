@@ -102,7 +102,7 @@ def test_weights_without_a_gpu_are_not_enough(tmp_path, monkeypatch):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(b"weights")
     for gpu in (False, True):
-        monkeypatch.setattr(checkpoints, "has_gpu", lambda gpu=gpu: gpu)
+        monkeypatch.setattr(checkpoints, "device", lambda gpu=gpu: "cuda" if gpu else "cpu")
         (job,) = [job for job in jobs_of(read_plan("long_range"), "quick") if job.method.name == "paper_full"]
         assert bool(job.key) == gpu and ("no GPU here" in job.reason) != gpu
 
