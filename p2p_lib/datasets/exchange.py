@@ -150,16 +150,15 @@ def as_run(
     objects = {}
     for name in sequence.objects:
         T_cam_obj = poses.get(name, np.tile(NO_POSE, (len(sequence), 1, 1)))
-        estimates = [_estimate(name, i, sequence.times_s[i], T_cam_obj[i]) for i in frames]
+        estimates = [
+            PoseEstimate(name, i, sequence.times_s[i], Status.TRACKED, T_cam_obj[i], 1.0)
+            if np.isfinite(T_cam_obj[i]).all()
+            else PoseEstimate(name, i, sequence.times_s[i], Status.LOST, reason="no pose given")
+            for i in frames
+        ]
         objects[name] = ObjectRun.of(name, estimates, sequence, visible_px)
     info = {"sequence": sequence.name, "objects": list(sequence.objects), "tracker": "imported", "masks": None}
     return Run(path, info, objects, {name: load_points(file) for name, file in models.items()}, {})
-
-
-def _estimate(name: str, frame: int, time_s: float, T_cam_obj: np.ndarray) -> PoseEstimate:
-    if not np.isfinite(T_cam_obj).all():
-        return PoseEstimate(name, frame, time_s, Status.LOST, reason="no pose given")
-    return PoseEstimate(name, frame, time_s, Status.TRACKED, T_cam_obj, 1.0)
 
 
 def _only_object(path: Path, sequence: Sequence) -> str:

@@ -31,6 +31,9 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     files = image_files(folder)
     chosen, own = files.find_masks(masks, [folder / "gt_mask", folder / "masks"], (OBJECT,))
 
+    at = images.full(folder)
+    known = [at.parent / "models" / ycb for begins, ycb in YCB_NAMES.items() if at.name.startswith(begins)]
+
     def read_truth() -> dict[str, ObjectTruth]:
         if not (folder / "annotated_poses").is_dir():
             return {}
@@ -43,11 +46,5 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
         mask_files=chosen,
         own_masks=own,
         read_truth=read_truth,
-        model_places={OBJECT: _models(folder)},
+        model_places={OBJECT: (folder / "models" / OBJECT, *known)},
     )
-
-
-def _models(folder: Path) -> tuple[Path, ...]:
-    at = images.full(folder)
-    known = [at.parent / "models" / ycb for begins, ycb in YCB_NAMES.items() if at.name.startswith(begins)]
-    return folder / "models" / OBJECT, *known

@@ -25,14 +25,9 @@ DEPTH_INVALID = 65535
 LABELS = {"is_mask_visible": "is_mask_visible.npy", "is_obj_in_image_labels": "is_obj_in_image.npy"}
 
 
-def _objects(folder: Path) -> tuple[str, ...]:
-    poses = folder / "annotated_poses"
-    return tuple(sorted(p.name for p in poses.iterdir() if p.is_dir())) if poses.is_dir() else ()
-
-
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
-    files, objects = image_files(folder), _objects(folder)
+    files, objects = image_files(folder), tuple(sorted(p.name for p in folder.glob("annotated_poses/*/")))
     if not objects:
         raise BadInput(str(folder / "annotated_poses"), "no folders", "one folder of poses for each object")
     chosen, own = files.find_masks(masks, [folder / "masks"], objects)

@@ -6,6 +6,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import OracleConfig
+from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.evaluation.true_tracks import NO_POINTS, TrueScene
 from p2p_lib.trackers.ids import PointIds
@@ -14,8 +15,8 @@ from p2p_lib.trackers.ids import PointIds
 _NOISE, _DROPOUT, _OUTLIER, _PLACE, _SLIDE = range(5)
 
 
-class OracleTracker:
-    """True tracks of a sequence's own frames. Implements :class:`p2p_lib.core.interfaces.PointTracker`.
+class OracleTracker(PointTracker):
+    """True tracks of a sequence's own frames; rejections and suggestions are ignored.
 
     A query belongs to the object whose mask holds it, and lies on that object's true surface; one that lies on
     no object is never visible again. A visible point is reported with Gaussian noise, new in each frame, and with an
@@ -65,12 +66,6 @@ class OracleTracker:
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
         self._points = self._points.select(self._ids.drop(ids))
-
-    def reject(self, ids: np.ndarray) -> None:
-        """Ignored: it knows better."""
-
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
-        """Ignored: it knows better."""
 
     def _drawn(self, kind: int, time: int, distribution: str, *columns: int) -> np.ndarray:
         """Numbers of a distribution of :class:`numpy.random.Generator` at a time, a row for each live point."""

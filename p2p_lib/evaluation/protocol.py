@@ -47,15 +47,14 @@ WHAT_RAN = ("tracker", "masks", "segmenter", "preset", "seed")
 class ObjectScore:
     """One object's errors over its m scored frames, and their summary in percent.
 
-    frame_index, time_s  (m,) of the scored frames
-    add_m, adds_m        (m,) metres; infinite where there was no pose
-    T_obj_model          (4, 4) the constant that the alignment fixed; NaN where there was never a pose
-    lost                 scored frames without a pose
-    returns              each return after an absence, see :mod:`p2p_lib.evaluation.recovery`
+    frame_index    (m,) of the scored frames
+    add_m, adds_m  (m,) metres; infinite where there was no pose
+    T_obj_model    (4, 4) the constant that the alignment fixed; NaN where there was never a pose
+    lost           scored frames without a pose
+    returns        each return after an absence, see :mod:`p2p_lib.evaluation.recovery`
     """
 
     frame_index: np.ndarray
-    time_s: np.ndarray
     add_m: np.ndarray
     adds_m: np.ndarray
     T_obj_model: np.ndarray
@@ -165,7 +164,6 @@ def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) ->
     T_pred = T_cam_obj @ T_obj_model
     scores = ObjectScore(
         frame_index=obj.frame_index[scored],
-        time_s=obj.time_s[scored],
         add_m=metrics.add_m(T_pred, T_cam_model, points),
         adds_m=metrics.adds_m(T_pred, T_cam_model, points),
         T_obj_model=T_obj_model,

@@ -219,10 +219,6 @@ def _shifted(image: np.ndarray, px: float) -> np.ndarray:
     return cv2.warpAffine(image, np.array([[1.0, 0, px], [0, 1, 0]]), image.shape[::-1], flags=cv2.INTER_NEAREST)
 
 
-def _moved(mask: np.ndarray, at: Moment) -> np.ndarray:
-    return _shifted(mask.astype(np.uint8), at.severity) > 0
-
-
 def _grown(mask: np.ndarray, at: Moment) -> np.ndarray:
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(at.severity) + 1,) * 2)
     return cv2.dilate(mask.astype(np.uint8), disk) > 0
@@ -232,10 +228,6 @@ def _left_part(mask: np.ndarray, at: Moment) -> np.ndarray:
     """Without a share of its columns, the right ones."""
     columns = np.flatnonzero(mask.any(0))
     return mask & (np.arange(mask.shape[1]) < np.quantile(columns, 1 - at.severity)) if len(columns) else mask
-
-
-def _flickering(mask: np.ndarray, at: Moment) -> np.ndarray:
-    return mask & bool((at.index - at.start) % 2)
 
 
 def _board(frame: Frame, at: Moment) -> Frame:
@@ -305,9 +297,9 @@ FAULTS: dict[str, Fault] = {
     "mask whole image": _mask(lambda mask, at: np.ones_like(mask)),
     "mask empty": _mask(lambda mask, at: np.zeros_like(mask)),
     # Empty in every second frame.
-    "mask flickers": _mask(_flickering),
+    "mask flickers": _mask(lambda mask, at: mask & bool((at.index - at.start) % 2)),
     # Pixels to the right.
-    "mask misplaced": _mask(_moved),
+    "mask misplaced": _mask(lambda mask, at: _shifted(mask.astype(np.uint8), at.severity) > 0),
     # The share that is missing.
     "mask cut": _mask(_left_part),
     # The share of the image that the board is wide.

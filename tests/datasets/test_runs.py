@@ -276,6 +276,21 @@ def test_no_archive_holds_a_pickle(table, tmp_path):
         assert {key.split("/")[1] for key in file.files} == set(COLUMNS)
 
 
+def test_a_run_of_before_there_were_several_maps_is_of_one(table, tmp_path):
+    write(tmp_path / "run", table)
+    now, path = load_run(tmp_path / "run").objects["can"], tmp_path / "run" / "poses.npz"
+    with np.load(path) as file:
+        older = {key: file[key] for key in file.files if not key.endswith(("map_id", "joined_map", "T_obj_joined"))}
+    np.savez(path, **older)
+    then = load_run(tmp_path / "run").objects["can"]
+    np.testing.assert_array_equal(then.T_cam_obj, now.T_cam_obj)
+    assert (then.map_id == 0).all() and (then.joined_map == -1).all() and np.isnan(then.T_obj_joined).all()
+    del older["can/status"]
+    np.savez(path, **older)
+    with pytest.raises(BadInput, match="no can/status, expected what p2p run wrote"):
+        load_run(tmp_path / "run")
+
+
 def test_faults_of_runs(table, tmp_path):
     with pytest.raises(MissingData, match=r"nowhere: no run there.*p2p run SEQ --out"):
         load_run(tmp_path / "nowhere")

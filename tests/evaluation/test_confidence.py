@@ -54,5 +54,5 @@ def test_right_is_within_two_centimetres_and_five_degrees():
     obj.T_cam_obj = np.concatenate([obj.T_cam_obj, np.full((1, 4, 4), np.nan)])
     obj.T_cam_model = np.concatenate([Obj.T_cam_model, Obj.T_cam_model[:1]])
     none = np.zeros(0)
-    score = ObjectScore(none, none, none, none, T_obj_model, 1)
+    score = ObjectScore(none, none, none, T_obj_model, 1)
     assert right_poses(obj, score).tolist() == [True, True, False, True, False, False]

@@ -1,5 +1,6 @@
 """The scenarios that are hard without one component: each has, for every seed, what makes it so."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -207,3 +208,13 @@ def test_plain_shapes_have_no_print_and_one_two_or_all_turns_that_fit():
     for body in scenario.bodies:
         uv = scenario.camera.project(se3.transform(T_cam_world @ body.T_world_model[::10], body.mesh.vertices))
         assert scenario.camera.inside(uv).all(), body.name
+
+
+def test_of_eight_objects_none_hides_another():
+    scenario = made("eight_objects", 1)
+    room = render([], scenario.camera, scenario.T_world_cam[0])
+    assert len(scenario.bodies) == 8
+    for t in (0, 45, 89):
+        together = np.bincount(scenario.rendered(t, room).label.ravel(), minlength=9)[1:]
+        alone = [replace(scenario, bodies=(body,)).rendered(t, room).label.sum() for body in scenario.bodies]
+        assert min(together) > 1000 and (together > 0.9 * np.array(alone)).all(), t
