@@ -48,6 +48,7 @@ class PointTracker(Protocol):
 
         A tracker may use it, e.g. to look for the points anew; ignoring it is allowed.
         """
+        return None
 
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """The caller expects points ids (N,) of one rigid body at uv_px (N, 2) in the newest frame.
@@ -55,6 +56,7 @@ class PointTracker(Protocol):
         NaN where it expects none. A tracker may look there for those that it holds for invisible. Returns the newest
         frame's tracks with what it found, or None where it has nothing to add: ignoring it is allowed.
         """
+        return None
 
 
 @dataclass(frozen=True, eq=False)
