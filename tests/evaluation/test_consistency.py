@@ -10,7 +10,7 @@ from p2p_lib.core import se3
 from p2p_lib.datasets.images import save_png
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, load_points
-from p2p_lib.evaluation.consistency import HEADS, consistency
+from p2p_lib.evaluation.consistency import HEADS, consistency, verdict
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 OFF_PX = 2.0
@@ -86,3 +86,19 @@ def test_what_cannot_be_said_is_not(made, run, tmp_path):
         assert said.as_dict()["objects"][name]["mask_iou"] is None
     for head, says in HEADS.values():
         assert head in said.as_table() and says in said.as_table()
+
+
+@pytest.mark.parametrize(
+    ("worse", "word"),
+    [
+        ({}, "good"),
+        ({"reprojection_px": 4.5}, "look"),
+        ({"doubted": 60.0}, "look"),
+        ({"pose_where_seen": 50.0}, "look"),
+    ],
+)
+def test_a_verdict_in_a_word(worse, word):
+    """Numbers of a real run, those with poses 1 cm off, and NaN for what was not kept, which says nothing."""
+    numbers = dict.fromkeys(HEADS, float("nan")) | {"pose": 90.0, "doubted": 5.0, "reprojection_px": 0.6}
+    assert verdict(numbers | worse) == word
+    assert verdict(numbers | {"pose": 0.0}) == "look"
