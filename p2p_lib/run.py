@@ -129,7 +129,9 @@ class Keeper:
 
     def save_maps(self) -> None:
         """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
-        models = {name: obj.model for name, obj in self.method.objects.items()}
+        objects = self.method.objects.items()
+        kept = {name: obj.known_as(self.writer.kept_map(name)) for name, obj in objects}
+        models = {name: known.model for name, known in kept.items() if known is not None}
         for name, model in models.items():
             if model.surface is not None and len((mesh := model.surface.mesh()).faces):
                 save_mesh(mesh, self.writer.path / "meshes" / f"{name}.ply")

@@ -145,6 +145,10 @@ class RunWriter:
         self.begun = True
         self.flush()
 
+    def kept_map(self, name: str) -> int:
+        """The map of an object that the run keeps to: that of the most poses so far."""
+        return ObjectRun.of(name, self._estimates[name], self._sequence, self._visible_px).kept_map
+
     def add_masks(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> None:
         """Keep the masks (H, W) bool that served at the frame last added; all False where nothing is known."""
         for name in self._estimates:

@@ -129,10 +129,16 @@ class ObjectRun:
             covariance[rows] = A @ covariance[rows] @ A.T
         return replace(self, map_id=map_id, T_cam_obj=T_cam_obj, covariance=covariance)
 
-    def of_one_map(self) -> ObjectRun:
-        """The same in the frame of the map with the most poses: without those of maps that are no part of it."""
+    @property
+    def kept_map(self) -> int:
+        """The map with the most poses, once joined: the one that files, scores and the surface are of."""
         joined = self.in_joined_maps()
-        kept = joined.map_id == np.bincount(joined.map_id[self.has_pose], minlength=1).argmax()
+        return int(np.bincount(joined.map_id[joined.has_pose], minlength=1).argmax())
+
+    def of_one_map(self) -> ObjectRun:
+        """The same in the frame of :attr:`kept_map`: without the poses of maps that are no part of it."""
+        joined = self.in_joined_maps()
+        kept = joined.map_id == self.kept_map
         return replace(
             joined,
             T_cam_obj=np.where(kept[:, None, None], joined.T_cam_obj, np.nan),

@@ -60,9 +60,8 @@ class Playback:
         return {name: obj.in_joined_maps() for name, obj in said.items()}
 
     def of_kept_map(self, name: str) -> np.ndarray:
-        """(n,) bool: rows whose pose is in the frame of the surface and the keypoints in the folder: the last map's."""
-        map_id = self.objects[name].map_id
-        return map_id == map_id[-1]
+        """(n,) bool: rows whose pose is in the frame of the surface and the keypoints in the folder."""
+        return self.objects[name].map_id == self.objects[name].kept_map
 
     @cached_property
     def frame_index(self) -> np.ndarray:

@@ -115,6 +115,10 @@ class ObjectTracker:
         """The tracker's ids of all points, those of the map aside too."""
         return self.map.ids if self.aside is None else np.concatenate([self.map.ids, self.aside.map.ids])
 
+    def known_as(self, map_id: int) -> Known | None:
+        """What is known in the map of this number; None where it has been given up."""
+        return next((known for known in (self.known, self.aside) if known and known.map_id == map_id), None)
+
     # -- the step ------------------------------------------------------------------------------
 
     def observe(

@@ -138,6 +138,7 @@ def test_poses_are_of_the_map_with_the_most_unless_all_are_asked_for(table, tmp_
             w.flush()
             rows = np.loadtxt(tmp_path / "run/poses/box.txt", ndmin=2)
             np.testing.assert_allclose(rows[:, 0] * 30, [[0], *[[0, 1]] * 4, [3, 4, 5]][i], atol=1e-6)
+    assert w.kept_map("box") == 1
     last, every = (load_run(tmp_path / "run", every_map=every).objects["box"] for every in (False, True))
     np.testing.assert_array_equal(every.map_id, [0, 0, 0, 1, 1, 1])
     np.testing.assert_array_equal(every.has_pose, [True, True, False, True, True, True])

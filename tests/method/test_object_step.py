@@ -759,6 +759,8 @@ def test_where_the_first_map_fits_again_and_the_second_does_not_the_first_one_go
     assert back.estimate.map_id == 0 and back.estimate.status is Status.RECOVERED
     deg, mm = lump.off(about(3))
     assert deg < 1 and mm < 1 and lump.tracker.aside.map_id == 1
+    of_map = [lump.tracker.known_as(k) for k in range(3)]
+    assert of_map == [lump.tracker.known, lump.tracker.aside, None]
 
 
 def test_no_second_map_of_what_only_the_segmenter_takes_for_the_object():
