@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -63,6 +64,7 @@ class RunWriter:
         names = sequence.objects if objects is None else objects
         # Of each object one estimate for every frame so far.
         self._estimates: dict[str, list[PoseEstimate]] = {file_name("object name", name): [] for name in names}
+        self._map_ids: dict[str, set[int]] = defaultdict(set)
         self._pose_files: dict[str, Path] = {}  # those that have been written
         self._frames: list[tuple[int, float]] = []  # index and time of every frame so far
         self._visible_px: list[Mapping[str, int] | None] = []
@@ -111,6 +113,7 @@ class RunWriter:
                 self._estimates[file_name("object name", name)] = past
         for name, kept in self._estimates.items():
             kept.append(estimates.get(name) or _not_yet(name, frame.index, frame.time_s))
+            self._map_ids[name].add(kept[-1].map_id)
         self._visible_px.append(self._sequence.visible_px(frame.index))
         self._frames.append((frame.index, frame.time_s))
         row = {"frame_index": str(frame.index), "time_s": f"{frame.time_s:.9f}", "total_ms": f"{total_ms:.4f}"}
@@ -247,7 +250,7 @@ class RunWriter:
 
     def _several_maps(self, name: str) -> bool:
         """Whether poses of an object are in several maps: which has the most is seen when all are written."""
-        return len({estimate.map_id for estimate in self._estimates[name]}) > 1
+        return len(self._map_ids[name]) > 1
 
     def _csv_line(self, row: Mapping[str, str]) -> str:
         return ",".join(row.get(key, "") for key in self._timing_columns) + "\n"
