@@ -64,12 +64,15 @@ def background_share(frame: Frame, mask: np.ndarray, before: Frame, mask_before:
     return float(np.count_nonzero(same) / max(np.count_nonzero(mask_before), 1))
 
 
-def half_stands(frame: Frame, before: Frame) -> bool:
-    """Whether of depth and colour one is that of a frame before, to the last bit, while the other goes on.
-
-    No sensor measures so: the two are not of one moment. A whole image that comes again tells nothing.
-    """
+def stands(frame: Frame, before: Frame) -> tuple[bool, bool]:
+    """Whether depth, and whether colour, is that of a frame before to the last bit. No sensor measures so."""
     some, depth_m, rgb = np.s_[::_STEP, ::_STEP], frame.depth_m, frame.rgb
     depth = np.array_equal(depth_m[some], before.depth_m[some]) and np.array_equal(depth_m, before.depth_m)
     colour = np.array_equal(rgb[some], before.rgb[some]) and np.array_equal(rgb, before.rgb)
-    return depth != colour and bool(depth_m.any() and rgb.any())
+    return depth and bool(depth_m.any()), colour and bool(rgb.any())
+
+
+def half_stands(frame: Frame, before: Frame) -> bool:
+    """Whether of depth and colour one stands while the other goes on: the two are not of one moment."""
+    depth, colour = stands(frame, before)
+    return depth != colour and bool(frame.depth_m.any() and frame.rgb.any())

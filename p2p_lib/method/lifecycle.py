@@ -42,6 +42,7 @@ class Evidence:
     lead           share of that which is more than where it is turned otherwise; None where nobody has compared
     size           times as large as its keypoint map it is measured, and the standard deviation; None: few are seen
     background     pixels that its mask took in although nothing changed there, as a share of the mask
+    still          whether the same image has come again and again
     """
 
     support: int
@@ -50,6 +51,7 @@ class Evidence:
     lead: float | None = None
     size: tuple[float, float] | None = None
     background: float = 0.0
+    still: bool = False
 
 
 @dataclass(frozen=True)
@@ -225,6 +227,10 @@ def _another_size(life: Lifecycle, evidence: Evidence) -> str:
     return f"its depth shows it {ratio:.2f} times as large as before" if off_size(ratio, sigma) else ""
 
 
+def _same_image(life: Lifecycle, evidence: Evidence) -> str:
+    return "the camera gives the same image again and again" if evidence.still else ""
+
+
 def off_size(ratio: float, sigma: float = 0.0) -> bool:
     """Whether something is measured so many times as large as before that it is not the same."""
     return abs(ratio - 1) > _SIZE + _SIZE_SIGMAS * sigma
@@ -234,6 +240,7 @@ def off_size(ratio: float, sigma: float = 0.0) -> bool:
 DOUBTS: dict[str, Callable[[Lifecycle, Evidence], str]] = {
     "size": _another_size,
     "background": _mask_on_background,
+    "still": _same_image,
 }
 
 #: Every reason to refuse a pose, in the order in which they are asked: state, evidence and bounds to words, or "".

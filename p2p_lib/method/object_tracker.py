@@ -128,12 +128,13 @@ class ObjectTracker:
         tracks: Tracks,
         sighting: Sighting | None = None,
         given: bool = True,
+        still: bool = False,
     ) -> Observation:
         """The object's share of a frame; mask (H, W) bool, None where it is not known, and everybody's tracks."""
         with self._stopwatch("observation"):
             sighted = None if sighting is None else sighting.T_cam_obj
-            obs = replace(self.observer.observe(frame, mask, tracks.select(self.map.ids), sighted), given=given)
-            return self._with_aside(obs, tracks)
+            obs = self.observer.observe(frame, mask, tracks.select(self.map.ids), sighted)
+            return self._with_aside(replace(obs, given=given, still=still), tracks)
 
     def seen_anew(self, obs: Observation, tracks: Tracks) -> Observation:
         """The observation again, with tracks that have been added to."""
@@ -176,7 +177,8 @@ class ObjectTracker:
         if best is None:
             nothing = obs.mask is None and not obs.seen.any()
             return Verdict(False, Status.OCCLUDED if nothing else Status.LOST, reason)
-        evidence = replace(best.evidence, size=self._size(obs, best), background=self._background(obs))
+        size, background = self._size(obs, best), self._background(obs)
+        evidence = replace(best.evidence, size=size, background=background, still=obs.still)
         return self.life.judge(evidence, self._gates, self.config.lifecycle)
 
     def _before(self, obs: Observation) -> Observation | None:

@@ -33,6 +33,7 @@ class Observation:
     cloud    (M, 3) depth points in the mask, camera frame
     sighted  (4, 4) T_cam_obj where an absent object was found by shape and colour; None where it was not
     given    whether the caller vouches for the mask; else the segmenter made it
+    still    whether the image is the same as for a while
     aside    the same of a second map of the object, which is put aside; None where there is none
     """
 
@@ -43,6 +44,7 @@ class Observation:
     cloud: np.ndarray
     sighted: np.ndarray | None = None
     given: bool = True
+    still: bool = False
     aside: Observation | None = None
 
     @property

@@ -37,7 +37,7 @@ from p2p_lib.core.interfaces import Hint, PointTracker, Segmenter
 from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_mask, check_not_on, check_prompt
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
-from p2p_lib.method.agreement import half_stands
+from p2p_lib.method.agreement import half_stands, stands
 from p2p_lib.method.object_model import NO_IDS, Requests
 from p2p_lib.method.object_tracker import ObjectTracker
 from p2p_lib.method.observation import Observation
@@ -49,7 +49,7 @@ _LOG = logging.getLogger("p2p_lib")
 Masks = dict[str, np.ndarray | None]
 #: The camera is located every so many frames: while all objects have poses, while one is away.
 _LOCATE_EVERY, _LOCATE_EVERY_AWAY = 5, 2
-#: Depth or colour may be that of a frame before for so long, s: some cameras deliver one more seldom.
+#: Depth, colour or both may be that of a frame before for so long, s: some cameras deliver one more seldom.
 _STANDS_S = 0.08
 #: Few depth cameras see half of their pixels farther than this, m.
 _FAR_M = 50.0
@@ -94,6 +94,7 @@ class Point2Pose:
         self._beside = ThreadPoolExecutor(2, "p2p")
         self._time_s: float | None = -np.inf  # of the frame before; None once it is said that time runs backwards
         self._fresh: Frame | None = None  # the newest of which both depth and colour were new, or neither
+        self._image: Frame | None = None  # the first that showed what the newest one does
         self._status: dict[str, Status] = {}
         self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
         self._waiting: deque[tuple[Frame, Masks, dict[str, Prompt]]] = deque()  # frames without an answer yet
@@ -203,11 +204,11 @@ class Point2Pose:
                 frame = replace(frame, T_world_cam=locating.result())
         # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
         objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
-        self.tracks = tracks
+        self.tracks, still = tracks, self._still(frame)
         sightings = self._sightings(frame, masks, objects)
         self.masks = self._segment(frame, masks, said, sightings)
         seen = {
-            name: obj.observe(frame, self.masks[name], self.tracks, sightings.get(name), masks[name] is not None)
+            name: obj.observe(frame, self.masks[name], self.tracks, sightings.get(name), masks[name] is not None, still)
             for name, obj in objects.items()
         }
         self._apply(self._misplaced(seen, masks))
@@ -231,6 +232,12 @@ class Point2Pose:
         got = "one is the same image again and again while the other goes on"
         doubt("depth and colour", got, "Until both go on, depth counts as missing.")
         return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+
+    def _still(self, frame: Frame) -> bool:
+        """Whether the same image has come again and again for a while: what it shows may long have moved on."""
+        if self._image is None or stands(frame, self._image) != (True, True):
+            self._image = frame
+        return frame.time_s - self._image.time_s > _STANDS_S
 
     def _check_time(self, frame: Frame) -> None:
         """Warn, once, of frames that come in another order than they were taken."""

@@ -7,7 +7,7 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.types import Frame
-from p2p_lib.method.agreement import background_share, half_stands, scene_ratio, size_ratio
+from p2p_lib.method.agreement import background_share, half_stands, scene_ratio, size_ratio, stands
 
 RNG = np.random.default_rng(0)
 P_OBJ = RNG.uniform(-0.05, 0.05, (30, 3))
@@ -74,7 +74,8 @@ def test_half_an_image_stands_where_the_other_half_goes_on():
     noisy = later.depth_m.copy()
     noisy[3, 5] += 1e-4
     assert not half_stands(Frame(1, 0.1, later.rgb, noisy), before), "to the last bit"
-    assert not half_stands(before, before), "the same image twice tells nothing"
+    assert not half_stands(before, before) and stands(before, before) == (True, True), "it stands, all of it"
+    assert stands(later, before) == (True, False) and stands(moved, before) == (False, True)
     nothing = np.zeros_like(later.depth_m)
     assert not half_stands(Frame(1, 0.1, later.rgb, nothing), Frame(0, 0.0, before.rgb, nothing))
     black = np.zeros_like(before.rgb)

@@ -177,6 +177,7 @@ def test_a_return_without_points_is_sought_until_points_confirm_it():
         ({"size": (0.9, 0.01)}, True),
         ({"size": (1.1, 0.02)}, False),
         ({"background": 0.3}, True),
+        ({"still": True}, True),
     ],
 )
 def test_what_contradicts_itself_is_doubted_and_the_paper_doubts_nothing(contradiction, doubted):

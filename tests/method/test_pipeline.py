@@ -14,7 +14,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt
-from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
+from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.method.lifecycle import CONFIRM_FRAMES
 from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.synthetic import shapes
@@ -489,6 +489,21 @@ def test_depth_and_colour_of_different_moments_are_no_measurement(half):
     assert deg[-4:].max() < 1 and mm[-4:].max() < 3
     paper = track(frames, config=quick("paper"))
     assert paper[14]["left"].T_cam_obj is not None, "the paper doubts nothing"
+
+
+def test_the_same_image_again_and_again_is_doubted():
+    """A camera that hangs: what it shows may have moved on. A few times the same image is a camera that is slow."""
+    frozen, masks = film()[9]
+    frames = [
+        (replace(f, rgb=frozen.rgb, depth_m=frozen.depth_m), masks) if f.index in range(10, 16) else (f, m)
+        for f, m in film()[:20]
+    ]
+    estimates = track(frames)
+    doubted = [e["left"].confidence <= DOUBTED for e in estimates]
+    assert doubted == [False] * 12 + [True] * 4 + [False] * 4
+    assert {(e["left"].status, e["left"].keyframe) for e in estimates[12:16]} == {(Status.DEGRADED, False)}
+    assert "same image" in estimates[12]["left"].reason
+    assert track(frames, config=quick("paper"))[14]["left"].status is Status.TRACKED, "the paper doubts nothing"
 
 
 def test_nan_depth_is_no_depth():
