@@ -121,7 +121,7 @@ def test_the_example_tracker_tracks():
     method, mask = Point2Pose(camera, config, tracker=names["StillTracker"]()), np.zeros((120, 160), bool)
     mask[20:100, 30:130] = True
     method.add_object("poster")
-    for k in range(4):
+    for k in range(3):  # more of the same image would be a camera that hangs
         estimate = method.step(Frame(k, k / 30, rgb, np.full((120, 160), 0.8, np.float32)), {"poster": mask})["poster"]
     assert estimate.status is Status.TRACKED and estimate.inliers >= 20
     np.testing.assert_allclose(estimate.T_cam_obj[:3, :3], np.eye(3), atol=1e-6)
