@@ -11,14 +11,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 from time import monotonic
 
 import numpy as np
 
 from p2p_lib.apps.click import Clicker, wait_for_clicks
-from p2p_lib.core.backends import SEGMENTERS
+from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -29,6 +28,9 @@ from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
 from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.run import Keeper, told
+
+#: Made-up images that are tracked before a camera starts.
+_WARM_FRAMES = 4
 
 
 @dataclass
@@ -80,8 +82,8 @@ def track_live(
     if masks.name != "clicks":
         raise BadInput("masks", repr(options.masks), f"the name of a segmenter: {', '.join(SEGMENTERS)}")
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
-    if config.method.surface:
-        import_module("torch")  # which takes seconds, in which the camera need not run
+    if options.tracker.startswith("builtin") and masks.segmenter == DEFAULT_SEGMENTER:
+        _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector))
     waiting: deque[Frame] = deque()  # those that a late 2D tracker has not answered yet
     with ExitStack() as kept:
         listeners = [lambda _, estimates: [on_estimate(estimate) for estimate in estimates.values()]]
@@ -115,6 +117,18 @@ def track_live(
         got = f"frame {prompts[0].frame}, which never came"
         raise BadInput(f"prompt of {prompts[0].name!r}", got, "a frame of the camera", "Click in an earlier one.")
     return count
+
+
+def _warm_up(method: Point2Pose) -> None:
+    """Load and compile on made-up images what the first of a camera would wait for, and later ones be dropped."""
+    h, w = method.camera.height, method.camera.width
+    print_ = np.kron(np.random.default_rng(0).integers(0, 255, (h // 8, w // 8, 3)), np.ones((8, 8, 1)))
+    rgb, depth_m = np.full((h, w, 3), 90, np.uint8), np.full((h, w), 1.0, np.float32)
+    part = np.s_[h // 3 : 2 * h // 3, w // 3 : 2 * w // 3]
+    rgb[part], depth_m[part] = print_[part], 0.6
+    method.add_object("made up", clicks=[[w / 2, h / 2]])
+    for k in range(_WARM_FRAMES):
+        method.step(Frame(k, k / 30, np.roll(rgb, 2 * k, 1), np.roll(depth_m, 2 * k, 1)))
 
 
 Listener = Callable[[Frame, dict[str, PoseEstimate]], object]

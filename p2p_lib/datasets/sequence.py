@@ -167,7 +167,8 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
             raise MissingData(name, where, f"See p2p data info {dataset}.")
         fix = f"Give a folder, a bundled sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
         where = "$P2P_DATA is not set" if home is None else f"no sequence of this name below {home}"
-        raise MissingData(name, f"no such folder, and {where}", fix)
+        what = "file" if folder.suffix else "folder"
+        raise MissingData(name, f"no such {what}, and {where}", fix)
     return found[0], format or found[1].format
 
 

@@ -50,8 +50,9 @@ _STAYS_LOST, _IN_PLAIN_VIEW = 12, 0.4
 
 #: Why a pose is degraded that nothing contradicts.
 _UNTOLD = "its shape leaves a turn free, and too little texture tells it"
-#: A pose (4, 4) to its covariance (6, 6), with what the map may be wrong by, and its confidence.
-Belief = Callable[[np.ndarray], tuple[np.ndarray, float]]
+#: A pose (4, 4) and whether its turn is told to its covariance (6, 6), what the map may be wrong by included, and its
+#: confidence.
+Belief = Callable[[np.ndarray, bool], tuple[np.ndarray, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,12 +220,11 @@ class ObjectTracker:
         T_cam_obj, agrees, model = best.T_cam_obj, best.hypothesis.inliers, self.model
         life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict.status, best.lead)
         requests = Requests(reject=self.map.ids[self.known.keypoints(obs) & ~agrees])
-        told = self._told(obs, best)
-        belief = self._belief(obs, best, told, DOUBTED if life.doubted else 1.0)
-        covariance, sure = belief(T_cam_obj)
+        told, belief = self._told(obs, best), self._belief(obs, best, DOUBTED if life.doubted else 1.0)
+        _, mapped = belief(T_cam_obj, True)  # a turn that nothing tells bends no map
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
-            trusted = not life.confirming and (sure >= MAPPED or not self._gates)
+            trusted = not life.confirming and (mapped >= MAPPED or not self._gates)
             keyframe = due or (trusted and model.keyframe_due(obs, T_cam_obj, agrees))
         model.settle_surface()
         if keyframe:
@@ -232,9 +232,9 @@ class ObjectTracker:
             if self._gates and not due:  # two maps that become one lie to each other as well as poses tell
                 good &= model.explained(obs, T_cam_obj)
             of_frame = self._covariance(obs, best)
-            T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, self._sample(obs), good, of_frame, sure)
+            T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, self._sample(obs), good, of_frame, mapped)
             requests = replace(asked, reject=requests.reject)
-            covariance, sure = belief(T_cam_obj)
+        covariance, sure = belief(T_cam_obj, told)
         self.life = replace(life, T_cam_obj=T_cam_obj).placed(obs.frame.T_world_cam)
         if not told and verdict.status is Status.TRACKED:
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNTOLD)
@@ -244,10 +244,10 @@ class ObjectTracker:
         """A pose from what contradicts itself: neither map nor surface learns from it, and no track is rejected."""
         self.life = self.life.with_pose(best.T_cam_obj, obs.frame.time_s, verdict.status, best.lead, doubted=True)
         self.model.settle_surface()
-        covariance, sure = self._belief(obs, best, self._told(obs, best), DOUBTED)(best.T_cam_obj)
+        covariance, sure = self._belief(obs, best, DOUBTED)(best.T_cam_obj, self._told(obs, best))
         return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, False))
 
-    def _belief(self, obs: Observation, best: Candidate, told: bool, most: float) -> Belief:
+    def _belief(self, obs: Observation, best: Candidate, most: float) -> Belief:
         """What a pose is worth that rests on this; asked before a keyframe changes the rows of the map.
 
         most  the confidence at most
@@ -256,7 +256,7 @@ class ObjectTracker:
         of_frame, support = self._covariance(obs, best), self.map.confidence[agrees].sum()
         agreement = (agrees & keypoints).sum() / max(keypoints.sum(), 1)
 
-        def belief(T_cam_obj: np.ndarray) -> tuple[np.ndarray, float]:
+        def belief(T_cam_obj: np.ndarray, told: bool) -> tuple[np.ndarray, float]:
             accumulated_rad = self.model.views.accumulated_rad(T_cam_obj)
             covariance = pose_covariance(of_frame, self.model.covariance, free, accumulated_rad, told)
             return covariance, min(confidence(covariance, support, agreement), most)

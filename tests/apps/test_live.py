@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.apps import cli
-from p2p_lib.apps.live import json_line, text_line, track_live
+from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
@@ -27,6 +27,7 @@ from p2p_lib.datasets.prompts import save_prompts
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.figures.film import write_film
+from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.run import run
 from tests.apps.test_cli import POINTS_ALONE
 from tests.fixtures.sliding_board import H, K, W, write_sequence
@@ -336,3 +337,11 @@ def test_realsense_is_named_by_open_camera(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(MissingBackend, match=r"pyrealsense2: .*uv pip install"):
         open_camera("realsense")
+
+
+def test_what_is_tracked_before_the_camera_starts_uses_all_that_its_frames_will():
+    method = Point2Pose(Camera(300, 300, 159.5, 119.5, 320, 240))
+    _warm_up(method)
+    assert method.objects["made up"].life.has_pose and method.masks["made up"].any()
+    used = {"tracking", "segmentation", "observation", "registration", "refinement", "selection", "map"}
+    assert used <= set(method.stopwatch.last_ms)
