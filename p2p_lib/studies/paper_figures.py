@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import subprocess
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,7 +29,6 @@ from p2p_lib.figures.pipeline_diagram import pipeline_diagram
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.provenance import Saved, save_figure
 from p2p_lib.figures.scenes import Scene, beside
-from p2p_lib.run import export_run
 from p2p_lib.studies.final_figures import rate_figure, scene_of
 
 PLAN = "paper_figures"
@@ -75,14 +73,13 @@ def airplane_and_can(runs: Benchmark) -> np.ndarray:
 
 
 def return_beside(runs: Benchmark, poses: Path | None = None) -> np.ndarray:
-    """A complete occlusion and the return, ours above imported poses."""
+    """A complete occlusion and the return, ours above imported poses, or above the method without long memory."""
     ours = scene_of(runs, _OURS, _HIDDEN)
-    with tempfile.TemporaryDirectory() as place:
-        if poses is None:
-            export_run(runs.run(_RIVAL, _HIDDEN).path, "tum", Path(place))
-        rival = imported(poses or Path(place), ours.sequence)
-    name = "no long memory (stand-in)" if poses is None else poses.stem
-    scenes = {"ours": ours, name: Scene(ours.sequence, rival, evaluate(rival))}
+    if poses is None:
+        scenes = {"ours": ours, "no long memory (stand-in)": scene_of(runs, _RIVAL, _HIDDEN)}
+    else:
+        rival = imported(poses, ours.sequence)
+        scenes = {"ours": ours, poses.stem: Scene(ours.sequence, rival, evaluate(rival))}
     return _marked(beside(scenes, 4, axes=True), _OTHER)
 
 
