@@ -179,7 +179,7 @@ def test_a_file_is_told_apart_from_what_is_not_there(name, what, tmp_path, capsy
     assert what in capsys.readouterr().err
     (finding,) = check_folder(tmp_path / name)
     assert what.split("got ")[1].split(",")[0] in finding.text and finding.fix
-    with pytest.raises(MissingData, match="no such folder"):
+    with pytest.raises(MissingData, match="no such file"):
         open_sequence(tmp_path / f"gone_{name}")
 
 
