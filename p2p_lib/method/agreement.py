@@ -1,10 +1,12 @@
-"""Does what camera and masks say agree with itself: four measures, from values alone (not in the paper).
+"""Does what camera and masks say agree with itself: measures from values alone (not in the paper).
 
 They know no truth. What follows of an object is in :data:`p2p_lib.method.lifecycle.DOUBTS`; depth and colour that are
 not of one moment are left out in :mod:`p2p_lib.method.pipeline`.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,6 +19,8 @@ _APART_M, _KEYPOINTS = 0.02, 8
 _SAME_M, _SAME_GREY = 0.01, 12
 #: So much of an image has to look the same before it tells of the scene.
 _LOOKS_THE_SAME = 0.2
+#: Depth, colour or both may be that of a frame before for so long, s: some cameras deliver one more seldom.
+_STANDS_S = 0.08
 #: Pixels between those that are compared first.
 _STEP = 8
 
@@ -64,15 +68,30 @@ def background_share(frame: Frame, mask: np.ndarray, before: Frame, mask_before:
     return float(np.count_nonzero(same) / max(np.count_nonzero(mask_before), 1))
 
 
-def stands(frame: Frame, before: Frame) -> tuple[bool, bool]:
-    """Whether depth, and whether colour, is that of a frame before to the last bit. No sensor measures so."""
-    some, depth_m, rgb = np.s_[::_STEP, ::_STEP], frame.depth_m, frame.rgb
-    depth = np.array_equal(depth_m[some], before.depth_m[some]) and np.array_equal(depth_m, before.depth_m)
-    colour = np.array_equal(rgb[some], before.rgb[some]) and np.array_equal(rgb, before.rgb)
-    return depth and bool(depth_m.any()), colour and bool(rgb.any())
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Since when the newest depth and the newest colour have been the same to the last bit: no sensor measures so.
+
+    first_depth, first_rgb  the first frames that had them; of nothing, none
+    """
+
+    first_depth: Frame | None = None
+    first_rgb: Frame | None = None
+
+    def with_frame(self, frame: Frame) -> Standing:
+        """After one more."""
+        return Standing(_first(self.first_depth, frame, "depth_m"), _first(self.first_rgb, frame, "rgb"))
+
+    def for_long(self, time_s: float) -> tuple[bool, bool]:
+        """Whether one has stood for a while though the other goes on: not of one moment; and whether both have."""
+        firsts = [first for first in (self.first_depth, self.first_rgb) if first is not None]
+        stand = sum(time_s - first.time_s > _STANDS_S for first in firsts)
+        return len(firsts) == 2 and stand == 1, stand == 2
 
 
-def half_stands(frame: Frame, before: Frame) -> bool:
-    """Whether of depth and colour one stands while the other goes on: the two are not of one moment."""
-    depth, colour = stands(frame, before)
-    return depth != colour and bool(frame.depth_m.any() and frame.rgb.any())
+def _first(first: Frame | None, frame: Frame, image: str) -> Frame | None:
+    now, before = getattr(frame, image), None if first is None else getattr(first, image)
+    some = np.s_[::_STEP, ::_STEP]
+    if before is not None and np.array_equal(now[some], before[some]) and np.array_equal(now, before):
+        return first
+    return frame if now.any() else None

@@ -361,7 +361,8 @@ class ObjectTracker:
         best = self.finder.refine_and_select(obs, aside, found)[0] if found else None
         if best is None or best.agreement(aside.keypoints(obs)) < 0:
             return None
-        verdict, share = aside.life.judge(best.evidence, self._gates, cfg), best.evidence.surface_share
+        verdict = aside.life.judge(replace(best.evidence, still=obs.still), self._gates, cfg)
+        share = best.evidence.surface_share
         fits = verdict.accepted and (share is None or share >= cfg.surface_only_share)
         return (best, verdict) if fits else None
 

@@ -37,7 +37,7 @@ from p2p_lib.core.interfaces import Hint, PointTracker, Segmenter
 from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_mask, check_not_on, check_prompt
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
-from p2p_lib.method.agreement import half_stands, stands
+from p2p_lib.method.agreement import Standing
 from p2p_lib.method.object_model import NO_IDS, Requests
 from p2p_lib.method.object_tracker import ObjectTracker
 from p2p_lib.method.observation import Observation
@@ -49,8 +49,6 @@ _LOG = logging.getLogger("p2p_lib")
 Masks = dict[str, np.ndarray | None]
 #: The camera is located every so many frames: while all objects have poses, while one is away.
 _LOCATE_EVERY, _LOCATE_EVERY_AWAY = 5, 2
-#: Depth, colour or both may be that of a frame before for so long, s: some cameras deliver one more seldom.
-_STANDS_S = 0.08
 #: Few depth cameras see half of their pixels farther than this, m.
 _FAR_M = 50.0
 #: The share of pixels among which the nearest may be wild.
@@ -93,11 +91,10 @@ class Point2Pose:
         self._unlocated = _LOCATE_EVERY
         self._beside = ThreadPoolExecutor(2, "p2p")
         self._time_s: float | None = -np.inf  # of the frame before; None once it is said that time runs backwards
-        self._fresh: Frame | None = None  # the newest of which both depth and colour were new, or neither
-        self._image: Frame | None = None  # the first that showed what the newest one does
+        self._standing = Standing()
         self._status: dict[str, Status] = {}
         self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
-        self._waiting: deque[tuple[Frame, Masks, dict[str, Prompt]]] = deque()  # frames without an answer yet
+        self._waiting: deque[tuple[Frame, Masks, dict[str, Prompt], bool]] = deque()  # frames without an answer yet
 
     def add_object(
         self,
@@ -176,7 +173,11 @@ class Point2Pose:
             given = self._given(frame, masks or {})
             said, self._said = self._said, {}
             self._check_time(frame)
-            return self._advance(self._measured(frame), given, said)
+            self._standing = self._standing.with_frame(frame)
+            half, still = self._standing.for_long(frame.time_s)
+            if half and self.config.method.gates == "all":
+                frame = self._without_depth(frame)
+            return self._advance(frame, given, said, still)
 
     def finish(self) -> Iterator[dict[str, PoseEstimate]]:
         """After the last frame: the estimates still owed, oldest first. None are unless the tracker answers late."""
@@ -190,21 +191,21 @@ class Point2Pose:
         self._waiting.clear()
 
     @uninterrupted()
-    def _advance(self, frame: Frame, masks: Masks, said: dict[str, Prompt]) -> dict[str, PoseEstimate]:
+    def _advance(self, frame: Frame, masks: Masks, said: dict[str, Prompt], still: bool) -> dict[str, PoseEstimate]:
         """Track into a frame, then segment and estimate at the frame that the tracks are of."""
-        self._waiting.append((frame, masks, said))
+        self._waiting.append((frame, masks, said, still))
         answers = len(self._waiting) > self.tracker.latency_frames
         locating = self._locate(self._waiting[0][0]) if answers else None
         tracks = self._track(frame, masks)
         if not answers:
             return {}
-        frame, masks, said = self._waiting.popleft()
+        frame, masks, said, still = self._waiting.popleft()
         if locating is not None:
             with self.stopwatch("scene"):
                 frame = replace(frame, T_world_cam=locating.result())
         # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
         objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
-        self.tracks, still = tracks, self._still(frame)
+        self.tracks = tracks
         sightings = self._sightings(frame, masks, objects)
         self.masks = self._segment(frame, masks, said, sightings)
         seen = {
@@ -223,21 +224,11 @@ class Point2Pose:
                 _LOG.info("frame %d: %s is %s%s", estimate.frame_index, name, estimate.status, why)
         return estimates
 
-    def _measured(self, frame: Frame) -> Frame:
-        """The frame, without its depth where that or colour has stood still for a while: points can wait for depth."""
-        if self._fresh is None or not half_stands(frame, self._fresh) or self.config.method.gates == "none":
-            self._fresh = frame
-        if frame.time_s - self._fresh.time_s <= _STANDS_S:
-            return frame
+    def _without_depth(self, frame: Frame) -> Frame:
+        """A frame of which depth and colour are not of one moment: points can wait for depth."""
         got = "one is the same image again and again while the other goes on"
         doubt("depth and colour", got, "Until both go on, depth counts as missing.")
         return replace(frame, depth_m=np.zeros_like(frame.depth_m))
-
-    def _still(self, frame: Frame) -> bool:
-        """Whether the same image has come again and again for a while: what it shows may long have moved on."""
-        if self._image is None or stands(frame, self._image) != (True, True):
-            self._image = frame
-        return frame.time_s - self._image.time_s > _STANDS_S
 
     def _check_time(self, frame: Frame) -> None:
         """Warn, once, of frames that come in another order than they were taken."""

@@ -7,7 +7,7 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.types import Frame
-from p2p_lib.method.agreement import background_share, half_stands, scene_ratio, size_ratio, stands
+from p2p_lib.method.agreement import Standing, background_share, scene_ratio, size_ratio
 
 RNG = np.random.default_rng(0)
 P_OBJ = RNG.uniform(-0.05, 0.05, (30, 3))
@@ -68,15 +68,21 @@ def test_a_mask_takes_in_background_that_an_object_that_moves_does_not():
     assert background_share(frame, mask_before & mask, before, mask_before) == 0, "what it leaves out is no background"
 
 
+def stood(frame: Frame, before: Frame) -> tuple[bool, bool]:
+    """What is said of a frame that comes a tenth of a second after another."""
+    return Standing().with_frame(replace(before, time_s=0.0)).with_frame(replace(frame, time_s=0.1)).for_long(0.1)
+
+
 def test_half_an_image_stands_where_the_other_half_goes_on():
+    half, whole, nothing = (True, False), (False, True), (False, False)
     (before, _), (moved, _), (later, _) = scene(20), scene(21), scene(20, grey=101)
-    assert half_stands(later, before) and half_stands(moved, before), "depth stands, colour stands"
+    assert stood(later, before) == stood(moved, before) == half, "depth stands, colour stands"
     noisy = later.depth_m.copy()
     noisy[3, 5] += 1e-4
-    assert not half_stands(Frame(1, 0.1, later.rgb, noisy), before), "to the last bit"
-    assert not half_stands(before, before) and stands(before, before) == (True, True), "it stands, all of it"
-    assert stands(later, before) == (True, False) and stands(moved, before) == (False, True)
-    nothing = np.zeros_like(later.depth_m)
-    assert not half_stands(Frame(1, 0.1, later.rgb, nothing), Frame(0, 0.0, before.rgb, nothing))
+    assert stood(replace(later, depth_m=noisy), before) == nothing, "to the last bit"
+    assert stood(before, before) == whole
+    assert Standing().with_frame(before).with_frame(before).for_long(0.05) == nothing, "a camera may be slow"
+    empty = np.zeros_like(later.depth_m)
+    assert stood(replace(later, depth_m=empty), replace(before, depth_m=empty)) == nothing
     black = np.zeros_like(before.rgb)
-    assert not half_stands(Frame(1, 0.1, black, moved.depth_m), Frame(0, 0.0, black, before.depth_m))
+    assert stood(replace(moved, rgb=black), replace(before, rgb=black)) == nothing
