@@ -7,7 +7,6 @@ becomes its pose. Whatever the object wants of the shared tracker it returns as
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,26 +16,21 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config
-from p2p_lib.core.image import in_mask
-from p2p_lib.core.interfaces import Detector, Hint
+from p2p_lib.core.interfaces import Detector
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import DOUBTED, OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
-from p2p_lib.method import registration
 from p2p_lib.method.agreement import background_share, scene_ratio, size_ratio
-from p2p_lib.method.confidence import confidence, pose_covariance
+from p2p_lib.method.belief import Belief
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.lifecycle import BACKGROUND, GATES, MAPPED, Lifecycle, Verdict, off_size
 from p2p_lib.method.object_model import NO_IDS, Known, NewPoints, ObjectModel, Requests
-from p2p_lib.method.observability import contrast_along
 from p2p_lib.method.observation import Observation, Observer
+from p2p_lib.method.outlook import Outlook, hidden
 from p2p_lib.method.pose_finder import Candidate, PoseFinder
-from p2p_lib.method.refinement import surface_distance
 from p2p_lib.method.sampling import choose, usable_region
 from p2p_lib.method.two_maps import Relation, agreeing_together, seen_together
 from p2p_lib.recovery.search import Sighting
 
-#: While an object has a pose, the tracker is asked every so many frames to look for points that are not seen.
-_LOOK_EVERY = 3
 #: An object whose mask grows by more than this factor from frame to frame is still coming into view.
 _GROWTH = 1.1
 #: A map is founded anew where an object has been lost for so many frames and shows more than this of what it knows.
@@ -50,9 +44,6 @@ _STAYS_LOST, _IN_PLAIN_VIEW = 12, 0.4
 
 #: Why a pose is degraded that nothing contradicts.
 _UNTOLD = "its shape leaves a turn free, and too little texture tells it"
-#: A pose (4, 4) and whether its turn is told to its covariance (6, 6), what the map may be wrong by included, and its
-#: confidence.
-Belief = Callable[[np.ndarray, bool], tuple[np.ndarray, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +107,11 @@ class ObjectTracker:
         """The tracker's ids of all points, those of the map aside too."""
         return self.map.ids if self.aside is None else np.concatenate([self.map.ids, self.aside.map.ids])
 
+    @property
+    def outlook(self) -> Outlook:
+        """Where it should show."""
+        return Outlook(self.known, self.observer, self.finder, self.config)
+
     def known_as(self, map_id: int) -> Known | None:
         """What is known in the map of this number; None where it has been given up."""
         return next((known for known in (self.known, self.aside) if known and known.map_id == map_id), None)
@@ -151,7 +147,7 @@ class ObjectTracker:
         """The object's pose at a frame."""
         if self.model.empty or self._outgrown(obs) or self._turned_over(obs):
             return self._initialise(obs)
-        if self._hidden(obs.mask):
+        if hidden(obs.mask, self.config):
             return self._without_pose(obs, Status.OCCLUDED, f"{np.count_nonzero(obs.mask)} mask pixels")
         self.life = self.life.at(obs.frame.time_s)
         found = self.finder.register(obs, self.known)
@@ -220,8 +216,8 @@ class ObjectTracker:
         T_cam_obj, agrees, model = best.T_cam_obj, best.hypothesis.inliers, self.model
         life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict.status, best.lead)
         requests = Requests(reject=self.map.ids[self.known.keypoints(obs) & ~agrees])
-        told, belief = self._told(obs, best), self._belief(obs, best, DOUBTED if life.doubted else 1.0)
-        _, mapped = belief(T_cam_obj, True)  # a turn that nothing tells bends no map
+        belief, most = self._belief(obs, best), DOUBTED if life.doubted else 1.0
+        _, mapped = belief.at(T_cam_obj, model, most, told=True)  # a turn that nothing tells bends no map
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
             trusted = not life.confirming and (mapped >= MAPPED or not self._gates)
@@ -231,12 +227,12 @@ class ObjectTracker:
             good = obs.seen & (agrees | ~self.map.promoted)
             if self._gates and not due:  # two maps that become one lie to each other as well as poses tell
                 good &= model.explained(obs, T_cam_obj)
-            of_frame = self._covariance(obs, best)
-            T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, self._sample(obs), good, of_frame, mapped)
+            new = self._sample(obs)
+            T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, new, good, belief.of_frame, mapped)
             requests = replace(asked, reject=requests.reject)
-        covariance, sure = belief(T_cam_obj, told)
+        covariance, sure = belief.at(T_cam_obj, model, most)
         self.life = replace(life, T_cam_obj=T_cam_obj).placed(obs.frame.T_world_cam)
-        if not told and verdict.status is Status.TRACKED:
+        if not belief.told and verdict.status is Status.TRACKED:
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNTOLD)
         return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, keyframe), requests)
 
@@ -244,38 +240,11 @@ class ObjectTracker:
         """A pose from what contradicts itself: neither map nor surface learns from it, and no track is rejected."""
         self.life = self.life.with_pose(best.T_cam_obj, obs.frame.time_s, verdict.status, best.lead, doubted=True)
         self.model.settle_surface()
-        covariance, sure = self._belief(obs, best, DOUBTED)(best.T_cam_obj, self._told(obs, best))
+        covariance, sure = self._belief(obs, best).at(best.T_cam_obj, self.model, DOUBTED)
         return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, False))
 
-    def _belief(self, obs: Observation, best: Candidate, most: float) -> Belief:
-        """What a pose is worth that rests on this; asked before a keyframe changes the rows of the map.
-
-        most  the confidence at most
-        """
-        keypoints, agrees, free = self.known.keypoints(obs), best.hypothesis.inliers, best.refined.free_rotations
-        of_frame, support = self._covariance(obs, best), self.map.confidence[agrees].sum()
-        agreement = (agrees & keypoints).sum() / max(keypoints.sum(), 1)
-
-        def belief(T_cam_obj: np.ndarray, told: bool) -> tuple[np.ndarray, float]:
-            accumulated_rad = self.model.views.accumulated_rad(T_cam_obj)
-            covariance = pose_covariance(of_frame, self.model.covariance, free, accumulated_rad, told)
-            return covariance, min(confidence(covariance, support, agreement), most)
-
-        return belief
-
-    def _told(self, obs: Observation, best: Candidate) -> bool:
-        """Whether the texture at the points that agree tells every turn that the shape leaves free."""
-        p_cam, camera = obs.p_cam[best.hypothesis.inliers], self.observer.camera
-        least, needed = self.config.tracking.textureless_contrast, self.config.lifecycle.return_inliers
-        turns = best.refined.free_rotations
-        found = [contrast_along(obs.frame, camera, best.T_cam_obj, p_cam, turn) >= least for turn in turns]
-        return not self._gates or all(textured.sum() >= needed for textured in found)
-
-    def _covariance(self, obs: Observation, best: Candidate) -> np.ndarray:
-        """(6, 6) of the pose relative to the map, right tangent of T_cam_obj."""
-        if best.refined.covariance is not None:
-            return best.refined.covariance
-        return registration.covariance(best.hypothesis, self.map.p_obj, obs.p_cam, self.observer.noise_m(obs.p_cam))
+    def _belief(self, obs: Observation, best: Candidate) -> Belief:
+        return Belief.of(obs, best, self.known, self.observer, self.config)
 
     def _sample(self, obs: Observation) -> NewPoints:
         """New points where the objective wants them."""
@@ -301,7 +270,7 @@ class ObjectTracker:
         without = Status.INITIALISING if self.model.empty else Status.LOST
         pixels = None if obs.mask is None else np.count_nonzero(obs.mask)
         self.life = replace(self.life, start_px=pixels)
-        if pixels is None or self._hidden(obs.mask):
+        if pixels is None or hidden(obs.mask, self.config):
             return self._without_pose(obs, without, "not seen yet")
         # Points on the first sliver of an object would all be at its rim.
         if self._gates and before is not None and pixels > _GROWTH * before:
@@ -385,10 +354,6 @@ class ObjectTracker:
         step = self._extend(seen_together(obs, obs.aside), both, verdict, due=True)
         return replace(step, estimate=replace(step.estimate, joined=(gone.map_id, T_obj_aside)))
 
-    def _hidden(self, mask: np.ndarray | None) -> bool:
-        """Whether a mask says that nothing of the object is to be seen."""
-        return mask is not None and np.count_nonzero(mask) < self.config.lifecycle.min_mask_px
-
     def _estimate(
         self, obs: Observation, verdict: Verdict, support: int, sure: float, covariance: np.ndarray, keyframe: bool
     ) -> PoseEstimate:
@@ -412,7 +377,7 @@ class ObjectTracker:
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
         self.life, self._trusted = self.life.without_pose(status), self._trusted if status is Status.LOST else None
-        reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self._left() else reason
+        reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self.outlook.out_of_view else reason
         estimate = PoseEstimate(
             self.name,
             obs.frame.index,
@@ -425,97 +390,3 @@ class ObjectTracker:
             map_id=self.map_id,
         )
         return ObjectStep(estimate)
-
-    # -- questions of the pipeline -------------------------------------------------------------
-
-    @property
-    def sought(self) -> bool:
-        """Whether an object that has been seen is absent, or back by shape and colour alone."""
-        return not self.model.empty and self.life.sought
-
-    @property
-    def away(self) -> bool:
-        """Whether an object that has been seen has no pose now."""
-        return not self.model.empty and not self.life.has_pose
-
-    def awaited(self, mask: np.ndarray | None) -> bool:
-        """Whether the object was hidden or lost until now and its mask says that it is back."""
-        return self.away and mask is not None and not self._hidden(mask)
-
-    def misplaced(self, obs: Observation, within: np.ndarray | None) -> Requests:
-        """Tracks that an absent object has elsewhere, on a look-alike perhaps: to be looked for anew.
-
-        within  (H, W) bool, where they may be; None: anywhere
-        """
-        if self.life.has_pose or within is None:
-            return Requests()
-        return Requests(reject=self.map.ids[obs.tracks.visible & ~in_mask(obs.tracks.uv_px, within)])
-
-    def expected_px(self, obs: Observation) -> np.ndarray | None:
-        """(N, 2) where keypoints show under the best hypothesis, NaN where not: what guided re-detection looks for.
-
-        None where enough are seen, or there is no pose to go by. A few points that agree say where all the others
-        should show, which the tracker checks by their appearance: so an object is back in the frame of its return.
-        """
-        if not self.config.method.redetection or self.model.empty or obs.mask is None or self._hidden(obs.mask):
-            return None
-        enough = self.known.keypoints(obs).sum() >= self.config.keypoint_map.keyframe_min_points
-        if self.life.has_pose and (enough or obs.frame.index % _LOOK_EVERY):
-            return None
-        best = max(self.finder.register(obs, self.known), key=lambda h: h.support, default=None)
-        return None if best is None else self.points_px(obs, best.T_cam_obj)
-
-    def sighted(self, obs: Observation) -> Sighting | None:
-        """Where a sought object shows by shape and colour."""
-        if not (self.sought and self.finder.shape.knows(self.known)) or self._hidden(obs.mask):
-            return None
-        return self.finder.shape.sighted(obs, self.known)
-
-    def points_px(self, obs: Observation, T_cam_obj: np.ndarray) -> np.ndarray:
-        """(N, 2) where keypoints show under a pose; NaN where not."""
-        keypoints = np.where(self.map.promoted[:, None], self.map.p_obj, np.nan)
-        return self.observer.expected_px(obs, T_cam_obj, keypoints)
-
-    def hint(self, frame: Frame, tracks: Tracks, sighting: Sighting | None = None) -> tuple[Hint, Requests]:
-        """Where this object should be, by its tracks and its model, before the frame is segmented.
-
-        Also the tracks to reject: while the object is away, points that agree on no pose are somewhere else.
-        """
-        if self.model.empty:
-            return Hint(), Requests()
-        obs = self.observe(frame, None, tracks, sighting)
-        found, requests = self.finder.register(obs, self.known), Requests()
-        best = max(found, key=lambda h: h.support, default=None)
-        if self.sought:
-            agrees = np.zeros(len(self.map), bool) if best is None else best.inliers
-            certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)
-            requests = Requests(reject=self.map.ids[certain & ~agrees])
-            enough = best is not None and best.support >= self.config.lifecycle.return_inliers
-            if sighting is not None and not enough:
-                uv_px = np.concatenate([obs.tracks.uv_px[agrees], sighting.uv_px])
-                return self._hint(frame, uv_px, sighting.T_cam_obj, True), requests
-            best = best if enough else None
-        if best is None:
-            return Hint(gone=self._gone(frame)), requests
-        return self._hint(frame, obs.tracks.uv_px[best.inliers], best.T_cam_obj, False), requests
-
-    def _left(self) -> bool:
-        """Whether most keypoints of an absent object lay outside the image at its last pose."""
-        inside = np.ones(1, bool) if self.life.T_cam_obj is None else self._inside(self.life.T_cam_obj)
-        return bool(len(inside)) and inside.mean() < 0.5
-
-    def _gone(self, frame: Frame) -> bool:
-        """Whether nothing of an absent object would show in the image if it has lain still; False if nobody knows."""
-        return any(not self._inside(T).any() for T in self.life.scene_prior(frame.T_world_cam).values())
-
-    def _inside(self, T_cam_obj: np.ndarray) -> np.ndarray:
-        """(N,) bool: the keypoints that a pose puts into the image, whatever may hide them."""
-        camera = self.observer.camera
-        return camera.inside(camera.project(se3.transform(T_cam_obj, self.map.p_obj)), -0.5)
-
-    def _hint(self, frame: Frame, uv_px: np.ndarray, T_cam_obj: np.ndarray, sighted: bool) -> Hint:
-        """The hint of a pose, with the distances from the surface under it."""
-        distance_m = None
-        if self.model.has_surface:
-            distance_m = surface_distance(self.model.surface, frame.depth_m, self.observer.camera, T_cam_obj)
-        return Hint(uv_px, distance_m, T_cam_obj, sighted)

@@ -242,7 +242,7 @@ class Point2Pose:
     def _locate(self, frame: Frame) -> Future[np.ndarray | None] | None:
         """The camera's pose, sought beside the 2D tracker: often while an object is away, else now and then."""
         self._unlocated += 1
-        away = any(obj.away for obj in self.objects.values())
+        away = any(obj.outlook.away for obj in self.objects.values())
         every = _LOCATE_EVERY_AWAY if away else _LOCATE_EVERY
         if self.scene is None or frame.T_world_cam is not None or self._unlocated < every:
             return None
@@ -253,10 +253,11 @@ class Point2Pose:
 
     def _sightings(self, frame: Frame, masks: Masks, objects: Mapping[str, ObjectTracker]) -> dict[str, Sighting]:
         """Sought objects that show by shape and colour; the tracker looks for their points there."""
-        seen = {name: obj.observe(frame, masks[name], self.tracks) for name, obj in objects.items() if obj.sought}
-        looked = {name: objects[name].sighted(obs) for name, obs in seen.items()}
+        sought = {name: obj for name, obj in objects.items() if obj.outlook.sought}
+        seen = {name: obj.observe(frame, masks[name], self.tracks) for name, obj in sought.items()}
+        looked = {name: objects[name].outlook.sighted(obs) for name, obs in seen.items()}
         found = {name: sighting for name, sighting in looked.items() if sighting is not None}
-        self._suggest({name: objects[name].points_px(seen[name], at.T_cam_obj) for name, at in found.items()})
+        self._suggest({name: objects[name].outlook.points_px(seen[name], at.T_cam_obj) for name, at in found.items()})
         return found
 
     def _suggest(self, expected_px: Mapping[str, np.ndarray]) -> None:
@@ -278,11 +279,11 @@ class Point2Pose:
             name for name, obs in seen.items() if given[name] is None and obs.mask is not None and not obs.mask.any()
         }
         within = {name: ~others if name in nowhere else obs.mask for name, obs in seen.items()}
-        return {name: self.objects[name].misplaced(obs, within[name]) for name, obs in seen.items()}
+        return {name: self.objects[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
     def _redetect(self, seen: Mapping[str, Observation]) -> dict[str, Observation]:
         """Guided re-detection: the tracker looks for points where their objects expect them; what is seen then."""
-        looked = {name: self.objects[name].expected_px(obs) for name, obs in seen.items()}
+        looked = {name: self.objects[name].outlook.expected_px(obs) for name, obs in seen.items()}
         expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}
         self._suggest(expected)
         return {name: self.objects[name].seen_anew(seen[name], self.tracks) for name in expected}
@@ -336,12 +337,15 @@ class Point2Pose:
             return masks
         with self.stopwatch("segmentation"):
             sought = [name for name in self.segmenter.names if name in masks and masks[name] is None]
-            hints = _Hints(sought, lambda name: self.objects[name].hint(frame, self.tracks, sightings.get(name)))
-            self._apply({name: hints.requests(name) for name in sought if self.objects[name].sought})
+            hints = _Hints(sought, lambda name: self._hint(self.objects[name], frame, sightings.get(name)))
+            self._apply({name: hints.requests(name) for name in sought if self.objects[name].outlook.sought})
             labels = self.segmenter.segment(frame, said.values(), hints)
             label_of = {name: label for label, name in enumerate(self.segmenter.names, 1)}
             looked_after = [name for name, mask in masks.items() if mask is None and name in label_of]
             return masks | {name: labels == label_of[name] for name in looked_after}
+
+    def _hint(self, obj: ObjectTracker, frame: Frame, sighting: Sighting | None) -> tuple[Hint, Requests]:
+        return obj.outlook.hint(obj.observe(frame, None, self.tracks, sighting), sighting)
 
     def _track(self, frame: Frame, masks: dict[str, np.ndarray | None]) -> Tracks:
         """All objects' points in a single pass of the 2D tracker."""
@@ -353,7 +357,7 @@ class Point2Pose:
                 return NOTHING_TRACKED
             known = [mask for mask in masks.values() if mask is not None]
             search = np.logical_or.reduce(known) if len(known) == len(masks) > 0 else None
-            urgent = any(obj.awaited(masks[name]) for name, obj in self.objects.items())
+            urgent = any(obj.outlook.awaited(masks[name]) for name, obj in self.objects.items())
             return self.tracker.track(frame, search, urgent)
 
 

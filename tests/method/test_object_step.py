@@ -14,7 +14,9 @@ from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.method import refinement
+from p2p_lib.method.belief import Belief
 from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
+from p2p_lib.method.outlook import Outlook
 from p2p_lib.method.pose_finder import Candidate
 from p2p_lib.recovery.search import ImageSearch
 from tests.method.analytic_scene import CAMERA, LUMP, look_from, render
@@ -74,6 +76,19 @@ class Lump:
     def registered(self, obs) -> list:
         """Its candidate poses."""
         return self.tracker.finder.register(obs, self.tracker.known)
+
+    def belief(self, obs, best: Candidate) -> Belief:
+        """What a candidate rests on."""
+        return Belief.of(obs, best, self.tracker.known, self.tracker.observer, self.tracker.config)
+
+    def hint(self, frame, tracks: Tracks):
+        """Where it should be, before anybody segments."""
+        return self.outlook.hint(self.tracker.observe(frame, None, tracks))
+
+    @property
+    def outlook(self) -> Outlook:
+        """Where it should show."""
+        return self.tracker.outlook
 
     def see(self, T_cam_model: np.ndarray, spoil=None, mask: np.ndarray | None = None) -> ObjectStep:
         """One frame at a true pose; ``spoil`` changes the tracks."""
@@ -353,7 +368,7 @@ def test_what_slides_over_the_object_does_not_enter_the_graph(gates):
 @pytest.mark.parametrize("gates", [True, False])
 def test_a_pose_that_is_hardly_believed_makes_no_keyframe(gates, monkeypatch):
     lump = settled(begun(method__gates="all" if gates else "none"), [2])
-    monkeypatch.setattr("p2p_lib.method.object_tracker.confidence", lambda *_: 0.09)
+    monkeypatch.setattr("p2p_lib.method.belief.confidence", lambda *_: 0.09)
     assert not any(lump.see(turned(deg)).estimate.keyframe for deg in (5, 8, 11, 14)) == gates
     monkeypatch.undo()
     assert lump.see(turned(26)).estimate.keyframe
@@ -465,9 +480,9 @@ def test_a_keyframe_takes_what_the_graph_finds_unless_it_was_refused(ok):
 
 
 @pytest.mark.parametrize("noise", ["sensor", "constant"])
-def test_the_graph_gets_the_noise_of_the_sensor_and_of_registration(noise):
+def test_the_graph_gets_the_noise_of_the_sensor_and_of_registration(monkeypatch, noise):
     lump, known = settled(begun(method__noise=noise), [5]), 1e-6 * np.diag([1.0, 2, 3, 4, 5, 6])
-    lump.tracker._covariance = lambda obs, best: known
+    monkeypatch.setattr("p2p_lib.method.belief._of_frame", lambda *_: known)
     assert lump.see(turned(12)).estimate.keyframe
     keyframe = lump.tracker.model.graph._keyframes[max(lump.tracker.model.graph.keys)]
     by_range = 0.001 + 0.0025 * keyframe.p_cam[:, 2] ** 2
@@ -548,8 +563,8 @@ def test_the_covariance_of_refinement_goes_before_that_of_the_keypoints():
     obs, known = lump.observed(turned(3)), np.diag([1.0, 2, 3, 4, 5, 6])
     best = max(lump.registered(obs), key=lambda h: h.support)
     refined = refinement.Refinement(best.T_cam_obj, covariance=known)
-    np.testing.assert_array_equal(lump.tracker._covariance(obs, Candidate(best, refined)), known)
-    by_keypoints = lump.tracker._covariance(obs, Candidate(best, refinement.Refinement(best.T_cam_obj)))
+    np.testing.assert_array_equal(lump.belief(obs, Candidate(best, refined)).of_frame, known)
+    by_keypoints = lump.belief(obs, Candidate(best, refinement.Refinement(best.T_cam_obj))).of_frame
     sigma_m = 0.001 + 0.0025 * np.median(obs.p_cam[best.inliers, 2]) ** 2
     mean_m = np.sqrt(np.diag(by_keypoints)[3:].max())
     assert sigma_m / np.sqrt(best.support) < mean_m < 10 * sigma_m, "about that of a mean of as many points"
@@ -780,23 +795,23 @@ def test_points_off_the_mask_are_no_observations_and_elsewhere_when_it_is_away()
     obs = lump.observed(turned(4), mask=left)
     u, v = np.rint(obs.tracks.uv_px[obs.seen]).astype(int).T
     assert 0 < obs.seen.sum() < obs.tracks.visible.sum() and left[v, u].all()
-    assert not len(lump.tracker.misplaced(obs, left).reject)
+    assert not len(lump.outlook.misplaced(obs, left).reject)
     lump.see(turned(4), mask=np.zeros_like(mask))
     away = lump.observed(turned(4), mask=left)
     off = away.tracks.visible & ~in_mask(away.tracks.uv_px, left)
-    assert set(lump.tracker.misplaced(away, left).reject.tolist()) == set(away.tracks.ids[off].tolist()) != set()
-    assert not len(lump.tracker.misplaced(away, None).reject), "it may be anywhere"
+    assert set(lump.outlook.misplaced(away, left).reject.tolist()) == set(away.tracks.ids[off].tolist()) != set()
+    assert not len(lump.outlook.misplaced(away, None).reject), "it may be anywhere"
 
 
 def test_an_object_is_awaited_from_when_its_mask_is_back():
     lump, nothing = settled(begun(), [2]), np.zeros((CAMERA.height, CAMERA.width), bool)
     full = ~nothing
-    assert not lump.tracker.awaited(full), "it is there"
+    assert not lump.outlook.awaited(full), "it is there"
     lump.see(turned(3), mask=nothing)
-    assert lump.tracker.awaited(full) and not lump.tracker.awaited(nothing) and not lump.tracker.awaited(None)
+    assert lump.outlook.awaited(full) and not lump.outlook.awaited(nothing) and not lump.outlook.awaited(None)
     sliver = nothing.copy()
     sliver[:2, :40] = True
-    assert not lump.tracker.awaited(sliver) and lump.see(turned(3), mask=sliver).estimate.status is Status.OCCLUDED
+    assert not lump.outlook.awaited(sliver) and lump.see(turned(3), mask=sliver).estimate.status is Status.OCCLUDED
 
 
 def test_few_points_say_where_the_others_show():
@@ -804,12 +819,12 @@ def test_few_points_say_where_the_others_show():
     few, truth = hide(lambda tracks: np.cumsum(tracks.visible) > 8), lump.tracks(turned(4))
     obs = lump.observed(turned(4), few)
     obs = replace(obs, frame=replace(obs.frame, index=3))
-    expected = lump.tracker.expected_px(obs)
+    expected = lump.outlook.expected_px(obs)
     known = np.isfinite(expected[:, 0])
     assert known.sum() > 15
     assert np.abs(expected - truth.uv_px)[known].max() < 1.5
-    assert lump.tracker.expected_px(lump.observed(turned(4))) is None, "enough are seen"
-    assert lump.tracker.expected_px(replace(obs, frame=replace(obs.frame, index=4))) is None, "not in every frame"
+    assert lump.outlook.expected_px(lump.observed(turned(4))) is None, "enough are seen"
+    assert lump.outlook.expected_px(replace(obs, frame=replace(obs.frame, index=4))) is None, "not in every frame"
     covered = replace(obs, frame=replace(obs.frame, depth_m=obs.frame.depth_m - np.float32(0.05)))
     assert not np.isfinite(lump.tracker.observer.expected_px(covered, START, lump.tracker.map.p_obj)).any()
 
@@ -817,12 +832,12 @@ def test_few_points_say_where_the_others_show():
 def test_a_hint_rejects_what_agrees_on_no_pose_only_while_it_is_away():
     lump = settled(begun(), [2])
     frame, wrong = lump.observed(turned(4)).frame, moved_to(turned(30), lump, visible_first(6))
-    there, requests = lump.tracker.hint(frame, wrong(lump.tracks(turned(4))))
+    there, requests = lump.hint(frame, wrong(lump.tracks(turned(4))))
     assert len(there.uv_px) > 10 and there.distance_m is not None and not len(requests.reject)
     lump.see(turned(3), mask=np.zeros((CAMERA.height, CAMERA.width), bool))
     few = wrong(lump.tracks(turned(4)))
     few = replace(few, visible=few.visible & (np.cumsum(few.visible) <= 12))
-    back, requests = lump.tracker.hint(frame, few)
+    back, requests = lump.hint(frame, few)
     assert not len(back.uv_px), "six points are no return"
     lifted = lump.tracker.map.ids[lump.tracker.observe(frame, None, few).seen]
     assert set(requests.reject.tolist()) >= set(few.ids[visible_first(6)(few)].tolist()) & set(lifted.tolist()) != set()
@@ -834,7 +849,7 @@ def test_a_hint_leaves_doubtful_tracks_to_the_tracker():
     lump.see(turned(3), mask=np.zeros((CAMERA.height, CAMERA.width), bool))
     tracks = lump.tracks(turned(4))
     doubtful = replace(tracks, uncertainty=np.full(len(tracks), 0.9))
-    hint, requests = lump.tracker.hint(lump.observed(turned(4)).frame, doubtful)
+    hint, requests = lump.hint(lump.observed(turned(4)).frame, doubtful)
     assert not len(hint.uv_px) and not len(requests.reject)
 
 
@@ -846,9 +861,9 @@ def test_a_hint_says_that_what_lay_still_is_outside_the_image_where_the_camera_i
     hidden = replace(lump.tracks(turned(0)), visible=np.zeros(len(lump.tracks(turned(0))), bool))
     for aside_m, gone in ((0.0, False), (5.0, True)):
         T_world_cam = se3.exp(np.array([0, 0, 0, aside_m, 0, 0]))
-        hint, _ = lump.tracker.hint(replace(frame, T_world_cam=T_world_cam), hidden)
+        hint, _ = lump.hint(replace(frame, T_world_cam=T_world_cam), hidden)
         assert hint.gone == gone
-    assert not lump.tracker.hint(frame, hidden)[0].gone, "nobody knows where the camera is"
+    assert not lump.hint(frame, hidden)[0].gone, "nobody knows where the camera is"
 
 
 def test_a_lost_object_is_looked_for_turned_as_in_its_keyframes():
@@ -856,16 +871,16 @@ def test_a_lost_object_is_looked_for_turned_as_in_its_keyframes():
     truth = se3.from_rt(np.eye(3), [0.05, 0.03, 0.1]) @ turned(25)
     assert lump.see(truth, unseen).estimate.status is Status.LOST
     obs = lump.observed(truth, unseen)
-    found = lump.tracker.sighted(obs)
+    found = lump.outlook.sighted(obs)
     T_obj_model = se3.inverse(lump.T_first[0]) @ lump.T_first[1]
     error = se3.inverse(truth) @ found.T_cam_obj @ T_obj_model
     assert np.degrees(se3.angle_rad(error)) < 6 and np.linalg.norm(error[:3, 3]) < 0.006
-    assert lump.tracker.sighted(replace(obs, mask=None)) is None, "where nobody knows where it is"
+    assert lump.outlook.sighted(replace(obs, mask=None)) is None, "where nobody knows where it is"
     depth_m = obs.frame.depth_m.copy()
     depth_m[0] = 0.9  # a wall above; nothing is measured below the object, of which that may be the upper half
-    assert lump.tracker.sighted(replace(obs, frame=replace(obs.frame, depth_m=depth_m))) is None
+    assert lump.outlook.sighted(replace(obs, frame=replace(obs.frame, depth_m=depth_m))) is None
     off_it = obs.cloud + 0.04 * np.array([0, 0, 1]) * np.array([0, 1, 0, -1])[np.arange(len(obs.cloud)) % 4, None]
-    assert lump.tracker.sighted(replace(obs, cloud=off_it)) is None, "half of the depth in the mask is not on it"
+    assert lump.outlook.sighted(replace(obs, cloud=off_it)) is None, "half of the depth in the mask is not on it"
 
 
 NOTHING = np.zeros((CAMERA.height, CAMERA.width), bool)
@@ -897,6 +912,6 @@ def test_questions_change_nothing():
     lump, other = settled(begun(), [2]), settled(begun(), [2])
     for _ in range(3):
         obs = lump.observed(turned(4))
-        lump.tracker.misplaced(obs, obs.mask)
-        lump.tracker.awaited(obs.mask)
+        lump.outlook.misplaced(obs, obs.mask)
+        lump.outlook.awaited(obs.mask)
     np.testing.assert_array_equal(lump.see(turned(4)).estimate.T_cam_obj, other.see(turned(4)).estimate.T_cam_obj)
