@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import trimesh
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from pandas import DataFrame, Series
+from pandas import DataFrame, Series, read_csv, to_numeric
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
@@ -23,8 +26,64 @@ from p2p_lib.figures import overlay, style
 from p2p_lib.figures.mesh_view import portrait
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, panels
+from p2p_lib.figures.provenance import Saved, save_figure
 from p2p_lib.figures.scenes import Scene
+from p2p_lib.studies.final_tables import SHIPPED
 from p2p_lib.synthetic.shapes import load_mesh
+
+if TYPE_CHECKING:
+    from IPython.display import Markdown
+
+
+#: What a fault should at most do: a share of the frames for lies, else what the column of the table is in.
+FAULT_GOALS = {"lies in it": 0.005, "lies after": 0.005, "longest": 5.0, "worst": 15.0, "mesh off (%)": 5.0}
+
+
+@style.styled
+def fault_picture(table: DataFrame) -> Figure:
+    """A row per fault of ``faults.csv`` (:func:`~p2p_lib.studies.final_tables.by_fault`): its numbers against goals.
+
+    The colour is the number by its goal: from 0 to twice as much or more, or never good again. What misses it is
+    bold, what has no number grey.
+    """
+    numbers = table.replace("never", np.inf).apply(to_numeric, errors="coerce")
+    goals = DataFrame(FAULT_GOALS, index=table.index)
+    goals[["lies in it", "lies after"]] = goals[["lies in it", "lies after"]].mul(numbers["frames"], axis=0)
+    of_goal = numbers[list(goals)] / goals
+    figure, (axis,) = panels(1, (WIDTH_IN, 1.4 + 0.2 * len(table)))
+    shades = colormaps["Oranges"].with_extremes(bad=style.STATUS[Status.TRACKED][0])
+    image = axis.imshow(np.ma.masked_invalid(of_goal.clip(upper=2)), shades, vmin=0, vmax=2, aspect="auto")
+    for (row, column), ratio in np.ndenumerate(of_goal.to_numpy()):
+        shown = str(table[of_goal.columns[column]].iloc[row])
+        dark = {"color": style.ink(to_hex(image.to_rgba(min(ratio, 2.0)))), "weight": "bold" if ratio > 1 else "normal"}
+        axis.text(column, row, shown, ha="center", va="center", fontsize=7.5, **dark)
+    rows = [
+        f"{fault} (failed: {n})" if n not in ("0", 0) else fault for fault, n in zip(table["Fault"], table["failed"])
+    ]
+    axis.set_yticks(range(len(table)), rows, fontsize=7.5)
+    heads = "lies in it\n[frames]|lies after\n[frames]|longest lie\n[frames]|good again,\nworst [frames]|mesh off\n[%]"
+    axis.set_xticks(range(len(FAULT_GOALS)), heads.split("|"))
+    axis.tick_params(top=True, labeltop=True, bottom=False, labelbottom=False, length=0)
+    axis.grid(False)
+    bar = figure.colorbar(image, orientation="horizontal", shrink=0.5, aspect=40, pad=0.01)
+    bar.set_ticks([0, 1, 2], labels=["0", "the goal", "twice as much, or never"])
+    bar.ax.axvline(1, color="#333333", lw=1.5)
+    return figure
+
+
+def shown_faults(parameters: Mapping[str, object], folder: Path = SHIPPED) -> Saved | Markdown:
+    """The picture of ``faults.csv`` in a folder for a notebook; without one, the command that makes it."""
+    file = folder / "faults.csv"
+    if not file.is_file():
+        from IPython.display import Markdown
+
+        return Markdown("*No table here. `p2p benchmark faults --out out/benchmark --tables figures/tables` makes it.*")
+    caption = """Faults of camera, depth, masks and time, each alone for 30 frames or from a frame on. Lies: poses that
+are sure (confidence above 0.5) and more than 5 cm off, while the fault lasts and after it, in all frames, and the
+longest stretch. Good again: frames in view after it until the pose is within 2 cm, worst object. Mesh off: vertices
+more than 1 cm off the true surface at the end. The line in the bar is the goal: lies in 0.5 % of the frames and for 5
+in a row, good again after 15 frames, 5 % of the mesh. What misses it is bold."""
+    return save_figure(fault_picture(read_csv(file)), "own_faults", caption, sources=[file], parameters=parameters)
 
 
 def errors_against(source: Recording, frames: Iterable[int], run: Run) -> dict[str, tuple[np.ndarray, np.ndarray]]:

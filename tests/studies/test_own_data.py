@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 
@@ -127,3 +128,27 @@ def test_errors_against_a_truth_that_was_not_known(made):
     np.testing.assert_allclose(deg[[0, 2, 3]], [0, 0, 4], atol=1e-6)
     np.testing.assert_allclose(mm[[0, 2, 3]], [0, 7, 0], atol=1e-6)
     assert np.isnan(deg[1]) and np.isnan(mm[1])
+
+
+def test_faults_that_miss_their_goal_are_bold_and_beyond_it(tmp_path):
+    heads = "Fault,runs,failed,frames,lies in it,lies after,longest,good again,worst,mesh off (%),notes"
+    lines = ["none,9,0,1000,0,5,5,0,15,5.0,", "mask wide,9,2,1000,6,0,6,3,never,40.0,", "black,9,-,-,-,-,-,-,-,-,why"]
+    (tmp_path / "faults.csv").write_text("\n".join([heads, *lines]))
+    (axis, bar) = own_data.fault_picture(pd.read_csv(tmp_path / "faults.csv")).axes
+    assert [t.get_text() for t in axis.get_yticklabels()] == [
+        "none",
+        "mask wide (failed: 2)",
+        "black (failed: -)",
+    ]
+    said = [(t.get_text(), t.get_weight()) for t in axis.texts]
+    assert [text for text, _ in said[:5]] == ["0", "5", "5", "15", "5.0"] and {w for _, w in said[:5]} == {"normal"}
+    assert said[5:10] == [("6", "bold"), ("0", "normal"), ("6", "bold"), ("never", "bold"), ("40.0", "bold")]
+    ratios = axis.images[0].get_array()
+    np.testing.assert_allclose(ratios[:2], [[0, 1, 1, 1, 1], [1.2, 0, 1.2, 2, 2]])
+    assert ratios.mask[2].all() and not ratios.mask[:2].any()
+    (line,) = bar.get_lines()
+    assert set(line.get_xdata()) == {1}
+
+
+def test_without_the_table_of_faults_there_is_the_command_that_makes_it(tmp_path):
+    assert "p2p benchmark faults" in own_data.shown_faults({}, tmp_path).data
