@@ -175,7 +175,7 @@ def _eval_masks(a: argparse.Namespace) -> None:
     "eval-tracks",
     "score a 2D point tracker against true tracks",
     _SEQUENCE,
-    run_options("settings", "seed", "tracker", "format", "depth_scale", models="meshes; else by measured depth"),
+    run_options("settings", "seed", "tracker", "format", "depth_scale", "stop", models="meshes; else measured depth"),
     arg("--queries", type=int, default=256, metavar="N", help="points to follow (default 256)"),
     arg("--search", choices=("picture", "masks"), default="picture", help="where invisible points are looked for"),
     _JSON,
@@ -485,7 +485,6 @@ def _data_where(a: argparse.Namespace) -> None:
     "config",
     "list and explain the parameters, or how the presets differ",
     arg("only", nargs="?", metavar="STAGE", help="only this one: registration, tsdf, ..."),
-    arg("--stage", metavar="STAGE", help="the same"),
     arg("--diff", action="store_true", help="only those in which the presets paper and default differ"),
     run_options("preset", "config_file", "settings"),
     _JSON,
@@ -493,7 +492,7 @@ def _data_where(a: argparse.Namespace) -> None:
 def _config(a: argparse.Namespace) -> None:
     from p2p_lib.core import config as configuration
 
-    rows = configuration.parameters(RunOptions.of_arguments(a).config(), a.only or a.stage)
+    rows = configuration.parameters(RunOptions.of_arguments(a).config(), a.only)
     if a.diff:
         paper = {key: left for key, (left, _) in configuration.diff().items()}
         rows = [{"key": r["key"], "paper": paper[r["key"]], **r} for r in rows if r["key"] in paper]

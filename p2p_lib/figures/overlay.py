@@ -111,7 +111,11 @@ def draw_mask(image: np.ndarray, mask: np.ndarray, colour: str, width_px: int = 
     if fill > 0:
         image[mask] = np.rint((1 - fill) * image[mask] + fill * np.array(style.rgb(colour))).astype(np.uint8)
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    return _rimmed(image, lambda on, *paint: cv2.drawContours(on, outlines, -1, *paint, cv2.LINE_AA), colour, width_px)
+
+    def draw(on: np.ndarray, *paint) -> np.ndarray:
+        return cv2.drawContours(on, outlines, -1, *paint, cv2.LINE_AA)
+
+    return _rimmed(image, draw, np.concatenate(outlines)[:, 0], colour, width_px) if outlines else image
 
 
 def draw_masks(
@@ -304,17 +308,22 @@ def _stroke(
     def draw(on: np.ndarray, *paint) -> np.ndarray:
         return cv2.polylines(on, lines, False, *paint, cv2.LINE_AA, _SHIFT)
 
-    return _rimmed(image, draw, colour, width_px, rim, strength) if lines else image.copy()
+    return _rimmed(image, draw, segments.reshape(-1, 2), colour, width_px, rim, strength) if lines else image.copy()
 
 
 def _rimmed(
-    image: np.ndarray, draw: Callable, colour: str, width_px: int, rim: float = 0.6, strength: float = 1.0
+    image: np.ndarray, draw: Callable, uv_px: np.ndarray, colour: str, width_px: int, rim: float = 0.6, strength=1.0
 ) -> np.ndarray:
-    """``draw(image, rgb, thickness)`` first for a dark rim, then in colour, each as opaque as it says."""
+    """``draw(image, rgb, thickness)`` about pixels (N, 2): a dark rim, then in colour, each as opaque as it says."""
+    image, reach, size = image.copy(), width_px + 4, image.shape[1::-1]
+    left, top = np.clip(np.floor(uv_px.min(0)) - reach, 0, size).astype(int)
+    right, bottom = np.clip(np.ceil(uv_px.max(0)) + reach, 0, size).astype(int)
+    part = image[top:bottom, left:right]  # nothing is drawn elsewhere, and to blend a whole image takes long
     for paint, thickness, opacity in ((_RIM, width_px + 2, rim), (colour, width_px, strength)):
-        if opacity:
-            drawn = draw(image.copy(), style.rgb(paint), thickness)
-            image = cv2.addWeighted(drawn, opacity, image, 1 - opacity, 0)
+        if opacity and part.size:
+            before = part.copy()
+            draw(image, style.rgb(paint), thickness)
+            part[:] = cv2.addWeighted(part, opacity, before, 1 - opacity, 0)
     return image
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -28,7 +27,8 @@ class Scene:
     """A run on its video, ready to be drawn.
 
     evaluation  brings the model's frame into the object's, and with it true boxes beside the estimated ones
-    boxes       object to its box in the object's frame, where there is no model or another is wanted
+    boxes       object to its box in the frame of the map that is kept, where there is no model or another is wanted
+    objects     what is drawn, by default those of the run, which are in the map that is kept (see :class:`Playback`)
     """
 
     def __init__(
@@ -38,6 +38,7 @@ class Scene:
         evaluation: Evaluation | None = None,
         boxes: Mapping[str, Box] | None = None,
         truth: bool = True,
+        objects: Mapping[str, ObjectRun] | None = None,
     ):
         if sequence.name != run.info["sequence"]:
             raise BadInput("scene", f"a run of {run.info['sequence']!r}", f"one of {sequence.name!r}")
@@ -48,33 +49,43 @@ class Scene:
             if not np.allclose(T_cam_model, obj.T_cam_model, atol=1e-6, equal_nan=True):
                 # A synthetic sequence may have been generated anew since.
                 raise BadInput("scene", f"a run on another {sequence.name!r}", "the data it ran on", "Run it again.")
-        self.sequence, self.run = sequence, run
+        self.sequence, self.run, self.objects = sequence, run, objects or run.objects
         known = set(run.objects) <= set(sequence.objects)  # a folder without masks knows no names
         self.colours = style.object_colours(sequence.objects if known else run.objects)
         self._model_boxes = {name: Box.around(points) for name, points in run.points.items()} if truth else {}
-        scored = evaluation.objects if evaluation else {}
-        self._boxes = {
-            name: Box.around(run.points[name], score.T_obj_model)
-            for name, score in scored.items()
-            if name in run.points and np.isfinite(score.T_obj_model).all()
-        } | dict(boxes or {})
+        kept = {name: obj.kept_map for name, obj in self.objects.items()}
+        self._boxes: dict[tuple[str, int], Box] = {}  # of an object's map, in the frame of that map
+        for name, score in evaluation.objects.items() if evaluation else ():
+            obj, points = self.objects[name], run.points.get(name)
+            if points is None or not np.isfinite(score.T_obj_model).all():
+                continue
+            both = np.flatnonzero(obj.has_pose & obj.has_truth)
+            for k in both[np.unique(obj.map_id[both], return_index=True)[1]].tolist():  # the first of each map
+                T_obj_model = se3.inverse(obj.T_cam_obj[k]) @ obj.T_cam_model[k]
+                self._boxes[name, int(obj.map_id[k])] = Box.around(points, T_obj_model)
+            self._boxes[name, kept[name]] = Box.around(points, score.T_obj_model)
+        self._boxes |= {(name, kept[name]): box for name, box in (boxes or {}).items()}
         self._playback: Playback | None = None
 
     @classmethod
     def of(cls, playback: Playback) -> Scene:
         """With all that the run's folder holds: keypoints, masks, and a box around each reconstructed surface."""
         boxes = {name: overlay.tight_box(mesh) for name, mesh in playback.meshes.items()}
-        run = replace(playback.run, objects=playback.objects)
-        scene = cls(playback.sequence, run, boxes=boxes, truth=False)
+        scene = cls(playback.sequence, playback.run, boxes=boxes, truth=False, objects=playback.objects)
         scene._playback = playback
         return scene
 
+    @classmethod
+    def scored(cls, playback: Playback) -> Scene:
+        """With the model's box, true and as estimated: in each map of an object by the first frame that has both."""
+        return cls(playback.sequence, playback.run, playback.evaluation, objects=playback.objects)
+
     def __len__(self) -> int:
-        return len(next(iter(self.run.objects.values())))
+        return len(next(iter(self.objects.values())))
 
     def row(self, index: int) -> int:
         """The row of the run that is of frame ``index`` of the sequence; :class:`BadInput` where there is none."""
-        frames = next(iter(self.run.objects.values())).frame_index
+        frames = next(iter(self.objects.values())).frame_index
         rows = np.flatnonzero(frames == index)
         if not len(rows):
             raise BadInput("frame", index, f"one of the run, {frames[0]} to {frames[-1]}")
@@ -97,14 +108,14 @@ class Scene:
         the path goes back; ``dots`` are pixels (K, 2) of the whole image and their colours (K, 3); ``note`` stands in
         the lower left corner.
         """
-        first = next(iter(self.run.objects.values()))
+        first = next(iter(self.objects.values()))
         frame = self.sequence.frame(int(first.frame_index[row]))
         whole, image = self.sequence.camera, self._with_what_was_seen(frame, row)
         region_px = region_px or (0, 0, whole.width, whole.height)
         image, camera = overlay.zoomed(image, whole, region_px, width_px or region_px[2] - region_px[0])
         foot = (0, image.shape[0] - 2, 1, image.shape[0] - 1)
         labels = [Label(note, "#222222", foot)] if note else []
-        for name, obj in self.run.objects.items():
+        for name, obj in self.objects.items():
             image = self._draw_object(image, camera, name, obj, row, axes, trail)
             labels.append(self._label(camera, name, obj, row))
         if dots is not None:
@@ -122,7 +133,7 @@ class Scene:
     def moments(self, count: int) -> list[int]:
         """Rows that tell the story: the first, each gap's middle and the return from it, then what lies between."""
         n, wanted = len(self), [0]
-        for obj in self.run.objects.values():
+        for obj in self.objects.values():
             for start, stop in gaps(obj):
                 wanted += [(start + stop) // 2, min(stop + 2, n - 1)]
         rows = sorted(set(wanted))[:count]
@@ -135,10 +146,11 @@ class Scene:
     def region(self, margin: float = 0.08) -> tuple[int, int, int, int]:
         """The rectangle of the objects over the whole run, with a margin (a fraction of the image's width)."""
         camera, uv = self.sequence.camera, [np.zeros((0, 2))]
-        for name, obj in self.run.objects.items():
-            estimated = self._boxes.get(name), obj.T_cam_obj[obj.has_pose & self._boxed(name)]
-            true = self._model_boxes.get(name), obj.T_cam_model[obj.has_truth]
-            uv += [camera.project(box.corners(T)).reshape(-1, 2) for box, T in (estimated, true) if box]
+        for name, obj in self.objects.items():
+            shown = [(self._model_boxes.get(name), obj.T_cam_model[obj.has_truth])]
+            for map_id in np.unique(obj.map_id).tolist():
+                shown.append((self._boxes.get((name, map_id)), obj.T_cam_obj[obj.has_pose & (obj.map_id == map_id)]))
+            uv += [camera.project(box.corners(T)).reshape(-1, 2) for box, T in shown if box]
         uv = np.concatenate(uv)
         uv = uv[camera.inside(uv)]
         if not len(uv):
@@ -146,11 +158,9 @@ class Scene:
         margin_px = round(margin * camera.width)
         return overlay.region_around(uv, camera, (margin_px, margin_px))
 
-    def _boxed(self, name: str) -> np.ndarray:
-        """(n,) bool: rows whose pose is in the frame of the object's box, where it has one."""
-        if self._playback is None or name not in self._boxes:
-            return np.full(len(self), name in self._boxes)
-        return self._playback.of_kept_map(name)
+    def _box(self, name: str, row: int) -> Box | None:
+        """An object's box in the frame of its pose at a row, where there is one."""
+        return self._boxes.get((name, int(self.objects[name].map_id[row])))
 
     def _with_what_was_seen(self, frame: Frame, row: int) -> np.ndarray:
         """The image with the masks and keypoints of the row, where the run's folder has them."""
@@ -165,7 +175,7 @@ class Scene:
         self, image: np.ndarray, camera: Camera, name: str, obj: ObjectRun, row: int, axes: bool, trail: int
     ) -> np.ndarray:
         colour, true_box = self.colours[name], self._model_boxes.get(name)
-        box = self._boxes[name] if self._boxed(name)[row] else None
+        box = self._box(name, row)
         if true_box and obj.has_truth[row]:
             T_cam_box = obj.T_cam_model[row] @ true_box.T_obj_box
             image = overlay.draw_box(image, camera, T_cam_box, true_box.size_m, style.TRUTH, 1, dashed=True)
@@ -186,8 +196,7 @@ class Scene:
         if not obj.has_pose[row] and name in self._model_boxes and obj.has_truth[row]:
             box, T_cam_obj = self._model_boxes[name], obj.T_cam_model[row]
         elif len(before):
-            box = self._boxes[name] if self._boxed(name)[before[-1]] else None
-            T_cam_obj = obj.T_cam_obj[before[-1]]
+            box, T_cam_obj = self._box(name, before[-1]), obj.T_cam_obj[before[-1]]
         else:
             return None
         uv = camera.project(box.corners(T_cam_obj) if box else T_cam_obj[None, :3, 3])
@@ -200,7 +209,7 @@ class Scene:
 def beside(scenes: Mapping[str, Scene], count: int, width_px: int = 300, axes: bool = False) -> np.ndarray:
     """A line of images for each method under its name: the moments that tell the story of the first."""
     first = next(iter(scenes.values()))
-    frames = next(iter(first.run.objects.values())).frame_index[first.moments(count)]
+    frames = next(iter(first.objects.values())).frame_index[first.moments(count)]
     region_px, images = first.region(), []
     for name, scene in scenes.items():
         for index in frames.tolist():

@@ -22,6 +22,7 @@ from p2p_lib.datasets.sequence import SYNTHETIC
 from p2p_lib.evaluation.consistency import reprojected
 from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.figures import mesh_view, overlay, style
+from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.scenes import Scene, beside
 from p2p_lib.synthetic.shapes import load_mesh
@@ -62,8 +63,7 @@ FAR_PX = 4.0
 
 def scene_of(benchmark: Benchmark, method: str, sequence: str = "") -> Scene:
     """A method's first finished run (on a sequence) on its video, ready to be drawn."""
-    run = benchmark.run(method, sequence)
-    return Scene(benchmark.video(method, sequence), run, evaluate(run))
+    return Scene.scored(Playback.of(benchmark.run(method, sequence), benchmark.video(method, sequence)))
 
 
 @style.styled

@@ -161,6 +161,10 @@ def test_every_map_is_drawn_and_the_surface_only_where_it_is_of_that_map(made, t
         assert in_colour(scene.draw(10, trail=0, words=False), colour, uv_px) > 0.8
     assert playback.keyframes("box")[0].tolist() == [16, 24, 32]
 
+    scored = Scene.scored(replace(playback, run=replace(playback.run, points={"box": points})))
+    for row in (10, 30):  # by the model, the box is known in either map
+        assert in_colour(scored.draw(row, axes=False), scored.colours["box"], box_edges(made, "box", row)) > 0.8
+
     messages = unpacked(scene_page(playback, points=100))
     shown = told(messages, "SetSceneNodeVisibilityMessage", "/objects/box/map")
     assert [(round(30 * t), m["visible"]) for t, m in shown][-2:] == [(0, False), (16, True)]
