@@ -5,7 +5,7 @@ Scores a 2D tracker by itself and any method's poses as well, and writes a run i
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy as np
 
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt
+from p2p_lib.core.late import Answers
 from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
@@ -154,6 +155,10 @@ def evaluate_tracker(
     options = replace(options or RunOptions(), **changes)
     config = options.config()
     sequence = sequences.open_sequence(sequence, options.format, options.depth_scale)
+    if options.stop is not None:
+        kept = slice(_frame_range(len(sequence), 0, options.stop).stop)
+        parts = {key: getattr(sequence, key)[kept] for key in ("rgb", "depth", "times_s")}
+        sequence = replace(sequence, **parts)
     task = TrackTask.of(sequence, config.seed, options.models, count)
     return task.score(task.tracker(options.tracker, config), search)
 
@@ -339,17 +344,13 @@ def _track(job: _Job, keeper: Keeper, progress: bool) -> None:
 
 def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
     """Every frame with its estimates, which a late 2D tracker gives some frames later."""
-    waiting: deque[Frame] = deque()
+    answers = Answers(method)
     for i in job.frames:
         frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
         for prompt in job.prompts.get(i, ()):
             method.tell(prompt)
-        waiting.append(frame)
-        estimates = method.step(frame, {name: masks[name] for name in method.objects if name in masks})
-        if len(waiting) > method.tracker.latency_frames:
-            yield waiting.popleft(), estimates
-    for estimates in method.finish():
-        yield waiting.popleft(), estimates
+        yield from answers.step(frame, {name: masks[name] for name in method.objects if name in masks})
+    yield from answers.finish()
 
 
 def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:

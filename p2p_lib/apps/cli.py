@@ -23,6 +23,7 @@ METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "det
 _SEQUENCE = arg("sequence", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA")
 _RUN = arg("run", type=Path, metavar="DIR", help="folder written by p2p run")
 _DATASET = arg("dataset", metavar="NAME")
+_FILES = "bop: p2p_SEQ-test.csv; tum: OBJECT.txt; poses: annotated_poses/OBJECT/FRAME.txt, 4x4 (all in DIR)"
 _POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
 _JSON = arg("--json", action="store_true", help="JSON instead of a table")
 _QUIET = arg("--quiet", action="store_true", help="no progress bar")
@@ -135,32 +136,38 @@ def _eval(a: argparse.Namespace) -> None:
         from p2p_lib.benchmark.rows import COLUMNS, as_csv
         from p2p_lib.benchmark.scoring import run_rows
 
-        return print(as_csv(run_rows(a.run, options.models), COLUMNS), end="")
-    if a.poses is not None:
+        print(as_csv(run_rows(a.run, options.models), COLUMNS), end="")
+    elif a.poses is not None:
         from p2p_lib.run import evaluate_poses
 
         how = {"format": options.format, "start": options.start, "stop": options.stop}
-        return _show(evaluate_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how), a.json)
+        _show(evaluate_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how), a.json)
+    else:
+        _eval_run(a, options)
+
+
+def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
+    """Against the truth; where there is none, or no model, against what the camera saw."""
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.evaluation.consistency import consistency
     from p2p_lib.evaluation.protocol import evaluate
 
     run = load_run(a.run)
+    score = None
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
-            return _show(evaluate(run, options.models, a.align, a.min_visible_px), a.json)
-        except MissingData as error:  # without a model it goes on as without truth
+            score = evaluate(run, options.models, a.align, a.min_visible_px)
+        except MissingData as error:
             if run.points or options.models:
                 raise
             warn(f"p2p eval: {error}")
-    _show(consistency(run), a.json)
-    if not a.json and not (a.run / "masks").is_dir() and run.info["masks"] != "dataset":
-        again = f"p2p run {run.info['path'] or run.info['sequence']} --out {a.run} --force --save-masks"
-        if prompts := (run.info.get("options") or {}).get("prompts"):
-            again += f" --prompts {prompts}"
-        empty = "where seen and mask IoU are empty, because no masks were kept"
-        warn(f"p2p eval: {empty}. Next, with any other options of the run: {again}")
-    return None
+    _show(score or consistency(run), a.json)
+    if not (score or a.json or (a.run / "masks").is_dir() or run.info["masks"] == "dataset"):
+        asked = RunOptions(**(run.info.get("options") or {}) | {"save_masks": True})
+        again = " ".join(
+            ["p2p run", run.info["path"] or run.info["sequence"], f"--out {a.run} --force", *asked.words()]
+        )
+        warn(f"p2p eval: where seen and mask IoU are empty, because no masks were kept. Next: {again}")
 
 
 @command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, _JSON, _MIN_VISIBLE)
@@ -268,7 +275,7 @@ def _figures(a: argparse.Namespace) -> None:
     "export",
     "write a run's poses as BOP, TUM or a dataset keeps them",
     _RUN,
-    arg("--format", required=True, choices=("bop", "tum", "poses"), help="BOP CSV, TUM, or 4x4 files"),
+    arg("--format", required=True, choices=("bop", "tum", "poses"), help=_FILES),
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
     arg("--frame", choices=("object", "model"), help="the tracker's (bop without truth needs it) or the model's"),
     arg("--min-confidence", type=float, default=0.0, metavar="C", help="leave less confident poses out (default 0)"),
@@ -276,8 +283,10 @@ def _figures(a: argparse.Namespace) -> None:
 def _export(a: argparse.Namespace) -> None:
     from p2p_lib.run import export_run
 
-    for path in export_run(a.run, a.format, a.out, a.frame, a.min_confidence):
-        print(path)
+    written = export_run(a.run, a.format, a.out, a.frame, a.min_confidence)
+    counts = {path: len(list(path.iterdir())) for path in written if path.is_dir()}
+    files = (f"{path}/*.txt ({counts[path]})" if path in counts else str(path) for path in written)
+    print(f"Written: {', '.join(files)}")
 
 
 @command(

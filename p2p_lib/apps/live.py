@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -19,6 +18,7 @@ import numpy as np
 from p2p_lib.apps.click import Clicker, wait_for_clicks
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.late import Answer, Answers
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate, status_text
@@ -84,7 +84,7 @@ def track_live(
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
     if options.tracker.startswith("builtin") and masks.segmenter == DEFAULT_SEGMENTER:
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector))
-    waiting: deque[Frame] = deque()  # those that a late 2D tracker has not answered yet
+    answers = Answers(method)
     with ExitStack() as kept:
         listeners = [lambda _, estimates: [on_estimate(estimate) for estimate in estimates.values()]]
         if overlay is not None:
@@ -92,10 +92,10 @@ def track_live(
         if out is not None:
             listeners.append(kept.enter_context(_kept(out, camera, method, options, prompts, if_exists)))
 
-        def answer(estimates: dict[str, PoseEstimate]) -> None:
-            frame = waiting.popleft()
-            for listen in listeners:
-                listen(frame, estimates)
+        def tell(answered: Iterable[Answer]) -> None:
+            for frame, estimates in answered:
+                for listen in listeners:
+                    listen(frame, estimates)
 
         start_s = monotonic()
         newest = kept.enter_context(Newest(camera, keep={p.frame for p in prompts}))
@@ -103,16 +103,12 @@ def track_live(
         while frame is not None and (frame is first or options.stop is None or frame.index < options.stop):
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))
-            waiting.append(frame)
-            estimates = method.step(frame)
-            if len(waiting) > method.tracker.latency_frames:
-                answer(estimates)
+            tell(answers.step(frame))
             if frame is not first:  # which may be long ago
                 count.count(frame)
             count.seconds = monotonic() - start_s
             frame = newest.take()
-        for estimates in method.finish():
-            answer(estimates)
+        tell(answers.finish())
     if prompts:
         got = f"frame {prompts[0].frame}, which never came"
         raise BadInput(f"prompt of {prompts[0].name!r}", got, "a frame of the camera", "Click in an earlier one.")

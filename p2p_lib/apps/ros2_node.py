@@ -21,6 +21,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.late import Answers
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.ros_messages import read_depth_m, read_rgb, seconds
 
@@ -79,26 +80,22 @@ class TrackingNode:
     def __init__(self, prompts: Any, publish: Any, config: Any = None):
         self.prompts, self.publish, self.config = sorted(prompts, key=lambda p: p.frame), publish, config
         self.tracker: Any = None
-        self._headers: list[Any] = []  # of frames without an answer yet
         self._count = 0
 
-    def on_images(self, rgb: Any, depth: Any, info: Any) -> dict[str, PoseEstimate]:
-        """One synchronised triple of messages; the estimates, which are of an earlier one if the tracker is late."""
+    def on_images(self, rgb: Any, depth: Any, info: Any) -> None:
+        """One synchronised triple of messages; what is published is of an earlier one if the tracker is late."""
         from p2p_lib.method.pipeline import Point2Pose
 
         if self.tracker is None:
             self.tracker = Point2Pose(camera_of(info), self.config)
+            self._answers = Answers(self.tracker)
         while self.prompts and self.prompts[0].frame <= self._count:
             self.tracker.tell(self.prompts.pop(0))
-        self._headers.append(rgb.header)
-        estimates = self.tracker.step(frame_of(self._count, rgb, depth))
-        self._count += 1
-        if len(self._headers) > self.tracker.tracker.latency_frames:
-            header = self._headers.pop(0)
+        for header, estimates in self._answers.step(frame_of(self._count, rgb, depth), about=rgb.header):
             for estimate in estimates.values():
                 if estimate.T_cam_obj is not None:
                     self.publish(estimate, header)
-        return estimates
+        self._count += 1
 
 
 def main() -> None:

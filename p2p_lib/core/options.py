@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from p2p_lib.core import config as configuration
@@ -160,6 +161,41 @@ class RunOptions:
         given["prompts"] = self.prompts if isinstance(self.prompts, str | Path) else None
         return json.loads(json.dumps(given, default=str))
 
+    def words(self) -> list[str]:
+        """The options that are not as they are by default, as one types them: ``["--stop 60", "--save-masks"]``."""
+        given = self.as_dict()
+        return [_word(of, given[of.name]) for of in fields(self) if given[of.name] not in (of.default, [])]
+
+
+def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, str]:
+    """What two runs were asked for where it differs, as one types it: ``("--stop 60", "no --stop")``."""
+    said: tuple[list[str], list[str]] = ([], [])
+    for of in fields(RunOptions):
+        pair = [asked.get(of.name, of.default) for asked in (one, other)]
+        if pair[0] == pair[1]:
+            continue
+        if of.metadata["flag"] == "--set" or of.name == "models":  # only those values that differ
+            pair = [
+                {k: v for k, v in (a or {}).items() if (b or {}).get(k) != v} or None for a, b in (pair, pair[::-1])
+            ]
+        for words, value in zip(said, pair, strict=True):
+            words.append(_word(of, value))
+    return " ".join(said[0]), " ".join(said[1])
+
+
+def _flag(option: Field) -> str:
+    return option.metadata["flag"] or "--" + option.name.replace("_", "-")
+
+
+def _word(option: Field, value: Any) -> str:
+    """An option with its value, as one types it; ``no --option`` where it is not typed."""
+    flag = _flag(option)
+    if value == option.default or value == []:
+        return f"no {flag}"
+    if isinstance(value, Mapping):
+        return " ".join(f"{flag} {quote(f'{name}={of}')}" for name, of in value.items())
+    return flag if value is True else f"{flag} {quote(','.join(value) if isinstance(value, list) else str(value))}"
+
 
 def add_options(parser: argparse.ArgumentParser, *wanted: str, **helps: str) -> None:
     """Make command-line arguments of the fields of :class:`RunOptions` that are wanted; none named: of all.
@@ -168,6 +204,5 @@ def add_options(parser: argparse.ArgumentParser, *wanted: str, **helps: str) -> 
     """
     for option in fields(RunOptions):
         if option.name in (*wanted, *helps) or not (wanted or helps):
-            flag = option.metadata["flag"] or "--" + option.name.replace("_", "-")
             how = {**option.metadata["how"], "dest": option.name, "default": option.default}
-            parser.add_argument(flag, **how | ({"help": helps[option.name]} if option.name in helps else {}))
+            parser.add_argument(_flag(option), **how | ({"help": helps[option.name]} if option.name in helps else {}))

@@ -14,6 +14,7 @@ import numpy as np
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import append, file_name, read_text, replace_text, replacing, writing_alone
+from p2p_lib.core.options import differing
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.images import save_png
 from p2p_lib.datasets.keypoint_log import FILE as KEYPOINTS
@@ -216,13 +217,21 @@ class RunWriter:
     def _check_same(self, earlier: Mapping[str, Any]) -> None:
         """That what is to be resumed was asked for in the same words."""
         mine, fix = json.loads(json.dumps(self.info)), f"Ask for the same, or run it anew: {_ANEW}."
-        for key, value in mine.items():
-            # Objects may have come later.
-            theirs = earlier.get(key) if key != "objects" else earlier[key][: len(value)]
-            if theirs != value and key not in _MAY_DIFFER:
-                raise BadInput(f"{self.path}: {key}", str(value)[:80], f"{str(theirs)[:80]}, as it began", fix)
-        if read_text(self.path / "config.toml", "the parameters of the run") != self._config.to_toml():
+        parameters = read_text(self.path / "config.toml", "the parameters of the run") == self._config.to_toml()
+        # Objects may have come later.
+        theirs = {key: earlier.get(key) if key != "objects" else earlier[key][: len(mine[key])] for key in mine}
+        differ = [key for key in mine if theirs[key] != mine[key] and key not in _MAY_DIFFER]
+        if not differ and parameters:
+            return
+        was, now = differing(theirs.get("options") or {}, mine.get("options") or {})
+        if "sequence" in differ or "path" in differ:
+            was, now = f"{_place(theirs)} {was}".strip(), f"{_place(mine)} {now}".strip()
+        if now:  # what somebody typed; all else follows of it
+            raise BadInput(f"{self.path}: the run to go on with", now, f"{was}, as it began", fix)
+        if not differ:
             raise BadInput(str(self.path / "config.toml"), "other parameters", "those that it began with", fix)
+        got, expected = (", ".join(str(info[key])[:80] for key in differ) for info in (mine, theirs))
+        raise BadInput(f"{self.path}: {', '.join(differ)}", got, f"{expected}, as it began", fix)
 
     def _compare(self, earlier: Run, k: int) -> None:
         """That the k-th frame came out as it did before."""
@@ -291,6 +300,10 @@ def look_into(out: Path, if_exists: IfExists) -> dict[str, Any] | None:
 def _in_words(info: Mapping[str, Any]) -> str:
     tracker, seed = info["tracker"], info["seed"]
     return f"a run of {info['sequence']} ({info['frames']} frames, tracker {tracker}, seed {seed})"
+
+
+def _place(info: Mapping[str, Any]) -> str:
+    return info["path"] or info["sequence"]
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:

@@ -236,7 +236,18 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert run(sequence, out, *words) == 0
     assert "which is finished" in capsys.readouterr().err and contents(out) == before
     assert run(sequence, out, "--seed", "8", "--resume") == 2
-    assert "seed: got 8, expected 7, as it began" in one_line(capsys)
+    got = "out: the run to go on with: got --seed 8, expected --seed 7, as it began. Ask for the same, or run it anew"
+    assert got in one_line(capsys)
+    assert run(sequence, out, *words, "--stop", "4", "--objects", "object", "--set", "sampling.points=9") == 2
+    got = "got --set sampling.points=9 --objects object --stop 4, expected no --set no --objects no --stop, as it began"
+    assert f"{got}. " in one_line(capsys), "and not what follows of it"
+    moved = shutil.copytree(sequence, tmp_path / "moved")
+    assert run(moved, out, *words) == 2
+    assert f"got {moved}, expected {sequence}, as it began" in one_line(capsys)
+    (out / "config.toml").write_text((out / "config.toml").read_text() + "\n")
+    assert run(sequence, out, *words) == 2
+    assert "config.toml: got other parameters" in one_line(capsys)
+    before["config.toml"] += b"\n"
     assert contents(out) == before
 
 
@@ -280,10 +291,10 @@ def test_config_explains_every_parameter_and_how_the_presets_differ(capsys):
     assert cli.main(["config", "--diff", "--json"]) == 0
     differ = {row["key"]: (row["paper"], row["value"]) for row in json.loads(capsys.readouterr().out)}
     assert differ == diff()
-    assert cli.main(["config", "--stage", "tsdf", "--set", "tsdf.voxel_m=0.007"]) == 0
+    assert cli.main(["config", "tsdf", "--set", "tsdf.voxel_m=0.007"]) == 0
     out = capsys.readouterr().out
     assert "tsdf.voxel_m = 0.007 m\n    A voxel has this edge. [ours]" in out and "registration." not in out
-    assert cli.main(["config", "--stage", "tsdff"]) == 2
+    assert cli.main(["config", "tsdff"]) == 2
     assert "Did you mean tsdf?" in capsys.readouterr().err
 
 
@@ -676,7 +687,7 @@ def test_an_object_of_ones_own_is_tracked_without_score(sequence, tmp_path, caps
     assert cli.main(["eval", str(tmp_path / "out")]) == 0
     out, err = capsys.readouterr()
     assert "my board" in out and err.count("\n") == 1 and "where seen and mask IoU are empty" in err
-    again = shlex.split(err.partition("of the run: p2p ")[2])
+    again = shlex.split(err.partition("Next: p2p ")[2])
     assert cli.main([*again, *POINTS_ALONE]) == 0
     capsys.readouterr()
     assert cli.main(["eval", str(tmp_path / "out")]) == 0

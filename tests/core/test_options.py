@@ -1,13 +1,14 @@
 """Options of a run are declared once: every field is an argument of the command line and comes back from it."""
 
 import argparse
+import shlex
 from dataclasses import fields
 
 import pytest
 
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.options import RunOptions, add_options
+from p2p_lib.core.options import RunOptions, add_options, differing
 
 #: What is typed for each field, and what the field is then.
 TYPED = {
@@ -31,6 +32,19 @@ TYPED = {
     "stop": (["--stop", "9"], 9),
     "models": (["--models", "mug=a.ply", "can=b.ply"], {"mug": "a.ply", "can": "b.ply"}),
 }
+
+
+def test_options_are_spelled_as_they_are_typed():
+    words = [word for typed, _ in TYPED.values() for word in typed]
+    again = parsed(*shlex.split(" ".join(parsed(*words).words())))
+    assert again.as_dict() == parsed(*words).as_dict() and parsed().words() == []
+    quoted = RunOptions(prompts="my clicks.json").words()
+    assert shlex.split(" ".join(quoted)) == ["--prompts", "my clicks.json"]
+    asked = parsed("--stop", "9", "--save-masks").as_dict()
+    assert differing(asked, parsed("--seed", "1").as_dict()) == (
+        "no --seed --save-masks --stop 9",
+        "--seed 1 no --save-masks no --stop",
+    )
 
 
 def parsed(*words: str, wanted: tuple[str, ...] = ()) -> RunOptions:
