@@ -7,9 +7,9 @@ milliseconds, masks that hold the table too, objects without anything to track.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,12 +20,15 @@ from p2p_lib.core.backends import DEFAULT_DETECTOR, make_detector
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
+from p2p_lib.core.findings import Finding, Level
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
+from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
+from p2p_lib.datasets.image_sequence import paired_images
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.prompts import prompts_by_frame
-from p2p_lib.datasets.sequence import Sequence, open_sequence
+from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
 from p2p_lib.method.sampling import choose, usable_region
 
 #: Frames that are looked at, evenly spread.
@@ -51,25 +54,14 @@ LARGE_SHARE, DEEP_SHARE = 0.12, 0.25
 #: Fraction of depth at its largest value from which on it was cut off there.
 CLIPPED_SHARE = 0.1
 
+#: What to put where something of a folder is missing.
+_PUT = {
+    "rgb": "Put the colour images there, one for each depth image.",
+    "depth": "Put the depth images there, registered to colour, one for each colour image, in 16-bit millimetres.",
+    "K": "Write fx 0 cx / 0 fy cy / 0 0 1 into it, in pixels at the size of the images.",
+}
+
 FirstMasks = dict[str, tuple[Frame, np.ndarray]]
-
-
-class Level(StrEnum):
-    """How bad a finding is: fine, worth a look, or to be mended before anything else."""
-
-    OK = "ok"
-    LOOK = "look"
-    WRONG = "WRONG"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that was looked at: its name, how it is, what was measured, and what to do about it."""
-
-    name: str
-    level: Level
-    text: str
-    fix: str = ""
 
 
 def check_folder(
@@ -85,22 +77,30 @@ def check_folder(
     prompts  clicks, for a sequence without masks: the built-in segmenter makes its first ones
     config   whose limits count (default: the preset ``default``)
 
-    Files that cannot be read are findings too.
+    Files that are missing or cannot be read are findings too, all that can be told without each other.
     """
     config = config or preset()
     try:
-        sequence = open_sequence(sequence, format, depth_scale)
-        chosen = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist()
-        frames = [sequence.frame(i) for i in chosen]
-        masks = [sequence.masks(i) or {} for i in chosen]
-        with warnings.catch_warnings(record=True) as doubts:
-            warnings.simplefilter("always", Doubt)
-            try:
-                firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
-            except BadInput as error:
-                return [replace(_unreadable(error), name="clicks" if prompts else "masks")]
+        opened = open_sequence(sequence, format, depth_scale)
     except P2PError as error:
-        return [_unreadable(error)]
+        own = isinstance(sequence, str | Path) and format in (None, "folder")
+        return (_files(Path(sequence).expanduser()) if own else []) or [_unreadable("files", error)]
+    sequence, frames, masks, wrong = opened, [], [], []
+    chosen = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist()
+    for i in chosen:
+        try:
+            frames.append(sequence.frame(i))
+            masks.append(sequence.masks(i) or {})
+        except P2PError as error:
+            wrong.append(_unreadable("files", error))
+    if wrong:
+        return wrong
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always", Doubt)
+        try:
+            firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
+        except P2PError as error:
+            return [_unreadable("clicks" if prompts else "masks", error)]
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     depth = _depth(frames)
     findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
@@ -125,25 +125,40 @@ def check_folder(
     return findings
 
 
-def as_lines(findings: Iterable[Finding]) -> str:
-    """The findings for people, each remedy under what it mends."""
-    findings = list(findings)
-    width = max(len(finding.name) for finding in findings)
-    lines = []
-    for finding in findings:
-        lines.append(f"{finding.level:7}{finding.name:{width}}  {finding.text}")
-        lines += [f"{'':7}{'':{width}}  -> {finding.fix}"] * bool(finding.fix)
-    wrong, look = (", ".join(f.name for f in findings if f.level is level) for level in (Level.WRONG, Level.LOOK))
-    if wrong:
-        return "\n".join([*lines, f"To mend first: {wrong}"])
-    nothing = "Nothing is wrong with it as far as can be seen."
-    return "\n".join([*lines, f"To look at before tracking: {look}" if look else nothing])
-
-
-def _unreadable(error: P2PError) -> Finding:
+def _unreadable(name: str, error: P2PError, fix: str = "") -> Finding:
     if isinstance(error, BadInput):
-        return Finding("files", Level.WRONG, f"{error.name}: got {error.got}, expected {error.expected}", error.fix)
-    return Finding("files", Level.WRONG, str(error))
+        got = f"{error.name}: got {error.got}, expected {error.expected}"
+        return Finding(name, Level.WRONG, got, error.fix or fix)
+    return Finding(name, Level.WRONG, str(error), fix)
+
+
+def _files(folder: Path) -> list[Finding]:
+    """Each file of a folder of one's own that is missing or wrong; none where it is in another layout."""
+    if not any((folder / part).exists() for part in ("rgb", "depth", "cam_K.txt")):
+        return []
+    with suppress(P2PError):
+        if recognise(folder) != "folder":
+            return []
+    wrong: list[Finding] = []
+
+    def look(name: str, fix: str, read: Callable[[], object]) -> None:
+        try:
+            read()
+        except P2PError as error:
+            wrong.append(_unreadable(name, error, fix))
+
+    def first(part: str, suffixes: tuple[str, ...], read: Callable[[Path], np.ndarray]) -> None:
+        look(f"{part}/", _PUT[part], lambda: read(images.list_files(folder / part, suffixes, f"{part} images")[0]))
+
+    first("rgb", images.COLOUR, images.read_rgb)
+    first("depth", images.DEPTH, images.read_raw_depth)
+    if not wrong:
+        look("depth/", "", lambda: paired_images(folder))
+    K = "a 3x3 camera matrix in pixels"
+    look("cam_K.txt", _PUT["K"], lambda: Camera.from_K(images.read_numbers(folder / "cam_K.txt", K), 1, 1, "cam_K.txt"))
+    for path in (path for path in (folder / "times.txt", folder / "depth_scale.txt") if path.exists()):
+        look(path.name, "It is optional: mend it or take it away.", partial(images.read_numbers, path, "numbers"))
+    return wrong
 
 
 def _camera(camera: Camera) -> Finding:

@@ -198,7 +198,7 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     "benchmark",
     "run methods on sequences with seeds as a plan says; resumes",
     arg("plan", nargs="*", metavar="PLAN", help="TOML files, or names that --list shows"),
-    arg("--list", action="store_true", help="list the plans of the paper's tables and of the README"),
+    arg("--list", action="store_true", help="what can run here and now; of PLAN: what it lacks"),
     arg("--out", type=Path, metavar="DIR", help="runs, records and tables; several plans may share it"),
     arg("--quick", action="store_true", help="a few frames of bundled data instead of the plan in full"),
     arg("--jobs", type=int, metavar="N", help="runs at a time on this machine (default: one a core)"),
@@ -209,17 +209,17 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     _QUIET,
 )
 def _benchmark(a: argparse.Namespace) -> int:
-    from p2p_lib.apps.readiness import present_plans, readiness, what_to_fetch
-    from p2p_lib.benchmark import plan_names, read_plan, run_benchmarks
+    from p2p_lib.apps.readiness import overview, present_plans, readiness, what_to_fetch
+    from p2p_lib.benchmark import read_plan, run_benchmarks
     from p2p_lib.core.paths import data_dir
     from p2p_lib.figures.provenance import save_table
     from p2p_lib.studies.final_tables import paper_table, write_table
 
     if a.list:
         wide = get_terminal_size((10_000, 24)).columns  # elsewhere than on a terminal lines stay whole
-        where = "Data and weights are looked for below $P2P_DATA (export P2P_DATA=DIR), see p2p data list; with --quick"
-        last = f"{where} no plan needs any. p2p doctor says which packages networks need besides."
-        for line in [*(line for name in plan_names() for line in readiness(name).splitlines()), last]:
+        last = "Data and weights are looked for below $P2P_DATA (see p2p data list); with --quick no plan needs any."
+        found = [readiness(plan) for plan in a.plan] or [overview(), "What a plan lacks: p2p benchmark --list PLAN"]
+        for line in "\n".join([*found, last]).splitlines():
             print(fill(line, wide, subsequent_indent=" " * 6, break_long_words=False, break_on_hyphens=False))
         return 0
     if a.present and not (present := present_plans()):
@@ -373,12 +373,14 @@ def _click(a: argparse.Namespace) -> None:
     _JSON,
 )
 def _check(a: argparse.Namespace) -> int:
-    from p2p_lib.apps.check import Level, as_lines, check_folder
+    from p2p_lib.apps.check import check_folder
+    from p2p_lib.core.findings import Level, as_lines
     from p2p_lib.datasets.prompts import load_prompts
 
     prompts = load_prompts(a.prompts) if a.prompts else ()
     findings = check_folder(a.sequence, prompts=prompts, format=a.format, depth_scale=a.depth_scale)
-    print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings))
+    fine = "Nothing is wrong with it as far as can be seen."
+    print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings, fine))
     return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
 
 
@@ -461,9 +463,9 @@ def _data_verify(a: argparse.Namespace) -> int:
     from p2p_lib.datasets.inventory import manifest, verify
 
     good = True
-    for check in verify(manifest(a.dataset), a.every_frame):
-        print(f"{'ok   ' if check.ok else 'WRONG'}  {check.what}: {check.text}", flush=True)
-        good &= check.ok
+    for finding in verify(manifest(a.dataset), a.every_frame):
+        print(finding.line(), flush=True)
+        good &= finding.fine
     return 0 if good else P2PError.exit_code
 
 
@@ -518,11 +520,12 @@ def _config(a: argparse.Namespace) -> None:
 
 @command("doctor", "check this installation and say how to mend it")
 def _doctor(a: argparse.Namespace) -> int:
-    from p2p_lib.apps.doctor import format_checks, run_doctor
+    from p2p_lib.apps.doctor import run_doctor
+    from p2p_lib.core.findings import Level, as_lines
 
-    checks = run_doctor()
-    print(format_checks(checks))
-    return 0 if all(check.ok or check.optional for check in checks) else P2PError.exit_code
+    findings = run_doctor()
+    print(as_lines(findings, "All that is required is there. A dash is optional."))
+    return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
 
 
 def _film_wanted(path: Path | None) -> Callable[..., Path] | None:

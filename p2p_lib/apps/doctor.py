@@ -9,11 +9,11 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
 from p2p_lib.core import native
+from p2p_lib.core.findings import Finding, Level
 from p2p_lib.core.packages import INSTALL, PIP, command, cotracker_folder
 from p2p_lib.core.paths import PROJECT, cache_dir, data_dir
 
@@ -34,18 +34,7 @@ FREE_GB = 5.0
 IMPORT_TIMEOUT_S = 180
 
 
-@dataclass(frozen=True)
-class Check:
-    """One finding: what was looked at, whether it is fine, whether one can do without, and what mends it."""
-
-    name: str
-    ok: bool
-    optional: bool
-    found: str
-    remedy: str = ""
-
-
-def run_doctor() -> list[Check]:
+def run_doctor() -> list[Finding]:
     """Python, required packages (really imported, in a process of their own), libraries, GPU, backends, data."""
     required = required_packages()
     # Together they take seconds; where that fails each is imported by itself, which tells which it is.
@@ -56,16 +45,10 @@ def run_doctor() -> list[Check]:
     return [_python(), *imports, *libraries, _kernel(), _gpu(), *optional, _cotracker(), _data(), _cache(), _disk()]
 
 
-def format_checks(checks: list[Check]) -> str:
-    """The findings as lines for people, the remedies under what they mend."""
-    width = max(len(check.name) for check in checks)
-    lines = []
-    for check in checks:
-        mark = "ok" if check.ok else "-" if check.optional else "MISSING"
-        lines.append(f"{mark:8}{check.name:{width}}  {check.found}")
-        lines += [] if check.ok else [f"{'':8}{'':{width}}  -> {check.remedy}"]
-    wrong = ", ".join(check.name for check in checks if not (check.ok or check.optional))
-    return "\n".join([*lines, f"To mend: {wrong}" if wrong else "All that is required is there. A dash is optional."])
+def _found(name: str, ok: bool, optional: bool, found: str, remedy: str = "") -> Finding:
+    """Whether it is fine, whether one can do without, and what mends it where it is not."""
+    level = Level.OK if ok else Level.OPTIONAL if optional else Level.WRONG
+    return Finding(name, level, found, "" if ok else remedy)
 
 
 def required_packages() -> list[str]:
@@ -74,10 +57,10 @@ def required_packages() -> list[str]:
     return sorted(re.match(r"[A-Za-z0-9._-]+", need)[0] for need in needs if "extra ==" not in need)
 
 
-def _python() -> Check:
+def _python() -> Finding:
     fine = (3, 11) <= sys.version_info[:2] <= (3, 13)
     found = f"{platform.python_version()}, glibc {platform.libc_ver()[1] or 'none'}, {os.cpu_count()} cores"
-    return Check("Python", fine, False, found, "Set P2P_PYTHON to a Python 3.11 to 3.13 and run: make setup")
+    return _found("Python", fine, False, found, "Set P2P_PYTHON to a Python 3.11 to 3.13 and run: make setup")
 
 
 def _loading(name: str) -> str:
@@ -87,12 +70,12 @@ def _loading(name: str) -> str:
     return f"import {MODULES.get(name, name.replace('-', '_'))}"
 
 
-def _package(name: str, error: str | None = None) -> Check:
+def _package(name: str, error: str | None = None) -> Finding:
     """A required package; ``error`` is what ended its import, None where nobody has tried."""
     if name == "libusb-package" and native.loads("libusb-1.0.so.0"):
-        return Check(name, True, True, "not needed: the system has libusb")
+        return _found(name, True, True, "not needed: the system has libusb")
     error = _fails(_loading(name)) if error is None else error
-    return Check(name, not error, False, error or metadata.version(name), error.partition("Run: ")[2] or "make setup")
+    return _found(name, not error, False, error or metadata.version(name), error.partition("Run: ")[2] or "make setup")
 
 
 def _fails(code: str) -> str:
@@ -107,60 +90,60 @@ def _fails(code: str) -> str:
     return last if result.returncode else ""
 
 
-def _library(library: str, package: str) -> Check:
+def _library(library: str, package: str) -> Finding:
     if native.loads(library):
-        return Check(library, True, False, "of the system")
+        return _found(library, True, False, "of the system")
     if package == "libusb-1.0-0" and native.preload_libusb():
-        return Check(library, True, False, "of the package libusb-package")
-    return Check(library, False, False, "not found; Open3D needs it", native.install_command([library]))
+        return _found(library, True, False, "of the package libusb-package")
+    return _found(library, False, False, "not found; Open3D needs it", native.install_command([library]))
 
 
-def _kernel() -> Check:
+def _kernel() -> Finding:
     there = (Path(sys.prefix) / "share" / "jupyter" / "kernels" / "python3").is_dir()
-    return Check("Jupyter kernel", there, False, "python3" if there else "none", "make setup")
+    return _found("Jupyter kernel", there, False, "python3" if there else "none", "make setup")
 
 
-def _gpu() -> Check:
+def _gpu() -> Finding:
     smi = shutil.which("nvidia-smi")
     listed = subprocess.run([smi, "-L"], capture_output=True, text=True).stdout.strip().splitlines() if smi else []
     if not listed:
-        return Check("GPU", False, True, "none; everything runs on the CPU", "nothing to do without an NVIDIA GPU")
+        return _found("GPU", False, True, "none; everything runs on the CPU", "nothing to do without an NVIDIA GPU")
     name = re.sub(r" \(UUID.*", "", listed[0])
     error = _fails("import torch, sys; sys.exit(None if torch.cuda.is_available() else f'torch {torch.__version__}')")
-    return Check("GPU", not error, True, f"{name}; {error or 'torch uses it'}", "P2P_TORCH=cuda make setup")
+    return _found("GPU", not error, True, f"{name}; {error or 'torch uses it'}", "P2P_TORCH=cuda make setup")
 
 
-def _optional(name: str, module: str, serves: str, remedy: str) -> Check:
+def _optional(name: str, module: str, serves: str, remedy: str) -> Finding:
     try:
         there = importlib.util.find_spec(module) is not None
     except ModuleNotFoundError:  # its parent package is missing
         there = False
-    return Check(name, there, True, serves + ("" if there else "; not installed"), command(remedy))
+    return _found(name, there, True, serves + ("" if there else "; not installed"), command(remedy))
 
 
-def _cotracker() -> Check:
+def _cotracker() -> Finding:
     there = cotracker_folder() is not None  # it comes through torch.hub, which keeps it under its own cache folder
     serves = "2D tracker cotracker3, CC BY-NC: not for commercial use" + ("" if there else "; not there")
-    return Check("cotracker", there, True, serves, command(INSTALL["co-tracker"]))
+    return _found("cotracker", there, True, serves, command(INSTALL["co-tracker"]))
 
 
-def _data() -> Check:
+def _data() -> Finding:
     folder = data_dir()
     if folder is None:
-        return Check("$P2P_DATA", False, True, "not set; bundled data only", "export P2P_DATA=FOLDER of your datasets")
+        return _found("$P2P_DATA", False, True, "not set; bundled data only", "export P2P_DATA=FOLDER of your datasets")
     found = f"{folder}{'' if folder.is_dir() else ' does not exist'}"
-    return Check("$P2P_DATA", folder.is_dir(), True, found, "point P2P_DATA at an existing folder")
+    return _found("$P2P_DATA", folder.is_dir(), True, found, "point P2P_DATA at an existing folder")
 
 
-def _cache() -> Check:
+def _cache() -> Finding:
     folder = cache_dir()
     nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     used_mb = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
     remedy = "set P2P_CACHE to a folder you may write to"
-    return Check("cache folder", os.access(nearest, os.W_OK), False, f"{folder}, {used_mb:.0f} MB used", remedy)
+    return _found("cache folder", os.access(nearest, os.W_OK), False, f"{folder}, {used_mb:.0f} MB used", remedy)
 
 
-def _disk() -> Check:
+def _disk() -> Finding:
     free_gb = shutil.disk_usage(PROJECT).free / 1e9
     remedy = f"free {FREE_GB:.0f} GB beside the project"
-    return Check("disk", free_gb >= FREE_GB, False, f"{free_gb:.0f} GB free", remedy)
+    return _found("disk", free_gb >= FREE_GB, False, f"{free_gb:.0f} GB free", remedy)

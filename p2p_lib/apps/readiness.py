@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from textwrap import shorten
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import jobs_of
 from p2p_lib.benchmark.plan import plan_names, read_plan
+from p2p_lib.core.tables import as_text
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.sequence import SYNTHETIC
+
+_TITLE = 60  # letters of a plan's title that a narrow table has room for
 
 
 def readiness(name: str) -> str:
@@ -26,6 +30,21 @@ def readiness(name: str) -> str:
             said += f"; else: {why[0]}" + f" ({len(why) - 1} more likewise)" * (len(why) > 1)
         alike[said].append(method)
     return "\n".join([*lines, *(f"  {'; '.join(methods)}: {said}" for said, methods in alike.items())])
+
+
+def overview() -> str:
+    """What can run here and now, in one line, then a row for each plan: how many of its methods on a sequence can."""
+    from pandas import DataFrame
+
+    rows, whole, here, every = [], 0, 0, 0
+    for name in plan_names():
+        plan = read_plan(name)
+        jobs = {(job.method.name, job.sequence.name): job.reason for job in jobs_of(plan, "full")}
+        ready = sum(not reason for reason in jobs.values())
+        whole, here, every = whole + (ready == len(jobs)), here + ready, every + len(jobs)
+        rows.append((name, f"{ready} of {len(jobs)}", shorten(plan.title, _TITLE, placeholder=" ...")))
+    first = f"{whole} of {len(rows)} plans can run here and now in full; {here} of {every} methods on a sequence can."
+    return f"{first}\n{as_text(DataFrame(rows, columns=['plan', 'can run', 'what']))}"
 
 
 def present_plans() -> list[str]:

@@ -174,10 +174,9 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, st
         pair = [asked.get(of.name, of.default) for asked in (one, other)]
         if pair[0] == pair[1]:
             continue
-        if of.metadata["flag"] == "--set" or of.name == "models":  # only those values that differ
-            pair = [
-                {k: v for k, v in (a or {}).items() if (b or {}).get(k) != v} or None for a, b in (pair, pair[::-1])
-            ]
+        if any(isinstance(value, Mapping) for value in pair):  # of these only the values that differ
+            a, b = (dict(value or {}) for value in pair)
+            pair = [dict(a.items() - b.items()) or None, dict(b.items() - a.items()) or None]
         for words, value in zip(said, pair, strict=True):
             words.append(_word(of, value))
     return " ".join(said[0]), " ".join(said[1])

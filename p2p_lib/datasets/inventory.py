@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from tqdm import tqdm
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.files import read_text, replace_text
+from p2p_lib.core.findings import Finding, Level
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.tables import as_text
 from p2p_lib.datasets.archives import unpack
@@ -25,15 +25,6 @@ from p2p_lib.datasets.download import download, sha256
 from p2p_lib.datasets.manifests import Manifest, RemoteFile, find_sequence, folder_of, manifest, names
 from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import open_sequence
-
-
-@dataclass(frozen=True)
-class Check:
-    """One thing that was looked at; ``text`` says what was found."""
-
-    what: str
-    ok: bool
-    text: str
 
 
 class _Recorded(BaseModel):
@@ -134,14 +125,14 @@ def require(of: Manifest) -> list[Path]:
 # --- verifying -------------------------------------------------------------------------------------
 
 
-def verify(of: Manifest, every_frame: bool = False) -> Iterator[Check]:
+def verify(of: Manifest, every_frame: bool = False) -> Iterator[Finding]:
     """Look at what is on disk: files against checksums, unpacked files, every sequence opened and its truth read.
 
     every_frame  read all images of every sequence, else the first and the last
     """
     folder = folder_of(of)
     if not folder.is_dir():
-        yield Check(str(folder), False, f"not there. Next: p2p data info {of.name}")
+        yield Finding(str(folder), Level.WRONG, "not there", f"Next: p2p data info {of.name}")
         return
     record = _Record(of)
     for file in of.files:
@@ -152,22 +143,26 @@ def verify(of: Manifest, every_frame: bool = False) -> Iterator[Check]:
         yield from _verify_sequences(of, folder / of.sequences_in, every_frame)
 
 
-def _verify_file(file: RemoteFile, record: _Record) -> Check:
+def _found(name: str, ok: bool, text: str) -> Finding:
+    return Finding(name, Level.OK if ok else Level.WRONG, text)
+
+
+def _verify_file(file: RemoteFile, record: _Record) -> Finding:
     path, expected, unpacked = record.folder / file.path, record.sha256(file), record.unpacked(file)
     if path.is_file():
         digest = sha256(path)
         if expected is None:
-            return Check(file.path, True, f"there, nothing to compare with; sha256 {digest}")
-        return Check(file.path, digest == expected, "sha256 as expected" if digest == expected else f"sha256 {digest}")
+            return _found(file.path, True, f"there, nothing to compare with; sha256 {digest}")
+        return _found(file.path, digest == expected, "sha256 as expected" if digest == expected else f"sha256 {digest}")
     if unpacked is None:
-        return Check(file.path, False, "not there")
+        return _found(file.path, False, "not there")
     into = record.folder / (file.unpack_to or ".")
     gone = [n for n, size in unpacked.items() if not ((into / n).is_file() and (into / n).stat().st_size == size)]
     text = f"{len(gone)} unpacked files are missing or changed, {gone[0]} first" if gone else "unpacked, all there"
-    return Check(file.path, not gone, text)
+    return _found(file.path, not gone, text)
 
 
-def _verify_listed(path: Path) -> Check:
+def _verify_listed(path: Path) -> Finding:
     """The checksums that a dataset's own ``sequences.json`` lists, of those files that are there."""
     listed: dict[str, str] = {}
 
@@ -180,24 +175,24 @@ def _verify_listed(path: Path) -> Check:
     try:
         json.loads(read_text(path, "checksums"), object_hook=note)
     except (ValueError, RecursionError) as error:
-        return Check(path.name, False, f"unreadable ({error})")
+        return _found(path.name, False, f"unreadable ({error})")
     here = [name for name in listed if (path.parent / name).is_file()]
     wrong = [name for name in here if sha256(path.parent / name) != listed[name]]
     text = f"{len(here)} of the {len(listed)} files it lists are here"
-    return Check(path.name, not wrong, f"{text}, wrong: {', '.join(wrong)}" if wrong else text)
+    return _found(path.name, not wrong, f"{text}, wrong: {', '.join(wrong)}" if wrong else text)
 
 
-def _verify_sequences(of: Manifest, folder: Path, every_frame: bool) -> Iterator[Check]:
+def _verify_sequences(of: Manifest, folder: Path, every_frame: bool) -> Iterator[Finding]:
     frames = {entry.name: entry.frames for entry in of.sequences}
     found = sorted(path.parent.name for path in folder.glob("*/rgb") if path.is_dir())
     for name in dict.fromkeys([*frames, *found]):
         try:
             yield _verify_sequence(folder / name, of.format, frames.get(name), every_frame)
         except P2PError as error:
-            yield Check(name, False, str(error))
+            yield _found(name, False, str(error))
 
 
-def _verify_sequence(folder: Path, format: str | None, frames: int | None, every_frame: bool) -> Check:
+def _verify_sequence(folder: Path, format: str | None, frames: int | None, every_frame: bool) -> Finding:
     sequence = open_sequence(folder, format)
     for i in range(len(sequence)) if every_frame else {0, len(sequence) - 1}:
         sequence.frame(i)
@@ -205,8 +200,8 @@ def _verify_sequence(folder: Path, format: str | None, frames: int | None, every
     truth = {obj: int((t.T_cam_model == t.T_cam_model).all((1, 2)).sum()) for obj, t in sequence.truth.items()}
     text = f"{len(sequence)} frames, truth " + (", ".join(f"{o} in {n}" for o, n in truth.items()) or "none")
     if frames is not None and frames != len(sequence):
-        return Check(folder.name, False, f"{text}, expected {frames} frames")
-    return Check(folder.name, True, text)
+        return _found(folder.name, False, f"{text}, expected {frames} frames")
+    return _found(folder.name, True, text)
 
 
 # --- describing ------------------------------------------------------------------------------------

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from p2p_lib.apps import check, cli
-from p2p_lib.apps.check import Level, as_lines, check_folder
+from p2p_lib.apps.check import check_folder
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.findings import Level, as_lines
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
@@ -206,7 +207,7 @@ def test_what_cannot_be_read_is_a_finding(good, tmp_path, capsys):
     (folder / "depth" / "000003.png").unlink()
     assert cli.main(["check", str(folder)]) == 2
     out, err = capsys.readouterr()
-    assert "WRONG  files" in out and "000003.png is missing" in out and err == ""
+    assert "WRONG  depth/" in out and "000003.png is missing" in out and err == ""
     assert cli.main(["check", str(tmp_path / "nowhere"), "--json"]) == 2
     (listed,) = json.loads(capsys.readouterr().out)
     assert listed["name"] == "files" and listed["level"] == "WRONG" and "no such folder" in listed["text"]
@@ -220,7 +221,7 @@ def test_without_masks_it_asks_for_clicks(good, tmp_path):
     assert found(folder, "times").text.startswith("30 images per second, 0.2 s; assumed, since there is no times.txt")
     (asked,) = alarms(check_folder(folder))
     assert asked.name == "masks" and asked.level is Level.LOOK and "--prompts" in asked.fix
-    assert as_lines(check_folder(folder)).endswith("To look at before tracking: masks")
+    assert as_lines(check_folder(folder), "fine").endswith("To look at before tracking: masks")
 
 
 def test_points_that_a_pose_can_do_with_are_worth_a_look(good):
@@ -291,12 +292,21 @@ def test_what_is_missing_is_named(good, tmp_path):
     (wrong,) = check_folder(folder)
     assert "000000.png is missing. Masks of some images have their names" in wrong.fix
     shutil.rmtree(folder / "rgb")
-    (wrong,) = check_folder(folder)
-    assert wrong.fix.startswith("rgb/ is missing")
+    (folder / "cam_K.txt").unlink()
+    shutil.rmtree(folder / "depth")
+    (folder / "depth").mkdir()
+    (folder / "times.txt").write_text("noon")
+    wrong = check_folder(folder)
+    assert [finding.name for finding in wrong] == ["rgb/", "depth/", "cam_K.txt", "times.txt"]
+    assert all(finding.level is Level.WRONG and finding.fix for finding in wrong)
+    folder = shutil.copytree(good, tmp_path / "torn")
+    for k in (1, 3):
+        (folder / f"rgb/00000{k}.png").write_bytes(b"torn")
+    assert [finding.text.partition(":")[0][-10:] for finding in check_folder(folder)] == ["000001.png", "000003.png"]
 
 
 def test_lines_align_and_remedies_follow_what_they_mend(good):
-    lines = as_lines(check_folder(good)).splitlines()
+    lines = as_lines(check_folder(good), "fine").splitlines()
     assert all(re.match(r"ok     \S", line) for line in lines[:-1])
 
 

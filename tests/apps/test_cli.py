@@ -344,14 +344,19 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     first, *_, last = capsys.readouterr().err.splitlines()
     assert "$P2P_DATA is not set" in first and "--quick" in first and "nothing ran" in last
     assert cli.main(["benchmark", "--list"]) == 0
+    first, *table = capsys.readouterr().out.splitlines()
+    assert re.match(r"\d+ of 17 plans can run here and now in full; \d+ of \d+ methods", first)
+    assert any(re.match(r"ycbineoat +0 of 18 +YCBInEOAT$", line) for line in table)
+    assert any(re.match(r"sampling_embedded +9 of 9 ", line) for line in table)
+    assert max(map(len, [first, *table])) <= 100
+    assert cli.main(["benchmark", "--list", "ycbineoat", "runtime"]) == 0
     listed = capsys.readouterr().out
     assert "YCBInEOAT (tab:ycb_ineoat)" in listed and "Runtime\n" in listed
     assert (
         "0 of 9 sequences; else: ycbineoat/bleach0: not below $P2P_DATA" in listed and "p2p data fetch tapir" in listed
     )
-    monkeypatch.setattr("p2p_lib.benchmark.plan_names", lambda: ["ycbineoat"])
     monkeypatch.setenv("COLUMNS", "72")
-    assert cli.main(["benchmark", "--list"]) == 0
+    assert cli.main(["benchmark", "--list", "ycbineoat"]) == 0
     lines = capsys.readouterr().out
     plan = lines.partition("Data and weights")[0].splitlines()
     assert max(map(len, lines.splitlines())) <= 72 and " ".join(" ".join(plan).split()) in " ".join(listed.split())

@@ -119,7 +119,7 @@ def test_fetched_recorded_unpacked_and_verified(tiny, server, tmp_path):
     record = json.loads((tmp_path / "data/tiny/.p2p-tiny.json").read_text())["files"]["archives/one.tar.gz"]
     assert record["sha256"] == hashlib.sha256(server.data).hexdigest() and record["bytes"] == len(server.data)
     checks = list(inventory.verify(of, every_frame=True))
-    assert [(c.what, c.ok, c.text) for c in checks] == [
+    assert [(c.name, c.fine, c.text) for c in checks] == [
         ("archives/one.tar.gz", True, "sha256 as expected"),
         ("one", True, "3 frames, truth none"),
     ]
@@ -135,7 +135,7 @@ def test_a_download_that_breaks_off_is_resumed(tiny, server):
         fetch(of)
     assert fetch(of)
     assert server.asked == [None, "bytes=65536-"]
-    assert all(check.ok for check in inventory.verify(of))
+    assert all(check.fine for check in inventory.verify(of))
 
 
 @pytest.mark.parametrize("change", ["another version", "no ranges", "no mark"])
@@ -149,7 +149,7 @@ def test_halves_of_different_files_are_not_put_together(tiny, server, change):
         server.data, server.etag = archive([("one/new.txt", b"new")]), '"two"'
     server.ranges = change != "no ranges"
     assert fetch(of)
-    assert all(check.ok for check in inventory.verify(of))
+    assert all(check.fine for check in inventory.verify(of))
     assert server.asked[1] is None if change == "no mark" else server.asked[1] == "bytes=65536-"
 
 
@@ -183,14 +183,14 @@ def test_damage_on_disk_is_found(tiny, tmp_path):
     at = tmp_path / "data/tiny/archives/one.tar.gz"
     whole = at.read_bytes()
     at.write_bytes(whole[:-1] + b"\1")
-    assert [c.ok for c in inventory.verify(of)] == [False, True]
+    assert [c.fine for c in inventory.verify(of)] == [False, True]
     assert "checked" in fetch(of)[0] and at.read_bytes() == whole  # mended
     at.unlink()
     (tmp_path / "data/tiny/one/noise.bin").unlink()
     (tmp_path / "data/tiny/one/depth/0001.png").unlink()
-    checks = {c.what: c for c in inventory.verify(of)}
+    checks = {c.name: c for c in inventory.verify(of)}
     assert checks["archives/one.tar.gz"].text.startswith("2 unpacked files are missing or changed, one/noise.bin first")
-    assert not checks["one"].ok and "depth: got 2 files, expected 3" in checks["one"].text
+    assert not checks["one"].fine and "depth: got 2 files, expected 3" in checks["one"].text
     (tmp_path / "data/tiny/one/rgb/0001.png").unlink()
     assert "2 frames, truth none, expected 3 frames" in [c.text for c in inventory.verify(of)]
 
@@ -224,11 +224,11 @@ def test_the_datasets_own_list_of_checksums(tiny, tmp_path):
     digest = hashlib.sha256((root / "one/cam_K.txt").read_bytes()).hexdigest()
     files = [{"path": "one/cam_K.txt", "sha256": digest.upper()}, {"path": "two.zip", "sha256": "0" * 64}]
     (root / "sequences.json").write_text(json.dumps({"sequences": [{"name": "one", "files": files}]}))
-    check = {c.what: c for c in inventory.verify(of)}["sequences.json"]
-    assert check.ok and check.text == "1 of the 2 files it lists are here"
+    check = {c.name: c for c in inventory.verify(of)}["sequences.json"]
+    assert check.fine and check.text == "1 of the 2 files it lists are here"
     (root / "one/cam_K.txt").write_text(K + "\n")
-    check = {c.what: c for c in inventory.verify(of)}["sequences.json"]
-    assert not check.ok and check.text.endswith("wrong: one/cam_K.txt")
+    check = {c.name: c for c in inventory.verify(of)}["sequences.json"]
+    assert not check.fine and check.text.endswith("wrong: one/cam_K.txt")
 
 
 def test_the_commands(tiny, server, tmp_path, capsys, monkeypatch):
