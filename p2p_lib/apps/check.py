@@ -19,7 +19,7 @@ from p2p_lib.apps.click import clicked_masks
 from p2p_lib.core.backends import DEFAULT_DETECTOR, make_detector
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput, Doubt, P2PError
+from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError
 from p2p_lib.core.findings import Finding, Level
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
@@ -127,9 +127,10 @@ def check_folder(
 
 def _unreadable(name: str, error: P2PError, fix: str = "") -> Finding:
     if isinstance(error, BadInput):
-        got = f"{error.name}: got {error.got}, expected {error.expected}"
-        return Finding(name, Level.WRONG, got, error.fix or fix)
-    return Finding(name, Level.WRONG, str(error), fix)
+        text = f"{error.name}: got {error.got}, expected {error.expected}"
+        return Finding(name, Level.WRONG, text, fix or error.fix)
+    text = f"{error.name}: {error.expected}" if isinstance(error, MissingData) and fix else str(error)
+    return Finding(name, Level.WRONG, text, fix)
 
 
 def _files(folder: Path) -> list[Finding]:

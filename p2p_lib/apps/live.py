@@ -81,6 +81,8 @@ def track_live(
     config, masks = options.config(), replace(options, prompts=prompts).mask_source()
     if masks.name != "clicks":
         raise BadInput("masks", repr(options.masks), f"the name of a segmenter: {', '.join(SEGMENTERS)}")
+    if options.stop is not None and options.stop < 1:
+        raise BadInput("stop", options.stop, "the number of an image from 1", "Leave it out to end with Ctrl-C.")
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
     if options.tracker.startswith("builtin") and masks.segmenter == DEFAULT_SEGMENTER:
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector))

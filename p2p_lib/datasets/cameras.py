@@ -99,7 +99,8 @@ def open_camera(spec: str, rate_hz: float | None = None) -> LiveCamera:
     if kind == "folder" and what:
         return FolderCamera(open_sequence(what), DEFAULT_RATE_HZ if rate_hz is None else rate_hz)
     if kind != "realsense":
-        raise BadInput("camera", repr(spec), _FORMS)
+        fix = f"Did you mean folder:{spec}?" if Path(spec).is_dir() else ""
+        raise BadInput("camera", repr(spec), _FORMS, fix)
     if rate_hz is not None:
         raise BadInput("rate", f"{rate_hz:g} with {spec}", "a rate for folder:PATH alone: other cameras have their own")
     from p2p_lib.datasets.realsense import RealSenseCamera

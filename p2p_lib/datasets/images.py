@@ -32,7 +32,8 @@ def full(folder: Path) -> Path:
 def list_files(folder: Path, suffixes: tuple[str, ...], what: str) -> tuple[Path, ...]:
     """The files of a folder in natural order (2 before 10); at least one, or an error that names the folder."""
     if not folder.is_dir():
-        raise MissingData(str(folder), f"no such folder, expected {what} there")
+        fix = "p2p check FOLDER says what else is missing."
+        raise MissingData(str(folder), f"no such folder, expected {what} there", fix)
     files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     if not files:
         raise BadInput(str(folder), "no files", f"{what} ({' '.join(suffixes)})")
