@@ -264,7 +264,7 @@ class ObjectTracker:
     def _initialise(self, obs: Observation) -> ObjectStep:
         """The first frame of a map: fix the object frame and start with the first points.
 
-        What was known is put aside, or let go where it was known from a sliver alone.
+        What was known is put aside, for points enough to go on with; or let go where it was known from a sliver alone.
         """
         cfg, before = self.config, self.life.start_px
         without = Status.INITIALISING if self.model.empty else Status.LOST
@@ -279,8 +279,8 @@ class ObjectTracker:
         if len(v) < cfg.lifecycle.min_mask_px:
             return self._without_pose(obs, without, f"only {len(v)} mask pixels with depth")
         points = self._sample(obs)
-        few = len(points) < cfg.registration.min_inliers
-        if few and not (self.model.surface is not None and cfg.method.motion):
+        few, aside = len(points) < cfg.registration.min_inliers, not (self.model.empty or self._outgrown(obs))
+        if few and (aside or self.model.surface is None or not cfg.method.motion):
             return self._without_pose(obs, without, f"only {len(points)} points to start from")
         T_cam_obj = np.eye(4)
         if cfg.method.object_frame == "centroid":
@@ -288,10 +288,10 @@ class ObjectTracker:
             T_cam_obj[:3, 3] = np.median(p_cam, 0)
         verdict, forgotten = Verdict(True, Status.TRACKED), NO_IDS
         if not self.model.empty:
-            if self._outgrown(obs):
-                forgotten = self.map.ids[self.map.ids >= 0]
-            else:
+            if aside:
                 self.aside = self.known.lost()
+            else:
+                forgotten = self.map.ids[self.map.ids >= 0]
             self.known, self._relation = Known(self._new_model(), self.life, self.map_id + 1), Relation()
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:

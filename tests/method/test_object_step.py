@@ -721,9 +721,10 @@ def about(deg: float) -> np.ndarray:
     return START @ se3.exp(np.array([0, 0, np.radians(deg), 0, 0, 0]))
 
 
-def turned_over(**settings) -> tuple[Lump, np.ndarray, list[ObjectStep]]:
+def turned_over(detector=None, **settings) -> tuple[Lump, np.ndarray, list[ObjectStep]]:
     """Known from one side, then seen from another, where none of its points is found; the ids of those."""
     lump = settled(begun(**settings), [2, 4])
+    lump.tracker.detector = detector or lump.tracker.detector
     old = lump.tracker.map.ids.copy()
     return lump, old, [lump.see(about(150), hide(lambda tracks: np.isin(tracks.ids, old))) for _ in range(16)]
 
@@ -776,6 +777,11 @@ def test_where_the_first_map_fits_again_and_the_second_does_not_the_first_one_go
     assert deg < 1 and mm < 1 and lump.tracker.aside.map_id == 1
     of_map = [lump.tracker.known_as(k) for k in range(3)]
     assert of_map == [lump.tracker.known, lump.tracker.aside, None]
+
+
+def test_no_second_map_is_begun_on_few_points():
+    lump, _, steps = turned_over(Pair())
+    assert lump.tracker.aside is None and steps[-1].estimate.reason == "only 2 points to start from"
 
 
 def test_no_second_map_of_what_only_the_segmenter_takes_for_the_object():
