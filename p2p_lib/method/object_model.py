@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Status
-from p2p_lib.method.factor_graph import ObjectGraph
+from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
 from p2p_lib.method.keyframe_views import KeyframeViews
 from p2p_lib.method.keyframes import misfit
 from p2p_lib.method.keypoint_map import KeypointMap
@@ -59,19 +60,22 @@ class NewPoints:
 class ObjectModel:
     """Keypoints, surface and graph of one object; rows of observations are rows of ``map``.
 
-    Views are fused ``beside`` whatever comes next, until the surface is asked for.
+    Mapping runs ``beside`` whatever comes next: the graph is solved and views are fused until surface or graph are
+    asked for. What the graph finds is taken into the map by :meth:`adopt`, at the start of the next frame, however
+    long it took: what comes out is the same whatever the number of threads.
     """
 
     def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch, beside: Executor):
         self.config = config
         self.map = KeypointMap(config.keypoint_map)
         self._surface = _volume(config) if config.method.surface else None
-        self.graph = ObjectGraph(config.factor_graph) if config.method.graph else None
+        self._graph = ObjectGraph(config.factor_graph) if config.method.graph else None
         self.views = KeyframeViews()
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
         self.seen_m2 = 0.0  # the most that a keyframe showed
         self._observer, self._stopwatch, self._beside = observer, stopwatch, beside
-        self._fusing: Future | None = None
+        self._mapping: Future | None = None  # the newest of what runs beside, one after the other
+        self._solved: Future[GraphResult | None] | None = None  # by the graph, to be adopted
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
         self._since_keyframe, self._next_key = 0, 0
         self._sample: SurfaceSample | None = None  # of the surface as it is
@@ -84,11 +88,46 @@ class ObjectModel:
     @property
     def surface(self) -> TsdfVolume | None:
         """With all that was given to it; None where the configuration wants none."""
-        if self._fusing is not None:
-            with self._stopwatch("fusion"):
-                self._fusing.result()
-            self._fusing = None
+        self._settle("fusion")
         return self._surface
+
+    @property
+    def graph(self) -> ObjectGraph | None:
+        """With all keyframes; None where the configuration wants none."""
+        self._settle("graph")
+        return self._graph
+
+    def _beside_after(self, work: Callable[..., object], *args: object) -> Future:
+        """Do this beside what comes next, after all that was begun so; mapping is one thing after the other."""
+        before = self._mapping
+
+        def after() -> object:
+            if before is not None:
+                before.result()
+            return work(*args)
+
+        self._mapping = self._beside.submit(after)
+        return self._mapping
+
+    def _settle(self, stage: str) -> None:
+        """Wait for what runs beside."""
+        if self._mapping is not None:
+            with self._stopwatch(stage):
+                self._mapping.result()
+            self._mapping = None
+
+    def adopt(self) -> None:
+        """Take into the map what the graph found since the frame before."""
+        if self._solved is None:
+            return
+        with self._stopwatch("graph"):
+            result, self._solved = self._solved.result(), None
+        if result is None or not result.ok:
+            return
+        self.map.move(result.point_ids, result.p_obj)
+        if result.covariance is not None:
+            self.covariance = result.covariance
+        self._corrected = dict(zip(result.keys.tolist(), result.T_cam_obj, strict=True))
 
     @property
     def has_surface(self) -> bool:
@@ -116,7 +155,7 @@ class ObjectModel:
         if self.graph is not None:
             self.graph.join(other.graph, T_obj_other, self._next_key)
         if self.surface is not None:
-            self._fusing = self._beside.submit(self.surface.join, other.surface, T_obj_other, vertices)
+            self._beside_after(self._surface.join, other.surface, T_obj_other, vertices)
         for T_cam_obj in other.views.T_cam_obj @ se3.inverse(T_obj_other):
             self.views.add(T_cam_obj)
         self.seen_m2 = max(self.seen_m2, other.seen_m2)
@@ -163,72 +202,72 @@ class ObjectModel:
         agrees: np.ndarray,
         covariance: np.ndarray | None = None,
         confidence: float = 1.0,
-    ) -> tuple[np.ndarray, Requests]:
+    ) -> Requests:
         """New points, a vertex of the graph, a view of the surface.
 
         agrees      (N,) bool: points of the map whose observation the pose agrees with
         covariance  (6, 6) of the pose relative to the map; None at the first keyframe
         confidence  of the pose
 
-        Returns the pose as the graph corrects it, and what the tracker has to follow and to drop.
+        Returns what the tracker has to follow and to drop.
         """
         p_obj = se3.transform(se3.inverse(T_cam_obj), new.p_cam)
-        old_keys = self.map.keys[agrees]
         keys = self._next_key + np.arange(len(new))
         self._next_key += len(new)
+        seen = np.concatenate([self.map.keys[agrees], keys]), np.concatenate([obs.p_cam[agrees], new.p_cam])
         self.map.add(keys, p_obj, self.empty, confidence, new.p_cam)
-        vertex, registered = None, T_cam_obj
-        if self.graph is not None:
-            with self._stopwatch("graph"):
-                p_cam = np.concatenate([obs.p_cam[agrees], new.p_cam])
-                vertex, T_cam_obj = self._optimise(T_cam_obj, np.concatenate([old_keys, keys]), p_cam, covariance)
-        self.views.add(registered)
+        self.views.add(T_cam_obj)
         self.seen_m2 = max(self.seen_m2, self._observer.area_m2(obs))
         self._since_keyframe = 0
         self._sample = None
-        if self.surface is not None:
-            image = obs.frame.depth_m, obs.frame.rgb, self._observer.measured(obs), self._observer.camera
-            self._fusing = self._beside.submit(self.surface.integrate, *image, T_cam_obj, key=vertex)
         gone, drop = self.map.retire()
-        if self.graph is not None:
-            self.graph.forget(gone)
-        return T_cam_obj, Requests(drop=drop, add_px=new.uv_px, keys=keys)
+        self._solved = self._beside_after(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone)
+        return Requests(drop=drop, add_px=new.uv_px, keys=keys)
 
-    def settle_surface(self) -> None:
-        """Re-integrate the keyframe that the graph has moved farthest: one a frame, so that no frame waits long."""
-        if self.surface is not None and self._corrected:
-            self._fusing = self._beside.submit(self._follow_graph, self.surface, self._corrected)
+    def _map_keyframe(
+        self,
+        obs: Observation,
+        T_cam_obj: np.ndarray,
+        keys: np.ndarray,
+        p_cam: np.ndarray,
+        covariance: np.ndarray | None,
+        gone: np.ndarray,
+    ) -> GraphResult | None:
+        """Solve the graph with a new vertex, and fuse its view where the graph has it.
 
-    def _follow_graph(self, surface: TsdfVolume, corrected: dict[int, np.ndarray]) -> None:
-        if not surface.move(corrected, limit=1):
-            self._corrected = {}
-
-    def _optimise(
-        self, T_cam_obj: np.ndarray, keys: np.ndarray, p_cam: np.ndarray, covariance: np.ndarray | None
-    ) -> tuple[int, np.ndarray]:
-        """Add a vertex to the graph, solve, and carry the result into map and surface; its key and its pose.
+        keys (N,) and p_cam (N, 3)  what is seen; gone (M,) points that the map has given up since
 
         Only what the graph still holds can be moved later: images of keyframes that it has merged are let go.
         """
-        sigma_m = self.noise_m(p_cam)
-        vertex = self.graph.add_keyframe(
-            T_cam_obj,
-            keys,
-            p_cam,
-            p_obj_init=se3.transform(se3.inverse(T_cam_obj), p_cam),
-            covariance=None if sigma_m is None else covariance,
-            sigma_m=sigma_m,
-        )
-        result = self.graph.optimise()
-        if self.surface is not None:
-            self.surface.keep_only(result.keys)
-        if not result.ok:
-            return vertex, T_cam_obj
-        self.map.move(result.point_ids, result.p_obj)
-        if result.covariance is not None:
-            self.covariance = result.covariance
-        self._corrected = dict(zip(result.keys.tolist(), result.T_cam_obj, strict=True))
-        return vertex, result.T_cam_obj[-1]
+        vertex, result = None, None
+        if self._graph is not None:
+            sigma_m = self.noise_m(p_cam)
+            vertex = self._graph.add_keyframe(
+                T_cam_obj,
+                keys,
+                p_cam,
+                p_obj_init=se3.transform(se3.inverse(T_cam_obj), p_cam),
+                covariance=None if sigma_m is None else covariance,
+                sigma_m=sigma_m,
+            )
+            result = self._graph.optimise()
+            self._graph.forget(gone)
+            T_cam_obj = result.T_cam_obj[-1] if result.ok else T_cam_obj
+        if self._surface is not None:
+            if result is not None:
+                self._surface.keep_only(result.keys)
+            image = obs.frame.depth_m, obs.frame.rgb, self._observer.measured(obs), self._observer.camera
+            self._surface.integrate(*image, T_cam_obj, key=vertex)
+        return result
+
+    def settle_surface(self) -> None:
+        """Re-integrate the keyframe that the graph has moved farthest: one a frame, so that no frame waits long."""
+        if self._surface is not None and self._corrected:
+            self._beside_after(self._follow_graph)
+
+    def _follow_graph(self) -> None:
+        if not self._surface.move(self._corrected, limit=1):
+            self._corrected = {}
 
 
 @dataclass(frozen=True, eq=False)

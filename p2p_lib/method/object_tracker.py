@@ -118,6 +118,12 @@ class ObjectTracker:
 
     # -- the step ------------------------------------------------------------------------------
 
+    def adopt(self) -> None:
+        """Take in what was found beside since the frame before; before anything else in a frame."""
+        self.model.adopt()
+        if self.aside is not None:
+            self.aside.model.adopt()
+
     def observe(
         self,
         frame: Frame,
@@ -228,10 +234,10 @@ class ObjectTracker:
             if self._gates and not due:  # two maps that become one lie to each other as well as poses tell
                 good &= model.explained(obs, T_cam_obj)
             new = self._sample(obs)
-            T_cam_obj, asked = model.insert_keyframe(obs, T_cam_obj, new, good, belief.of_frame, mapped)
+            asked = model.insert_keyframe(obs, T_cam_obj, new, good, belief.of_frame, mapped)
             requests = replace(asked, reject=requests.reject)
         covariance, sure = belief.at(T_cam_obj, model, most)
-        self.life = replace(life, T_cam_obj=T_cam_obj).placed(obs.frame.T_world_cam)
+        self.life = life.placed(obs.frame.T_world_cam)
         if not belief.told and verdict.status is Status.TRACKED:
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNTOLD)
         return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, keyframe), requests)
@@ -296,7 +302,8 @@ class ObjectTracker:
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:
             verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")
-        T_cam_obj, requests = self.model.insert_keyframe(obs, T_cam_obj, points, np.zeros(0, bool))
+        requests = self.model.insert_keyframe(obs, T_cam_obj, points, np.zeros(0, bool))
+        self.model.adopt()
         self.life = self.life.started(T_cam_obj, obs.frame.time_s, verdict.status).placed(obs.frame.T_world_cam)
         self._trusted = obs
         # The first pose defines the object frame: it is right by definition, whatever the points are worth.

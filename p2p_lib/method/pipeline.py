@@ -199,6 +199,8 @@ class Point2Pose:
         tracks = self._track(frame, masks)
         if not answers:
             return {}
+        for obj in self.objects.values():
+            obj.adopt()
         frame, masks, said, still = self._waiting.popleft()
         if locating is not None:
             with self.stopwatch("scene"):
