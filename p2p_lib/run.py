@@ -154,12 +154,12 @@ def evaluate_tracker(
     """
     options = replace(options or RunOptions(), **changes)
     config = options.config()
-    sequence = sequences.open_sequence(sequence, options.format, options.depth_scale)
+    opened = sequences.open_sequence(sequence, options.format, options.depth_scale)
     if options.stop is not None:
-        kept = slice(_frame_range(len(sequence), 0, options.stop).stop)
-        parts = {key: getattr(sequence, key)[kept] for key in ("rgb", "depth", "times_s")}
-        sequence = replace(sequence, **parts)
-    task = TrackTask.of(sequence, config.seed, options.models, count)
+        kept = slice(_frame_range(len(opened), 0, options.stop).stop)
+        cut = {key: getattr(opened, key)[kept] for key in ("rgb", "depth", "times_s")}
+        opened = replace(opened, **cut)  # type: ignore[type-var]  # what is opened is a dataclass
+    task = TrackTask.of(opened, config.seed, options.models, count)
     return task.score(task.tracker(options.tracker, config), search)
 
 

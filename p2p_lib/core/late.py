@@ -18,7 +18,8 @@ class Answers:
     """Steps a :class:`~p2p_lib.method.pipeline.Point2Pose`; its estimates come with the frame that they are of."""
 
     def __init__(self, method: Any):
-        self._method, self._waiting = method, deque()
+        self._method = method
+        self._waiting: deque[Any] = deque()
 
     def step(self, frame: Frame, masks: Mapping[str, np.ndarray] | None = None, about: Any = None) -> list[Answer]:
         """One frame in; the one answer that is due by now, or none. ``about`` comes back in the frame's place."""
