@@ -86,7 +86,7 @@ LESSONS = (
         "07_occlusion_recovery",
         "Occlusion and recovery",
         'section "Results on YCBMultiTrack" and the ablation P2P-SH(10)',
-        "a box behind a hand: status, the moment of return frame by frame, long range against SH(10), confidence",
+        "a box behind a hand: the return frame by frame, long range against SH(10), confidence; never lost for good",
     ),
     Lesson(
         "08_texture_analysis",

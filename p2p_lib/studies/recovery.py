@@ -6,12 +6,18 @@ Methods (the long-range tracker, the one that forgets, ...) come by label, each 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from shutil import rmtree
+from textwrap import fill
 
 import numpy as np
 from matplotlib.figure import Figure
 from pandas import DataFrame, Series
 
-from p2p_lib.datasets.runs import Run
+from p2p_lib.datasets.runs import ObjectRun, Run
+from p2p_lib.datasets.sequence import Sequence as Video
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M, Judged, reliability, right_poses
 from p2p_lib.evaluation.point_tracks import Outcome
 from p2p_lib.evaluation.protocol import Evaluation
@@ -20,20 +26,42 @@ from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box
 from p2p_lib.figures.plots import WIDTH_IN, draw_strip, logarithmic, panels
 from p2p_lib.figures.scenes import Scene
+from p2p_lib.synthetic.generate import write_scenario
+from p2p_lib.synthetic.noise import Sensor
+from p2p_lib.synthetic.scenarios import SCENARIOS
 
 _RIGHT = f"{100 * MAX_M:.0f} cm and {MAX_DEG:.0f}°"
 
 
-@style.styled
 def return_strip(scenes: Mapping[str, Scene], name: str, event: RecoveryEvent) -> Figure:
     """A row of images per method: the object before, while and after it is hidden, with its status below each."""
     shown = {"last in sight": event.hidden_frame - 2, "hidden": (event.hidden_frame + event.return_frame) // 2}
     shown |= {f"return + {k}" if k else "return": event.return_frame + k for k in (0, 1, 10)}
+    return strip(scenes, name, shown)
+
+
+def excerpt(name: str, frames: range, seed: int, folder: Path) -> Video:
+    """These frames of ``synthetic/NAME``, rendered into ``folder``, whose earlier content goes: no others are."""
+    whole = SCENARIOS[name](seed)
+    bodies = tuple(replace(body, T_world_model=body.T_world_model[frames]) for body in whole.bodies)
+    rmtree(folder, ignore_errors=True)
+    write_scenario(folder, replace(whole, T_world_cam=whole.T_world_cam[frames], bodies=bodies), Sensor(), seed, name)
+    video = open_sequence(folder, "ycbmultitrack")
+    return replace(video, name=f"synthetic/{name}", times_s=frames.step * video.times_s)
+
+
+@style.styled
+def strip(scenes: Mapping[str, Scene], name: str, shown: Mapping[str, int], said: ObjectRun | None = None) -> Figure:
+    """A row of images per method, one for each title and frame in ``shown``, with the object's status below each.
+
+    said  the object in every map (``load_run(..., every_map=True)``): then its map and the reason stand there, too
+    """
     first = next(iter(scenes.values()))
     regions = around(first, name, list(shown.values()))
     (left, top, right, bottom), *_ = regions
     high = WIDTH_IN / len(shown) * (bottom - top) / (right - left)
-    figure = Figure((WIDTH_IN, (0.96 * high + 0.1) * len(scenes) + 0.7), layout="constrained")
+    words_in = 0.1 if said is None else 0.5
+    figure = Figure((WIDTH_IN, (0.96 * high + words_in) * len(scenes) + 0.7), layout="constrained")
     axes = figure.subplots(len(scenes), len(shown), squeeze=False)
     for row, (label, scene) in zip(axes, scenes.items()):
         for axis, index, region_px in zip(row, shown.values(), regions):
@@ -41,6 +69,9 @@ def return_strip(scenes: Mapping[str, Scene], name: str, event: RecoveryEvent) -
             axis.imshow(scene.draw(at, region_px, 300, axes=False, trail=0, words=False))
             axis.set(xticks=[], yticks=[])
             axis.set_xlabel(scene.run.objects[name].status[at], fontsize=10)
+            if said is not None:
+                why = fill(said.reason[at], 150 // len(shown))
+                axis.set_xlabel(f"{said.status[at]}, map {said.map_id[at]}\n{why}", fontsize=7.5, va="top")
             axis.spines[:].set_visible(False)
         row[0].set_ylabel(label, fontweight="bold")
     for axis, (title, index) in zip(axes[0], shown.items()):

@@ -1,5 +1,7 @@
 """Figures of a return say what the runs say: images, curves, statuses, counts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from p2p_lib.evaluation.confidence import Judged, judge
 from p2p_lib.evaluation.recovery import RecoveryEvent
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.studies import recovery
+from p2p_lib.synthetic.scenarios import SCENARIOS
 
 EVENT = RecoveryEvent(hidden_frame=16, return_frame=21, frames_to_recovery=1)
 
@@ -29,6 +32,27 @@ def test_the_strip_has_a_row_per_method_and_says_which_frames(scenes):
     titles = [axis.get_title(loc="left") for axis in figure.axes[:5]]
     assert titles[0] == "last in sight\n(frame 14)" and titles[2:4] == ["return\n(frame 21)", "return + 1\n(frame 22)"]
     assert len(figure.axes) == 10 and figure.axes[5].get_ylabel() == "forgets"
+
+
+def test_the_strip_says_map_and_reason_where_they_are_given(scenes, made):
+    obj = made.run.objects["can"]
+    said = replace(obj, map_id=np.arange(len(obj)) // 20, reason=np.where(np.arange(len(obj)) == 25, "a new map", ""))
+    figure = recovery.strip({"one": scenes["remembers"]}, "can", {"before": 3, "after": 25}, said)
+    words = [axis.get_xlabel() for axis in figure.axes]
+    assert words == [f"{obj.status[3]}, map 0\n", f"{obj.status[25]}, map 1\na new map"]
+
+
+def test_an_excerpt_is_these_frames_of_the_scene_at_their_times(tmp_path):
+    clip = recovery.excerpt("other_side", range(40, 130, 60), 3, tmp_path / "clip")
+    scenario = SCENARIOS["other_side"](3)
+    rendered = [scenario.rendered(t).label == 1 for t in (40, 100)]
+    assert clip.name == "synthetic/other_side" and len(clip) == 2
+    np.testing.assert_allclose(np.diff(clip.times_s), 60 / 30, atol=1e-4)  # the file has microseconds
+    T_cam_model = np.linalg.inv(scenario.T_world_cam[[40, 100]]) @ scenario.bodies[0].T_world_model[[40, 100]]
+    np.testing.assert_allclose(clip.truth["box"].T_cam_model, T_cam_model, atol=1e-6)
+    for i, mask in enumerate(rendered):
+        found = clip.masks(i)["box"]
+        assert (found & mask).sum() >= 0.95 * max(found.sum(), mask.sum())
 
 
 def test_pictures_are_cut_to_where_the_object_truly_is(scenes, made):
