@@ -113,8 +113,15 @@ class _Dataclass(Protocol):
 Arrays = TypeVar("Arrays", bound=_Dataclass)
 
 
+#: Of a field of :class:`Rows`: what is joined has the first one's.
+SHARED = {"shared": True}
+
+
 class Rows:
-    """What dataclasses have in common whose fields are arrays (or such dataclasses again) of one row per item."""
+    """What dataclasses have in common whose fields are arrays (or such dataclasses again) of one row per item.
+
+    A field with ``metadata=SHARED`` is one value for all items.
+    """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
@@ -123,14 +130,16 @@ class Rows:
 
     def select(self, rows: np.ndarray) -> Self:
         """The items at these rows or under this mask."""
-        columns = (getattr(self, f.name) for f in fields(self))
-        return type(self)(*(c.select(rows) if isinstance(c, Rows) else c[rows] for c in columns))
+        columns = ((getattr(self, f.name), f.metadata) for f in fields(self))
+        return type(self)(*(c if about else c.select(rows) if isinstance(c, Rows) else c[rows] for c, about in columns))
 
 
 def joined(parts: Sequence[Arrays], join: Callable[..., np.ndarray] = np.concatenate) -> Arrays:
     """Values of one dataclass that holds arrays (or such dataclasses again), one after the other."""
-    columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(parts[0])}
-    return type(parts[0])(*(joined(c, join) if is_dataclass(c[0]) else join(c) for c in columns.values()))
+    columns = (([getattr(part, f.name) for part in parts], f.metadata) for f in fields(parts[0]))
+    return type(parts[0])(
+        *(c[0] if about else joined(c, join) if is_dataclass(c[0]) else join(c) for c, about in columns)
+    )
 
 
 class Status(StrEnum):

@@ -95,5 +95,5 @@ def test_a_blank_picture_gives_finite_numbers():
 
 def test_no_points():
     assert len(take(texture(), np.zeros((0, 2)))) == 0
-    seen = align(texture(), Patches.empty((0,)), np.zeros((0, 2)), np.zeros((0, 2, 2)), 3)
+    seen = align(texture(), Patches.empty(0), np.zeros((0, 2)), np.zeros((0, 2, 2)), 3)
     assert seen.uv_px.shape == (0, 2) and RADIUS > 0

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.types import Frame
 from p2p_lib.trackers.builtin import recognition
-from tests.trackers.made_up import grid, image, noisy, shifted, started, texture
+from p2p_lib.trackers.builtin.tracker import BuiltinTracker
+from tests.trackers.made_up import CAMERA, DEPTH_M, grid, image, noisy, shifted, started, texture
 
 UV = grid((60, 260), (60, 180), 40)
 CFG = TrackingConfig()
@@ -85,12 +87,28 @@ def test_a_template_is_added_where_the_scale_or_the_appearance_has_changed():
 
 def test_the_template_of_the_present_scale_is_compared_and_the_first_is_never_replaced():
     p, _ = started(UV[:1], image())
-    first = p.fine.pixels[0, 0].copy()
+    first = p.templates.fine.pixels[p.template[0, 0]].copy()
     for turn in range(12):
         p.warp[0] = (1.5 ** (1 + turn % 4)) * EYE
         recognition.store_templates(p, np.array([0]), shifted(turn), turn)
     assert p.count[0] == CFG.templates
-    np.testing.assert_array_equal(p.fine.pixels[0, 0], first)
+    np.testing.assert_array_equal(p.templates.fine.pixels[p.template[0, 0]], first)
     scales = p.template_warp[0, :, 0, 0]
     p.warp[0] = scales[3] * EYE
     assert recognition.best_template(p, np.array([0]))[0] == 3
+
+
+def test_points_that_come_and_go_leave_no_templates():
+    tracker = BuiltinTracker(CFG)
+    tracker.start(Frame(0, 0.0, texture(), np.full((240, 320), DEPTH_M, np.float32)), CAMERA)
+    stays = tracker.add(UV[:4])
+    p = tracker._points
+    looks = p.templates.fine.select(p.template[:, 0])
+    for _ in range(20):
+        tracker.drop(tracker.add(UV[4:]))
+    p = tracker._points
+    assert len(p.templates.fine) <= 4 * len(UV) and len(p) == len(stays)
+    np.testing.assert_array_equal(p.templates.fine.select(p.template[:, 0]).pixels, looks.pixels)
+    tracker.add(UV[4:])
+    p = tracker._points
+    assert len(np.unique(p.template[:, 0])) == len(p), "every point has its own"

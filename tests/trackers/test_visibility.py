@@ -68,6 +68,6 @@ def test_textureless_points_are_not_searched_for(tracker, monkeypatch):
     p, searched = tracker._points, []
     monkeypatch.setattr(builtin.recognition, "find", lambda p, at, *_: searched.append(at.tolist()))
     p.verified[:4] = False
-    p.fine.contrast[:2, 0] = 3
+    p.templates.fine.contrast[p.template[:2, 0]] = 3
     tracker._find_predicted(None)
     assert searched == [[2, 3]]

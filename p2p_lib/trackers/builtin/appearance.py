@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.compiled import compiled
-from p2p_lib.core.types import Rows
+from p2p_lib.core.types import Rows, joined
 
 #: Half a patch's side in pixels, and the standard deviation of the window's weight.
 RADIUS, WINDOW_PX = 7, 5.0
@@ -50,18 +50,46 @@ class Patches(Rows):
     unit_cov: np.ndarray
     contrast: np.ndarray
 
-    def __getitem__(self, rows: np.ndarray) -> Patches:
-        return self.select(rows)
-
     def __setitem__(self, rows: np.ndarray, other: Patches) -> None:
         for f in fields(self):
             getattr(self, f.name)[rows] = getattr(other, f.name)
 
     @classmethod
-    def empty(cls, shape: tuple[int, ...]) -> Patches:
-        """Zeros for patches, ``shape`` of them."""
+    def empty(cls, count: int) -> Patches:
+        """Zeros for so many patches."""
         p = _SIDE**2
-        return cls(*(np.zeros(shape + tail, np.float32) for tail in ((p,), (6, p), (2, 2), ())))
+        return cls(*(np.zeros((count, *tail), np.float32) for tail in ((p,), (6, p), (2, 2), ())))
+
+
+class Templates:
+    """What points look like, at full and at half resolution: a row for each time that a point was looked at.
+
+    Room grows by doubling, and rows that are let go are used again: points come and go at every keyframe, and to copy
+    what all of them look like would take longer than to track them.
+    """
+
+    def __init__(self) -> None:
+        self.fine, self.coarse = Patches.empty(0), Patches.empty(0)
+        self._free = np.zeros(0, np.int64)
+
+    def new(self, count: int) -> np.ndarray:
+        """(count,) rows that nobody uses."""
+        short = count - len(self._free)
+        if short > 0:
+            size = len(self.fine)
+            more = Patches.empty(max(short, size))
+            self.fine, self.coarse = joined([self.fine, more]), joined([self.coarse, more])
+            self._free = np.concatenate([self._free, np.arange(size, len(self.fine))])
+        rows, self._free = self._free[:count], self._free[count:]
+        return rows
+
+    def put(self, rows: np.ndarray, fine: Patches, coarse: Patches) -> None:
+        """Keep these patches in these rows."""
+        self.fine[rows], self.coarse[rows] = fine, coarse
+
+    def let_go(self, rows: np.ndarray) -> None:
+        """Nobody uses these rows any more."""
+        self._free = np.concatenate([rows, self._free])
 
 
 def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:

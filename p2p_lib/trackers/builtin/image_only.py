@@ -63,7 +63,7 @@ class ImageOnlyTracker(BuiltinTracker):
     def _find_predicted(self, search: np.ndarray | None) -> None:
         """There are no predictions: points that were lost are sought among the corners of the whole image."""
         p, cfg, now = self._points, self.config, self._now
-        lost = np.flatnonzero(~p.verified & (p.fine.contrast[:, 0] >= cfg.textureless_contrast))
+        lost = np.flatnonzero(~p.verified & (p.contrast >= cfg.textureless_contrast))
         if not len(lost) or self._frames % cfg.redetect_every:
             return
         corners = features.detect(now.gray, search, cfg.corners)

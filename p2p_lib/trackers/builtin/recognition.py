@@ -30,7 +30,7 @@ def follow(p: Points, before: Image, now: Image, cfg: TrackingConfig) -> None:
     moved, tracked = flow(before, now, start, cfg.window_px)
     moved = np.where(tracked[:, None], moved, start)
     k = best_template(p, at)
-    seen = align(now.fine, p.fine[at, k], moved, _warp_of(p, at, k))
+    seen = align(now.fine, p.templates.fine.select(p.template[at, k]), moved, _warp_of(p, at, k))
     shift_px = np.linalg.norm(seen.uv_px - moved, axis=1)
     good = (seen.ncc >= cfg.min_ncc) & (shift_px < cfg.search_px) & _same_appearance(p, at, k, seen, now, cfg)
     _settle(p, at, k, seen, good)
@@ -66,8 +66,9 @@ def find(
         return
     p.warp[at] = warp
     k = best_template(p, at)
-    rough = align(now.coarse, p.coarse[at, k], uv_px / 2, _warp_of(p, at, k))
-    seen = align(now.fine, p.fine[at, k], 2 * rough.uv_px, rough.A)
+    fine, coarse = (patches.select(p.template[at, k]) for patches in (p.templates.fine, p.templates.coarse))
+    rough = align(now.coarse, coarse, uv_px / 2, _warp_of(p, at, k))
+    seen = align(now.fine, fine, 2 * rough.uv_px, rough.A)
     off_px = np.linalg.norm(seen.uv_px - uv_px, axis=1)
     own_px = np.sqrt(np.trace(seen.cov_px2, axis1=1, axis2=2))
     near = off_px < np.minimum(cfg.search_px, 2 + 3 * np.hypot(sigma_px, own_px))
@@ -121,6 +122,8 @@ def store_templates(p: Points, rows: np.ndarray, now: Image, turn: int) -> None:
     k = np.where(p.count[rows] < room, p.count[rows], 1 + turn % (room - 1))
     uv = p.uv[rows]
     p.template_warp[rows, k], p.template_cov[rows, k] = p.warp[rows], p.cov[rows]
-    p.fine[rows, k], p.coarse[rows, k] = take(now.fine, uv), take(now.coarse, uv / 2)
+    first = p.template[rows, k] < 0
+    p.template[rows[first], k[first]] = p.templates.new(np.count_nonzero(first))
+    p.templates.put(p.template[rows, k], take(now.fine, uv), take(now.coarse, uv / 2))
     p.chroma[rows, k] = now.chroma_at(uv)
     p.count[rows] = np.minimum(p.count[rows] + 1, room)

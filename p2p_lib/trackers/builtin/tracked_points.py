@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from p2p_lib.core.types import Rows
-from p2p_lib.trackers.builtin.appearance import Patches
+from p2p_lib.core.types import SHARED, Rows
+from p2p_lib.trackers.builtin.appearance import Templates
 
 _EYE = np.eye(2, dtype=np.float32)
 
@@ -31,14 +31,14 @@ class Points(Rows):
     count: np.ndarray  # (N,) templates in use
     template_warp: np.ndarray  # (N, K, 2, 2)
     template_cov: np.ndarray  # (N, K, 2, 2) of the point's position in the template
-    fine: Patches  # (N, K) at full resolution
-    coarse: Patches  # (N, K) at half resolution
+    template: np.ndarray  # (N, K) their rows in ``templates``, -1 for none
     chroma: np.ndarray  # (N, K, 2) around the point
     segment: np.ndarray  # (N,) which rigid motion segment it belongs to, -1 for none
     leaving: np.ndarray  # (N,) bool: disagrees with its segment together with others, but is not far from it yet
     p_seg: np.ndarray  # (N, 3) position on the segment, metres
     map_cov: np.ndarray  # (N, 3, 3) its covariance
     tangent: np.ndarray  # (N, 3, 2) offset on the segment per pixel of offset in the first template
+    templates: Templates = field(metadata=SHARED)  # of all points
 
     @classmethod
     def new(cls, uv_px: np.ndarray, templates: int) -> Points:
@@ -56,15 +56,20 @@ class Points(Rows):
             count=np.zeros(n, np.int64),
             template_warp=np.tile(_EYE, (n, k, 1, 1)),
             template_cov=np.zeros((n, k, 2, 2), np.float32),
-            fine=Patches.empty((n, k)),
-            coarse=Patches.empty((n, k)),
+            template=np.full((n, k), -1),
             chroma=np.zeros((n, k, 2), np.float32),
             segment=np.full(n, -1),
             leaving=np.zeros(n, bool),
             p_seg=np.zeros((n, 3)),
             map_cov=np.zeros((n, 3, 3)),
             tangent=np.zeros((n, 3, 2)),
+            templates=Templates(),
         )
+
+    @property
+    def contrast(self) -> np.ndarray:
+        """(N,) standard deviation of the grey values in the first template."""
+        return self.templates.fine.contrast[self.template[:, 0]]
 
     @property
     def sigma_px(self) -> np.ndarray:

@@ -55,7 +55,10 @@ class BuiltinTracker:
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
-        self._points = self._points.select(self._ids.drop(ids))
+        kept = self._ids.drop(ids)
+        gone = self._points.template[~kept]
+        self._points.templates.let_go(gone[gone >= 0])
+        self._points = self._points.select(kept)
         self._segments.compact(self._points)
 
     def reject(self, ids: np.ndarray) -> None:
@@ -118,7 +121,7 @@ class BuiltinTracker:
     def _find_predicted(self, search: np.ndarray | None) -> None:
         """Search for the points that were not followed where their segments predict them."""
         p, cfg = self._points, self.config
-        textured = p.fine.contrast[:, 0] >= cfg.textureless_contrast
+        textured = p.contrast >= cfg.textureless_contrast
         rows = np.flatnonzero(~p.verified & textured & self._segments.posed(p, cfg.linger_frames))
         if len(rows):
             predicted = self._segments.predict(p, rows, self._now)
