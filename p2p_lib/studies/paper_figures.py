@@ -146,6 +146,7 @@ def _table(paper: str, shows: str, plan: str, notebook: str, data: str, on: str)
 
 
 _STAND_IN, _BUNDLED = "stand-in, rendered", "bundled sequences"
+_AND_MUSTARD = f"{_BUNDLED}, YCBInEOAT mustard0"
 _ROWS = (
     ("Figure 1", "three objects through occlusion", "fig1_three_objects.png", "p2p figures", "07",
      "ycbmultitrack_real", _STAND_IN),
@@ -170,6 +171,8 @@ _ROWS = (
     ("", "the same as a plot", "runtime.png", "p2p figures", "09", "-", _BUNDLED),
     _table("Section 4.5, long range", "5 of 5 returns against 0 of 5", "long_range", "07, 09", "ycbmultitrack_real",
            _BUNDLED),
+    _table("-", "2D point trackers, and what of the built-in one is 2D alone", "trackers", "01", "-", _AND_MUSTARD),
+    _table("-", "faults of camera, depth, masks and time", "faults", "10", "-", _AND_MUSTARD),
 )  # fmt: skip
 #: The paper's figures, tables and statements: where each is found (``file``, below ``figures/``), what that is made
 #: ``on``, and what ``data`` the paper's own form needs.
