@@ -214,7 +214,8 @@ def _scale(pairs: list[tuple[Frame, Frame]]) -> Finding:
 def _truth(sequence: Sequence) -> Finding:
     """Whether there is anything to score a run against."""
     seen = [f"{name} in {np.isfinite(of.T_cam_model).all((1, 2)).sum()} images" for name, of in sequence.truth.items()]
-    return Finding("truth", Level.OK, ", ".join(seen) or "none, so that a run is not scored")
+    none = "none (looked for in annotated_poses/ of a folder), so that a run is not scored"
+    return Finding("truth", Level.OK, ", ".join(seen) or none)
 
 
 def _repeated(pairs: list[tuple[Frame, Frame]]) -> Finding:

@@ -362,7 +362,7 @@ def _click(a: argparse.Namespace) -> None:
     sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed or 0)
     page = Clicker(sequence, a.out, a.frame, a.port)
     prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)
-    print(f"{len(prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --out DIR")
+    print(f"{len(prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --save-masks --out DIR")
 
 
 @command(
@@ -495,7 +495,7 @@ def _data_where(a: argparse.Namespace) -> None:
 @command(
     "config",
     "list and explain the parameters, or how the presets differ",
-    arg("only", nargs="?", metavar="STAGE", help="only this one: registration, tsdf, ..."),
+    arg("only", nargs="?", metavar="STAGE[.KEY]", help="only this one: registration, tsdf.voxel_m, ..."),
     arg("--diff", action="store_true", help="only those in which the presets paper and default differ"),
     run_options("preset", "config_file", "settings"),
     _JSON,

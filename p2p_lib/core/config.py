@@ -340,23 +340,28 @@ class Config:
         return "\n".join(lines) + "\n"
 
 
-def parameters(config: Config, stage: str | None = None) -> list[dict[str, Any]]:
-    """Every parameter, or one stage's: ``key``, ``value`` in this configuration, ``unit``, ``source``, ``meaning``.
+def parameters(config: Config, only: str | None = None) -> list[dict[str, Any]]:
+    """All parameters, or ``only`` those of STAGE or the one STAGE.KEY: key, value here, unit, source, meaning.
 
-    Raises :class:`BadInput` for an unknown stage.
+    Raises :class:`BadInput` for an unknown stage or key.
     """
-    if stage is not None and stage not in _STAGES:
+    stage, _, key = (only or "").partition(".")
+    if stage and stage not in _STAGES:
         # The key of a parameter, or a slip of the pen.
         near = [s for s in _STAGES if stage in {f.name for f in fields(getattr(Config, s))}]
         near = near or difflib.get_close_matches(stage, _STAGES, n=1)
         fix = f"Did you mean {near[0]}?" if near else ""
         raise BadInput("stage", repr(stage), f"one of {', '.join(_STAGES)}", fix)
-    return [
+    rows = [
         {"key": f"{s}.{f.name}", "value": getattr(getattr(config, s), f.name)}
-        | {key: f.metadata[key] for key in ("unit", "source", "meaning")}
+        | {about: f.metadata[about] for about in ("unit", "source", "meaning")}
         for s in ([stage] if stage else _STAGES)
         for f in fields(getattr(config, s))
+        if key in ("", f.name)
     ]
+    if not rows:
+        raise BadInput(f"key of {stage}", repr(key), ", ".join(f.name for f in fields(getattr(config, stage))))
+    return rows
 
 
 _STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.default))

@@ -183,6 +183,9 @@ class PoseEstimate:
     covariance      (6, 6) or None: right tangent of T_cam_obj, [rotation rad, translation m]
     confidence      in [0, 1]; 0 without a pose
     reason          why the status is what it is, in words; empty when tracked
+    visible_points  the object's points that the 2D tracker saw; those that this very frame adds are not among them
+    inliers         keypoints that agree on the pose; in the frame in which a map begins, those it begins with
+    keyframe        whether the frame was taken into the map
     map_id          0, and one more for each map that was started since: another map has another object frame
     joined          (id, T_obj_joined) of a map that became part of this one at this frame, else None: a point of its
                     object frame is T_obj_joined times it in this one

@@ -101,6 +101,10 @@ class ImageSequence(ImageFiles):
     def __len__(self) -> int:
         return len(self.rgb)
 
+    def __repr__(self) -> str:
+        size = f"{self.camera.width}x{self.camera.height}"
+        return f"{type(self).__name__}({self.name!r}, {len(self)} frames, {size}, objects: {', '.join(self.objects)})"
+
     @cached_property
     def truth(self) -> dict[str, ObjectTruth]:
         """Object to its truth, read when first asked for."""

@@ -191,6 +191,10 @@ class Run:
     points: dict[str, np.ndarray]
     timings: dict[str, np.ndarray]
 
+    def __repr__(self) -> str:
+        poses = ", ".join(f"{name} {obj.has_pose.sum()} of {len(obj)}" for name, obj in self.objects.items())
+        return f"{type(self).__name__}({str(self.path)!r}, frames with a pose: {poses})"
+
 
 def load_run(folder: str | Path, every_map: bool = False) -> Run:
     """Read what :class:`~p2p_lib.datasets.run_writer.RunWriter` wrote, finished or not.

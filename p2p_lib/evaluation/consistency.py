@@ -54,8 +54,8 @@ _LOOK_ABOVE = {"doubted": 50.0, "reprojection_px": 2.0}
 SCALE = (
     "On real video that was tracked well: depth 70 to 90 %, IoU 80 to 90 %, below 1 px; with poses 1 cm off: "
     "40 to 80 %, 70 to 80 %, 4 to 5 px. "
-    "Verdict: good, or look (at the film before you believe it) with a pose in less than 90 % where seen, IoU < 50 %, "
-    "doubted > 50 % or more than 2 px."
+    "Verdict: good, or look (at the film before you believe it) with a pose in less than 90 % where seen "
+    "(of all frames, where no masks tell), IoU < 50 %, doubted > 50 % or more than 2 px."
 )
 
 
@@ -95,7 +95,12 @@ class Consistency:
 
 
 def verdict(numbers: Mapping[str, float]) -> str:
-    """In a word, what the numbers of an object say: ``good``, or ``look`` at its film before it is believed."""
+    """In a word, what the numbers of an object say: ``good``, or ``look`` at its film before it is believed.
+
+    Where no masks tell in which frames it is seen, it may be in any.
+    """
+    if np.isnan(numbers["pose_where_seen"]):
+        numbers = {**numbers, "pose_where_seen": numbers["pose"]}
     low = any(numbers[key] < least for key, least in _LOOK_BELOW.items())
     high = any(numbers[key] > most for key, most in _LOOK_ABOVE.items())
     return "look" if low or high or not numbers["pose"] else "good"

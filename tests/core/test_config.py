@@ -379,3 +379,6 @@ def test_files_that_cannot_be_read(tmp_path):
 def test_a_key_given_for_a_stage_names_its_stage():
     with pytest.raises(BadInput, match=r"Did you mean method\?"):
         config.parameters(preset(), "gates")
+    assert [row["key"] for row in config.parameters(preset(), "method.gates")] == ["method.gates"]
+    with pytest.raises(BadInput, match=r"key of method: got 'gate', expected .*gates"):
+        config.parameters(preset(), "method.gate")

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -321,3 +322,11 @@ def test_a_nan_pose_file_is_named_before_anything_runs(table, tmp_path):
     finally:
         path.write_text(kept)
     assert not (tmp_path / "run").exists()
+
+
+def test_sequences_and_runs_print_as_a_line(table, tmp_path):
+    sequence = write(tmp_path / "run", table)
+    assert repr(sequence) == f"ImageSequence({sequence.name!r}, {N} frames, {W}x{H}, objects: box, can)"
+    assert re.fullmatch(
+        r"Run\('.*run', frames with a pose: box \d+ of 20, can \d+ of 20\)", repr(load_run(tmp_path / "run"))
+    )

@@ -95,10 +95,12 @@ def test_what_cannot_be_said_is_not(made, run, tmp_path):
         ({"reprojection_px": 4.5}, "look"),
         ({"doubted": 60.0}, "look"),
         ({"pose_where_seen": 50.0}, "look"),
+        ({"pose": 40.0}, "look"),
+        ({"pose": 40.0, "pose_where_seen": 100.0}, "good"),
     ],
 )
 def test_a_verdict_in_a_word(worse, word):
-    """Numbers of a real run, those with poses 1 cm off, and NaN for what was not kept, which says nothing."""
+    """Numbers of a real run, those with poses 1 cm off, and NaN for what was not kept."""
     numbers = dict.fromkeys(HEADS, float("nan")) | {"pose": 90.0, "doubted": 5.0, "reprojection_px": 0.6}
     assert verdict(numbers | worse) == word
     assert verdict(numbers | {"pose": 0.0}) == "look"
