@@ -2,21 +2,21 @@
 
     python benchmarks/bench_confidence.py [SEED ...]      (400 401 402 where none is given)
 
-Tracks synthetic sequences that are degraded (pale labels, coarse depth, blurred noisy images) until many poses are
-wrong, and prints per sequence and pooled: the share of poses within 2 cm and 5 degrees, the expected calibration error
-and the AUROC of the confidence. Then, on sequences as they are, the normalised squared error of the poses' covariance,
-for rotation and for translation, whose expectation is 3. Seeds 310 to 314 were used to set the parameters.
+Writes ``benchmarks/confidence.md``, about ten minutes. Seeds 310 to 314 were used to set the parameters.
 """
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
-from common import squared_errors
+import pandas as pd
+from common import machine, squared_errors
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
+from p2p_lib.core.tables import as_markdown
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M, Judged, pooled
@@ -31,6 +31,24 @@ DEGRADED = [
     ("crossing", BLURRED),
     ("occlusion", BLURRED),
 ]
+PAGE = """# What confidence and covariance are worth
+
+Written by `python benchmarks/bench_confidence.py`; do not edit. Seeds {seeds}, on none of which a parameter was chosen;
+masks of every frame. Commit {commit}.
+
+## Where poses go wrong
+
+Sequences degraded (pale labels, coarse depth, blurred noisy images) until many poses are wrong. *Right*: within
+{max_cm:g} cm and {max_deg:g} degrees of the truth. *ECE*: expected calibration error of the confidence, 0 is ideal.
+*AUROC*: the probability that a right pose has a higher confidence than a wrong one, 0.5 is chance.
+
+{}
+## Where nothing is degraded
+
+Squared error of tracked poses in units of their covariance, three degrees of freedom each: 3 is expected, more is too
+sure.
+
+{}"""
 AS_THEY_ARE = ["crossing", "occlusion", "three_objects"]
 
 
@@ -68,31 +86,48 @@ def tracked_errors(told: dict[str, list]) -> np.ndarray:
     return squared_errors(off.reshape(-1, 6), covariance.reshape(-1, 6, 6))
 
 
-def line(label: str, one: Judged) -> None:
-    right = f"{100 * one.right.mean():5.0f} %"
-    print(f"{label:44} {len(one):6} {right}   {one.calibration_error:.3f}   {one.auroc:.3f}", flush=True)
+def row(of: str, one: Judged) -> dict[str, object]:
+    """A row of the first table."""
+    right = f"{100 * one.right.mean():.0f} %"
+    return {"sequence": of, "poses": len(one), "right": right, "ECE": one.calibration_error, "AUROC": one.auroc}
 
 
-def errors_line(label: str, off: np.ndarray) -> None:
-    print(f"{label:44} {len(off):6}  {off[:, 0].mean():6.2f} {off[:, 1].mean():6.2f}", flush=True)
+def errors_row(of: str, off: np.ndarray) -> dict[str, object]:
+    """A row of the second one."""
+    rotation, translation = off.mean(0)
+    return {"sequence": of, "poses": len(off), "rotation": rotation, "translation": translation}
+
+
+def degraded(seeds: list[int]) -> pd.DataFrame:
+    """What confidences are worth where poses go wrong."""
+    found = {}
+    for name, how in DEGRADED:
+        of = f"contrast {how['contrast']}" if "contrast" in how else "blurred"
+        runs = (judged(tracked(open_sequence(scenario_dir(name, seed, **how)), seed)) for seed in seeds)
+        found[f"`{name}`, {of}"] = pooled(runs)
+    found["all"] = pooled(found.values())
+    return pd.DataFrame([row(of, one) for of, one in found.items()])
+
+
+def as_they_are(seeds: list[int]) -> pd.DataFrame:
+    """How large the errors of tracked poses are in units of their covariance."""
+    found = {
+        f"`{name}`, seed {seed}": tracked_errors(tracked(open_sequence(scenario_dir(name, seed)), seed))
+        for name in AS_THEY_ARE
+        for seed in seeds
+    }
+    return pd.DataFrame(
+        [errors_row(of, off) for of, off in {**found, "all": np.concatenate([*found.values()])}.items()]
+    )
 
 
 def main(seeds: list[int]) -> None:
-    print(f"{'degraded sequence':44} {'poses':>6} {'right':>7}   ECE     AUROC")
-    total = []
-    for name, how in DEGRADED:
-        of_all = pooled(judged(tracked(open_sequence(scenario_dir(name, s, **how)), s)) for s in seeds)
-        line(f"{name} {how.get('contrast', 'blurred')}, seeds {' '.join(map(str, seeds))}", of_all)
-        total.append(of_all)
-    line("pooled", pooled(total))
-    print(f"\n{'sequence as it is':44} {'poses':>6}  squared error, rotation and translation (expected 3)")
-    total = []
-    for name in AS_THEY_ARE:
-        for seed in seeds:
-            off = tracked_errors(tracked(open_sequence(scenario_dir(name, seed)), seed))
-            errors_line(f"{name} {seed}", off)
-            total.append(off)
-    errors_line("pooled", np.concatenate(total))
+    about = machine()
+    tables = [as_markdown(table(seeds).round(3)) for table in (degraded, as_they_are)]
+    text = PAGE.format(*tables, seeds=", ".join(map(str, seeds)), max_cm=100 * MAX_M, max_deg=MAX_DEG, **about)
+    page = Path(__file__).with_name("confidence.md")
+    page.write_text(text, encoding="utf-8")
+    print(f"{text}\n{page}")
 
 
 if __name__ == "__main__":
