@@ -33,8 +33,8 @@ DEGRADED = [
 ]
 PAGE = """# What confidence and covariance are worth
 
-Written by `python benchmarks/bench_confidence.py`; do not edit. Seeds {seeds}, on none of which a parameter was chosen;
-masks of every frame. Commit {commit}.
+Written by `python benchmarks/bench_confidence.py`; do not edit. Seeds {seeds}, on none of which a parameter was
+chosen; masks of every frame. Commit {commit}.
 
 ## Where poses go wrong
 
