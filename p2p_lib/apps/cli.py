@@ -128,6 +128,8 @@ def _live(a: argparse.Namespace) -> None:
 )
 def _eval(a: argparse.Namespace) -> None:
     options = RunOptions.of_arguments(a)
+    if a.run is not None and a.sequence is not None:
+        a.parser.error(f"DIR and --sequence do not go together: --poses {a.run / 'poses'} --sequence {a.sequence}")
     if (a.run is None) == (a.poses is None) or (a.poses is None) != (a.sequence is None):
         a.parser.error("needs either DIR, a run's folder, or --poses with --sequence")
     if a.rows and a.run is None:
@@ -153,15 +155,15 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     from p2p_lib.evaluation.protocol import evaluate
 
     run = load_run(a.run)
-    score = None
+    score, not_scored = None, ""
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
             score = evaluate(run, options.models, a.align, a.min_visible_px)
         except MissingData as error:
             if run.points or options.models:
                 raise
-            warn(f"p2p eval: {error}")
-    _show(score or consistency(run), a.json)
+            not_scored = str(error)
+    _show(score or replace(consistency(run), not_scored=not_scored), a.json)
     if not (score or a.json or (a.run / "masks").is_dir() or run.info["masks"] == "dataset"):
         asked = RunOptions(**(run.info.get("options") or {}) | {"save_masks": True})
         again = " ".join(

@@ -44,6 +44,9 @@ class Frame:
 
     def __post_init__(self) -> None:
         rgb, depth = self.rgb, self.depth_m
+        for what, image in (("colour", rgb), ("depth", depth)):
+            if not isinstance(image, np.ndarray):
+                raise BadInput(f"frame {self.index} {what}", type(image).__name__, "a NumPy array")
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
             raise BadInput(f"frame {self.index} colour", f"{rgb.shape} {rgb.dtype}", "(H, W, 3) uint8")
         if depth.shape != rgb.shape[:2]:

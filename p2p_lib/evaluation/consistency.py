@@ -63,12 +63,14 @@ SCALE = (
 class Consistency:
     """What can be said of a run without truth: per object the numbers of :data:`HEADS`, NaN where there is none.
 
-    depth_on_surface, mask_iou and reprojection_px are medians over the frames that were looked at.
+    depth_on_surface, mask_iou and reprojection_px are medians over the frames that were looked at. not_scored: why
+    there is truth and no score.
     """
 
     objects: dict[str, dict[str, float]]
     info: dict[str, Any] = field(default_factory=dict)
     hz: float | None = None
+    not_scored: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as ``p2p eval --json`` prints them; None where there is nothing to say."""
@@ -76,7 +78,8 @@ class Consistency:
             name: {key: value if np.isfinite(value) else None for key, value in numbers.items()}
             for name, numbers in self.objects.items()
         }
-        return {"truth": None, "objects": plain, "hz": self.hz, **{key: self.info.get(key) for key in WHAT_RAN}}
+        ran = {key: self.info.get(key) for key in WHAT_RAN}
+        return {"truth": self.not_scored or None, "objects": plain, "hz": self.hz, **ran}
 
     def as_frame(self) -> DataFrame:
         """A row per object."""
@@ -90,7 +93,8 @@ class Consistency:
         told = [f"{head}: {says}" for head, says in HEADS.values()]
         hz = [f"{self.hz:.1f} Hz"] if self.hz is not None else []
         ran = ", ".join(f"{key} {self.info.get(key)}" for key in WHAT_RAN)
-        title = "Without truth: how well the run agrees with what the camera saw (- where nothing was kept to tell)"
+        without = f"Not scored: {self.not_scored}.\nWithout a model" if self.not_scored else "Without truth"
+        title = f"{without}: how well the run agrees with what the camera saw (- where nothing was kept to tell)"
         return "\n".join([title, tables.as_text(self.as_frame()), *told, SCALE, *hz, ran])
 
 

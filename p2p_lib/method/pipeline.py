@@ -369,7 +369,7 @@ def _check_unit(frame: Frame) -> None:
     if not len(measured):
         return
     near_m, middle_m = np.quantile(measured, [_NEAREST, 0.5]).tolist()
-    what, fix = f"depth of frame {frame.index}", "Is it in millimetres? Give metres."
+    what, fix = f"depth of frame {frame.index}", "Is it in millimetres? Give metres (p2p: --depth-scale 0.001)."
     if near_m > _FAR_M:
         raise BadInput(what, f"{near_m:.0f} m and more", f"objects nearer than {_FAR_M:g} m", fix)
     if middle_m > _FAR_M:

@@ -164,6 +164,7 @@ _ROWS = (
     _table("", "the same with stand-ins", "ycbmultitrack_standins", "09", "-", _STAND_IN),
     _table("Table 3 (b)", "YCBMultiTrack-Real", "ycbmultitrack_real", "09", "ycbmultitrack_real", "the paper's data"),
     _table("Table 4", "ablation of components", "ablation", "09", "ho3d_v3", "the paper's data"),
+    _table("", "the same on bundled sequences", "ablation_embedded", "09", "-", _BUNDLED),
     _table("", "what each component is worth, by 2D tracker", "ablation_trackers", "09", "-", _BUNDLED),
     _table("Table 5", "ablation of sampling", "sampling", "09", "ho3d_v3", "the paper's data"),
     _table("", "the same on bundled sequences", "sampling_embedded", "09", "-", _BUNDLED),
@@ -171,6 +172,7 @@ _ROWS = (
     ("", "the same as a plot", "runtime.png", "p2p figures", "09", "-", _BUNDLED),
     _table("Section 4.5, long range", "5 of 5 returns against 0 of 5", "long_range", "07, 09", "ycbmultitrack_real",
            _BUNDLED),
+    _table("-", "README's first tables", "readme", "-", "-", f"{_AND_MUSTARD}, 7-Scenes"),
     _table("-", "2D point trackers, and what of the built-in one is 2D alone", "trackers", "01", "-", _AND_MUSTARD),
     _table("-", "faults of camera, depth, masks and time", "faults", "10", "-", _AND_MUSTARD),
 )  # fmt: skip

@@ -269,7 +269,11 @@ def test_with_truth_and_no_model_both_are_said(sequence, tmp_path, capsys):
     capsys.readouterr()
     assert cli.main(["eval", str(tmp_path / "out")]) == 0
     out, err = capsys.readouterr()
-    assert "reprojection [px]" in out and "object: no model for ADD" in err and "off the truth" in err
+    assert "reprojection [px]" in out and "object: no model for ADD" in out and "off the truth" in out and err == ""
+    assert "Without a model: " in out
+    with pytest.raises(SystemExit):
+        cli.main(["eval", str(tmp_path / "out"), "--sequence", str(sequence)])
+    assert "DIR and --sequence do not go together: --poses" in capsys.readouterr().err
 
 
 def test_depth_whose_scale_moves_is_doubted_before_anything_is_tracked(sequence, tmp_path, capsys):
