@@ -152,6 +152,12 @@ class Lifecycle:
             return self
         return replace(self, T_world_obj=T_world_cam @ self.T_cam_obj)
 
+    def corrected(self, T_cam_obj: np.ndarray) -> Lifecycle:
+        """With the newest pose as the graph has it: what comes next starts from there."""
+        lies = self.T_world_obj
+        lies = None if lies is None else lies @ se3.inverse(self.T_cam_obj) @ T_cam_obj
+        return replace(self, T_cam_obj=T_cam_obj, T_world_obj=lies)
+
     def moved_from_last(self, T_cam_obj: np.ndarray) -> tuple[float, float] | None:
         """Metres and degrees from the pose of the frame before to another (4, 4); None after a gap."""
         if not self.has_pose:
@@ -184,6 +190,7 @@ class Lifecycle:
             seen_s=time_s,
             pace_s=time_s - self.seen_s if self.has_pose else self.pace_s,
             lost_frames=0,
+            start_px=None,
             doubted_frames=self.doubted_frames + 1 if doubted else 0,
             doubted=self.doubted if lead is None else lead < TELLING,
             T_previous=self.T_cam_obj if self.has_pose else None,

@@ -116,18 +116,19 @@ class ObjectModel:
                 self._mapping.result()
             self._mapping = None
 
-    def adopt(self) -> None:
-        """Take into the map what the graph found since the frame before."""
+    def adopt(self) -> np.ndarray | None:
+        """Take into the map what the graph found since the frame before; (4, 4) where it has that frame's pose."""
         if self._solved is None:
-            return
+            return None
         with self._stopwatch("graph"):
             result, self._solved = self._solved.result(), None
         if result is None or not result.ok:
-            return
+            return None
         self.map.move(result.point_ids, result.p_obj)
         if result.covariance is not None:
             self.covariance = result.covariance
         self._corrected = dict(zip(result.keys.tolist(), result.T_cam_obj, strict=True))
+        return result.T_cam_obj[-1]
 
     @property
     def has_surface(self) -> bool:

@@ -120,7 +120,9 @@ class ObjectTracker:
 
     def adopt(self) -> None:
         """Take in what was found beside since the frame before; before anything else in a frame."""
-        self.model.adopt()
+        T_cam_obj = self.model.adopt()
+        if T_cam_obj is not None and self.life.has_pose:
+            self.life = self.life.corrected(T_cam_obj)
         if self.aside is not None:
             self.aside.model.adopt()
 
@@ -278,8 +280,9 @@ class ObjectTracker:
         self.life = replace(self.life, start_px=pixels)
         if pixels is None or hidden(obs.mask, self.config):
             return self._without_pose(obs, without, "not seen yet")
-        # Points on the first sliver of an object would all be at its rim.
-        if self._gates and before is not None and pixels > _GROWTH * before:
+        # Points on the first sliver of an object would all be at its rim, and what is known may be about to return.
+        grows = not self.model.empty if before is None else pixels > _GROWTH * before
+        if self._gates and grows:
             return self._without_pose(obs, without, "still coming into view")
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < cfg.lifecycle.min_mask_px:

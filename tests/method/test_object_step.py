@@ -485,6 +485,8 @@ def test_a_keyframe_takes_what_the_graph_finds_unless_it_was_refused(ok):
     np.testing.assert_array_equal(model.covariance, before)
     lump.tracker.adopt()
     np.testing.assert_array_equal(model.covariance, known if ok else before)
+    moved_m = np.linalg.norm((lump.tracker.life.T_cam_obj - step.estimate.T_cam_obj)[:3, 3])
+    assert moved_m == 0 if not ok else 0.0015 < moved_m < 0.0025, "what comes next starts where the graph has it"
     key = max(model.graph.keys)
     off_m = np.linalg.norm((model.surface._views[key].T_cam_obj - step.estimate.T_cam_obj)[:3, 3])
     assert off_m == 0 if not ok else 0.0015 < off_m < 0.0025, "the view is fused where the graph has it"
@@ -793,6 +795,17 @@ def test_where_the_first_map_fits_again_and_the_second_does_not_the_first_one_go
 def test_no_second_map_is_begun_on_few_points():
     lump, _, steps = turned_over(Pair())
     assert lump.tracker.aside is None and steps[-1].estimate.reason == "only 2 points to start from"
+
+
+def test_no_second_map_is_begun_while_the_object_still_comes_into_view():
+    """How large it was before it was followed says nothing of how it comes back."""
+    lump = settled(begun(), [2, 4])
+    assert lump.tracker.life.start_px is None
+    old, (_, mask) = lump.tracker.map.ids.copy(), render(LUMP, about(150))
+    sliver = mask & (np.cumsum(mask.sum(0)) <= 0.3 * mask.sum())
+    shown = [sliver] * 13 + [mask] * 2
+    steps = [lump.see(about(150), hide(lambda tracks: np.isin(tracks.ids, old)), part) for part in shown]
+    assert [step.estimate.map_id for step in steps] == [0] * 14 + [1]
 
 
 def test_no_second_map_of_what_only_the_segmenter_takes_for_the_object():
