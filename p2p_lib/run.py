@@ -292,7 +292,7 @@ def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path,
     for what, places in read.items():
         if any(place.is_dir() and place.resolve().is_relative_to(Path(out).resolve()) for place in places):
             raise BadInput(str(out), f"a folder that holds {what}", "another one for the results")
-    known = find_models(job.sequence) | given_models(options.models or {}, job.sequence.objects)
+    known = find_models(job.sequence) | given_models(options.models or {}, {*job.objects, *job.sequence.truth})
     writer = RunWriter(
         out,
         job.sequence,

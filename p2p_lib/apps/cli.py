@@ -150,6 +150,7 @@ def _eval(a: argparse.Namespace) -> None:
 
 def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     """Against the truth; where there is none, or no model, against what the camera saw."""
+    from p2p_lib.datasets.models import given_models
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.evaluation.consistency import consistency
     from p2p_lib.evaluation.protocol import evaluate
@@ -163,6 +164,8 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
             if run.points or options.models:
                 raise
             not_scored = str(error)
+    elif given_models(options.models or {}, run.objects):
+        warn("p2p eval: --models is not used, because the run has no truth.")
     _show(score or replace(consistency(run), not_scored=not_scored), a.json)
     if not (score or a.json or (a.run / "masks").is_dir() or run.info["masks"] == "dataset"):
         asked = RunOptions(**(run.info.get("options") or {}) | {"save_masks": True})

@@ -127,7 +127,8 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _meant(word: str, known: list[str]) -> str:
-    near = get_close_matches(word, known, n=1, cutoff=0.6)
+    harmless = [option for option in known if option != "--force"]  # it replaces an earlier run
+    near = get_close_matches(word, harmless, n=1, cutoff=0.6)
     return f". Did you mean {near[0]}?" if near else ""
 
 

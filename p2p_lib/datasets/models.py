@@ -50,7 +50,7 @@ def given_models(
 
     Raises :class:`BadInput` for a name that is none of ``objects``, :class:`MissingData` for a file not there.
     """
-    known, models = tuple(objects), {}
+    known, models = tuple(sorted(objects)), {}
     for name, where in given.items():
         if name not in known:
             listed = ", ".join(known) or "there are none"

@@ -276,6 +276,22 @@ def test_with_truth_and_no_model_both_are_said(sequence, tmp_path, capsys):
     assert "DIR and --sequence do not go together: --poses" in capsys.readouterr().err
 
 
+def test_models_that_cannot_be_used_are_said(sequence, tmp_path, capsys):
+    shutil.rmtree(sequence / "annotated_poses")
+    mesh = tmp_path / "mesh.obj"
+    mesh.write_text("v 0 0 0\nv 0 0 1\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(SystemExit):
+        cli.main(["run", str(sequence), "--out", str(tmp_path / "out"), "--frames", "10"])
+    assert "no option --frames" in (said := capsys.readouterr().err) and "--force" not in said
+    assert run(sequence, tmp_path / "out", "--models", f"nobody={mesh}") == 2
+    assert run(sequence, tmp_path / "out") == 0
+    capsys.readouterr()
+    assert cli.main(["eval", str(tmp_path / "out"), "--models", f"nobody={mesh}"]) == 2
+    assert "expected one of the objects: object" in capsys.readouterr().err
+    assert cli.main(["eval", str(tmp_path / "out"), "--models", f"object={mesh}"]) == 0
+    assert "--models is not used" in capsys.readouterr().err
+
+
 def test_depth_whose_scale_moves_is_doubted_before_anything_is_tracked(sequence, tmp_path, capsys):
     for k, path in enumerate(sorted((sequence / "depth").iterdir())):
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
