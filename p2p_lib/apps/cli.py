@@ -128,7 +128,7 @@ def _live(a: argparse.Namespace) -> None:
 )
 def _eval(a: argparse.Namespace) -> None:
     options = RunOptions.of_arguments(a)
-    if a.run is not None and a.sequence is not None:
+    if a.run is not None and a.sequence is not None and a.poses is None:
         a.parser.error(f"DIR and --sequence do not go together: --poses {a.run / 'poses'} --sequence {a.sequence}")
     if (a.run is None) == (a.poses is None) or (a.poses is None) != (a.sequence is None):
         a.parser.error("needs either DIR, a run's folder, or --poses with --sequence")
