@@ -79,7 +79,7 @@ class Lifecycle:
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
     T_world_obj     newest pose in the scene that many points agreed with, where the camera was known; None before
-    start_px        pixels of the newest mask before a map was started; None without a mask
+    start_px        pixels of the newest mask, in a frame without a pose; None without a mask
     doubted         since a gap nothing has told its turn from others that look alike
     lost_frames     frames since the newest pose in which it was in view and had none
     doubted_frames  newest frames in a row whose pose was doubted by one of :data:`DOUBTS`
@@ -200,13 +200,13 @@ class Lifecycle:
 
     def started(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:
         """The state after the first pose in a map."""
-        return Lifecycle(status, T_cam_obj, time_s, start_px=self.start_px)
+        return Lifecycle(status, T_cam_obj, time_s)
 
-    def without_pose(self, status: Status) -> Lifecycle:
+    def without_pose(self, status: Status, mask_px: int | None = None) -> Lifecycle:
         """The state after a frame without a pose. A return that was not confirmed is taken back."""
         taken_back = {"T_cam_obj": self.T_left, "confirming": 0} if self.confirming else {}
         lost_frames = self.lost_frames + (status is Status.LOST)
-        return replace(self, status=status, lost_frames=lost_frames, **taken_back)
+        return replace(self, status=status, lost_frames=lost_frames, start_px=mask_px, **taken_back)
 
 
 def _sighted(life: Lifecycle, evidence: Evidence) -> bool:

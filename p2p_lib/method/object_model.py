@@ -88,13 +88,13 @@ class ObjectModel:
     @property
     def surface(self) -> TsdfVolume | None:
         """With all that was given to it; None where the configuration wants none."""
-        self._settle("fusion")
+        self._settle()
         return self._surface
 
     @property
     def graph(self) -> ObjectGraph | None:
         """With all keyframes; None where the configuration wants none."""
-        self._settle("graph")
+        self._settle()
         return self._graph
 
     def _beside_after(self, work: Callable[..., object], *args: object) -> Future:
@@ -109,10 +109,10 @@ class ObjectModel:
         self._mapping = self._beside.submit(after)
         return self._mapping
 
-    def _settle(self, stage: str) -> None:
+    def _settle(self) -> None:
         """Wait for what runs beside."""
         if self._mapping is not None:
-            with self._stopwatch(stage):
+            with self._stopwatch("fusion"):
                 self._mapping.result()
             self._mapping = None
 

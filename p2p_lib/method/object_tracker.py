@@ -277,12 +277,10 @@ class ObjectTracker:
         cfg, before = self.config, self.life.start_px
         without = Status.INITIALISING if self.model.empty else Status.LOST
         pixels = None if obs.mask is None else np.count_nonzero(obs.mask)
-        self.life = replace(self.life, start_px=pixels)
         if pixels is None or hidden(obs.mask, self.config):
             return self._without_pose(obs, without, "not seen yet")
         # Points on the first sliver of an object would all be at its rim, and what is known may be about to return.
-        grows = not self.model.empty if before is None else pixels > _GROWTH * before
-        if self._gates and grows:
+        if self._gates and before is not None and pixels > _GROWTH * before:
             return self._without_pose(obs, without, "still coming into view")
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < cfg.lifecycle.min_mask_px:
@@ -386,7 +384,9 @@ class ObjectTracker:
         )
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
-        self.life, self._trusted = self.life.without_pose(status), self._trusted if status is Status.LOST else None
+        pixels = None if obs.mask is None else np.count_nonzero(obs.mask)
+        self.life = self.life.without_pose(status, pixels)
+        self._trusted = self._trusted if status is Status.LOST else None
         reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self.outlook.out_of_view else reason
         estimate = PoseEstimate(
             self.name,

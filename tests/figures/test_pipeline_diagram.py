@@ -39,7 +39,7 @@ def test_the_order_is_that_of_a_run():
         estimate = method.step(frame, {"left": masks["left"]})["left"]
         if estimate.keyframe and frame.index:
             break
-    beside = {"fusion", "scene"}  # what waits for them is what a frame meets of them
+    beside = {"fusion", "graph", "scene"}  # what waits for them is what a frame meets of them
     met = [stage for stage in method.stopwatch.last_ms if stage not in {"total", *beside}]
     assert [stage for stage in STAGES if stage in met] == met
     assert set(STAGES) - set(met) <= {*beside, "search", "judging"}, "these take no time here, or none worth a name"

@@ -806,6 +806,7 @@ def test_no_second_map_is_begun_while_the_object_still_comes_into_view():
     shown = [sliver] * 13 + [mask] * 2
     steps = [lump.see(about(150), hide(lambda tracks: np.isin(tracks.ids, old)), part) for part in shown]
     assert [step.estimate.map_id for step in steps] == [0] * 14 + [1]
+    assert steps[13].estimate.reason == "still coming into view"
 
 
 def test_no_second_map_of_what_only_the_segmenter_takes_for_the_object():
