@@ -15,7 +15,6 @@ import numpy as np
 
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt
-from p2p_lib.core.late import Answers
 from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
@@ -344,13 +343,16 @@ def _track(job: _Job, keeper: Keeper, progress: bool) -> None:
 
 def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
     """Every frame with its estimates, which a late 2D tracker gives some frames later."""
-    answers = Answers(method)
     for i in job.frames:
         frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
         for prompt in job.prompts.get(i, ()):
             method.tell(prompt)
-        yield from answers.step(frame, {name: masks[name] for name in method.objects if name in masks})
-    yield from answers.finish()
+        estimates = method.step(frame, {name: masks[name] for name in method.objects if name in masks})
+        if method.frame is not None:
+            yield method.frame, estimates
+    for estimates in method.finish():
+        assert method.frame is not None  # what is still owed is of some frame
+        yield method.frame, estimates
 
 
 def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:

@@ -13,7 +13,7 @@ from importlib import metadata
 from pathlib import Path
 
 from p2p_lib.core import native
-from p2p_lib.core.findings import Finding, Level
+from p2p_lib.core.findings import Finding
 from p2p_lib.core.packages import INSTALL, PIP, command, cotracker_folder
 from p2p_lib.core.paths import PROJECT, cache_dir, data_dir
 
@@ -45,12 +45,6 @@ def run_doctor() -> list[Finding]:
     return [_python(), *imports, *libraries, _kernel(), _gpu(), *optional, _cotracker(), _data(), _cache(), _disk()]
 
 
-def _found(name: str, ok: bool, optional: bool, found: str, remedy: str = "") -> Finding:
-    """Whether it is fine, whether one can do without, and what mends it where it is not."""
-    level = Level.OK if ok else Level.OPTIONAL if optional else Level.WRONG
-    return Finding(name, level, found, "" if ok else remedy)
-
-
 def required_packages() -> list[str]:
     """The distributions that this package requires, as its own metadata says."""
     needs = metadata.requires("p2p-lib") or []
@@ -60,7 +54,7 @@ def required_packages() -> list[str]:
 def _python() -> Finding:
     fine = (3, 11) <= sys.version_info[:2] <= (3, 13)
     found = f"{platform.python_version()}, glibc {platform.libc_ver()[1] or 'none'}, {os.cpu_count()} cores"
-    return _found("Python", fine, False, found, "Set P2P_PYTHON to a Python 3.11 to 3.13 and run: make setup")
+    return Finding.whether(fine, "Python", found, "Set P2P_PYTHON to a Python 3.11 to 3.13 and run: make setup")
 
 
 def _loading(name: str) -> str:
@@ -73,9 +67,11 @@ def _loading(name: str) -> str:
 def _package(name: str, error: str | None = None) -> Finding:
     """A required package; ``error`` is what ended its import, None where nobody has tried."""
     if name == "libusb-package" and native.loads("libusb-1.0.so.0"):
-        return _found(name, True, True, "not needed: the system has libusb")
+        return Finding.whether(True, name, "not needed: the system has libusb")
     error = _fails(_loading(name)) if error is None else error
-    return _found(name, not error, False, error or metadata.version(name), error.partition("Run: ")[2] or "make setup")
+    return Finding.whether(
+        not error, name, error or metadata.version(name), error.partition("Run: ")[2] or "make setup"
+    )
 
 
 def _fails(code: str) -> str:
@@ -92,25 +88,29 @@ def _fails(code: str) -> str:
 
 def _library(library: str, package: str) -> Finding:
     if native.loads(library):
-        return _found(library, True, False, "of the system")
+        return Finding.whether(True, library, "of the system")
     if package == "libusb-1.0-0" and native.preload_libusb():
-        return _found(library, True, False, "of the package libusb-package")
-    return _found(library, False, False, "not found; Open3D needs it", native.install_command([library]))
+        return Finding.whether(True, library, "of the package libusb-package")
+    return Finding.whether(False, library, "not found; Open3D needs it", native.install_command([library]))
 
 
 def _kernel() -> Finding:
     there = (Path(sys.prefix) / "share" / "jupyter" / "kernels" / "python3").is_dir()
-    return _found("Jupyter kernel", there, False, "python3" if there else "none", "make setup")
+    return Finding.whether(there, "Jupyter kernel", "python3" if there else "none", "make setup")
 
 
 def _gpu() -> Finding:
     smi = shutil.which("nvidia-smi")
     listed = subprocess.run([smi, "-L"], capture_output=True, text=True).stdout.strip().splitlines() if smi else []
     if not listed:
-        return _found("GPU", False, True, "none; everything runs on the CPU", "nothing to do without an NVIDIA GPU")
+        return Finding.whether(
+            False, "GPU", "none; everything runs on the CPU", "nothing to do without an NVIDIA GPU", optional=True
+        )
     name = re.sub(r" \(UUID.*", "", listed[0])
     error = _fails("import torch, sys; sys.exit(None if torch.cuda.is_available() else f'torch {torch.__version__}')")
-    return _found("GPU", not error, True, f"{name}; {error or 'torch uses it'}", "P2P_TORCH=cuda make setup")
+    return Finding.whether(
+        not error, "GPU", f"{name}; {error or 'torch uses it'}", "P2P_TORCH=cuda make setup", optional=True
+    )
 
 
 def _optional(name: str, module: str, serves: str, remedy: str) -> Finding:
@@ -118,21 +118,23 @@ def _optional(name: str, module: str, serves: str, remedy: str) -> Finding:
         there = importlib.util.find_spec(module) is not None
     except ModuleNotFoundError:  # its parent package is missing
         there = False
-    return _found(name, there, True, serves + ("" if there else "; not installed"), command(remedy))
+    return Finding.whether(there, name, serves + ("" if there else "; not installed"), command(remedy), optional=True)
 
 
 def _cotracker() -> Finding:
     there = cotracker_folder() is not None  # it comes through torch.hub, which keeps it under its own cache folder
     serves = "2D tracker cotracker3, CC BY-NC: not for commercial use" + ("" if there else "; not there")
-    return _found("cotracker", there, True, serves, command(INSTALL["co-tracker"]))
+    return Finding.whether(there, "cotracker", serves, command(INSTALL["co-tracker"]), optional=True)
 
 
 def _data() -> Finding:
     folder = data_dir()
     if folder is None:
-        return _found("$P2P_DATA", False, True, "not set; bundled data only", "export P2P_DATA=FOLDER of your datasets")
+        return Finding.whether(
+            False, "$P2P_DATA", "not set; bundled data only", "export P2P_DATA=FOLDER of your datasets", optional=True
+        )
     found = f"{folder}{'' if folder.is_dir() else ' does not exist'}"
-    return _found("$P2P_DATA", folder.is_dir(), True, found, "point P2P_DATA at an existing folder")
+    return Finding.whether(folder.is_dir(), "$P2P_DATA", found, "point P2P_DATA at an existing folder", optional=True)
 
 
 def _cache() -> Finding:
@@ -140,10 +142,10 @@ def _cache() -> Finding:
     nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     used_mb = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
     remedy = "set P2P_CACHE to a folder you may write to"
-    return _found("cache folder", os.access(nearest, os.W_OK), False, f"{folder}, {used_mb:.0f} MB used", remedy)
+    return Finding.whether(os.access(nearest, os.W_OK), "cache folder", f"{folder}, {used_mb:.0f} MB used", remedy)
 
 
 def _disk() -> Finding:
     free_gb = shutil.disk_usage(PROJECT).free / 1e9
     remedy = f"free {FREE_GB:.0f} GB beside the project"
-    return _found("disk", free_gb >= FREE_GB, False, f"{free_gb:.0f} GB free", remedy)
+    return Finding.whether(free_gb >= FREE_GB, "disk", f"{free_gb:.0f} GB free", remedy)

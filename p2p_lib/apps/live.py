@@ -18,7 +18,6 @@ import numpy as np
 from p2p_lib.apps.click import Clicker, wait_for_clicks
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.late import Answer, Answers
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate, status_text
@@ -86,7 +85,6 @@ def track_live(
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
     if options.tracker.startswith("builtin") and masks.segmenter == DEFAULT_SEGMENTER:
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector))
-    answers = Answers(method)
     with ExitStack() as kept:
         listeners = [lambda _, estimates: [on_estimate(estimate) for estimate in estimates.values()]]
         if overlay is not None:
@@ -94,10 +92,9 @@ def track_live(
         if out is not None:
             listeners.append(kept.enter_context(_kept(out, camera, method, options, prompts, if_exists)))
 
-        def tell(answered: Iterable[Answer]) -> None:
-            for frame, estimates in answered:
-                for listen in listeners:
-                    listen(frame, estimates)
+        def tell(estimates: dict[str, PoseEstimate]) -> None:
+            for listen in listeners if method.frame is not None else ():
+                listen(method.frame, estimates)
 
         start_s = monotonic()
         newest = kept.enter_context(Newest(camera, keep={p.frame for p in prompts}))
@@ -105,12 +102,13 @@ def track_live(
         while frame is not None and (frame is first or options.stop is None or frame.index < options.stop):
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))
-            tell(answers.step(frame))
+            tell(method.step(frame))
             if frame is not first:  # which may be long ago
                 count.count(frame)
             count.seconds = monotonic() - start_s
             frame = newest.take()
-        tell(answers.finish())
+        for estimates in method.finish():
+            tell(estimates)
     if prompts:
         got = f"frame {prompts[0].frame}, which never came"
         raise BadInput(f"prompt of {prompts[0].name!r}", got, "a frame of the camera", "Click in an earlier one.")

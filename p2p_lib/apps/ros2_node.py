@@ -21,7 +21,6 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.late import Answers
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.ros_messages import read_depth_m, read_rgb, seconds
 
@@ -80,6 +79,7 @@ class TrackingNode:
     def __init__(self, prompts: Any, publish: Any, config: Any = None):
         self.prompts, self.publish, self.config = sorted(prompts, key=lambda p: p.frame), publish, config
         self.tracker: Any = None
+        self._headers: dict[int, Any] = {}  # of frames without an answer yet
         self._count = 0
 
     def on_images(self, rgb: Any, depth: Any, info: Any) -> None:
@@ -88,14 +88,17 @@ class TrackingNode:
 
         if self.tracker is None:
             self.tracker = Point2Pose(camera_of(info), self.config)
-            self._answers = Answers(self.tracker)
         while self.prompts and self.prompts[0].frame <= self._count:
             self.tracker.tell(self.prompts.pop(0))
-        for header, estimates in self._answers.step(frame_of(self._count, rgb, depth), about=rgb.header):
-            for estimate in estimates.values():
-                if estimate.T_cam_obj is not None:
-                    self.publish(estimate, header)
+        self._headers[self._count] = rgb.header
+        estimates = self.tracker.step(frame_of(self._count, rgb, depth))
         self._count += 1
+        if self.tracker.frame is None:
+            return
+        header = self._headers.pop(self.tracker.frame.index)
+        for estimate in estimates.values():
+            if estimate.T_cam_obj is not None:
+                self.publish(estimate, header)
 
 
 def main() -> None:

@@ -25,6 +25,12 @@ class Finding:
     text: str
     fix: str = ""
 
+    @classmethod
+    def whether(cls, ok: bool, name: str, text: str, fix: str = "", optional: bool = False) -> Finding:
+        """Whether it is fine, else what mends it, and whether one can do without."""
+        level = Level.OK if ok else Level.OPTIONAL if optional else Level.WRONG
+        return cls(name, level, text, "" if ok else fix)
+
     @property
     def fine(self) -> bool:
         """Whether there is nothing to do."""

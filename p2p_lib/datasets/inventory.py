@@ -143,23 +143,21 @@ def verify(of: Manifest, every_frame: bool = False) -> Iterator[Finding]:
         yield from _verify_sequences(of, folder / of.sequences_in, every_frame)
 
 
-def _found(name: str, ok: bool, text: str) -> Finding:
-    return Finding(name, Level.OK if ok else Level.WRONG, text)
-
-
 def _verify_file(file: RemoteFile, record: _Record) -> Finding:
     path, expected, unpacked = record.folder / file.path, record.sha256(file), record.unpacked(file)
     if path.is_file():
         digest = sha256(path)
         if expected is None:
-            return _found(file.path, True, f"there, nothing to compare with; sha256 {digest}")
-        return _found(file.path, digest == expected, "sha256 as expected" if digest == expected else f"sha256 {digest}")
+            return Finding.whether(True, file.path, f"there, nothing to compare with; sha256 {digest}")
+        return Finding.whether(
+            digest == expected, file.path, "sha256 as expected" if digest == expected else f"sha256 {digest}"
+        )
     if unpacked is None:
-        return _found(file.path, False, "not there")
+        return Finding.whether(False, file.path, "not there")
     into = record.folder / (file.unpack_to or ".")
     gone = [n for n, size in unpacked.items() if not ((into / n).is_file() and (into / n).stat().st_size == size)]
     text = f"{len(gone)} unpacked files are missing or changed, {gone[0]} first" if gone else "unpacked, all there"
-    return _found(file.path, not gone, text)
+    return Finding.whether(not gone, file.path, text)
 
 
 def _verify_listed(path: Path) -> Finding:
@@ -175,11 +173,11 @@ def _verify_listed(path: Path) -> Finding:
     try:
         json.loads(read_text(path, "checksums"), object_hook=note)
     except (ValueError, RecursionError) as error:
-        return _found(path.name, False, f"unreadable ({error})")
+        return Finding.whether(False, path.name, f"unreadable ({error})")
     here = [name for name in listed if (path.parent / name).is_file()]
     wrong = [name for name in here if sha256(path.parent / name) != listed[name]]
     text = f"{len(here)} of the {len(listed)} files it lists are here"
-    return _found(path.name, not wrong, f"{text}, wrong: {', '.join(wrong)}" if wrong else text)
+    return Finding.whether(not wrong, path.name, f"{text}, wrong: {', '.join(wrong)}" if wrong else text)
 
 
 def _verify_sequences(of: Manifest, folder: Path, every_frame: bool) -> Iterator[Finding]:
@@ -189,7 +187,7 @@ def _verify_sequences(of: Manifest, folder: Path, every_frame: bool) -> Iterator
         try:
             yield _verify_sequence(folder / name, of.format, frames.get(name), every_frame)
         except P2PError as error:
-            yield _found(name, False, str(error))
+            yield Finding.whether(False, name, str(error))
 
 
 def _verify_sequence(folder: Path, format: str | None, frames: int | None, every_frame: bool) -> Finding:
@@ -200,8 +198,8 @@ def _verify_sequence(folder: Path, format: str | None, frames: int | None, every
     truth = {obj: int((t.T_cam_model == t.T_cam_model).all((1, 2)).sum()) for obj, t in sequence.truth.items()}
     text = f"{len(sequence)} frames, truth " + (", ".join(f"{o} in {n}" for o, n in truth.items()) or "none")
     if frames is not None and frames != len(sequence):
-        return _found(folder.name, False, f"{text}, expected {frames} frames")
-    return _found(folder.name, True, text)
+        return Finding.whether(False, folder.name, f"{text}, expected {frames} frames")
+    return Finding.whether(True, folder.name, text)
 
 
 # --- describing ------------------------------------------------------------------------------------

@@ -79,7 +79,7 @@ class Consistency:
             for name, numbers in self.objects.items()
         }
         ran = {key: self.info.get(key) for key in WHAT_RAN}
-        return {"truth": self.not_scored or None, "objects": plain, "hz": self.hz, **ran}
+        return {"truth": None, "not_scored": self.not_scored or None, "objects": plain, "hz": self.hz, **ran}
 
     def as_frame(self) -> DataFrame:
         """A row per object."""

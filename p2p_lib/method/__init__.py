@@ -11,8 +11,7 @@ object's step; ``pose_finder`` has its first half, up to the pose), then at the 
 - judge: ``lifecycle`` holds an object's state, every gate and every doubt; ``agreement`` says whether camera and masks
   agree with themselves;
 - extend: ``object_model`` holds map, surface (``tsdf``, ``tsdf_grid``, ``mesh``) and graph (``factor_graph``,
-  ``keyframes``, ``keyframe_views``); ``sampling`` chooses new points; ``belief`` and ``confidence`` say how well the
-  pose is known.
+  ``keyframes``, ``keyframe_views``); ``sampling`` chooses new points; ``confidence`` says how well the pose is known.
 
 ``outlook`` answers what the pipeline asks around this step: where the object should show, which tracks are elsewhere.
 An object that shows a side never seen has two maps for a while: ``two_maps`` says when they are one. ``shape_search``

@@ -20,7 +20,7 @@ from p2p_lib.core.interfaces import Detector
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import DOUBTED, OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method.agreement import background_share, scene_ratio, size_ratio
-from p2p_lib.method.belief import Belief
+from p2p_lib.method.confidence import Belief
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.lifecycle import BACKGROUND, GATES, MAPPED, Lifecycle, Verdict, off_size
 from p2p_lib.method.object_model import NO_IDS, Known, NewPoints, ObjectModel, Requests
@@ -120,11 +120,9 @@ class ObjectTracker:
 
     def adopt(self) -> None:
         """Take in what was found beside since the frame before; before anything else in a frame."""
-        T_cam_obj = self.model.adopt()
-        if T_cam_obj is not None and self.life.has_pose:
+        T_cam_obj = self.model.adopt()  # nothing is ever found for the map aside: it was put there after this
+        if T_cam_obj is not None:
             self.life = self.life.corrected(T_cam_obj)
-        if self.aside is not None:
-            self.aside.model.adopt()
 
     def observe(
         self,

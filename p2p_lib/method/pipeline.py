@@ -84,6 +84,7 @@ class Point2Pose:
         scene_rng = np.random.default_rng([self.config.seed, 2])
         self.scene = Scene(camera, self.config.depth, scene_rng) if self.config.method.scene else None
         self.objects: dict[str, ObjectTracker] = {}
+        self.frame: Frame | None = None
         self.masks: Masks = {}
         self.tracks = NOTHING_TRACKED
         self.stopwatch = Stopwatch()
@@ -166,8 +167,9 @@ class Point2Pose:
                hidden. The segmenter looks after the objects that are left out, or whose mask is None.
 
         Where the 2D tracker answers late, so does this: the estimates are of the frame ``latency_frames`` ago,
-        as each says, and there are none for the first of the stream until then. ``self.masks`` keeps the masks
-        that they were made with, the segmenter's included, and ``self.tracks`` everybody's 2D tracks.
+        and there are none for the first of the stream until then. ``self.frame`` is the one that they are of (None
+        while there are none), ``self.masks`` keeps the masks that they were made with, the segmenter's included, and
+        ``self.tracks`` everybody's 2D tracks.
         """
         with self.stopwatch.frame():
             given = self._given(frame, masks or {})
@@ -198,6 +200,7 @@ class Point2Pose:
         locating = self._locate(self._waiting[0][0]) if answers else None
         tracks = self._track(frame, masks)
         if not answers:
+            self.frame = None
             return {}
         for obj in self.objects.values():
             obj.adopt()
@@ -205,6 +208,7 @@ class Point2Pose:
         if locating is not None:
             with self.stopwatch("scene"):
                 frame = replace(frame, T_world_cam=locating.result())
+        self.frame = frame
         # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
         objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
         self.tracks = tracks

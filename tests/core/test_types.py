@@ -39,6 +39,8 @@ def test_readings_that_are_none_become_zero(reading, dtype):
 @pytest.mark.parametrize(
     ("rgb", "depth", "time_s", "words"),
     [
+        (RGB.tolist(), DEPTH, 0.0, "frame 7 colour: got list, expected a NumPy array"),
+        (RGB, DEPTH.tolist(), 0.0, "frame 7 depth: got list, expected a NumPy array"),
         (RGB[..., 0], DEPTH, 0.0, r"frame 7 colour: got \(4, 6\) uint8, expected \(H, W, 3\) uint8"),
         (RGB.astype(float), DEPTH, 0.0, r"frame 7 colour: got \(4, 6, 3\) float64"),
         (np.zeros((4, 6, 4), np.uint8), DEPTH, 0.0, r"frame 7 colour: got \(4, 6, 4\)"),

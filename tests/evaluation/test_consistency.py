@@ -84,6 +84,9 @@ def test_what_cannot_be_said_is_not(made, run, tmp_path):
     for name, numbers in said.objects.items():
         assert {key for key, value in numbers.items() if np.isfinite(value)} == {"pose", "doubted"}
         assert said.as_dict()["objects"][name]["mask_iou"] is None
+    assert said.as_dict()["truth"] is None and said.as_dict()["not_scored"] is None
+    unscored = replace(said, not_scored="no model of 'box'")
+    assert unscored.as_dict()["truth"] is None and unscored.as_dict()["not_scored"] == "no model of 'box'"
     for head, says in HEADS.values():
         assert head in said.as_table() and says in said.as_table()
 

@@ -141,6 +141,14 @@ def test_a_pose_of_few_points_places_nothing_again():
     np.testing.assert_array_equal(poor.T_world_obj, life.T_world_obj)
 
 
+def test_what_the_graph_corrects_lies_elsewhere_in_the_world_too():
+    T_world_cam = pose(7)
+    life = lived(GOOD)[-1].placed(T_world_cam).corrected(pose(3))
+    np.testing.assert_array_equal(life.T_cam_obj, pose(3))
+    np.testing.assert_allclose(life.T_world_obj, T_world_cam @ pose(3), atol=1e-12)
+    assert lived(GOOD)[-1].corrected(pose(3)).T_world_obj is None
+
+
 def test_a_return_has_a_place_once_it_is_confirmed():
     life = lived(GOOD)[-1].placed(np.eye(4)).without_pose(Status.LOST)
     back = life.with_pose(pose(9), 9.0, Status.RECOVERED)

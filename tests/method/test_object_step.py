@@ -15,7 +15,7 @@ from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.method import refinement
-from p2p_lib.method.belief import Belief
+from p2p_lib.method.confidence import Belief
 from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
 from p2p_lib.method.outlook import Outlook
 from p2p_lib.method.pose_finder import Candidate
@@ -370,7 +370,7 @@ def test_what_slides_over_the_object_does_not_enter_the_graph(gates):
 @pytest.mark.parametrize("gates", [True, False])
 def test_a_pose_that_is_hardly_believed_makes_no_keyframe(gates, monkeypatch):
     lump = settled(begun(method__gates="all" if gates else "none"), [2])
-    monkeypatch.setattr("p2p_lib.method.belief.confidence", lambda *_: 0.09)
+    monkeypatch.setattr("p2p_lib.method.confidence.confidence", lambda *_: 0.09)
     assert not any(lump.see(turned(deg)).estimate.keyframe for deg in (5, 8, 11, 14)) == gates
     monkeypatch.undo()
     assert lump.see(turned(26)).estimate.keyframe
@@ -495,7 +495,7 @@ def test_a_keyframe_takes_what_the_graph_finds_unless_it_was_refused(ok):
 @pytest.mark.parametrize("noise", ["sensor", "constant"])
 def test_the_graph_gets_the_noise_of_the_sensor_and_of_registration(monkeypatch, noise):
     lump, known = settled(begun(method__noise=noise), [5]), 1e-6 * np.diag([1.0, 2, 3, 4, 5, 6])
-    monkeypatch.setattr("p2p_lib.method.belief._of_frame", lambda *_: known)
+    monkeypatch.setattr("p2p_lib.method.confidence._of_frame", lambda *_: known)
     assert lump.see(turned(12)).estimate.keyframe
     keyframe = lump.tracker.model.graph._keyframes[max(lump.tracker.model.graph.keys)]
     by_range = 0.001 + 0.0025 * keyframe.p_cam[:, 2] ** 2
