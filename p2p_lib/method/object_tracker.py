@@ -151,7 +151,7 @@ class ObjectTracker:
 
     def step(self, obs: Observation) -> ObjectStep:
         """The object's pose at a frame."""
-        if self.model.empty or self._outgrown(obs) or self._turned_over(obs):
+        if self.model.empty:
             return self._initialise(obs)
         if hidden(obs.mask, self.config):
             return self._without_pose(obs, Status.OCCLUDED, f"{np.count_nonzero(obs.mask)} mask pixels")
@@ -168,6 +168,8 @@ class ObjectTracker:
             if self._relation.certain:
                 return self._joined(obs, best, known[0])
         if best is None or not verdict.accepted:
+            if self._outgrown(obs) or self._turned_over(obs):
+                return self._initialise(obs)
             return self._without_pose(obs, verdict.status, verdict.reason)
         if not verdict.doubted:
             self._trusted = obs

@@ -178,7 +178,7 @@ def outlier_trials(seeds: Iterable[int], config: Config, outliers: float) -> Dat
 def consistency(trials: int, config: Config, seed: int = 0, **turn: object) -> np.ndarray:
     """(trials, 2) normalised squared errors of the newest keyframe, rotation and translation, by its covariance.
 
-    Each is e^T Sigma^-1 e of three numbers: 3 on average, and distributed as chi square, if the covariance is honest.
+    Each is e^T Sigma^-1 e of three numbers, distributed as chi square of 3 if the covariance is honest: median 2.37.
     """
     rows = []
     for trial in range(trials):
@@ -275,7 +275,7 @@ def consistency_plot(nees: np.ndarray) -> Figure:
         weights = np.full(len(values), 1 / (len(values) * (bins[1] - bins[0])))
         axis.hist(np.minimum(values, 13.99), bins, weights=weights, color="#A9CCE8", edgecolor="white")
         axis.plot(at, chi2(3).pdf(at), color="#222222", label=r"$\chi^2$ of 3")
-        axis.axvline(values.mean(), color=style.METHODS[0], linestyle="--", label=f"mean {values.mean():.2f}")
+        axis.axvline(np.median(values), color=style.METHODS[0], linestyle="--", label=f"median {np.median(values):.2f}")
         last = f"last bar: all {(values >= bins[-2]).sum()} beyond {bins[-2]:.0f}"
         axis.text(0.99, 0.35, last, transform=axis.transAxes, ha="right", fontsize=8)
         axis.set_title(f"{name}, {len(values)} simulated turns")

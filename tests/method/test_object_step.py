@@ -809,6 +809,15 @@ def test_no_second_map_is_begun_while_the_object_still_comes_into_view():
     assert steps[13].estimate.reason == "still coming into view"
 
 
+def test_no_map_is_begun_in_a_frame_that_shows_the_object_as_it_is_known():
+    lump = settled(begun(), [2, 4])
+    old = lump.tracker.map.ids.copy()
+    steps = [lump.see(about(150), hide(lambda tracks: np.isin(tracks.ids, old))) for _ in range(12)]
+    assert {step.estimate.map_id for step in steps} == {0} and lump.tracker._turned_over(lump.observed(about(6)))
+    back = lump.see(about(6))
+    assert back.estimate.map_id == 0 and back.estimate.status is Status.RECOVERED
+
+
 def test_no_second_map_of_what_only_the_segmenter_takes_for_the_object():
     lump = settled(begun(), [2, 4])
     old = lump.tracker.map.ids.copy()

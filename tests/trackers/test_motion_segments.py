@@ -48,15 +48,16 @@ def test_a_segment_is_lost_where_too_few_of_its_points_agree():
     assert len(RIGHT) > 20 and segments.segments[0].hidden_for == 1
 
 
-@pytest.mark.parametrize(("found", "posed"), [(3, False), (5, True)])
-def test_a_lost_segment_needs_a_fair_share_of_the_points_that_were_searched_for(found, posed):
+@pytest.mark.parametrize("hidden_for", [0, 1])
+@pytest.mark.parametrize(("found", "posed"), [(3, False), (5, False), (6, True)])
+def test_a_segment_needs_a_fair_share_of_the_points_that_were_searched_for(found, posed, hidden_for):
     """Three points that agree are enough to hold a segment, but three of twenty-four are chance on a look-alike.
 
     What was found there goes with the pose: else chance would add up from frame to frame.
     """
     p, segments = started(RIGHT, image())
     (segment,) = segments.segments
-    segment.hidden_for = 1
+    segment.hidden_for = hidden_for
     p.verified[found:] = False
     segments.fit(p, image(), lost_only=True, sought=np.arange(24))
     assert segment.posed == posed and p.verified.sum() == (found if posed else 0)

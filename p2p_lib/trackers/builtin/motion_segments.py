@@ -23,8 +23,8 @@ from p2p_lib.trackers.builtin.tracked_points import Points
 _PROPOSED_COV = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
 #: Fraction of a segment's followed points that must agree on its pose.
 _MIN_AGREEING = 0.3
-#: Fraction of the points searched for on a lost segment that must be found: fewer are chance, on something like it.
-_MIN_FOUND = 0.2
+#: Fraction of a segment's points that should show which must be found: fewer are chance, on something like it.
+_MIN_FOUND = 0.25
 #: Effective information: errors of so many successive frames count as one observation of a position.
 _REPEATS = 4.0
 #: Error of a position (px) beside what alignment states: when a point is placed, when it is observed again.
@@ -116,16 +116,19 @@ class MotionSegments:
     def fit(self, p: Points, now: Image, lost_only: bool = False, sought: np.ndarray = _NO_ROWS) -> None:
         """Fit poses to the points that were followed or found; points that disagree are not verified.
 
-        ``sought`` (M,) are the rows that were searched for where lost segments predict them.
+        ``sought`` (M,) are the rows that were searched for where segments predict them. ``lost_only``: a segment with a
+        pose keeps it, unless hardly any of its points are found there.
         """
         p.leaving &= lost_only
         for s, segment in enumerate(self.segments):
+            at = np.flatnonzero(p.verified & (p.segment == s))
+            own = sought[p.segment[sought] == s]
             if lost_only and segment.posed:
+                if len(at) < _MIN_FOUND * (len(at) + np.count_nonzero(~p.verified[own])):
+                    segment.hidden_for, p.verified[at] = 1, False
                 continue
             if not lost_only:
                 segment.rejected_for = max(segment.rejected_for - 1, 0)
-            at = np.flatnonzero(p.verified & (p.segment == s))
-            own = sought[p.segment[sought] == s]
             fit = self._fitted(segment, p, at, now, _MIN_FOUND * len(own))
             if fit is not None:
                 segment.before = segment.fit.T_cam_seg if segment.posed else fit.T_cam_seg
