@@ -277,8 +277,11 @@ def test_the_workflow_runs_the_two_commands_on_every_python():
     assert tuple(sorted(job["strategy"]["matrix"]["python"])) == tuple(sorted(("3.11", "3.12", "3.13")))
     run = [step["run"] for step in job["steps"] if "run" in step]
     assert {"make reproduce", "make test"} <= set(run)
-    assert flow["jobs"]["backends"]["steps"][-1]["run"] == "make test-backends"
+    weekly = flow["jobs"]["weekly"]
+    assert weekly["steps"][-1]["run"] == "make ${{ matrix.target }}"
+    once_a_week = set(weekly["strategy"]["matrix"]["target"])
+    assert once_a_week == {"test-backends", "figures", "seeds"}
     targets = set(re.findall(r"(?m)^([a-z-]+):", (PROJECT / "Makefile").read_text()))
-    assert {line.split()[1] for line in run if line.startswith("make ")} <= targets
-    for step in [*job["steps"], *flow["jobs"]["backends"]["steps"]]:
+    assert {line.split()[1] for line in run if line.startswith("make ")} | once_a_week <= targets
+    for step in [*job["steps"], *weekly["steps"]]:
         assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", step.get("uses", "a@" + "0" * 40)), "an action at one commit"

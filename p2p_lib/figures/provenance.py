@@ -33,7 +33,7 @@ from p2p_lib.figures.film import write_video
 from p2p_lib.figures.tables import Table
 
 _WHAT_RAN = "sequence objects start stop frames tracker masks preset seed commit modified".split()
-_OF_THE_CODE = {"versions", "commit", "modified", "run"}  # a run's name is a checksum that holds the commit, too
+_OF_THE_CODE = {"versions", "commit", "modified", "run", "runs"}  # the name of a run holds the commit, too
 _SHOWN_PX = 900  # a notebook shows images at most this wide
 
 
