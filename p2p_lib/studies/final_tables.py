@@ -353,7 +353,7 @@ def by_run(numbers: Numbers) -> Table:
     lines = []
     for at, outcomes in done.items():
         cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 5
-        rate = [number(hz.get(at), digits=1)] if numbers.judges else []
+        rate = [number(hz[at], digits=1) if at in hz else numbers.missing(*at)] * numbers.judges
         lines.append([Cell(at[0]), Cell(at[1]), *cells, *rate])
     heads = ["Method", "Sequence", *_AREA_HEADS, *_AREA_HEADS, "frames lost", *["rate (Hz)"] * numbers.judges]
     groups = [("", 2), ("aligned at the first frame", 2), ("one constant over all", 2), ("", 1 + numbers.judges)]

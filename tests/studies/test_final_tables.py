@@ -241,6 +241,9 @@ def test_rates_and_runs(tmp_path):
     (row,) = paper_table(benchmark(tmp_path, runs, seeds=(0, 1), kind="runs")).rows
     area = "92.0 (90.0 to 94.0)"
     assert [c.text for c in row] == ["Ours", "ycbineoat/a", area, area, area, area, "0 of 10", "20.0"]
+    absent = Outcome(key="k", status="not run", reason="no models")
+    (row,) = paper_table(benchmark(tmp_path, {("Ours", "a"): [absent]}, kind="runs")).rows
+    assert {(c.text, c.note) for c in row[2:]} == {("-", "no models")}, "every dash has its reason"
 
 
 def test_three_files_lie_beside_the_results(tmp_path):
