@@ -8,19 +8,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from p2p_lib.core.image import bounds
+from p2p_lib.core.image import bounds, in_image, nearest_px
 from p2p_lib.core.types import Frame
 
 #: Keypoints nearer to each other say little of the size, m; so many are needed.
 _APART_M, _KEYPOINTS = 0.02, 8
-#: What has changed by less is the same thing: depth in m, each of red, green and blue in grey levels.
-_SAME_M, _SAME_GREY = 0.01, 12
+#: What has changed by less is the same thing: each of red, green and blue, in grey levels.
+_SAME_GREY = 12
 #: So much of an image has to look the same before it tells of the scene.
 _LOOKS_THE_SAME = 0.2
 #: Depth, colour or both may be that of a frame before for so long, s: some cameras deliver one more seldom.
 _STANDS_S = 0.08
+#: Where a mask ends, depth is compared so many pixels to either side of so many pixels at least; a step is larger, m.
+_BESIDE_PX, _OUTLINE, _DEPTH_STEP_M = 4, 20, 0.02
+#: The outline's direction is that from so many of its pixels before to so many behind.
+_ALONG = 3
 #: Pixels between those that are compared first.
 _STEP = 8
 
@@ -55,17 +60,23 @@ def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.n
     return float(np.median(now_m[same] / then_m[same])) if same.mean() > _LOOKS_THE_SAME else 1.0
 
 
-def background_share(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.ndarray) -> float:
-    """Pixels that a mask has taken in although nothing has changed there, as a share of the mask (H, W) before.
+def outline_share(frame: Frame, mask: np.ndarray) -> float | None:
+    """Share of a mask's (H, W) outline where the measured depth has a step, as it has where an object ends.
 
-    What an object moves onto changes, and what comes out from behind something does, too.
+    Of the mask's largest part, and where the image goes on; None where too little is measured on both sides.
     """
-    cut = bounds(mask)
-    taken = mask[cut] & ~mask_before[cut]
-    now_m, then_m = (of.depth_m[cut][taken] for of in (frame, before))
-    now, then = (of.rgb[cut][taken].astype(int) for of in (frame, before))
-    same = (now_m > 0) & (then_m > 0) & (np.abs(now_m - then_m) < _SAME_M) & (np.abs(now - then) < _SAME_GREY).all(1)
-    return float(np.count_nonzero(same) / max(np.count_nonzero(mask_before), 1))
+    cut = bounds(mask, 1)
+    found, _ = cv2.findContours(mask[cut].astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not found:
+        return None
+    uv_px = max(found, key=len)[:, 0] + np.array([cut[1].start, cut[0].start])
+    along = np.roll(uv_px, -_ALONG, 0) - np.roll(uv_px, _ALONG, 0)
+    across = along[:, ::-1] * [1, -1] * _BESIDE_PX / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1)
+    sides = uv_px + across, uv_px - across
+    z = [np.where(in_image(at, mask.shape), frame.depth_m[nearest_px(at, mask.shape)[::-1]], 0) for at in sides]
+    measured = (z[0] > 0) & (z[1] > 0)
+    steps = np.abs(z[0] - z[1])[measured] > _DEPTH_STEP_M
+    return float(steps.mean()) if len(steps) >= _OUTLINE else None
 
 
 @dataclass(frozen=True, eq=False)

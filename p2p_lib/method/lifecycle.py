@@ -23,8 +23,9 @@ SIGHTED, SIGHTED_STILL = 0.5, 0.3
 _PAUSE_S, _PAUSE = 0.25, 5
 #: Another size is one that is off by this and so many standard deviations.
 _SIZE, _SIZE_SIGMAS = 0.05, 3.0
-#: A mask that takes in so much background is doubted. One that stays so for this many frames is taken for right.
-BACKGROUND, _LONGEST_DOUBT = 0.2, 60
+#: A mask is doubted of whose outline less than this share lies where depth has steps, of what did before. One that
+#: stays so for this many frames is taken for right.
+OUTLINE, _LONGEST_DOUBT = 0.45, 60
 #: A pose of less confidence makes no keyframe: what it places agrees with it for ever after. One that the surface
 #: alone determines well has more.
 MAPPED = 0.1
@@ -41,7 +42,7 @@ class Evidence:
     sighting       share of the surface that shows in the image where and as it should; None where nobody has looked
     lead           share of that which is more than where it is turned otherwise; None where nobody has compared
     size           times as large as its keypoint map it is measured, and the standard deviation; None: few are seen
-    background     pixels that its mask took in although nothing changed there, as a share of the mask
+    outline        what of its mask's outline lies where depth has steps, as a share of what did before any doubt
     still          whether the same image has come again and again
     """
 
@@ -50,7 +51,7 @@ class Evidence:
     sighting: float | None = None
     lead: float | None = None
     size: tuple[float, float] | None = None
-    background: float = 0.0
+    outline: float = 1.0
     still: bool = False
 
 
@@ -224,9 +225,9 @@ def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: Life
     return "too few points, and the surface does not fit either" if nothing else ""
 
 
-def _mask_on_background(life: Lifecycle, evidence: Evidence) -> str:
-    on = evidence.background > BACKGROUND and life.doubted_frames < _LONGEST_DOUBT
-    return f"its mask took in {100 * evidence.background:.0f} % more where nothing changed" if on else ""
+def _mask_off_steps(life: Lifecycle, evidence: Evidence) -> str:
+    off = evidence.outline < OUTLINE and life.doubted_frames < _LONGEST_DOUBT
+    return "its mask does not end where its depth does any more" if off else ""
 
 
 def _another_size(life: Lifecycle, evidence: Evidence) -> str:
@@ -246,7 +247,7 @@ def off_size(ratio: float, sigma: float = 0.0) -> bool:
 #: Every reason to doubt a pose that no gate refuses: what camera and masks say contradicts itself.
 DOUBTS: dict[str, Callable[[Lifecycle, Evidence], str]] = {
     "size": _another_size,
-    "background": _mask_on_background,
+    "outline": _mask_off_steps,
     "still": _same_image,
 }
 

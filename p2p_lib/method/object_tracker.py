@@ -19,10 +19,10 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.interfaces import Detector
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import DOUBTED, OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
-from p2p_lib.method.agreement import background_share, scene_ratio, size_ratio
+from p2p_lib.method.agreement import scene_ratio, size_ratio
 from p2p_lib.method.confidence import Belief
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import BACKGROUND, GATES, MAPPED, Lifecycle, Verdict, off_size
+from p2p_lib.method.lifecycle import GATES, MAPPED, OUTLINE, Lifecycle, Verdict, off_size
 from p2p_lib.method.object_model import NO_IDS, Known, NewPoints, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.outlook import Outlook, hidden
@@ -35,8 +35,8 @@ from p2p_lib.recovery.search import Sighting
 _GROWTH = 1.1
 #: A map is founded anew where an object has been lost for so many frames and shows more than this of what it knows.
 _PATIENCE, _OUTGROWN = 5, 1.5
-#: A smaller share of background in a mask is nothing to look into.
-_SOME = 0.05
+#: Where depth has steps at less of a mask's outline than this, it does not tell where the object ends.
+_SOME = 0.3
 #: A known object that has been lost for so many frames and shows this share of the most that was ever seen of it is
 #: turned to a side that nobody knows: a second map is begun.
 _STAYS_LOST, _IN_PLAIN_VIEW = 12, 0.4
@@ -182,8 +182,8 @@ class ObjectTracker:
         if best is None:
             nothing = obs.mask is None and not obs.seen.any()
             return Verdict(False, Status.OCCLUDED if nothing else Status.LOST, reason)
-        size, background = self._size(obs, best), self._background(obs)
-        evidence = replace(best.evidence, size=size, background=background, still=obs.still)
+        size, outline = self._size(obs, best), self._outline(obs)
+        evidence = replace(best.evidence, size=size, outline=outline, still=obs.still)
         return self.life.judge(evidence, self._gates, self.config.lifecycle)
 
     def _before(self, obs: Observation) -> Observation | None:
@@ -205,15 +205,11 @@ class ObjectTracker:
         p_cam = obs.p_cam[sized]
         return size_ratio(self.map.p_obj[sized], p_cam, self.observer.noise_m(p_cam))
 
-    def _background(self, obs: Observation) -> float:
-        """What the mask has taken in of the background, as a share of itself when nothing was doubted last."""
+    def _outline(self, obs: Observation) -> float:
+        """What of the mask's outline lies where depth has steps, as a share of what did before any doubt."""
         before = self._before(obs)
-        if before is None:
-            return 0.0
-        share = background_share(obs.frame, obs.mask, before.frame, before.mask)
-        # At the image's border a mask grows with what comes into view.
-        cut_off = share > _SOME and (self.observer.cut_off(obs) or self.observer.cut_off(before))
-        return 0.0 if cut_off else share
+        then, now = None if before is None else before.outline_share, obs.outline_share
+        return 1.0 if then is None or now is None or then < _SOME else now / then
 
     # -- extend --------------------------------------------------------------------------------
 
@@ -316,7 +312,7 @@ class ObjectTracker:
         if not self._gates or self.life.lost_frames < _PATIENCE or obs.mask is None:
             return False
         more = self.observer.area_m2(obs) > _OUTGROWN * self.model.seen_m2
-        return not self.life.followed or (more and self._background(obs) <= BACKGROUND)
+        return not self.life.followed or (more and self._outline(obs) >= OUTLINE)
 
     def _turned_over(self, obs: Observation) -> bool:
         """Whether a known object stays lost in plain view: it shows a side that nobody knows, in a mask that is given.
@@ -327,7 +323,7 @@ class ObjectTracker:
         if not known or obs.mask is None or not obs.given or self.observer.cut_off(obs):
             return False
         plain = self.observer.area_m2(obs) >= _IN_PLAIN_VIEW * self.model.seen_m2
-        return plain and self._background(obs) <= BACKGROUND
+        return plain and self._outline(obs) >= OUTLINE
 
     # -- two maps ------------------------------------------------------------------------------
 

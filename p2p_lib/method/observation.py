@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import depth_noise_m, in_range, lift, off_edges
 from p2p_lib.core.image import bounds, in_mask
 from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.method.agreement import outline_share
 
 #: Depth this near the mask's border mixes the object with what is behind it.
 _BORDER_PX = 2
@@ -51,6 +53,11 @@ class Observation:
     def seen(self) -> np.ndarray:
         """(N,) bool: points with a 3D observation."""
         return np.isfinite(self.p_cam[:, 0])
+
+    @cached_property
+    def outline_share(self) -> float | None:
+        """What of the mask's outline lies where depth has steps; None where nobody knows."""
+        return None if self.mask is None else outline_share(self.frame, self.mask)
 
 
 class Observer:

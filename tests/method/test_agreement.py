@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.types import Frame
-from p2p_lib.method.agreement import Standing, background_share, scene_ratio, size_ratio
+from p2p_lib.method.agreement import Standing, outline_share, scene_ratio, size_ratio
 
 RNG = np.random.default_rng(0)
 P_OBJ = RNG.uniform(-0.05, 0.05, (30, 3))
@@ -56,16 +57,22 @@ def test_a_camera_that_measures_otherwise_does_so_beside_the_object_too(factor):
     assert scene_ratio(moving, mask, before, mask_before) == 1, "nothing looks the same"
 
 
-def test_a_mask_takes_in_background_that_an_object_that_moves_does_not():
-    (before, mask_before), (frame, mask) = scene(20), scene(30)
-    assert background_share(frame, mask, before, mask_before) == 0, "there it has moved"
-    wide = mask.copy()
-    wide[10:30, 50:55] = True
-    assert background_share(frame, wide, before, mask_before) == pytest.approx(5 / 20)
-    nearer, brighter = scene(30, wall_m=0.7)[0], scene(30, grey=130)[0]  # something passes, in depth or in colour
-    assert background_share(nearer, wide, before, mask_before) == 0
-    assert background_share(brighter, wide, before, mask_before) == 0
-    assert background_share(frame, mask_before & mask, before, mask_before) == 0, "what it leaves out is no background"
+def test_a_mask_ends_where_depth_has_steps():
+    frame, mask = scene(30)
+    assert outline_share(frame, mask) == 1
+    wide, beside = cv2.dilate(mask.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0, np.roll(mask, 14, 1)
+    assert outline_share(frame, wide) == 0 and outline_share(frame, beside) < 0.4
+    half = np.where(np.arange(mask.shape[0])[:, None] < 20, np.roll(frame.depth_m, 8, 1), frame.depth_m)
+    assert 0.3 < outline_share(replace(frame, depth_m=half), mask) < 0.9
+
+
+def test_where_nothing_is_measured_or_the_image_ends_an_outline_tells_nothing():
+    frame, mask = scene(30)
+    assert outline_share(replace(frame, depth_m=np.where(mask, frame.depth_m, 0)), mask) is None
+    assert outline_share(frame, np.zeros_like(mask)) is None
+    left, cut = np.roll(frame.depth_m, -40, 1), np.roll(mask, -40, 1)
+    left[:, -40:], cut[:, -40:] = left[:, :1] * 0 + frame.depth_m[0, 0], False
+    assert cut[:, 0].any() and outline_share(replace(frame, depth_m=left), cut) == 1
 
 
 def stood(frame: Frame, before: Frame) -> tuple[bool, bool]:

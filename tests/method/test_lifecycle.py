@@ -180,11 +180,11 @@ def test_a_return_without_points_is_sought_until_points_confirm_it():
     ("contradiction", "doubted"),
     [
         ({}, False),
-        ({"size": (1.03, 0.0), "background": 0.1}, False),
+        ({"size": (1.03, 0.0), "outline": 0.6}, False),
         ({"size": (1.1, 0.01)}, True),
         ({"size": (0.9, 0.01)}, True),
         ({"size": (1.1, 0.02)}, False),
-        ({"background": 0.3}, True),
+        ({"outline": 0.4}, True),
         ({"still": True}, True),
     ],
 )
@@ -197,6 +197,6 @@ def test_what_contradicts_itself_is_doubted_and_the_paper_doubts_nothing(contrad
 
 
 def test_a_mask_that_stays_as_wide_is_taken_for_right_in_the_end():
-    long, wide = dataclasses.replace(lived(GOOD)[-1], doubted_frames=60), dataclasses.replace(GOOD, background=0.3)
+    long, wide = dataclasses.replace(lived(GOOD)[-1], doubted_frames=60), dataclasses.replace(GOOD, outline=0.4)
     assert not long.judge(wide, ALL, CFG).doubted
     assert long.judge(dataclasses.replace(GOOD, size=(1.2, 0.0)), ALL, CFG).doubted, "an object has one size"
