@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from nbformat import NotebookNode
 
 #: ``quick``: bundled data, CPU. ``full``: the data and backends that are present. Each with what it takes on two cores.
-PROFILES = {"quick": "some minutes", "full": "half an hour without data of yours, hours with it"}
+PROFILES = {"quick": "some minutes", "full": "a quarter of an hour without data of yours, hours with it"}
 CHECKS_MIME = "application/vnd.p2p.checks+json"
 Value = bool | int | float | str
 

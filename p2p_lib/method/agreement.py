@@ -63,7 +63,7 @@ def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.n
 def outline_share(frame: Frame, mask: np.ndarray) -> float | None:
     """Share of a mask's (H, W) outline where the measured depth has a step, as it has where an object ends.
 
-    Of the mask's largest part, and where the image goes on; None where too little is measured on both sides.
+    Of the mask's largest part; None where too little is measured on both sides. At the image's border there is none.
     """
     cut = bounds(mask, 1)
     found, _ = cv2.findContours(mask[cut].astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -73,9 +73,9 @@ def outline_share(frame: Frame, mask: np.ndarray) -> float | None:
     along = np.roll(uv_px, -_ALONG, 0) - np.roll(uv_px, _ALONG, 0)
     across = along[:, ::-1] * [1, -1] * _BESIDE_PX / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1)
     sides = uv_px + across, uv_px - across
-    z = [np.where(in_image(at, mask.shape), frame.depth_m[nearest_px(at, mask.shape)[::-1]], 0) for at in sides]
-    measured = (z[0] > 0) & (z[1] > 0)
-    steps = np.abs(z[0] - z[1])[measured] > _DEPTH_STEP_M
+    inside = in_image(sides[0], mask.shape) & in_image(sides[1], mask.shape)
+    z = [frame.depth_m[nearest_px(at, mask.shape)[::-1]] for at in sides]
+    steps = (inside & (np.abs(z[0] - z[1]) > _DEPTH_STEP_M))[~inside | (z[0] > 0) & (z[1] > 0)]
     return float(steps.mean()) if len(steps) >= _OUTLINE else None
 
 

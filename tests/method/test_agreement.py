@@ -66,13 +66,17 @@ def test_a_mask_ends_where_depth_has_steps():
     assert 0.3 < outline_share(replace(frame, depth_m=half), mask) < 0.9
 
 
-def test_where_nothing_is_measured_or_the_image_ends_an_outline_tells_nothing():
+def test_where_nothing_is_measured_an_outline_tells_nothing():
     frame, mask = scene(30)
     assert outline_share(replace(frame, depth_m=np.where(mask, frame.depth_m, 0)), mask) is None
     assert outline_share(frame, np.zeros_like(mask)) is None
-    left, cut = np.roll(frame.depth_m, -40, 1), np.roll(mask, -40, 1)
-    left[:, -40:], cut[:, -40:] = left[:, :1] * 0 + frame.depth_m[0, 0], False
-    assert cut[:, 0].any() and outline_share(replace(frame, depth_m=left), cut) == 1
+
+
+def test_at_the_border_of_the_image_depth_has_no_step():
+    inside, mask = scene(30)
+    shown = [outline_share(*scene(left)) for left in (30, 60, 0)]
+    assert shown == [1, pytest.approx(0.75, abs=0.05), pytest.approx(0.75, abs=0.05)], "one side of a square is cut off"
+    assert outline_share(inside, np.ones_like(mask)) == 0, "it ends nowhere"
 
 
 def stood(frame: Frame, before: Frame) -> tuple[bool, bool]:
