@@ -22,6 +22,8 @@ figures: setup ## every table and figure of the paper from the data and backends
 	@.venv/bin/p2p benchmark --present --out out/benchmark --tables out/full/tables
 	@.venv/bin/p2p figures
 	@.venv/bin/p2p notebooks --profile full --jobs 2
+	@# The index says what the notebooks have drawn, too.
+	@.venv/bin/p2p figures --quiet
 
 test: setup ## linter and types, then all tests, every notebook included, and the API reference
 	@.venv/bin/ruff check .
