@@ -20,10 +20,8 @@ reproduce: setup ## run every notebook on bundled data into out/quick (profile q
 
 figures: setup ## every table and figure of the paper from the data and backends present; goes on where it was stopped
 	@.venv/bin/p2p benchmark --present --out out/benchmark --tables out/full/tables
-	@.venv/bin/p2p figures
 	@.venv/bin/p2p notebooks --profile full --jobs 2
-	@# The index says what the notebooks have drawn, too.
-	@.venv/bin/p2p figures --quiet
+	@.venv/bin/p2p figures
 
 test: setup ## linter and types, then all tests, every notebook included, and the API reference
 	@.venv/bin/ruff check .

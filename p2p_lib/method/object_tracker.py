@@ -153,8 +153,8 @@ class ObjectTracker:
         """The object's pose at a frame."""
         if self.model.empty:
             return self._initialise(obs)
-        if hidden(obs.mask, self.config):
-            return self._without_pose(obs, Status.OCCLUDED, f"{np.count_nonzero(obs.mask)} mask pixels")
+        if hidden(obs.mask_px, self.config):
+            return self._without_pose(obs, Status.OCCLUDED, f"{obs.mask_px} mask pixels")
         self.life = self.life.at(obs.frame.time_s)
         found = self.finder.register(obs, self.known)
         best, reason = self.finder.refine_and_select(obs, self.known, found)
@@ -272,11 +272,10 @@ class ObjectTracker:
         """
         cfg, before = self.config, self.life.start_px
         without = Status.INITIALISING if self.model.empty else Status.LOST
-        pixels = None if obs.mask is None else np.count_nonzero(obs.mask)
-        if pixels is None or hidden(obs.mask, self.config):
+        if obs.mask_px is None or hidden(obs.mask_px, self.config):
             return self._without_pose(obs, without, "not seen yet")
         # Points on the first sliver of an object would all be at its rim, and what is known may be about to return.
-        if self._gates and before is not None and pixels > _GROWTH * before:
+        if self._gates and before is not None and obs.mask_px > _GROWTH * before:
             return self._without_pose(obs, without, "still coming into view")
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < cfg.lifecycle.min_mask_px:
@@ -380,8 +379,7 @@ class ObjectTracker:
         )
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
-        pixels = None if obs.mask is None else np.count_nonzero(obs.mask)
-        self.life = self.life.without_pose(status, pixels)
+        self.life = self.life.without_pose(status, obs.mask_px)
         self._trusted = self._trusted if status is Status.LOST else None
         reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self.outlook.out_of_view else reason
         estimate = PoseEstimate(

@@ -55,6 +55,11 @@ class Observation:
         return np.isfinite(self.p_cam[:, 0])
 
     @cached_property
+    def mask_px(self) -> int | None:
+        """Pixels of the mask; None where no mask is known."""
+        return None if self.mask is None else int(np.count_nonzero(self.mask))
+
+    @cached_property
     def outline_share(self) -> float | None:
         """What of the mask's outline lies where depth has steps; None where nobody knows."""
         return None if self.mask is None else outline_share(self.frame, self.mask)

@@ -24,9 +24,9 @@ from p2p_lib.recovery.search import Sighting
 _LOOK_EVERY = 3
 
 
-def hidden(mask: np.ndarray | None, config: Config) -> bool:
-    """Whether a mask says that nothing of an object is to be seen."""
-    return mask is not None and np.count_nonzero(mask) < config.lifecycle.min_mask_px
+def hidden(mask_px: int | None, config: Config) -> bool:
+    """Whether a mask of so many pixels, None where no mask is known, says that nothing of an object is to be seen."""
+    return mask_px is not None and mask_px < config.lifecycle.min_mask_px
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Outlook:
 
     def awaited(self, mask: np.ndarray | None) -> bool:
         """Whether the object was hidden or lost until now and its mask says that it is back."""
-        return self.away and mask is not None and not hidden(mask, self.config)
+        return self.away and mask is not None and not hidden(np.count_nonzero(mask), self.config)
 
     def misplaced(self, obs: Observation, within: np.ndarray | None) -> Requests:
         """Tracks that an absent object has elsewhere, on a look-alike perhaps: to be looked for anew.
@@ -74,8 +74,8 @@ class Outlook:
         None where enough are seen, or there is no pose to go by. A few points that agree say where all the others
         should show, which the tracker checks by their appearance: so an object is back in the frame of its return.
         """
-        known, mask = self.known, obs.mask
-        if not self.config.method.redetection or known.model.empty or mask is None or hidden(mask, self.config):
+        known, unknown = self.known, obs.mask is None or self.known.model.empty
+        if unknown or not self.config.method.redetection or hidden(obs.mask_px, self.config):
             return None
         enough = known.keypoints(obs).sum() >= self.config.keypoint_map.keyframe_min_points
         if known.life.has_pose and (enough or obs.frame.index % _LOOK_EVERY):
@@ -90,7 +90,7 @@ class Outlook:
 
     def sighted(self, obs: Observation) -> Sighting | None:
         """Where a sought object shows by shape and colour."""
-        if not (self.sought and self.finder.shape.knows(self.known)) or hidden(obs.mask, self.config):
+        if not (self.sought and self.finder.shape.knows(self.known)) or hidden(obs.mask_px, self.config):
             return None
         return self.finder.shape.sighted(obs, self.known)
 

@@ -87,6 +87,16 @@ def test_late_estimates_are_the_same_estimates(crossing, on_time, late):
     assert [e["box"].frame_index for e in told[late:] + owed] == list(FRAMES)
 
 
+def test_the_frame_is_that_of_the_estimates(crossing):
+    method = Point2Pose(crossing.camera, CONFIG, Late(2))
+    method.add_object("box")
+    for stream in ((0, 1, 2, 3), (4, 5)):
+        for k, t in enumerate(stream):
+            method.step(crossing.frame(t), {"box": crossing.masks(t)["box"]})
+            assert (method.frame is None) if k < 2 else method.frame.index == stream[k - 2]
+        assert [method.frame.index for _ in method.finish()] == list(stream[-2:])
+
+
 def test_a_stream_shorter_than_the_delay_is_finished_too(crossing, on_time):
     told, owed = estimates(crossing, 7, FRAMES[:3])
     assert told == [{}] * 3

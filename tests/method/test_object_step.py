@@ -718,6 +718,14 @@ def test_nothing_is_learnt_from_what_contradicts_itself(fault, word):
     assert good.status is Status.TRACKED and good.keyframe and good.confidence > 0.5, "all is well again"
 
 
+@pytest.mark.parametrize(("share", "doubted"), [(0.9, True), (0.2, False), (0.0, False)])
+def test_an_outline_that_never_told_where_the_object_ends_does_not_now(share, doubted):
+    lump = before_a_wall()
+    vars(lump.tracker._trusted)["outline_share"] = share  # as it was in the newest frame that was not doubted
+    estimate = doubtful(lump, mask=dilated).estimate
+    assert ("does not end where its depth does" in estimate.reason) == doubted != estimate.keyframe
+
+
 @pytest.mark.parametrize(("settings", "fault"), [({}, {}), ({"method__gates": "none"}, {"mask": dilated})])
 def test_what_agrees_is_learnt_and_the_paper_doubts_nothing(settings, fault):
     lump = before_a_wall(**settings)

@@ -123,13 +123,14 @@ class MotionSegments:
         for s, segment in enumerate(self.segments):
             at = np.flatnonzero(p.verified & (p.segment == s))
             own = sought[p.segment[sought] == s]
+            fewest = _MIN_FOUND * (len(at) + np.count_nonzero(~p.verified[own]))
             if lost_only and segment.posed:
-                if len(at) < _MIN_FOUND * (len(at) + np.count_nonzero(~p.verified[own])):
+                if len(at) < fewest:
                     segment.hidden_for, p.verified[at] = 1, False
                 continue
             if not lost_only:
                 segment.rejected_for = max(segment.rejected_for - 1, 0)
-            fit = self._fitted(segment, p, at, now, _MIN_FOUND * len(own))
+            fit = self._fitted(segment, p, at, now, fewest)
             if fit is not None:
                 segment.before = segment.fit.T_cam_seg if segment.posed else fit.T_cam_seg
                 segment.fit, segment.hidden_for = fit, 0
