@@ -17,7 +17,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import DepthConfig
-from p2p_lib.core.image import in_image, nearest_px
+from p2p_lib.core.image import in_image
 from p2p_lib.core.types import Frame, Rows
 
 if TYPE_CHECKING:
@@ -117,9 +117,11 @@ class ImageSearch:
             return []
         poses = np.concatenate([_shifted(T, _NEAR_M, 1) for T in _laid_on(turns, cloud, sample)])
         share, distinct = self._roughly(poses, sample), []
+        turn_of, free = np.arange(len(poses)) // (len(poses) // len(turns)), np.ones(len(turns), bool)
         for k in np.argsort(-share):
-            if np.isfinite(share[k]) and (not distinct or _turned_rad(poses[distinct], poses[k]).min() > _APART_RAD):
+            if np.isfinite(share[k]) and free[turn_of[k]]:
                 distinct.append(k)
+                free &= _turned_rad(turns, poses[k]) > _APART_RAD
             if len(distinct) == _TRIED_TURNS:
                 break
         return self._all_aligned(poses[distinct], sample)
@@ -165,19 +167,11 @@ class ImageSearch:
 
     def _aligned(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> np.ndarray:
         """The pose moved until its points lie in the tangent planes of those measured at their pixels, robustly."""
+        camera = self._camera
         for _ in range(_ITERATIONS):
-            p_cam, normal = se3.transform(T_cam_obj, sample.p_obj), sample.n_obj @ T_cam_obj[:3, :3].T
-            uv_px = self._camera.project(p_cam)
-            u, v = nearest_px(uv_px, self._depth_m.shape)
-            z = self._depth_m[v, u]
-            off_m = ((self._camera.unproject(uv_px, z) - p_cam) * normal).sum(1)
-            facing = (normal * p_cam).sum(1) < _FACING * np.linalg.norm(p_cam, axis=1)
-            used = facing & (z > 0) & in_image(uv_px, self._depth_m.shape)
-            used &= np.abs(z - p_cam[:, 2]) < 2 * _ROUGH_M
-            centre = p_cam[used].mean(0) if used.any() else p_cam.mean(0)
-            J = np.concatenate([np.cross(p_cam - centre, normal), normal], 1)[used]
-            w = 1 / (_FINE_M**2 + off_m[used] ** 2)
-            step = np.linalg.solve((J * w[:, None]).T @ J + _FREE, (J * w[:, None]).T @ off_m[used])
+            arrays = np.ascontiguousarray(T_cam_obj), sample.p_obj, sample.n_obj, self._depth_m
+            A, b, centre = _normal_equations(*arrays, (camera.fx, camera.fy, camera.cx, camera.cy))
+            step = np.linalg.solve(A + _FREE, b)
             R = cv2.Rodrigues(step[:3])[0]
             T_cam_obj = se3.from_rt(R, centre - R @ centre + step[3:]) @ T_cam_obj
         return T_cam_obj
@@ -190,6 +184,32 @@ class ImageSearch:
         lens, noise = (camera.fx, camera.fy, camera.cx, camera.cy), (config.noise_m, config.noise_per_m2)
         arrays = np.ascontiguousarray(T_cam_obj), sample.p_obj, sample.n_obj, sample.lab, self._depth_m, self._lab
         return _compare(*arrays, lens, noise, near_m, _FEWEST * len(sample) / _POINTS)
+
+
+@compiled
+def _normal_equations(T, p_obj, n_obj, depth_m, lens):
+    """A (6, 6), b (6,) of the motion about a centre (3,) that lays points into the planes of those at their pixels."""
+    (height, width), (fx, fy, cx, cy) = depth_m.shape, lens
+    p_cam, normal = p_obj @ T[:3, :3].T + T[:3, 3], n_obj @ T[:3, :3].T
+    off_m, used = np.zeros(len(p_cam)), np.zeros(len(p_cam), np.bool_)
+    for m in range(len(p_cam)):
+        (x, y, z), (a, b, c) = p_cam[m], normal[m]
+        if z <= 0 or a * x + b * y + c * z >= _FACING * np.sqrt(x * x + y * y + z * z):
+            continue
+        u, v = fx * x / z + cx, fy * y / z + cy
+        if 0 <= u <= width - 1 and 0 <= v <= height - 1:
+            measured = depth_m[int(np.rint(v)), int(np.rint(u))]
+            used[m] = measured > 0 and abs(measured - z) < 2 * _ROUGH_M
+            off_m[m] = (measured - z) / z * (a * x + b * y + c * z)  # along the ray
+    p_cam, normal, off_m = (p_cam[used], normal[used], off_m[used]) if used.any() else (p_cam, normal, off_m)
+    centre, A, right = np.zeros(3), np.zeros((6, 6)), np.zeros(6)
+    for i in range(3):
+        centre[i] = p_cam[:, i].mean()
+    if used.any():
+        J = np.hstack((np.cross(p_cam - centre, normal), normal))
+        weighted = (J / (_FINE_M**2 + off_m * off_m).reshape(-1, 1)).T
+        A, right = weighted @ J, weighted @ off_m
+    return A, right, centre
 
 
 @compiled
