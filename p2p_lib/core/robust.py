@@ -210,10 +210,12 @@ def consensus(
     Two pairs go together if they are equally far apart in both frames. Triples are made of those that most others
     go together with, so that a few right pairs among many wrong ones suffice.
     """
+    from scipy.spatial.distance import cdist
+
     no_inliers = np.eye(4), np.zeros(len(p_b), bool)
     if len(p_b) < 3:
         return no_inliers
-    apart_b, apart_a = (np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (p_b, p_a))
+    apart_b, apart_a = cdist(p_b, p_b), cdist(p_a, p_a)
     together = (np.abs(apart_b - apart_a) < inlier_m) & (np.minimum(apart_b, apart_a) > 2 * inlier_m)
     C = together.astype(np.float32)
     votes = C @ C * C

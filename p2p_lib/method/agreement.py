@@ -56,7 +56,7 @@ def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.n
     some = np.s_[::_STEP, ::_STEP]
     now_m, then_m, now, then = (of[some] for of in (frame.depth_m, before.depth_m, frame.rgb, before.rgb))
     same = (now_m > 0) & (then_m > 0) & ~(mask[some] | mask_before[some])
-    same &= (np.abs(now.astype(int) - then) < _SAME_GREY).all(-1)
+    same &= cv2.inRange(cv2.absdiff(now, then), (0,) * 3, (_SAME_GREY - 1,) * 3) > 0
     return float(np.median(now_m[same] / then_m[same])) if same.mean() > _LOOKS_THE_SAME else 1.0
 
 

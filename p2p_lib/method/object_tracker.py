@@ -221,7 +221,7 @@ class ObjectTracker:
         life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict.status, best.lead)
         requests = Requests(reject=self.map.ids[self.known.keypoints(obs) & ~agrees])
         belief, most = self._belief(obs, best), DOUBTED if life.doubted else 1.0
-        _, mapped = belief.at(T_cam_obj, model, most, told=True)  # a turn that nothing tells bends no map
+        covariance, mapped = belief.at(T_cam_obj, model, most, told=True)  # a turn that nothing tells bends no map
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
             trusted = not life.confirming and (mapped >= MAPPED or not self._gates)
@@ -234,7 +234,8 @@ class ObjectTracker:
             new = self._sample(obs)
             asked = model.insert_keyframe(obs, T_cam_obj, new, good, belief.of_frame, mapped)
             requests = replace(asked, reject=requests.reject)
-        covariance, sure = belief.at(T_cam_obj, model, most)
+        changed = keyframe or not belief.told
+        covariance, sure = belief.at(T_cam_obj, model, most) if changed else (covariance, mapped)
         self.life = life.placed(obs.frame.T_world_cam)
         if not belief.told and verdict.status is Status.TRACKED:
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNTOLD)

@@ -31,24 +31,25 @@ def eigen(J: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues (6,) ascending and eigenvectors (6, 6), columns, of the mean of J^T J without gradient noise.
 
     J      (N, 6) derivatives of the points' distances by the pose
-    pairs  (P, 2) rows of neighbours with independent noise
+    pairs  (2, P) rows of neighbours with independent noise
 
     The eigenvalues are relative to those of the squared gradient; one that is not clear of noise is 0.
     """
     H = J.T @ J / len(J)
     scale = max(np.trace(H[3:, 3:]), 1e-12)
-    if len(pairs) < max(_MIN_PAIRS, len(J) // 4):
+    count = pairs.shape[1]
+    if count < max(_MIN_PAIRS, len(J) // 4):
         value, vector = np.linalg.eigh(H)  # the points lie too far apart for pairs
         return value / scale, vector
-    S = J[pairs[:, 0]].T @ J[pairs[:, 1]] / len(pairs)
+    S = J.take(pairs[0], 0).T @ J.take(pairs[1], 0) / count  # take: an index of rows alone is a third as fast
     value, vector = np.linalg.eigh((S + S.T) / 2)
     gradient_noise = np.einsum("ik,ij,jk->k", vector, H, vector) - value
-    clear = value > _CLEAR_OF_NOISE * np.abs(gradient_noise) / np.sqrt(len(pairs))
+    clear = value > _CLEAR_OF_NOISE * np.abs(gradient_noise) / np.sqrt(count)
     return np.where(clear, np.maximum(value, 0.0), 0.0) / scale, vector
 
 
 def neighbours(p_cam: np.ndarray, distance_m: float) -> np.ndarray:
-    """(P, 2) rows of points about ``distance_m`` apart, each point with one to its right and one below it."""
+    """(2, P) rows of points about ``distance_m`` apart, each point with one to its right and one below it."""
     pairs = []
     for along, across in ((0, 1), (1, 0)):
         strip = np.floor(p_cam[:, across] / (distance_m / 2))
@@ -57,11 +58,11 @@ def neighbours(p_cam: np.ndarray, distance_m: float) -> np.ndarray:
         order = np.argsort(key)
         nearest = np.searchsorted(key[order], key + distance_m)
         first = np.flatnonzero(nearest < len(key))
-        pairs.append(np.stack([first, order[nearest[first]]], -1))
-    first, second = np.concatenate(pairs).T
-    apart = np.linalg.norm(p_cam[first] - p_cam[second], axis=-1)
+        pairs.append(np.stack([first, order[nearest[first]]]))
+    first, second = found = np.concatenate(pairs, 1)
+    apart = np.linalg.norm(p_cam.take(first, 0) - p_cam.take(second, 0), axis=-1)
     near = (apart > distance_m / 2) & (apart < 2 * distance_m)
-    return np.stack([first[near], second[near]], -1)
+    return found[:, near]
 
 
 def rotations_in(tangents: np.ndarray) -> np.ndarray:

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 import numpy as np
@@ -254,8 +254,7 @@ class Point2Pose:
             return None
         self._unlocated = 0
         known = [mask for mask in self.masks.values() if mask is not None]
-        occupied = np.logical_or.reduce(known) if known else None
-        return self._beside.submit(self.scene.locate, frame, occupied)
+        return self._beside.submit(self.scene.locate, frame, _either(known) if known else None)
 
     def _sightings(self, frame: Frame, masks: Masks, objects: Mapping[str, ObjectTracker]) -> dict[str, Sighting]:
         """Sought objects that show by shape and colour; the tracker looks for their points there."""
@@ -280,11 +279,10 @@ class Point2Pose:
 
         Where the segmenter finds nothing of an object it went by these very tracks: only other objects are elsewhere.
         """
-        others = np.logical_or.reduce([mask for mask in self.masks.values() if mask is not None])
-        nowhere = {
-            name for name, obs in seen.items() if given[name] is None and obs.mask is not None and not obs.mask.any()
-        }
-        within = {name: ~others if name in nowhere else obs.mask for name, obs in seen.items()}
+        within = {name: obs.mask for name, obs in seen.items()}
+        for name in seen:
+            if given[name] is None and within[name] is not None and not within[name].any():
+                within[name] = ~_either(self.masks.values())
         return {name: self.objects[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
     def _redetect(self, seen: Mapping[str, Observation]) -> dict[str, Observation]:
@@ -362,9 +360,14 @@ class Point2Pose:
                 self._streaming = True
                 return NOTHING_TRACKED
             known = [mask for mask in masks.values() if mask is not None]
-            search = np.logical_or.reduce(known) if len(known) == len(masks) > 0 else None
+            search = _either(known) if len(known) == len(masks) > 0 else None
             urgent = any(obj.outlook.awaited(masks[name]) for name, obj in self.objects.items())
             return self.tracker.track(frame, search, urgent)
+
+
+def _either(masks: Iterable[np.ndarray | None]) -> np.ndarray:
+    """(H, W) bool: what any of some masks holds; None holds nothing."""
+    return reduce(np.logical_or, (mask for mask in masks if mask is not None))  # its ufunc would copy all of them first
 
 
 def _check_unit(frame: Frame) -> None:

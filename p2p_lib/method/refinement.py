@@ -107,7 +107,7 @@ class Refinement:
 class _Linear:
     """The surface at one pose: distances, and normal equations per point about the cloud's centre.
 
-    distance_m is that of every point, infinite off the observed surface. ``rows`` are the points used, J (n, 6) the
+    distance_m is that of every point, positive, infinite off the observed surface. ``rows`` are the points used, J (n, 6) the
     derivatives of their distances. H and g are means over them; rotations are scaled by the cloud's radius, so that
     everything is in metres.
 
@@ -166,7 +166,7 @@ class _Problem:
     keypoints: Keypoints | None
     centre: np.ndarray  # of the cloud, object frame
     radius: float  # of the cloud: turns a rotation into the displacement it causes
-    pairs: np.ndarray  # (P, 2) rows of p_cam: neighbours far enough apart for their noise to be independent
+    pairs: np.ndarray  # (2, P) rows of p_cam: neighbours far enough apart for their noise to be independent
 
     @classmethod
     def about(cls, T_cam_obj, p_cam, volume, config, keypoints) -> _Problem | None:
@@ -209,12 +209,12 @@ class _Problem:
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj, _GRADIENT_VOXELS)
-        q, floor_m, reach_m = (p_obj - self.centre) / self.radius, *self.scales_m
         huber_m, least_m = self.config.huber_m, max(self.config.huber_m, widest_m)
-        used, J, H, g, cut, rms, sigma = _linearised(q, value, gradient, valid, reach_m, floor_m, huber_m, least_m)
+        about, bounds_m = (self.centre, self.radius), (*self.scales_m, huber_m, least_m)
+        used, J, H, g, cut, rms, sigma = _linearised(p_obj, *about, value, gradient, valid, *bounds_m)
         if len(used) < MIN_POINTS:
             return None
-        distance = np.where(valid, value, np.inf)
+        distance = np.where(valid, np.abs(value), np.inf)
         held = (beside.eigenvalues, beside.directions) if beside else self.eigen(used, J)
         return _Linear(T, distance, H, g, *held, cut, used, J, rms, sigma)
 
@@ -227,8 +227,8 @@ class _Problem:
         """Eigenvalues (6,) ascending and eigenvectors (6, 6), columns, of what the shape determines."""
         row = np.full(len(self.p_cam), -1)
         row[used] = np.arange(len(used))
-        pairs = row[self.pairs]
-        return observability.eigen(J, pairs[(pairs >= 0).all(1)])
+        first, second = pairs = row.take(self.pairs)
+        return observability.eigen(J, pairs[:, (first >= 0) & (second >= 0)])
 
     def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of T^-1 p_cam - p_obj in standard deviations, same variables."""
@@ -282,12 +282,12 @@ class _Problem:
 
         Trimmed points and those off the observed surface cost what the trimming distance does.
         """
-        distance_m = np.minimum(np.abs(new.distance_m), at.cut_m)
-        total = self.effective_information(at) / at.used * _huber_loss(distance_m, self.config.huber_m)
+        loss = _huber_loss(new.distance_m, self.config.huber_m, at.cut_m)
+        total = self.effective_information(at) / at.used * loss
         if self.keypoints is not None:
             k = self.keypoints
             off_m = se3.transform(se3.inverse(new.T), k.p_cam) - k.p_obj
-            total += _huber_loss(np.sqrt((off_m * off_m).sum(-1)) / k.sigma_m, _HUBER)
+            total += _huber_loss(np.sqrt((off_m * off_m).sum(-1)) / k.sigma_m, _HUBER, np.inf)
         return total
 
     def result(self, at: _Linear, tries: int, converged: bool) -> Refinement:
@@ -318,10 +318,10 @@ _HUBER = 1.345
 
 
 @compiled
-def _huber_loss(e: np.ndarray, threshold: float) -> float:
-    """Twice Huber's loss of residuals (N,) at least 0, summed."""
+def _huber_loss(e: np.ndarray, threshold: float, most: float) -> float:
+    """Twice Huber's loss of residuals (N,) at least 0 and, as they count, at most ``most``, summed."""
     total = 0.0
-    for x in e:
+    for x in np.minimum(e, most):
         total += x * x if x < threshold else 2 * threshold * x - threshold * threshold
     return total
 
@@ -333,16 +333,18 @@ def _upper_median(x: np.ndarray) -> float:
 
 @compiled
 def _linearised(
-    q: np.ndarray,
+    p_obj: np.ndarray,
+    centre: np.ndarray,
+    radius: float,
     value: np.ndarray,
     gradient: np.ndarray,
     valid: np.ndarray,
-    reach_m: float,
     floor_m: float,
+    reach_m: float,
     huber_m: float,
     least_m: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, float, float]:
-    """Of points q (N, 3) with these distances: rows (n,) used, their J (n, 6), H, g, the cut, the rms and the noise.
+    """Of points (N, 3) with these distances: rows (n,) used, their J (n, 6), H, g, the cut, the rms and the noise.
 
     Points beyond ``reach_m`` know no distance. Those that scatter beyond the median, but at least ``least_m``, are cut.
     """
@@ -354,7 +356,7 @@ def _linearised(
     sigma = max(_MAD_TO_SIGMA * _upper_median(np.abs(value[near] - middle)), floor_m)
     cut = max(abs(middle) + _MAD_TRIM * sigma, least_m)
     used = near[np.abs(value[near]) <= cut]
-    J, squares = surface_jacobian(q[used], gradient[used]), 0.0
+    J, squares = surface_jacobian((p_obj[used] - centre) / radius, gradient[used]), 0.0
     for n in range(len(used)):
         r = value[used[n]]
         w = min(1.0, huber_m / max(abs(r), 1e-12))

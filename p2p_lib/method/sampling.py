@@ -78,9 +78,11 @@ def choose(candidates: Candidates, stored_px: np.ndarray, count: int, config: Sa
 
 def distance_px(uv_px: np.ndarray, others_px: np.ndarray) -> np.ndarray:
     """d_k of the objective: distance (N,) from pixels (N, 2) to the nearest of others (M, 2); infinite without any."""
+    from scipy.spatial.distance import cdist
+
     if not len(others_px):
         return np.full(len(uv_px), np.inf)
-    return np.linalg.norm(uv_px[:, None] - others_px[None], axis=-1).min(1)
+    return cdist(uv_px, others_px).min(1)
 
 
 def usable_region(frame: Frame, mask: np.ndarray, edge_m: float) -> np.ndarray:

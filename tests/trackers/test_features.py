@@ -20,7 +20,7 @@ def picture(seed: int = 0) -> np.ndarray:
 def described(image: np.ndarray, A: np.ndarray, limit: int = 200, region=None) -> tuple[np.ndarray, np.ndarray]:
     """Corners, and descriptors on a surface whose steps appear in the picture as the columns of A."""
     uv = features.detect(image, region, limit)
-    return uv, features.describe(image, uv, np.tile(1.5 * A, (len(uv), 1, 1)))
+    return uv, features.describe(image, uv, [np.tile(1.5 * A, (len(uv), 1, 1))])[:, 0]
 
 
 def seen_under(A: np.ndarray) -> np.ndarray:
@@ -127,7 +127,7 @@ def test_noise_makes_few_wrong_matches():
         uv = features.detect(image, None, 120)
         steps = np.tile(1.5 * np.eye(2), (len(uv), 1, 1))
         noisy = np.clip(image + noise, 0, 255).astype(np.uint8)
-        wanted, found = features.match(*(features.describe(one, uv, steps) for one in (image, noisy)), uv, 4.0, 0.85)
+        wanted, found = features.match(*(features.describe(one, uv, [steps])[:, 0] for one in (image, noisy)), uv, 4.0, 0.85)
         same = np.linalg.norm(uv[wanted] - uv[found], axis=1) < 4
         right.append(same.sum() / len(uv))
         wrong.append((~same).sum() / len(uv))

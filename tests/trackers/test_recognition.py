@@ -95,7 +95,7 @@ def test_the_template_of_the_present_scale_is_compared_and_the_first_is_never_re
     np.testing.assert_array_equal(p.templates.fine.pixels[p.template[0, 0]], first)
     scales = p.template_warp[0, :, 0, 0]
     p.warp[0] = scales[3] * EYE
-    assert recognition.best_template(p, np.array([0]))[0] == 3
+    assert recognition.best_template(p, np.array([0]))[0][0] == 3
 
 
 def test_points_that_come_and_go_leave_no_templates():

@@ -127,26 +127,38 @@ class Alignment:
     contrast_ratio: np.ndarray
 
 
-def align(image: np.ndarray, patches: Patches, uv_px: np.ndarray, A: np.ndarray, iterations: int = 4) -> Alignment:
-    """Find each patch near uv_px (N, 2), seen under about A (N, 2, 2), in a float32 grey image."""
+def align(
+    image: np.ndarray,
+    patches: Patches,
+    uv_px: np.ndarray,
+    A: np.ndarray,
+    iterations: int = 4,
+    rows: np.ndarray | None = None,
+) -> Alignment:
+    """Find each patch near uv_px (N, 2), seen under about A (N, 2, 2), in a float32 grey image.
+
+    rows  (N,) of the patches; all of them where it is left out. Patches are large: they are not copied for it
+    """
+    rows = np.arange(len(patches)) if rows is None else rows
     uv, A = uv_px.astype(np.float32), A.astype(np.float32)
     height, width = image.shape
     start, identity = uv.copy(), np.eye(2, dtype=np.float32)
-    ncc, contrast = _aligned(image, patches.pixels, patches.solver, uv, A, iterations)
+    ncc, contrast = _aligned(image, patches.pixels, patches.solver, rows, uv, A, iterations)
     inside = (uv >= 0).all(1) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1)
     area = np.abs(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])
     found = inside & np.isfinite(A).all((1, 2)) & (area > 1 / _MAX_AREA_CHANGE) & (area < _MAX_AREA_CHANGE)
     uv, A = np.where(found[:, None], uv, start), np.where(found[:, None, None], A, identity)
     ncc = np.where(found, ncc, -1.0)
     variance = 2 * np.maximum(1 - ncc, 0.01) / _SAMPLES
-    cov = A @ (variance[:, None, None] * patches.unit_cov) @ A.transpose(0, 2, 1)
-    return Alignment(uv, A, ncc, cov, contrast / patches.contrast)
+    cov = A @ (variance[:, None, None] * patches.unit_cov[rows]) @ A.transpose(0, 2, 1)
+    return Alignment(uv, A, ncc, cov, contrast / patches.contrast[rows])
 
 
 @compiled
-def _aligned(image, pixels, solver, uv, A, iterations):
-    """Moves uv (N, 2) and A (N, 2, 2) to where the patches are; their correlation and contrast (N,) there."""
+def _aligned(image, pixels, solver, rows, uv, A, iterations):
+    """Moves uv (N, 2) and A (N, 2, 2) to where the patches at these rows are; their correlation and contrast (N,) there."""
     right, bottom, one = np.float32(image.shape[1] - 1), np.float32(image.shape[0] - 1), np.float32(1)
+    last_i, last_j, next_px = image.shape[1] - 2, image.shape[0] - 2, np.uint32(1)
     ncc, contrast, seen, step = np.zeros(len(uv)), np.zeros(len(uv)), np.zeros(pixels.shape[1], np.float32), np.ones(6)
     for n in range(len(uv)):
         step[:] = 1.0
@@ -157,11 +169,13 @@ def _aligned(image, pixels, solver, uv, A, iterations):
                 # The border is repeated; NaN lands on it as well.
                 x = min(max(np.float32(0), u + m00 * _X[p] + m01 * _Y[p]), right)
                 y = min(max(np.float32(0), v + m10 * _X[p] + m11 * _Y[p]), bottom)
-                i, j = min(np.int32(x), image.shape[1] - 2), min(np.int32(y), image.shape[0] - 2)
+                # Unsigned, for a look whether indices count from the end takes as long as the pixel.
+                i, j = np.uint32(min(np.int32(x), last_i)), np.uint32(min(np.int32(y), last_j))
                 a, b = x - np.float32(i), y - np.float32(j)
-                upper = image[j, i] * (one - a) + image[j, i + 1] * a
-                lower = image[j + 1, i] * (one - a) + image[j + 1, i + 1] * a
+                upper = image[j, i] * (one - a) + image[j, i + next_px] * a
+                lower = image[j + next_px, i] * (one - a) + image[j + next_px, i + next_px] * a
                 seen[p] = upper * (one - b) + lower * b
+            for p in range(len(seen)):  # a loop of its own: the one above is done for several pixels at once
                 mean += seen[p] * _SQUARE[p]
             mean = np.float32(mean)
             for p in range(len(seen)):
@@ -175,9 +189,9 @@ def _aligned(image, pixels, solver, uv, A, iterations):
             contrast[n] = np.sqrt(max(squared, 1.0))
             seen *= np.float32(1 / contrast[n])
             if turn == iterations or np.abs(step).max() < _SETTLED:
-                ncc[n] = np.dot(seen, pixels[n])
+                ncc[n] = np.dot(seen, pixels[rows[n]])
                 break
-            step[:] = np.dot(solver[n], seen - pixels[n])
+            step[:] = np.dot(solver[rows[n]], seen - pixels[rows[n]])
             # The linearisation holds for a few pixels and a few tenths of scale.
             step[:2] *= min(1.0, 3.0 / max(np.sqrt(step[0] ** 2 + step[1] ** 2), 1e-6))
             for k in range(2, 6):

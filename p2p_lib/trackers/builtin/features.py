@@ -8,6 +8,8 @@ removes scale and slant. All corners are described in one batch of matrix produc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -65,18 +67,23 @@ def detect(gray: np.ndarray, region: np.ndarray | None, limit: int) -> np.ndarra
     return step * corners.reshape(-1, 2) + np.float32([x0, y0])
 
 
-def describe(gray: np.ndarray, uv_px: np.ndarray, step_px: np.ndarray) -> np.ndarray:
-    """Descriptors (M, SIZE) float32, unit length, of the surroundings of uv_px in a uint8 image.
+def describe(gray: np.ndarray, uv_px: np.ndarray, step_px: Sequence[np.ndarray]) -> np.ndarray:
+    """Descriptors (M, scales, SIZE) float32, unit length, of the surroundings of uv_px in a uint8 image.
 
-    step_px  (M, 2, 2): columns are the steps of the sampling grid on the surface, in pixels
+    step_px  (M, 2, 2) each: columns are the steps of the sampling grid on the surface, in pixels
     """
     if not len(uv_px):
-        return np.zeros((0, SIZE), np.float32)
+        return np.zeros((0, len(step_px), SIZE), np.float32)
     x0, y0 = np.maximum(np.floor(uv_px.min(0)).astype(int) - 60, 0)
     x1, y1 = np.ceil(uv_px.max(0)).astype(int) + 61
     smooth = cv2.GaussianBlur(gray[y0:y1, x0:x1], (0, 0), 1.0)
     maps = [cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))]
-    uv, M = (uv_px - [x0, y0]).astype(np.float32), step_px.astype(np.float32)
+    uv = (uv_px - [x0, y0]).astype(np.float32)
+    return np.stack([_described(maps, uv, step.astype(np.float32)) for step in step_px], 1)
+
+
+def _described(maps: list[np.ndarray], uv: np.ndarray, M: np.ndarray) -> np.ndarray:
+    """(N, SIZE) at one scale, from the derivatives of the image."""
     gx, gy = _gradients(maps, uv, M)
     angle = _dominant(np.stack([np.maximum(c * gx + s * gy, 0) @ _ROUND for c, s in _DIRECTION_VECTORS], 1))
     c, s = np.cos(angle), np.sin(angle)

@@ -81,7 +81,7 @@ class ImageOnlyTracker(BuiltinTracker):
         p.warp[rows[left]] = warp[left]
 
     def _describe(self, uv_px: np.ndarray) -> np.ndarray:
-        return features.describe(self._now.gray, uv_px, np.tile(_STEP_PX, (len(uv_px), 1, 1)))
+        return features.describe(self._now.gray, uv_px, [np.tile(_STEP_PX, (len(uv_px), 1, 1))])[:, 0]
 
 
 def _without_depth(frame: Frame) -> Frame:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import TrackingConfig
@@ -39,7 +40,7 @@ def corners(now: Image, region: np.ndarray | None, limit: int) -> Corners:
     known = np.isfinite(planes.p_cam[:, 0])
     uv, planes = uv[known], planes.select(known)
     steps = [tangent_steps(planes, now.camera, step_m) for step_m in _STEPS_M]
-    return Corners(uv, planes.p_cam, np.stack([features.describe(now.gray, uv, step) for step in steps], 1))
+    return Corners(uv, planes.p_cam, features.describe(now.gray, uv, steps))
 
 
 @dataclass(eq=False)
@@ -73,7 +74,7 @@ class Landmarks:
         """Add the corners near points of the segment, seen at uv_px (N, 2), p_seg (N, 3); at most ``max_landmarks``."""
         found = corners(now, _region_around(uv_px, now, cfg.segment_reach_m), cfg.corners)
         at = se3.transform(se3.inverse(T_cam_seg), found.p_cam)
-        near = np.linalg.norm(at[:, None] - p_seg[None], axis=-1).min(1) < cfg.segment_reach_m
+        near = cdist(at, p_seg).min(1) < cfg.segment_reach_m
         at = np.concatenate([self.p_seg, at[near]])
         keep = np.sort(rng.permutation(len(at))[: cfg.max_landmarks])
         self.p_seg, self.descriptors = at[keep], np.concatenate([self.descriptors, found.descriptors[near]])[keep]

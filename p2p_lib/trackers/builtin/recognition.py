@@ -29,8 +29,8 @@ def follow(p: Points, before: Image, now: Image, cfg: TrackingConfig) -> None:
     start = p.uv[at]
     moved, tracked = flow(before, now, start, cfg.window_px)
     moved = np.where(tracked[:, None], moved, start)
-    k = best_template(p, at)
-    seen = align(now.fine, p.templates.fine.select(p.template[at, k]), moved, _warp_of(p, at, k))
+    k, warp = best_template(p, at)
+    seen = align(now.fine, p.templates.fine, moved, warp, rows=p.template[at, k])
     shift_px = np.linalg.norm(seen.uv_px - moved, axis=1)
     good = (seen.ncc >= cfg.min_ncc) & (shift_px < cfg.search_px) & _same_appearance(p, at, k, seen, now, cfg)
     _settle(p, at, k, seen, good)
@@ -65,28 +65,24 @@ def find(
     if not len(at):
         return
     p.warp[at] = warp
-    k = best_template(p, at)
-    fine, coarse = (patches.select(p.template[at, k]) for patches in (p.templates.fine, p.templates.coarse))
-    rough = align(now.coarse, coarse, uv_px / 2, _warp_of(p, at, k))
-    seen = align(now.fine, fine, 2 * rough.uv_px, rough.A)
+    k, warp = best_template(p, at)
+    rows = p.template[at, k]
+    rough = align(now.coarse, p.templates.coarse, uv_px / 2, warp, rows=rows)
+    seen = align(now.fine, p.templates.fine, 2 * rough.uv_px, rough.A, rows=rows)
     off_px = np.linalg.norm(seen.uv_px - uv_px, axis=1)
     own_px = np.sqrt(np.trace(seen.cov_px2, axis1=1, axis2=2))
     near = off_px < np.minimum(cfg.search_px, 2 + 3 * np.hypot(sigma_px, own_px))
     _settle(p, at, k, seen, (seen.ncc >= cfg.return_ncc) & near & _same_appearance(p, at, k, seen, now, cfg))
 
 
-def best_template(p: Points, at: np.ndarray) -> np.ndarray:
-    """The template of each of these points that its present warp distorts least."""
-    A = p.warp[at][:, None] @ np.linalg.inv(p.template_warp[at])
+def best_template(p: Points, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The template (M,) of each of these points that its present warp distorts least, and how (M, 2, 2) it appears."""
+    A = p.warp[at][:, None] @ p.template_unwarp[at]
     squared = A @ A.transpose(0, 1, 3, 2) - _EYE
     distortion = np.sqrt((squared**2).sum((2, 3))) + _OLDER_DISTORTION * np.arange(A.shape[1])
     distortion[np.arange(A.shape[1]) >= p.count[at][:, None]] = np.inf
-    return distortion.argmin(1)
-
-
-def _warp_of(p: Points, at: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """(M, 2, 2) how templates k of these points appear under their present warps."""
-    return p.warp[at] @ np.linalg.inv(p.template_warp[at, k])
+    best = distortion.argmin(1)
+    return best, A[np.arange(len(A)), best]
 
 
 def _settle(p: Points, at: np.ndarray, k: np.ndarray, seen: Alignment, good: np.ndarray) -> None:
@@ -109,7 +105,7 @@ def _same_appearance(
 def update_templates(p: Points, now: Image, cfg: TrackingConfig, turn: int) -> None:
     """Store a further template of points that no template resembles at the present scale and slant."""
     at = np.flatnonzero(p.verified & p.visible & (p.coasting == 0))
-    scales = np.linalg.svd(_warp_of(p, at, best_template(p, at)), compute_uv=False)
+    scales = np.linalg.svd(best_template(p, at)[1], compute_uv=False)
     changed = np.abs(np.log(scales)).max(1) > np.log(cfg.update_scale_change)
     store_templates(p, at[changed | (p.ncc[at] < cfg.update_ncc)], now, turn)
 
@@ -122,6 +118,7 @@ def store_templates(p: Points, rows: np.ndarray, now: Image, turn: int) -> None:
     k = np.where(p.count[rows] < room, p.count[rows], 1 + turn % (room - 1))
     uv = p.uv[rows]
     p.template_warp[rows, k], p.template_cov[rows, k] = p.warp[rows], p.cov[rows]
+    p.template_unwarp[rows, k] = np.linalg.inv(p.warp[rows])
     first = p.template[rows, k] < 0
     p.template[rows[first], k[first]] = p.templates.new(np.count_nonzero(first))
     p.templates.put(p.template[rows, k], take(now.fine, uv), take(now.coarse, uv / 2))

@@ -17,7 +17,7 @@ class Points(Rows):
     """N points with K templates each. Offsets and warps are in pixels of the template's image.
 
     A warp takes offsets in a point's first template to offsets in the newest image, template_warp[k] to
-    those in template k: warp inv(template_warp[k]) is how template k appears now.
+    those in template k: warp template_unwarp[k] is how template k appears now.
     """
 
     uv: np.ndarray  # (N, 2) newest known position
@@ -30,6 +30,7 @@ class Points(Rows):
     coasting: np.ndarray  # (N,) frames since a template was last recognised
     count: np.ndarray  # (N,) templates in use
     template_warp: np.ndarray  # (N, K, 2, 2)
+    template_unwarp: np.ndarray  # (N, K, 2, 2) its inverse
     template_cov: np.ndarray  # (N, K, 2, 2) of the point's position in the template
     template: np.ndarray  # (N, K) their rows in ``templates``, -1 for none
     chroma: np.ndarray  # (N, K, 2) around the point
@@ -55,6 +56,7 @@ class Points(Rows):
             coasting=np.zeros(n, np.int64),
             count=np.zeros(n, np.int64),
             template_warp=np.tile(_EYE, (n, k, 1, 1)),
+            template_unwarp=np.tile(_EYE, (n, k, 1, 1)),
             template_cov=np.zeros((n, k, 2, 2), np.float32),
             template=np.full((n, k), -1),
             chroma=np.zeros((n, k, 2), np.float32),
