@@ -107,9 +107,9 @@ class Refinement:
 class _Linear:
     """The surface at one pose: distances, and normal equations per point about the cloud's centre.
 
-    distance_m is that of every point, positive, infinite off the observed surface. ``rows`` are the points used, J (n, 6) the
-    derivatives of their distances. H and g are means over them; rotations are scaled by the cloud's radius, so that
-    everything is in metres.
+    distance_m is that of every point, without its sign, infinite off the observed surface. ``rows`` are the points
+    used, J (n, 6) the derivatives of their distances. H and g are means over them; rotations are scaled by the cloud's
+    radius, so that everything is in metres.
 
     eigenvalues (6,) and directions (6, 6), columns, are those of :func:`p2p_lib.method.observability.eigen`.
     """

@@ -127,7 +127,8 @@ def test_noise_makes_few_wrong_matches():
         uv = features.detect(image, None, 120)
         steps = np.tile(1.5 * np.eye(2), (len(uv), 1, 1))
         noisy = np.clip(image + noise, 0, 255).astype(np.uint8)
-        wanted, found = features.match(*(features.describe(one, uv, [steps])[:, 0] for one in (image, noisy)), uv, 4.0, 0.85)
+        described = (features.describe(one, uv, [steps])[:, 0] for one in (image, noisy))
+        wanted, found = features.match(*described, uv, 4.0, 0.85)
         same = np.linalg.norm(uv[wanted] - uv[found], axis=1) < 4
         right.append(same.sum() / len(uv))
         wrong.append((~same).sum() / len(uv))

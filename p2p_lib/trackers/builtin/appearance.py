@@ -156,7 +156,7 @@ def align(
 
 @compiled
 def _aligned(image, pixels, solver, rows, uv, A, iterations):
-    """Moves uv (N, 2) and A (N, 2, 2) to where the patches at these rows are; their correlation and contrast (N,) there."""
+    """Moves uv (N, 2) and A (N, 2, 2) to where the patches at ``rows`` are; correlation and contrast (N,) there."""
     right, bottom, one = np.float32(image.shape[1] - 1), np.float32(image.shape[0] - 1), np.float32(1)
     last_i, last_j, next_px = image.shape[1] - 2, image.shape[0] - 2, np.uint32(1)
     ncc, contrast, seen, step = np.zeros(len(uv)), np.zeros(len(uv)), np.zeros(pixels.shape[1], np.float32), np.ones(6)
