@@ -53,7 +53,7 @@ def confidence(covariance: np.ndarray, inliers: float, agreement: float) -> floa
     inliers     keypoints that agree with the pose, each counted by the confidence of the pose that placed it
     agreement   their share of the keypoints seen, 0 to 1
     """
-    sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    sigma_deg = np.degrees(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))
     logit = _CONSTANT + _LOG_SIGMA * np.log(max(sigma_deg, 1e-3)) + _LOG_INLIERS * np.log1p(inliers)
     return float(1 / (1 + np.exp(-logit - _AGREEMENT * agreement)))
 
@@ -64,6 +64,7 @@ class Belief:
 
     of_frame        (6, 6) covariance of the pose relative to the map, right tangent of T_cam_obj
     free_rotations  (K, 6) tangents of one radian each that the shape leaves free
+    slides          whether it leaves more free than that
     told            whether the texture at the points that agree tells these turns
     support         keypoints that agree, each counted by the confidence of the pose that placed it
     agreement       their share of the keypoints seen
@@ -71,6 +72,7 @@ class Belief:
 
     of_frame: np.ndarray
     free_rotations: np.ndarray
+    slides: bool
     told: bool
     support: float
     agreement: float
@@ -82,7 +84,9 @@ class Belief:
         support = known.map.confidence[agrees].sum()
         agreement = (agrees & keypoints).sum() / max(keypoints.sum(), 1)
         told = config.method.gates != "all" or _told(obs, best, observer.camera, config)
-        return cls(_of_frame(obs, best, known, observer), best.refined.free_rotations, told, support, agreement)
+        free, held = best.refined.free_rotations, best.refined.eigenvalues
+        slides = held is not None and (held < config.refinement.min_eigenvalue).sum() > len(free)
+        return cls(_of_frame(obs, best, known, observer), free, slides, told, support, agreement)
 
     def at(
         self, T_cam_obj: np.ndarray, model: ObjectModel, most: float, told: bool | None = None
@@ -96,6 +100,13 @@ class Belief:
         told = self.told if told is None else told
         covariance = pose_covariance(self.of_frame, model.covariance, self.free_rotations, accumulated_rad, told)
         return covariance, min(confidence(covariance, self.support, self.agreement), most)
+
+    def given_turn(self, covariance: np.ndarray) -> float:
+        """The confidence in all but turns, where the shape leaves nothing else free: these bend no surface."""
+        axes = np.pad(self.free_rotations[: 0 if self.slides else None, :3], ((0, 0), (0, 3)))
+        shared = covariance @ axes.T
+        held = covariance - shared @ np.linalg.pinv(axes @ shared) @ shared.T
+        return confidence(held, self.support, self.agreement)
 
 
 def _of_frame(obs: Observation, best: Candidate, known: Known, observer: Observer) -> np.ndarray:

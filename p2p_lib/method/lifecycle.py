@@ -199,10 +199,6 @@ class Lifecycle:
             confirming=min(max(self.confirming - 1, 0), longest) if self.has_pose else longest,
         )
 
-    def started(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Lifecycle:
-        """The state after the first pose in a map."""
-        return Lifecycle(status, T_cam_obj, time_s)
-
     def without_pose(self, status: Status, mask_px: int | None = None) -> Lifecycle:
         """The state after a frame without a pose. A return that was not confirmed is taken back."""
         taken_back = {"T_cam_obj": self.T_left, "confirming": 0} if self.confirming else {}

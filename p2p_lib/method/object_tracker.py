@@ -40,8 +40,6 @@ _SOME = 0.3
 #: A known object that has been lost for so many frames and shows this share of the most that was ever seen of it is
 #: turned to a side that nobody knows: a second map is begun.
 _STAYS_LOST, _IN_PLAIN_VIEW = 12, 0.4
-
-
 #: Why a pose is degraded that nothing contradicts.
 _UNTOLD = "its shape leaves a turn free, and too little texture tells it"
 
@@ -224,7 +222,7 @@ class ObjectTracker:
         covariance, mapped = belief.at(T_cam_obj, model, most, told=True)  # a turn that nothing tells bends no map
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
-            trusted = not life.confirming and (mapped >= MAPPED or not self._gates)
+            trusted = not life.confirming and (belief.given_turn(covariance) >= MAPPED or not self._gates)
             keyframe = due or (trusted and model.keyframe_due(obs, T_cam_obj, agrees))
         model.settle_surface()
         if keyframe:
@@ -301,7 +299,7 @@ class ObjectTracker:
             verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")
         requests = self.model.insert_keyframe(obs, T_cam_obj, points, np.zeros(0, bool))
         self.model.adopt()
-        self.life = self.life.started(T_cam_obj, obs.frame.time_s, verdict.status).placed(obs.frame.T_world_cam)
+        self.life = Lifecycle(verdict.status, T_cam_obj, obs.frame.time_s).placed(obs.frame.T_world_cam)
         self._trusted = obs
         # The first pose defines the object frame: it is right by definition, whatever the points are worth.
         estimate = self._estimate(obs, verdict, len(self.map), 1.0, self.model.covariance, True)

@@ -20,7 +20,6 @@ from p2p_lib.method.agreement import outline_share
 _BORDER_PX = 2
 #: A larger step in the 3x3 neighbourhood of a pixel of the cloud is an edge, m.
 _CLOUD_EDGE_M = 0.02
-
 #: A keypoint farther from the depth measured at its pixel is hidden, m.
 _HIDDEN_M = 0.015
 

@@ -210,18 +210,14 @@ class _Problem:
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj, _GRADIENT_VOXELS)
         huber_m, least_m = self.config.huber_m, max(self.config.huber_m, widest_m)
-        about, bounds_m = (self.centre, self.radius), (*self.scales_m, huber_m, least_m)
+        floor_m, reach_m = _SIGMA_FLOOR_VOXELS * self.volume.voxel_m, 0.98 * self.volume.tau_m
+        about, bounds_m = (self.centre, self.radius), (floor_m, reach_m, huber_m, least_m)
         used, J, H, g, cut, rms, sigma = _linearised(p_obj, *about, value, gradient, valid, *bounds_m)
         if len(used) < MIN_POINTS:
             return None
         distance = np.where(valid, np.abs(value), np.inf)
         held = (beside.eigenvalues, beside.directions) if beside else self.eigen(used, J)
         return _Linear(T, distance, H, g, *held, cut, used, J, rms, sigma)
-
-    @property
-    def scales_m(self) -> tuple[float, float]:
-        """The least standard deviation of a distance, and where the distance is no longer known."""
-        return _SIGMA_FLOOR_VOXELS * self.volume.voxel_m, 0.98 * self.volume.tau_m
 
     def eigen(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues (6,) ascending and eigenvectors (6, 6), columns, of what the shape determines."""

@@ -21,7 +21,7 @@ def pose(k: float) -> np.ndarray:
 
 def lived(*steps: Evidence | Status) -> list[Lifecycle]:
     """Started at pose 0, then judged with all gates, frame by frame; a status stands for a frame without a pose."""
-    lives = [Lifecycle().started(pose(0), 0.0, Status.TRACKED)]
+    lives = [Lifecycle(Status.TRACKED, pose(0), 0.0)]
     for k, step in enumerate(steps, 1):
         life = lives[-1]
         if isinstance(step, Evidence):
@@ -111,7 +111,7 @@ def test_a_return_is_doubted_until_its_turn_is_told_from_others():
 
 
 def test_after_a_pause_in_the_stream_an_object_may_be_anywhere():
-    life = Lifecycle().started(pose(0), 0.0, Status.TRACKED).with_pose(pose(1), 0.03, Status.TRACKED)
+    life = Lifecycle(Status.TRACKED, pose(0), 0.0).with_pose(pose(1), 0.03, Status.TRACKED)
     assert life.at(0.06).motion_priors() and life.at(0.2).motion_priors(), "a few frames are dropped"
     paused = life.at(1.0)
     assert (
@@ -119,7 +119,7 @@ def test_after_a_pause_in_the_stream_an_object_may_be_anywhere():
         and paused.unconfirmed
         and paused.with_pose(pose(2), 1.0, Status.RECOVERED).confirming
     )
-    slow = Lifecycle().started(pose(0), 0.0, Status.TRACKED).with_pose(pose(1), 1.0, Status.TRACKED)
+    slow = Lifecycle(Status.TRACKED, pose(0), 0.0).with_pose(pose(1), 1.0, Status.TRACKED)
     assert slow.at(2.0).motion_priors(), "a frame a second is no pause"
 
 

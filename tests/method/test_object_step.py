@@ -376,6 +376,25 @@ def test_a_pose_that_is_hardly_believed_makes_no_keyframe(gates, monkeypatch):
     assert lump.see(turned(26)).estimate.keyframe
 
 
+@pytest.mark.parametrize("free", ["a turn", "nothing", "a turn and a shift"])
+def test_a_turn_that_the_shape_leaves_free_keeps_no_keyframe_back(free, monkeypatch):
+    """A body of revolution without points is mapped as it tilts; a pose that is known no better else is not."""
+    loosest = {"a turn": 1, "nothing": 0, "a turn and a shift": 2}[free]
+    lump, inner = settled(begun(), [2]), refinement.refine
+    spin = np.array([[0, 0, 1.0, 0.02, 0, 0]])
+
+    def loose(*args, **kwargs):
+        found = inner(*args, **kwargs)
+        covariance = found.covariance + 0.2**2 * spin.T @ spin
+        held = np.where(np.arange(6) < loosest, 0.0, 1.0)
+        return replace(found, covariance=covariance, free_rotations=spin[:loosest], eigenvalues=held)
+
+    monkeypatch.setattr(refinement, "refine", loose)
+    steps = [lump.see(turned(deg), hide(lambda tracks: tracks.visible)).estimate for deg in (4, 6, 8, 10, 12, 14)]
+    assert all(step.T_cam_obj is not None and step.confidence < 0.1 for step in steps)
+    assert any(step.keyframe for step in steps) == (free == "a turn")
+
+
 def test_pending_points_are_not_rejected_and_enter_the_graph():
     """They took no part in registration, so that they agree with nothing."""
     lump, pending = pending_and_promoted(method__graph=True)

@@ -102,9 +102,9 @@ def test_joined_keypoints_keep_what_they_have_been_through():
 
 def test_a_life_told_in_another_frame_is_the_same():
     T = se3.exp(np.random.default_rng(0).normal(0, 0.3, (2, 6)))
-    life = Lifecycle().started(T[0], 0.0, "tracked").placed(np.eye(4)).with_pose(T[1], 0.03, "tracked")
+    life = Lifecycle("tracked", T[0], 0.0).placed(np.eye(4)).with_pose(T[1], 0.03, "tracked")
     T_other = T @ T_FIRST_SECOND
-    other = Lifecycle().started(T_other[0], 0.0, "tracked").placed(np.eye(4)).with_pose(T_other[1], 0.03, "tracked")
+    other = Lifecycle("tracked", T_other[0], 0.0).placed(np.eye(4)).with_pose(T_other[1], 0.03, "tracked")
     moved = life.in_frame(T_FIRST_SECOND)
     for name in ("T_cam_obj", "T_previous", "T_world_obj"):
         np.testing.assert_allclose(getattr(moved, name), getattr(other, name), atol=1e-12)
