@@ -1,11 +1,12 @@
 """What each mechanism of the method is worth: sequences with and without it.
 
-    python benchmarks/bench_mechanisms.py OUT SEQUENCE ... [--mechanisms A,B] [--clicks]
+    python benchmarks/bench_mechanisms.py OUT SEQUENCE ... [--mechanisms A,B] [--clicks] [--stop N]
 
 A mechanism is an entry of ``mechanisms.toml``: one text of the library, and what it is replaced with to switch the
 mechanism off. Each run is a process of its own with a patched copy of the library. ``OUT/runs.jsonl`` keeps a line per
 run and no run is done twice; ``OUT/table.md`` and ``OUT/table.csv`` compare with the unchanged method. SEQUENCE is what
-``p2p run`` takes, with masks, truth and models; ``--clicks`` starts from one click per object instead of masks.
+``p2p run`` takes, with masks, truth and models; ``--clicks`` starts from one click per object instead of masks. Of each
+the first ``--stop`` frames are taken.
 
 Scores are means over the objects of a run, in percent, aligned at the first scored frame with a pose. A frame is
 confidently wrong where the confidence is above 0.5 and ADD or the error of translation above 5 cm. The Brier score is
@@ -45,7 +46,7 @@ SUMS = ["frames", "lost", "confidently_wrong"]
 MEANS = ["add", "adds", "brier", "rotation_error2", "translation_error2"]
 
 
-def track(sequence: str, clicks: bool, out: Path) -> None:
+def track(sequence: str, clicks: bool, stop: int | None, out: Path) -> None:
     """Follow every object of a sequence with the library that is imported; its estimates go to the file ``out``."""
     from p2p_lib import Point2Pose, open_sequence, preset
 
@@ -57,7 +58,7 @@ def track(sequence: str, clicks: bool, out: Path) -> None:
         elif name in first and first[name].any():
             method.add_object(name, clicks=innermost_pixel(first[name]))
     frame_ms, told = [], {name: [] for name in method.objects}
-    for t in range(len(seq)):
+    for t in range(len(seq))[:stop]:
         frame, masks = seq.frame(t), None if clicks else seq.masks(t)
         start = time.process_time()
         estimates = method.step(frame, masks)
@@ -123,7 +124,7 @@ def score_object(
     wrong = (add_m[posed] > FAR_M) | (apart_m[posed] > FAR_M)
     return {
         "add": metrics.auc_exact(add_m),
-        "adds": metrics.auc_exact(metrics.adds_m(T_pred, T_cam_model, points, workers=1)),
+        "adds": metrics.auc_exact(metrics.adds_m(T_pred, T_cam_model, points)),
         "brier": float(np.mean((confidence[judged] - right) ** 2)),
         "rotation_error2": float(error2[0]),
         "translation_error2": float(error2[1]),
@@ -138,20 +139,24 @@ def score(sequence: str, tracked: Path) -> dict[str, float]:
     run, rows = np.load(tracked), []
     for name, (T_cam_model, scored, points) in known_truth(sequence).items():
         if f"{name}/T_cam_obj" in run:
-            told = (run[f"{name}/{key}"][scored] for key in ("T_cam_obj", "confidence", "covariance"))
-            rows.append(score_object(*told, T_cam_model[scored], points))
+            told = [run[f"{name}/{key}"] for key in ("T_cam_obj", "confidence", "covariance")]
+            at = np.flatnonzero(scored[: len(told[0])])
+            rows.append(score_object(*(each[at] for each in told), T_cam_model[at], points))
     table = pd.DataFrame(rows, columns=[*MEANS, *SUMS])
     return table[MEANS].mean().to_dict() | table[SUMS].sum().to_dict() | {"frame_ms": float(run["frame_ms"].mean())}
 
 
-def run_once(mechanism: dict[str, str] | None, sequence: str, clicks: bool) -> dict[str, float | str]:
+def run_once(
+    mechanism: dict[str, str] | None, sequence: str, clicks: bool = False, stop: int | None = None
+) -> dict[str, float | str]:
     """A run without the mechanism, scored by the library as it is; ``failed`` says with which error it ended."""
     with tempfile.TemporaryDirectory() as scratch:
         shutil.copytree(ROOT / "p2p_lib", Path(scratch) / "p2p_lib")
         if mechanism is not None:
             switch_off(mechanism, Path(scratch))
         out = Path(scratch) / "tracked.npz"
-        command = [sys.executable, __file__, "--track", sequence, str(out), *(["--clicks"] if clicks else [])]
+        command = [sys.executable, __file__, str(out), sequence, "--track", *(["--clicks"] if clicks else [])]
+        command += [] if stop is None else ["--stop", str(stop)]
         done = subprocess.run(command, env=os.environ | {"PYTHONPATH": scratch}, capture_output=True, text=True)
         if done.returncode:
             return {"failed": done.stderr.strip().splitlines()[-1]}
@@ -181,7 +186,11 @@ def main() -> None:
     parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
     parser.add_argument("--mechanisms", default="", metavar="A,B", help="only these")
     parser.add_argument("--clicks", action="store_true", help="from one click per object instead of masks")
+    parser.add_argument("--stop", type=int, metavar="N", help="this many frames of each")
+    parser.add_argument("--track", action="store_true", help="one sequence with the library that is imported, into OUT")
     asked = parser.parse_args()
+    if asked.track:
+        return track(*asked.sequences, asked.clicks, asked.stop, asked.out)
     asked.out.mkdir(parents=True, exist_ok=True)
     log = asked.out / "runs.jsonl"
     runs = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
@@ -194,7 +203,7 @@ def main() -> None:
             }
             if tuple(what.values()) in done:
                 continue
-            runs.append(what | run_once(mechanism, sequence, asked.clicks))
+            runs.append(what | run_once(mechanism, sequence, asked.clicks, asked.stop))
             with log.open("a") as file:
                 file.write(json.dumps(runs[-1]) + "\n")
             print(json.dumps(runs[-1]), flush=True)
@@ -205,7 +214,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "--track":
-        track(sys.argv[2], "--clicks" in sys.argv, Path(sys.argv[3]))
-    else:
-        main()
+    main()

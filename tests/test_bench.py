@@ -145,3 +145,17 @@ def test_the_stream_goes_there_and_back_without_a_cut(load):
     assert [int(masks["box"][0, 0]) for _, masks in stream] == [0, 1, 2, 3, 2, 1] * 2
     assert [frame.index for frame, _ in stream] == list(range(12))
     assert np.allclose(np.diff([frame.time_s for frame, _ in stream]), 1 / 30)
+
+
+def test_a_mechanism_is_worth_what_the_method_loses_without_it(load):
+    bench = load("bench_mechanisms")
+    judged = "        if best is None:\n            nothing"
+    blind = {"name": "any pose", "file": "p2p_lib/method/object_tracker.py", "find": judged}
+    blind["replace"] = judged.replace("best is None", "True")
+    runs = [bench.run_once(mechanism, "synthetic/exit_reentry", stop=5) for mechanism in (None, blind)]
+    assert runs[0]["add"] > 95 and runs[0]["lost"] == runs[0]["confidently_wrong"] == 0
+    assert runs[1]["lost"] == runs[1]["frames"] - 1, "the first pose is right by definition"
+    names = bench.UNCHANGED, blind["name"]
+    table = bench.compare(bench.pd.DataFrame([{"mechanism": m, "sequence": "s"} | run for m, run in zip(names, runs)]))
+    assert table.loc["any pose", "ADD"] == pytest.approx(runs[0]["add"] - runs[1]["add"])
+    assert table.loc["any pose", "lost"] == runs[1]["lost"]
