@@ -71,6 +71,11 @@ class Frame:
         return self.depth_m.shape
 
     @cached_property
+    def sparse(self) -> tuple[np.ndarray, np.ndarray]:
+        """Colour and depth of every eighth pixel of every eighth row: copies, since a stride reads the whole image."""
+        return self.rgb[::8, ::8].copy(), self.depth_m[::8, ::8].copy()
+
+    @cached_property
     def lab(self) -> np.ndarray:
         """(H, W, 3) uint8, the colours in CIELAB; converted when first asked for."""
         return cv2.cvtColor(self.rgb, cv2.COLOR_RGB2LAB)

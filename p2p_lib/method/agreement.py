@@ -26,8 +26,6 @@ _STANDS_S = 0.08
 _BESIDE_PX, _OUTLINE, _DEPTH_STEP_M = 4, 20, 0.02
 #: The outline's direction is that from so many of its pixels before to so many behind.
 _ALONG = 3
-#: Pixels between those that are compared first.
-_STEP = 8
 
 
 def size_ratio(p_obj: np.ndarray, p_cam: np.ndarray, noise_m: np.ndarray) -> tuple[float, float] | None:
@@ -53,9 +51,8 @@ def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.n
 
     1 where too little looks the same, as before a moving camera: nothing is said then.
     """
-    some = np.s_[::_STEP, ::_STEP]
-    now_m, then_m, now, then = (of[some] for of in (frame.depth_m, before.depth_m, frame.rgb, before.rgb))
-    same = (now_m > 0) & (then_m > 0) & ~(mask[some] | mask_before[some])
+    (now, now_m), (then, then_m) = frame.sparse, before.sparse
+    same = (now_m > 0) & (then_m > 0) & ~(mask[::8, ::8] | mask_before[::8, ::8])
     same &= cv2.inRange(cv2.absdiff(now, then), (0,) * 3, (_SAME_GREY - 1,) * 3) > 0
     return float(np.median(now_m[same] / then_m[same])) if same.mean() > _LOOKS_THE_SAME else 1.0
 
@@ -91,7 +88,7 @@ class Standing:
 
     def with_frame(self, frame: Frame) -> Standing:
         """After one more."""
-        return Standing(_first(self.first_depth, frame, "depth_m"), _first(self.first_rgb, frame, "rgb"))
+        return Standing(_first(self.first_depth, frame, "depth_m", 1), _first(self.first_rgb, frame, "rgb", 0))
 
     def for_long(self, time_s: float) -> tuple[bool, bool]:
         """Whether one has stood for a while though the other goes on: not of one moment; and whether both have."""
@@ -100,9 +97,8 @@ class Standing:
         return len(firsts) == 2 and stand == 1, stand == 2
 
 
-def _first(first: Frame | None, frame: Frame, image: str) -> Frame | None:
-    now, before = getattr(frame, image), None if first is None else getattr(first, image)
-    some = np.s_[::_STEP, ::_STEP]
-    if before is not None and np.array_equal(now[some], before[some]) and np.array_equal(now, before):
+def _first(first: Frame | None, frame: Frame, image: str, sparse: int) -> Frame | None:
+    same = first is not None and np.array_equal(frame.sparse[sparse], first.sparse[sparse])
+    if same and np.array_equal(getattr(frame, image), getattr(first, image)):
         return first
-    return frame if now.any() else None
+    return frame if getattr(frame, image).any() else None

@@ -12,7 +12,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.image import bounds, nearest_px
+from p2p_lib.core.image import nearest_px
 from p2p_lib.core.types import Frame
 
 #: The noise of the surface is independent this many voxels apart.
@@ -90,9 +90,7 @@ def contrast_along(
     flow_px = camera.project(moved) - uv_px
     flow_px /= np.maximum(np.linalg.norm(flow_px, axis=-1, keepdims=True), 1e-9)
     u, v = nearest_px(uv_px, frame.shape)
-    near = np.zeros(frame.shape, bool)
-    near[v, u] = True
-    cut = bounds(near, _AROUND_PX + 1)
+    cut = tuple(slice(max(at.min() - _AROUND_PX - 1, 0), at.max() + _AROUND_PX + 2) for at in (v, u))
     grey = cv2.cvtColor(np.ascontiguousarray(frame.rgb[cut]), cv2.COLOR_RGB2GRAY)
     y, x = np.mgrid[-_AROUND_PX : _AROUND_PX + 1, -_AROUND_PX : _AROUND_PX + 1].reshape(2, -1)
     v = np.clip(v[:, None] - cut[0].start + y, 0, grey.shape[0] - 1)

@@ -152,9 +152,9 @@ def sample_cloud(depth_m: np.ndarray, mask: np.ndarray, camera: Camera, max_poin
     kernel = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
     inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-    v, u = np.nonzero((inside > 0) & off_edges(depth, _CLOUD_EDGE_M))
+    usable = (inside > 0) & off_edges(depth, _CLOUD_EDGE_M)
     # A lattice of pixels, then an even thinning of what is left over.
-    stride = max(1, int(np.sqrt(len(u) / max_points)))
-    on = np.flatnonzero((u % stride == 0) & (v % stride == 0))
-    on = on[np.linspace(0, len(on) - 1, min(len(on), max_points)).astype(int)]
+    stride = max(1, int(np.sqrt(np.count_nonzero(usable) / max_points)))
+    v, u = stride * np.stack(np.nonzero(usable[::stride, ::stride]))
+    on = np.linspace(0, len(u) - 1, min(len(u), max_points)).astype(int)
     return camera.unproject(np.stack([u[on] + left, v[on] + top], -1), depth[v[on], u[on]].astype(float))

@@ -210,9 +210,10 @@ class _Problem:
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj, _GRADIENT_VOXELS)
         huber_m, least_m = self.config.huber_m, max(self.config.huber_m, widest_m)
+        # The least standard deviation of a distance, and where the distance is no longer known.
         floor_m, reach_m = _SIGMA_FLOOR_VOXELS * self.volume.voxel_m, 0.98 * self.volume.tau_m
-        about, bounds_m = (self.centre, self.radius), (floor_m, reach_m, huber_m, least_m)
-        used, J, H, g, cut, rms, sigma = _linearised(p_obj, *about, value, gradient, valid, *bounds_m)
+        points = p_obj, self.centre, self.radius, value, gradient, valid
+        used, J, H, g, cut, rms, sigma = _linearised(*points, floor_m, reach_m, huber_m, least_m)
         if len(used) < MIN_POINTS:
             return None
         distance = np.where(valid, np.abs(value), np.inf)
@@ -328,18 +329,7 @@ def _upper_median(x: np.ndarray) -> float:
 
 
 @compiled
-def _linearised(
-    p_obj: np.ndarray,
-    centre: np.ndarray,
-    radius: float,
-    value: np.ndarray,
-    gradient: np.ndarray,
-    valid: np.ndarray,
-    floor_m: float,
-    reach_m: float,
-    huber_m: float,
-    least_m: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, float, float]:
+def _linearised(p_obj, centre, radius, value, gradient, valid, floor_m, reach_m, huber_m, least_m):
     """Of points (N, 3) with these distances: rows (n,) used, their J (n, 6), H, g, the cut, the rms and the noise.
 
     Points beyond ``reach_m`` know no distance. Those that scatter beyond the median, but at least ``least_m``, are cut.

@@ -14,6 +14,7 @@ import numpy as np
 
 from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.depth import off_edges
+from p2p_lib.core.image import bounds
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Frame
 
@@ -87,6 +88,8 @@ def distance_px(uv_px: np.ndarray, others_px: np.ndarray) -> np.ndarray:
 
 def usable_region(frame: Frame, mask: np.ndarray, edge_m: float) -> np.ndarray:
     """(H, W) bool: where points can be lifted: in the mask, off its border, measured, off depth edges of ``edge_m``."""
-    size = 2 * _EDGE_MARGIN_PX + 1
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0)
-    return (inner > 0) & off_edges(frame.depth_m, edge_m)
+    cut, size, region = bounds(mask, 1), 2 * _EDGE_MARGIN_PX + 1, np.zeros(mask.shape, bool)
+    if mask.any():
+        inner = cv2.erode(mask[cut].astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0)
+        region[cut] = (inner > 0) & off_edges(frame.depth_m[cut], edge_m)
+    return region

@@ -18,7 +18,6 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import TsdfConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.method.tsdf_grid import NO_WEIGHT, CpuGrid, Image, TorchGrid
@@ -384,7 +383,8 @@ class TsdfVolume:
         """
         offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * step_voxels
         value, valid = self._sample(np.asarray(p_obj, float).reshape(-1, 3), offsets)
-        return *_central(value, valid, 2 * step_voxels * self.voxel_m), valid
+        gradient = (value[1:4] - value[4:7]).T / (2 * step_voxels * self.voxel_m)
+        return np.where(valid, value[0], 0.0), np.where(valid[:, None], gradient, 0.0), valid
 
     def _sample(self, p_obj: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Metres (K, N) at points (N, 3) moved by offsets (K, 3) in voxels, and whether all K are valid (N,)."""
@@ -399,14 +399,3 @@ class TsdfVolume:
         from p2p_lib.method.mesh import extract
 
         return extract(self, min_weight, min_component)
-
-
-@compiled
-def _central(value: np.ndarray, valid: np.ndarray, apart_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """The first of values (7, N), and half of the others less the other half by their distance; 0 if not valid (N,)."""
-    middle, gradient = np.zeros(len(valid)), np.zeros((len(valid), 3))
-    for n in np.flatnonzero(valid):
-        middle[n] = value[0, n]
-        for i in range(3):
-            gradient[n, i] = (value[1 + i, n] - value[4 + i, n]) / apart_m
-    return middle, gradient

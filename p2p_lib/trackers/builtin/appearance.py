@@ -133,13 +133,13 @@ def align(
     uv_px: np.ndarray,
     A: np.ndarray,
     iterations: int = 4,
-    rows: np.ndarray | None = None,
+    rows: np.ndarray | slice = slice(None),
 ) -> Alignment:
     """Find each patch near uv_px (N, 2), seen under about A (N, 2, 2), in a float32 grey image.
 
-    rows  (N,) of the patches; all of them where it is left out. Patches are large: they are not copied for it
+    rows  (N,) of the patches, which are too large to be copied for it; or all
     """
-    rows = np.arange(len(patches)) if rows is None else rows
+    rows = np.arange(len(patches))[rows]
     uv, A = uv_px.astype(np.float32), A.astype(np.float32)
     height, width = image.shape
     start, identity = uv.copy(), np.eye(2, dtype=np.float32)

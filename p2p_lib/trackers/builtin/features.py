@@ -13,10 +13,13 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from p2p_lib.core.compiled import compiled
+from p2p_lib.core.image import bounds
+
 _DIRECTIONS, _CELLS, _SAMPLES = 8, 4, 16
 SIZE = _DIRECTIONS * _CELLS**2
 _ANGLES = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-_DIRECTION_VECTORS = [(np.float32(np.cos(a)), np.float32(np.sin(a))) for a in _ANGLES]
+_DIRECTION_VECTORS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1).astype(np.float32)
 _AXIS = np.arange(_SAMPLES) - (_SAMPLES - 1) / 2
 _GRID = np.stack(np.meshgrid(_AXIS, _AXIS)).reshape(2, -1).astype(np.float32)
 _RADIUS = _AXIS[-1]
@@ -46,25 +49,17 @@ def detect(gray: np.ndarray, region: np.ndarray | None, limit: int) -> np.ndarra
 
     Regions of more than :data:`_LARGE_PX` pixels are searched at half the resolution, for speed.
     """
-    x0, y0, x1, y1 = 0, 0, gray.shape[1], gray.shape[0]
-    if region is not None:
-        x, y, w, h = cv2.boundingRect(region.view(np.uint8))
-        if not w:
-            return np.zeros((0, 2), np.float32)
-        x0, y0, x1, y1 = (
-            max(0, x - _MARGIN_PX),
-            max(0, y - _MARGIN_PX),
-            min(x1, x + w + _MARGIN_PX),
-            min(y1, y + h + _MARGIN_PX),
-        )
-    part, step = gray[y0:y1, x0:x1], 1 + ((x1 - x0) * (y1 - y0) > _LARGE_PX)
+    if region is not None and not region.any():
+        return np.zeros((0, 2), np.float32)
+    cut = rows, columns = bounds(np.ones(gray.shape, bool) if region is None else region, _MARGIN_PX)
+    step = 1 + (gray[cut].size > _LARGE_PX)
     # pyrDown keeps every other pixel where it is.
-    level = cv2.pyrDown(part) if step == 2 else part
-    inside = None if region is None else np.ascontiguousarray(region[y0:y1:step, x0:x1:step]).view(np.uint8)
+    level = cv2.pyrDown(gray[cut]) if step == 2 else gray[cut]
+    inside = None if region is None else np.ascontiguousarray(region[cut][::step, ::step]).view(np.uint8)
     corners = cv2.goodFeaturesToTrack(level, limit, 0.005, 4 - step + 1, mask=inside, blockSize=7 - 2 * step)
     if corners is None:
         return np.zeros((0, 2), np.float32)
-    return step * corners.reshape(-1, 2) + np.float32([x0, y0])
+    return step * corners.reshape(-1, 2) + np.float32([columns.start, rows.start])
 
 
 def describe(gray: np.ndarray, uv_px: np.ndarray, step_px: Sequence[np.ndarray]) -> np.ndarray:
@@ -85,12 +80,24 @@ def describe(gray: np.ndarray, uv_px: np.ndarray, step_px: Sequence[np.ndarray])
 def _described(maps: list[np.ndarray], uv: np.ndarray, M: np.ndarray) -> np.ndarray:
     """(N, SIZE) at one scale, from the derivatives of the image."""
     gx, gy = _gradients(maps, uv, M)
-    angle = _dominant(np.stack([np.maximum(c * gx + s * gy, 0) @ _ROUND for c, s in _DIRECTION_VECTORS], 1))
+    angle = _dominant(np.stack([along @ _ROUND for along in _rectified(gx, gy, _DIRECTION_VECTORS)], 1))
     c, s = np.cos(angle), np.sin(angle)
     gx, gy = _gradients(maps, uv, M @ np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2).astype(np.float32))
-    raw = np.concatenate([np.maximum(c * gx + s * gy, 0) @ _POOL for c, s in _DIRECTION_VECTORS], 1)
+    raw = np.concatenate([along @ _POOL for along in _rectified(gx, gy, _DIRECTION_VECTORS)], 1)
     # The square root (Hellinger kernel) keeps strong edges from dominating.
     return np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-6))
+
+
+@compiled
+def _rectified(gx: np.ndarray, gy: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """(D, N, S) derivatives along directions (D, 2), 0 where negative: in one pass over each."""
+    out = np.empty((len(directions), *gx.shape), gx.dtype)
+    for d in range(len(directions)):
+        c, s = directions[d]
+        for n in range(gx.shape[0]):
+            for p in range(gx.shape[1]):
+                out[d, n, p] = max(c * gx[n, p] + s * gy[n, p], np.float32(0))
+    return out
 
 
 def _gradients(maps: list[np.ndarray], uv: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,13 +125,16 @@ def match(
     A wanted one may match its two nearest places, for two objects may look alike. Each counts if it is nearer than
     ``ratio`` times the next best place beyond those two. Corners within ``same_px`` are one place.
     """
+    from scipy.spatial.distance import cdist
+
     similarity = wanted @ found.T
     rows, best, similarities = np.arange(len(wanted)), [], []
-    same = np.abs(uv_px[:, None] - uv_px[None]).max(-1) <= same_px
-    for _ in range(_PLACES + 1):
+    same = cdist(uv_px, uv_px, "chebyshev") <= same_px
+    for place in range(_PLACES + 1):
+        if place:
+            np.copyto(similarity, -1, where=same[best[-1]])
         best.append(similarity.argmax(1))
         similarities.append(similarity[rows, best[-1]])
-        similarity[same[best[-1]]] = -1
     distance = np.sqrt(np.maximum(2 - 2 * np.stack(similarities, 1), 0))
     which, rank = np.nonzero(distance[:, :_PLACES] < ratio * distance[:, _PLACES:])
     return which, np.stack(best, 1)[which, rank]
