@@ -280,8 +280,8 @@ class Point2Pose:
         Where the segmenter finds nothing of an object it went by these very tracks: only other objects are elsewhere.
         """
         within = {name: obs.mask for name, obs in seen.items()}
-        for name in seen:
-            if given[name] is None and within[name] is not None and not within[name].any():
+        for name, obs in seen.items():
+            if given[name] is None and obs.mask is not None and not obs.mask.any():
                 within[name] = ~_either(self.masks.values())
         return {name: self.objects[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
