@@ -16,6 +16,8 @@ from p2p_lib.core.errors import BadInput
 
 #: What can be depth in any unit: so wide that ``p2p check`` still tells millimetres that were taken for metres.
 NEAREST_M, FARTHEST_M = 0.001, 1e4
+#: Every eighth pixel of every eighth row: where some of an image tells enough.
+SPARSE = np.s_[::8, ::8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +73,9 @@ class Frame:
         return self.depth_m.shape
 
     @cached_property
-    def sparse(self) -> tuple[np.ndarray, np.ndarray]:
-        """Colour and depth of every eighth pixel of every eighth row: copies, since a stride reads the whole image."""
-        return self.rgb[::8, ::8].copy(), self.depth_m[::8, ::8].copy()
+    def sparse(self) -> dict[str, np.ndarray]:
+        """``rgb`` and ``depth_m`` at :data:`SPARSE`: copies, since a stride reads the whole image."""
+        return {name: getattr(self, name)[SPARSE].copy() for name in ("rgb", "depth_m")}
 
     @cached_property
     def lab(self) -> np.ndarray:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.image import bounds, in_image, nearest_px
-from p2p_lib.core.types import Frame
+from p2p_lib.core.types import SPARSE, Frame
 
 #: Keypoints nearer to each other say little of the size, m; so many are needed.
 _APART_M, _KEYPOINTS = 0.02, 8
@@ -51,8 +51,8 @@ def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.n
 
     1 where too little looks the same, as before a moving camera: nothing is said then.
     """
-    (now, now_m), (then, then_m) = frame.sparse, before.sparse
-    same = (now_m > 0) & (then_m > 0) & ~(mask[::8, ::8] | mask_before[::8, ::8])
+    now, now_m, then, then_m = (of.sparse[name] for of in (frame, before) for name in ("rgb", "depth_m"))
+    same = (now_m > 0) & (then_m > 0) & ~(mask[SPARSE] | mask_before[SPARSE])
     same &= cv2.inRange(cv2.absdiff(now, then), (0,) * 3, (_SAME_GREY - 1,) * 3) > 0
     return float(np.median(now_m[same] / then_m[same])) if same.mean() > _LOOKS_THE_SAME else 1.0
 
@@ -88,7 +88,7 @@ class Standing:
 
     def with_frame(self, frame: Frame) -> Standing:
         """After one more."""
-        return Standing(_first(self.first_depth, frame, "depth_m", 1), _first(self.first_rgb, frame, "rgb", 0))
+        return Standing(_first(self.first_depth, frame, "depth_m"), _first(self.first_rgb, frame, "rgb"))
 
     def for_long(self, time_s: float) -> tuple[bool, bool]:
         """Whether one has stood for a while though the other goes on: not of one moment; and whether both have."""
@@ -97,8 +97,8 @@ class Standing:
         return len(firsts) == 2 and stand == 1, stand == 2
 
 
-def _first(first: Frame | None, frame: Frame, image: str, sparse: int) -> Frame | None:
-    same = first is not None and np.array_equal(frame.sparse[sparse], first.sparse[sparse])
+def _first(first: Frame | None, frame: Frame, image: str) -> Frame | None:
+    same = first is not None and np.array_equal(frame.sparse[image], first.sparse[image])
     if same and np.array_equal(getattr(frame, image), getattr(first, image)):
         return first
     return frame if getattr(frame, image).any() else None

@@ -279,10 +279,9 @@ class Point2Pose:
 
         Where the segmenter finds nothing of an object it went by these very tracks: only other objects are elsewhere.
         """
-        within = {name: obs.mask for name, obs in seen.items()}
-        for name, obs in seen.items():
-            if given[name] is None and obs.mask is not None and not obs.mask.any():
-                within[name] = ~_either(self.masks.values())
+        nowhere = {name for name, obs in seen.items() if given[name] is None and obs.mask_px == 0}
+        elsewhere = ~_either(self.masks.values()) if nowhere else None
+        within = {name: elsewhere if name in nowhere else obs.mask for name, obs in seen.items()}
         return {name: self.objects[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
     def _redetect(self, seen: Mapping[str, Observation]) -> dict[str, Observation]:
