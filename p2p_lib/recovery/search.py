@@ -190,7 +190,8 @@ class ImageSearch:
 def _normal_equations(T, p_obj, n_obj, depth_m, lens):
     """A (6, 6), b (6,) of the motion about a centre (3,) that lays points into the planes of those at their pixels."""
     (height, width), (fx, fy, cx, cy) = depth_m.shape, lens
-    p_cam, normal = p_obj @ T[:3, :3].T + T[:3, 3], n_obj @ T[:3, :3].T
+    R_obj_cam = np.ascontiguousarray(T[:3, :3].T)
+    p_cam, normal = p_obj @ R_obj_cam + T[:3, 3], n_obj @ R_obj_cam
     off_m, used = np.zeros(len(p_cam)), np.zeros(len(p_cam), np.bool_)
     for m in range(len(p_cam)):
         (x, y, z), (a, b, c) = p_cam[m], normal[m]
