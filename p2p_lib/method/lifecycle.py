@@ -14,6 +14,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import LifecycleConfig
 from p2p_lib.core.types import WITH_POSE, Status
+from p2p_lib.method.motion import Motion
 
 #: A return has to be confirmed for so many frames, and is marked as recovered meanwhile; for more without points.
 CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES = 5, 15
@@ -29,6 +30,8 @@ OUTLINE, _LONGEST_DOUBT = 0.45, 60
 #: A pose of less confidence makes no keyframe: what it places agrees with it for ever after. One that the surface
 #: alone determines well has more.
 MAPPED = 0.1
+#: The motion so far is that of poses with more confidence.
+_SURE = 0.5
 #: Shape and colour tell a turn from all others by this lead.
 TELLING = 0.25
 
@@ -44,6 +47,7 @@ class Evidence:
     size           times as large as its keypoint map it is measured, and the standard deviation; None: few are seen
     outline        what of its mask's outline lies where depth has steps, as a share of what did before any doubt
     still          whether the same image has come again and again
+    carried        whether its motion before the gap still says where it is
     """
 
     support: int
@@ -53,6 +57,7 @@ class Evidence:
     size: tuple[float, float] | None = None
     outline: float = 1.0
     still: bool = False
+    carried: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,12 +65,14 @@ class Verdict:
     """Whether a pose stands, with the status that it gives the object and the reason in words.
 
     doubted  whether what it rests on contradicts itself: a pose that nothing is learnt from
+    proven   whether enough speaks for it to confirm a return: more than a surface that fits where the motion leads
     """
 
     accepted: bool
     status: Status
     reason: str = ""
     doubted: bool = False
+    proven: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +87,10 @@ class Lifecycle:
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
     T_world_obj     newest pose in the scene that many points agreed with, where the camera was known; None before
+    motion          how it moves, by the sure poses; None before the first
     start_px        pixels of the newest mask, in a frame without a pose; None without a mask
     doubted         since a gap nothing has told its turn from others that look alike
-    lost_frames     frames since the newest pose in which it was in view and had none
+    lost_frames     frames since the newest proven pose in which it was in view
     doubted_frames  newest frames in a row whose pose was doubted by one of :data:`DOUBTS`
     """
 
@@ -94,6 +102,7 @@ class Lifecycle:
     T_left: np.ndarray | None = None
     confirming: int = 0
     T_world_obj: np.ndarray | None = None
+    motion: Motion | None = None
     start_px: int | None = None
     doubted: bool = False
     lost_frames: int = 0
@@ -133,6 +142,10 @@ class Lifecycle:
             priors["constant velocity"] = self.T_cam_obj @ se3.inverse(self.T_previous) @ self.T_cam_obj
         return priors
 
+    def carried(self, time_s: float) -> bool:
+        """Whether its motion so far still says where it is at this time."""
+        return self.motion is not None and self.motion.holds(time_s)
+
     def scene_prior(self, T_world_cam: np.ndarray | None) -> dict[str, np.ndarray]:
         """Where an absent object is if it has lain still: origin to T_cam_obj; empty where nobody knows."""
         if self.has_pose or T_world_cam is None or self.T_world_obj is None:
@@ -142,7 +155,8 @@ class Lifecycle:
     def in_frame(self, T_old_new: np.ndarray) -> Lifecycle:
         """The same in another object frame; T_old_new (4, 4) maps it to the one so far."""
         poses = {name: getattr(self, name) for name in ("T_cam_obj", "T_previous", "T_left", "T_world_obj")}
-        return replace(self, **{name: None if T is None else T @ T_old_new for name, T in poses.items()})
+        motion = self.motion and self.motion.in_frame(T_old_new)
+        return replace(self, motion=motion, **{n: None if T is None else T @ T_old_new for n, T in poses.items()})
 
     def placed(self, T_world_cam: np.ndarray | None) -> Lifecycle:
         """The state with the newest pose's place in the scene, once a return has been confirmed.
@@ -152,6 +166,14 @@ class Lifecycle:
         if T_world_cam is None or self.confirming or (self.status is Status.DEGRADED and self.T_world_obj is not None):
             return self
         return replace(self, T_world_obj=T_world_cam @ self.T_cam_obj)
+
+    def moved(self, confidence: float) -> Lifecycle:
+        """The state with its motion, which goes on with the newest pose where that is sure."""
+        if confidence <= _SURE:
+            return self
+        known = self.motion is not None and self.motion.time_s < self.seen_s
+        go_on = self.motion.followed_by if known else Motion.begun
+        return replace(self, motion=go_on(self.T_cam_obj, self.seen_s))
 
     def corrected(self, T_cam_obj: np.ndarray) -> Lifecycle:
         """With the newest pose as the graph has it: what comes next starts from there."""
@@ -175,28 +197,28 @@ class Lifecycle:
             if reason := DOUBTS[name](self, evidence):
                 return Verdict(True, Status.DEGRADED, reason, doubted=True)
         if evidence.support < config.return_inliers:
-            return Verdict(True, Status.DEGRADED, f"only {evidence.support} points agree")
+            proven = not gates or evidence.sighting is None or _sighted(self, evidence)
+            return Verdict(True, Status.DEGRADED, f"only {evidence.support} points agree", proven=proven)
         confirming = not self.has_pose or self.confirming > 1
         return Verdict(True, Status.RECOVERED if confirming else Status.TRACKED)
 
-    def with_pose(
-        self, T_cam_obj: np.ndarray, time_s: float, status: Status, lead: float | None = None, doubted: bool = False
-    ) -> Lifecycle:
-        """The state after a frame with an accepted pose, the lead by which it was, and whether it is doubted."""
-        longest = CONFIRM_SIGHTED_FRAMES if status is Status.DEGRADED else CONFIRM_FRAMES
+    def with_pose(self, T_cam_obj: np.ndarray, time_s: float, verdict: Verdict, lead: float | None = None) -> Lifecycle:
+        """The state after a frame with an accepted pose, and the lead by which it was."""
+        told = lead is not None and lead >= TELLING
+        longest = CONFIRM_SIGHTED_FRAMES if verdict.status is Status.DEGRADED and not told else CONFIRM_FRAMES
         return replace(
             self,
-            status=status,
+            status=verdict.status,
             T_cam_obj=T_cam_obj,
             seen_s=time_s,
             pace_s=time_s - self.seen_s if self.has_pose else self.pace_s,
-            lost_frames=0,
+            lost_frames=0 if verdict.proven else self.lost_frames + 1,
             start_px=None,
-            doubted_frames=self.doubted_frames + 1 if doubted else 0,
+            doubted_frames=self.doubted_frames + 1 if verdict.doubted else 0,
             doubted=self.doubted if lead is None else lead < TELLING,
             T_previous=self.T_cam_obj if self.has_pose else None,
             T_left=self.T_left if self.has_pose else self.T_cam_obj,
-            confirming=min(max(self.confirming - 1, 0), longest) if self.has_pose else longest,
+            confirming=min(max(self.confirming - verdict.proven, 0), longest) if self.has_pose else longest,
         )
 
     def without_pose(self, status: Status, mask_px: int | None = None) -> Lifecycle:
@@ -211,7 +233,9 @@ def _sighted(life: Lifecycle, evidence: Evidence) -> bool:
 
 
 def _few_points_on_return(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
-    few = life.unconfirmed and evidence.support < config.return_inliers and not _sighted(life, evidence)
+    on_its_way = evidence.carried and (evidence.surface_share or 0.0) >= config.surface_only_share
+    found = _sighted(life, evidence) or on_its_way
+    few = life.unconfirmed and evidence.support < config.return_inliers and not found
     return f"only {evidence.support} points agree on a return" if few else ""
 
 

@@ -181,7 +181,8 @@ class ObjectTracker:
             nothing = obs.mask is None and not obs.seen.any()
             return Verdict(False, Status.OCCLUDED if nothing else Status.LOST, reason)
         size, outline = self._size(obs, best), self._outline(obs)
-        evidence = replace(best.evidence, size=size, outline=outline, still=obs.still)
+        carried = self.life.carried(obs.frame.time_s)
+        evidence = replace(best.evidence, size=size, outline=outline, still=obs.still, carried=carried)
         return self.life.judge(evidence, self._gates, self.config.lifecycle)
 
     def _before(self, obs: Observation) -> Observation | None:
@@ -216,7 +217,7 @@ class ObjectTracker:
         if verdict.doubted:
             return self._doubted(obs, best, verdict)
         T_cam_obj, agrees, model = best.T_cam_obj, best.hypothesis.inliers, self.model
-        life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict.status, best.lead)
+        life = self.life.with_pose(T_cam_obj, obs.frame.time_s, verdict, best.lead)
         requests = Requests(reject=self.map.ids[self.known.keypoints(obs) & ~agrees])
         belief, most = self._belief(obs, best), DOUBTED if life.doubted else 1.0
         covariance, mapped = belief.at(T_cam_obj, model, most, told=True)  # a turn that nothing tells bends no map
@@ -234,14 +235,14 @@ class ObjectTracker:
             requests = replace(asked, reject=requests.reject)
         changed = keyframe or not belief.told
         covariance, sure = belief.at(T_cam_obj, model, most) if changed else (covariance, mapped)
-        self.life = life.placed(obs.frame.T_world_cam)
+        self.life = life.placed(obs.frame.T_world_cam).moved(sure)
         if not belief.told and verdict.status is Status.TRACKED:
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNTOLD)
         return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, keyframe), requests)
 
     def _doubted(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
         """A pose from what contradicts itself: neither map nor surface learns from it, and no track is rejected."""
-        self.life = self.life.with_pose(best.T_cam_obj, obs.frame.time_s, verdict.status, best.lead, doubted=True)
+        self.life = self.life.with_pose(best.T_cam_obj, obs.frame.time_s, verdict, best.lead)
         self.model.settle_surface()
         covariance, sure = self._belief(obs, best).at(best.T_cam_obj, self.model, DOUBTED)
         return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, False))

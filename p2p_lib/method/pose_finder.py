@@ -18,6 +18,7 @@ from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.refinement import Keypoints, Refinement
 from p2p_lib.method.registration import Hypothesis
 from p2p_lib.method.shape_search import ShapeSearch
+from p2p_lib.recovery.search import laid_on
 
 #: With fewer visible keypoints, pending ones help to register (the release's).
 _FEW_KEYPOINTS = 12
@@ -82,7 +83,7 @@ class PoseFinder:
             use = certain & known.map.promoted
             if use.sum() < _FEW_KEYPOINTS:
                 use = certain
-            priors = known.life.motion_priors() if with_motion else {}
+            priors = known.life.motion_priors() or self._carried_on(obs, known) if with_motion else {}
             if obs.sighted is not None:
                 priors = {"sighting": obs.sighted, **priors}
             found = self._hypotheses(obs, known, use, priors)
@@ -92,6 +93,16 @@ class PoseFinder:
                 found = self._hypotheses(obs, known, certain, priors)
                 found += self._along_surface(obs, known, certain, priors)
             return found or self._surface_only(known, priors)
+
+    def _carried_on(self, obs: Observation, known: Known) -> dict[str, np.ndarray]:
+        """Where an absent object is if it has gone on as it did, and where its depth is, turned like that."""
+        motion, time_s = known.life.motion, obs.frame.time_s
+        if not (known.life.carried(time_s) and len(obs.cloud) and self.shape.knows(known)):
+            return {}
+        T_cam_obj = motion.at(time_s)
+        (on_depth,) = laid_on(T_cam_obj[None], obs.cloud, known.model.sample)
+        near = np.linalg.norm(on_depth[:3, 3] - T_cam_obj[:3, 3]) < motion.reach_m(time_s)
+        return {"motion": T_cam_obj} | ({"motion, on its depth": on_depth} if near else {})
 
     def _hypotheses(
         self, obs: Observation, known: Known, use: np.ndarray, priors: dict[str, np.ndarray]
@@ -142,7 +153,7 @@ class PoseFinder:
         """The candidate to go on with, and why."""
         with self._stopwatch("selection"):
             few = max((c.hypothesis.support for c in candidates), default=0) < self.config.lifecycle.return_inliers
-            if few and any(c.sighting is not None for c in candidates):
+            if few and any((c.sighting or 0.0) > 0 for c in candidates):
                 return max(candidates, key=lambda c: c.sighting or 0.0), "most of the surface shows"
             poses, distance_m, weight = [c.T_cam_obj for c in candidates], None, None
             if len(poses) > 1 and known.model.has_surface and len(obs.cloud):

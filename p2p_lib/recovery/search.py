@@ -115,7 +115,7 @@ class ImageSearch:
         """The best poses near some turns that differ, aligned."""
         if len(sample.p_obj) < _FEWEST or not len(cloud) or not len(turns):
             return []
-        poses = np.concatenate([_shifted(T, _NEAR_M, 1) for T in _laid_on(turns, cloud, sample)])
+        poses = np.concatenate([_shifted(T, _NEAR_M, 1) for T in laid_on(turns, cloud, sample)])
         share, distinct = self._roughly(poses, sample), []
         turn_of, free = np.arange(len(poses)) // (len(poses) // len(turns)), np.ones(len(turns), bool)
         for k in np.argsort(-share):
@@ -264,7 +264,7 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
     return share, found, uv_px
 
 
-def _laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.ndarray:
+def laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.ndarray:
     """(V, 4, 4) poses of these turns, the points that face the camera about where the cloud (M, 3) is."""
     centre, poses = cloud.mean(0), turns.copy()
     for T in poses:

@@ -669,7 +669,7 @@ def test_a_map_in_which_nothing_ever_was_followed_is_founded_anew():
 
 
 def test_no_map_is_founded_on_the_background():
-    lump, (depth_m, seen) = before_a_wall(), render(LUMP, turned(9))
+    lump, (depth_m, seen) = later(before_a_wall()), render(LUMP, turned(9))
     depth_m = np.where(seen, depth_m, np.float32(0.8))
     beside = np.roll(seen, 60, axis=1) & ~seen
     for _ in range(16):
@@ -752,6 +752,12 @@ def test_what_agrees_is_learnt_and_the_paper_doubts_nothing(settings, fault):
     assert step.estimate.keyframe and step.estimate.status is Status.TRACKED
 
 
+def later(lump: Lump) -> Lump:
+    """Two seconds later: how it moved says nothing any more."""
+    lump.steps += [lump.steps[-1]] * 60
+    return lump
+
+
 def about(deg: float) -> np.ndarray:
     """The pose turned about the object's z axis alone: it stays in view all around."""
     return START @ se3.exp(np.array([0, 0, np.radians(deg), 0, 0, 0]))
@@ -759,7 +765,7 @@ def about(deg: float) -> np.ndarray:
 
 def turned_over(detector=None, **settings) -> tuple[Lump, np.ndarray, list[ObjectStep]]:
     """Known from one side, then seen from another, where none of its points is found; the ids of those."""
-    lump = settled(begun(**settings), [2, 4])
+    lump = later(settled(begun(**settings), [2, 4]))
     lump.tracker.detector = detector or lump.tracker.detector
     old = lump.tracker.map.ids.copy()
     return lump, old, [lump.see(about(150), hide(lambda tracks: np.isin(tracks.ids, old))) for _ in range(16)]
@@ -833,7 +839,7 @@ def test_no_second_map_is_begun_while_the_object_still_comes_into_view():
 
 
 def test_no_map_is_begun_in_a_frame_that_shows_the_object_as_it_is_known():
-    lump = settled(begun(), [2, 4])
+    lump = later(settled(begun(), [2, 4]))
     old = lump.tracker.map.ids.copy()
     steps = [lump.see(about(150), hide(lambda tracks: np.isin(tracks.ids, old))) for _ in range(12)]
     assert {step.estimate.map_id for step in steps} == {0} and lump.tracker._turned_over(lump.observed(about(6)))
@@ -842,7 +848,7 @@ def test_no_map_is_begun_in_a_frame_that_shows_the_object_as_it_is_known():
 
 
 def test_no_second_map_of_what_only_the_segmenter_takes_for_the_object():
-    lump = settled(begun(), [2, 4])
+    lump = later(settled(begun(), [2, 4]))
     old = lump.tracker.map.ids.copy()
     for _ in range(16):
         obs = lump.observed(about(150), hide(lambda tracks: np.isin(tracks.ids, old)))
@@ -951,6 +957,32 @@ NOTHING = np.zeros((CAMERA.height, CAMERA.width), bool)
 
 def unseen(tracks: Tracks) -> Tracks:
     return replace(tracks, visible=np.zeros(len(tracks), bool))
+
+
+@pytest.mark.parametrize(("moved_m", "found"), [(0.0, True), (0.02, True), (0.05, False)])
+def test_what_went_on_behind_something_is_found_by_its_surface(moved_m, found):
+    """No point is found again, and depth is where nobody expected it: turned as the motion says, it fits."""
+    lump = settled(begun(), range(1, 60))
+    for _ in range(6):
+        assert lump.see(turned(60), mask=NOTHING).estimate.status is Status.OCCLUDED
+    truth = se3.from_rt(np.eye(3), [moved_m, 0, -moved_m]) @ turned(66)
+    back = lump.see(truth, unseen).estimate
+    assert back.inliers == 0 and back.confidence < 0.5
+    assert back.status is (Status.DEGRADED if found else Status.LOST)
+    assert not found or (lump.off(truth)[0] < 3 and lump.off(truth)[1] < 3)
+
+
+def test_where_the_image_speaks_for_no_candidate_the_surface_chooses():
+    lump = settled(begun(), [2])
+    obs, finder, known = lump.observed(turned(4), unseen), lump.tracker.finder, lump.tracker.known
+    T_cam_obj = turned(4) @ se3.inverse(lump.T_first[1]) @ lump.T_first[0]
+    poses = {"beside": se3.exp(np.array([0, 0, 0, 0.02, 0, 0])) @ T_cam_obj, "there": T_cam_obj}
+    beside, there = (Candidate(hypothesis) for hypothesis in finder._surface_only(known, poses))
+    chosen = {
+        s: finder._select(obs, known, [replace(beside, sighting=s), replace(there, sighting=-0.1)])[0]
+        for s in (None, 0.6)
+    }
+    assert chosen[None].hypothesis.origin == "there" and chosen[0.6].hypothesis.origin == "beside"
 
 
 def test_what_would_show_more_turned_otherwise_is_turned():

@@ -7,7 +7,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.method.factor_graph import ObjectGraph
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import Lifecycle
+from p2p_lib.method.lifecycle import Lifecycle, Verdict
 from p2p_lib.method.two_maps import Relation
 from tests.method.analytic_scene import LUMP, around
 from tests.method.test_factor_graph import ALL, Turntable
@@ -31,7 +31,7 @@ def test_a_relation_needs_frames_that_say_it_alike_and_begins_anew_where_they_do
     for off in ([0, np.radians(8), 0, 0, 0, 0], [0, 0, 0, 0.015, 0, 0]):
         other = T_FIRST_SECOND @ se3.exp(np.array(off))
         assert not relation.with_frame(other, p).certain
-        np.testing.assert_array_equal(relation.with_frame(other, p).mean, other)
+        np.testing.assert_allclose(relation.with_frame(other, p).mean, other, atol=1e-12)
 
 
 def test_joined_surfaces_are_that_of_all_views_in_one_frame():
@@ -102,10 +102,14 @@ def test_joined_keypoints_keep_what_they_have_been_through():
 
 def test_a_life_told_in_another_frame_is_the_same():
     T = se3.exp(np.random.default_rng(0).normal(0, 0.3, (2, 6)))
-    life = Lifecycle("tracked", T[0], 0.0).placed(np.eye(4)).with_pose(T[1], 0.03, "tracked")
+    life = Lifecycle("tracked", T[0], 0.0).placed(np.eye(4)).with_pose(T[1], 0.03, Verdict(True, "tracked"))
     T_other = T @ T_FIRST_SECOND
-    other = Lifecycle("tracked", T_other[0], 0.0).placed(np.eye(4)).with_pose(T_other[1], 0.03, "tracked")
+    other = (
+        Lifecycle("tracked", T_other[0], 0.0).placed(np.eye(4)).with_pose(T_other[1], 0.03, Verdict(True, "tracked"))
+    )
     moved = life.in_frame(T_FIRST_SECOND)
     for name in ("T_cam_obj", "T_previous", "T_world_obj"):
         np.testing.assert_allclose(getattr(moved, name), getattr(other, name), atol=1e-12)
+    np.testing.assert_allclose(moved.moved(0.9).motion.T_cam_obj, other.T_cam_obj, atol=1e-12)
+    np.testing.assert_allclose(life.moved(0.9).in_frame(T_FIRST_SECOND).motion.T_cam_obj, other.T_cam_obj, atol=1e-12)
     assert moved.T_left is None and pytest.approx(moved.seen_s) == other.seen_s

@@ -1,0 +1,59 @@
+"""How one object moves: a prior that outlives a gap (not in the paper)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+
+#: The newest velocity counts by this share in what it was, which smooths the noise of poses.
+_NEWEST = 0.1
+#: What it has been for so long says where the object is, s.
+_CARRIED_S = 1.5
+#: What it leaves open grows by this, m/s.
+_OPEN_M_S = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What the sure poses of an object say of its motion; a value that each of them makes anew.
+
+    T_cam_obj  (4, 4) the newest of them
+    time_s     its time
+    velocity   (6,) in the camera frame: of the turn, rad/s, and of the origin, m/s
+    """
+
+    T_cam_obj: np.ndarray
+    time_s: float
+    velocity: np.ndarray
+
+    @classmethod
+    def begun(cls, T_cam_obj: np.ndarray, time_s: float) -> Motion:
+        """At rest, until another pose follows."""
+        return cls(T_cam_obj, time_s, np.zeros(6))
+
+    def followed_by(self, T_cam_obj: np.ndarray, time_s: float) -> Motion:
+        """With a later pose."""
+        turn = cv2.Rodrigues(T_cam_obj[:3, :3] @ self.T_cam_obj[:3, :3].T)[0].ravel()
+        newest = np.concatenate([turn, T_cam_obj[:3, 3] - self.T_cam_obj[:3, 3]]) / (time_s - self.time_s)
+        return Motion(T_cam_obj, time_s, self.velocity + _NEWEST * (newest - self.velocity))
+
+    def holds(self, time_s: float) -> bool:
+        """Whether it still says where the object is."""
+        return time_s - self.time_s <= _CARRIED_S
+
+    def reach_m(self, time_s: float) -> float:
+        """How far from where it would be the object may be."""
+        return _OPEN_M_S * (time_s - self.time_s)
+
+    def at(self, time_s: float) -> np.ndarray:
+        """(4, 4) T_cam_obj if it has gone on as it did."""
+        turn, moved_m = np.split(self.velocity * (time_s - self.time_s), 2)
+        return se3.from_rt(cv2.Rodrigues(turn)[0] @ self.T_cam_obj[:3, :3], self.T_cam_obj[:3, 3] + moved_m)
+
+    def in_frame(self, T_old_new: np.ndarray) -> Motion:
+        """The same of another object frame; T_old_new (4, 4) maps it to the one so far."""
+        return Motion(self.T_cam_obj @ T_old_new, self.time_s, self.velocity)
