@@ -14,8 +14,8 @@ object's step; ``pose_finder`` has its first half, up to the pose), then at the 
   ``keyframes``, ``keyframe_views``); ``sampling`` chooses new points; ``confidence`` says how well the pose is known.
 
 ``outlook`` answers what the pipeline asks around this step: where the object should show, which tracks are elsewhere.
-An object that shows a side never seen has two maps for a while: ``two_maps`` says when they are one. ``shape_search``
-looks for an absent object by its surface.
+An object that shows a side never seen has two maps for a while: ``two_maps`` says when they are one. ``motion``
+says where an absent object was going, ``shape_search`` looks for it by its surface.
 
 The 2D tracker, the detector of candidates and the segmenter are parts that it is given; what it asks of them is in
 :mod:`p2p_lib.core.interfaces`. Where an absent object may lie it is told by :mod:`p2p_lib.recovery`.
