@@ -32,8 +32,8 @@ OUTLINE, _LONGEST_DOUBT = 0.45, 60
 MAPPED = 0.1
 #: The motion so far is that of poses with more confidence.
 _SURE = 0.5
-#: Shape and colour tell a turn from all others by this lead.
-TELLING = 0.25
+#: Shape and colour tell a turn from all others by this lead, and leave no doubt by this one.
+TELLING, CLEAR = 0.25, 0.5
 
 
 @dataclass(frozen=True)
@@ -204,8 +204,8 @@ class Lifecycle:
 
     def with_pose(self, T_cam_obj: np.ndarray, time_s: float, verdict: Verdict, lead: float | None = None) -> Lifecycle:
         """The state after a frame with an accepted pose, and the lead by which it was."""
-        told = lead is not None and lead >= TELLING
-        longest = CONFIRM_SIGHTED_FRAMES if verdict.status is Status.DEGRADED and not told else CONFIRM_FRAMES
+        clear = verdict.status is not Status.DEGRADED or (lead is not None and lead >= CLEAR)
+        longest = CONFIRM_FRAMES if clear else CONFIRM_SIGHTED_FRAMES
         return replace(
             self,
             status=verdict.status,
