@@ -9,6 +9,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import LifecycleConfig
 from p2p_lib.core.types import WITH_POSE, Status
 from p2p_lib.method.lifecycle import (
+    CLEAR,
     CONFIRM_FRAMES,
     CONFIRM_SIGHTED_FRAMES,
     GATES,
@@ -102,10 +103,10 @@ def test_what_the_surface_alone_says_proves_nothing_where_the_image_says_otherwi
     assert proven.confirming == CONFIRM_SIGHTED_FRAMES - 1 and not proven.lost_frames
 
 
-def test_a_return_whose_turn_is_told_is_confirmed_as_soon_as_one_by_points():
+def test_a_return_whose_turn_is_clear_is_confirmed_as_soon_as_one_by_points():
     away = lived(GOOD, Status.LOST)[-1]
-    assert away.with_pose(pose(3), 3.0, DEGRADED, 0.9 * TELLING).confirming == CONFIRM_SIGHTED_FRAMES
-    assert away.with_pose(pose(3), 3.0, DEGRADED, TELLING).confirming == CONFIRM_FRAMES
+    assert away.with_pose(pose(3), 3.0, DEGRADED, 0.9 * CLEAR).confirming == CONFIRM_SIGHTED_FRAMES
+    assert away.with_pose(pose(3), 3.0, DEGRADED, CLEAR).confirming == CONFIRM_FRAMES
 
 
 def test_moves_are_told_from_the_frame_before():
