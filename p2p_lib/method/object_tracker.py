@@ -181,7 +181,7 @@ class ObjectTracker:
             nothing = obs.mask is None and not obs.seen.any()
             return Verdict(False, Status.OCCLUDED if nothing else Status.LOST, reason)
         size, outline = self._size(obs, best), self._outline(obs)
-        carried = self.life.carried(obs.frame.time_s)
+        carried = self.config.method.motion and self.life.carried(obs.frame.time_s)
         evidence = replace(best.evidence, size=size, outline=outline, still=obs.still, carried=carried)
         return self.life.judge(evidence, self._gates, self.config.lifecycle)
 

@@ -19,7 +19,7 @@ OCCASIONS = {
     "registration.iterations": ((100, 1), {"method.motion": False}),
     "registration.sample_size": ((4, 3), {"method.motion": False, "registration.iterations": 1, "method.scene": False}),
     "refinement.huber_m": ((0.01, 0.0005), {}),
-    "method.gates": (("none", "all"), {"method.redetection": False, "method.scene": False}),
+    "method.gates": (("none", "all"), {"method.redetection": False, "method.scene": False, "method.motion": False}),
     "method.scene": ((False, True), {"method.redetection": False}),
 }
 #: A tracker that finds so few points again tells these.
