@@ -86,6 +86,8 @@ class Hint:
     T_cam_obj   (4, 4) that pose; None where there is none
     sighted     the object has been found there by shape and colour, after an absence
     gone        it lies outside the image, if it has stayed where it was
+    place       (4,) where its motion leads, while nothing of it is found: its middle in the camera frame, and how far
+                it may be from there, m; None where nobody knows
     """
 
     uv_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
@@ -93,6 +95,7 @@ class Hint:
     T_cam_obj: np.ndarray | None = None
     sighted: bool = False
     gone: bool = False
+    place: np.ndarray | None = None
 
 
 class Segmenter(Protocol):

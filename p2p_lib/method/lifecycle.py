@@ -92,6 +92,7 @@ class Lifecycle:
     doubted         since a gap nothing has told its turn from others that look alike
     lost_frames     frames since the newest proven pose in which it was in view
     doubted_frames  newest frames in a row whose pose was doubted by one of :data:`DOUBTS`
+    in_sight        it has had a mask in every frame since its newest pose, or since its motion still led to it
     """
 
     status: Status = Status.INITIALISING
@@ -107,6 +108,7 @@ class Lifecycle:
     doubted: bool = False
     lost_frames: int = 0
     doubted_frames: int = 0
+    in_sight: bool = False
 
     @property
     def has_pose(self) -> bool:
@@ -141,10 +143,6 @@ class Lifecycle:
         if self.T_previous is not None:
             priors["constant velocity"] = self.T_cam_obj @ se3.inverse(self.T_previous) @ self.T_cam_obj
         return priors
-
-    def carried(self, time_s: float) -> bool:
-        """Whether its motion so far still says where it is at this time."""
-        return self.motion is not None and self.motion.holds(time_s)
 
     def scene_prior(self, T_world_cam: np.ndarray | None) -> dict[str, np.ndarray]:
         """Where an absent object is if it has lain still: origin to T_cam_obj; empty where nobody knows."""
@@ -214,6 +212,7 @@ class Lifecycle:
             pace_s=time_s - self.seen_s if self.has_pose else self.pace_s,
             lost_frames=0 if verdict.proven else self.lost_frames + 1,
             start_px=None,
+            in_sight=True,
             doubted_frames=self.doubted_frames + 1 if verdict.doubted else 0,
             doubted=self.doubted if lead is None else lead < TELLING,
             T_previous=self.T_cam_obj if self.has_pose else None,
@@ -221,11 +220,16 @@ class Lifecycle:
             confirming=min(max(self.confirming - verdict.proven, 0), longest) if self.has_pose else longest,
         )
 
-    def without_pose(self, status: Status, mask_px: int | None = None) -> Lifecycle:
-        """The state after a frame without a pose. A return that was not confirmed is taken back."""
+    def without_pose(self, status: Status, mask_px: int | None = None, carried: bool = False) -> Lifecycle:
+        """The state after a frame without a pose, where its motion leads or not; see :class:`Evidence`.
+
+        A return that was not confirmed is taken back.
+        """
         taken_back = {"T_cam_obj": self.T_left, "confirming": 0} if self.confirming else {}
-        lost_frames = self.lost_frames + (status is Status.LOST)
-        return replace(self, status=status, lost_frames=lost_frames, start_px=mask_px, **taken_back)
+        lost = status is Status.LOST
+        in_sight = lost and (self.in_sight or carried)
+        lost_frames = self.lost_frames + lost
+        return replace(self, status=status, lost_frames=lost_frames, start_px=mask_px, in_sight=in_sight, **taken_back)
 
 
 def _sighted(life: Lifecycle, evidence: Evidence) -> bool:

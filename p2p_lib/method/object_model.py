@@ -288,6 +288,16 @@ class Known:
         """(N,) bool: the promoted points that are seen."""
         return obs.seen & self.map.promoted
 
+    def carried(self, time_s: float) -> bool:
+        """Whether its motion so far still says where the object is at this time."""
+        life = self.life
+        return self.model.config.method.motion and life.motion is not None and life.motion.holds(time_s)
+
+    @property
+    def first_view_alone(self) -> bool:
+        """Whether it is known from the view that it began with, and never was sure of another pose."""
+        return self.life.motion is None and len(self.model.views) == 1
+
     def lost(self) -> Known:
         """The same after a frame in which the object was not found by it."""
         return replace(self, life=self.life.without_pose(Status.LOST))

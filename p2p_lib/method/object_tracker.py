@@ -108,7 +108,7 @@ class ObjectTracker:
     @property
     def outlook(self) -> Outlook:
         """Where it should show."""
-        return Outlook(self.known, self.observer, self.finder, self.config)
+        return Outlook(self.known, self.observer, self.finder, self.config, self.aside)
 
     def known_as(self, map_id: int) -> Known | None:
         """What is known in the map of this number; None where it has been given up."""
@@ -181,7 +181,7 @@ class ObjectTracker:
             nothing = obs.mask is None and not obs.seen.any()
             return Verdict(False, Status.OCCLUDED if nothing else Status.LOST, reason)
         size, outline = self._size(obs, best), self._outline(obs)
-        carried = self.config.method.motion and self.life.carried(obs.frame.time_s)
+        carried = self.known.carried(obs.frame.time_s)
         evidence = replace(best.evidence, size=size, outline=outline, still=obs.still, carried=carried)
         return self.life.judge(evidence, self._gates, self.config.lifecycle)
 
@@ -290,10 +290,9 @@ class ObjectTracker:
             T_cam_obj[:3, 3] = np.median(p_cam, 0)
         verdict, forgotten = Verdict(True, Status.TRACKED), NO_IDS
         if not self.model.empty:
-            if aside:
-                self.aside = self.known.lost()
-            else:
-                forgotten = self.map.ids[self.map.ids >= 0]
+            gone = self.aside if aside else self.known
+            forgotten = NO_IDS if gone is None else gone.map.ids[gone.map.ids >= 0]
+            self.aside = self.known.lost() if aside else self.aside
             self.known, self._relation = Known(self._new_model(), self.life, self.map_id + 1), Relation()
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:
@@ -314,12 +313,15 @@ class ObjectTracker:
         return not self.life.followed or (more and self._outline(obs) >= OUTLINE)
 
     def _turned_over(self, obs: Observation) -> bool:
-        """Whether a known object stays lost in plain view: it shows a side that nobody knows, in a mask that is given.
+        """Whether a known object stays lost in plain view: it shows a side that nobody knows.
 
-        What the segmenter takes for an object that agrees with nothing known of it may be anything.
+        Its mask is given, or it has been in sight since: what the segmenter takes later for an object that was hidden,
+        and that agrees with nothing known of it, may be anything.
         """
-        known = self._gates and self.aside is None and self.life.lost_frames >= _STAYS_LOST
-        if not known or obs.mask is None or not obs.given or self.observer.cut_off(obs):
+        room = self.aside is None or self.aside.first_view_alone
+        known = self._gates and room and self.life.lost_frames >= _STAYS_LOST
+        of_it = obs.given or self.life.in_sight
+        if not known or obs.mask is None or not of_it or self.observer.cut_off(obs):
             return False
         plain = self.observer.area_m2(obs) >= _IN_PLAIN_VIEW * self.model.seen_m2
         return plain and self._outline(obs) >= OUTLINE
@@ -379,7 +381,7 @@ class ObjectTracker:
         )
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
-        self.life = self.life.without_pose(status, obs.mask_px)
+        self.life = self.life.without_pose(status, obs.mask_px, self.known.carried(obs.frame.time_s))
         self._trusted = self._trusted if status is Status.LOST else None
         reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self.outlook.out_of_view else reason
         estimate = PoseEstimate(

@@ -5,7 +5,7 @@ Questions, without side effects: an object's step is :mod:`p2p_lib.method.object
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,12 +31,13 @@ def hidden(mask_px: int | None, config: Config) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """By what is ``known`` of one object."""
+    """By what is ``known`` of one object, and where it is absent by what was put ``aside``."""
 
     known: Known
     observer: Observer
     finder: PoseFinder
     config: Config
+    aside: Known | None = None
 
     @property
     def sought(self) -> bool:
@@ -112,8 +113,12 @@ class Outlook:
                 uv_px = np.concatenate([obs.tracks.uv_px[agrees], sighting.uv_px])
                 return self._hint(obs.frame, uv_px, sighting.T_cam_obj, True), requests
             best = best if enough else None
+        if best is None and self.aside is not None:
+            by_aside, _ = replace(self, known=self.aside, aside=None).hint(obs.aside)
+            if len(by_aside.uv_px):
+                return by_aside, requests
         if best is None:
-            return Hint(gone=self._gone(obs.frame)), requests
+            return Hint(gone=self._gone(obs.frame), place=self._place(obs.frame.time_s)), requests
         return self._hint(obs.frame, obs.tracks.uv_px[best.inliers], best.T_cam_obj, False), requests
 
     def _hint(self, frame: Frame, uv_px: np.ndarray, T_cam_obj: np.ndarray, sighted: bool) -> Hint:
@@ -126,6 +131,14 @@ class Outlook:
     def _gone(self, frame: Frame) -> bool:
         """Whether nothing of an absent object would show in the image if it has lain still; False if nobody knows."""
         return any(not self._inside(T).any() for T in self.known.life.scene_prior(frame.T_world_cam).values())
+
+    def _place(self, time_s: float) -> np.ndarray | None:
+        """Where an absent object's motion leads: see :class:`p2p_lib.core.interfaces.Hint`."""
+        if not (self.sought and self.known.carried(time_s)):
+            return None
+        motion = self.known.life.motion
+        middle = se3.transform(motion.at(time_s), self.known.map.p_obj.mean(0, keepdims=True))[0]
+        return np.append(middle, motion.reach_m(time_s))
 
     def _inside(self, T_cam_obj: np.ndarray) -> np.ndarray:
         """(N,) bool: the keypoints that a pose puts into the image, whatever may hide them."""

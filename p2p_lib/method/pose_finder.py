@@ -97,7 +97,7 @@ class PoseFinder:
     def _carried_on(self, obs: Observation, known: Known) -> dict[str, np.ndarray]:
         """Where an absent object is if it has gone on as it did, and where its depth is, turned like that."""
         motion, time_s = known.life.motion, obs.frame.time_s
-        if not (known.life.carried(time_s) and len(obs.cloud) and self.shape.knows(known)):
+        if not (known.carried(time_s) and len(obs.cloud) and self.shape.knows(known)):
             return {}
         T_cam_obj = motion.at(time_s)
         (on_depth,) = laid_on(T_cam_obj[None], obs.cloud, known.model.sample)

@@ -1,4 +1,4 @@
-"""Where an object shows by shape and colour, when points do not say it: its last places, the turns of its keyframes.
+"""Where an object shows by shape and colour, when points do not say it: its last places, its motion, its known turns.
 
 What it is compared with is the surface, by :class:`p2p_lib.recovery.search.ImageSearch` (not in the paper).
 """
@@ -37,9 +37,11 @@ class ShapeSearch:
         return [search.at(T_cam_obj, known.model.sample) for T_cam_obj in poses]
 
     def sighted(self, obs: Observation, known: Known) -> Sighting | None:
-        """Where a sought object shows, near where the scene says or it was found a frame ago, or in its mask."""
-        life, model = known.life, known.model
+        """Where a sought object shows: near where scene or motion say, or where it was a frame ago; or in its mask."""
+        life, model, time_s = known.life, known.model, obs.frame.time_s
         proposed = [*life.scene_prior(obs.frame.T_world_cam).values()]
+        if obs.mask is None and known.carried(time_s):  # in a mask it is laid on its depth besides
+            proposed.append(life.motion.at(time_s))
         proposed += [life.T_cam_obj] if life.has_pose else []
         with self._stopwatch("search"):
             search = self._search(obs.frame)

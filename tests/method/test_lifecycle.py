@@ -80,13 +80,21 @@ def test_only_sure_poses_say_how_it_moves():
 
 def test_for_a_while_the_surface_stands_for_points_where_the_motion_leads():
     away = lived(GOOD)[-1].moved(0.9).without_pose(Status.OCCLUDED)
-    assert away.carried(away.seen_s + 1) and not away.carried(away.seen_s + 2)
-    assert not lived(GOOD)[-1].carried(1.0), "no pose was sure"
+    assert away.motion.holds(away.seen_s + 1) and not away.motion.holds(away.seen_s + 2)
     fits = Evidence(0, 0.61, carried=True)
     assert away.judge(fits, ALL, CFG).accepted and away.judge(fits, ALL, CFG).status is Status.DEGRADED
     assert not away.judge(dataclasses.replace(fits, surface_share=0.59), ALL, CFG).accepted
     assert not away.judge(dataclasses.replace(fits, surface_share=0.59, support=3), ALL, CFG).accepted
     assert not away.judge(dataclasses.replace(fits, carried=False), ALL, CFG).accepted
+
+
+def test_it_is_in_sight_until_it_is_hidden():
+    life = lived(GOOD, Status.LOST)[-1]
+    assert life.in_sight and life.without_pose(Status.LOST).in_sight
+    hidden = life.without_pose(Status.OCCLUDED, carried=True)
+    assert not hidden.in_sight and not hidden.without_pose(Status.LOST).in_sight
+    back = hidden.without_pose(Status.LOST, carried=True)
+    assert back.in_sight and back.without_pose(Status.LOST).in_sight
 
 
 def test_what_the_surface_alone_says_proves_nothing_where_the_image_says_otherwise():

@@ -808,6 +808,19 @@ def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_bo
     assert valid.mean() > 0.9 and np.median(np.abs(distance_m[valid])) < 0.002
 
 
+@pytest.mark.parametrize(("sure", "views", "room"), [(False, 1, True), (False, 2, False), (True, 1, False)])
+def test_a_map_aside_makes_room_where_it_knows_one_view_alone(sure, views, room):
+    lump, old, _ = turned_over()
+    gone, second = lump.tracker.aside, lump.tracker.map.ids.copy()
+    gone.model.views.T_cam_obj = np.repeat(START[None], views, 0)
+    lump.tracker.aside = gone if sure else replace(gone, life=replace(gone.life, motion=None))
+    lump.steps += [lump.steps[-1]] * 60
+    steps = [lump.see(about(270), unseen) for _ in range(16)]
+    begun = [step for step in steps if step.estimate.map_id == 2]
+    assert bool(begun) == room and (not room or set(begun[0].requests.drop) == set(old[old >= 0]))
+    assert set(second) <= set(lump.tracker.ids)
+
+
 def test_where_the_first_map_fits_again_and_the_second_does_not_the_first_one_goes_on():
     lump, old, _ = turned_over()
     second = lump.tracker.map.ids.copy()
@@ -847,14 +860,55 @@ def test_no_map_is_begun_in_a_frame_that_shows_the_object_as_it_is_known():
     assert back.estimate.map_id == 0 and back.estimate.status is Status.RECOVERED
 
 
-def test_no_second_map_of_what_only_the_segmenter_takes_for_the_object():
+@pytest.mark.parametrize("hidden", [True, False])
+def test_no_second_map_of_what_only_the_segmenter_takes_for_a_hidden_object(hidden):
+    """What it has followed since there was a pose is the object."""
     lump = later(settled(begun(), [2, 4]))
     old = lump.tracker.map.ids.copy()
+    if hidden:
+        lump.see(about(150), mask=NOTHING)
     for _ in range(16):
         obs = lump.observed(about(150), hide(lambda tracks: np.isin(tracks.ids, old)))
         step = lump.tracker.step(replace(obs, given=False))
         lump.steps.append(step)
-    assert step.estimate.status is Status.LOST and step.estimate.map_id == 0
+    assert step.estimate.map_id == (0 if hidden else 1) and (step.estimate.status is Status.LOST) == hidden
+
+
+def test_what_is_back_while_its_motion_leads_is_in_sight():
+    lump = settled(begun(), range(1, 30))
+    assert lump.see(turned(30), mask=NOTHING).estimate.T_cam_obj is None and not lump.tracker.life.in_sight
+    beyond = se3.from_rt(np.eye(3), [0.05, 0, -0.05]) @ turned(30)
+    assert lump.see(beyond, unseen).estimate.status is Status.LOST and lump.tracker.life.in_sight
+
+
+def test_where_an_absent_object_is_expected_by_its_motion():
+    lump = settled(begun(), range(1, 60))
+
+    def place(deg: float, time_s: float = 0.0) -> np.ndarray | None:
+        obs = replace(lump.observed(turned(deg), unseen), mask=None)
+        obs = replace(obs, frame=replace(obs.frame, time_s=obs.frame.time_s + time_s))
+        return lump.outlook.hint(obs)[0].place
+
+    assert place(60) is None, "it has a pose"
+    lump.see(turned(60), mask=NOTHING)
+    T_cam_obj = turned(61) @ se3.inverse(lump.T_first[1]) @ lump.T_first[0]
+    middle = se3.transform(T_cam_obj, lump.tracker.map.p_obj.mean(0, keepdims=True))[0]
+    assert np.linalg.norm(place(61)[:3] - middle) < 0.003 and 0 < place(61)[3] < 0.02 and place(61, 2.0) is None
+    other = settled(begun(method__motion=False), range(1, 60))
+    other.see(turned(60), mask=NOTHING)
+    assert other.outlook.hint(replace(other.observed(turned(61), unseen), mask=None))[0].place is None
+
+
+def test_an_absent_object_is_looked_for_by_the_map_that_was_put_aside_too():
+    lump, *_ = turned_over()
+    second = lump.tracker.map.ids.copy()
+    lump.see(START, mask=NOTHING)
+    frame = lump.observed(about(3)).frame
+    known = lump.tracker.observe(frame, None, hide(lambda tracks: np.isin(tracks.ids, second))(lump.tracks(about(3))))
+    hint, _ = lump.outlook.hint(known)
+    assert len(hint.uv_px) > 10 and np.linalg.norm(hint.T_cam_obj[:3, 3] - about(3)[:3, 3]) < 0.1
+    neither = lump.tracker.observe(frame, None, unseen(lump.tracks(about(3))))
+    assert not len(lump.outlook.hint(neither)[0].uv_px)
 
 
 def test_points_off_the_mask_are_no_observations_and_elsewhere_when_it_is_away():
@@ -936,7 +990,7 @@ def test_a_hint_says_that_what_lay_still_is_outside_the_image_where_the_camera_i
 
 
 def test_a_lost_object_is_looked_for_turned_as_in_its_keyframes():
-    lump = settled(begun(), range(5, 65, 5))
+    lump = later(settled(begun(), range(5, 65, 5)))
     truth = se3.from_rt(np.eye(3), [0.05, 0.03, 0.1]) @ turned(25)
     assert lump.see(truth, unseen).estimate.status is Status.LOST
     obs = lump.observed(truth, unseen)
@@ -970,6 +1024,19 @@ def test_what_went_on_behind_something_is_found_by_its_surface(moved_m, found):
     assert back.inliers == 0 and back.confidence < 0.5
     assert back.status is (Status.DEGRADED if found else Status.LOST)
     assert not found or (lump.off(truth)[0] < 3 and lump.off(truth)[1] < 3)
+
+
+def test_without_a_mask_an_object_is_sighted_where_its_motion_leads():
+    """So the segmenter finds it again."""
+    lump = settled(begun(), range(1, 60))
+    lump.see(turned(60), mask=NOTHING)
+    truth = se3.from_rt(np.eye(3), [0.03, 0, -0.02]) @ turned(66)
+    obs = replace(lump.observed(truth, unseen), mask=None)
+    T_obj_model = se3.inverse(lump.T_first[0]) @ lump.T_first[1]
+    error = se3.inverse(truth) @ lump.outlook.sighted(obs).T_cam_obj @ T_obj_model
+    assert np.degrees(se3.angle_rad(error)) < 6 and np.linalg.norm(error[:3, 3]) < 0.006
+    late = replace(obs, frame=replace(obs.frame, time_s=obs.frame.time_s + 5))
+    assert lump.outlook.sighted(late) is None
 
 
 def test_where_the_image_speaks_for_no_candidate_the_surface_chooses():

@@ -1,5 +1,6 @@
 """The embedded segmenter on an analytic scene and on the embedded sequence: outlines, absence, causality."""
 
+import copy
 from functools import cache
 
 import cv2
@@ -169,6 +170,47 @@ def test_what_is_covered_is_absent_whatever_covers_it():
     points = np.array([[38.0, 158], [50, 165], [60, 170], [70, 160], [80, 190], [45, 185], [60, 190], [75, 175]])
     found = follow.segment(frame, hints={"card": Hint(points)}) == 1
     assert iou(found, card((30, 150))) > 0.9
+
+
+def test_what_comes_out_where_its_motion_leads_is_known_by_its_colours():
+    """No point of it is found again, since it shows another side."""
+    at, back, follow = (40, 90), (230, 95), segmenter()
+
+    def painted(k: int, where: tuple[int, int], rgb: tuple[int, int, int]) -> Frame:
+        frame = picture(k, [(where, 1)])
+        frame.rgb[card(where)], frame.rgb[150:] = rgb, (90, 90, 90)
+        return frame
+
+    first = painted(0, at, (200, 40, 30))
+    first.rgb[card(at, (60, 40))] = (90, 90, 90)  # as the wall's lower end
+    follow.segment(first, on(card=at))
+    assert not (follow.segment(picture(1, [], card(at, (160, 120)))) == 1).any()
+
+    def found(frame: Frame, reach_m: float = 0.05, aside_m: float = 0.0) -> np.ndarray:
+        place = CAMERA.unproject(np.add([back], [30, 25]), np.array([CARD_M + 0.05]))[0] + [aside_m, 0, 0]
+        return copy.deepcopy(follow).segment(frame, hints={"card": Hint(place=np.append(place, reach_m))}) == 1
+
+    there = painted(2, back, (200, 40, 30))
+    assert iou(found(there), card(back)) > 0.9 and iou(found(there, 0.3, -0.3), card(back)) > 0.9
+    assert not found(there, aside_m=-0.3).any(), "out of reach"
+    for other in ((40, 160, 30), (90, 90, 90)):
+        assert not found(painted(2, back, other)).any(), "in other colours"
+    flat = picture(2, [])
+    flat.rgb[card(back)] = 200, 40, 30
+    place = np.append(CAMERA.unproject(np.add([back], [30, 25]), np.array([WALL_M]))[0], 0.05)
+    on_wall = copy.deepcopy(follow).segment(flat, hints={"card": Hint(place=place)})
+    assert not (on_wall == 1).any(), "it is painted on the wall"
+    small, piece = picture(2, []), card((250, 115), (14, 12))
+    small.rgb[piece], small.depth_m[piece] = (200, 40, 30), CARD_M
+    for z_m, there_px in ((CARD_M + 0.05, 100), (CARD_M + 0.25, 0)):
+        place = np.append(CAMERA.unproject(np.array([[257, 121]]), np.array([z_m]))[0], 0.05)
+        shown = copy.deepcopy(follow).segment(small, hints={"card": Hint(place=place)}) == 1
+        assert (shown & piece).sum() >= there_px and shown.any() == (there_px > 0)
+    twin = card((162, 90), (60, 56))
+    there.rgb[twin], there.depth_m[twin] = (200, 40, 30), CARD_M
+    hints = {"card": Hint(place=np.array([0.2, 0.0, 0.75, 0.2]))}
+    beside = copy.deepcopy(follow).segment(there, [Prompt("twin", 2, mask=twin)], hints)
+    assert iou(beside == 1, card(back)) > 0.7, "its larger twin is another object"
 
 
 def test_points_on_something_else_do_not_bring_it_back():

@@ -22,9 +22,19 @@ from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
-from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
+from p2p_lib.segmenters.builtin.cut import PLANE_SLACK_M, by_colour, by_geometry, by_surface, cut, warped
 from p2p_lib.segmenters.builtin.motion import Motions, Past, scene_stays
-from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, filled, middle, support_plane
+from p2p_lib.segmenters.builtin.patch import (
+    Box,
+    Patch,
+    around,
+    dilated,
+    filled,
+    middle,
+    parts_of,
+    plane_heights,
+    support_plane,
+)
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start, only
 
 _NO_PX = np.zeros((0, 2))
@@ -36,6 +46,9 @@ _JUMPED, _CHANGED, _BLIND = 0.03, 0.1, 0.25
 _MEASURED = 0.6
 #: What shows again after nothing of an object was measured is near to where it was.
 _APART_M = 0.1
+#: So many pixels together, each so much likelier in an object's colours (nats), are the object where it is expected;
+#: they are so many standard deviations above what is flat there.
+_ENOUGH_PX, _TOLD, _STANDS_OUT = 80, 1.0, 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,16 +327,22 @@ class BuiltinSegmenter:
         return replace(target, room_m=away_px / px_m)
 
     def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> tuple[Box, np.ndarray] | None:
-        """Where enough of its points have come back, on nothing that is ``taken`` (H, W) bool by another object."""
+        """Where enough of its points are back, or it is expected, on nothing ``taken`` (H, W) by another object."""
         cfg, uv_px = self.config, hint.uv_px[~in_mask(hint.uv_px, taken)]
-        if target.colours is None or len(uv_px) < cfg.find_points:
+        if target.colours is None:
+            return None
+        expected = len(uv_px) < cfg.find_points and hint.place is not None
+        if expected:
+            uv_px = self._expected(frame, target, hint.place, taken)
+        if len(uv_px) < cfg.find_points:
             return None
         z_m = float(np.nanmedian(depths_at(uv_px, frame)))
         low, high = uv_px.min(0), uv_px.max(0)
         half = np.maximum(target.size_m * self._focal_px / z_m * (0.5 + cfg.margin), high - low) + ROOM_PX
         patch = Patch.of(frame, around((low + high) / 2, half, frame.shape), self.camera, cfg)
         barred = patch.down(taken.astype(np.float32)) > 0.5
-        seeds, surface = patch.dots(uv_px, 1) & (patch.depth_m > 0) & ~barred, by_surface(patch, hint, cfg)
+        seeds = patch.dots(uv_px, 0 if expected else 1) & (patch.depth_m > 0) & ~barred
+        surface = by_surface(patch, hint, cfg)
         outside = ~dilated(seeds | (surface > 0), 3)
         plane = support_plane(patch, (patch.depth_m > 0) & outside, self._rng)
         log_odds, component = by_geometry(patch, seeds, plane, cfg)
@@ -332,6 +351,29 @@ class BuiltinSegmenter:
         x = only(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
         own_colours = colour[x > 0.5]
         return (patch.box, patch.up(x)) if len(own_colours) and (hint.sighted or own_colours.mean() > 0) else None
+
+    def _expected(self, frame: Frame, target: _Target, place: np.ndarray, taken: np.ndarray) -> np.ndarray:
+        """(N, 2) pixels of what shows an object's colours near the place of a hint, and nothing beside that does."""
+        middle_m, within_m = place[:3], target.size_m.max() / 2 + place[3]
+        (middle_px,) = self.camera.project(middle_m[None])
+        if not self.camera.inside(middle_px, -0.5):
+            return _NO_PX
+        half = within_m * self._focal_px / middle_m[2] + ROOM_PX
+        patch = Patch.like(frame, around(middle_px, half, frame.shape), 1, self.camera)
+        measured = (patch.depth_m > 0) & ~taken[patch.box.slices]
+        near = measured & (np.linalg.norm(patch.points() - middle_m, axis=-1) < within_m)
+        colour = by_colour(patch, target.colours, measured & ~near, self.config)
+        like, plane = near & (colour > 0), support_plane(patch, measured, self._rng)
+        if plane is not None:
+            like &= plane_heights(patch, plane) > _STANDS_OUT * patch.sigma_m + PLANE_SLACK_M
+        part = np.where(like, parts_of(dilated(like, 1)), 0)
+        size = np.bincount(part.ravel())
+        told = np.bincount(part.ravel(), colour.ravel()) / np.maximum(size, 1)
+        size[(told < _TOLD) | (size < _ENOUGH_PX)], size[0] = 0, 0
+        if not size.any():
+            return _NO_PX
+        v, u = np.nonzero(part == size.argmax())
+        return np.stack([u + patch.box.left, v + patch.box.top], -1).astype(float)
 
     def _box_of_all(self, target: _Target, shape: tuple[int, int]) -> Box:
         """Where to look for an object that was seen: room for all of it to either side of what showed."""
