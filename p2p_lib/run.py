@@ -336,7 +336,7 @@ def _track(job: _Job, keeper: Keeper, progress: bool) -> None:
             if not writer.begun:
                 writer.begin()  # all frames were on disk, the maps were not
         except KeyboardInterrupt:
-            writer.info["stopped_by"] = "KeyboardInterrupt"
+            writer.stopped("KeyboardInterrupt")
     if writer.begun:
         keeper.save_maps()
 

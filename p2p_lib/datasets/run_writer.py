@@ -161,6 +161,18 @@ class RunWriter:
                 mask = masks.get(name)
                 save_png(path, np.zeros(frame.shape, bool) if mask is None else mask)
 
+    def stopped(self, by: str) -> None:
+        """An error or a signal ends the run, perhaps while a frame was written: those before it are kept, whole."""
+        self.info["stopped_by"] = by
+        kept = [*self._estimates.values(), self._visible_px, self._frames, self._timings]
+        whole = min(map(len, kept))
+        for rows in kept:
+            del rows[whole:]
+        if self.begun:
+            for name in self._estimates:
+                self._write_poses(name)
+            self._write_timings()
+
     @property
     def resumed(self) -> bool:
         """Whether the run in the folder goes on."""
@@ -194,7 +206,7 @@ class RunWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         with self._held:
             if kind is not None:
-                self.info["stopped_by"] = kind.__name__
+                self.stopped(kind.__name__)
             if self.begun:
                 self.info["finished"] = self.info["stopped_by"] is None
                 self.flush()

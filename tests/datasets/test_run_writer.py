@@ -222,6 +222,26 @@ def test_a_kill_at_any_moment_leaves_a_readable_run(folder, tmp_path, monkeypatc
         add(made, 1)
 
 
+@pytest.mark.parametrize(("at", "frames"), [("_not_yet", 3), ("append", 4)])
+def test_an_interrupt_while_a_frame_is_written_leaves_whole_frames(folder, tmp_path, monkeypatch, at, frames):
+    """Before all of it is known, or after its pose and before its time is on disk."""
+    write_one = run_writer.append
+
+    def interrupt(path, *rest):
+        if at == "append" and Path(path).name != "timings.csv":
+            return write_one(path, *rest)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), writer(tmp_path / "run", folder) as made:
+        add(made, 3)
+        monkeypatch.setattr(run_writer, at, interrupt)
+        add(made, 4, start=3, objects=("box", "can") if at == "append" else ("box",))
+    monkeypatch.undo()
+    run, lines = load_run(tmp_path / "run"), (tmp_path / "run/poses/box.txt").read_text().splitlines()
+    assert [len(run.objects[name]) for name in ("box", "can")] == [frames] * 2
+    assert len(run.timings["total_ms"]) == len(lines) == frames and run.info["frames"] == frames
+
+
 def test_a_line_is_appended_whole_or_not(tmp_path, monkeypatch):
     """A disk that takes the first bytes of a line alone."""
     import resource
