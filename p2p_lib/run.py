@@ -336,7 +336,8 @@ def _track(job: _Job, keeper: Keeper, progress: bool) -> None:
             if not writer.begun:
                 writer.begin()  # all frames were on disk, the maps were not
         except KeyboardInterrupt:
-            writer.stopped("KeyboardInterrupt")
+            writer.info["stopped_by"] = "KeyboardInterrupt"
+            writer.keep_whole_frames()
     if writer.begun:
         keeper.save_maps()
 

@@ -168,6 +168,7 @@ def _kept(
             yield listen
         except KeyboardInterrupt as stop:
             stopped = stop
+            writer.keep_whole_frames()
         if writer.begun:
             keeper.save_maps()
     if stopped:

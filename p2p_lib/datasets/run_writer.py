@@ -161,9 +161,8 @@ class RunWriter:
                 mask = masks.get(name)
                 save_png(path, np.zeros(frame.shape, bool) if mask is None else mask)
 
-    def stopped(self, by: str) -> None:
-        """An error or a signal ends the run, perhaps while a frame was written: those before it are kept, whole."""
-        self.info["stopped_by"] = by
+    def keep_whole_frames(self) -> None:
+        """After an interrupt, perhaps while a frame was written: the frames before it are kept, whole."""
         kept = [*self._estimates.values(), self._visible_px, self._frames, self._timings]
         whole = min(map(len, kept))
         for rows in kept:
@@ -206,7 +205,8 @@ class RunWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         with self._held:
             if kind is not None:
-                self.stopped(kind.__name__)
+                self.info["stopped_by"] = kind.__name__
+                self.keep_whole_frames()
             if self.begun:
                 self.info["finished"] = self.info["stopped_by"] is None
                 self.flush()

@@ -292,7 +292,8 @@ class ObjectTracker:
         if not self.model.empty:
             gone = self.aside if aside else self.known
             forgotten = NO_IDS if gone is None else gone.map.ids[gone.map.ids >= 0]
-            self.aside = self.known.lost() if aside else self.aside
+            if aside:
+                self.aside = self.known.lost()
             self.known, self._relation = Known(self._new_model(), self.life, self.map_id + 1), Relation()
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:

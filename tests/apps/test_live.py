@@ -7,6 +7,7 @@ import shutil
 import sys
 import threading
 import time
+from pathlib import Path
 from urllib.request import Request, urlopen
 
 import av
@@ -21,6 +22,7 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
+from p2p_lib.datasets import run_writer
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.prompts import save_prompts
@@ -224,6 +226,27 @@ def test_stopping_a_camera_ends_its_run_well(scripted, folder, tmp_path):
     kept = load_run(tmp_path / "run")
     assert kept.info["finished"] and len(kept.objects["board"]) == 2 and kept.info["path"] is None
     assert load_keypoints(tmp_path / "run")
+
+
+def test_stopping_a_camera_while_a_frame_is_written_keeps_the_frames_before_it(scripted, folder, tmp_path, monkeypatch):
+    sequence, write_one, written = open_sequence(folder), run_writer.append, []
+
+    def interrupted(path, line):
+        written.append(Path(path).name)
+        if written.count("timings.csv") == 2:
+            raise KeyboardInterrupt
+        write_one(path, line)
+
+    def go_on(estimate):
+        scripted.hand.put(sequence.frame(estimate.frame_index + 1))
+
+    monkeypatch.setattr(run_writer, "append", interrupted)
+    for k in range(3):
+        scripted.hand.put(sequence.frame(k))
+    with pytest.raises(KeyboardInterrupt):
+        track_live(scripted, PROMPTS, go_on, RunOptions(settings=SETTINGS), out=tmp_path / "run")
+    kept = load_run(tmp_path / "run")
+    assert kept.info["finished"] and len(kept.objects["board"]) == len(kept.timings["total_ms"]) == kept.info["frames"]
 
 
 # --- the command -------------------------------------------------------------------------------

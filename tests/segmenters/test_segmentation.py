@@ -200,6 +200,11 @@ def test_what_comes_out_where_its_motion_leads_is_known_by_its_colours():
     place = np.append(CAMERA.unproject(np.add([back], [30, 25]), np.array([WALL_M]))[0], 0.05)
     on_wall = copy.deepcopy(follow).segment(flat, hints={"card": Hint(place=place)})
     assert not (on_wall == 1).any(), "it is painted on the wall"
+    tiny = picture(2, [])
+    tiny.rgb[card((255, 118), (8, 8))], tiny.depth_m[card((255, 118), (8, 8))] = (200, 40, 30), CARD_M
+    assert not found(tiny).any(), "a few pixels"
+    behind = {"card": Hint(place=np.array([0.2, 0.0, -0.6, 0.3]))}
+    assert not (copy.deepcopy(follow).segment(there, hints=behind) == 1).any()
     small, piece = picture(2, []), card((250, 115), (14, 12))
     small.rgb[piece], small.depth_m[piece] = (200, 40, 30), CARD_M
     for z_m, there_px in ((CARD_M + 0.05, 100), (CARD_M + 0.25, 0)):

@@ -24,9 +24,14 @@ _AT_THE_BORDER = 0.02
 #: Height in standard deviations of depth at which something stands out of its support.
 _STANDS_OUT = 2.0
 #: A strip of this height above the plane, besides noise, belongs to the plane: its fit is no better.
-PLANE_SLACK_M = 0.003
+_PLANE_SLACK_M = 0.003
 #: Pixels of the smallest image whose optical flow is taken.
 _SMALLEST_FLOW = 32
+
+
+def of_plane_m(sigma_m: np.ndarray | float) -> np.ndarray | float:
+    """Up to which height what is measured with this noise may be of the plane below it."""
+    return (_STANDS_OUT + 0.5) * sigma_m + _PLANE_SLACK_M
 
 
 def by_geometry(
@@ -55,7 +60,7 @@ def by_geometry(
         if abs(above_m) < _STANDS_OUT * sigma_m:
             return log_odds, nothing  # flat: depth does not tell it from what it lies on
         if above_m > 0:
-            low = height < min(above_m / 2, (_STANDS_OUT + 0.5) * sigma_m + PLANE_SLACK_M)
+            low = height < min(above_m / 2, of_plane_m(sigma_m))
             log_odds[measured & low] -= config.geometry_weight
             free = free & ~low
     part = parts_of(free)

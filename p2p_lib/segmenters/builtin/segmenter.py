@@ -22,7 +22,7 @@ from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
-from p2p_lib.segmenters.builtin.cut import PLANE_SLACK_M, by_colour, by_geometry, by_surface, cut, warped
+from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, of_plane_m, warped
 from p2p_lib.segmenters.builtin.motion import Motions, Past, scene_stays
 from p2p_lib.segmenters.builtin.patch import (
     Box,
@@ -46,9 +46,8 @@ _JUMPED, _CHANGED, _BLIND = 0.03, 0.1, 0.25
 _MEASURED = 0.6
 #: What shows again after nothing of an object was measured is near to where it was.
 _APART_M = 0.1
-#: So many pixels together, each so much likelier in an object's colours (nats), are the object where it is expected;
-#: they are so many standard deviations above what is flat there.
-_ENOUGH_PX, _TOLD, _STANDS_OUT = 80, 1.0, 2.5
+#: So many pixels together, each so much likelier in an object's colours (nats), are the object where it is expected.
+_ENOUGH_PX, _TOLD = 80, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,7 +364,7 @@ class BuiltinSegmenter:
         colour = by_colour(patch, target.colours, measured & ~near, self.config)
         like, plane = near & (colour > 0), support_plane(patch, measured, self._rng)
         if plane is not None:
-            like &= plane_heights(patch, plane) > _STANDS_OUT * patch.sigma_m + PLANE_SLACK_M
+            like &= plane_heights(patch, plane) > of_plane_m(patch.sigma_m)
         part = np.where(like, parts_of(dilated(like, 1)), 0)
         size = np.bincount(part.ravel())
         told = np.bincount(part.ravel(), colour.ravel()) / np.maximum(size, 1)
