@@ -74,6 +74,7 @@ def _run(a: argparse.Namespace) -> int:
     "track objects before a camera; a line of JSON per object and frame, on a terminal with --out a readable one",
     arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
     arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
+    arg("--backlog", type=int, metavar="N", help="images that may wait while one takes long (default 4); then drop some"),
     run_options(
         *METHOD,
         prompts="clicks; without, the first image is clicked on",
@@ -95,6 +96,7 @@ def _live(a: argparse.Namespace) -> None:
     options.config()  # what does not fit is said before the camera starts
     _film_wanted(a.overlay)
     keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
+    keep |= {} if a.backlog is None else {"backlog": a.backlog}
     if a.out is not None:
         look_into(a.out, keep["if_exists"])  # before anyone clicks
     prompts = load_prompts(a.prompts) if a.prompts else ()

@@ -1,6 +1,7 @@
 """Track objects in front of a running camera: what ``p2p live`` calls.
 
-The newest frame wins: when a frame takes longer than the camera's, those that came meanwhile are dropped, and counted.
+Where a frame takes longer than the camera's, those that came meanwhile wait; of more than a few the oldest are dropped,
+and counted.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate, status_text
-from p2p_lib.datasets.cameras import LiveCamera, Newest, Stream
+from p2p_lib.datasets.cameras import DEFAULT_BACKLOG, LiveCamera, Newest, Stream
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
@@ -62,6 +63,7 @@ def track_live(
     out: str | Path | None = None,
     overlay: str | Path | None = None,
     if_exists: IfExists = "refuse",
+    backlog: int = DEFAULT_BACKLOG,
 ) -> LiveCount:
     """Follow the objects of the prompts until the camera ends; every estimate goes to ``on_estimate`` at once.
 
@@ -72,6 +74,7 @@ def track_live(
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
     out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
     overlay  a film of it, .mp4, .gif or .webp, as the tracker sees it
+    backlog  how many images may wait while one takes long, before the oldest is dropped; with 0 the newest one wins
 
     Closes the camera at the end, whatever ends it. Raises :class:`BadInput` for clicks that do not fit.
     """
@@ -82,6 +85,8 @@ def track_live(
         raise BadInput("masks", repr(options.masks), f"the name of a segmenter: {', '.join(SEGMENTERS)}")
     if options.stop is not None and options.stop < 1:
         raise BadInput("stop", options.stop, "the number of an image from 1", "Leave it out to end with Ctrl-C.")
+    if backlog < 0:
+        raise BadInput("backlog", backlog, "how many images may wait, from 0")
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
     if options.tracker.startswith("builtin") and masks.segmenter == DEFAULT_SEGMENTER:
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector))
@@ -97,7 +102,7 @@ def track_live(
                 listen(method.frame, estimates)
 
         start_s = monotonic()
-        newest = kept.enter_context(Newest(camera, keep={p.frame for p in prompts}))
+        newest = kept.enter_context(Newest(camera, {p.frame for p in prompts}, backlog))
         frame = first or newest.take()
         while frame is not None and (frame is first or options.stop is None or frame.index < options.stop):
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):

@@ -1,7 +1,7 @@
 """Live cameras: a RealSense, one of its recordings, or a folder played at some rate.
 
-A camera does not wait. :class:`Newest` reads it in a thread of its own and hands out the newest frame alone, so that
-a tracker that is slower than the camera skips frames instead of falling behind.
+A camera does not wait. :class:`Newest` reads it in a thread of its own and lets a few frames wait while one takes long,
+so that a tracker that is slower than the camera skips frames instead of falling behind.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import ObjectTruth, Sequence, open_sequence
 
 DEFAULT_RATE_HZ = 30.0
+#: So many frames may wait: a search or a keyframe takes as long as some frames, and those after it make up for that.
+DEFAULT_BACKLOG = 4
 _FORMS = "realsense, realsense:RECORDING or folder:PATH"
 
 
@@ -109,17 +111,21 @@ def open_camera(spec: str, rate_hz: float | None = None) -> LiveCamera:
 
 
 class Newest:
-    """A camera's newest frame; older ones are dropped, but for those of the indices ``keep``. A context manager."""
+    """A camera's newest frames, in turn. A context manager.
 
-    def __init__(self, source: LiveCamera, keep: Collection[int] = ()):
-        self._source, self._keep = source, frozenset(keep)
+    keep     indices of frames that are not dropped
+    backlog  how many others wait behind the next one; where more do the oldest is dropped
+    """
+
+    def __init__(self, source: LiveCamera, keep: Collection[int] = (), backlog: int = 0):
+        self._source, self._keep, self._most = source, frozenset(keep), backlog + 1
         self._waiting: deque[Frame] = deque()
         self._changed, self._ended = Condition(), False
         self._pool = ThreadPoolExecutor(1)
         self._grabbing = self._pool.submit(self._grab)
 
     def take(self) -> Frame | None:
-        """The newest frame, once each; waits for one. None at the end; raises what ended the camera, if anything."""
+        """The next frame; waits for one. None at the end; raises what ended the camera, if anything."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._ended)
             if self._waiting:
@@ -138,9 +144,10 @@ class Newest:
         try:
             while (frame := self._source.read()) is not None:
                 with self._changed:
-                    if self._waiting and self._waiting[-1].index not in self._keep:
-                        self._waiting.pop()
                     self._waiting.append(frame)
+                    idle = [waits for waits in self._waiting if waits.index not in self._keep]
+                    if len(idle) > self._most:
+                        self._waiting.remove(idle[0])
                     self._changed.notify()
         finally:
             with self._changed:

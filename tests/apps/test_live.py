@@ -91,6 +91,20 @@ def test_the_newest_frame_wins(scripted):
         assert newest.take() is None and newest.take() is None
 
 
+def test_a_few_frames_wait_their_turn(scripted):
+    with Newest(scripted, keep={1}, backlog=2) as newest:
+        for k in range(8):
+            scripted.hand.put(picture(k))
+        scripted.hand.put(None)
+        taken_by_thread(scripted)
+        assert [f.index for f in iter(newest.take, None)] == [1, 5, 6, 7], "three wait besides the one that is kept"
+
+
+def test_a_backlog_below_none_is_refused(folder):
+    with pytest.raises(BadInput, match="backlog.*-1"):
+        track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, print, backlog=-1)
+
+
 def test_frames_that_must_not_be_dropped_wait(scripted):
     with Newest(scripted, keep={1, 3}) as newest:
         for k in range(6):

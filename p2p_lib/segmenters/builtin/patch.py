@@ -173,6 +173,12 @@ class Patch:
         x, y = self.rays()
         return np.stack(np.broadcast_arrays(x, y[:, None], 1.0), -1) * self.depth_m[..., None]
 
+    def squared_distances_m2(self, p_cam: np.ndarray) -> np.ndarray:
+        """(h, w) from a point (3,) in the camera's frame; of an unmeasured pixel it means nothing."""
+        x, y = self.rays()
+        z, (x_m, y_m, z_m) = self.depth_m, p_cam.astype(np.float32)
+        return (x.astype(np.float32) * z - x_m) ** 2 + (y[:, None].astype(np.float32) * z - y_m) ** 2 + (z - z_m) ** 2
+
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         """The slopes x / z of the columns (w,) and y / z of the rows (h,)."""
         u, v = self.centres_px()

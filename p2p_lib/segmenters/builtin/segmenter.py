@@ -360,7 +360,9 @@ class BuiltinSegmenter:
         half = within_m * self._focal_px / middle_m[2] + ROOM_PX
         patch = Patch.like(frame, around(middle_px, half, frame.shape), 1, self.camera)
         measured = (patch.depth_m > 0) & ~taken[patch.box.slices]
-        near = measured & (np.linalg.norm(patch.points() - middle_m, axis=-1) < within_m)
+        near = measured & (patch.squared_distances_m2(middle_m) < within_m**2)
+        if np.count_nonzero(near) < _ENOUGH_PX:
+            return _NO_PX
         colour = by_colour(patch, target.colours, measured & ~near, self.config)
         like, plane = near & (colour > 0), support_plane(patch, measured, self._rng)
         if plane is not None:
