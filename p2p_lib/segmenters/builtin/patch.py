@@ -227,11 +227,6 @@ def dilated(region: np.ndarray, radius: int) -> np.ndarray:
     return cv2.dilate(region.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
 
 
-def filled(region: np.ndarray) -> np.ndarray:
-    """A region (h, w) bool with its gaps of a pixel: those of whose eight neighbours five are of it."""
-    return region | (cv2.blur(region.astype(np.float32), (3, 3)) > 4.5 / 9)
-
-
 def parts_of(region: np.ndarray) -> np.ndarray:
     """(h, w) int: the number of each connected part of a region (h, w) bool, 0 outside it."""
     return cv2.connectedComponents(region.astype(np.uint8), connectivity=4)[1]

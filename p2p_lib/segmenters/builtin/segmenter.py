@@ -29,7 +29,6 @@ from p2p_lib.segmenters.builtin.patch import (
     Patch,
     around,
     dilated,
-    filled,
     middle,
     parts_of,
     plane_heights,
@@ -42,8 +41,6 @@ _NO_PX = np.zeros((0, 2))
 _TURNS = 3
 #: unless more of it than this jumped in depth, its area changed by more, or more of it has no depth.
 _JUMPED, _CHANGED, _BLIND = 0.03, 0.1, 0.25
-#: An object is labelled where it is measured, and where more of it than the rest is not, also where its colours go on.
-_MEASURED = 0.6
 #: What shows again after nothing of an object was measured is near to where it was.
 _APART_M = 0.1
 #: So many pixels together, each so much likelier in an object's colours (nats), are the object where it is expected.
@@ -254,14 +251,12 @@ class BuiltinSegmenter:
                 self._targets[name] = replace(target, seen=None) if name in found else target
                 continue
             box = found[name][0]
-            part, measured = labels[box.slices], frame.depth_m[box.slices] > 0
+            part = labels[box.slices]
             mask = part == label
             seen = _seen(frame, mask, self.config.min_px, box, None if target.seen is None else target.seen.z_m)
             self._targets[name] = self._updated(frame, target, seen)
             if seen is None:
                 part[mask] = 0
-            elif np.count_nonzero(mask & measured) > _MEASURED * np.count_nonzero(mask):
-                part[mask & ~filled(mask & measured)] = 0
         return labels
 
     def _moved(self, frame: Frame, target: _Target) -> _Moved:
