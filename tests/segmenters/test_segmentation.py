@@ -126,6 +126,18 @@ def test_where_most_of_an_object_loses_its_depth_its_colours_carry_it():
     assert iou(found, card(at)) > 0.85
 
 
+def test_what_has_no_depth_is_taken_in_beside_what_has_it_alone():
+    """Beside the card something of its colour begins that has no depth."""
+    at, follow = (100, 80), segmenter()
+    for k in range(4):
+        frame = picture(k, [(at, 1)])
+        frame.rgb[card(at)] = 20, 120, 30
+        if k:
+            frame.rgb[90:120, 160:180], frame.depth_m[90:120, 160:180] = (20, 120, 30), 0
+        found = follow.segment(frame, () if k else on(card=at)) == 1
+        assert iou(found, card(at)) > 0.96
+
+
 # --- from frame to frame -----------------------------------------------------------------------
 
 
