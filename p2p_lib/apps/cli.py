@@ -74,7 +74,7 @@ def _run(a: argparse.Namespace) -> int:
     "track objects before a camera; a line of JSON per object and frame, on a terminal with --out a readable one",
     arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
     arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
-    arg("--backlog", type=int, metavar="N", help="images that may wait while one takes long (default 4); then drop some"),
+    arg("--backlog", type=int, metavar="N", help="images that may wait while one takes long (default 4)"),
     run_options(
         *METHOD,
         prompts="clicks; without, the first image is clicked on",
