@@ -101,7 +101,7 @@ def test_a_few_frames_wait_their_turn(scripted):
 
 
 def test_a_backlog_below_none_is_refused(folder):
-    with pytest.raises(BadInput, match="backlog.*-1"):
+    with pytest.raises(BadInput, match=r"backlog.*-1"):
         track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, print, backlog=-1)
 
 
