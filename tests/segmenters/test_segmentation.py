@@ -228,6 +228,9 @@ def test_what_comes_out_where_its_motion_leads_is_known_by_its_colours():
     hints = {"card": Hint(place=np.array([0.2, 0.0, 0.75, 0.2]))}
     beside = copy.deepcopy(follow).segment(there, [Prompt("twin", 2, mask=twin)], hints)
     assert iou(beside == 1, card(back)) > 0.7, "its larger twin is another object"
+    rest = [Prompt("twin", 2, mask=card(back, (40, 50)))]
+    left_out = copy.deepcopy(follow).segment(painted(2, back, (200, 40, 30)), rest, hints)
+    assert not (left_out == 1).any(), "what another object's mask leaves out of it"
 
 
 def test_points_on_something_else_do_not_bring_it_back():

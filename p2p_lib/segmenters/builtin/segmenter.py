@@ -29,6 +29,7 @@ from p2p_lib.segmenters.builtin.patch import (
     Patch,
     around,
     dilated,
+    holding,
     middle,
     parts_of,
     plane_heights,
@@ -354,14 +355,17 @@ class BuiltinSegmenter:
             return _NO_PX
         half = within_m * self._focal_px / middle_m[2] + ROOM_PX
         patch = Patch.like(frame, around(middle_px, half, frame.shape), 1, self.camera)
-        measured = (patch.depth_m > 0) & ~taken[patch.box.slices]
+        others = taken[patch.box.slices]
+        measured = (patch.depth_m > 0) & ~others
         near = measured & (patch.squared_distances_m2(middle_m) < within_m**2)
         if np.count_nonzero(near) < _ENOUGH_PX:
             return _NO_PX
         colour = by_colour(patch, target.colours, measured & ~near, self.config)
-        like, plane = near & (colour > 0), support_plane(patch, measured, self._rng)
+        plane, free = support_plane(patch, measured, self._rng), patch.smooth
         if plane is not None:
-            like &= plane_heights(patch, plane) > of_plane_m(patch.sigma_m)
+            free = free & (plane_heights(patch, plane) > of_plane_m(patch.sigma_m))
+        # What hangs together with another object is of that one, whatever its mask has left out.
+        like = near & (colour > 0) & free & ~holding(parts_of(free), others)
         part = np.where(like, parts_of(dilated(like, 1)), 0)
         size = np.bincount(part.ravel())
         told = np.bincount(part.ravel(), colour.ravel()) / np.maximum(size, 1)
