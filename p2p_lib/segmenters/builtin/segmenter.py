@@ -355,8 +355,7 @@ class BuiltinSegmenter:
             return _NO_PX
         half = within_m * self._focal_px / middle_m[2] + ROOM_PX
         patch = Patch.like(frame, around(middle_px, half, frame.shape), 1, self.camera)
-        others = taken[patch.box.slices]
-        measured = (patch.depth_m > 0) & ~others
+        measured = patch.depth_m > 0
         near = measured & (patch.squared_distances_m2(middle_m) < within_m**2)
         if np.count_nonzero(near) < _ENOUGH_PX:
             return _NO_PX
@@ -365,7 +364,7 @@ class BuiltinSegmenter:
         if plane is not None:
             free = free & (plane_heights(patch, plane) > of_plane_m(patch.sigma_m))
         # What hangs together with another object is of that one, whatever its mask has left out.
-        like = near & (colour > 0) & free & ~holding(parts_of(free), others)
+        like = near & (colour > 0) & free & ~holding(parts_of(free), taken[patch.box.slices])
         part = np.where(like, parts_of(dilated(like, 1)), 0)
         size = np.bincount(part.ravel())
         told = np.bincount(part.ravel(), colour.ravel()) / np.maximum(size, 1)
