@@ -174,8 +174,6 @@ class ObjectGraph:
                 solution = _solve(self._keyframes, self._points, self._anchor, self.config)
             except (RuntimeError, ValueError) as error:  # gtsam's, for an indeterminate system or impossible noise
                 reason = "gtsam: " + str(error).strip().splitlines()[0]
-            else:
-                reason = _implausible(solution)
         if reason:
             left_out = ", ".join(map(str, self._new))
             for key in self._new:
@@ -188,8 +186,7 @@ class ObjectGraph:
         self._points |= solution.points
         self._new, self._last = [], solution
         result = self._result(True, solution.note)
-        merge_keyframes(self._keyframes, self._points, self.config.max_keyframes)
-        self._drop_unseen()
+        merge_keyframes(self._keyframes, self.config.max_keyframes)
         return result
 
     def _noise(self, sigma_rad: np.ndarray | float | None, sigma_m: np.ndarray | float | None) -> tuple[Any, Any]:
@@ -256,15 +253,6 @@ def _about(p_obj: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
 
 def _is_covariance(covariance: np.ndarray | None) -> bool:
     return covariance is not None and np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance).min() > 0
-
-
-def _implausible(solution: _Solution) -> str:
-    values = [*solution.T_obj_cam.values(), *solution.points.values()]
-    if not all(np.isfinite(v).all() for v in values) or not np.isfinite(solution.error_after):
-        return "the solution is not finite"
-    if solution.error_after > solution.error_before * (1 + 1e-6) + 1e-9:
-        return f"the loss grew from {solution.error_before:.3g} to {solution.error_after:.3g}"
-    return ""
 
 
 def _solve(

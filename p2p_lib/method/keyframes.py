@@ -17,8 +17,6 @@ from p2p_lib.core import se3
 # Noise of an observation moved to another keyframe, in its own: the relative pose by which it moves
 # adds to it. Measured: without, the covariance after much merging is too sure by half.
 _MOVED_SIGMA = 1.25
-# Observations off by more standard deviations are left out when keyframes merge: later, a mean hides them.
-_KEPT_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +76,10 @@ def misfit(expected: np.ndarray, seen: np.ndarray, sigma: np.ndarray) -> np.ndar
     return np.hypot(angle / sigma[:, 0], range_m / sigma[:, 1])
 
 
-def merge_keyframes(keyframes: dict[int, Keyframe], points: dict[int, np.ndarray], most: int) -> None:
+def merge_keyframes(keyframes: dict[int, Keyframe], most: int) -> None:
     """Merges keyframes, in place, until ``most`` remain (0: no bound), those with the most similar views first.
 
-    The first keyframe, which holds the gauge, and the newest are never given up. ``points`` are the
-    solved positions. Observations of merging keyframes that do not fit them are dropped, so that a point may be left
-    without any.
+    The first keyframe, which holds the gauge, and the newest are never given up.
     """
     while most and max(most, 2) < len(keyframes):
         keys = sorted(keyframes)
@@ -93,7 +89,7 @@ def merge_keyframes(keyframes: dict[int, Keyframe], points: dict[int, np.ndarray
         gone = np.arange(similarity.shape[1])
         similarity[gone + 1, gone] = -np.inf
         kept, gone = np.unravel_index(np.argmax(similarity), similarity.shape)
-        _merge(keyframes[keys[kept]], keyframes[keys[gone + 1]], points)
+        _merge(keyframes[keys[kept]], keyframes[keys[gone + 1]])
         remove(keyframes, keys[gone + 1])
 
 
@@ -115,23 +111,18 @@ def remove(keyframes: dict[int, Keyframe], key: int) -> None:
         )
 
 
-def _merge(kept: Keyframe, gone: Keyframe, points: dict[int, np.ndarray]) -> None:
-    """Adds the observations of ``gone`` to ``kept``; where both saw a point, their weighted mean remains.
-
-    A mean cannot be told from its misfits later, so those of both are left out now.
-    """
+def _merge(kept: Keyframe, gone: Keyframe) -> None:
+    """Adds the observations of ``gone`` to ``kept``; where both saw a point, their weighted mean remains."""
     moved, moved_sigma = gone.seen_from(kept.T_obj_cam)
     moved_sigma *= _MOVED_SIGMA
     ids = np.concatenate([kept.ids, gone.ids])
     p_cam, sigma = np.concatenate([kept.p_cam, moved]), np.concatenate([kept.sigma, moved_sigma])
     if not len(ids):
         return
-    p_obj = np.array([points[i] for i in ids.tolist()])
-    stays = misfit(se3.transform(se3.inverse(kept.T_obj_cam), p_obj), p_cam, sigma) <= _KEPT_SIGMAS
-    merged, row = np.unique(ids[stays], return_inverse=True)
-    information = sigma[stays] ** -2
+    merged, row = np.unique(ids, return_inverse=True)
+    information = sigma**-2
     total = _sums(row, information)
-    mean = _sums(row, p_cam[stays] * information[:, 1:]) / total[:, 1:]
+    mean = _sums(row, p_cam * information[:, 1:]) / total[:, 1:]
     kept.replace_observations(merged, mean, total**-0.5)
 
 

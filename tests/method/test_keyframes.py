@@ -69,24 +69,20 @@ def test_observations_seen_from_elsewhere_keep_place_and_noise() -> None:
 def test_merging_averages_what_both_saw_and_keeps_what_one_saw() -> None:
     T, rng = cameras([0, 3, 80, 90]), np.random.default_rng(3)
     p_obj = rng.uniform(-0.05, 0.05, (40, 3))
-    points = dict(enumerate(p_obj))
     exact = se3.transform(se3.inverse(T), p_obj[None])
     noisy = exact + 0.001 * rng.normal(size=exact.shape)
     seen = [np.arange(0, 30), np.arange(10, 40), np.arange(40), np.arange(40)]
     keyframes = {k: keyframe(T[k], seen[k], noisy[k][seen[k]]) for k in range(4)}
-    keyframes[1].p_cam[5] += 0.05  # point 15: a misfit must not enter the mean
-    merge_keyframes(keyframes, points, 3)
+    merge_keyframes(keyframes, 3)
     assert sorted(keyframes) == [0, 2, 3]  # 1 looks like 0, and the first stays
     host = keyframes[0]
     np.testing.assert_array_equal(host.ids, np.arange(40))
     assert host.factors is None
     np.testing.assert_allclose(host.p_cam[:10], noisy[0][:10], atol=1e-12)
-    np.testing.assert_allclose(host.p_cam[15], noisy[0][15], atol=1e-12)
     alone, both = np.linalg.norm(noisy[0] - exact[0], axis=1), np.linalg.norm(host.p_cam - exact[0], axis=1)
-    shared = np.setdiff1d(np.arange(10, 30), 15)
+    shared = np.arange(10, 30)
     assert np.mean(both[shared]) < 0.85 * np.mean(alone[shared])
-    own = np.r_[:10, 15]
-    np.testing.assert_allclose(host.sigma[own], np.tile([0.0015, 0.003], (11, 1)), rtol=1e-9)
+    np.testing.assert_allclose(host.sigma[:10], np.tile([0.0015, 0.003], (10, 1)), rtol=1e-9)
     one, two = 0.003, 0.003 / np.sqrt(2)
     assert (two < host.sigma[shared, 1]).all() and (host.sigma[shared, 1] < one).all()
     assert (host.sigma[30:, 1] > one).all()  # moved, and nothing to average with
@@ -96,9 +92,9 @@ def test_no_bound_and_nothing_to_merge() -> None:
     T = cameras([0, 10, 20])
     keyframes = chain(T, np.tile(np.eye(6), (3, 1, 1)))
     for most in (0, 3, 5):
-        merge_keyframes(keyframes, {}, most)
+        merge_keyframes(keyframes, most)
         assert sorted(keyframes) == [0, 1, 2]
-    merge_keyframes(keyframes, {}, 1)
+    merge_keyframes(keyframes, 1)
     assert sorted(keyframes) == [0, 2]  # the first and the newest always stay
 
 

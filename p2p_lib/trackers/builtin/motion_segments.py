@@ -21,8 +21,6 @@ from p2p_lib.trackers.builtin.tracked_points import Points
 
 #: Covariance of a pose that matches have proposed: rad, m.
 _PROPOSED_COV = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
-#: Fraction of a segment's followed points that must agree on its pose.
-_MIN_AGREEING = 0.3
 #: Fraction of a segment's points that should show which must be found: fewer are chance, on something like it.
 _MIN_FOUND = 0.25
 #: Effective information: errors of so many successive frames count as one observation of a position.
@@ -143,7 +141,7 @@ class MotionSegments:
 
     def _fitted(self, segment: MotionSegment, p: Points, at: np.ndarray, now: Image, fewest: float) -> PoseFit | None:
         """The pose of a segment by its points at these rows; None where too few, or than ``fewest``, agree on one."""
-        fewest = max(self.config.segment_min_points, _MIN_AGREEING * len(at), fewest)
+        fewest = max(self.config.segment_min_points, fewest)
         if len(at) < fewest:
             return None
         uv, cov, z = p.uv[at].astype(float), p.cov[at].astype(float), now.depth_at(p.uv[at])
