@@ -1,4 +1,4 @@
-"""Live: the newest frame wins, what is dropped is counted, and a line of JSON says what was seen."""
+"""Live: a few frames wait, what is dropped is counted, and a line of JSON says what was seen."""
 
 import json
 import queue

@@ -3,8 +3,8 @@
 A segmenter takes a few clicks on each object in some frame and labels every frame from there on, causally.
 The built-in one needs no weights: evidence of colour, depth and geometry, of where the object was a
 frame ago and of what the rest of the pipeline knows, is weighed per pixel and cut along edges by a random
-walker (:mod:`p2p_lib.segmenters.builtin.random_walk`). It labels measured pixels and gaps of a pixel between them:
-without depth nothing can be lifted, and depth is missing just where a silhouette is doubtful.
+walker (:mod:`p2p_lib.segmenters.builtin.random_walk`). Depth is missing just where a silhouette is doubtful: there
+colours say whose a pixel is, and only beside what is measured.
 """
 
 from __future__ import annotations
