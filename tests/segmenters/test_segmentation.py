@@ -138,6 +138,18 @@ def test_what_has_no_depth_is_taken_in_beside_what_has_it_alone():
         assert iou(found, card(at)) > 0.96
 
 
+def test_where_nothing_is_measured_colours_outweigh_where_it_was():
+    """From one frame to the next a third of the card shows the wall's colour, and its depth is missing."""
+    at, follow = (100, 80), segmenter()
+    for k in range(3):
+        frame = picture(k, [(at, 1)])
+        frame.rgb[:], frame.rgb[card(at)] = (150, 140, 120), (20, 120, 30)
+        if k:
+            frame.rgb[80:130, 140:160], frame.depth_m[80:130, 140:160] = (150, 140, 120), 0
+        found = follow.segment(frame, () if k else on(card=at)) == 1
+    assert not found[:, 142:].any() and iou(found, card(at, (40, 50))) > 0.93
+
+
 # --- from frame to frame -----------------------------------------------------------------------
 
 
