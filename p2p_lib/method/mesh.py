@@ -56,28 +56,17 @@ def _marching_cubes(volume: TsdfVolume, min_weight: float) -> tuple[np.ndarray, 
     """Vertices in array indices (N, 3) and faces (M, 3), over fully observed cells."""
     from skimage.measure import marching_cubes
 
-    value, observed = volume.values(), volume.weights() >= min_weight
-    cells = _cells(observed)
-    known = value[observed & np.isfinite(value)]
-    if not cells.any() or known.min() >= 0 or known.max() <= 0:
+    value, cells = volume.values(), volume.weights() >= min_weight
+    value[~cells] = 1.0
+    for axis in range(3):  # scikit-image looks at the mask of a cell's last corner only
+        cells = cells & np.roll(cells, 1, axis)
+    try:
+        vertices, faces, _, _ = marching_cubes(
+            value, 0.0, mask=cells, gradient_direction="descent", allow_degenerate=False
+        )
+    except (RuntimeError, ValueError):  # nothing is observed, or the surface crosses no cell that is
         return np.zeros((0, 3)), np.zeros((0, 3), int)
-    # scikit-image looks at the mask of a cell's last corner only.
-    mask = np.zeros(value.shape, bool)
-    mask[1:, 1:, 1:] = cells
-    vertices, faces, _, _ = marching_cubes(
-        np.where(observed, value, 1.0), 0.0, mask=mask, gradient_direction="descent", allow_degenerate=False
-    )
     return vertices.astype(float), faces.astype(int)
-
-
-def _cells(observed: np.ndarray) -> np.ndarray:
-    """(nx-1, ny-1, nz-1): cells whose eight corners are all observed."""
-    for axis in range(3):
-        a = [slice(None)] * 3
-        b = [slice(None)] * 3
-        a[axis], b[axis] = slice(None, -1), slice(1, None)
-        observed = observed[tuple(a)] & observed[tuple(b)]
-    return observed
 
 
 def _colours(volume: TsdfVolume, vertices: np.ndarray) -> np.ndarray:

@@ -78,7 +78,6 @@ class Refinement:
     rms_m        root mean square distance of the used points to the surface; NaN where none
     inliers      share of the given points that lie on observed surface and were not trimmed
     iterations   Levenberg-Marquardt steps tried
-    converged    whether it stopped because the step had become small
     eigenvalues  (6,): how well the shape determines each of :attr:`directions`, the mean squared change of the
                  points' distance per squared displacement; a plane has three at 0, a can one
     directions   (6, 6) rows: unit tangents about the cloud's centre, rotation scaled by the cloud's radius
@@ -91,7 +90,6 @@ class Refinement:
     rms_m: float = float("nan")
     inliers: float = 0.0
     iterations: int = 0
-    converged: bool = False
     eigenvalues: np.ndarray | None = None
     directions: np.ndarray | None = None
     free_rotations: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
@@ -197,7 +195,7 @@ class _Problem:
         if at is None:
             return Refinement(T, iterations=tries, reason="the cloud lies beyond the surface's truncation")
         eigenvalues, directions = self.eigen(at.rows, at.J)
-        return self.result(replace(at, eigenvalues=eigenvalues, directions=directions), tries, converged)
+        return self.result(replace(at, eigenvalues=eigenvalues, directions=directions), tries)
 
     # -- the two kinds of residual -----------------------------------------------------------------
 
@@ -287,7 +285,7 @@ class _Problem:
             total += _huber_loss(np.sqrt((off_m * off_m).sum(-1)) / k.sigma_m, _HUBER, np.inf)
         return total
 
-    def result(self, at: _Linear, tries: int, converged: bool) -> Refinement:
+    def result(self, at: _Linear, tries: int) -> Refinement:
         """The pose reached, its covariance moved from the cloud's centre to the object's origin."""
         H, _ = self.joint(at)
         # What nothing determines is known to within the largest step.
@@ -302,7 +300,6 @@ class _Problem:
             at.rms_m,
             at.used / len(self.p_cam),
             tries,
-            converged,
             at.eigenvalues,
             at.directions.T,
             observability.rotations_in(loose).T @ to_origin.T * self.radius,

@@ -213,7 +213,9 @@ class TsdfVolume:
         )
         order = [i for i in np.argsort(-excess, kind="stable") if excess[i] > 1 and np.isfinite(T_new[i]).all()]
         for i in order[:limit]:
-            self._move_one(known[i], T_new[i])
+            view = self._views[known[i]]
+            self._fuse(view, -view.weight)
+            self._put(known[i], view, T_new[i])
         return [known[i] for i in order[:limit]]
 
     def join(self, other: TsdfVolume, T_obj_other: np.ndarray, shift: int) -> None:
@@ -223,11 +225,6 @@ class TsdfVolume:
         """
         for key, view in other._views.items():
             self._put(key + shift, view, view.T_cam_obj @ se3.inverse(T_obj_other))
-
-    def _move_one(self, key: int, T_cam_obj: np.ndarray) -> None:
-        view = self._views[key]
-        self._fuse(view, -view.weight)
-        self._put(key, view, T_cam_obj)
 
     def _put(self, key: int, view: _View, T_cam_obj: np.ndarray) -> None:
         """Fuse and keep a view at a pose."""

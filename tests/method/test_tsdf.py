@@ -368,6 +368,17 @@ def test_bad_depth_and_empty_masks_touch_nothing():
     assert len(volume.mesh().faces) == 0
 
 
+def test_a_surface_that_crosses_no_observed_cell_gives_an_empty_mesh():
+    config = TsdfConfig(voxel_m=0.01, carve=False)
+    volume = TsdfVolume(config, origin_m=(-0.01, -0.01, 0.3), shape=(4, 2, 20))
+    u = np.arange(CAMERA.width) - CAMERA.cx
+    for depth_m, beside in ((0.4, u / CAMERA.fx * 0.4 < -0.005), (0.8, u / CAMERA.fx * 0.4 > 0.005)):
+        mask = np.tile(beside, (CAMERA.height, 1))  # one sheet of voxels has the surface, two have free space
+        volume.integrate(np.full(mask.shape, depth_m, np.float32), WHITE, mask, CAMERA, np.eye(4))
+    assert (volume.values() < 0).any() and (volume.values() > 0).any()
+    assert len(volume.mesh().faces) == 0
+
+
 def test_invalid_pixels_leave_the_others_as_they_are():
     T = look_from((1, 0, 0))
     depth, mask = render(ball((0, 0, 0), 0.05), T)
