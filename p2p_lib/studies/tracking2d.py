@@ -74,7 +74,7 @@ def score_reliability(score: TrackerScore) -> Reliability:
     truth, run = score.truth, score.run
     both = run.visible & truth.visible & truth.known & np.isfinite(run.uv_px[..., 0])
     error_px = np.linalg.norm(run.uv_px[both] - truth.uv_px[both], axis=-1)
-    return reliability(error_px, run.uncertainty[both], 10)
+    return reliability(error_px, run.uncertainty[both])
 
 
 class TrackScene:
