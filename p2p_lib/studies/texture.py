@@ -98,9 +98,7 @@ class RecordedTracker:
             frame = scene.sequence.frame(index)
             ids.append(new_ids)
             points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
-        ids = np.concatenate(ids)
-        ids, points = np.sort(ids), points.select(np.argsort(ids))
-        found = []
+        ids, found = np.concatenate(ids), []
         for index, tracks in self._answers:
             tracks = tracks.select(tracks.ids[tracks.visible])
             mine = points.select(np.searchsorted(ids, tracks.ids))
@@ -220,7 +218,7 @@ def rank_correlation(
     Pairs that are not finite are left out. Raises :class:`BadInput` for fewer than three groups.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
-    group = np.arange(len(x)) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]
+    group = np.arange(len(x)) if groups is None else np.asarray(groups)
     keep = np.isfinite(x) & np.isfinite(y)
     x, y, group = x[keep], y[keep], np.unique(group[keep], return_inverse=True)[1]
     count = int(group.max(initial=-1)) + 1
