@@ -320,10 +320,9 @@ def windows_against_texture(
     """
     figure, axes = panels(2, (WIDTH_IN, 3.4), side_by_side=True)
     real = synthetic is not None
-    if real:
-        _against_texture(axes, {"synthetic": synthetic} | dict(windows), 16, [style.NEUTRAL[1], *style.OBJECTS])
-    else:
-        _against_texture(axes, windows, 16, _colours(len(windows)))
+    shown = {"synthetic": synthetic, **windows} if real else windows
+    colours = [style.NEUTRAL[1], *style.OBJECTS] if real else _colours(len(windows))
+    _against_texture(axes, shown, 16, colours)
     for axis, found in zip(axes, correlations):
         axis.set_title(f"Spearman {found.rho:+.2f}, 95 % [{found.low:+.2f}, {found.high:+.2f}], n = {found.pairs}")
     entries, title = axes[0].get_legend_handles_labels(), None if real else LEGEND

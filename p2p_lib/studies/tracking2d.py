@@ -115,9 +115,8 @@ class TrackScene:
         """Objects and spans [start, stop) of frames in which truth sees none of their points, by their start."""
         found = []
         for name, points in self._points.items():
-            seen = self.score.truth.visible[:, points].any(1)
-            spans = status_intervals(np.where(seen, "seen", "gone"))
-            found += [(name, a, b) for kind, a, b in spans if kind == "gone" and a > 0 and b - a >= _MIN_ABSENCE]
+            spans = status_intervals(self.score.truth.visible[:, points].any(1))
+            found += [(name, a, b) for seen, a, b in spans if seen == "False" and a > 0 and b - a >= _MIN_ABSENCE]
         return sorted(found, key=lambda span: span[1])
 
     def moments(self, count: int) -> list[int]:
