@@ -8,6 +8,7 @@ mask is not, the object should not be either, and its keypoints should lie where
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -115,11 +116,8 @@ def consistency(run: Run, sequence: Sequence | None = None) -> Consistency:
 
     sequence  that the run was made on (default: opened as the run says)
     """
-    if sequence is None:
-        try:
-            sequence = reopen(run.info)
-        except P2PError:
-            sequence = None
+    with suppress(P2PError):
+        sequence = sequence or reopen(run.info)
     keypoints = load_keypoints(run.path)
     objects = {}
     for name, obj in run.objects.items():

@@ -43,11 +43,10 @@ def adds_m(T_pred: np.ndarray, T_gt: np.ndarray, points: np.ndarray) -> np.ndarr
     errors = np.full(len(T_pred), np.inf)
     tree = cKDTree(points)
     usable = np.flatnonzero(np.isfinite(T_pred).all((1, 2)) & np.isfinite(T_gt).all((1, 2)))
-    T_pred_gt = se3.inverse(T_pred[usable]) @ T_gt[usable]
     step = max(1, _CHUNK // len(points))
-    for rows in np.split(np.arange(len(usable)), range(step, len(usable), step)):
-        moved = se3.transform(T_pred_gt[rows], points)
-        errors[usable[rows]] = tree.query(moved, workers=2)[0].mean(-1)
+    for at in np.split(usable, range(step, len(usable), step)):
+        moved = se3.transform(se3.inverse(T_pred[at]) @ T_gt[at], points)
+        errors[at] = tree.query(moved, workers=2)[0].mean(-1)
     return errors
 
 

@@ -90,27 +90,24 @@ class Reliability:
 
     uncertainty  (B,) median of the bin
     median_px, p90_px  (B,) error that half, and nine in ten, of the bin stay below
-    count        (B,) predictions
     rank_correlation  Spearman's, of uncertainty and error over all predictions
     """
 
     uncertainty: np.ndarray
     median_px: np.ndarray
     p90_px: np.ndarray
-    count: np.ndarray
     rank_correlation: float
 
 
-def reliability(error_px: np.ndarray, uncertainty: np.ndarray, bins: int = 10) -> Reliability:
+def reliability(error_px: np.ndarray, uncertainty: np.ndarray) -> Reliability:
     """Errors (M,) of predictions against their uncertainty (M,); equal uncertainties stay in one order."""
     from scipy.stats import spearmanr
 
-    parts = [part for part in np.array_split(np.argsort(uncertainty, kind="stable"), bins) if len(part)]
+    parts = [part for part in np.array_split(np.argsort(uncertainty, kind="stable"), 10) if len(part)]
     return Reliability(
         np.array([np.median(uncertainty[part]) for part in parts]),
         np.array([np.median(error_px[part]) for part in parts]),
         np.array([np.quantile(error_px[part], 0.9) for part in parts]),
-        np.array([len(part) for part in parts]),
         float(spearmanr(uncertainty, error_px).statistic) if len(error_px) > 1 else float("nan"),
     )
 

@@ -12,7 +12,7 @@ The tracker's object frame is its own choice, so one rigid constant T_obj_model 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +51,6 @@ class ObjectScore:
     add_m, adds_m  (m,) metres; infinite where there was no pose
     T_obj_model    (4, 4) the constant that the alignment fixed; NaN where there was never a pose
     lost           scored frames without a pose
-    returns        each return after an absence, see :mod:`p2p_lib.evaluation.recovery`
     """
 
     frame_index: np.ndarray
@@ -59,7 +58,11 @@ class ObjectScore:
     adds_m: np.ndarray
     T_obj_model: np.ndarray
     lost: int
-    returns: tuple[RecoveryEvent, ...] = ()
+
+    @property
+    def returns(self) -> tuple[RecoveryEvent, ...]:
+        """Each return after an absence, see :mod:`p2p_lib.evaluation.recovery`."""
+        return recovery_events(self.frame_index, self.adds_m)
 
     def as_dict(self) -> dict[str, Any]:
         """The four areas under the curve, frames scored, frames lost, and the frames to recovery of each return."""
@@ -162,14 +165,13 @@ def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) ->
     if has_pose.any():
         T_obj_model = ALIGNMENTS[align](T_cam_obj[has_pose], T_cam_model[has_pose], points)
     T_pred = T_cam_obj @ T_obj_model
-    scores = ObjectScore(
+    return ObjectScore(
         frame_index=obj.frame_index[scored],
         add_m=metrics.add_m(T_pred, T_cam_model, points),
         adds_m=metrics.adds_m(T_pred, T_cam_model, points),
         T_obj_model=T_obj_model,
         lost=int((~has_pose).sum()),
     )
-    return replace(scores, returns=tuple(recovery_events(obj, scores)))
 
 
 def _apart(obj: ObjectRun, at: np.ndarray) -> str:

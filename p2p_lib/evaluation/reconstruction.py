@@ -81,7 +81,7 @@ def seen_surface(sequence: Sequence, name: str, model: Path | np.ndarray, frames
     """
     given = sequence.path / "visible_mesh.ply" if sequence.path else None
     if given and given.is_file():
-        return _sampled(given), "visible_mesh.ply"
+        return dense(given), "visible_mesh.ply"
     points = dense(model)
     seen = np.zeros(len(points), bool)
     for k in np.unique(frames[np.linspace(0, len(frames) - 1, min(_VIEWS, len(frames))).astype(int)]):
@@ -96,13 +96,11 @@ def seen_surface(sequence: Sequence, name: str, model: Path | np.ndarray, frames
 
 def dense(model: Path | np.ndarray) -> np.ndarray:
     """(M, 3) points of a model: sampled densely where it is a mesh, else as they are."""
-    return _sampled(model) if isinstance(model, Path) else model
-
-
-def _sampled(path: Path) -> np.ndarray:
     import trimesh
 
-    mesh = trimesh.Trimesh(*load_mesh(path), process=False)
+    if not isinstance(model, Path):
+        return model
+    mesh = trimesh.Trimesh(*load_mesh(model), process=False)
     return trimesh.sample.sample_surface(mesh, REFERENCE_SAMPLES, seed=0)[0]
 
 

@@ -9,14 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import pairwise
 
 import numpy as np
-
-from p2p_lib.datasets.runs import ObjectRun
-
-if TYPE_CHECKING:
-    from p2p_lib.evaluation.protocol import ObjectScore
 
 MIN_HIDDEN_FRAMES = 10
 MAX_ADDS_M = 0.02
@@ -37,23 +32,17 @@ class RecoveryEvent:
     frames_to_recovery: int | None
 
 
-def recovery_events(obj: ObjectRun, score: ObjectScore) -> list[RecoveryEvent]:
-    """The returns of one object in a run; it is visible in the frames that are scored."""
-    visible = np.isin(obj.frame_index, score.frame_index)
-    adds_m = np.full(len(obj), np.inf)
-    adds_m[visible] = score.adds_m
-    seen = np.flatnonzero(visible)
-    # Rows of the last visible frame before, and of the first after, each stretch that is long enough.
-    gap = np.diff(obj.frame_index[seen]) > MIN_HIDDEN_FRAMES
-    before, after = seen[:-1][gap], seen[1:][gap]
-    ends = np.append(after[1:], len(obj))
+def recovery_events(frame_index: np.ndarray, adds_m: np.ndarray) -> tuple[RecoveryEvent, ...]:
+    """The returns of an object from the frames (m,) in which it is visible, which are scored, and its errors there."""
+    good = adds_m <= MAX_ADDS_M
+    returns = np.flatnonzero(np.diff(frame_index) > MIN_HIDDEN_FRAMES) + 1
     events = []
-    for last, first, end in zip(before, after, ends):
-        good = np.flatnonzero(adds_m[first:end] <= MAX_ADDS_M) if (adds_m[:first] <= MAX_ADDS_M).any() else ()
-        returned = int(obj.frame_index[first])
-        delay = int(obj.frame_index[first + good[0]]) - returned if len(good) else None
-        events.append(RecoveryEvent(int(obj.frame_index[last]) + 1, returned, delay))
-    return events
+    for first, end in pairwise([*returns, len(frame_index)]):
+        found = np.flatnonzero(good[first:end]) if good[:first].any() else ()
+        returned = int(frame_index[first])
+        delay = int(frame_index[first + found[0]]) - returned if len(found) else None
+        events.append(RecoveryEvent(int(frame_index[first - 1]) + 1, returned, delay))
+    return tuple(events)
 
 
 def recovered_within(frames_to_recovery: Iterable[int | None], within: Iterable[int] = WITHIN_FRAMES) -> dict[int, int]:

@@ -90,11 +90,6 @@ class TrackTask:
         queries = draw_queries(scene, np.random.default_rng(seed), count)
         return cls(sequence, scene, queries, true_tracks(scene, queries.points), seed)
 
-    @property
-    def scored(self) -> np.ndarray:
-        """(T, N) bool: after the query, where truth says whether the point is visible."""
-        return after_query(self.queries.frame, len(self.sequence)) & self.truth.known
-
     def tracker(self, name: str | PointTracker, config: Config) -> PointTracker:
         """The tracker of this name: ``oracle``, which knows the truth, or a known one; or the one given."""
         known = OracleTracker(self.scene, config.oracle, self.seed) if name == OracleTracker.name else name
@@ -104,6 +99,7 @@ class TrackTask:
         """Run a tracker over the queries; ``search`` tells it where the objects' masks are, as the pipeline does."""
         sequence, scene, queries, truth = self.sequence, self.scene, self.queries, self.truth
         run = run_tracker(tracker, sequence, queries, search)
+        scored = after_query(queries.frame, len(sequence)) & truth.known
         shape = sequence.camera.height, sequence.camera.width
         info = {
             "sequence": sequence.name,
@@ -112,10 +108,10 @@ class TrackTask:
             "queries": len(queries),
             "frames": len(sequence),
             "search": "masks" if search else "whole picture",
-            "truth": ", ".join(f"{name}: {'mesh' if name in scene.by_mesh else 'depth'}" for name in scene.objects),
+            "truth": ", ".join(f"{name}: {'mesh' if name in scene.surfaces else 'depth'}" for name in scene.objects),
         }
         return TrackerScore(
-            tapvid(truth.uv_px, truth.visible, run.uv_px, run.visible, self.scored, shape),
+            tapvid(truth.uv_px, truth.visible, run.uv_px, run.visible, scored, shape),
             redetections(truth.uv_px, truth.visible, truth.known, truth.view, run.uv_px, run.visible, queries.frame),
             truth,
             run,

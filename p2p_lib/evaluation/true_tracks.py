@@ -65,7 +65,9 @@ class Sight:
 class TrueScene:
     """The true surfaces of a sequence's objects: knows where any of their points is in any frame.
 
-    meshes  object to mesh file; objects without one are lifted by the measured depth.
+    meshes    object to mesh file; objects without one are lifted by the measured depth
+    surfaces  object to its mesh, ready for rays
+
     Raises :class:`MissingData` for a sequence without truth.
     """
 
@@ -75,7 +77,7 @@ class TrueScene:
             raise MissingData(sequence.name, "has no true poses", fix)
         self.sequence = sequence
         self.objects = tuple(sequence.truth)
-        self._scenes = {name: ray_scene(*load_mesh(path)) for name, path in (meshes or {}).items()}
+        self.surfaces = {name: ray_scene(*load_mesh(path)) for name, path in (meshes or {}).items()}
 
     @classmethod
     def of(cls, sequence: Sequence, models: Mapping[str, str | Path] | None = None) -> TrueScene:
@@ -85,14 +87,9 @@ class TrueScene:
         given = {name: path for name, path in (models or {}).items() if Path(path).suffix.lower() != ".xyz"}
         return cls(sequence, meshes | given_models(given, sequence.objects, MESHES))
 
-    @property
-    def by_mesh(self) -> tuple[str, ...]:
-        """The objects whose surface is a mesh; that of the others is measured depth."""
-        return tuple(name for name in self.objects if name in self._scenes)
-
     def owners(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
         """(N,) index of the object whose mask holds each pixel; -1 where none does."""
-        masks = self._masks(frame.index)
+        masks = self.masks(frame.index)
         owner = np.full(len(uv_px), -1)
         for k, name in enumerate(self.objects):
             if name in masks:
@@ -107,7 +104,7 @@ class TrueScene:
             T_cam_model = self.sequence.truth[name].T_cam_model[frame.index]
             if not len(rows) or not np.isfinite(T_cam_model).all():
                 continue
-            if name in self._scenes:
+            if name in self.surfaces:
                 rays = self.sequence.camera.unproject(uv_px[rows], np.ones(len(rows))) @ T_cam_model[:3, :3]
                 p_model[rows], normal[rows] = self._lift_by_ray(name, T_cam_model, rays)
             else:
@@ -118,7 +115,7 @@ class TrueScene:
         """Where the points are in this frame and which of them are visible."""
         n = len(points)
         sight = Sight(np.full((n, 2), np.nan), np.zeros(n, bool), np.zeros(n, bool), np.full((n, 3), np.nan))
-        masks = self._masks(frame.index)
+        masks = self.masks(frame.index)
         for k, name in enumerate(self.objects):
             rows = np.flatnonzero(points.object == k)
             if not len(rows):
@@ -151,9 +148,8 @@ class TrueScene:
         cosine = np.einsum("nc,nc->n", points.normal, view)
         visible = self.sequence.camera.inside(uv) & ~(cosine < MIN_COSINE)  # an unknown normal hides nothing
         visible &= agrees if mask is None else mask[v, u] & (agrees | (measured_m == 0))
-        if name in self._scenes:
-            hit_m, _ = self._first_hits(name, centre, -view)
-            visible &= hit_m > distance_m - _SELF_OCCLUSION_M
+        if name in self.surfaces:
+            visible &= cast(self.surfaces[name], centre, -view)["t_hit"] > distance_m - _SELF_OCCLUSION_M
         return uv, visible, view
 
     def _lift_by_depth(self, frame: Frame, uv_px: np.ndarray, T_cam_model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -167,19 +163,16 @@ class TrueScene:
     def _lift_by_ray(self, name: str, T_cam_model: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         centre = se3.inverse(T_cam_model)[:3, 3]
-        distance_m, normal = self._first_hits(name, centre, rays)
-        met = np.isfinite(distance_m)[:, None]
+        hit = cast(self.surfaces[name], centre, rays)
+        distance_m, normal = hit["t_hit"].astype(float)[:, None], hit["primitive_normals"].astype(float)
+        met = np.isfinite(distance_m)
         # Towards the camera, so that a mesh wound the other way round serves as well.
         normal *= -np.sign(np.einsum("nc,nc->n", normal, rays))[:, None]
-        reach = np.where(met, distance_m[:, None], 0)
+        reach = np.where(met, distance_m, 0)
         return np.where(met, centre + reach * rays, np.nan), np.where(met, normal, np.nan)
 
-    def _first_hits(self, name: str, centre: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (N,) along unit rays (N, 3) to the mesh, infinite without a hit, and the triangles' normals."""
-        hit = cast(self._scenes[name], centre, rays)
-        return hit["t_hit"].astype(float), hit["primitive_normals"].astype(float)
-
-    def _masks(self, i: int) -> dict[str, np.ndarray]:
+    def masks(self, i: int) -> dict[str, np.ndarray]:
+        """Those of a frame; none where the sequence has none."""
         return self.sequence.masks(i) or {}
 
 
@@ -221,13 +214,11 @@ def true_tracks(scene: TrueScene, points: SurfacePoints) -> Sight:
 
 def _draw(scene: TrueScene, frame: Frame, wanted: int, rng: np.random.Generator) -> Queries:
     """Up to ``wanted`` visible pixels of a frame, in random order."""
-    masks = scene.sequence.masks(frame.index) or {}
+    masks = scene.masks(frame.index)
     anything = np.logical_or.reduce([np.zeros(frame.shape, bool), *(masks[n] for n in scene.objects if n in masks)])
     v, u = np.nonzero(anything)
     # Some pixels fall out (no surface, depth that disagrees): draw four times as many as are wanted.
     uv = rng.permutation(np.stack([u, v], 1).astype(float))[: 4 * wanted]
     points = scene.lift(frame, scene.owners(frame, uv), uv)
-    met = np.isfinite(points.p_model[:, 0])
-    points, uv = points.select(met), uv[met]
     seen = np.flatnonzero(scene.see(frame, points).visible)[:wanted]
     return Queries(np.full(len(seen), frame.index), uv[seen], points.select(seen))

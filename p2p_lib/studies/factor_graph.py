@@ -193,14 +193,13 @@ def consistency(trials: int, config: Config, seed: int = 0, **turn: object) -> n
 #: The line of each way, the same in every plot; told apart without colour too.
 _LINES = {
     "registration alone": (style.NEUTRAL[0], "-"),
-    "factor graph": (style.METHODS[0], "-"),
-    "all three": (style.METHODS[0], "-"),
-    "all three, Huber": (style.METHODS[0], "-"),
     "without prior": (style.METHODS[1], "--"),
     "without observations": (style.METHODS[4], "-."),
     "without registration": (style.METHODS[3], ":"),
     "all three, squares": (style.METHODS[5], "--"),
 }
+#: That of the graph as it is, whatever it is compared with.
+_GRAPH = (style.METHODS[0], "-")
 _UNITS = ("rotation [°]", "translation [mm]")
 
 
@@ -210,7 +209,7 @@ def turn_from_above(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
     true_xz = 100 * se3.inverse(turn.T_cam_obj)[:, [0, 2], 3]
     figure, axes = panels(len(solved), (4.0 * len(solved), 4.4), side_by_side=True)
     for axis, (name, one) in zip(axes, solved.items(), strict=True):
-        colour, _ = _LINES[name]
+        colour, _ = _LINES.get(name, _GRAPH)
         xz = 100 * se3.inverse(one.T_cam_obj)[:, [0, 2], 3]
         axis.plot(*np.stack([true_xz, xz]).transpose(2, 0, 1), color=colour, linewidth=1)
         axis.plot(*true_xz.T, ".", color="#222222", markersize=4, label="true $X_m$")
@@ -234,13 +233,12 @@ def errors_by_way(turn: Turn, solved: Mapping[str, Solved]) -> Figure:
     figure, axes = panels(2, (8.0, 4.6))
     for k, (axis, unit) in enumerate(zip(axes, _UNITS, strict=True)):
         for name, error in errors.items():
-            colour, line = _LINES[name]
+            colour, line = _LINES.get(name, _GRAPH)
             label = f"{name} ({error[k, common].mean():.1f})"
             axis.plot(error[k], line, color=colour, marker=".", markersize=4, label=label)
         if len(shaded):
             axis.axvspan(shaded[0] - 0.5, shaded[-1] + 0.5, color="#D9D9D9", lw=0)
-        axis.set_ylabel(unit)
-        axis.set_ylim(bottom=0)
+        axis.set(ylabel=unit, ylim=(0, None))
         axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, title=over, alignment="left")
     axes[1].set_xlabel("keyframe m (simulated)")
     return figure
@@ -258,8 +256,7 @@ def known_when(turn: Turn, online: Sequence[Solved]) -> Figure:
         axis.fill_between(range(len(online)), 0, 2 * width, color="#DCEAF5", lw=0, label="two of them")
         axis.fill_between(range(len(online)), 0, width, color="#A9CCE8", lw=0, label="one standard deviation")
         axis.plot(error, color="#222222", marker=".", markersize=4, label="error of the newest keyframe")
-        axis.set_ylabel(unit)
-        axis.set_ylim(bottom=0)
+        axis.set(ylabel=unit, ylim=(0, None))
     axes[0].legend(loc="upper left", fontsize=8, ncols=3)
     axes[0].set_ylim(top=1.35 * np.nanmax([errors[0], 2 * sigma[0]]))
     axes[1].set_xlabel("keyframe m (simulated)")
@@ -278,7 +275,6 @@ def consistency_plot(nees: np.ndarray) -> Figure:
         axis.axvline(np.median(values), color=style.METHODS[0], linestyle="--", label=f"median {np.median(values):.2f}")
         last = f"last bar: all {(values >= bins[-2]).sum()} beyond {bins[-2]:.0f}"
         axis.text(0.99, 0.35, last, transform=axis.transAxes, ha="right", fontsize=8)
-        axis.set_title(f"{name}, {len(values)} simulated turns")
-        axis.set(xlabel=r"$e^\top \Sigma^{-1} e$", ylabel="density")
+        axis.set(xlabel=r"$e^\top \Sigma^{-1} e$", ylabel="density", title=f"{name}, {len(values)} simulated turns")
         axis.legend(loc="upper right")
     return figure

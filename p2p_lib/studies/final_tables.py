@@ -147,18 +147,14 @@ class Numbers:
 class _Line:
     """One method's numbers of one metric.
 
-    cells       by column; others hold ``empty``
+    cells       by column, with what stands in all others
     comparable  columns in which it ran on what the paper ran on, without a CAD model
     """
 
     setting: str
     name: str
-    cells: dict[str, Cell]
+    cells: defaultdict[str, Cell]
     comparable: set[str]
-    empty: Cell
-
-    def cell(self, column: str) -> Cell:
-        return self.cells.get(column, self.empty)
 
 
 def by_sequence(numbers: Numbers) -> Table:
@@ -170,7 +166,7 @@ def by_sequence(numbers: Numbers) -> Table:
         rules.append(len(rows))
         for line in _lines(numbers, paper, metric):
             about = [Cell(METRICS[metric][1]), Cell(line.setting), Cell(line.name)]
-            rows.append(about + [line.cell(column) for column in columns])
+            rows.append(about + [line.cells[column] for column in columns])
     heads = ["Metric", "Setting", "Method", *columns]
     return Table(numbers.plan.title, heads, rows, words=3, rules=rules[1:], notes=numbers.notes())
 
@@ -180,23 +176,22 @@ def by_object(numbers: Numbers) -> Table:
     paper = paper_reported().table(numbers.plan.paper)
     found = {metric: _lines(numbers, paper, metric) for metric in _metrics(numbers, paper)}
     lines = [line for group in found.values() for line in group]
-    labels = dict(zip(_columns(paper), ((c.sequence, c.object) for c in paper.columns), strict=True))
-    labels |= {column: (shown_name(job), name) for column, (job, name) in _own_columns(numbers, paper).items()}
-    labels |= {"Mean": ("Mean", "")}
+    labels = _columns(paper) | _own_columns(numbers, paper) | {"Mean": ("Mean", "")}
     rows, rules, last = [], [], ""
     for column, (sequence, object) in labels.items():
         if sequence != last and rows:
             rules.append(len(rows))
         about = [Cell(sequence if sequence != last else ""), Cell(object)]
-        rows.append(about + [line.cell(column) for line in lines])
+        rows.append(about + [line.cells[column] for line in lines])
         last = sequence
     groups = [("", 2), *((METRICS[metric][1], len(group)) for metric, group in found.items())]
     heads = ["Category", "Object", *(line.name + ", CAD" * (line.setting == "CAD") for line in lines)]
     return Table(numbers.plan.title, heads, rows, groups, words=2, rules=rules, notes=numbers.notes())
 
 
-def _columns(paper: Reported) -> list[str]:
-    return [f"{column.sequence} {column.object}".strip() for column in paper.columns]
+def _columns(paper: Reported) -> dict[str, tuple[str, str]]:
+    """Column to the sequence and the object that it is of."""
+    return {f"{c.sequence} {c.object}".strip(): (c.sequence, c.object) for c in paper.columns}
 
 
 def _metrics(numbers: Numbers, paper: Reported) -> list[str]:
@@ -218,9 +213,10 @@ def _places(numbers: Numbers) -> dict[str, tuple[Job, str]]:
     return places
 
 
-def _own_columns(numbers: Numbers, paper: Reported) -> dict[str, tuple[Job, str]]:
-    """Columns of ours that the paper does not have."""
-    return {column: at for column, at in _places(numbers).items() if column not in _columns(paper)}
+def _own_columns(numbers: Numbers, paper: Reported) -> dict[str, tuple[str, str]]:
+    """The same of ours that the paper does not have."""
+    known, places = _columns(paper), _places(numbers).items()
+    return {column: (shown_name(job), name) for column, (job, name) in places if column not in known}
 
 
 def _lines(numbers: Numbers, paper: Reported, metric: str) -> list[_Line]:
@@ -231,7 +227,7 @@ def _lines(numbers: Numbers, paper: Reported, metric: str) -> list[_Line]:
             lines.append(_our_line(numbers, paper, metric, form, method))
     for column in (*_columns(paper), "Mean"):
         compared = [line for line in lines if column in line.comparable]
-        best = emboldened([line.cell(column) for line in compared], METRICS[metric][2])
+        best = emboldened([line.cells[column] for line in compared], METRICS[metric][2])
         for line, cell in zip(compared, best, strict=True):
             line.cells[column] = cell
     return lines
@@ -242,12 +238,12 @@ def _reported_line(paper: Reported, row: object) -> _Line:
     cells = [Cell(FAIL) if value == FAIL else number(float(value)) for value in row.values]
     name = "Point2Pose" if row.method == "Ours" else row.method
     comparable = set() if row.cad else {*columns, "Mean"}
-    cells = dict(zip(columns, cells, strict=True)) | {"Mean": number(row.mean)}
-    return _Line("CAD" if row.cad else "CAD-free", f"{name} (reported)", cells, comparable, _NOT_IN_PAPER)
+    cells = defaultdict(lambda: _NOT_IN_PAPER, zip(columns, cells, strict=True), Mean=number(row.mean))
+    return _Line("CAD" if row.cad else "CAD-free", f"{name} (reported)", cells, comparable)
 
 
 def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method: Method) -> _Line:
-    columns, cells, whole, same = _columns(paper), {}, set(), set()
+    columns, cells, whole, same = _columns(paper), defaultdict(numbers.not_planned), set(), set()
     frames = {shown_name(j): o.ran.get("frames") for j, o in numbers.benchmark.results if j.method.name == method.name}
     for column, (job, name) in _places(numbers).items():
         cells[column] = numbers.cell(method.name, METRICS[metric][0], shown_name(job), name, form)
@@ -263,7 +259,7 @@ def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method:
         cells["Mean"] = Cell(note=f"{len(whole)} of the table's {len(columns)} columns were run in whole")
     name = method.name if metric in _AREAS else f"{method.name}, {form}'s form"
     comparable = {*same, "Mean"} if len(same) == len(columns) else same
-    return _Line("CAD-free", name, cells, comparable, numbers.not_planned())
+    return _Line("CAD-free", name, cells, comparable)
 
 
 def _part(job: Job, frames: int | None, dataset: str) -> str:
@@ -390,10 +386,8 @@ def by_pair(numbers: Numbers) -> Table:
         lines.append([Cell(""), Cell(name), Cell(str(len(worth))), *cells])
     heads = ["2D tracker", "component", "runs", *_AREA_HEADS, *(scene.removeprefix(SYNTHETIC) for scene in scenes)]
     groups = [("", 3), ("over all runs", 2), ("ADD (%) by scene", len(scenes))]
-    how = (
-        "First line of a tracker: its areas under the curve. Below: with the component less without it, in points, and "
-    )
-    how += "the 95 % interval of the mean by bootstrap over runs; bold where that leaves out 0"
+    how = "First line of a tracker: its areas under the curve. Below: with the component less without it, in points, "
+    how += "and the 95 % interval of the mean by bootstrap over runs; bold where that leaves out 0"
     notes = [how, numbers.what_ran()]
     return Table(numbers.plan.title, heads, lines, groups, words=2, rules=rules, notes=notes)
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import trimesh
+from IPython.display import Markdown
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -30,10 +31,6 @@ from p2p_lib.figures.provenance import Saved, save_figure
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.studies.final_tables import SHIPPED
 from p2p_lib.synthetic.shapes import load_mesh
-
-if TYPE_CHECKING:
-    from IPython.display import Markdown
-
 
 #: What a fault should at most do: a share of the frames for lies, else what the column of the table is in.
 FAULT_GOALS = {"lies in it": 0.005, "lies after": 0.005, "longest": 5.0, "worst": 15.0, "mesh off (%)": 5.0}
@@ -75,8 +72,6 @@ def shown_faults(parameters: Mapping[str, object], folder: Path = SHIPPED) -> Sa
     """The picture of ``faults.csv`` in a folder for a notebook; without one, the command that makes it."""
     file = folder / "faults.csv"
     if not file.is_file():
-        from IPython.display import Markdown
-
         return Markdown("*No table here. `p2p benchmark faults --out out/benchmark --tables figures/tables` makes it.*")
     caption = """Faults of camera, depth, masks and time, each alone for 30 frames or from a frame on. Lies: poses that
 are sure (confidence above 0.5) and more than 5 cm off, while the fault lasts and after it, in all frames, and the

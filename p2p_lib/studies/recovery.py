@@ -181,9 +181,8 @@ def recovery_counts(cases: Mapping[tuple[str, str], tuple[Run, Evaluation]]) -> 
         objects = {name: (run.objects[name], score) for name, score in evaluation.objects.items()}
         events = [event for _, score in objects.values() for event in score.returns]
         row = {"sequence": sequence, "method": label, "returns": len(events)}
-        row |= {
-            f"within {n} frames": count for n, count in recovered_within(e.frames_to_recovery for e in events).items()
-        }
+        within = recovered_within(event.frames_to_recovery for event in events)
+        row |= {f"within {n} frames": count for n, count in within.items()}
         made_up = [(obj.has_pose & (obj.visible_px == 0)).sum() for obj, _ in objects.values()]
         rows.append(row | {"poses while hidden": int(sum(made_up))})
     return DataFrame(rows)

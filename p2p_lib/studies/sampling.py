@@ -20,7 +20,7 @@ from p2p_lib.core.config import Config, SamplingConfig, preset
 from p2p_lib.core.depth import depth_noise_m, lift
 from p2p_lib.core.image import nearest_px
 from p2p_lib.core.interfaces import Candidates, PointTracker
-from p2p_lib.core.types import Frame, Status
+from p2p_lib.core.types import Status
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.figures import overlay, style
@@ -48,25 +48,16 @@ _RIM = [withStroke(linewidth=2.4, foreground="black")]
 _IN_SIGHT_M = 0.01
 
 
-@dataclass(frozen=True, eq=False)
 class Situation:
-    """One object in one frame, before any point is chosen.
+    """One object in one frame, before any point is chosen; with the default parameters and ``settings``.
 
     mask    (H, W) bool; usable, those pixels of it where a point can be lifted
     """
 
-    video: Video
-    name: str
-    frame: Frame
-    mask: np.ndarray
-    usable: np.ndarray
-    config: Config
-
-    @classmethod
-    def of(cls, video: Video, name: str, index: int, settings: Mapping[str, Any] | None = None) -> Situation:
-        """The object ``name`` in frame ``index``, with the default parameters and ``settings``."""
-        config, frame, mask = preset().with_values(dict(settings or {})), video.frame(index), video.masks(index)[name]
-        return cls(video, name, frame, mask, usable_region(frame, mask, config.depth.edge_m), config)
+    def __init__(self, video: Video, name: str, index: int, settings: Mapping[str, Any] | None = None):
+        self.video, self.name, self.config = video, name, preset().with_values(dict(settings or {}))
+        self.frame, self.mask = video.frame(index), video.masks(index)[name]
+        self.usable = usable_region(self.frame, self.mask, self.config.depth.edge_m)
 
     def candidates(self, detector: str = "corners", seed: int = 0) -> Candidates:
         """What a detector offers here, as far as it can be lifted."""
@@ -169,7 +160,7 @@ def open_views(video: Video, count: int, frames_on: int) -> list[Situation]:
     for name in video.truth:
         clear = [i for i in looked if sizes[i].get(name, 0) >= 2000 and sizes.get(i + frames_on, sizes[i])[name] > 0]
         rows = np.linspace(0, len(clear) - 1, min(count, len(clear))).astype(int)
-        found += [Situation.of(video, name, clear[row]) for row in rows]
+        found += [Situation(video, name, clear[row]) for row in rows]
     return found
 
 

@@ -321,8 +321,7 @@ def onto_the_surface(volume: TsdfVolume, p_cam: np.ndarray, poses: Mapping[str, 
         p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
         near_mm = 1e3 * p_obj[np.abs(p_obj[:, 2]) < 0.006]
         axis.plot(*near_mm[:, :2].T, "o", color=style.AXES[0], markersize=3.5, markeredgecolor="white", mew=0.4)
-        axis.set_title(f"synthetic: {name}")
-        axis.set(xlabel="x [mm]")
+        axis.set(xlabel="x [mm]", title=f"synthetic: {name}")
     axes[0].set_ylabel("y [mm]")
     figure.colorbar(shown, ax=axes, label=r"signed distance $\Phi$ [mm]", shrink=0.85)
     return figure

@@ -98,9 +98,7 @@ class RecordedTracker:
             frame = scene.sequence.frame(index)
             ids.append(new_ids)
             points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
-        ids = np.concatenate(ids)
-        ids, points = np.sort(ids), points.select(np.argsort(ids))
-        found = []
+        ids, found = np.concatenate(ids), []
         for index, tracks in self._answers:
             tracks = tracks.select(tracks.ids[tracks.visible])
             mine = points.select(np.searchsorted(ids, tracks.ids))
@@ -220,7 +218,7 @@ def rank_correlation(
     Pairs that are not finite are left out. Raises :class:`BadInput` for fewer than three groups.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
-    group = np.arange(len(x)) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]
+    group = np.arange(len(x)) if groups is None else np.asarray(groups)
     keep = np.isfinite(x) & np.isfinite(y)
     x, y, group = x[keep], y[keep], np.unique(group[keep], return_inverse=True)[1]
     count = int(group.max(initial=-1)) + 1
@@ -322,10 +320,9 @@ def windows_against_texture(
     """
     figure, axes = panels(2, (WIDTH_IN, 3.4), side_by_side=True)
     real = synthetic is not None
-    if real:
-        _against_texture(axes, {"synthetic": synthetic} | dict(windows), 16, [style.NEUTRAL[1], *style.OBJECTS])
-    else:
-        _against_texture(axes, windows, 16, _colours(len(windows)))
+    shown = {"synthetic": synthetic, **windows} if real else windows
+    colours = [style.NEUTRAL[1], *style.OBJECTS] if real else _colours(len(windows))
+    _against_texture(axes, shown, 16, colours)
     for axis, found in zip(axes, correlations):
         axis.set_title(f"Spearman {found.rho:+.2f}, 95 % [{found.low:+.2f}, {found.high:+.2f}], n = {found.pairs}")
     entries, title = axes[0].get_legend_handles_labels(), None if real else LEGEND

@@ -74,7 +74,7 @@ def score_reliability(score: TrackerScore) -> Reliability:
     truth, run = score.truth, score.run
     both = run.visible & truth.visible & truth.known & np.isfinite(run.uv_px[..., 0])
     error_px = np.linalg.norm(run.uv_px[both] - truth.uv_px[both], axis=-1)
-    return reliability(error_px, run.uncertainty[both], 10)
+    return reliability(error_px, run.uncertainty[both])
 
 
 class TrackScene:
@@ -92,15 +92,14 @@ class TrackScene:
 
         Small dark dots are missed points at their true place, lines the right part of the last ``trail`` frames.
         """
-        frame, camera, run = self.sequence.frame(index), self.sequence.camera, self.score.run
+        frame, camera, score = self.sequence.frame(index), self.sequence.camera, self.score
         image, seen_by = overlay.zoomed(frame.rgb, camera, self.region_px, width_px)
-        uv_px, true_px = (overlay.zoomed_px(uv, camera, seen_by) for uv in (run.uv_px, self.score.truth.uv_px))
-        first, came = max(index - trail, 0), self.outcomes[index]
+        uv_px, true_px = (overlay.zoomed_px(uv, camera, seen_by) for uv in (score.run.uv_px, score.truth.uv_px))
+        past, came = slice(max(index - trail, 0), index + 1), self.outcomes[index]
+        path_px = np.where((self.outcomes[past] == Outcome.RIGHT)[..., None], uv_px[past], np.nan)
         for name, points in self._points.items():
             right, missed, wrong = (points & (came == k) for k in (Outcome.RIGHT, Outcome.MISSED, Outcome.WRONG))
-            was_right = run.visible & (self.outcomes == Outcome.RIGHT)
-            paths = np.where(was_right[..., None], uv_px, np.nan)[first : index + 1, right]
-            image = overlay.draw_trail(image, paths.transpose(1, 0, 2), self._colours[name], 1)
+            image = overlay.draw_trail(image, path_px[:, right].swapaxes(0, 1), self._colours[name], 1)
             image = overlay.draw_points(image, true_px[index, missed], style.OUTCOMES[Outcome.MISSED], 0.7)
             image = overlay.draw_points(image, uv_px[index, right], self._colours[name], 2.5)
             image = overlay.draw_points(image, uv_px[index, wrong], style.OUTCOMES[Outcome.WRONG], 4, filled=False)
@@ -116,9 +115,8 @@ class TrackScene:
         """Objects and spans [start, stop) of frames in which truth sees none of their points, by their start."""
         found = []
         for name, points in self._points.items():
-            seen = self.score.truth.visible[:, points].any(1)
-            spans = status_intervals(np.where(seen, "seen", "gone"))
-            found += [(name, a, b) for kind, a, b in spans if kind == "gone" and a > 0 and b - a >= _MIN_ABSENCE]
+            spans = status_intervals(self.score.truth.visible[:, points].any(1))
+            found += [(name, a, b) for seen, a, b in spans if seen == "False" and a > 0 and b - a >= _MIN_ABSENCE]
         return sorted(found, key=lambda span: span[1])
 
     def moments(self, count: int) -> list[int]:
@@ -163,9 +161,8 @@ def outcome_bands(scores: Mapping[str, TrackerScore], times_s: np.ndarray) -> Fi
         extent = (times_s[0], times_s[-1], len(order), 0)
         pixels = {"vmin": 0, "vmax": 4, "aspect": "auto", "interpolation": "nearest", "extent": extent}
         axis.imshow(score_outcomes(score)[:, order].T, colours, **pixels)
-        axis.set_title(label)
+        axis.set(title=label, ylabel="points")
         axis.grid(visible=False)
-        axis.set_ylabel("points")
     axes[-1].set_xlabel("time [s]", loc="left")
     edge = {"edgecolor": "#333333", "linewidth": 0.3}
     patches = [Patch(facecolor=style.OUTCOMES[k], label=words, **edge) for k, words in _OUTCOMES.items()]
@@ -190,9 +187,8 @@ def reliability_plot(rows: Mapping[str, Reliability], uncertain_px: Mapping[str,
         if label in uncertain_px:
             stated_px = uncertain_px[label] * row.uncertainty / (1 - row.uncertainty)
             axis.plot(row.uncertainty, stated_px, "--", color=style.NEUTRAL[0], label="standard deviation stated")
-        axis.set_xlabel(r"uncertainty $\sigma_t$")
+        axis.set(xlabel=r"uncertainty $\sigma_t$", title=f"{label}: rank correlation {row.rank_correlation:.2f}")
         logarithmic(axis.yaxis)
-        axis.set_title(f"{label}: rank correlation {row.rank_correlation:.2f}")
         axis.sharey(axes[0])
     axes[0].set_ylabel("error [px]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower right", ncols=3, fontsize=8)

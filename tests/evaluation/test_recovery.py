@@ -6,7 +6,7 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation.protocol import evaluate
-from p2p_lib.evaluation.recovery import RecoveryEvent, recovered_within, recovery_events
+from p2p_lib.evaluation.recovery import RecoveryEvent, recovered_within
 
 POINTS = np.random.default_rng(0).normal(0, 0.05, (400, 3))
 
@@ -30,8 +30,7 @@ def standing(visible, found, wrong=(), first_frame=0):
 
 def events_of(*how, **where):
     obj = standing(*how, **where)
-    score = evaluate(Run(None, {}, {"mug": obj}, {"mug": POINTS}, {})).objects["mug"]
-    return recovery_events(obj, score)
+    return list(evaluate(Run(None, {}, {"mug": obj}, {"mug": POINTS}, {})).objects["mug"].returns)
 
 
 def delays(events):

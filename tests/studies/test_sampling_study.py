@@ -78,7 +78,7 @@ def test_terms_of_the_choices_sum_to_what_was_maximised():
 
 
 def test_choices_are_scored_on_the_same_ground(crossing):
-    at = Situation.of(crossing, "box", 0)
+    at = Situation(crossing, "box", 0)
     scores = compare_choices([at], frames_on=0).set_index("choice")
     assert [len(uv_px) for uv_px in scores["uv_px"]] == [CONFIG.sampling.points] * 6
     assert scores["covered [%]"]["farthest"] > scores["covered [%]"]["score alone"]
@@ -108,7 +108,7 @@ def test_the_life_of_a_map_follows_the_rules_of_promotion(crossing):
 
 
 def test_maps_show_the_terms_and_the_next_choice(crossing):
-    situation = Situation.of(crossing, "box", 0)
+    situation = Situation(crossing, "box", 0)
     candidates, config = situation.candidates(), situation.config.sampling
     figure = sampling.term_maps(situation, candidates, after=(0, 4))
     axes = figure.axes  # two rows of four, then the colour bars
