@@ -55,12 +55,12 @@ def find_masks(
     folder: Path,
     rgb_files: tuple[Path, ...],
     shape: tuple[int, int],
-    objects: tuple[str, ...] | None = None,
+    objects: tuple[str, ...] = (),
     some_frames: bool = False,
 ) -> MaskFiles:
     """The masks below a folder: one folder per object, or one label image per frame.
 
-    ``objects`` are the names to find; None takes what is there: the folders' names, or ``object_k`` for
+    ``objects`` are the names to find; none takes what is there: the folders' names, or ``object_k`` for
     label k (``object`` where there is a single one). With known names, label k is the k-th of them, and
     a single object is everything that is not 0. With ``some_frames`` there may be masks of some frames, named as their
     images, or a single one, of the first image.
@@ -69,7 +69,7 @@ def find_masks(
         fix = f"Name a folder inside the sequence, a path, or {', '.join(MASK_SOURCES)}."
         raise MissingData(str(folder), "no such folder of masks", fix)
     below = tuple(sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")))
-    names = below if objects is None else objects
+    names = objects or below
 
     def paired(where: Path) -> dict[int, Path | None]:
         files = list_files(where, LOSSLESS, "mask images")
@@ -84,12 +84,9 @@ def find_masks(
     if below:
         return MaskFiles({name: paired(folder / name) for name in names}, dict.fromkeys(names), shape)
     files = paired(folder)
-    labels: dict[str, int | None]
-    if objects is None:
-        found = _labels_in(files.values(), shape)
-        labels = {f"object_{k}": k for k in found} if len(found) > 1 else {"object": None}
-    else:
-        labels = {name: k + 1 for k, name in enumerate(names)} if len(names) > 1 else {names[0]: None}
+    found = range(1, len(objects) + 1) if objects else _labels_in(files.values(), shape)
+    names = objects or [f"object_{k}" for k in found]
+    labels = dict(zip(names, found)) if len(found) > 1 else dict.fromkeys(objects or ["object"])
     return MaskFiles(dict.fromkeys(labels, files), labels, shape)
 
 
