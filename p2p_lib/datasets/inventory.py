@@ -99,7 +99,7 @@ def _fetch_one(file: RemoteFile, record: _Record, progress: bool) -> str:
             unpacked = unpack(path, into, bar.update)
         record.keep(file, digest, unpacked)
         said += f", {len(unpacked)} files unpacked into {into}"
-    return f"{file.path}: {human_size(path.stat().st_size)}, {said}"
+    return f"{file.path}: {tqdm.format_sizeof(path.stat().st_size, 'B')}, {said}"
 
 
 def require(of: Manifest) -> list[Path]:
@@ -149,9 +149,8 @@ def _verify_file(file: RemoteFile, record: _Record) -> Finding:
         digest = sha256(path)
         if expected is None:
             return Finding.whether(True, file.path, f"there, nothing to compare with; sha256 {digest}")
-        return Finding.whether(
-            digest == expected, file.path, "sha256 as expected" if digest == expected else f"sha256 {digest}"
-        )
+        text = "sha256 as expected" if digest == expected else f"sha256 {digest}"
+        return Finding.whether(digest == expected, file.path, text)
     if unpacked is None:
         return Finding.whether(False, file.path, "not there")
     into = record.folder / (file.unpack_to or ".")
@@ -244,15 +243,11 @@ def describe(of: Manifest) -> str:
     lines += [f"unit      {what}: {unit}" for what, unit in of.units.items()]
     lines += [f"layout    {line}" for line in of.layout]
     for file in of.files:
+        size = tqdm.format_sizeof(file.bytes, "B") if file.bytes else "size unknown"
         checksum = f"sha256 {file.sha256}" if file.sha256 else file.unknown
-        lines.append(f"file      {file.path}, {human_size(file.bytes)}, {checksum}")
+        lines.append(f"file      {file.path}, {size}, {checksum}")
     lines += [f"files     {of.files_unknown}"] if of.files_unknown else []
     for entry in of.sequences:
         known = [f"{entry.frames} frames" if entry.frames else "", f"paper: {entry.paper}" if entry.paper else ""]
         lines.append(f"sequence  {', '.join([entry.name, *filter(None, known)])}")
     return "\n".join([*lines, f"cite      {of.citation}"])
-
-
-def human_size(count: int | None) -> str:
-    """``1.20GB``; "size unknown" of None."""
-    return "size unknown" if count is None else tqdm.format_sizeof(count, "B")
