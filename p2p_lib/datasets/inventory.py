@@ -226,8 +226,7 @@ def overview() -> str:
     rows = []
     for of in map(manifest, names()):
         # A download that broke off leaves only hidden files.
-        files = [] if root is None else (p for p in folder_of(of).rglob("[!.]*") if p.is_file())
-        here = "?" if root is None else "yes" if any(files) else "no"
+        here = "?" if root is None else "yes" if any(p.is_file() for p in folder_of(of).rglob("[!.]*")) else "no"
         rows.append((of.name, of.kind, here, of.access, of.title))
     table = as_text(DataFrame(rows, columns=["name", "kind", "here", "access", "what"]))
     return f"{table}\n" + (f"In {root}" if root else "$P2P_DATA is not set: it says in which folder datasets live.")

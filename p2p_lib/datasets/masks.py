@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,10 +12,6 @@ import numpy as np
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import MASK_SOURCES
 from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_files, read_image
-
-if TYPE_CHECKING:
-    from p2p_lib.datasets.runs import Run
-    from p2p_lib.datasets.sequence import Sequence
 
 
 @dataclass(eq=False)
@@ -88,16 +83,6 @@ def find_masks(
     names = objects or [f"object_{k}" for k in found]
     labels = dict(zip(names, found)) if len(found) > 1 else dict.fromkeys(objects or ["object"])
     return MaskFiles(dict.fromkeys(labels, files), labels, shape)
-
-
-def masks_of_run(run: Run, sequence: Sequence, frame: int) -> dict[str, np.ndarray]:
-    """Object to (H, W) bool at a frame of the sequence: the masks that the run kept, else those of its that it used."""
-    kept = {name: run.path / "masks" / name / f"{frame:06d}.png" for name in run.objects}
-    if any(path.is_file() for path in kept.values()):
-        shape = sequence.camera.height, sequence.camera.width
-        return {name: read_labels(path, shape) > 0 for name, path in kept.items() if path.is_file()}
-    masks = sequence.masks(frame) if run.info["masks"] == "dataset" else None
-    return {name: masks[name] for name in run.objects if name in masks} if masks else {}
 
 
 def _labels_in(files: Iterable[Path], shape: tuple[int, int]) -> list[int]:
