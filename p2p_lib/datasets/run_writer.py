@@ -123,20 +123,19 @@ class RunWriter:
         self._timings.append(row | {f"{k}_ms": f"{v:.4f}" for k, v in (stages_ms or {}).items()})
         n = len(self._frames)
         if self.resumed is not None and n <= len(next(iter(self.resumed.objects.values()))):
-            return self._compare(self.resumed, n - 1)
-        if not self.begun:
-            return self.begin()
-        self._append_last()
-        if n >= self._flush_at:
-            self.flush()
-        return None
+            self._compare(self.resumed, n - 1)
+        elif not self.begun:
+            self.begin()
+        else:
+            self._append_last()
+            if n >= self._flush_at:
+                self.flush()
 
     def begin(self) -> None:
         """Write all so far in the place of an earlier run; what :meth:`add` does at the first frame that is new."""
         for folder in ("poses", "meshes", "masks"):
             if (self.path / folder).is_symlink():
                 raise BadInput(str(self.path / folder), "a link", "a folder of the run's own", "Take it away.")
-        (self.path / "poses").mkdir(exist_ok=True)
         if self.resumed is None:
             if (earlier := read_info(self.path)) is not None:
                 _clear(self.path, earlier)

@@ -87,18 +87,15 @@ class Sequence(Protocol):
 
     def frame(self, i: int) -> Frame:
         """The i-th frame, read now; :class:`BadInput` or :class:`MissingData` names a file that is wrong."""
-        ...
 
     def masks(self, i: int) -> dict[str, np.ndarray] | None:
         """Object to (H, W) bool at frame i; None where the sequence has no masks (or none for this frame)."""
-        ...
 
     def visible_px(self, i: int) -> dict[str, int] | None:
         """Object to the size of its visible mask at frame i, by the dataset's OWN masks whatever ``masks`` gives.
 
         Scoring uses this, so that the same frames count for every source of masks.
         """
-        ...
 
 
 def open_sequence(

@@ -55,7 +55,7 @@ def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:
     except ValueError:
         raise BadInput(str(path), "another kind of line", form) from None
     if not len(files) or not (np.diff(times_s) > 0).all():
-        got = "no line" if not len(files) else f"times that run backwards at {times_s[1:][np.diff(times_s) <= 0][0]}"
+        got = "no line" if not len(files) else f"times that run backwards at {times_s[1:][~(np.diff(times_s) > 0)][0]}"
         raise BadInput(str(path), got, form)
     return times_s, files
 
