@@ -17,7 +17,7 @@ from tqdm import tqdm
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.files import read_text, replace_text
-from p2p_lib.core.findings import Finding, Level
+from p2p_lib.core.findings import Finding
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.tables import as_text
 from p2p_lib.datasets.archives import unpack
@@ -132,7 +132,7 @@ def verify(of: Manifest, every_frame: bool = False) -> Iterator[Finding]:
     """
     folder = folder_of(of)
     if not folder.is_dir():
-        yield Finding(str(folder), Level.WRONG, "not there", f"Next: p2p data info {of.name}")
+        yield Finding.whether(False, str(folder), "not there", f"Next: p2p data info {of.name}")
         return
     record = _Record(of)
     for file in of.files:
@@ -196,9 +196,8 @@ def _verify_sequence(folder: Path, format: str | None, frames: int | None, every
         sequence.masks(i)
     truth = {obj: int((t.T_cam_model == t.T_cam_model).all((1, 2)).sum()) for obj, t in sequence.truth.items()}
     text = f"{len(sequence)} frames, truth " + (", ".join(f"{o} in {n}" for o, n in truth.items()) or "none")
-    if frames is not None and frames != len(sequence):
-        return Finding.whether(False, folder.name, f"{text}, expected {frames} frames")
-    return Finding.whether(True, folder.name, text)
+    complete = frames in (None, len(sequence))
+    return Finding.whether(complete, folder.name, text if complete else f"{text}, expected {frames} frames")
 
 
 # --- describing ------------------------------------------------------------------------------------

@@ -76,10 +76,8 @@ class ObjectRun:
 
     def __post_init__(self) -> None:
         of_a_frame = {"T_cam_obj": (4, 4), "covariance": (6, 6), "T_cam_model": (4, 4), "T_obj_joined": (4, 4)}
-        if self.frame_index.ndim != 1:
-            raise BadInput("run: frame_index", f"shape {self.frame_index.shape}", "one number for each frame")
         for column in COLUMNS:
-            got, expected = getattr(self, column).shape, (len(self), *of_a_frame.get(column, ()))
+            got, expected = getattr(self, column).shape, (self.frame_index.size, *of_a_frame.get(column, ()))
             if got != expected:
                 raise BadInput(f"run: {column}", f"shape {got}", f"{expected}")
             if (kind := getattr(self, column).dtype.kind) not in _KINDS.get(column, "f"):
@@ -221,7 +219,7 @@ def load_run(folder: str | Path, every_map: bool = False) -> Run:
     arrays, objects = load_arrays(folder / "poses.npz"), {}
     for name in info["objects"] if info["frames"] else ():
         if f"{name}/frame_index" in arrays:
-            n = len(np.atleast_1d(arrays[f"{name}/frame_index"]))
+            n = arrays[f"{name}/frame_index"].size
             of_older_runs = {"map_id": np.zeros(n, int), "joined_map": np.full(n, -1)}
             of_older_runs["T_obj_joined"] = np.tile(NO_POSE, (n, 1, 1))
             columns = {column: arrays.get(f"{name}/{column}", of_older_runs.get(column)) for column in COLUMNS}
