@@ -26,7 +26,7 @@ OPTIONAL = {
     "torchvision": ("torchvision", "2D tracker tapnextpp", INSTALL["torchvision"]),
     "rerun": ("rerun", "recordings to look at frame by frame, p2p view --rerun", PIP + "rerun-sdk"),
     "rosbags": ("rosbags", "ROS 1 and 2 recordings, p2p convert", PIP + "rosbags"),
-    "pyrealsense2": ("pyrealsense2", "RealSense cameras and recordings", PIP + "pyrealsense2"),
+    "pyrealsense2": ("pyrealsense2", "RealSense cameras and recordings", INSTALL["pyrealsense2"]),
     "dask": ("dask.distributed", "runs on a cluster", PIP + "'dask[distributed]'"),
 }
 FREE_GB = 5.0

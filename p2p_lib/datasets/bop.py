@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, paired_images
+from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.masks import MaskFiles
 from p2p_lib.datasets.models import load_mesh, load_points
 from p2p_lib.datasets.schema import read_json
@@ -52,25 +53,18 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     rgb, depth = paired_images(folder)
     numbers = [_number(path) for path in rgb]
     camera, scale_mm = _camera(folder / "scene_camera.json", numbers, rgb[0])
-    files = ImageFiles(folder, rgb, depth, camera, (np.array(numbers) - numbers[0]) / images.DEFAULT_HZ)
+    files = ImageSequence(folder, rgb, depth, camera, (np.array(numbers) - numbers[0]) / images.DEFAULT_HZ)
     listed = _named(_lists(folder / "scene_gt.json", _Pose), numbers)
     objects = tuple(sorted({obj for at in listed for obj in at}))
     own = _visible_masks(folder, numbers, listed, objects, files.shape)
-    chosen = files.find_masks(masks, (), objects or None)[0] if masks else own
+    files = replace(files, own_masks=own).with_masks(masks, objects=objects)
 
     def read_truth() -> dict[str, ObjectTruth]:
         info = _lists(folder / "scene_gt_info.json", _Info)
         return {obj: _truth(folder, obj, numbers, listed, info) for obj in objects}
 
-    return ImageSequence(
-        **vars(files),
-        objects=objects or ("object",),
-        depth_scale=scale_mm * MM,
-        mask_files=chosen,
-        own_masks=own or chosen,
-        read_truth=read_truth,
-        model_places={obj: _model_places(folder, obj) for obj in objects},
-    )
+    model_places = {obj: _model_places(folder, obj) for obj in objects}
+    return replace(files, depth_scale=scale_mm * MM, read_truth=read_truth, model_places=model_places)
 
 
 def _number(path: Path) -> int:

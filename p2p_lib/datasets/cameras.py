@@ -23,7 +23,6 @@ from p2p_lib.datasets.sequence import ObjectTruth, Sequence, open_sequence
 DEFAULT_RATE_HZ = 30.0
 #: So many frames may wait: a search or a keyframe takes as long as some frames, and those after it make up for that.
 DEFAULT_BACKLOG = 4
-_FORMS = "realsense, realsense:RECORDING or folder:PATH"
 
 
 class LiveCamera(Protocol):
@@ -102,7 +101,7 @@ def open_camera(spec: str, rate_hz: float | None = None) -> LiveCamera:
         return FolderCamera(open_sequence(what), DEFAULT_RATE_HZ if rate_hz is None else rate_hz)
     if kind != "realsense":
         fix = f"Did you mean folder:{spec}?" if Path(spec).is_dir() else ""
-        raise BadInput("camera", repr(spec), _FORMS, fix)
+        raise BadInput("camera", repr(spec), "realsense, realsense:RECORDING or folder:PATH", fix)
     if rate_hz is not None:
         raise BadInput("rate", f"{rate_hz:g} with {spec}", "a rate for folder:PATH alone: other cameras have their own")
     from p2p_lib.datasets.realsense import RealSenseCamera

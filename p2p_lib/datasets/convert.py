@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -44,14 +44,8 @@ def convert(
         folder.write(sequence, out)
         return len(sequence)
     recording = _opened(Path(source), colour, depth)
-    with closing(recording), progress_bar(Path(source).name, shown=progress) as bar:
-
-        def counted(frames: Iterable[Frame]) -> Iterator[Frame]:
-            for frame in frames:
-                yield frame
-                bar.update()
-
-        times_s = folder.write_images(out, counted(recording), recording.unit_m)
+    with closing(recording), progress_bar(Path(source).name, shown=progress, iterable=recording) as frames:
+        times_s = folder.write_images(out, frames, recording.unit_m)
         folder.write_about(out, recording.camera, times_s, recording.unit_m)
     return len(times_s)
 

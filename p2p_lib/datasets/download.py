@@ -86,8 +86,7 @@ def _fetch(url: str, part: Path, progress: bool) -> None:
         if left > shutil.disk_usage(part.parent).free:
             raise BadInput(url, f"{left} bytes", f"room for them in {part.parent}")
         name = part.name.removeprefix(".").removesuffix(".part")
-        options = {"unit": "B", "unit_scale": True, "initial": begun, "shown": progress}
-        bar = progress_bar(name, begun + left or None, **options)
+        bar = progress_bar(name, begun + left or None, unit="B", unit_scale=True, initial=begun, shown=progress)
         with bar, part.open("ab" if begun else "wb") as sink:
             for chunk in response.iter_content(CHUNK):
                 sink.write(chunk)

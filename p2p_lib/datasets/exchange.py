@@ -119,18 +119,15 @@ def read_poses(path: str | Path, sequence: Sequence) -> dict[str, np.ndarray]:
         return {_only_object(path, sequence): _read_tum(path, sequence)}
     if not path.is_dir():
         raise MissingData(str(path), "no such file or folder, expected poses (BOP .csv, TUM .txt, or 4x4 matrices)")
-    found = sorted(path.glob("*.csv"))
-    if found:
+    if found := sorted(path.glob("*.csv")):
         if len(found) > 1:
             raise BadInput(str(path), f"{len(found)} .csv files", "one", "Name the one that is meant.")
         return _read_bop(found[0], sequence)
     folder = next((path / name for name in MATRIX_FOLDERS if (path / name).is_dir()), path)
-    named = {name: folder / name for name in sequence.objects if (folder / name).is_dir()}
-    if named:
+    if named := {name: folder / name for name in sequence.objects if (folder / name).is_dir()}:
         return {name: _read_matrices(where, sequence) for name, where in named.items()}
-    trajectories = {name: folder / f"{name}.txt" for name in sequence.objects if (folder / f"{name}.txt").is_file()}
-    if trajectories:
-        return {name: _read_tum(where, sequence) for name, where in trajectories.items()}
+    if files := {name: folder / f"{name}.txt" for name in sequence.objects if (folder / f"{name}.txt").is_file()}:
+        return {name: _read_tum(file, sequence) for name, file in files.items()}
     return {_only_object(folder, sequence): _read_matrices(folder, sequence)}
 
 

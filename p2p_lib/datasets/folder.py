@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageSequence, image_files, without_truth
+from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import Sequence
 
 #: Depth cameras see no farther; and nearer than 20 mm none does.
@@ -29,7 +30,8 @@ _FARTHEST_M = 20.0
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)
-    return without_truth(files, masks, _depth_scale(folder / "depth_scale.txt", files.depth[0]))
+    scale = _depth_scale(folder / "depth_scale.txt", files.depth[0])
+    return replace(files, depth_scale=scale).without_truth(masks)
 
 
 def write(

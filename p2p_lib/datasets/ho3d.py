@@ -9,6 +9,7 @@ the object; those of others lie in ``HO3D_v3/masks/<sequence>/`` or ``HO3D_v3/ma
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, paired_images
+from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.pickles import load_plain
 from p2p_lib.datasets.sequence import ObjectTruth
 
@@ -35,21 +36,20 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     meta_files = images.check_paired(images.list_files(folder / "meta", (".pkl",), "meta files"), rgb)
     first = read_meta(meta_files[0])
     camera = camera_for(rgb[0], first["camMat"], f"{meta_files[0]}: camMat")
-    files = ImageFiles(folder, rgb, depth, camera, images.frame_times(folder, rgb))
+    files = ImageSequence(folder, rgb, depth, camera, images.frame_times(folder, rgb))
     at = images.full(folder)
     beside = [at.parents[1] / str(where) / at.name for where in ([masks] if masks else MASKS)]
-    found, _ = files.find_masks(next((where for where in beside if where.is_dir()), masks), (), (OBJECT,))
+    files = files.with_masks(next((where for where in beside if where.is_dir()), masks), objects=(OBJECT,))
 
     def read_truth() -> dict[str, ObjectTruth]:
         poses = [read_pose(path, read_meta(path), camera) for path in meta_files]
         return {OBJECT: ObjectTruth(np.stack(poses), np.ones(len(poses), bool))}
 
-    return ImageSequence(
-        **vars(files),
-        objects=(OBJECT,),
+    return replace(
+        files,
         depth_scale=DEPTH_SCALE,
         read_depth=read_raw_depth,
-        mask_files=found,
+        own_masks=None,
         read_truth=read_truth,
         model_places={OBJECT: _models(folder, first)},
     )

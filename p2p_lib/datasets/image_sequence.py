@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -15,46 +15,6 @@ from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.masks import MaskFiles, find_masks
 from p2p_lib.datasets.sequence import ObjectTruth
-
-
-@dataclass(frozen=True, eq=False)
-class ImageFiles:
-    """What every layout has: a folder with one ``rgb/`` and one ``depth/`` image a frame, a camera, times (N,)."""
-
-    path: Path
-    rgb: tuple[Path, ...]
-    depth: tuple[Path, ...]
-    camera: Camera
-    times_s: np.ndarray
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(height, width) in pixels."""
-        return self.camera.height, self.camera.width
-
-    def find_masks(
-        self,
-        asked: str | Path | None,
-        places: Iterable[Path],
-        objects: tuple[str, ...] | None = None,
-        some_frames: bool = False,
-    ) -> tuple[MaskFiles | None, MaskFiles | None]:
-        """The masks to use and the dataset's own, which are in the first of ``places`` that there is.
-
-        asked  another folder to use, with masks of some frames or of all: a name inside the sequence, or a path. Other
-               arguments as of ``find_masks``.
-        """
-
-        def find(where: Path) -> MaskFiles:
-            return find_masks(where, self.rgb, self.shape, objects, some_frames or where == given)
-
-        inside = None if asked is None else self.path / asked
-        given = inside if inside is None or inside.is_dir() else Path(asked).expanduser()
-        own = next((find(where) for where in places if where.is_dir()), None)
-        if given is None:
-            return own, own
-        chosen = find(given)
-        return chosen, own or chosen
 
 
 def paired_images(folder: Path, colour: str = "rgb") -> tuple[tuple[Path, ...], tuple[Path, ...]]:
@@ -69,17 +29,9 @@ def camera_for(rgb: Path, K: np.ndarray, name: str) -> Camera:
     return Camera.from_K(K, width, height, name=name)
 
 
-def image_files(folder: Path) -> ImageFiles:
-    """The files of a folder with ``rgb/``, ``depth/``, ``cam_K.txt`` and times, paired and checked."""
-    rgb, depth = paired_images(folder)
-    path = folder / "cam_K.txt"
-    camera = camera_for(rgb[0], images.read_numbers(path, "a 3x3 camera matrix in pixels"), str(path))
-    return ImageFiles(folder, rgb, depth, camera, images.frame_times(folder, rgb))
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ImageSequence(ImageFiles):
-    """A :class:`~p2p_lib.datasets.sequence.Sequence` of image files.
+@dataclass(frozen=True, eq=False)
+class ImageSequence:
+    """A :class:`~p2p_lib.datasets.sequence.Sequence` of image files, one ``rgb`` and one ``depth`` a frame.
 
     depth_invalid  raw depth value that means "no measurement" besides 0
     read_depth     reads a depth file: (H, W) in the file's unit, of which depth_scale is metres
@@ -87,9 +39,14 @@ class ImageSequence(ImageFiles):
     read_truth     called once, when truth is first asked for
     """
 
+    path: Path
+    rgb: tuple[Path, ...]
+    depth: tuple[Path, ...]
+    camera: Camera
+    times_s: np.ndarray
     name: str = ""
     format: str = ""
-    objects: tuple[str, ...]
+    objects: tuple[str, ...] = ("object",)
     depth_scale: float = images.DEPTH_SCALE
     depth_invalid: int = 0
     read_depth: Callable[[Path], np.ndarray] = images.read_raw_depth
@@ -104,6 +61,11 @@ class ImageSequence(ImageFiles):
     def __repr__(self) -> str:
         size = f"{self.camera.width}x{self.camera.height}"
         return f"{type(self).__name__}({self.name!r}, {len(self)} frames, {size}, objects: {', '.join(self.objects)})"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.camera.height, self.camera.width
 
     @cached_property
     def truth(self) -> dict[str, ObjectTruth]:
@@ -140,16 +102,38 @@ class ImageSequence(ImageFiles):
         if not 0 <= i < len(self):
             raise BadInput(f"{self.name}: frame", i, f"a number from 0 to {len(self) - 1}")
 
+    def with_masks(
+        self,
+        asked: str | Path | None,
+        places: Iterable[Path] = (),
+        objects: tuple[str, ...] = (),
+        some_frames: bool = False,
+    ) -> ImageSequence:
+        """The same with masks and their objects; the dataset's own are in the first of ``places`` that there is.
 
-def without_truth(files: ImageFiles, masks: str | Path | None, depth_scale: float) -> ImageSequence:
-    """The sequence of a layout that has no truth: its objects are those of its masks, which lie in ``masks/``."""
-    found, _ = files.find_masks(masks, [] if masks else [files.path / "masks"], some_frames=True)
-    objects = tuple(found.files) if found else ("object",)
-    return ImageSequence(
-        **vars(files),
-        objects=objects,
-        depth_scale=depth_scale,
-        mask_files=found,
-        own_masks=found,
-        model_places={obj: (files.path / "models" / obj,) for obj in objects},
-    )
+        asked  another folder to use, with masks of some frames or of all: a name inside the sequence, or a path. Other
+               arguments as of ``find_masks``.
+        """
+
+        def find(where: Path) -> MaskFiles:
+            return find_masks(where, self.rgb, self.shape, objects, some_frames or where == given)
+
+        inside = None if asked is None else self.path / asked
+        given = inside if inside is None or inside.is_dir() else Path(asked).expanduser()
+        own = next((find(where) for where in places if where.is_dir()), self.own_masks)
+        chosen = find(given) if given else own
+        objects = objects or (tuple(chosen.files) if chosen else self.objects)
+        return replace(self, objects=objects, mask_files=chosen, own_masks=own or chosen)
+
+    def without_truth(self, masks: str | Path | None) -> ImageSequence:
+        """The same with the objects of its masks, which lie in ``masks/`` where no others are asked for."""
+        made = self.with_masks(masks, [] if masks else [self.path / "masks"], some_frames=True)
+        return replace(made, model_places={obj: (self.path / "models" / obj,) for obj in made.objects})
+
+
+def image_files(folder: Path) -> ImageSequence:
+    """The sequence in a folder with ``rgb/``, ``depth/``, ``cam_K.txt`` and times, paired and checked."""
+    rgb, depth = paired_images(folder)
+    path = folder / "cam_K.txt"
+    camera = camera_for(rgb[0], images.read_numbers(path, "a 3x3 camera matrix in pixels"), str(path))
+    return ImageSequence(folder, rgb, depth, camera, images.frame_times(folder, rgb))

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.files import read_text, replace_text
-from p2p_lib.core.findings import Finding, Level
+from p2p_lib.core.findings import Finding
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.tables import as_text
 from p2p_lib.datasets.archives import unpack
@@ -99,7 +99,7 @@ def _fetch_one(file: RemoteFile, record: _Record, progress: bool) -> str:
             unpacked = unpack(path, into, bar.update)
         record.keep(file, digest, unpacked)
         said += f", {len(unpacked)} files unpacked into {into}"
-    return f"{file.path}: {human_size(path.stat().st_size)}, {said}"
+    return f"{file.path}: {tqdm.format_sizeof(path.stat().st_size, 'B')}, {said}"
 
 
 def require(of: Manifest) -> list[Path]:
@@ -132,7 +132,7 @@ def verify(of: Manifest, every_frame: bool = False) -> Iterator[Finding]:
     """
     folder = folder_of(of)
     if not folder.is_dir():
-        yield Finding(str(folder), Level.WRONG, "not there", f"Next: p2p data info {of.name}")
+        yield Finding.whether(False, str(folder), "not there", f"Next: p2p data info {of.name}")
         return
     record = _Record(of)
     for file in of.files:
@@ -149,9 +149,8 @@ def _verify_file(file: RemoteFile, record: _Record) -> Finding:
         digest = sha256(path)
         if expected is None:
             return Finding.whether(True, file.path, f"there, nothing to compare with; sha256 {digest}")
-        return Finding.whether(
-            digest == expected, file.path, "sha256 as expected" if digest == expected else f"sha256 {digest}"
-        )
+        text = "sha256 as expected" if digest == expected else f"sha256 {digest}"
+        return Finding.whether(digest == expected, file.path, text)
     if unpacked is None:
         return Finding.whether(False, file.path, "not there")
     into = record.folder / (file.unpack_to or ".")
@@ -197,9 +196,8 @@ def _verify_sequence(folder: Path, format: str | None, frames: int | None, every
         sequence.masks(i)
     truth = {obj: int((t.T_cam_model == t.T_cam_model).all((1, 2)).sum()) for obj, t in sequence.truth.items()}
     text = f"{len(sequence)} frames, truth " + (", ".join(f"{o} in {n}" for o, n in truth.items()) or "none")
-    if frames is not None and frames != len(sequence):
-        return Finding.whether(False, folder.name, f"{text}, expected {frames} frames")
-    return Finding.whether(True, folder.name, text)
+    complete = frames in (None, len(sequence))
+    return Finding.whether(complete, folder.name, text if complete else f"{text}, expected {frames} frames")
 
 
 # --- describing ------------------------------------------------------------------------------------
@@ -227,8 +225,7 @@ def overview() -> str:
     rows = []
     for of in map(manifest, names()):
         # A download that broke off leaves only hidden files.
-        files = [] if root is None else (p for p in folder_of(of).rglob("[!.]*") if p.is_file())
-        here = "?" if root is None else "yes" if any(files) else "no"
+        here = "?" if root is None else "yes" if any(p.is_file() for p in folder_of(of).rglob("[!.]*")) else "no"
         rows.append((of.name, of.kind, here, of.access, of.title))
     table = as_text(DataFrame(rows, columns=["name", "kind", "here", "access", "what"]))
     return f"{table}\n" + (f"In {root}" if root else "$P2P_DATA is not set: it says in which folder datasets live.")
@@ -244,15 +241,11 @@ def describe(of: Manifest) -> str:
     lines += [f"unit      {what}: {unit}" for what, unit in of.units.items()]
     lines += [f"layout    {line}" for line in of.layout]
     for file in of.files:
+        size = tqdm.format_sizeof(file.bytes, "B") if file.bytes else "size unknown"
         checksum = f"sha256 {file.sha256}" if file.sha256 else file.unknown
-        lines.append(f"file      {file.path}, {human_size(file.bytes)}, {checksum}")
+        lines.append(f"file      {file.path}, {size}, {checksum}")
     lines += [f"files     {of.files_unknown}"] if of.files_unknown else []
     for entry in of.sequences:
         known = [f"{entry.frames} frames" if entry.frames else "", f"paper: {entry.paper}" if entry.paper else ""]
         lines.append(f"sequence  {', '.join([entry.name, *filter(None, known)])}")
     return "\n".join([*lines, f"cite      {of.citation}"])
-
-
-def human_size(count: int | None) -> str:
-    """``1.20GB``; "size unknown" of None."""
-    return "size unknown" if count is None else tqdm.format_sizeof(count, "B")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,10 +12,6 @@ import numpy as np
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import MASK_SOURCES
 from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_files, read_image
-
-if TYPE_CHECKING:
-    from p2p_lib.datasets.runs import Run
-    from p2p_lib.datasets.sequence import Sequence
 
 
 @dataclass(eq=False)
@@ -55,12 +50,12 @@ def find_masks(
     folder: Path,
     rgb_files: tuple[Path, ...],
     shape: tuple[int, int],
-    objects: tuple[str, ...] | None = None,
+    objects: tuple[str, ...] = (),
     some_frames: bool = False,
 ) -> MaskFiles:
     """The masks below a folder: one folder per object, or one label image per frame.
 
-    ``objects`` are the names to find; None takes what is there: the folders' names, or ``object_k`` for
+    ``objects`` are the names to find; none takes what is there: the folders' names, or ``object_k`` for
     label k (``object`` where there is a single one). With known names, label k is the k-th of them, and
     a single object is everything that is not 0. With ``some_frames`` there may be masks of some frames, named as their
     images, or a single one, of the first image.
@@ -69,7 +64,7 @@ def find_masks(
         fix = f"Name a folder inside the sequence, a path, or {', '.join(MASK_SOURCES)}."
         raise MissingData(str(folder), "no such folder of masks", fix)
     below = tuple(sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")))
-    names = below if objects is None else objects
+    names = objects or below
 
     def paired(where: Path) -> dict[int, Path | None]:
         files = list_files(where, LOSSLESS, "mask images")
@@ -84,23 +79,10 @@ def find_masks(
     if below:
         return MaskFiles({name: paired(folder / name) for name in names}, dict.fromkeys(names), shape)
     files = paired(folder)
-    labels: dict[str, int | None]
-    if objects is None:
-        found = _labels_in(files.values(), shape)
-        labels = {f"object_{k}": k for k in found} if len(found) > 1 else {"object": None}
-    else:
-        labels = {name: k + 1 for k, name in enumerate(names)} if len(names) > 1 else {names[0]: None}
+    found = range(1, len(objects) + 1) if objects else _labels_in(files.values(), shape)
+    names = objects or [f"object_{k}" for k in found]
+    labels = dict(zip(names, found)) if len(found) > 1 else dict.fromkeys(objects or ["object"])
     return MaskFiles(dict.fromkeys(labels, files), labels, shape)
-
-
-def masks_of_run(run: Run, sequence: Sequence, frame: int) -> dict[str, np.ndarray]:
-    """Object to (H, W) bool at a frame of the sequence: the masks that the run kept, else those of its that it used."""
-    kept = {name: run.path / "masks" / name / f"{frame:06d}.png" for name in run.objects}
-    if any(path.is_file() for path in kept.values()):
-        shape = sequence.camera.height, sequence.camera.width
-        return {name: read_labels(path, shape) > 0 for name, path in kept.items() if path.is_file()}
-    masks = sequence.masks(frame) if run.info["masks"] == "dataset" else None
-    return {name: masks[name] for name in run.objects if name in masks} if masks else {}
 
 
 def _labels_in(files: Iterable[Path], shape: tuple[int, int]) -> list[int]:

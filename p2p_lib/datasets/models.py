@@ -36,7 +36,7 @@ def find_models(sequence: Sequence, preferred: tuple[str, ...] = PREFERRED) -> d
     return {name: path for name, path in found.items() if path is not None}
 
 
-def model_in(place: Path, preferred: tuple[str, ...] = PREFERRED) -> Path | None:
+def model_in(place: Path, preferred: tuple[str, ...]) -> Path | None:
     """The model file of a folder, or the file itself; None where there is none of the preferred kinds."""
     if place.is_file():
         return place if any(place.match(pattern) for pattern in preferred) else None

@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, paired_images, without_truth
+from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.schema import read_json
 
 
@@ -33,5 +33,5 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
         raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}", "Open3D's recorder writes it beside color/.")
     # It is written column by column.
     K = np.array(read_json(path, _Intrinsic, "a pinhole camera as Open3D writes it").intrinsic_matrix).reshape(3, 3).T
-    files = ImageFiles(folder, rgb, depth, camera_for(rgb[0], K, str(path)), images.frame_times(folder, rgb))
-    return without_truth(files, masks, images.DEPTH_SCALE)
+    files = ImageSequence(folder, rgb, depth, camera_for(rgb[0], K, str(path)), images.frame_times(folder, rgb))
+    return files.without_truth(masks)

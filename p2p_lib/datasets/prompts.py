@@ -61,9 +61,8 @@ def parse_prompts(content: object, folder: Path | None = None) -> tuple[Prompt, 
     prompts = [_prompt(given, folder) for given in objects]
     (name, frame), count = Counter((p.name, p.frame) for p in prompts).most_common(1)[0]
     if count > 1:
-        raise BadInput(
-            "prompts", f"{name!r} in frame {frame} twice", "one entry per object and frame, with all its points"
-        )
+        expected = "one entry per object and frame, with all its points"
+        raise BadInput("prompts", f"{name!r} in frame {frame} twice", expected)
     return tuple(prompts)
 
 

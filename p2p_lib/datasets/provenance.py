@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import subprocess
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,8 @@ def _commit() -> dict[str, Any]:
         command = ["git", "-C", str(paths.PROJECT), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
-    if not (paths.PROJECT / ".git").exists():
-        return {"commit": None, "modified": None}
-    try:
-        changed = git("status", "--porcelain", "--untracked-files=no", "--", "p2p_lib")
-        return {"commit": git("rev-parse", "HEAD"), "modified": bool(changed)}
-    except (OSError, subprocess.SubprocessError):
-        return {"commit": None, "modified": None}
+    with suppress(OSError, subprocess.SubprocessError):
+        if (paths.PROJECT / ".git").exists():
+            changed = git("status", "--porcelain", "--untracked-files=no", "--", "p2p_lib")
+            return {"commit": git("rev-parse", "HEAD"), "modified": bool(changed)}
+    return {"commit": None, "modified": None}

@@ -15,8 +15,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from p2p_lib.core import packages
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, in_a_line
+from p2p_lib.core.errors import BadInput, MissingData, in_a_line
 from p2p_lib.core.types import Frame
 
 WAIT_MS = 200
@@ -51,7 +52,7 @@ class RealSenseCamera:
         if recording is not None and not recording.is_file():
             fix = "Give a .bag of the RealSense Viewer or of rs-record, or nothing more than `realsense` for a camera."
             raise MissingData(str(recording), "no such recording", fix)
-        self._rs = _library()
+        self._rs = packages.load("pyrealsense2", "RealSense cameras and recordings", "pyrealsense2")
         self._closed, self._waiting, self._last = Event(), Lock(), -1
         self.name = str(recording) if recording else "realsense"
         self._pipeline, self._align = self._rs.pipeline(), self._rs.align(self._rs.stream.color)
@@ -147,15 +148,6 @@ def _together(colour: Any, depth: Any) -> bool:
     """Whether two images are of one moment: when we are late, the library may pair colour with older depth."""
     apart_ms = abs(colour.get_timestamp() - depth.get_timestamp())
     return colour.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain() or apart_ms <= APART_MS
-
-
-def _library() -> Any:
-    try:
-        import pyrealsense2
-    except ImportError as error:
-        fix = "Run: .venv/bin/uv pip install --python .venv pyrealsense2"
-        raise MissingBackend("pyrealsense2", f"reads RealSense cameras and recordings ({error})", fix) from None
-    return pyrealsense2
 
 
 def _pinhole(rs: Any, name: str, colour: Any) -> Any:

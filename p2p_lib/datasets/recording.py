@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
@@ -69,8 +70,6 @@ def read_log(path: Path) -> PoseLog:
         raise BadInput(str(path), f"{rows.shape[0]} rows of {rows.shape[1]} numbers", form)
     if (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > 0.1).any():
         raise BadInput(str(path), "quaternions that are not of unit length", form)
-    from scipy.spatial.transform import Rotation
-
     return PoseLog(rows[:, 0], se3.from_rt(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4]))
 
 

@@ -43,6 +43,7 @@ class RunWriter:
                or ``resume`` it: its frames are compared as they are added again, and nothing is written before they
                are all there. What was not written by a run is never touched
     earlier    what run was in the folder before, in words; empty where there was none
+    resumed    the run in the folder, where it goes on
     complete   whether a run that is resumed had finished, so that nothing is left to do
     begun      whether anything has been written
     """
@@ -75,7 +76,7 @@ class RunWriter:
         models = models or {}
         self._points = {f"{name}/points": load_points(path) for name, path in models.items()}
         self.earlier, self.complete, self.begun = "", False, False
-        self._resumed: Run | None = None
+        self.resumed: Run | None = None
         self._held = ExitStack()
         synthetic = sequence.name.startswith(SYNTHETIC)
         self.info: dict[str, Any] = {
@@ -121,22 +122,21 @@ class RunWriter:
         row["keyframe"] = str(int(any(e.keyframe for e in estimates.values())))
         self._timings.append(row | {f"{k}_ms": f"{v:.4f}" for k, v in (stages_ms or {}).items()})
         n = len(self._frames)
-        if self._resumed is not None and n <= len(next(iter(self._resumed.objects.values()))):
-            return self._compare(self._resumed, n - 1)
-        if not self.begun:
-            return self.begin()
-        self._append_last()
-        if n >= self._flush_at:
-            self.flush()
-        return None
+        if self.resumed is not None and n <= len(next(iter(self.resumed.objects.values()))):
+            self._compare(self.resumed, n - 1)
+        elif not self.begun:
+            self.begin()
+        else:
+            self._append_last()
+            if n >= self._flush_at:
+                self.flush()
 
     def begin(self) -> None:
         """Write all so far in the place of an earlier run; what :meth:`add` does at the first frame that is new."""
         for folder in ("poses", "meshes", "masks"):
             if (self.path / folder).is_symlink():
                 raise BadInput(str(self.path / folder), "a link", "a folder of the run's own", "Take it away.")
-        (self.path / "poses").mkdir(exist_ok=True)
-        if self._resumed is None:
+        if self.resumed is None:
             if (earlier := read_info(self.path)) is not None:
                 _clear(self.path, earlier)
             self._write_info()  # by which the folder is known to be a run's: before anything else
@@ -172,11 +172,6 @@ class RunWriter:
                 self._write_poses(name)
             self._write_timings()
 
-    @property
-    def resumed(self) -> bool:
-        """Whether the run in the folder goes on."""
-        return self._resumed is not None
-
     def flush(self) -> None:
         """Make everything so far readable on disk."""
         n = len(self._frames)
@@ -193,12 +188,15 @@ class RunWriter:
         self._write_info()
 
     def __enter__(self) -> RunWriter:
-        made = not self.path.exists()
-        if made:  # and nothing written by the end: then it goes again
+        if not self.path.exists():  # and nothing written by the end: then it goes again
             self._held.callback(self._leave_nothing)
         with self._held:
             self._held.enter_context(writing_alone(self.path))
-            self._look_around()
+            info = look_into(self.path, self._if_exists)
+            self.earlier = _in_words(info) if info else ""
+            if info and self._if_exists == "resume":
+                self.resumed, self.complete = load_run(self.path, every_map=True), info["finished"]
+                self._check_same(info)
             self._held = self._held.pop_all()
         return self
 
@@ -214,17 +212,6 @@ class RunWriter:
     def _leave_nothing(self) -> None:
         with suppress(OSError):
             self.path.rmdir()
-
-    def _look_around(self) -> None:
-        """What is in the folder, and whether it may be written to."""
-        info = look_into(self.path, self._if_exists)
-        if info is None:
-            return
-        self.earlier = _in_words(info)
-        if self._if_exists == "resume":
-            self._resumed = load_run(self.path, every_map=True)
-            self.complete = info["finished"]
-            self._check_same(info)
 
     def _check_same(self, earlier: Mapping[str, Any]) -> None:
         """That what is to be resumed was asked for in the same words."""
@@ -310,8 +297,7 @@ def look_into(out: Path, if_exists: IfExists) -> dict[str, Any] | None:
 
 
 def _in_words(info: Mapping[str, Any]) -> str:
-    tracker, seed = info["tracker"], info["seed"]
-    return f"a run of {info['sequence']} ({info['frames']} frames, tracker {tracker}, seed {seed})"
+    return f"a run of {info['sequence']} ({info['frames']} frames, tracker {info['tracker']}, seed {info['seed']})"
 
 
 def _place(info: Mapping[str, Any]) -> str:
@@ -331,9 +317,8 @@ def _clear(out: Path, info: Mapping[str, Any]) -> None:
     """Take away what the run that ``info`` tells of has written, and nothing else; ``run.json`` is replaced later."""
     kept_masks = (info.get("options") or {}).get("save_masks")
     masks = [f"masks/{name}/{'[0-9]' * 6}.png" for name in info["objects"]] if kept_masks else []
-    poses, meshes = (
-        [f"{kind}/{name}.{end}" for name in info["objects"]] for kind, end in (("poses", "txt"), ("meshes", "ply"))
-    )
+    poses = [f"poses/{name}.txt" for name in info["objects"]]
+    meshes = [f"meshes/{name}.ply" for name in info["objects"]]
     # First the one without which there is no run: two are never mixed, whenever a kill comes.
     for pattern in ("poses.npz", *poses, *meshes, *masks, "config.toml", "models.npz", "timings.csv", KEYPOINTS):
         for path in out.glob(pattern):

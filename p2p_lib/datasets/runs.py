@@ -31,6 +31,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import file_name, load_arrays, read_text
 from p2p_lib.core.types import DOUBTED, PoseEstimate
+from p2p_lib.datasets.masks import read_labels
 from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import Sequence
 
@@ -75,10 +76,8 @@ class ObjectRun:
 
     def __post_init__(self) -> None:
         of_a_frame = {"T_cam_obj": (4, 4), "covariance": (6, 6), "T_cam_model": (4, 4), "T_obj_joined": (4, 4)}
-        if self.frame_index.ndim != 1:
-            raise BadInput("run: frame_index", f"shape {self.frame_index.shape}", "one number for each frame")
         for column in COLUMNS:
-            got, expected = getattr(self, column).shape, (len(self), *of_a_frame.get(column, ()))
+            got, expected = getattr(self, column).shape, (self.frame_index.size, *of_a_frame.get(column, ()))
             if got != expected:
                 raise BadInput(f"run: {column}", f"shape {got}", f"{expected}")
             if (kind := getattr(self, column).dtype.kind) not in _KINDS.get(column, "f"):
@@ -195,6 +194,15 @@ class Run:
         poses = ", ".join(f"{name} {obj.has_pose.sum()} of {len(obj)}" for name, obj in self.objects.items())
         return f"{type(self).__name__}({str(self.path)!r}, frames with a pose: {poses})"
 
+    def masks(self, sequence: Sequence, frame: int) -> dict[str, np.ndarray]:
+        """Object to (H, W) bool at a frame of the sequence: the masks that were kept, else those of its that served."""
+        kept = {name: self.path / "masks" / name / f"{frame:06d}.png" for name in self.objects}
+        if any(path.is_file() for path in kept.values()):
+            shape = sequence.camera.height, sequence.camera.width
+            return {name: read_labels(path, shape) > 0 for name, path in kept.items() if path.is_file()}
+        masks = (sequence.masks(frame) if self.info["masks"] == "dataset" else None) or {}
+        return {name: masks[name] for name in self.objects if name in masks}
+
 
 def load_run(folder: str | Path, every_map: bool = False) -> Run:
     """Read what :class:`~p2p_lib.datasets.run_writer.RunWriter` wrote, finished or not.
@@ -211,18 +219,13 @@ def load_run(folder: str | Path, every_map: bool = False) -> Run:
     arrays, objects = load_arrays(folder / "poses.npz"), {}
     for name in info["objects"] if info["frames"] else ():
         if f"{name}/frame_index" in arrays:
-            n = len(np.atleast_1d(arrays[f"{name}/frame_index"]))
-            older = {
-                "map_id": np.zeros(n, int),
-                "joined_map": np.full(n, -1),
-                "T_obj_joined": np.tile(NO_POSE, (n, 1, 1)),
-            }
-            for column, values in older.items():
-                arrays.setdefault(f"{name}/{column}", values)  # an older run
-            lacking = [column for column in COLUMNS if f"{name}/{column}" not in arrays]
-            if lacking:
+            n = arrays[f"{name}/frame_index"].size
+            of_older_runs = {"map_id": np.zeros(n, int), "joined_map": np.full(n, -1)}
+            of_older_runs["T_obj_joined"] = np.tile(NO_POSE, (n, 1, 1))
+            columns = {column: arrays.get(f"{name}/{column}", of_older_runs.get(column)) for column in COLUMNS}
+            if lacking := [column for column, values in columns.items() if values is None]:
                 raise BadInput(str(folder / "poses.npz"), f"no {name}/{lacking[0]}", "what p2p run wrote")
-            obj = ObjectRun(**{column: arrays[f"{name}/{column}"] for column in COLUMNS})
+            obj = ObjectRun(**columns)
             objects[name] = obj if every_map else obj.of_one_map()
     if not any(map(len, objects.values())):
         raise MissingData(str(folder), "a run without frames", "It was stopped at once: run it again.")

@@ -87,18 +87,15 @@ class Sequence(Protocol):
 
     def frame(self, i: int) -> Frame:
         """The i-th frame, read now; :class:`BadInput` or :class:`MissingData` names a file that is wrong."""
-        ...
 
     def masks(self, i: int) -> dict[str, np.ndarray] | None:
         """Object to (H, W) bool at frame i; None where the sequence has no masks (or none for this frame)."""
-        ...
 
     def visible_px(self, i: int) -> dict[str, int] | None:
         """Object to the size of its visible mask at frame i, by the dataset's OWN masks whatever ``masks`` gives.
 
         Scoring uses this, so that the same frames count for every source of masks.
         """
-        ...
 
 
 def open_sequence(
@@ -156,20 +153,19 @@ def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | Non
     from p2p_lib.datasets.manifests import find_sequence, names
 
     name = str(path_or_name)
-    found = find_sequence(name)
-    below = home / folder if (home := data_dir()) else None
-    if found is None and below is not None and below.is_dir():
-        return below, format
-    if found is None:
-        dataset = name.partition("/")[0]
-        if dataset in names("dataset"):
-            where = "not below $P2P_DATA" + ", which is not set" * (home is None)
-            raise MissingData(name, where, f"See p2p data info {dataset}.")
-        fix = f"Give a folder, a bundled sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
-        where = "$P2P_DATA is not set" if home is None else f"no sequence of this name below {home}"
-        what = "file" if folder.suffix else "folder"
-        raise MissingData(name, f"no such {what}, and {where}", fix)
-    return found[0], format or found[1].format
+    if found := find_sequence(name):
+        return found[0], format or found[1].format
+    home = data_dir()
+    if home is not None and (home / folder).is_dir():
+        return home / folder, format
+    dataset = name.partition("/")[0]
+    if dataset in names("dataset"):
+        where = "not below $P2P_DATA" + ", which is not set" * (home is None)
+        raise MissingData(name, where, f"See p2p data info {dataset}.")
+    fix = f"Give a folder, a bundled sequence such as {SYNTHETIC}crossing, or one of `p2p data list`."
+    where = "$P2P_DATA is not set" if home is None else f"no sequence of this name below {home}"
+    what = "file" if folder.suffix else "folder"
+    raise MissingData(name, f"no such {what}, and {where}", fix)
 
 
 def is_recording(path: Path) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageFiles, ImageSequence, camera_for, without_truth
+from p2p_lib.datasets.image_sequence import ImageSequence, camera_for
 
 DEPTH_SCALE = 1 / 5000
 APART_S = 0.02
@@ -35,14 +35,15 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     if not len(pairs):
         got = f"colour from {rgb_s[0]:.3f} s, depth from {depth_s[0]:.3f} s"
         raise BadInput(str(folder), got, f"images at most {1000 * APART_S:g} ms apart", "Are both of one clock?")
-    files = ImageFiles(
+    files = ImageSequence(
         folder,
         tuple(rgb[i] for i in pairs),
         tuple(depth[i] for i in nearest[pairs]),
         camera_for(rgb[0], *_K(folder)),
         rgb_s[pairs],
+        depth_scale=DEPTH_SCALE,
     )
-    return without_truth(files, masks, DEPTH_SCALE)
+    return files.without_truth(masks)
 
 
 def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:
@@ -54,7 +55,7 @@ def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:
     except ValueError:
         raise BadInput(str(path), "another kind of line", form) from None
     if not len(files) or not (np.diff(times_s) > 0).all():
-        got = "no line" if not len(files) else f"times that run backwards at {times_s[1:][np.diff(times_s) <= 0][0]}"
+        got = "no line" if not len(files) else f"times that run backwards at {times_s[1:][~(np.diff(times_s) > 0)][0]}"
         raise BadInput(str(path), got, form)
     return times_s, files
 

@@ -8,6 +8,7 @@ their YCB name in ``models/`` of the dataset, one folder above: the sequence's n
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,7 @@ YCB_NAMES = {
 
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
-    files = image_files(folder)
-    chosen, own = files.find_masks(masks, [folder / "gt_mask", folder / "masks"], (OBJECT,))
-
+    files = image_files(folder).with_masks(masks, [folder / "gt_mask", folder / "masks"], (OBJECT,))
     at = images.full(folder)
     known = [at.parent / "models" / ycb for begins, ycb in YCB_NAMES.items() if at.name.startswith(begins)]
 
@@ -40,11 +39,4 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
         poses = images.read_poses(folder / "annotated_poses", files.rgb)
         return {OBJECT: ObjectTruth(poses, np.ones(len(poses), bool))}
 
-    return ImageSequence(
-        **vars(files),
-        objects=(OBJECT,),
-        mask_files=chosen,
-        own_masks=own,
-        read_truth=read_truth,
-        model_places={OBJECT: (folder / "models" / OBJECT, *known)},
-    )
+    return replace(files, read_truth=read_truth, model_places={OBJECT: (folder / "models" / OBJECT, *known)})

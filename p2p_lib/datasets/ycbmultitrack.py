@@ -11,6 +11,7 @@ The recorded truth is held constant while an object is occluded: it counts only 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,25 +28,19 @@ LABELS = {"is_mask_visible": "is_mask_visible.npy", "is_obj_in_image_labels": "i
 
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
-    files, objects = image_files(folder), tuple(sorted(p.name for p in folder.glob("annotated_poses/*/")))
+    objects = tuple(sorted(p.name for p in folder.glob("annotated_poses/*/")))
+    files = image_files(folder)
     if not objects:
         raise BadInput(str(folder / "annotated_poses"), "no folders", "one folder of poses for each object")
-    chosen, own = files.find_masks(masks, [folder / "masks"], objects)
+    files = files.with_masks(masks, [folder / "masks"], objects)
 
     def read_truth() -> dict[str, ObjectTruth]:
         poses = {obj: images.read_poses(folder / "annotated_poses" / obj, files.rgb) for obj in objects}
         return {obj: ObjectTruth(T, read_labels(folder, obj, len(T))) for obj, T in poses.items()}
 
     roots = folder, images.full(folder).parent
-    return ImageSequence(
-        **vars(files),
-        objects=objects,
-        depth_invalid=DEPTH_INVALID,
-        mask_files=chosen,
-        own_masks=own,
-        read_truth=read_truth,
-        model_places={obj: tuple(root / "models" / obj for root in roots) for obj in objects},
-    )
+    model_places = {obj: tuple(root / "models" / obj for root in roots) for obj in objects}
+    return replace(files, depth_invalid=DEPTH_INVALID, read_truth=read_truth, model_places=model_places)
 
 
 def write_truth(

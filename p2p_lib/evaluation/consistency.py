@@ -20,7 +20,6 @@ from p2p_lib.core.errors import P2PError
 from p2p_lib.core.raycasting import cast, ray_scene
 from p2p_lib.core.types import DOUBTED
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
-from p2p_lib.datasets.masks import masks_of_run
 from p2p_lib.datasets.models import load_mesh
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.datasets.sequence import Sequence, reopen
@@ -165,7 +164,7 @@ def _seen(run: Run, name: str, sequence: Sequence) -> dict[str, float]:
     found: dict[str, list[float]] = {"pose_where_seen": [], "depth_on_surface": [], "mask_iou": []}
     for row in np.unique(np.linspace(0, len(obj) - 1, LOOKS).astype(int)):
         index = int(obj.frame_index[row])
-        mask = masks_of_run(run, sequence, index).get(name)
+        mask = run.masks(sequence, index).get(name)
         if mask is not None and mask.sum() >= MIN_VISIBLE_PX:
             found["pose_where_seen"].append(obj.has_pose[row])
         if scene is None or not obj.has_pose[row]:

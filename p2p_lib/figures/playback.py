@@ -15,7 +15,6 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import P2PError
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
-from p2p_lib.datasets.masks import masks_of_run
 from p2p_lib.datasets.models import read_mesh
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
@@ -125,8 +124,8 @@ class Playback:
         return self.sequence.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u]), frame.rgb[v, u]
 
     def masks(self, i: int) -> dict[str, np.ndarray]:
-        """The masks (H, W) bool of row i, as :func:`~p2p_lib.datasets.masks.masks_of_run`; none without a sequence."""
-        return {} if self.sequence is None else masks_of_run(self.run, self.sequence, int(self.frame_index[i]))
+        """The masks (H, W) bool of row i, as the run gives them; none without a sequence."""
+        return {} if self.sequence is None else self.run.masks(self.sequence, int(self.frame_index[i]))
 
     def add_m(self, name: str) -> np.ndarray:
         """(n,) ADD in metres, NaN where there is no pose or no truth."""

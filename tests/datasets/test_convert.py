@@ -98,6 +98,9 @@ def test_tum_faults_are_named(tmp_path):
     (folder / "rgb.txt").write_text("\n".join([text[3], text[2]]))
     with pytest.raises(BadInput, match=r"rgb\.txt: got times that run backwards at 100\.0"):
         open_sequence(folder)
+    (folder / "rgb.txt").write_text(f"{text[2]}\nnan rgb/none.png")
+    with pytest.raises(BadInput, match=r"rgb\.txt: got times that run backwards at nan"):
+        open_sequence(folder)
     (folder / "rgb.txt").write_text("100.0\n")
     with pytest.raises(BadInput, match=r"rgb\.txt: got another kind of line"):
         open_sequence(folder)
