@@ -92,6 +92,19 @@ def test_models_in_millimetres(scene):
     np.testing.assert_allclose(np.ptp(load_points(found["obj_000005"]), axis=0), [0.06, 0.08, 0.12])
 
 
+def test_without_truth_the_objects_are_those_of_the_masks_asked_for(scene):
+    (scene / "scene_gt.json").unlink()
+    for name, columns in (("mug", 5), ("tin", 7)):
+        (scene / "own" / name).mkdir(parents=True)
+        for i in NUMBERS:
+            mask = np.zeros((H, W), np.uint8)
+            mask[:, :columns] = 255
+            cv2.imwrite(str(scene / f"own/{name}/{i:06d}.png"), mask)
+    sequence = open_sequence(scene, masks="own")
+    assert sequence.objects == ("mug", "tin") and not sequence.truth
+    assert {name: mask.sum() for name, mask in sequence.masks(0).items()} == {"mug": 5 * H, "tin": 7 * H}
+
+
 def test_without_truth_and_masks(scene):
     for name in ("scene_gt.json", "scene_gt_info.json"):
         (scene / name).unlink()
