@@ -49,23 +49,23 @@ class Landmarks:
 
     p_seg        (L, 3) positions on it
     descriptors  (L, scales, SIZE)
-    views        (V, 3) camera centres from which they were taken, relative to the segment's centre
+    views        (V, 3) camera centres from which they were taken, relative to the segment's centre, in its frame
     """
 
     p_seg: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     descriptors: np.ndarray = field(default_factory=lambda: np.zeros((0, len(_STEPS_M), features.SIZE), np.float32))
     views: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
-    def taken_from(self, camera_centre: np.ndarray, within_deg: float) -> bool:
-        """Whether landmarks were taken from about that direction; camera_centre (3,) as in ``views``."""
-        cosine = self.views @ camera_centre / (np.linalg.norm(self.views, axis=1) * np.linalg.norm(camera_centre))
+    def taken_from(self, view: np.ndarray, within_deg: float) -> bool:
+        """Whether landmarks were taken from about the direction of ``view`` (3,), one as in ``views``."""
+        cosine = self.views @ view / (np.linalg.norm(self.views, axis=1) * np.linalg.norm(view))
         return bool((cosine > np.cos(np.radians(within_deg))).any())
 
     def add(
         self,
         now: Image,
-        T_cam_seg: np.ndarray,
-        camera_centre: np.ndarray,
+        T_seg_cam: np.ndarray,
+        view: np.ndarray,
         uv_px: np.ndarray,
         p_seg: np.ndarray,
         cfg: TrackingConfig,
@@ -73,12 +73,12 @@ class Landmarks:
     ) -> None:
         """Add the corners near points of the segment, seen at uv_px (N, 2), p_seg (N, 3); at most ``max_landmarks``."""
         found = corners(now, _region_around(uv_px, now, cfg.segment_reach_m), cfg.corners)
-        at = se3.transform(se3.inverse(T_cam_seg), found.p_cam)
+        at = se3.transform(T_seg_cam, found.p_cam)
         near = cdist(at, p_seg).min(1) < cfg.segment_reach_m
         at = np.concatenate([self.p_seg, at[near]])
         keep = np.sort(rng.permutation(len(at))[: cfg.max_landmarks])
         self.p_seg, self.descriptors = at[keep], np.concatenate([self.descriptors, found.descriptors[near]])[keep]
-        self.views = np.vstack([self.views, camera_centre])
+        self.views = np.vstack([self.views, view])
 
     def match(
         self, found: Corners, ratio: float, rng: np.random.Generator

@@ -8,7 +8,7 @@ frame is the camera's when the segment was started.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,24 +28,19 @@ _SHARED_PX = 0.3
 _AGREES_CHI2, _AGREES_DEPTH_CHI2 = 16, 25
 
 
-def _motion_jacobian(arm: np.ndarray) -> np.ndarray:
-    """(N, 3, 6) change of points by a small motion [rotation, translation]; arm (N, 3) from its centre."""
-    return np.concatenate([-se3.hat(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], -1)
-
-
 @dataclass(frozen=True, eq=False)
 class PoseFit:
     """A segment's pose.
 
     T_cam_seg   (4, 4)
     covariance  (6, 6) of its rotation and translation, in the camera's axes, about ``centre`` (3,), on the segment
-    agrees      (N,) bool: the points that it was fitted to and that agree with it
+    agrees      (N,) bool: which of the points that it was fitted to agree with it
     """
 
     T_cam_seg: np.ndarray
     covariance: np.ndarray
     centre: np.ndarray
-    agrees: np.ndarray
+    agrees: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
 
 def fit_pose(
@@ -170,7 +165,9 @@ def predict(
     p_cam = (R @ p_seg[..., None])[..., 0] + T[:, :3, 3]
     uv, P = projection(camera, p_cam)
     across = R @ tangent
-    J, PR = P @ _motion_jacobian((R @ (p_seg - centre)[..., None])[..., 0]), P @ R
+    arm = (R @ (p_seg - centre)[..., None])[..., 0]
+    by_motion = np.concatenate([-se3.hat(arm), np.broadcast_to(np.eye(3), R.shape)], -1)  # [rotation, translation]
+    J, PR = P @ by_motion, P @ R
     cov = PR @ map_cov @ PR.transpose(0, 2, 1) + J @ covariance @ J.transpose(0, 2, 1)
     normal = np.cross(across[..., 0], across[..., 1])
     length = np.linalg.norm(normal, axis=1) * np.linalg.norm(p_cam, axis=1)

@@ -72,8 +72,3 @@ class Points(Rows):
     def contrast(self) -> np.ndarray:
         """(N,) standard deviation of the grey values in the first template."""
         return self.templates.fine.contrast[self.template[:, 0]]
-
-    @property
-    def sigma_px(self) -> np.ndarray:
-        """(N,) standard deviation of uv."""
-        return np.sqrt(np.trace(self.cov, axis1=1, axis2=2))
