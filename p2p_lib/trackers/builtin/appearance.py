@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-import cv2
 import numpy as np
 
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.types import Rows, joined
+from p2p_lib.trackers.builtin.image import sampled
 
 #: Half a patch's side in pixels, and the standard deviation of the window's weight.
 RADIUS, WINDOW_PX = 7, 5.0
@@ -83,10 +83,6 @@ class Templates:
         rows, self._free = self._free[:count], self._free[count:]
         return rows
 
-    def put(self, rows: np.ndarray, fine: Patches, coarse: Patches) -> None:
-        """Keep these patches in these rows."""
-        self.fine[rows], self.coarse[rows] = fine, coarse
-
     def let_go(self, rows: np.ndarray) -> None:
         """Nobody uses these rows any more."""
         self._free = np.concatenate([rows, self._free])
@@ -96,7 +92,7 @@ def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:
     """The patches at uv_px (N, 2) of a float32 grey image."""
     n, side = len(uv_px), _SIDE + 2
     y, x = (a.ravel().astype(np.float32) for a in np.mgrid[:side, :side] - float(RADIUS + 1))
-    raw = _sample(image, uv_px.astype(np.float32), np.stack([x, y])).reshape(n, side, side)
+    raw = sampled(image, uv_px.astype(np.float32)[:, :, None] + np.stack([x, y])).reshape(n, side, side)
     gx = 0.5 * (raw[:, 1:-1, 2:] - raw[:, 1:-1, :-2]).reshape(n, _SIDE**2)
     gy = 0.5 * (raw[:, 2:, 1:-1] - raw[:, :-2, 1:-1]).reshape(n, _SIDE**2)
     pixels, norm = _normalised(raw[:, 1:-1, 1:-1].reshape(n, _SIDE**2))
@@ -204,15 +200,6 @@ def _aligned(image, pixels, solver, rows, uv, A, iterations):
                 A[n, row, 0], A[n, row, 1] = (e * d11 - f * d10) / area, (f * d00 - e * d01) / area
                 uv[n, row] -= A[n, row, 0] * step[0] + A[n, row, 1] * step[1]
     return ncc, contrast
-
-
-def _sample(image: np.ndarray, uv: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """(N, P) grey values at uv (N, 2) + offsets (2, P) or (N, 2, P), bilinear, the border repeated."""
-    at = uv[:, :, None] + offsets
-    x, y = np.ascontiguousarray(at[:, 0]), np.ascontiguousarray(at[:, 1])
-    if not len(x):
-        return np.zeros(x.shape, np.float32)
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,8 +18,6 @@ from p2p_lib.trackers.builtin.tangent_planes import planes_at, tangent_steps
 
 #: Steps of the grids on the surface on which corners are described: descriptors cover 2.4 and 4.8 cm.
 _STEPS_M = (0.0015, 0.003)
-#: Corners within this many pixels are one.
-_SAME_PX = 4.0
 #: Landmarks searched for in one frame: the cost of a search grows with their matches squared.
 _SEARCHED = 400
 
@@ -86,7 +84,7 @@ class Landmarks:
         """Pairs of some of the landmarks with corners: p_seg (M, 3), p_cam (M, 3), and which corner (M,)."""
         some = rng.permutation(len(self.p_seg))[:_SEARCHED]
         wanted, offered = (np.moveaxis(of, 1, 0) for of in (self.descriptors[some], found.descriptors))
-        pairs = [features.match(w, o, found.uv_px, _SAME_PX, ratio) for w, o in zip(wanted, offered, strict=True)]
+        pairs = [features.match(w, o, found.uv_px, ratio) for w, o in zip(wanted, offered, strict=True)]
         which, corner = np.concatenate(pairs, 1)
         return self.p_seg[some[which]], found.p_cam[corner], corner
 
