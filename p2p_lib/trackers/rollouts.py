@@ -7,6 +7,7 @@ memory of the others is their queries and the frame that these were made in: fro
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -31,19 +32,6 @@ class Rollout(Protocol):
         """Take the next image; uv_px (Q, 2), visible (Q,), uncertainty (Q,) of the frame answered."""
 
 
-class RolloutModel(Protocol):
-    """What makes rollouts.
-
-    latency_frames  how many images after a frame its answer comes
-    """
-
-    name: str
-    latency_frames: int
-
-    def begin(self, images: list[np.ndarray], uv_px: np.ndarray) -> Rollout:
-        """A rollout with queries (Q, 2) in the first of the images; the others are those that came since."""
-
-
 @dataclass(eq=False)
 class _Queries:
     """Queries that were made in one frame, by rows: their ids, the image, where they were in it.
@@ -62,7 +50,10 @@ class _Queries:
 
 
 class RolloutTracker(PointTracker):
-    """A tracker over a :class:`RolloutModel`, which takes neither rejections nor suggestions.
+    """A tracker over a model of rollouts, which takes neither rejections nor suggestions.
+
+    begin           makes a rollout with queries (Q, 2) in the first of some images; the others have come since
+    latency_frames  how many images after a frame its answer comes
 
     A late model answers for the frame ``latency_frames`` ago, and queries are taken to be in that frame: the one that
     the caller is at. Of more than :data:`MAX_ROLLOUTS` those run that have the most visible points. The queries of the
@@ -73,9 +64,8 @@ class RolloutTracker(PointTracker):
     :data:`MAX_KEPT` images the fewest queries go, and their points stay invisible until they are dropped.
     """
 
-    def __init__(self, model: RolloutModel):
-        self.name, self.latency_frames = model.name, model.latency_frames
-        self._model = model
+    def __init__(self, name: str, begin: Callable[[list[np.ndarray], np.ndarray], Rollout], latency_frames: int):
+        self.name, self.latency_frames, self._make = name, latency_frames, begin
         self._ids = PointIds()
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
@@ -102,8 +92,7 @@ class RolloutTracker(PointTracker):
         self._begin_new()
         kept = [queries for queries in self._queries if queries.rollout is None]
         kept.sort(key=self._urgency, reverse=True)
-        asked = kept[: ASKED_URGENTLY if urgent else ASKED_AGAIN]
-        for queries in asked:
+        for queries in kept[: ASKED_URGENTLY if urgent else ASKED_AGAIN]:
             self._begin(queries)
         self._recent.append(frame.rgb)
         tracks = self._ids.unseen()
@@ -129,7 +118,7 @@ class RolloutTracker(PointTracker):
 
     def _begin(self, queries: _Queries) -> None:
         """A rollout of these queries; the image in which they were made stands in the place of the one answered."""
-        queries.rollout = self._model.begin([queries.rgb, *list(self._recent)[1:]], queries.uv_px)
+        queries.rollout = self._make([queries.rgb, *list(self._recent)[1:]], queries.uv_px)
         self.passes += 1
 
     def _step(self, queries: _Queries, frame: Frame, tracks: Tracks) -> None:
