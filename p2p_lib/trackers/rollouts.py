@@ -91,7 +91,7 @@ class RolloutTracker(PointTracker):
         self._now, self.passes = self._now + 1, 0
         self._begin_new()
         kept = [queries for queries in self._queries if queries.rollout is None]
-        kept.sort(key=self._urgency, reverse=True)
+        kept.sort(key=lambda queries: self._live(queries) * (self._now - queries.asked_at), reverse=True)
         for queries in kept[: ASKED_URGENTLY if urgent else ASKED_AGAIN]:
             self._begin(queries)
         self._recent.append(frame.rgb)
@@ -142,6 +142,3 @@ class RolloutTracker(PointTracker):
     def _live(self, queries: _Queries) -> int:
         """How many of them nobody has dropped."""
         return int(np.isin(queries.ids, self._ids.live).sum())
-
-    def _urgency(self, queries: _Queries) -> int:
-        return self._live(queries) * (self._now - queries.asked_at)

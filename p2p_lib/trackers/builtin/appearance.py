@@ -124,18 +124,12 @@ class Alignment:
 
 
 def align(
-    image: np.ndarray,
-    patches: Patches,
-    uv_px: np.ndarray,
-    A: np.ndarray,
-    iterations: int = 4,
-    rows: np.ndarray | slice = slice(None),
+    image: np.ndarray, patches: Patches, rows: np.ndarray, uv_px: np.ndarray, A: np.ndarray, iterations: int = 4
 ) -> Alignment:
-    """Find each patch near uv_px (N, 2), seen under about A (N, 2, 2), in a float32 grey image.
+    """Find the patches at rows (N,) near uv_px (N, 2), seen under about A (N, 2, 2), in a float32 grey image.
 
-    rows  (N,) of the patches, which are too large to be copied for it; or all
+    All patches are handed over: they are too large to be copied for it.
     """
-    rows = np.arange(len(patches))[rows]
     uv, A = uv_px.astype(np.float32), A.astype(np.float32)
     height, width = image.shape
     start, identity = uv.copy(), np.eye(2, dtype=np.float32)

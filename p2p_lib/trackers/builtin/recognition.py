@@ -30,7 +30,7 @@ def follow(p: Points, before: Image, now: Image, cfg: TrackingConfig) -> None:
     moved, tracked = flow(before, now, start, cfg.window_px)
     moved = np.where(tracked[:, None], moved, start)
     k, warp = best_template(p, at)
-    seen = align(now.fine, p.templates.fine, moved, warp, rows=p.template[at, k])
+    seen = align(now.fine, p.templates.fine, p.template[at, k], moved, warp)
     shift_px = np.linalg.norm(seen.uv_px - moved, axis=1)
     good = _settle(p, at, k, seen, (seen.ncc >= cfg.min_ncc) & (shift_px < cfg.search_px), now, cfg)
     changed = ~good & (seen.ncc > _COAST_NCC) & now.inside(moved)
@@ -66,8 +66,8 @@ def find(
     p.warp[at] = warp
     k, warp = best_template(p, at)
     rows = p.template[at, k]
-    rough = align(now.coarse, p.templates.coarse, uv_px / 2, warp, rows=rows)
-    seen = align(now.fine, p.templates.fine, 2 * rough.uv_px, rough.A, rows=rows)
+    rough = align(now.coarse, p.templates.coarse, rows, uv_px / 2, warp)
+    seen = align(now.fine, p.templates.fine, rows, 2 * rough.uv_px, rough.A)
     off_px = np.linalg.norm(seen.uv_px - uv_px, axis=1)
     own_px = np.sqrt(np.trace(seen.cov_px2, axis1=1, axis2=2))
     near = off_px < np.minimum(cfg.search_px, 2 + 3 * np.hypot(sigma_px, own_px))

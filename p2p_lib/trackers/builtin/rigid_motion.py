@@ -58,20 +58,10 @@ def fit_pose(
     not measured. Errors along an edge, where cov_px2 (N, 2, 2) is long, hardly count.
     """
     centre = p_seg.mean(0)
-    R, at, H, chi2, chi2_z = _fit_pose(
-        np.ascontiguousarray(T_cam_seg[:3, :3]),
-        T_cam_seg[:3, :3] @ centre + T_cam_seg[:3, 3],
-        p_seg - centre,
-        map_cov,
-        uv_px,
-        cov_px2,
-        z_m,
-        depth_noise_m(z_m),
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-    )
+    start = np.ascontiguousarray(T_cam_seg[:3, :3]), T_cam_seg[:3, :3] @ centre + T_cam_seg[:3, 3]
+    seen = uv_px, cov_px2, z_m, depth_noise_m(z_m)
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    R, at, H, chi2, chi2_z = _fit_pose(*start, p_seg - centre, map_cov, *seen, *intrinsics)
     agrees = (chi2 < _AGREES_CHI2) & (chi2_z < _AGREES_DEPTH_CHI2)
     return PoseFit(se3.from_rt(R, at - R @ centre), np.linalg.inv(H), centre, agrees)
 
