@@ -39,7 +39,7 @@ _DAMP = np.diag(np.float32([1e-4] * 2 + [0.05] * 4))
 class Patches(Rows):
     """N patches, ready to be searched for.
 
-    pixels    (N, P) weighted, zero mean, unit length
+    pixels    (N, P) weighted, without mean and slope, of unit length
     solver    (N, 6, P) takes a difference of pixels to the step [translation px, affine]
     unit_cov  (N, 2, 2) covariance of the translation per unit of the residual's variance, px^2
     contrast  (N,) standard deviation of the grey values
@@ -95,7 +95,11 @@ def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:
     raw = sampled(image, uv_px.astype(np.float32)[:, :, None] + np.stack([x, y])).reshape(n, side, side)
     gx = 0.5 * (raw[:, 1:-1, 2:] - raw[:, 1:-1, :-2]).reshape(n, _SIDE**2)
     gy = 0.5 * (raw[:, 2:, 1:-1] - raw[:, :-2, 1:-1]).reshape(n, _SIDE**2)
-    pixels, norm = _normalised(raw[:, 1:-1, 1:-1].reshape(n, _SIDE**2))
+    grey = raw[:, 1:-1, 1:-1].reshape(n, _SIDE**2)
+    centred = (grey - (grey @ _SQUARE)[:, None]) * _ROOT
+    centred -= (centred @ _RAMPS.T) @ _RAMPS
+    norm = np.sqrt(np.maximum(np.einsum("np,np->n", centred, centred), 1.0))
+    pixels = centred / norm[:, None]
     J = np.stack([gx, gy, gx * _X, gx * _Y, gy * _X, gy * _Y], 1) * (_ROOT / norm[:, None, None])
     # What a change of offset, slope or gain explains is not evidence of motion.
     J -= (J @ _ROOT)[..., None] * _ROOT
@@ -194,12 +198,3 @@ def _aligned(image, pixels, solver, rows, uv, A, iterations):
                 A[n, row, 0], A[n, row, 1] = (e * d11 - f * d10) / area, (f * d00 - e * d01) / area
                 uv[n, row] -= A[n, row, 0] * step[0] + A[n, row, 1] * step[1]
     return ncc, contrast
-
-
-def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted, without mean and slope, unit length; and the standard deviation (N,) before."""
-    mean = raw @ _SQUARE
-    centred = (raw - mean[:, None]) * _ROOT
-    centred -= (centred @ _RAMPS.T) @ _RAMPS
-    norm = np.sqrt(np.maximum(np.einsum("np,np->n", centred, centred), 1.0))
-    return centred / norm[:, None], norm

@@ -72,8 +72,7 @@ class ImageOnlyTracker(BuiltinTracker):
         rows, uv, warp = lost[which], corners[corner], p.warp[lost[which]].copy()
         for rotation in _ROTATIONS:
             left = ~p.verified[rows]
-            sigma_px = np.full(left.sum(), _FROM_CORNER_PX)
-            recognition.find(p, rows[left], uv[left], rotation @ warp[left], sigma_px, now, cfg)
+            recognition.find(p, rows[left], uv[left], rotation @ warp[left], _FROM_CORNER_PX, now, cfg)
         left = ~p.verified[rows]
         p.warp[rows[left]] = warp[left]
 

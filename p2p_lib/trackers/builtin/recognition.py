@@ -56,7 +56,7 @@ def find(
     at: np.ndarray,
     uv_px: np.ndarray,
     warp: np.ndarray,
-    sigma_px: np.ndarray,
+    sigma_px: np.ndarray | float,
     now: Image,
     cfg: TrackingConfig,
 ) -> None:
