@@ -60,8 +60,8 @@ class RolloutTracker(PointTracker):
     others are kept with the image in which they were made, and asked again in turn, those first that are many and have
     waited long: a rollout begins with that image and jumps to the newest. What it sees is reported; where it sees more
     than one that runs, it takes that one's place. So an object's points stay known however long it is hidden, at
-    :attr:`passes` passes of the network a frame: up to 20, and 24 where the caller waits for points. Beyond
-    :data:`MAX_KEPT` images the fewest queries go, and their points stay invisible until they are dropped.
+    up to 20 passes of the network a frame, and 24 where the caller waits for points: a beginning rollout makes two.
+    Beyond :data:`MAX_KEPT` images the fewest queries go, and their points stay invisible until they are dropped.
     """
 
     def __init__(self, name: str, begin: Callable[[list[np.ndarray], np.ndarray], Rollout], latency_frames: int):
@@ -75,8 +75,6 @@ class RolloutTracker(PointTracker):
         self._queries: list[_Queries] = []
         self._new_ids, self._new_uv = np.zeros(0, np.int64), np.zeros((0, 2))  # queries since the last image
         self._recent = deque([frame.rgb], maxlen=self.latency_frames + 1)
-        #: Passes of the network in the newest frame: a beginning rollout makes two.
-        self.passes = 0
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame answered; returns their ids."""
@@ -88,7 +86,7 @@ class RolloutTracker(PointTracker):
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame; rows of the frame answered."""
         self._ids.check_started()
-        self._now, self.passes = self._now + 1, 0
+        self._now += 1
         self._begin_new()
         kept = [queries for queries in self._queries if queries.rollout is None]
         kept.sort(key=lambda queries: self._live(queries) * (self._now - queries.asked_at), reverse=True)
@@ -119,7 +117,6 @@ class RolloutTracker(PointTracker):
     def _begin(self, queries: _Queries) -> None:
         """A rollout of these queries; the image in which they were made stands in the place of the one answered."""
         queries.rollout = self._make([queries.rgb, *list(self._recent)[1:]], queries.uv_px)
-        self.passes += 1
 
     def _step(self, queries: _Queries, frame: Frame, tracks: Tracks) -> None:
         """Put what a rollout says of the next frame into the tracks."""
@@ -129,7 +126,6 @@ class RolloutTracker(PointTracker):
         tracks.uv_px[rows], tracks.uncertainty[rows] = uv[live], np.clip(uncertainty[live], 0, 1)
         tracks.visible[rows] = visible[live] & in_image(uv[live], frame.shape, -0.5)
         queries.seen, queries.asked_at = int(tracks.visible[rows].sum()), self._now
-        self.passes += 1
 
     def _bound(self) -> None:
         """End the rollouts that see the fewest points, and forget the fewest of the kept queries, beyond the limits."""
