@@ -79,7 +79,7 @@ def best_template(p: Points, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     A = p.warp[at][:, None] @ p.template_unwarp[at]
     squared = A @ A.transpose(0, 1, 3, 2) - _EYE
     distortion = np.sqrt((squared**2).sum((2, 3))) + _OLDER_DISTORTION * np.arange(A.shape[1])
-    distortion[np.arange(A.shape[1]) >= p.count[at][:, None]] = np.inf
+    distortion[p.template[at] < 0] = np.inf
     best = distortion.argmin(1)
     return best, A[np.arange(len(A)), best]
 
@@ -111,8 +111,8 @@ def store_templates(p: Points, rows: np.ndarray, now: Image, turn: int) -> None:
     """Store the present appearance of these points; in a full set it replaces one in ``turn``, never the first."""
     if not len(rows):
         return
-    room = p.template_warp.shape[1]
-    k = np.where(p.count[rows] < room, p.count[rows], 1 + turn % (room - 1))
+    room, count = p.template.shape[1], (p.template[rows] >= 0).sum(1)
+    k = np.where(count < room, count, 1 + turn % (room - 1))
     uv = p.uv[rows]
     p.template_warp[rows, k], p.template_cov[rows, k] = p.warp[rows], p.cov[rows]
     p.template_unwarp[rows, k] = np.linalg.inv(p.warp[rows])
@@ -121,4 +121,3 @@ def store_templates(p: Points, rows: np.ndarray, now: Image, turn: int) -> None:
     own = p.template[rows, k]
     p.templates.fine[own], p.templates.coarse[own] = take(now.fine, uv), take(now.coarse, uv / 2)
     p.chroma[rows, k] = now.chroma_at(uv)
-    p.count[rows] = np.minimum(p.count[rows] + 1, room)
