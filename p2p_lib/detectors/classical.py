@@ -61,21 +61,22 @@ class UniformDetector:
 
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Random pixels of the mask."""
-        uv_px = self._rng.permutation(_pixels(mask))[: self._limit]
+        uv_px = self._drawn(mask, self._limit)
         return Candidates(uv_px, np.ones(len(uv_px)))
 
+    def _drawn(self, mask: np.ndarray, limit: int) -> np.ndarray:
+        """(N, 2) u, v of pixels of the mask in random order, at most ``limit``."""
+        return self._rng.permutation(np.argwhere(mask)[:, ::-1].astype(float))[:limit]
 
-class FarthestDetector:
+
+class FarthestDetector(UniformDetector):
     """Farthest-point sampling: each next pixel is the one farthest from those before, with a falling score."""
 
     name = "farthest"
 
-    def __init__(self, config: SamplingConfig, rng: np.random.Generator | None = None):
-        self._limit, self._rng = config.candidates, rng or np.random.default_rng(0)
-
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Pixels of the mask from the one nearest to its middle outwards."""
-        pool = self._rng.permutation(_pixels(mask))[:_POOL]
+        pool = self._drawn(mask, _POOL)
         count = min(self._limit, len(pool))
         if not count:
             return NO_CANDIDATES
@@ -114,8 +115,3 @@ def _cropped(frame: Frame, mask: np.ndarray, margin_px: int) -> tuple[np.ndarray
     rows, columns = bounds(mask, margin_px)
     gray = cv2.cvtColor(frame.rgb[rows, columns], cv2.COLOR_RGB2GRAY)
     return gray, mask[rows, columns].astype(np.uint8), np.array([columns.start, rows.start], float)
-
-
-def _pixels(mask: np.ndarray) -> np.ndarray:
-    """(N, 2) u, v of a mask's pixels."""
-    return np.argwhere(mask)[:, ::-1].astype(float)

@@ -8,6 +8,7 @@ begins with 8 copies of its first image, so that the first window is full after 
 from __future__ import annotations
 
 from collections import deque
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +30,7 @@ def load(config: TrackingConfig, rng: np.random.Generator | None = None) -> Roll
     weights = checkpoints.load_weights("cotracker3")
     predictor = new_predictor()
     checkpoints.fill(predictor.model, "cotracker3", weights)
-    return RolloutTracker(CoTrackerModel(predictor, checkpoints.device()))
+    return tracker(predictor, checkpoints.device())
 
 
 def new_predictor() -> torch.nn.Module:
@@ -43,55 +44,34 @@ def new_predictor() -> torch.nn.Module:
     return module.CoTrackerOnlinePredictor(checkpoint=None, window_len=16)
 
 
-class CoTrackerModel:
-    """Makes rollouts of a CoTracker3 (see :class:`p2p_lib.trackers.rollouts.RolloutModel`)."""
-
-    name = "cotracker3"
-
-    def __init__(self, predictor: torch.nn.Module, device: str = "cpu"):
-        self.model, self.device = predictor.model.to(device).eval(), device
-        self.size = tuple(predictor.interp_shape)  # height, width
-        self.window, self.fresh = self.model.window_len, predictor.step
-        self.latency_frames = self.fresh - 1
-
-    def begin(self, images: list[np.ndarray], uv_px: np.ndarray) -> CoTrackerRollout:
-        """A rollout with queries in the first image."""
-        return CoTrackerRollout(self, images, uv_px)
-
-    def resized(self, rgb: np.ndarray) -> torch.Tensor:
-        """(3, h, w) float32 in [0, 255]; the corners' pixel centres stay in the corners."""
-        import torch
-
-        image = torch.from_numpy(rgb).to(self.device).permute(2, 0, 1)[None].float()
-        return torch.nn.functional.interpolate(image, self.size, mode="bilinear", align_corners=True)[0]
-
-    def scale(self, shape: tuple[int, int]) -> np.ndarray:
-        """(2,) x, y: the model's pixels per pixel of a image of shape (H, W)."""
-        h, w = self.size
-        return np.array([(w - 1) / (shape[1] - 1), (h - 1) / (shape[0] - 1)])
+def tracker(predictor: torch.nn.Module, device: str = "cpu") -> RolloutTracker:
+    """A tracker that runs the predictor's model."""
+    predictor.model.to(device).eval()
+    return RolloutTracker("cotracker3", partial(CoTrackerRollout, predictor, device), predictor.step - 1)
 
 
 class CoTrackerRollout:
     """The model's sliding window with a fixed set of queries. It keeps its state in the model: swapped in and out."""
 
-    def __init__(self, of: CoTrackerModel, images: list[np.ndarray], uv_px: np.ndarray):
+    def __init__(self, predictor: torch.nn.Module, device: str, images: list[np.ndarray], uv_px: np.ndarray):
         import torch
 
-        self._of, self._scale = of, of.scale(images[0].shape[:2])
+        self._model, self._device = predictor.model, device
+        self._size, self._fresh = tuple(predictor.interp_shape), predictor.step
+        h, w = images[0].shape[:2]
+        self._scale = (np.array(self._size[::-1]) - 1) / [w - 1, h - 1]  # the model's pixels per pixel
         queries = np.concatenate([np.zeros((len(uv_px), 1)), uv_px * self._scale], 1).astype(np.float32)
-        self._queries = torch.from_numpy(queries).to(of.device)[None]
-        still = of.resized(images[0])
-        self._images = deque([still] * of.fresh, maxlen=of.window)
+        self._queries = torch.from_numpy(queries).to(device)[None]
+        self._images = deque([self._resized(images[0])] * self._fresh, maxlen=self._model.window_len)
         self._taken = 0  # real images so far
-        self._state: dict | None = None
-        self._told: tuple[np.ndarray, ...] = ()  # of the frames since the still, as far as the windows reach
+        self._state: dict = {}
         for rgb in images:
             self._take(rgb)
 
     def step(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions (Q, 2) in pixels, visible (Q,), uncertainty (Q,) of the frame ``latency_frames`` ago."""
+        """Positions (Q, 2) in pixels, visible (Q,), uncertainty (Q,) of the frame answered, NaN before the first."""
         self._take(rgb)
-        answered = self._taken - 1 - self._of.latency_frames
+        answered = self._taken - self._fresh
         if answered < 0:
             q = self._queries.shape[1]
             return np.full((q, 2), np.nan), np.zeros(q, bool), np.ones(q)
@@ -99,20 +79,26 @@ class CoTrackerRollout:
         return xy / self._scale, visible * sure > _VISIBLE, 1 - sure
 
     def _take(self, rgb: np.ndarray) -> None:
-        self._images.append(self._of.resized(rgb))
+        self._images.append(self._resized(rgb))
         self._taken += 1
-        if self._taken % self._of.fresh == 0:
+        if self._taken % self._fresh == 0:
             self._run_window()
+
+    def _resized(self, rgb: np.ndarray) -> torch.Tensor:
+        """(3, h, w) float32 in [0, 255]; the corners' pixel centres stay in the corners."""
+        import torch
+
+        image = torch.from_numpy(rgb).to(self._device).permute(2, 0, 1)[None].float()
+        return torch.nn.functional.interpolate(image, self._size, mode="bilinear", align_corners=True)[0]
 
     def _run_window(self) -> None:
         """One window over the newest images; of what the model predicts the window's part is kept."""
         import torch
 
-        model, window = self._of.model, self._of.window
+        model, window = self._model, self._model.window_len
         with torch.inference_mode():
             model.init_video_online_processing()
-            if self._state is not None:
-                vars(model).update(self._state)
+            vars(model).update(self._state)
             video = torch.stack(list(self._images))[None]
             told = model(video=video, queries=self._queries, iters=_ITERATIONS, is_online=True)[:3]
         self._state = {key: value for key, value in vars(model).items() if key.startswith("online_")}

@@ -11,8 +11,9 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.image import in_image
 from p2p_lib.core.interfaces import PointTracker
-from p2p_lib.core.types import Frame, Tracks
+from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.trackers.ids import PointIds
 
 _FLOW = {"winSize": (21, 21), "maxLevel": 3}
@@ -32,42 +33,38 @@ class LkTracker(PointTracker):
         """Begin a stream at this frame."""
         self._ids.start()
         self._gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        self._uv = np.zeros((0, 2), np.float32)
-        self._visible = np.zeros(0, bool)
-        self._uncertainty = np.zeros(0)
+        self._tracks = self._ids.unseen()
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids."""
         uv = np.asarray(uv_px, np.float32).reshape(-1, 2)
         ids = self._ids.add(len(uv))
-        self._uv = np.concatenate([self._uv, uv])
-        self._visible = np.concatenate([self._visible, np.ones(len(uv), bool)])
-        self._uncertainty = np.concatenate([self._uncertainty, np.zeros(len(uv))])
+        self._tracks = joined([self._tracks, Tracks(ids, uv, np.ones(len(uv), bool), np.zeros(len(uv)))])
         return ids
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame."""
         self._ids.check_started()
         previous, self._gray = self._gray, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        at = np.flatnonzero(self._visible)
+        now = self._tracks
+        at = np.flatnonzero(now.visible)
         if len(at):
-            here = self._uv[at]
+            here = now.uv_px[at].astype(np.float32)
             there, found, _ = cv2.calcOpticalFlowPyrLK(previous, self._gray, here, None, **_FLOW)
             home, back, _ = cv2.calcOpticalFlowPyrLK(self._gray, previous, there, None, **_FLOW)
             error_px = np.linalg.norm(home - here, axis=1)
-            h, w = self._gray.shape
             ok = (found[:, 0] > 0) & (back[:, 0] > 0) & (error_px < _FORWARD_BACKWARD_PX)
-            ok &= (there >= 0).all(1) & (there <= [w - 1, h - 1]).all(1)
-            self._uv[at], self._visible[at] = there, ok
-            self._uncertainty[at] = np.where(ok, 0.5 * error_px / _FORWARD_BACKWARD_PX, 1.0)
-        uv = np.where(self._visible[:, None], self._uv, np.nan).astype(float)
-        return Tracks(self._ids.live.copy(), uv, self._visible.copy(), self._uncertainty.copy())
+            ok &= in_image(there, frame.shape)
+            now.uv_px[at], now.visible[at] = there, ok
+            now.uncertainty[at] = np.where(ok, 0.5 * error_px / _FORWARD_BACKWARD_PX, 1.0)
+        uv = np.where(now.visible[:, None], now.uv_px, np.nan)
+        return Tracks(now.ids.copy(), uv, now.visible.copy(), now.uncertainty.copy())
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
-        keep = self._ids.drop(ids)
-        self._uv, self._visible, self._uncertainty = self._uv[keep], self._visible[keep], self._uncertainty[keep]
+        self._ids.drop(ids)
+        self._tracks = self._tracks.select(self._ids.live)
 
     def reject(self, ids: np.ndarray) -> None:
         """Take these tracks for invisible."""
-        self._visible &= ~np.isin(self._ids.live, ids)
+        self._tracks.visible[np.isin(self._ids.live, ids)] = False

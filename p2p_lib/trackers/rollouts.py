@@ -7,6 +7,7 @@ memory of the others is their queries and the frame that these were made in: fro
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -31,19 +32,6 @@ class Rollout(Protocol):
         """Take the next image; uv_px (Q, 2), visible (Q,), uncertainty (Q,) of the frame answered."""
 
 
-class RolloutModel(Protocol):
-    """What makes rollouts.
-
-    latency_frames  how many images after a frame its answer comes
-    """
-
-    name: str
-    latency_frames: int
-
-    def begin(self, images: list[np.ndarray], uv_px: np.ndarray) -> Rollout:
-        """A rollout with queries (Q, 2) in the first of the images; the others are those that came since."""
-
-
 @dataclass(eq=False)
 class _Queries:
     """Queries that were made in one frame, by rows: their ids, the image, where they were in it.
@@ -62,20 +50,22 @@ class _Queries:
 
 
 class RolloutTracker(PointTracker):
-    """A tracker over a :class:`RolloutModel`, which takes neither rejections nor suggestions.
+    """A tracker over a model of rollouts, which takes neither rejections nor suggestions.
+
+    begin           makes a rollout with queries (Q, 2) in the first of some images; the others have come since
+    latency_frames  how many images after a frame its answer comes
 
     A late model answers for the frame ``latency_frames`` ago, and queries are taken to be in that frame: the one that
     the caller is at. Of more than :data:`MAX_ROLLOUTS` those run that have the most visible points. The queries of the
     others are kept with the image in which they were made, and asked again in turn, those first that are many and have
     waited long: a rollout begins with that image and jumps to the newest. What it sees is reported; where it sees more
     than one that runs, it takes that one's place. So an object's points stay known however long it is hidden, at
-    :attr:`passes` passes of the network a frame: up to 20, and 24 where the caller waits for points. Beyond
-    :data:`MAX_KEPT` images the fewest queries go, and their points stay invisible until they are dropped.
+    up to 20 passes of the network a frame, and 24 where the caller waits for points: a beginning rollout makes two.
+    Beyond :data:`MAX_KEPT` images the fewest queries go, and their points stay invisible until they are dropped.
     """
 
-    def __init__(self, model: RolloutModel):
-        self.name, self.latency_frames = model.name, model.latency_frames
-        self._model = model
+    def __init__(self, name: str, begin: Callable[[list[np.ndarray], np.ndarray], Rollout], latency_frames: int):
+        self.name, self.latency_frames, self._make = name, latency_frames, begin
         self._ids = PointIds()
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
@@ -85,8 +75,6 @@ class RolloutTracker(PointTracker):
         self._queries: list[_Queries] = []
         self._new_ids, self._new_uv = np.zeros(0, np.int64), np.zeros((0, 2))  # queries since the last image
         self._recent = deque([frame.rgb], maxlen=self.latency_frames + 1)
-        #: Passes of the network in the newest frame: a beginning rollout makes two.
-        self.passes = 0
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame answered; returns their ids."""
@@ -98,12 +86,11 @@ class RolloutTracker(PointTracker):
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame; rows of the frame answered."""
         self._ids.check_started()
-        self._now, self.passes = self._now + 1, 0
+        self._now += 1
         self._begin_new()
         kept = [queries for queries in self._queries if queries.rollout is None]
-        kept.sort(key=self._urgency, reverse=True)
-        asked = kept[: ASKED_URGENTLY if urgent else ASKED_AGAIN]
-        for queries in asked:
+        kept.sort(key=lambda queries: self._live(queries) * (self._now - queries.asked_at), reverse=True)
+        for queries in kept[: ASKED_URGENTLY if urgent else ASKED_AGAIN]:
             self._begin(queries)
         self._recent.append(frame.rgb)
         tracks = self._ids.unseen()
@@ -129,8 +116,7 @@ class RolloutTracker(PointTracker):
 
     def _begin(self, queries: _Queries) -> None:
         """A rollout of these queries; the image in which they were made stands in the place of the one answered."""
-        queries.rollout = self._model.begin([queries.rgb, *list(self._recent)[1:]], queries.uv_px)
-        self.passes += 1
+        queries.rollout = self._make([queries.rgb, *list(self._recent)[1:]], queries.uv_px)
 
     def _step(self, queries: _Queries, frame: Frame, tracks: Tracks) -> None:
         """Put what a rollout says of the next frame into the tracks."""
@@ -140,7 +126,6 @@ class RolloutTracker(PointTracker):
         tracks.uv_px[rows], tracks.uncertainty[rows] = uv[live], np.clip(uncertainty[live], 0, 1)
         tracks.visible[rows] = visible[live] & in_image(uv[live], frame.shape, -0.5)
         queries.seen, queries.asked_at = int(tracks.visible[rows].sum()), self._now
-        self.passes += 1
 
     def _bound(self) -> None:
         """End the rollouts that see the fewest points, and forget the fewest of the kept queries, beyond the limits."""
@@ -153,6 +138,3 @@ class RolloutTracker(PointTracker):
     def _live(self, queries: _Queries) -> int:
         """How many of them nobody has dropped."""
         return int(np.isin(queries.ids, self._ids.live).sum())
-
-    def _urgency(self, queries: _Queries) -> int:
-        return self._live(queries) * (self._now - queries.asked_at)

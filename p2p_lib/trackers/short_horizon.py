@@ -28,14 +28,9 @@ class ShortHorizon:
         self._ids = PointIds()
 
     @property
-    def _forgotten(self) -> np.ndarray:
-        """(N,) bool."""
-        return self._hidden_for >= self._forget_after
-
-    @property
     def _followed(self) -> np.ndarray:
         """Ids of the points that are not forgotten."""
-        return self._ids.live[~self._forgotten]
+        return self._ids.live[self._hidden_for < self._forget_after]
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
@@ -52,10 +47,10 @@ class ShortHorizon:
 
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow the points that are not forgotten; rows of all, sorted by id."""
-        live = np.flatnonzero(~self._forgotten)
+        followed = self._followed
         tracks = self._with_forgotten(self._tracker.track(frame, search, urgent))
-        self._hidden_for[live] = np.where(tracks.visible[live], 0, self._hidden_for[live] + 1)
-        self._tracker.drop(self._ids.live[live][self._forgotten[live]])
+        self._hidden_for = np.where(tracks.visible, 0, self._hidden_for + 1)
+        self._tracker.drop(np.setdiff1d(followed, self._followed))
         return tracks
 
     def drop(self, ids: np.ndarray) -> None:
@@ -79,7 +74,8 @@ class ShortHorizon:
 
     def _with_forgotten(self, tracks: Tracks) -> Tracks:
         """The tracks of the points that are not forgotten among those of all."""
-        live, tracks, everyone = ~self._forgotten, tracks.select(self._followed), self._ids.unseen()
+        live = self._hidden_for < self._forget_after
+        tracks, everyone = tracks.select(self._ids.live[live]), self._ids.unseen()
         everyone.uv_px[live], everyone.visible[live] = tracks.uv_px, tracks.visible
         everyone.uncertainty[live] = tracks.uncertainty
         return everyone

@@ -68,7 +68,6 @@ class TapirTracker(PointTracker):
         import torch
 
         uv = np.asarray(uv_px, float).reshape(-1, 2)
-        first = not len(self._ids.live)
         ids = self._ids.add(len(uv))
         if not len(ids):
             return ids
@@ -83,7 +82,7 @@ class TapirTracker(PointTracker):
             )
             state = self._model.construct_initial_causal_state(len(uv), len(new.resolutions) - 1)
             state = [{key: value.to(self._device) for key, value in part.items()} for part in state]
-            if not first:
+            if self._features is not None:
                 new = self._each(self._features, lambda a, b: torch.cat([a, b], 1), new)
                 state = [
                     {key: torch.cat([old[key], part[key]], 1) for key in part}

@@ -6,6 +6,7 @@ c2cbab8 (July 2026).
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def load(config: TrackingConfig, rng: np.random.Generator | None = None) -> Roll
     model = new_model()
     # The trainer's prefix, where the checkpoint still has it.
     checkpoints.fill(model, "tapnextpp", {key.removeprefix("tapnext."): value for key, value in weights.items()})
-    return RolloutTracker(TapNextModel(model, checkpoints.device()))
+    return tracker(model, checkpoints.device())
 
 
 def new_model() -> torch.nn.Module:
@@ -41,30 +42,21 @@ def new_model() -> torch.nn.Module:
     return module.TAPNext(image_size=(SIZE_PX, SIZE_PX))
 
 
-class TapNextModel:
-    """Makes rollouts of a TAPNext model (see :class:`p2p_lib.trackers.rollouts.RolloutModel`)."""
-
-    name = "tapnextpp"
-    latency_frames = 0
-
-    def __init__(self, model: torch.nn.Module, device: str = "cpu"):
-        self.model, self.device = model.to(device).eval(), device
-
-    def begin(self, images: list[np.ndarray], uv_px: np.ndarray) -> TapNextRollout:
-        """A rollout with queries in the first and only image: it is never late."""
-        return TapNextRollout(self, images[0], uv_px)
+def tracker(model: torch.nn.Module, device: str = "cpu") -> RolloutTracker:
+    """A tracker that runs a TAPNext model."""
+    return RolloutTracker("tapnextpp", partial(TapNextRollout, model.to(device).eval(), device), latency_frames=0)
 
 
 class TapNextRollout:
-    """The model's recurrent state with a fixed set of queries."""
+    """The model's recurrent state with a fixed set of queries in the only image: it is never late."""
 
-    def __init__(self, of: TapNextModel, rgb: np.ndarray, uv_px: np.ndarray):
+    def __init__(self, model: torch.nn.Module, device: str, images: list[np.ndarray], uv_px: np.ndarray):
         import torch
 
-        self._of = of
+        self._model, self._device, (rgb,) = model, device, images
         xy = to_raster(uv_px, rgb.shape[:2], SIZE_PX)
         tyx = np.concatenate([np.zeros((len(xy), 1)), xy[:, ::-1]], 1).astype(np.float32)
-        self._state = self._forward(rgb, query_points=torch.from_numpy(tyx).to(of.device)[None])[-1]
+        self._state = self._forward(rgb, query_points=torch.from_numpy(tyx).to(device)[None])[-1]
 
     def step(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions (Q, 2) in pixels, visible (Q,), uncertainty (Q,) in the next image."""
@@ -78,7 +70,7 @@ class TapNextRollout:
         import torch
 
         with torch.inference_mode():
-            return self._of.model(video=square(rgb, SIZE_PX, self._of.device), **given)
+            return self._model(video=square(rgb, SIZE_PX, self._device), **given)
 
 
 def _mass_near(at: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:

@@ -48,7 +48,7 @@ def test_finds_corners_again_where_the_surface_is_known(A):
     image, M = picture(), seen_under(A)
     uv, before = described(image, np.eye(2))
     uv_after, after = described(cv2.warpAffine(image, M, SHAPE[::-1]), A)
-    wanted, found = features.match(before, after, uv_after, 4.0, 0.8)
+    wanted, found = features.match(before, after, uv_after, 0.8)
     error_px = np.linalg.norm(uv_after[found] - (uv @ M[:, :2].T + M[:, 2])[wanted], axis=1)
     assert len(error_px) > 15 and (error_px < 4).mean() > 0.8
 
@@ -61,7 +61,7 @@ def test_a_slant_that_is_not_known_costs_most_of_them():
 
     def right(known: np.ndarray) -> int:
         uv_after, after = described(slanted, known)
-        wanted, found = features.match(before, after, uv_after, 4.0, 0.8)
+        wanted, found = features.match(before, after, uv_after, 0.8)
         there = (uv @ M[:, :2].T + M[:, 2])[wanted]
         return int((np.linalg.norm(uv_after[found] - there, axis=1) < 4).sum())
 
@@ -70,7 +70,7 @@ def test_a_slant_that_is_not_known_costs_most_of_them():
 
 def test_another_picture_matches_nothing():
     (_, one), (uv, other) = described(picture(0), np.eye(2)), described(picture(1), np.eye(2))
-    assert len(features.match(one, other, uv, 4.0, 0.8)[0]) < 0.06 * len(one)
+    assert len(features.match(one, other, uv, 0.8)[0]) < 0.06 * len(one)
 
 
 def test_two_places_that_look_alike_are_both_named():
@@ -81,7 +81,7 @@ def test_two_places_that_look_alike_are_both_named():
     uv, found = described(twice, np.eye(2))
     uv_left, left = described(card, np.eye(2), 60)
     left = left[(np.abs(uv_left - [60, 50]) < [40, 30]).all(1)]
-    wanted, place = features.match(left, found, uv, 4.0, 0.8)
+    wanted, place = features.match(left, found, uv, 0.8)
     named = [uv[place[wanted == i]] for i in range(len(left))]
     twins = [len(at) == 2 and (np.abs(np.abs(at[0] - at[1]) - [160, 100]) < 3).all() for at in named]
     assert len(left) > 5 and np.mean(twins) > 0.6
@@ -91,9 +91,9 @@ def test_a_match_is_nearer_than_the_third_place():
     wanted = np.eye(4, dtype=np.float32)[:1]
     at = [np.float32([np.cos(a), np.sin(a), 0, 0]) for a in (0.30, 0.28, 0.32, 0.9)]
     uv = np.array([[10.0, 10], [12, 10], [50, 50], [90, 90]])
-    places = features.match(wanted, np.stack(at), uv, 4.0, 0.8)[1]
+    places = features.match(wanted, np.stack(at), uv, 0.8)[1]
     assert list(places) == [1, 2], "the two corners at one place are one place"
-    assert not len(features.match(wanted, np.stack(at[:3]), uv[:3], 1.0, 0.8)[0]), "three places that look alike"
+    assert not len(features.match(wanted, np.stack(at[:3]), 4 * uv[:3], 0.8)[0]), "three places that look alike"
 
 
 def test_stays_in_the_region():
@@ -115,7 +115,7 @@ def test_a_turn_in_the_plane_is_found_out():
     A, image = turned(70), picture()
     M, (uv, before) = seen_under(A), described(image, np.eye(2))
     uv_after, after = described(cv2.warpAffine(image, M, SHAPE[::-1]), np.eye(2))
-    wanted, found = features.match(before, after, uv_after, 4.0, 0.8)
+    wanted, found = features.match(before, after, uv_after, 0.8)
     error_px = np.linalg.norm(uv_after[found] - (uv @ M[:, :2].T + M[:, 2])[wanted], axis=1)
     assert len(error_px) > 60 and (error_px < 4).mean() > 0.8
 
@@ -128,7 +128,7 @@ def test_noise_makes_few_wrong_matches():
         steps = np.tile(1.5 * np.eye(2), (len(uv), 1, 1))
         noisy = np.clip(image + noise, 0, 255).astype(np.uint8)
         described = (features.describe(one, uv, [steps])[:, 0] for one in (image, noisy))
-        wanted, found = features.match(*described, uv, 4.0, 0.85)
+        wanted, found = features.match(*described, uv, 0.85)
         same = np.linalg.norm(uv[wanted] - uv[found], axis=1) < 4
         right.append(same.sum() / len(uv))
         wrong.append((~same).sum() / len(uv))

@@ -12,7 +12,6 @@ from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.datasets.manifests import manifest
 from p2p_lib.trackers import cotracker, tapir, tapnextpp
-from p2p_lib.trackers.rollouts import RolloutTracker
 
 UV = np.array([[100.0, 80], [320, 240], [600.5, 33.25], [17, 460], [411, 199]])
 
@@ -155,7 +154,7 @@ def test_tapnext_is_the_official_wrapper(tapnext_model, frames):
     import torch
 
     frames = frames[:4]
-    told = followed(RolloutTracker(tapnextpp.TapNextModel(tapnext_model)), frames)
+    told = followed(tapnextpp.tracker(tapnext_model), frames)
     check_values(told, frames)
     wrapper = module.TAPNextPP(tapnext_model.eval(), torch.device("cpu"))
     # The wrapper counts pixels from the picture's edge, as its raster does.
@@ -174,8 +173,7 @@ def test_tapnext_uncertainty_is_the_official_certainty_but_for_the_shape_of_the_
     utils = pytest.importorskip("tapnet.tapnext.tapnext_torch_utils")
     import torch
 
-    model = tapnextpp.TapNextModel(tapnext_model)
-    rollout = model.begin([frames[0].rgb], UV)
+    rollout = tapnextpp.TapNextRollout(tapnext_model.eval(), "cpu", [frames[0].rgb], UV)
     state = rollout._state
     _, _, uncertainty = rollout.step(frames[1].rgb)
     with torch.inference_mode():
@@ -188,11 +186,11 @@ def test_tapnext_uncertainty_is_the_official_certainty_but_for_the_shape_of_the_
 
 def test_tapnext_later_queries_run_in_a_rollout_of_their_own(tapnext_model, frames):
     frames = frames[:4]
-    alone = followed(RolloutTracker(tapnextpp.TapNextModel(tapnext_model)), frames)
-    tracker = RolloutTracker(tapnextpp.TapNextModel(tapnext_model))
+    alone = followed(tapnextpp.tracker(tapnext_model), frames)
+    tracker = tapnextpp.tracker(tapnext_model)
     crowd = followed(tracker, frames, later=UV[:2] + 7.0)
     np.testing.assert_array_equal(crowd[0], alone[0])
-    fresh = RolloutTracker(tapnextpp.TapNextModel(tapnext_model))
+    fresh = tapnextpp.tracker(tapnext_model)
     fresh.start(frames[2])
     fresh.add(UV[:2] + 7.0)
     fresh.track(frames[3])
@@ -224,8 +222,7 @@ def official_cotracker(predictor, pictures, uv):
 
 
 def test_cotracker_is_the_official_predictor_seven_frames_late(cotracker_predictor, frames):
-    model = cotracker.CoTrackerModel(cotracker_predictor)
-    tracker = RolloutTracker(model)
+    tracker = cotracker.tracker(cotracker_predictor)
     assert tracker.latency_frames == 7
     told = followed(tracker, frames)
     check_values(told, frames)
@@ -249,13 +246,13 @@ def test_cotracker_is_the_official_predictor_seven_frames_late(cotracker_predict
 
 def test_cotracker_queries_are_in_the_frame_answered(cotracker_predictor, frames):
     """Queries that come at frame 9 lie in frame 2, and are what a stream from frame 2 says of them."""
-    tracker = RolloutTracker(cotracker.CoTrackerModel(cotracker_predictor))
+    tracker = cotracker.tracker(cotracker_predictor)
     tracker.start(frames[0])
     tracker.add(UV)
     for frame in frames[1:10]:
         tracker.track(frame)
     late = tracker.add(UV[:2] + 5.0)
-    fresh = RolloutTracker(cotracker.CoTrackerModel(cotracker_predictor))
+    fresh = cotracker.tracker(cotracker_predictor)
     fresh.start(frames[2])
     ids = fresh.add(UV[:2] + 5.0)
     for frame in frames[3:10]:
@@ -286,7 +283,8 @@ def test_a_checkpoint_of_the_official_class_is_loaded_by_name(name, make, file, 
     torch.save({"state_dict": {prefix + key: value for key, value in model.state_dict().items()}}, place)
     tracker = make_tracker(name, TrackingConfig())
     assert tracker.name == name and tracker.latency_frames == (7 if name == "cotracker3" else 0)
-    loaded = tracker._model if name == "tapir" else tracker._model.model
+    loaded = tracker._model if name == "tapir" else tracker._make.args[0]
+    loaded = loaded.model if name == "cotracker3" else loaded
     for (key, own), (other, theirs) in zip(loaded.state_dict().items(), model.state_dict().items(), strict=True):
         assert key == other and own.cpu().numpy().tobytes() == theirs.numpy().tobytes()  # unset weights may be NaN
     place.write_bytes(place.read_bytes()[:-1] + b"\0\0")

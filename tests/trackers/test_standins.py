@@ -3,6 +3,7 @@
 Coordinates, memory of points that come and go, and lateness; the real classes are in test_official.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from p2p_lib.core.image import in_image
 from p2p_lib.core.raster import from_raster, to_raster
 from p2p_lib.core.types import Frame
 from p2p_lib.trackers import rollouts
-from p2p_lib.trackers.cotracker import CoTrackerModel
+from p2p_lib.trackers.cotracker import tracker as cotracker
 from p2p_lib.trackers.rollouts import RolloutTracker
 from p2p_lib.trackers.tapir import TapirTracker
 
@@ -150,14 +151,10 @@ class Echo:
         return self.uv + float(rgb[0, 0, 0]), np.ones(len(self.uv), bool), np.full(len(self.uv), 0.25)
 
 
-class EchoModel:
-    name = "echo"
-
-    def __init__(self, late=0):
-        self.latency_frames, self.log = late, []
-
-    def begin(self, pictures, uv_px):
-        return Echo(self.log, pictures, uv_px)
+def echo(late=0):
+    """A tracker of such rollouts, and its log."""
+    log = []
+    return RolloutTracker("echo", partial(Echo, log), late), log
 
 
 def value(t):
@@ -165,8 +162,7 @@ def value(t):
 
 
 def test_points_of_one_frame_share_a_rollout():
-    model = EchoModel()
-    tracker = RolloutTracker(model)
+    tracker, log = echo()
     with pytest.raises(BadInput, match="start"):
         tracker.add(UV)
     tracker.start(value(0))
@@ -176,24 +172,23 @@ def test_points_of_one_frame_share_a_rollout():
     tracker.track(value(2))
     tracker.add(UV[:1])
     tracks = tracker.track(value(3))
-    assert model.log == [("begin", [0], 3), ("begin", [2], 1)]
+    assert log == [("begin", [0], 3), ("begin", [2], 1)]
     assert tracks.ids.tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(tracks.uv_px, UV[[0, 1, 2, 0]] + 3)
 
 
 def test_a_late_model_gets_the_pictures_since_the_queries():
-    model = EchoModel(late=3)
-    tracker = RolloutTracker(model)
+    tracker, log = echo(late=3)
     tracker.start(value(0))
     for t in range(1, 6):
         tracker.track(value(t))
     tracker.add(UV)
     tracker.track(value(6))
-    assert model.log == [("begin", [2, 3, 4, 5], 3)]
+    assert log == [("begin", [2, 3, 4, 5], 3)]
 
 
 def test_dropped_points_are_gone_and_empty_rollouts_with_them():
-    tracker = RolloutTracker(EchoModel())
+    tracker, _ = echo()
     tracker.start(value(0))
     tracker.add(UV)
     tracker.drop(np.array([1]))  # before its rollout has seen a picture
@@ -211,7 +206,7 @@ def test_dropped_points_are_gone_and_empty_rollouts_with_them():
 @given(st.integers(0, 2**32 - 1))
 def test_any_coming_and_going_keeps_rows_and_points_together(seed):
     rng = np.random.default_rng(seed)
-    tracker, here = RolloutTracker(EchoModel()), {}
+    tracker, here = echo()[0], {}
     tracker.start(value(0))
     for t in range(1, 12):
         for _ in range(rng.integers(0, 3)):
@@ -227,21 +222,17 @@ def test_any_coming_and_going_keeps_rows_and_points_together(seed):
 
 
 class Sight:
-    """Rollouts that know a point by the number painted where it was asked for, and see it where that is painted now."""
+    """A rollout that knows a point by the number painted where it was asked for, and sees it where that is painted."""
 
-    name, latency_frames, running = "sight", 0, 0
-
-    def begin(self, pictures, uv_px):
-        assert len(pictures) == self.latency_frames + 1
-        numbers = pictures[0][tuple(np.round(uv_px).astype(int).T[::-1])].astype(int) @ [1, 256, 65536]
-        return SightRollout(numbers, pictures[1:])
-
-
-class SightRollout:
-    def __init__(self, numbers, pictures):
-        self.numbers, self.waiting = numbers, list(pictures)
+    def __init__(self, passes, late, pictures, uv_px):
+        assert len(pictures) == late + 1
+        self.passes = passes
+        passes[-1] += 1
+        self.numbers = pictures[0][tuple(np.round(uv_px).astype(int).T[::-1])].astype(int) @ [1, 256, 65536]
+        self.waiting = pictures[1:]
 
     def step(self, rgb):
+        self.passes[-1] += 1
         self.waiting.append(rgb)
         painted = self.waiting.pop(0).astype(int) @ [1, 256, 65536]
         uv = np.full((len(self.numbers), 2), np.nan)
@@ -262,9 +253,9 @@ def painted(t, numbers):
 @pytest.mark.parametrize("late", [0, 3])
 def test_an_object_hidden_for_300_frames_keeps_its_points(late):
     """Meanwhile another one turns and asks for new points every fifth frame, more often than rollouts can run."""
-    model, away, back, last = Sight(), 10, 310, 330 + late
-    model.latency_frames = late
-    tracker, ids, passes, returned = RolloutTracker(model), None, [], None
+    away, back, last = 10, 310, 330 + late
+    ids, passes, returned = None, [], None  # passes of the network in each frame: a beginning rollout makes two
+    tracker = RolloutTracker("sight", partial(Sight, passes, late), late)
 
     def shown(t):
         hidden = {} if away <= t < back else {k: (10 + 3 * k + (40 if t >= back else 0), 20) for k in range(1, 13)}
@@ -275,6 +266,7 @@ def test_an_object_hidden_for_300_frames_keeps_its_points(late):
 
     tracker.start(painted(0, shown(0)))
     for t in range(1, last):
+        passes.append(0)
         tracks = tracker.track(painted(t, shown(t)), urgent=t >= away)
         answered = t - late
         if answered < 0:
@@ -283,7 +275,6 @@ def test_an_object_hidden_for_300_frames_keeps_its_points(late):
             ids = tracker.add(np.array([shown(answered)[k] for k in range(1, 13)], float))
         elif answered % 5 == 0:
             tracker.add(np.array([shown(answered)[1000 + answered // 5]], float))
-        passes.append(tracker.passes)
         mine = tracks.select(ids[np.isin(ids, tracks.ids)])
         if away <= answered < back:
             assert not mine.visible.any()
@@ -299,7 +290,7 @@ def test_an_object_hidden_for_300_frames_keeps_its_points(late):
 def test_kept_queries_are_bounded(monkeypatch):
     monkeypatch.setattr(rollouts, "MAX_ROLLOUTS", 3)
     monkeypatch.setattr(rollouts, "MAX_KEPT", 2)
-    tracker = RolloutTracker(EchoModel())
+    tracker, _ = echo()
     tracker.start(value(0))
     for t in range(1, 9):
         # The second comes with a single point, the others with two.
@@ -337,7 +328,7 @@ class Predictor(torch.nn.Module):
 
 
 def test_cotracker_answers_for_the_frame_seven_ago_and_keeps_rollouts_apart():
-    tracker = RolloutTracker(CoTrackerModel(Predictor()))
+    tracker = cotracker(Predictor())
     tracker.start(value(0))
     tracker.add(UV)
     scale = np.array([127 / 63, 95 / 47])  # what is 1 px for the model, in the picture's

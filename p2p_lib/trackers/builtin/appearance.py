@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-import cv2
 import numpy as np
 
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.types import Rows, joined
+from p2p_lib.trackers.builtin.image import sampled
 
 #: Half a patch's side in pixels, and the standard deviation of the window's weight.
 RADIUS, WINDOW_PX = 7, 5.0
@@ -39,7 +39,7 @@ _DAMP = np.diag(np.float32([1e-4] * 2 + [0.05] * 4))
 class Patches(Rows):
     """N patches, ready to be searched for.
 
-    pixels    (N, P) weighted, zero mean, unit length
+    pixels    (N, P) weighted, without mean and slope, of unit length
     solver    (N, 6, P) takes a difference of pixels to the step [translation px, affine]
     unit_cov  (N, 2, 2) covariance of the translation per unit of the residual's variance, px^2
     contrast  (N,) standard deviation of the grey values
@@ -83,10 +83,6 @@ class Templates:
         rows, self._free = self._free[:count], self._free[count:]
         return rows
 
-    def put(self, rows: np.ndarray, fine: Patches, coarse: Patches) -> None:
-        """Keep these patches in these rows."""
-        self.fine[rows], self.coarse[rows] = fine, coarse
-
     def let_go(self, rows: np.ndarray) -> None:
         """Nobody uses these rows any more."""
         self._free = np.concatenate([rows, self._free])
@@ -96,10 +92,14 @@ def take(image: np.ndarray, uv_px: np.ndarray) -> Patches:
     """The patches at uv_px (N, 2) of a float32 grey image."""
     n, side = len(uv_px), _SIDE + 2
     y, x = (a.ravel().astype(np.float32) for a in np.mgrid[:side, :side] - float(RADIUS + 1))
-    raw = _sample(image, uv_px.astype(np.float32), np.stack([x, y])).reshape(n, side, side)
+    raw = sampled(image, uv_px.astype(np.float32)[:, :, None] + np.stack([x, y])).reshape(n, side, side)
     gx = 0.5 * (raw[:, 1:-1, 2:] - raw[:, 1:-1, :-2]).reshape(n, _SIDE**2)
     gy = 0.5 * (raw[:, 2:, 1:-1] - raw[:, :-2, 1:-1]).reshape(n, _SIDE**2)
-    pixels, norm = _normalised(raw[:, 1:-1, 1:-1].reshape(n, _SIDE**2))
+    grey = raw[:, 1:-1, 1:-1].reshape(n, _SIDE**2)
+    centred = (grey - (grey @ _SQUARE)[:, None]) * _ROOT
+    centred -= (centred @ _RAMPS.T) @ _RAMPS
+    norm = np.sqrt(np.maximum(np.einsum("np,np->n", centred, centred), 1.0))
+    pixels = centred / norm[:, None]
     J = np.stack([gx, gy, gx * _X, gx * _Y, gy * _X, gy * _Y], 1) * (_ROOT / norm[:, None, None])
     # What a change of offset, slope or gain explains is not evidence of motion.
     J -= (J @ _ROOT)[..., None] * _ROOT
@@ -128,18 +128,12 @@ class Alignment:
 
 
 def align(
-    image: np.ndarray,
-    patches: Patches,
-    uv_px: np.ndarray,
-    A: np.ndarray,
-    iterations: int = 4,
-    rows: np.ndarray | slice = slice(None),
+    image: np.ndarray, patches: Patches, rows: np.ndarray, uv_px: np.ndarray, A: np.ndarray, iterations: int = 4
 ) -> Alignment:
-    """Find each patch near uv_px (N, 2), seen under about A (N, 2, 2), in a float32 grey image.
+    """Find the patches at rows (N,) near uv_px (N, 2), seen under about A (N, 2, 2), in a float32 grey image.
 
-    rows  (N,) of the patches, which are too large to be copied for it; or all
+    All patches are handed over: they are too large to be copied for it.
     """
-    rows = np.arange(len(patches))[rows]
     uv, A = uv_px.astype(np.float32), A.astype(np.float32)
     height, width = image.shape
     start, identity = uv.copy(), np.eye(2, dtype=np.float32)
@@ -204,21 +198,3 @@ def _aligned(image, pixels, solver, rows, uv, A, iterations):
                 A[n, row, 0], A[n, row, 1] = (e * d11 - f * d10) / area, (f * d00 - e * d01) / area
                 uv[n, row] -= A[n, row, 0] * step[0] + A[n, row, 1] * step[1]
     return ncc, contrast
-
-
-def _sample(image: np.ndarray, uv: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """(N, P) grey values at uv (N, 2) + offsets (2, P) or (N, 2, P), bilinear, the border repeated."""
-    at = uv[:, :, None] + offsets
-    x, y = np.ascontiguousarray(at[:, 0]), np.ascontiguousarray(at[:, 1])
-    if not len(x):
-        return np.zeros(x.shape, np.float32)
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _normalised(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted, without mean and slope, unit length; and the standard deviation (N,) before."""
-    mean = raw @ _SQUARE
-    centred = (raw - mean[:, None]) * _ROOT
-    centred -= (centred @ _RAMPS.T) @ _RAMPS
-    norm = np.sqrt(np.maximum(np.einsum("np,np->n", centred, centred), 1.0))
-    return centred / norm[:, None], norm

@@ -15,6 +15,7 @@ import numpy as np
 
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.image import bounds
+from p2p_lib.trackers.builtin.image import sampled
 
 _DIRECTIONS, _CELLS, _SAMPLES = 8, 4, 16
 SIZE = _DIRECTIONS * _CELLS**2
@@ -25,6 +26,8 @@ _GRID = np.stack(np.meshgrid(_AXIS, _AXIS)).reshape(2, -1).astype(np.float32)
 _RADIUS = _AXIS[-1]
 #: Places that a landmark may match.
 _PLACES = 2
+#: Corners within this many pixels are one place.
+_SAME_PX = 4.0
 #: Room around a region in which gradients are computed.
 _MARGIN_PX = 14
 #: Half an image of 640 x 480.
@@ -103,8 +106,7 @@ def _rectified(gx: np.ndarray, gy: np.ndarray, directions: np.ndarray) -> np.nda
 def _gradients(maps: list[np.ndarray], uv: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N, S) derivatives along the two steps of the grids at uv (N, 2)."""
     at = uv[:, :, None] + M @ _GRID
-    x, y = np.ascontiguousarray(at[:, 0]), np.ascontiguousarray(at[:, 1])
-    gu, gv = (cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for values in maps)
+    gu, gv = (sampled(values, at) for values in maps)
     return M[:, 0, :1] * gu + M[:, 1, :1] * gv, M[:, 0, 1:] * gu + M[:, 1, 1:] * gv
 
 
@@ -117,19 +119,17 @@ def _dominant(histogram: np.ndarray) -> np.ndarray:
     return 2 * np.pi * (peak + shift) / _DIRECTIONS
 
 
-def match(
-    wanted: np.ndarray, found: np.ndarray, uv_px: np.ndarray, same_px: float, ratio: float
-) -> tuple[np.ndarray, np.ndarray]:
+def match(wanted: np.ndarray, found: np.ndarray, uv_px: np.ndarray, ratio: float) -> tuple[np.ndarray, np.ndarray]:
     """Rows of descriptors wanted (Q, SIZE) and of places found (M, SIZE) at uv_px (M, 2) that match.
 
     A wanted one may match its two nearest places, for two objects may look alike. Each counts if it is nearer than
-    ``ratio`` times the next best place beyond those two. Corners within ``same_px`` are one place.
+    ``ratio`` times the next best place beyond those two.
     """
     from scipy.spatial.distance import cdist
 
     similarity = wanted @ found.T
     rows, best, similarities = np.arange(len(wanted)), [], []
-    same = cdist(uv_px, uv_px, "chebyshev") <= same_px
+    same = cdist(uv_px, uv_px, "chebyshev") <= _SAME_PX
     for place in range(_PLACES + 1):
         if place:
             np.copyto(similarity, -1, where=same[best[-1]])

@@ -42,10 +42,7 @@ class Image:
 
     def chroma_at(self, uv_px: np.ndarray) -> np.ndarray:
         """(N, 2) around pixels."""
-        if not len(uv_px):
-            return np.zeros((0, 2), np.float32)
-        x, y = (np.ascontiguousarray((uv_px[:, i] + 0.5) / 4 - 0.5, np.float32)[:, None] for i in (0, 1))
-        return cv2.remap(self.chroma, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        return sampled(self.chroma, ((uv_px + 0.5) / 4 - 0.5).astype(np.float32)[..., None])[:, 0]
 
     def depth_at(self, uv_px: np.ndarray) -> np.ndarray:
         """(N,) metres at the nearest pixels, 0 where nothing was measured."""
@@ -56,6 +53,13 @@ class Image:
         """(N,) bool: pixels in the image, and in the region (H, W) if there is one."""
         inside = in_image(uv_px, self.gray.shape)
         return inside if region is None else inside & in_mask(uv_px, region)
+
+
+def sampled(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(N, P, ...) values of an image at pixels (N, 2, P) float32, bilinear, the border repeated."""
+    if not len(at):
+        return np.zeros((0, at.shape[2], *image.shape[2:]), np.float32)
+    return cv2.remap(image, at[:, 0], at[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def flow(before: Image, after: Image, uv_px: np.ndarray, window_px: int) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ from p2p_lib.trackers.builtin.tracker import BuiltinTracker
 #: The grid on which a point's surroundings are described: two pixels of the image a step.
 _STEP_PX = 2 * np.eye(2)
 #: A point lies at most about so far from the corner by which it is recognised.
-_FROM_CORNER_PX, _SAME_PX = 3.0, 4.0
+_FROM_CORNER_PX = 3.0
 #: Neither depth nor a segment tells that a point is hidden: what is not recognised is soon taken for it.
 _COAST_FRAMES = 2
 #: A description says nothing of how far a point has turned: these are tried.
@@ -35,12 +35,11 @@ class ImageOnlyTracker(BuiltinTracker):
 
     def __init__(self, config: TrackingConfig, rng: np.random.Generator | None = None):
         super().__init__(replace(config, coast_frames=min(config.coast_frames, _COAST_FRAMES)), rng)
-        self._described = np.zeros((0, features.SIZE), np.float32)  # a row per live point, of when it was added
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
         super().start(_without_depth(frame), camera)
-        self._described = self._described[:0]
+        self._described = np.zeros((0, features.SIZE), np.float32)  # a row per live point, of when it was added
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids."""
@@ -69,14 +68,11 @@ class ImageOnlyTracker(BuiltinTracker):
         corners = features.detect(now.gray, search, cfg.corners)
         if len(corners) <= 2:  # match() compares with the next best place but one
             return
-        which, corner = features.match(
-            self._described[lost], self._describe(corners), corners, _SAME_PX, cfg.match_ratio
-        )
+        which, corner = features.match(self._described[lost], self._describe(corners), corners, cfg.match_ratio)
         rows, uv, warp = lost[which], corners[corner], p.warp[lost[which]].copy()
         for rotation in _ROTATIONS:
             left = ~p.verified[rows]
-            sigma_px = np.full(left.sum(), _FROM_CORNER_PX)
-            recognition.find(p, rows[left], uv[left], rotation @ warp[left], sigma_px, now, cfg)
+            recognition.find(p, rows[left], uv[left], rotation @ warp[left], _FROM_CORNER_PX, now, cfg)
         left = ~p.verified[rows]
         p.warp[rows[left]] = warp[left]
 

@@ -18,8 +18,6 @@ from p2p_lib.trackers.builtin.tangent_planes import planes_at, tangent_steps
 
 #: Steps of the grids on the surface on which corners are described: descriptors cover 2.4 and 4.8 cm.
 _STEPS_M = (0.0015, 0.003)
-#: Corners within this many pixels are one.
-_SAME_PX = 4.0
 #: Landmarks searched for in one frame: the cost of a search grows with their matches squared.
 _SEARCHED = 400
 
@@ -49,23 +47,23 @@ class Landmarks:
 
     p_seg        (L, 3) positions on it
     descriptors  (L, scales, SIZE)
-    views        (V, 3) camera centres from which they were taken, relative to the segment's centre
+    views        (V, 3) camera centres from which they were taken, relative to the segment's centre, in its frame
     """
 
     p_seg: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     descriptors: np.ndarray = field(default_factory=lambda: np.zeros((0, len(_STEPS_M), features.SIZE), np.float32))
     views: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
-    def taken_from(self, camera_centre: np.ndarray, within_deg: float) -> bool:
-        """Whether landmarks were taken from about that direction; camera_centre (3,) as in ``views``."""
-        cosine = self.views @ camera_centre / (np.linalg.norm(self.views, axis=1) * np.linalg.norm(camera_centre))
+    def taken_from(self, view: np.ndarray, within_deg: float) -> bool:
+        """Whether landmarks were taken from about the direction of ``view`` (3,), one as in ``views``."""
+        cosine = self.views @ view / (np.linalg.norm(self.views, axis=1) * np.linalg.norm(view))
         return bool((cosine > np.cos(np.radians(within_deg))).any())
 
     def add(
         self,
         now: Image,
-        T_cam_seg: np.ndarray,
-        camera_centre: np.ndarray,
+        T_seg_cam: np.ndarray,
+        view: np.ndarray,
         uv_px: np.ndarray,
         p_seg: np.ndarray,
         cfg: TrackingConfig,
@@ -73,12 +71,12 @@ class Landmarks:
     ) -> None:
         """Add the corners near points of the segment, seen at uv_px (N, 2), p_seg (N, 3); at most ``max_landmarks``."""
         found = corners(now, _region_around(uv_px, now, cfg.segment_reach_m), cfg.corners)
-        at = se3.transform(se3.inverse(T_cam_seg), found.p_cam)
+        at = se3.transform(T_seg_cam, found.p_cam)
         near = cdist(at, p_seg).min(1) < cfg.segment_reach_m
         at = np.concatenate([self.p_seg, at[near]])
         keep = np.sort(rng.permutation(len(at))[: cfg.max_landmarks])
         self.p_seg, self.descriptors = at[keep], np.concatenate([self.descriptors, found.descriptors[near]])[keep]
-        self.views = np.vstack([self.views, camera_centre])
+        self.views = np.vstack([self.views, view])
 
     def match(
         self, found: Corners, ratio: float, rng: np.random.Generator
@@ -86,7 +84,7 @@ class Landmarks:
         """Pairs of some of the landmarks with corners: p_seg (M, 3), p_cam (M, 3), and which corner (M,)."""
         some = rng.permutation(len(self.p_seg))[:_SEARCHED]
         wanted, offered = (np.moveaxis(of, 1, 0) for of in (self.descriptors[some], found.descriptors))
-        pairs = [features.match(w, o, found.uv_px, _SAME_PX, ratio) for w, o in zip(wanted, offered, strict=True)]
+        pairs = [features.match(w, o, found.uv_px, ratio) for w, o in zip(wanted, offered, strict=True)]
         which, corner = np.concatenate(pairs, 1)
         return self.p_seg[some[which]], found.p_cam[corner], corner
 

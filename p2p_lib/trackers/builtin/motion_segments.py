@@ -50,11 +50,6 @@ class MotionSegment:
     rejected_for: int = 0
     landmarks: Landmarks = field(default_factory=Landmarks)
 
-    @classmethod
-    def at(cls, T_cam_seg: np.ndarray, covariance: np.ndarray, centre: np.ndarray) -> MotionSegment:
-        """A new segment; centre (3,) in its own frame."""
-        return cls(PoseFit(T_cam_seg, covariance, centre, np.zeros(0, bool)), T_cam_seg)
-
     @property
     def posed(self) -> bool:
         """Whether the pose is that of the newest frame."""
@@ -66,11 +61,6 @@ class MotionSegment:
         T = self.fit.T_cam_seg
         # Without this, rounding errors of the rotation would grow with every frame.
         return se3.orthonormalised(T @ se3.inverse(self.before) @ T) if self.posed else T
-
-    @property
-    def camera_centre(self) -> np.ndarray:
-        """(3,) relative to the segment's centre, in its frame."""
-        return se3.inverse(self.fit.T_cam_seg)[:3, 3] - self.fit.centre
 
 
 class MotionSegments:
@@ -168,7 +158,7 @@ class MotionSegments:
         p.leaving[own] = pose_distance_m(left, T, centre) < cfg.split_m
         if not p.leaving[own[0]]:
             p.segment[own] = len(self.segments)
-            self.segments.append(MotionSegment.at(T, _PROPOSED_COV, centre))
+            self.segments.append(MotionSegment(PoseFit(T, _PROPOSED_COV, centre), T))
 
     def search(self, now: Image, region: np.ndarray | None) -> None:
         """Propose poses for lost segments by their landmarks, outside of the regions where they were rejected."""
@@ -197,17 +187,19 @@ class MotionSegments:
         """Have a lost segment's points searched for at the pose that most pairs p_seg, p_cam (M, 3) agree on."""
         T, agrees = consensus(p_seg, p_cam, self.config.segment_inlier_m, corner)
         if len(np.unique(corner[agrees])) >= self.config.min_landmark_matches:
-            segment.fit, segment.hidden_for = PoseFit(T, _PROPOSED_COV, segment.fit.centre, np.zeros(0, bool)), 1
+            segment.fit, segment.hidden_for = PoseFit(T, _PROPOSED_COV, segment.fit.centre), 1
 
     def add_landmarks(self, p: Points, now: Image) -> None:
         """Remember the corners on segments that show a new side."""
         cfg = self.config
         for s, segment in enumerate(self.segments):
             rows = np.flatnonzero(p.visible & (p.segment == s))
-            enough = segment.posed and len(rows) >= 2 * cfg.segment_min_points
-            if enough and not segment.landmarks.taken_from(segment.camera_centre, cfg.landmark_view_deg):
-                points = p.uv[rows], p.p_seg[rows]
-                segment.landmarks.add(now, segment.fit.T_cam_seg, segment.camera_centre, *points, cfg, self._rng)
+            if not segment.posed or len(rows) < 2 * cfg.segment_min_points:
+                continue
+            T_seg_cam = se3.inverse(segment.fit.T_cam_seg)
+            view = T_seg_cam[:3, 3] - segment.fit.centre
+            if not segment.landmarks.taken_from(view, cfg.landmark_view_deg):
+                segment.landmarks.add(now, T_seg_cam, view, p.uv[rows], p.p_seg[rows], cfg, self._rng)
 
     def update_positions(self, p: Points, rows: np.ndarray, now: Image) -> None:
         """Kalman update of points' positions on their segments by where they were seen."""
@@ -247,8 +239,7 @@ class MotionSegments:
     def _nearby(self, p: Points, rows: np.ndarray, p_cam: np.ndarray) -> np.ndarray:
         """(M,) segment of the nearest point within reach, in steps over other new points; -1 for none."""
         label = np.full(len(rows), -1)
-        old = np.flatnonzero(p.visible & self.posed(p))
-        old = old[~np.isin(old, rows)]
+        old = np.flatnonzero(p.visible & self.posed(p))  # the new ones are on no segment
         if not len(old):
             return label
         reached = se3.transform(self._poses(p, old), p.p_seg[old][:, None])[:, 0]
@@ -273,4 +264,5 @@ class MotionSegments:
             members = free[component == c]
             if len(members) >= 2 * self.config.segment_min_points:
                 label[members] = len(self.segments)
-                self.segments.append(MotionSegment.at(np.eye(4), np.zeros((6, 6)), p_cam[members].mean(0)))
+                fit = PoseFit(np.eye(4), np.zeros((6, 6)), p_cam[members].mean(0))
+                self.segments.append(MotionSegment(fit, fit.T_cam_seg))

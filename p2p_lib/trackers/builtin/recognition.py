@@ -30,10 +30,9 @@ def follow(p: Points, before: Image, now: Image, cfg: TrackingConfig) -> None:
     moved, tracked = flow(before, now, start, cfg.window_px)
     moved = np.where(tracked[:, None], moved, start)
     k, warp = best_template(p, at)
-    seen = align(now.fine, p.templates.fine, moved, warp, rows=p.template[at, k])
+    seen = align(now.fine, p.templates.fine, p.template[at, k], moved, warp)
     shift_px = np.linalg.norm(seen.uv_px - moved, axis=1)
-    good = (seen.ncc >= cfg.min_ncc) & (shift_px < cfg.search_px) & _same_appearance(p, at, k, seen, now, cfg)
-    _settle(p, at, k, seen, good)
+    good = _settle(p, at, k, seen, (seen.ncc >= cfg.min_ncc) & (shift_px < cfg.search_px), now, cfg)
     changed = ~good & (seen.ncc > _COAST_NCC) & now.inside(moved)
     _coast(p, at[changed], before, now, start[changed], moved[changed], cfg)
 
@@ -57,7 +56,7 @@ def find(
     at: np.ndarray,
     uv_px: np.ndarray,
     warp: np.ndarray,
-    sigma_px: np.ndarray,
+    sigma_px: np.ndarray | float,
     now: Image,
     cfg: TrackingConfig,
 ) -> None:
@@ -67,12 +66,12 @@ def find(
     p.warp[at] = warp
     k, warp = best_template(p, at)
     rows = p.template[at, k]
-    rough = align(now.coarse, p.templates.coarse, uv_px / 2, warp, rows=rows)
-    seen = align(now.fine, p.templates.fine, 2 * rough.uv_px, rough.A, rows=rows)
+    rough = align(now.coarse, p.templates.coarse, rows, uv_px / 2, warp)
+    seen = align(now.fine, p.templates.fine, rows, 2 * rough.uv_px, rough.A)
     off_px = np.linalg.norm(seen.uv_px - uv_px, axis=1)
     own_px = np.sqrt(np.trace(seen.cov_px2, axis1=1, axis2=2))
     near = off_px < np.minimum(cfg.search_px, 2 + 3 * np.hypot(sigma_px, own_px))
-    _settle(p, at, k, seen, (seen.ncc >= cfg.return_ncc) & near & _same_appearance(p, at, k, seen, now, cfg))
+    _settle(p, at, k, seen, (seen.ncc >= cfg.return_ncc) & near, now, cfg)
 
 
 def best_template(p: Points, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,26 +79,24 @@ def best_template(p: Points, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     A = p.warp[at][:, None] @ p.template_unwarp[at]
     squared = A @ A.transpose(0, 1, 3, 2) - _EYE
     distortion = np.sqrt((squared**2).sum((2, 3))) + _OLDER_DISTORTION * np.arange(A.shape[1])
-    distortion[np.arange(A.shape[1]) >= p.count[at][:, None]] = np.inf
+    distortion[p.template[at] < 0] = np.inf
     best = distortion.argmin(1)
     return best, A[np.arange(len(A)), best]
 
 
-def _settle(p: Points, at: np.ndarray, k: np.ndarray, seen: Alignment, good: np.ndarray) -> None:
-    """Put those of the points that are ``good`` (M,) where their templates k were found."""
+def _settle(
+    p: Points, at: np.ndarray, k: np.ndarray, seen: Alignment, fits: np.ndarray, now: Image, cfg: TrackingConfig
+) -> np.ndarray:
+    """Put points where their templates k were found, if that ``fits`` (M,) and looks the same; returns which (M,)."""
+    # Alignment alone is invariant to colour and contrast: both have to be about those of the template.
+    colour_change = np.abs(now.chroma_at(seen.uv_px) - p.chroma[at, k]).max(1)
+    contrast_change = np.abs(np.log(seen.contrast_ratio))
+    good = fits & (colour_change < cfg.max_colour_change) & (contrast_change < np.log(cfg.max_contrast_change))
     at, k = at[good], k[good]
     p.uv[at], p.warp[at] = seen.uv_px[good], seen.A[good] @ p.template_warp[at, k]
     p.cov[at] = seen.cov_px2[good] + p.template_cov[at, k]
     p.verified[at], p.coasting[at], p.ncc[at] = True, 0, seen.ncc[good]
-
-
-def _same_appearance(
-    p: Points, at: np.ndarray, k: np.ndarray, seen: Alignment, now: Image, cfg: TrackingConfig
-) -> np.ndarray:
-    """Whether colour and contrast are about those of the template: alignment alone is invariant to both."""
-    colour_change = np.abs(now.chroma_at(seen.uv_px) - p.chroma[at, k]).max(1)
-    contrast_change = np.abs(np.log(seen.contrast_ratio))
-    return (colour_change < cfg.max_colour_change) & (contrast_change < np.log(cfg.max_contrast_change))
+    return good
 
 
 def update_templates(p: Points, now: Image, cfg: TrackingConfig, turn: int) -> None:
@@ -114,13 +111,13 @@ def store_templates(p: Points, rows: np.ndarray, now: Image, turn: int) -> None:
     """Store the present appearance of these points; in a full set it replaces one in ``turn``, never the first."""
     if not len(rows):
         return
-    room = p.template_warp.shape[1]
-    k = np.where(p.count[rows] < room, p.count[rows], 1 + turn % (room - 1))
+    room, count = p.template.shape[1], (p.template[rows] >= 0).sum(1)
+    k = np.where(count < room, count, 1 + turn % (room - 1))
     uv = p.uv[rows]
     p.template_warp[rows, k], p.template_cov[rows, k] = p.warp[rows], p.cov[rows]
     p.template_unwarp[rows, k] = np.linalg.inv(p.warp[rows])
     first = p.template[rows, k] < 0
     p.template[rows[first], k[first]] = p.templates.new(np.count_nonzero(first))
-    p.templates.put(p.template[rows, k], take(now.fine, uv), take(now.coarse, uv / 2))
+    own = p.template[rows, k]
+    p.templates.fine[own], p.templates.coarse[own] = take(now.fine, uv), take(now.coarse, uv / 2)
     p.chroma[rows, k] = now.chroma_at(uv)
-    p.count[rows] = np.minimum(p.count[rows] + 1, room)

@@ -8,7 +8,7 @@ frame is the camera's when the segment was started.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,24 +28,19 @@ _SHARED_PX = 0.3
 _AGREES_CHI2, _AGREES_DEPTH_CHI2 = 16, 25
 
 
-def _motion_jacobian(arm: np.ndarray) -> np.ndarray:
-    """(N, 3, 6) change of points by a small motion [rotation, translation]; arm (N, 3) from its centre."""
-    return np.concatenate([-se3.hat(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], -1)
-
-
 @dataclass(frozen=True, eq=False)
 class PoseFit:
     """A segment's pose.
 
     T_cam_seg   (4, 4)
     covariance  (6, 6) of its rotation and translation, in the camera's axes, about ``centre`` (3,), on the segment
-    agrees      (N,) bool: the points that it was fitted to and that agree with it
+    agrees      (N,) bool: which of the points that it was fitted to agree with it
     """
 
     T_cam_seg: np.ndarray
     covariance: np.ndarray
     centre: np.ndarray
-    agrees: np.ndarray
+    agrees: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
 
 def fit_pose(
@@ -63,20 +58,10 @@ def fit_pose(
     not measured. Errors along an edge, where cov_px2 (N, 2, 2) is long, hardly count.
     """
     centre = p_seg.mean(0)
-    R, at, H, chi2, chi2_z = _fit_pose(
-        np.ascontiguousarray(T_cam_seg[:3, :3]),
-        T_cam_seg[:3, :3] @ centre + T_cam_seg[:3, 3],
-        p_seg - centre,
-        map_cov,
-        uv_px,
-        cov_px2,
-        z_m,
-        depth_noise_m(z_m),
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-    )
+    start = np.ascontiguousarray(T_cam_seg[:3, :3]), T_cam_seg[:3, :3] @ centre + T_cam_seg[:3, 3]
+    seen = uv_px, cov_px2, z_m, depth_noise_m(z_m)
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    R, at, H, chi2, chi2_z = _fit_pose(*start, p_seg - centre, map_cov, *seen, *intrinsics)
     agrees = (chi2 < _AGREES_CHI2) & (chi2_z < _AGREES_DEPTH_CHI2)
     return PoseFit(se3.from_rt(R, at - R @ centre), np.linalg.inv(H), centre, agrees)
 
@@ -170,7 +155,9 @@ def predict(
     p_cam = (R @ p_seg[..., None])[..., 0] + T[:, :3, 3]
     uv, P = projection(camera, p_cam)
     across = R @ tangent
-    J, PR = P @ _motion_jacobian((R @ (p_seg - centre)[..., None])[..., 0]), P @ R
+    arm = (R @ (p_seg - centre)[..., None])[..., 0]
+    by_motion = np.concatenate([-se3.hat(arm), np.broadcast_to(np.eye(3), R.shape)], -1)  # [rotation, translation]
+    J, PR = P @ by_motion, P @ R
     cov = PR @ map_cov @ PR.transpose(0, 2, 1) + J @ covariance @ J.transpose(0, 2, 1)
     normal = np.cross(across[..., 0], across[..., 1])
     length = np.linalg.norm(normal, axis=1) * np.linalg.norm(p_cam, axis=1)

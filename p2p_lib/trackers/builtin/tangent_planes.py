@@ -18,11 +18,6 @@ _REACH_M, _OFF_PLANE_M = 0.015, 0.006
 _MIN_READINGS = 8
 
 
-def assumed_camera(width: int, height: int) -> Camera:
-    """A camera with the field of view of common depth cameras, for streams whose camera is not given."""
-    return Camera(0.95 * width, 0.95 * width, (width - 1) / 2, (height - 1) / 2, width, height)
-
-
 @dataclass(frozen=True, eq=False)
 class TangentPlanes(Rows):
     """The measured surface at N pixels.
@@ -54,7 +49,7 @@ def planes_at(depth_m: np.ndarray, camera: Camera, uv_px: np.ndarray, step_px: i
     z0 = z[np.arange(len(uv)), nearest[(z[:, nearest] > 0).argmax(1)]]
     # Moments about the pixel itself: the plane's first parameter is the depth there.
     basis = np.stack([np.ones_like(x, float), x - uv[:, :1], y - uv[:, 1:]], -1)
-    off, limit, plane = z - z0[:, None], _REACH_M * step_px, np.zeros((len(uv), 3))
+    off, limit = z - z0[:, None], _REACH_M * step_px
     for _ in range(2):
         use = (z > 0) & (np.abs(off) < limit)
         weighted = basis * use[..., None]
@@ -66,8 +61,7 @@ def planes_at(depth_m: np.ndarray, camera: Camera, uv_px: np.ndarray, step_px: i
     at_m = np.where(known, z0 + plane[:, 0], np.nan)
     spread = np.sqrt((use * off**2).sum(1) / np.maximum(count, 1))
     rays = np.column_stack([(uv[:, 0] - camera.cx) / camera.fx, (uv[:, 1] - camera.cy) / camera.fy, np.ones(len(uv))])
-    across = np.zeros((len(uv), 3, 2))
-    across[:, 0, 0], across[:, 1, 1] = 1 / camera.fx, 1 / camera.fy
+    across = np.array([[1 / camera.fx, 0], [0, 1 / camera.fy], [0, 0]])
     per_px = across * at_m[:, None, None] + rays[:, :, None] * plane[:, None, 1:]
     # Neighbouring readings share their noise; where the plane does not fit, the depth is uncertain by the misfit.
     return TangentPlanes(rays * at_m[:, None], per_px, np.hypot(0.7 * depth_noise_m(at_m), spread))
@@ -85,9 +79,8 @@ def projection(camera: Camera, p_cam: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def tangent_steps(planes: TangentPlanes, camera: Camera, step_m: float) -> np.ndarray:
     """(N, 2, 2) pixels per step of a square grid on each tangent plane, step_m apart."""
-    u = planes.per_px[..., 0]
+    u, v = planes.per_px[..., 0], planes.per_px[..., 1]
     a = u / np.linalg.norm(u, axis=1, keepdims=True)
-    v = planes.per_px[..., 1]
     b = v - (a * v).sum(1, keepdims=True) * a
     b /= np.linalg.norm(b, axis=1, keepdims=True)
     return step_m * (projection(camera, planes.p_cam)[1] @ np.stack([a, b], -1))

@@ -28,7 +28,6 @@ class Points(Rows):
     hidden_for: np.ndarray  # (N,) frames
     ncc: np.ndarray  # (N,) correlation with the template last recognised
     coasting: np.ndarray  # (N,) frames since a template was last recognised
-    count: np.ndarray  # (N,) templates in use
     template_warp: np.ndarray  # (N, K, 2, 2)
     template_unwarp: np.ndarray  # (N, K, 2, 2) its inverse
     template_cov: np.ndarray  # (N, K, 2, 2) of the point's position in the template
@@ -54,7 +53,6 @@ class Points(Rows):
             hidden_for=np.zeros(n, np.int64),
             ncc=np.ones(n, np.float32),
             coasting=np.zeros(n, np.int64),
-            count=np.zeros(n, np.int64),
             template_warp=np.tile(_EYE, (n, k, 1, 1)),
             template_unwarp=np.tile(_EYE, (n, k, 1, 1)),
             template_cov=np.zeros((n, k, 2, 2), np.float32),
@@ -72,8 +70,3 @@ class Points(Rows):
     def contrast(self) -> np.ndarray:
         """(N,) standard deviation of the grey values in the first template."""
         return self.templates.fine.contrast[self.template[:, 0]]
-
-    @property
-    def sigma_px(self) -> np.ndarray:
-        """(N,) standard deviation of uv."""
-        return np.sqrt(np.trace(self.cov, axis1=1, axis2=2))

@@ -11,7 +11,6 @@ from p2p_lib.trackers.builtin import recognition
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.motion_segments import MotionSegments
 from p2p_lib.trackers.builtin.rigid_motion import Prediction
-from p2p_lib.trackers.builtin.tangent_planes import assumed_camera
 from p2p_lib.trackers.builtin.tracked_points import Points
 from p2p_lib.trackers.ids import PointIds
 
@@ -36,11 +35,12 @@ class BuiltinTracker:
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame; without a camera, one with a common field of view is assumed."""
+        h, w = frame.shape
         self._ids.start()
         self._frames = 0
         self._points = Points.new(np.zeros((0, 2)), self.config.templates)
         self._segments = MotionSegments(self.config)
-        self._camera = camera or assumed_camera(*frame.shape[::-1])
+        self._camera = camera or Camera(0.95 * w, 0.95 * w, (w - 1) / 2, (h - 1) / 2, w, h)
         self._now = Image.of(frame, self._camera)
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
@@ -109,7 +109,8 @@ class BuiltinTracker:
         """The points as the caller gets them."""
         p = self._points
         # A bounded, monotonous reading of the standard deviation: 1/2 at uncertain_px.
-        uncertainty = np.where(p.visible, p.sigma_px / (p.sigma_px + self.config.uncertain_px), 1.0)
+        sigma_px = np.sqrt(np.trace(p.cov, axis1=1, axis2=2))
+        uncertainty = np.where(p.visible, sigma_px / (sigma_px + self.config.uncertain_px), 1.0)
         return Tracks(self._ids.live.copy(), p.uv.astype(float), p.visible.copy(), uncertainty.astype(float))
 
     def _exposed(self, predicted: Prediction, search: np.ndarray | None) -> np.ndarray:
