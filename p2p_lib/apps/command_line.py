@@ -12,12 +12,11 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
-from difflib import get_close_matches
 from functools import partial
 from typing import Any
 
 from p2p_lib import __version__
-from p2p_lib.core.errors import Doubt, P2PError
+from p2p_lib.core.errors import Doubt, P2PError, did_you_mean
 from p2p_lib.core.options import add_options
 
 EXIT_INTERRUPTED = 128  # and the signal's number: 130 for Ctrl-C, 143 for SIGTERM
@@ -127,9 +126,8 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _meant(word: str, known: list[str]) -> str:
-    harmless = [option for option in known if option != "--force"]  # it replaces an earlier run
-    near = get_close_matches(word, harmless, n=1, cutoff=0.6)
-    return f". Did you mean {near[0]}?" if near else ""
+    meant = did_you_mean(word, [option for option in known if option != "--force"])  # it replaces an earlier run
+    return f". {meant}" if meant else ""
 
 
 def warn(line: object) -> None:
