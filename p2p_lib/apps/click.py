@@ -12,6 +12,7 @@ import re
 import secrets
 import warnings
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -22,8 +23,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from p2p_lib.apps.command_line import open_page
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, make_segmenter
-from p2p_lib.core.browser import open_page
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
@@ -40,7 +41,7 @@ _HERE = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
 _JSON, _HTML, _PNG = "application/json", "text/html; charset=utf-8", "image/png"
 
 
-class Clicker:
+class Clicker(AbstractContextManager):
     """A page that is being served, a context manager; ``prompts`` is what was saved last.
 
     url   where the page is; a word in it keeps others out
@@ -73,9 +74,6 @@ class Clicker:
         """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
-
-    def __enter__(self) -> Clicker:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -11,6 +11,7 @@ import sys
 import threading
 import traceback
 import warnings
+import webbrowser
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -133,6 +134,11 @@ def _meant(word: str, known: list[str]) -> str:
 def warn(line: object) -> None:
     """Standard output is for results."""
     print(line, file=sys.stderr)
+
+
+def open_page(url: str) -> bool:
+    """Open a page in the user's browser; whether that was possible. A browser in text would take the terminal."""
+    return bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)) and webbrowser.open(url)
 
 
 def _show_doubt(others: Callable, name: str, message: Any, category: type, *where: Any) -> None:
