@@ -395,7 +395,7 @@ def preset(name: str = "default", seed: int = 0) -> Config:
     p2p_lib.core.errors.BadInput: configuration key: got 'tsdf.voxel', expected ... Did you mean tsdf.voxel_m?
     """
     if not isinstance(name, str) or name not in _PRESETS:
-        raise _unknown("preset", name, _PRESETS)
+        raise BadInput("preset", repr(name), f"one of {', '.join(_PRESETS)}", did_you_mean(str(name), _PRESETS))
     return replace(Config().with_values(_PRESETS[name] | {"seed": seed}), preset=name)
 
 
@@ -428,8 +428,7 @@ def _unknown(what: str, key: str, known: Any) -> BadInput:
         keys = [f.name for f in fields(getattr(Config, stage))]
         fix = did_you_mean(name, keys, f"{stage}.")
         return BadInput(what, repr(key), f"a key of [{stage}]: {', '.join(keys)}", fix)
-    stages = f"stage.key, where stage is one of {', '.join(_STAGES)}"
-    expected = f"one of {', '.join(known)}" if len(known) < 8 else stages
+    expected = f"stage.key, where stage is one of {', '.join(_STAGES)}"
     return BadInput(what, repr(key), expected, did_you_mean(str(key), known))
 
 
