@@ -41,8 +41,6 @@ Value = bool | int | float | str
 class NotebookFailed(P2PError):
     """A cell of a notebook raised: names the notebook, the cell as ``[n]``, and its message."""
 
-    exit_code = 1
-
 
 @dataclass(frozen=True)
 class Claim:

@@ -314,7 +314,7 @@ class Config:
             if key not in known:
                 raise _unknown(f"{source}: configuration key" if source else "configuration key", key, known)
             if key in _OF_ALL:
-                changes[key] = _checked(key, value)
+                changes[key] = _value_of_all(key, value)
             else:
                 stage, name = key.split(".")
                 part = changes.get(stage, getattr(self, stage))
@@ -439,7 +439,7 @@ _OF_ALL = {
 }
 
 
-def _checked(key: str, value: Any) -> Any:
+def _value_of_all(key: str, value: Any) -> Any:
     kind, form, expected = _OF_ALL[key]
     if not re.fullmatch(form, str(value)):
         raise BadInput(f"config {key}", repr(value), expected)
