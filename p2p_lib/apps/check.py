@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from p2p_lib.apps.click import clicked_masks
+from p2p_lib.apps.click import FirstMasks, clicked_masks
 from p2p_lib.core.backends import DEFAULT_DETECTOR, make_detector
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
@@ -27,7 +27,6 @@ from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.image_sequence import paired_images
 from p2p_lib.datasets.images import DEFAULT_HZ
-from p2p_lib.datasets.prompts import prompts_by_frame
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
 from p2p_lib.method.sampling import choose, usable_region
 
@@ -60,8 +59,6 @@ _PUT = {
     "depth": "Put the depth images there, registered to colour, one for each colour image, in 16-bit millimetres.",
     "K": "Write fx 0 cx / 0 fy cy / 0 0 1 into it, in pixels at the size of the images.",
 }
-
-FirstMasks = dict[str, tuple[Frame, np.ndarray]]
 
 
 def check_folder(
@@ -97,7 +94,7 @@ def check_folder(
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", Doubt)
         try:
-            firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
+            firsts = clicked_masks(sequence, prompts, config) if prompts else _first_masks(sequence, config)
         except P2PError as error:
             return [_unreadable("clicks" if prompts else "masks", error)]
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
@@ -383,14 +380,4 @@ def _first_masks(sequence: Sequence, config: Config) -> FirstMasks:
         for name in sorted(masks.keys() & set(sequence.objects) - firsts.keys()):
             if masks[name].sum() >= config.lifecycle.min_mask_px:
                 firsts[name] = sequence.frame(i), masks[name]
-    return firsts
-
-
-def _clicked(sequence: Sequence, prompts: Iterable[Prompt], config: Config) -> FirstMasks:
-    """Each clicked object's first mask, as the built-in segmenter cuts it out."""
-    firsts: FirstMasks = {}
-    for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
-        frame, new = sequence.frame(i), [prompt for prompt in said if prompt.name not in firsts]
-        found = clicked_masks(frame, new, sequence.camera, config)
-        firsts |= {name: (frame, mask) for name, mask in found.items()}
     return firsts

@@ -342,7 +342,7 @@ def _film(a: argparse.Namespace) -> None:
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.apps.notebooks import run_notebooks
 
-    parameters = pairs("--parameter", "NAME=VALUE")(a.parameter or ())
+    parameters = pairs(a.parameter or (), "--parameter", "NAME=VALUE")
     run_notebooks(a.profile, only=names(a.only) or (), jobs=a.jobs, parameters=parameters)
 
 
