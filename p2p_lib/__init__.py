@@ -27,37 +27,18 @@ if TYPE_CHECKING:  # what _WHERE says, for type checkers and editors
 logging.getLogger("p2p_lib").addHandler(logging.NullHandler())  # whoever wants to read it says so
 __version__ = "0.1.0"
 
-_WHERE = {
-    "Point2Pose": "p2p_lib.method.pipeline",
-    "open_sequence": "p2p_lib.datasets.sequence",
-    "Camera": "p2p_lib.core.camera",
-    "Config": "p2p_lib.core.config",
-    "preset": "p2p_lib.core.config",
-    "Frame": "p2p_lib.core.types",
-    "PoseEstimate": "p2p_lib.core.types",
-    "Status": "p2p_lib.core.types",
-    "Tracks": "p2p_lib.core.types",
-    "BadInput": "p2p_lib.core.errors",
-    "MissingData": "p2p_lib.core.errors",
-    "MissingBackend": "p2p_lib.core.errors",
-    "P2PError": "p2p_lib.core.errors",
+_NAMES = {
+    "p2p_lib.method.pipeline": ["Point2Pose"],
+    "p2p_lib.datasets.sequence": ["open_sequence"],
+    "p2p_lib.core.camera": ["Camera"],
+    "p2p_lib.core.config": ["Config", "preset"],
+    "p2p_lib.core.types": ["Frame", "PoseEstimate", "Status", "Tracks"],
+    "p2p_lib.core.errors": ["BadInput", "MissingData", "MissingBackend", "P2PError"],
 }
-__all__ = [  # noqa: RUF022 what one needs first comes first, in the reference as well
-    "Point2Pose",
-    "open_sequence",
-    "Camera",
-    "Config",
-    "preset",
-    "Frame",
-    "PoseEstimate",
-    "Status",
-    "Tracks",
-    "BadInput",
-    "MissingData",
-    "MissingBackend",
-    "P2PError",
-    "__version__",
-]
+_WHERE = {name: module for module, names in _NAMES.items() for name in names}
+__all__ = ["Point2Pose", "open_sequence", "Camera", "Config", "preset"]  # noqa: RUF022 what one needs first comes first
+__all__ += ["Frame", "PoseEstimate", "Status", "Tracks"]
+__all__ += ["BadInput", "MissingBackend", "MissingData", "P2PError", "__version__"]
 
 
 def __getattr__(name: str) -> Any:

@@ -345,17 +345,17 @@ def _track(job: _Job, keeper: Keeper, progress: bool) -> None:
 def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
     """Every frame with its estimates, which a late 2D tracker gives some frames later."""
 
-    def answered(estimates: dict[str, PoseEstimate]) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
+    def steps() -> Iterator[dict[str, PoseEstimate]]:
+        for i in job.frames:
+            frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
+            for prompt in job.prompts.get(i, ()):
+                method.tell(prompt)
+            yield method.step(frame, {name: masks[name] for name in method.objects if name in masks})
+        yield from method.finish()
+
+    for estimates in steps():
         if method.frame is not None:
             yield method.frame, estimates
-
-    for i in job.frames:
-        frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
-        for prompt in job.prompts.get(i, ()):
-            method.tell(prompt)
-        yield from answered(method.step(frame, {name: masks[name] for name in method.objects if name in masks}))
-    for estimates in method.finish():
-        yield from answered(estimates)
 
 
 def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:

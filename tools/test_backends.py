@@ -9,6 +9,7 @@ P2P_TAPNET, P2P_COTRACKER  a folder or URL to install these from, instead of Git
 import os
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -20,6 +21,13 @@ TORCHVISION = "torchvision==0.28.0"
 ALONE = {
     "tapnet": os.environ.get("P2P_TAPNET", "git+https://github.com/google-deepmind/tapnet"),
     "cotracker": os.environ.get("P2P_COTRACKER", "git+https://github.com/facebookresearch/co-tracker"),
+}
+#: With what the adapters were last run.
+TRIED = {
+    "transformers": "5.23.0",
+    "torchvision": "0.28.0",
+    "tapnet": "0.1.0 at c2cbab8 (July 2026)",
+    "co-tracker": "3.0 at 82e02e8 (January 2025)",
 }
 WHOLE = ("transformers", "einshape", "dm-tree", "einops")
 
@@ -55,6 +63,17 @@ def install_torchvision(uv):
         subprocess.run([*uv, "--reinstall", TORCHVISION, "-c", ROOT / "pins.txt"], check=True)
 
 
+def versions():
+    """Of each package the version that is installed there, and the one with which its adapters were last run."""
+    folders = [str(folder) for home in (VENV, HOME) for folder in home.glob("lib/python*/site-packages")]
+    said = {}
+    for package, tried in TRIED.items():
+        found = metadata.distributions(name=package.replace("co-tracker", "cotracker"), path=folders)
+        here = next((distribution.version for distribution in found), "not installed")
+        said[package] = f"{here}; last run with {tried}"
+    return said
+
+
 def main():
     if not (HOME / "bin/python").exists():
         sys.exit("p2p: .venv is not there. Run: make setup")
@@ -63,8 +82,7 @@ def main():
     except subprocess.CalledProcessError as error:
         fix = "Where GitHub is out of reach, set P2P_TAPNET and P2P_COTRACKER to folders with their sources."
         sys.exit(f"p2p: {' '.join(map(str, error.cmd[-2:]))} could not be installed. {fix}")
-    versions = "from p2p_lib.core.packages import tried; print(tried())"
-    subprocess.run([PYTHON, "-c", versions], cwd=ROOT, check=True)
+    print("\n".join(f"{package}: {version}" for package, version in versions().items()), flush=True)
     pytest = [PYTHON, "-m", "pytest", "-W", "ignore::DeprecationWarning", *TESTS, *sys.argv[1:]]
     sys.exit(subprocess.run(pytest, cwd=ROOT, env={**os.environ, "P2P_NO_SKIPS": "1"}).returncode)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from p2p_lib.apps.click import clicked_masks
+from p2p_lib.apps.click import FirstMasks, clicked_masks
 from p2p_lib.core.backends import DEFAULT_DETECTOR, make_detector
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
@@ -27,7 +27,6 @@ from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.image_sequence import paired_images
 from p2p_lib.datasets.images import DEFAULT_HZ
-from p2p_lib.datasets.prompts import prompts_by_frame
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
 from p2p_lib.method.sampling import choose, usable_region
 
@@ -61,8 +60,6 @@ _PUT = {
     "K": "Write fx 0 cx / 0 fy cy / 0 0 1 into it, in pixels at the size of the images.",
 }
 
-FirstMasks = dict[str, tuple[Frame, np.ndarray]]
-
 
 def check_folder(
     sequence: str | Path | Sequence,
@@ -86,8 +83,7 @@ def check_folder(
         own = isinstance(sequence, str | Path) and format in (None, "folder")
         return (_files(Path(sequence).expanduser()) if own else []) or [_unreadable("files", error)]
     sequence, frames, masks, wrong = opened, [], [], []
-    chosen = np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist()
-    for i in chosen:
+    for i in np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist():
         try:
             frames.append(sequence.frame(i))
             masks.append(sequence.masks(i) or {})
@@ -98,7 +94,7 @@ def check_folder(
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", Doubt)
         try:
-            firsts = _clicked(sequence, prompts, config) if prompts else _first_masks(sequence, config)
+            firsts = clicked_masks(sequence, prompts, config) if prompts else _first_masks(sequence, config)
         except P2PError as error:
             return [_unreadable("clicks" if prompts else "masks", error)]
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
@@ -111,7 +107,7 @@ def check_folder(
     findings.append(_truth(sequence))
     if not firsts:
         return [*findings, _no_masks(sequence, any(masks), config)]
-    if beyond := _all_beyond(firsts, config):
+    if beyond := _beyond(firsts, config):
         return [*findings, beyond]  # what follows would only be its consequences
     for name, (frame, mask) in firsts.items():
         if mask.sum() < config.lifecycle.min_mask_px:
@@ -299,7 +295,7 @@ def _distance_m(frame: Frame, mask: np.ndarray) -> float:
     return float(np.median(measured)) if enough else float("nan")
 
 
-def _all_beyond(firsts: FirstMasks, config: Config) -> Finding | None:
+def _beyond(firsts: FirstMasks, config: Config) -> Finding | None:
     """The one finding of objects that are all too far away, or all too near: most likely depth is in another unit."""
     limits, away_m = config.depth, {name: _distance_m(*first) for name, first in firsts.items()}
     distances = np.array(list(away_m.values()))
@@ -309,37 +305,28 @@ def _all_beyond(firsts: FirstMasks, config: Config) -> Finding | None:
     (first, (frame, mask)), *others = firsts.items()
     text = f"{away_m[first]:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
     text += f" ({', '.join(f'{name} {away_m[name]:.2f} m' for name, _ in others)})" if others else ""
-    return Finding(f"{first}: depth", Level.WRONG, *_beyond(text, distances, config))
-
-
-def _beyond(text: str, distances: np.ndarray, config: Config) -> tuple[str, str]:
-    """What is said of distances on one side of those that count, and what to do: the unit first, then the limit."""
-    limits, far = config.depth, bool(distances.max() > config.depth.max_m)
     factor = _factor(float(np.median(distances)))
     guess = f": {factor:g} times the present one would make it {distances[0] * factor:.2f} m" if factor else ""
     wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
     fix = f"If it was not, the depth scale is wrong (--depth-scale{guess}); if it was, --set depth.{wider}."
-    return f"{text}, but {limits.min_m:g} to {limits.max_m:g} m count", fix
+    text += f", but {limits.min_m:g} to {limits.max_m:g} m count"
+    return Finding(f"{first}: depth", Level.WRONG, text, fix)
 
 
 def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """Whether an object is where depth counts, and measured."""
-    limits, depth_m = config.depth, frame.depth_m[mask]
-    share = float((depth_m > 0).mean())
+    share = float((frame.depth_m[mask] > 0).mean())
     if share < MEASURED_SHARE:
         fix = "Dark, shiny and transparent things have none; change the light or the distance, or spray it matt."
         text = f"only {100 * share:.0f} % of its pixels in frame {frame.index} have a depth"
         return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
-    median_m = float(np.median(depth_m[depth_m > 0]))
-    text = f"{median_m:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
-    if not limits.min_m <= median_m <= limits.max_m:
-        return Finding(f"{name}: depth", Level.WRONG, *_beyond(text, np.array([median_m]), config))
-    return Finding(f"{name}: depth", Level.OK, text)
+    text = f"{_distance_m(frame, mask):.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
+    return _beyond({name: (frame, mask)}, config) or Finding(f"{name}: depth", Level.OK, text)
 
 
 def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Finding:
     """Whether an object's masks hold background; the first of them also whether it is background altogether."""
-    first = seen[0]
+    first, mask = seen[0]
     seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.lifecycle.min_mask_px]
     shares = np.array([background_share(mask, frame.depth_m) for frame, mask in seen])
     if np.isnan(shares).all():
@@ -350,19 +337,14 @@ def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Fin
         worst = seen[int(np.nanargmax(shares))][0].index
         fix = f"Draw it to the object's edge or a little inside; frame {worst} is the worst."
         return Finding(f"{name}: mask", Level.WRONG, text, fix)
-    large, deep_m, away_m = _extent(*first)
+    depth_m = first.depth_m[mask & (first.depth_m > 0)]
+    near_m, away_m, far_m = np.percentile(depth_m, [2, 50, 98]) if len(depth_m) else (0.0, 0.0, 0.0)
+    large, deep_m = mask.mean(), far_m - near_m  # without its outermost pixels
     if large > LARGE_SHARE or deep_m > DEEP_SHARE * away_m:
         text = f"it covers {100 * large:.0f} % of the image, over {deep_m:.2f} m of depth; {text}"
         fix = "Is it the object, or the table or wall? If it is not, click in its middle, or draw it tighter."
         return Finding(f"{name}: mask", Level.LOOK, text, fix)
     return Finding(f"{name}: mask", Level.OK, text)
-
-
-def _extent(frame: Frame, mask: np.ndarray) -> tuple[float, float, float]:
-    """A mask's fraction of the image, the depth that it reaches over without its outermost pixels, its distance (m)."""
-    depth_m = frame.depth_m[mask & (frame.depth_m > 0)]
-    near_m, away_m, far_m = np.percentile(depth_m, [2, 50, 98]) if len(depth_m) else (0.0, 0.0, 0.0)
-    return float(mask.mean()), float(far_m - near_m), float(away_m)
 
 
 def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
@@ -398,14 +380,4 @@ def _first_masks(sequence: Sequence, config: Config) -> FirstMasks:
         for name in sorted(masks.keys() & set(sequence.objects) - firsts.keys()):
             if masks[name].sum() >= config.lifecycle.min_mask_px:
                 firsts[name] = sequence.frame(i), masks[name]
-    return firsts
-
-
-def _clicked(sequence: Sequence, prompts: Iterable[Prompt], config: Config) -> FirstMasks:
-    """Each clicked object's first mask, as the built-in segmenter cuts it out."""
-    firsts: FirstMasks = {}
-    for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
-        frame, new = sequence.frame(i), [prompt for prompt in said if prompt.name not in firsts]
-        found = clicked_masks(frame, new, sequence.camera, config)
-        firsts |= {name: (frame, mask) for name, mask in found.items()}
     return firsts

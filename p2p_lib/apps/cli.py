@@ -14,7 +14,7 @@ from shutil import get_terminal_size
 from textwrap import fill
 from typing import Any
 
-from p2p_lib.apps.command_line import arg, command, main, run_options, warn
+from p2p_lib.apps.command_line import arg, command, main, open_page, run_options, warn
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.options import RunOptions, names, pairs
 
@@ -291,8 +291,7 @@ def _export(a: argparse.Namespace) -> None:
     from p2p_lib.run import export_run
 
     written = export_run(a.run, a.format, a.out, a.frame, a.min_confidence)
-    counts = {path: len(list(path.iterdir())) for path in written if path.is_dir()}
-    files = (f"{path}/*.txt ({counts[path]})" if path in counts else str(path) for path in written)
+    files = (f"{path}/*.txt ({len(list(path.iterdir()))})" if path.is_dir() else str(path) for path in written)
     print(f"Written: {', '.join(files)}")
 
 
@@ -310,7 +309,6 @@ def _view(a: argparse.Namespace) -> None:
 
         print(f"Written to {write_rerun(a.run, a.rerun)}. Next: rerun {a.rerun}")
         return
-    from p2p_lib.core.browser import open_page
     from p2p_lib.figures.viewer import write_page
 
     page = write_page(a.run, a.out)
@@ -344,7 +342,7 @@ def _film(a: argparse.Namespace) -> None:
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.apps.notebooks import run_notebooks
 
-    parameters = pairs("--parameter", "NAME=VALUE")(a.parameter or ())
+    parameters = pairs(a.parameter or (), "--parameter", "NAME=VALUE")
     run_notebooks(a.profile, only=names(a.only) or (), jobs=a.jobs, parameters=parameters)
 
 

@@ -12,6 +12,7 @@ import re
 import secrets
 import warnings
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -22,9 +23,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from p2p_lib.apps.command_line import open_page
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, make_segmenter
-from p2p_lib.core.browser import open_page
-from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.files import parse_json
@@ -33,6 +33,8 @@ from p2p_lib.core.types import Frame
 from p2p_lib.datasets.prompts import load_prompts, parse_prompts, prompts_by_frame, save_prompts
 from p2p_lib.datasets.sequence import Sequence
 
+#: Object to a frame and its mask (H, W) bool there.
+FirstMasks = dict[str, tuple[Frame, np.ndarray]]
 HOST = "127.0.0.1"
 PAGE = Path(__file__).with_name("click.html")
 _LARGEST_BODY = 1 << 20
@@ -40,7 +42,7 @@ _HERE = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
 _JSON, _HTML, _PNG = "application/json", "text/html; charset=utf-8", "image/png"
 
 
-class Clicker:
+class Clicker(AbstractContextManager):
     """A page that is being served, a context manager; ``prompts`` is what was saved last.
 
     url   where the page is; a word in it keeps others out
@@ -74,9 +76,6 @@ class Clicker:
         self._server.shutdown()
         self._server.server_close()
 
-    def __enter__(self) -> Clicker:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -105,16 +104,14 @@ class Clicker:
         ``masks`` are outlines [[x, y], ...] of each object that its prompts can start.
         """
         prompts = [prompt for prompt in parse_prompts(content) if prompt.starts]
-        found: dict[str, Any] = {"masks": {}, "doubts": []}
-        by_frame = prompts_by_frame(prompts, range(len(self.sequence)), self.sequence.camera)
+        found = {}
         with self._segmenting, warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", Doubt)
-            for i, said in by_frame.items():
-                for name, mask in clicked_masks(self.sequence.frame(i), said, self.sequence.camera).items():
-                    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
-                    found["masks"][name] = [outline[:, 0].tolist() for outline in outlines]
-        found["doubts"] = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
-        return found
+            for name, (_, mask) in clicked_masks(self.sequence, prompts).items():
+                outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
+                found[name] = [outline[:, 0].tolist() for outline in outlines]
+        said = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
+        return {"masks": found, "doubts": said}
 
     def save(self, content: object) -> None:
         """Check prompts as the page sends them, and write the file; :class:`BadInput` says what does not fit.
@@ -134,14 +131,15 @@ class Clicker:
             self._finished.set()
 
 
-def clicked_masks(
-    frame: Frame, prompts: Iterable[Prompt], camera: Camera, config: Config | None = None
-) -> dict[str, np.ndarray]:
-    """Object to its mask (H, W) bool, as the built-in segmenter cuts it out of the frame that the prompts are of."""
-    config = config or preset()
-    segmenter = make_segmenter(DEFAULT_SEGMENTER, camera, config.segmentation, np.random.default_rng(config.seed))
-    labels = segmenter.segment(frame, list(prompts))
-    return {name: labels == label for label, name in enumerate(segmenter.names, 1)}
+def clicked_masks(sequence: Sequence, prompts: Iterable[Prompt], config: Config | None = None) -> FirstMasks:
+    """Each object's first mask, as the built-in segmenter cuts it out of the frame that its first prompt is of."""
+    config, found = config or preset(), {}
+    for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
+        frame, rng = sequence.frame(i), np.random.default_rng(config.seed)
+        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
+        labels = segmenter.segment(frame, [prompt for prompt in said if prompt.name not in found])
+        found |= {name: (frame, labels == label) for label, name in enumerate(segmenter.names, 1)}
+    return found
 
 
 def check_writable(path: Path) -> None:

@@ -11,13 +11,13 @@ import sys
 import threading
 import traceback
 import warnings
+import webbrowser
 from collections.abc import Callable, Sequence
-from difflib import get_close_matches
 from functools import partial
 from typing import Any
 
 from p2p_lib import __version__
-from p2p_lib.core.errors import Doubt, P2PError
+from p2p_lib.core.errors import Doubt, P2PError, did_you_mean
 from p2p_lib.core.options import add_options
 
 EXIT_INTERRUPTED = 128  # and the signal's number: 130 for Ctrl-C, 143 for SIGTERM
@@ -127,14 +127,18 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _meant(word: str, known: list[str]) -> str:
-    harmless = [option for option in known if option != "--force"]  # it replaces an earlier run
-    near = get_close_matches(word, harmless, n=1, cutoff=0.6)
-    return f". Did you mean {near[0]}?" if near else ""
+    meant = did_you_mean(word, [option for option in known if option != "--force"])  # it replaces an earlier run
+    return f". {meant}" if meant else ""
 
 
 def warn(line: object) -> None:
     """Standard output is for results."""
     print(line, file=sys.stderr)
+
+
+def open_page(url: str) -> bool:
+    """Open a page in the user's browser; whether that was possible. A browser in text would take the terminal."""
+    return bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)) and webbrowser.open(url)
 
 
 def _show_doubt(others: Callable, name: str, message: Any, category: type, *where: Any) -> None:

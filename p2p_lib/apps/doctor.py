@@ -69,9 +69,8 @@ def _package(name: str, error: str | None = None) -> Finding:
     if name == "libusb-package" and native.loads("libusb-1.0.so.0"):
         return Finding.whether(True, name, "not needed: the system has libusb")
     error = _fails(_loading(name)) if error is None else error
-    return Finding.whether(
-        not error, name, error or metadata.version(name), error.partition("Run: ")[2] or "make setup"
-    )
+    remedy = error.partition("Run: ")[2] or "make setup"
+    return Finding.whether(not error, name, error or metadata.version(name), remedy)
 
 
 def _fails(code: str) -> str:
@@ -103,14 +102,12 @@ def _gpu() -> Finding:
     smi = shutil.which("nvidia-smi")
     listed = subprocess.run([smi, "-L"], capture_output=True, text=True).stdout.strip().splitlines() if smi else []
     if not listed:
-        return Finding.whether(
-            False, "GPU", "none; everything runs on the CPU", "nothing to do without an NVIDIA GPU", optional=True
-        )
+        found = "none; everything runs on the CPU"
+        return Finding.whether(False, "GPU", found, "nothing to do without an NVIDIA GPU", optional=True)
     name = re.sub(r" \(UUID.*", "", listed[0])
     error = _fails("import torch, sys; sys.exit(None if torch.cuda.is_available() else f'torch {torch.__version__}')")
-    return Finding.whether(
-        not error, "GPU", f"{name}; {error or 'torch uses it'}", "P2P_TORCH=cuda make setup", optional=True
-    )
+    found = f"{name}; {error or 'torch uses it'}"
+    return Finding.whether(not error, "GPU", found, "P2P_TORCH=cuda make setup", optional=True)
 
 
 def _optional(name: str, module: str, serves: str, remedy: str) -> Finding:
@@ -130,9 +127,8 @@ def _cotracker() -> Finding:
 def _data() -> Finding:
     folder = data_dir()
     if folder is None:
-        return Finding.whether(
-            False, "$P2P_DATA", "not set; bundled data only", "export P2P_DATA=FOLDER of your datasets", optional=True
-        )
+        remedy = "export P2P_DATA=FOLDER of your datasets"
+        return Finding.whether(False, "$P2P_DATA", "not set; bundled data only", remedy, optional=True)
     found = f"{folder}{'' if folder.is_dir() else ' does not exist'}"
     return Finding.whether(folder.is_dir(), "$P2P_DATA", found, "point P2P_DATA at an existing folder", optional=True)
 

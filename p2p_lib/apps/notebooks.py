@@ -9,7 +9,6 @@ same.
 from __future__ import annotations
 
 import ast
-import difflib
 import logging
 import math
 import os
@@ -25,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from p2p_lib.core.errors import BadInput, MissingData, P2PError
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, did_you_mean
 from p2p_lib.core.paths import PROJECT
 from p2p_lib.core.tables import as_html, as_text
 from p2p_lib.figures import course, equations
@@ -41,8 +40,6 @@ Value = bool | int | float | str
 
 class NotebookFailed(P2PError):
     """A cell of a notebook raised: names the notebook, the cell as ``[n]``, and its message."""
-
-    exit_code = 1
 
 
 @dataclass(frozen=True)
@@ -333,8 +330,7 @@ def _fitting_parameters(path: Path, given: Mapping[str, Any]) -> dict[str, Value
     values = {}
     for name, value in given.items():
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            fix = f"Did you mean {near[0]}?" if near else "Pick the notebooks that have it with --only."
+            fix = did_you_mean(name, known) or "Pick the notebooks that have it with --only."
             raise BadInput(f"{path.stem} parameter", name, "one of " + ", ".join(known), fix)
         kind = type(known[name])
         try:

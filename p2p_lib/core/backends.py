@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from importlib import import_module
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SamplingConfig, SegmentationConfig, TrackingConfig
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 
 #: 2D trackers by the name that --tracker takes, as module:callable(config, rng).
@@ -70,8 +69,7 @@ def make_segmenter(
 def _find(kind: str, name: str, known: dict[str, str]) -> Any:
     name = ALIASES.get(name, name)
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        raise BadInput(kind, repr(name), "one of " + ", ".join(known), f"Did you mean {near[0]!r}?" if near else "")
+        raise BadInput(kind, repr(name), "one of " + ", ".join(known), did_you_mean(name, known))
     return _load(known[name])
 
 

@@ -12,14 +12,13 @@ Each field's metadata says its symbol or meaning, its unit, and whose value it i
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import re
 import tomllib
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.files import read_toml
 
 
@@ -309,22 +308,18 @@ class Config:
         Raises :class:`BadInput` for an unknown stage or key (naming the nearest known one) or a
         value that does not fit. ``source`` says where the values came from, for the message.
         """
-        stages: dict[str, dict[str, Any]] = {}
-        top: dict[str, Any] = {}
-        known: dict[str, Any] = {
-            **{f"{s}.{f.name}": f for s in _STAGES for f in fields(getattr(self, s))},
-            "seed": None,
-            "device": None,
-        }
+        changes: dict[str, Any] = {}
+        known: dict[str, Any] = {**_OF_ALL, **{f"{s}.{f.name}": f for s in _STAGES for f in fields(getattr(self, s))}}
         for key, value in values.items():
             if key not in known:
                 raise _unknown(f"{source}: configuration key" if source else "configuration key", key, known)
-            if key in _CHECKS:
-                top[key] = _CHECKS[key](f"config {key}", value)
-                continue
-            stage, name = key.split(".", 1)
-            stages.setdefault(stage, {})[name] = _parse(value, type(known[key].default))
-        return replace(self, **top, **{s: replace(getattr(self, s), **v) for s, v in stages.items()})
+            if key in _OF_ALL:
+                changes[key] = _value_of_all(key, value)
+            else:
+                stage, name = key.split(".")
+                part = changes.get(stage, getattr(self, stage))
+                changes[stage] = replace(part, **{name: _parse(value, type(known[key].default))})
+        return replace(self, **changes)
 
     def as_dict(self) -> dict[str, Any]:
         """Nested plain values, as written to ``config.toml`` and to provenance."""
@@ -348,9 +343,8 @@ def parameters(config: Config, only: str | None = None) -> list[dict[str, Any]]:
     stage, _, key = (only or "").partition(".")
     if stage and stage not in _STAGES:
         # The key of a parameter, or a slip of the pen.
-        near = [s for s in _STAGES if stage in {f.name for f in fields(getattr(Config, s))}]
-        near = near or difflib.get_close_matches(stage, _STAGES, n=1)
-        fix = f"Did you mean {near[0]}?" if near else ""
+        of = [s for s in _STAGES if stage in {f.name for f in fields(getattr(Config, s))}]
+        fix = f"Did you mean {of[0]}?" if of else did_you_mean(stage, _STAGES)
         raise BadInput("stage", repr(stage), f"one of {', '.join(_STAGES)}", fix)
     rows = [
         {"key": f"{s}.{f.name}", "value": getattr(getattr(config, s), f.name)}
@@ -398,11 +392,11 @@ def preset(name: str = "default", seed: int = 0) -> Config:
     0.004
     >>> preset("default").with_values({"tsdf.voxel": 0.004})
     Traceback (most recent call last):
-    p2p_lib.core.errors.BadInput: configuration key: got 'tsdf.voxel', expected ... Did you mean 'tsdf.voxel_m'?
+    p2p_lib.core.errors.BadInput: configuration key: got 'tsdf.voxel', expected ... Did you mean tsdf.voxel_m?
     """
     if not isinstance(name, str) or name not in _PRESETS:
-        raise _unknown("preset", name, _PRESETS)
-    return replace(Config().with_values(_PRESETS[name]), preset=name, seed=_whole_number("config seed", seed))
+        raise BadInput("preset", repr(name), f"one of {', '.join(_PRESETS)}", did_you_mean(str(name), _PRESETS))
+    return replace(Config().with_values(_PRESETS[name] | {"seed": seed}), preset=name)
 
 
 def diff(a: str = "paper", b: str = "default") -> dict[str, tuple[Any, Any]]:
@@ -431,30 +425,25 @@ def from_toml(path: str | Path, base: Config | None = None) -> Config:
 def _unknown(what: str, key: str, known: Any) -> BadInput:
     stage, _, name = str(key).partition(".")
     if name and stage in _STAGES:
-        known = [f.name for f in fields(getattr(Config, stage))]
-        expected = f"a key of [{stage}]: {', '.join(known)}"
-    else:
-        name = str(key)
-        stages = f"stage.key, where stage is one of {', '.join(_STAGES)}"
-        expected = f"one of {', '.join(known)}" if len(known) < 8 else stages
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    prefix = f"{stage}." if stage in _STAGES and name != str(key) else ""
-    return BadInput(what, repr(key), expected, f"Did you mean {prefix + near[0]!r}?" if near else "")
+        keys = [f.name for f in fields(getattr(Config, stage))]
+        fix = did_you_mean(name, keys, f"{stage}.")
+        return BadInput(what, repr(key), f"a key of [{stage}]: {', '.join(keys)}", fix)
+    expected = f"stage.key, where stage is one of {', '.join(_STAGES)}"
+    return BadInput(what, repr(key), expected, did_you_mean(str(key), known))
 
 
-def _whole_number(name: str, value: Any) -> int:
-    if not re.fullmatch(r"\s*\d+\s*", str(value)):
-        raise BadInput(name, repr(value), "a whole number from 0")
-    return int(value)
+#: Values of no stage: their type, how they are written, and what that means.
+_OF_ALL = {
+    "seed": (int, r"\s*\d+\s*", "a whole number from 0"),
+    "device": (str, r"cpu|cuda(:\d+)?", "cpu, cuda or cuda:N: where the surface is kept"),
+}
 
 
-def _device(name: str, value: Any) -> str:
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", str(value)):
-        raise BadInput(name, repr(value), "cpu, cuda or cuda:N: where the surface is kept")
-    return str(value)
-
-
-_CHECKS = {"seed": _whole_number, "device": _device}
+def _value_of_all(key: str, value: Any) -> Any:
+    kind, form, expected = _OF_ALL[key]
+    if not re.fullmatch(form, str(value)):
+        raise BadInput(f"config {key}", repr(value), expected)
+    return kind(value)
 
 
 def _parse(value: Any, kind: type) -> Any:

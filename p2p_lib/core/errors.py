@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class P2PError(Exception):
@@ -60,6 +62,12 @@ def doubt(name: str, got: object, fix: str) -> None:
     while at.f_back is not None and at.f_globals.get("__name__", "").startswith(("p2p_lib.", "contextlib")):
         level, at = level + 1, at.f_back
     warnings.warn(Doubt(_sentence(f"{name}: {got}", fix)), stacklevel=level)
+
+
+def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
+    """``Did you mean NAME?``, of those that are known the nearest to a word; empty where none is near."""
+    near = get_close_matches(word, known, n=1)
+    return f"Did you mean {prefix}{near[0]}?" if near else ""
 
 
 def in_a_line(error: BaseException) -> str:

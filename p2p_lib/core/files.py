@@ -112,14 +112,12 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-        if size > LARGEST_ARRAYS:
-            raise BadInput(str(path), f"arrays of {size} bytes", f"at most {LARGEST_ARRAYS}")
-        with np.load(path, allow_pickle=False) as file:
-            return {name: np.asarray(file[name]) for name in file.files}
-    except BadInput:
-        raise
+        if size <= LARGEST_ARRAYS:
+            with np.load(path, allow_pickle=False) as file:
+                return {name: np.asarray(file[name]) for name in file.files}
     except UNREADABLE as error:
         raise BadInput(str(path), f"an unreadable archive ({error})", expected) from None
+    raise BadInput(str(path), f"arrays of {size} bytes", f"at most {LARGEST_ARRAYS}")
 
 
 def file_name(what: str, name: object) -> str:

@@ -6,6 +6,7 @@ import argparse
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -25,19 +26,15 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker
 
 
-def pairs(option: str, form: str) -> Callable[[Iterable[str]], dict[str, str]]:
-    """A reader of ``["a=1", ...]``, as an option collects them, to ``{"a": "1", ...}``."""
-
-    def read(given: Iterable[str]) -> dict[str, str]:
-        found = {}
-        for item in given:
-            name, equals, value = item.partition("=")
-            if not (name and equals and value):
-                raise BadInput(option, repr(item), form)
-            found[name] = value
-        return found
-
-    return read
+def pairs(given: Iterable[str], option: str, form: str) -> dict[str, str]:
+    """``["a=1", ...]``, as an option collects them, to ``{"a": "1", ...}``; ``form`` is how each is written."""
+    found = {}
+    for item in given:
+        name, equals, value = item.partition("=")
+        if not (name and equals and value):
+            raise BadInput(option, repr(item), form)
+        found[name] = value
+    return found
 
 
 def names(given: str | None) -> tuple[str, ...] | None:
@@ -55,7 +52,7 @@ _CONFIG = _typed("TOML file with [stage] key = value", flag="--config", type=Pat
 _SET = _typed(
     "change one parameter; repeatable",
     flag="--set",
-    read=pairs("--set", "stage.key=value"),
+    read=partial(pairs, option="--set", form="stage.key=value"),
     action="append",
     metavar="STAGE.KEY=VALUE",
 )
@@ -79,7 +76,7 @@ _START = _typed("first frame", type=int, metavar="I")
 _STOP = _typed("one past the last frame", type=int, metavar="J")
 _MODELS = _typed(
     "models for scoring",
-    read=pairs("--models", "NAME=PATH"),
+    read=partial(pairs, option="--models", form="NAME=PATH"),
     nargs="+",
     action="extend",
     metavar="NAME=PATH",

@@ -6,7 +6,6 @@ import importlib
 import os
 import shutil
 import sys
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
@@ -28,25 +27,6 @@ INSTALL = {
     "torchvision": PIP + "--torch-backend=auto torchvision==0.28.0",
     "co-tracker": '{python} -c "' + _HUB + '"',
 }
-#: With what the adapters were last run against the official classes (``make test-backends``).
-TRIED = {
-    "transformers": "5.23.0",
-    "torchvision": "0.28.0",
-    "tapnet": "0.1.0 at c2cbab8 (July 2026)",
-    "co-tracker": "3.0 at 82e02e8 (January 2025)",
-}
-
-
-def tried() -> str:
-    """A line per package: the version that is installed, and the one with which its adapters were last run."""
-    lines = []
-    for package, version in TRIED.items():
-        try:
-            here = metadata.version(package.replace("co-tracker", "cotracker"))
-        except metadata.PackageNotFoundError:
-            here = "not installed"
-        lines.append(f"{package}: {here}; last run with {version}")
-    return "\n".join(lines)
 
 
 def command(template: str) -> str:

@@ -134,7 +134,7 @@ def points_in_box(box_px: np.ndarray, frame: Frame) -> np.ndarray:
 def _pixels(what: str, given: Any) -> np.ndarray:
     """Pixels as (N, 2) float64."""
     try:
-        at = np.array(given, float)
+        at = np.array(given, float, ndmin=1)
     except (TypeError, ValueError):
         at = np.zeros((1, 1))
     if len(at) > MOST_CLICKS:

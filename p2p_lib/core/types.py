@@ -6,13 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import Field, dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import cached_property
-from typing import Any, ClassVar, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import cv2
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 #: What can be depth in any unit: so wide that ``p2p check`` still tells millimetres that were taken for metres.
 NEAREST_M, FARTHEST_M = 0.001, 1e4
@@ -116,13 +119,7 @@ class Tracks:
         return Tracks(ids, self.uv_px[at], self.visible[at], self.uncertainty[at])
 
 
-class _Dataclass(Protocol):
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-
-Arrays = TypeVar("Arrays", bound=_Dataclass)
-
-
+Arrays = TypeVar("Arrays", bound="DataclassInstance")
 #: Of a field of :class:`Rows`: what is joined has the first one's.
 SHARED = {"shared": True}
 
@@ -179,8 +176,6 @@ def status_text(status: str, reason: str) -> str:
 
 #: Statuses that carry a pose of this very frame.
 WITH_POSE = frozenset({Status.TRACKED, Status.DEGRADED, Status.RECOVERED})
-
-
 #: A pose of no more confidence is doubted; one that nothing has told from others that look alike has no more.
 DOUBTED = 0.5
 
@@ -222,9 +217,8 @@ class PoseEstimate:
         name = f"estimate of {self.object!r} at frame {self.frame_index}"
         if (self.T_cam_obj is not None) != (self.status in WITH_POSE):
             came = "a pose" if self.T_cam_obj is not None else "no pose"
-            raise BadInput(
-                name, f"{came} with status {self.status}", "a pose exactly when tracked, degraded, recovered"
-            )
+            expected = "a pose exactly when tracked, degraded, recovered"
+            raise BadInput(name, f"{came} with status {self.status}", expected)
         if self.T_cam_obj is not None:
             object.__setattr__(self, "T_cam_obj", se3.check(name, self.T_cam_obj))
         if not 0 <= self.confidence <= (self.T_cam_obj is not None):

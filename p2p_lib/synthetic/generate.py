@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, fields
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, did_you_mean
 from p2p_lib.core.paths import cache_dir
 from p2p_lib.datasets.bop import write_models, write_scene
 from p2p_lib.datasets.sequence import SYNTHETIC, open_sequence
@@ -171,9 +170,8 @@ def _write_obj(folder: Path, mesh: Mesh) -> None:
 def _settings(name: str, seed: int, overrides: dict) -> tuple[dict, Sensor]:
     """The scenario's own parameters and the sensor; unknown names and keys are refused."""
     if name not in SCENARIOS:
-        near = get_close_matches(name, SCENARIOS, n=1)
         known = "one of " + ", ".join(SYNTHETIC + k for k in sorted(SCENARIOS))
-        raise BadInput("synthetic sequence", repr(name), known, f"Did you mean {SYNTHETIC}{near[0]}?" if near else "")
+        raise BadInput("synthetic sequence", repr(name), known, did_you_mean(name, SCENARIOS, SYNTHETIC))
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise BadInput(f"{SYNTHETIC}{name} seed", repr(seed), "a whole number, 0 or above")
     taken = list(inspect.signature(SCENARIOS[name]).parameters.values())[1:]

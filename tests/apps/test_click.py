@@ -109,6 +109,7 @@ REFUSED = {
     "same name": ({"objects": [one(), one()]}, "'cup' in frame 0 twice"),
     "late frame": ({"objects": [one(frame=3)]}, "prompt of 'cup': got frame 3, expected a frame from 0 to 2"),
     "no points": ({"objects": [one(points=())]}, "at least one [x, y]"),
+    "a number": ({"objects": [one() | {"points": 5}]}, "at least one [x, y]"),
     "nothing": ({"objects": []}, "prompts: got"),
     "a list": ([1, 2], "prompts: got"),
     "no JSON": (b"{", "Expecting"),

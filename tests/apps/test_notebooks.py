@@ -246,7 +246,7 @@ def test_failing_check_names_notebook_cell_and_claim(run):
     message = str(run[2])
     assert message.startswith("notebook 01_fails, cell [3] 'check('")
     assert "AssertionError: AUC [%]: 12.34, not at least 95 (of ADD-S). See " in message and "\n" not in message
-    assert run[2].exit_code == 1
+    assert run[2].exit_code == 2
 
 
 def test_what_a_notebook_claimed_is_read_back(run):

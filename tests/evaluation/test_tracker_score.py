@@ -112,7 +112,7 @@ def test_the_command_prints_one_json_object(made, capsys):
         ("SEQUENCE --models tin=x.obj", "model: got the name 'tin', expected one of the objects: box, can"),
         ("SEQUENCE --models can=nowhere.obj", "nowhere.obj: no such model"),
         ("nowhere", "nowhere: no such folder"),
-        ("SEQUENCE --set tracking.windo=3", "Did you mean 'tracking.window_px'"),
+        ("SEQUENCE --set tracking.windo=3", "Did you mean tracking.window_px"),
     ],
 )
 def test_what_does_not_fit_is_said_in_one_line(made, capsys, words, complaint):
