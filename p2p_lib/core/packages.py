@@ -22,6 +22,8 @@ _HUB = "import torch; torch.hub.load('facebookresearch/co-tracker', 'cotracker3_
 INSTALL = {
     "transformers": PIP + "transformers",
     "rosbags": PIP + "rosbags",
+    "rerun-sdk": PIP + "rerun-sdk",
+    "distributed": PIP + "distributed",
     "tapnet": PIP + "einshape dm-tree einops && " + _TAPNET,
     # The one built for the torch that Open3D is built for; any other replaces torch.
     "torchvision": PIP + "--torch-backend=auto torchvision==0.28.0",
