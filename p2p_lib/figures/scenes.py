@@ -217,22 +217,15 @@ def beside(scenes: Mapping[str, Scene], count: int, width_px: int = 300, axes: b
 
 
 def draw_live(
-    method: Point2Pose,
-    frame: Frame,
-    estimates: Mapping[str, PoseEstimate],
-    masks: Mapping[str, np.ndarray] | None = None,
-    title: str = "",
-    start_s: float = 0.0,
+    method: Point2Pose, frame: Frame, estimates: Mapping[str, PoseEstimate], title: str, start_s: float = 0.0
 ) -> np.ndarray:
     """The tracker's own view of a frame: masks, boxes, axes, statuses, and the map's keypoints (pending ones as rings).
 
-    masks    object to (H, W) bool (default: those that the tracker used)
     start_s  the time of the first frame, from which seconds are counted
     """
-    image, labels = frame.rgb, []
-    colours = style.object_colours(method.objects)
-    masks = masks or {name: mask for name, mask in method.masks.items() if mask is not None}
-    image = overlay.draw_masks(image, masks, colours, fill=_FILL)
+    colours, labels = style.object_colours(method.objects), []
+    masks = {name: mask for name, mask in method.masks.items() if mask is not None}
+    image = overlay.draw_masks(frame.rgb, masks, colours, fill=_FILL)
     for name, estimate in estimates.items():
         T_cam_obj, keypoints = estimate.T_cam_obj, method.objects[name].map
         if T_cam_obj is None or not len(keypoints):
@@ -245,7 +238,7 @@ def draw_live(
         low, high = np.nanmin(uv_px, 0), np.nanmax(uv_px, 0)
         text = _status(name, estimate.status, estimate.reason, estimate.confidence <= DOUBTED)
         labels.append(Label(text, colours[name], (*low, *high)))
-    return overlay.draw_labels(image, labels, f"{title}  {frame.time_s - start_s:.2f} s".strip())
+    return overlay.draw_labels(image, labels, f"{title}  {frame.time_s - start_s:.2f} s")
 
 
 def _status(name: str, status: str, reason: str, doubted: bool) -> str:

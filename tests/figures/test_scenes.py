@@ -178,7 +178,7 @@ def test_live_view_shows_the_keypoints(made):
     for name in made.sequence.objects:
         method.add_object(name, masks[name])
     estimates = method.step(frame)
-    image = draw_live(method, frame, estimates, masks, title=made.sequence.name)
+    image = draw_live(method, frame, estimates, title=made.sequence.name)
     colours = style.object_colours(made.sequence.objects)
     for name, obj in method.objects.items():
         uv = method.camera.project(se3.transform(estimates[name].T_cam_obj, obj.map.p_obj))
