@@ -86,18 +86,6 @@ def tracked_errors(told: dict[str, list]) -> np.ndarray:
     return squared_errors(off.reshape(-1, 6), covariance.reshape(-1, 6, 6))
 
 
-def row(of: str, one: Judged) -> dict[str, object]:
-    """A row of the first table."""
-    right = f"{100 * one.right.mean():.0f} %"
-    return {"sequence": of, "poses": len(one), "right": right, "ECE": one.calibration_error, "AUROC": one.auroc}
-
-
-def errors_row(of: str, off: np.ndarray) -> dict[str, object]:
-    """A row of the second one."""
-    rotation, translation = off.mean(0)
-    return {"sequence": of, "poses": len(off), "rotation": rotation, "translation": translation}
-
-
 def degraded(seeds: list[int]) -> pd.DataFrame:
     """What confidences are worth where poses go wrong."""
     found = {}
@@ -106,7 +94,12 @@ def degraded(seeds: list[int]) -> pd.DataFrame:
         runs = (judged(tracked(open_sequence(scenario_dir(name, seed, **how)), seed)) for seed in seeds)
         found[f"`{name}`, {of}"] = pooled(runs)
     found["all"] = pooled(found.values())
-    return pd.DataFrame([row(of, one) for of, one in found.items()])
+    rows = []
+    for of, one in found.items():
+        right = f"{100 * one.right.mean():.0f} %"
+        about = {"sequence": of, "poses": len(one), "right": right}
+        rows.append(about | {"ECE": one.calibration_error, "AUROC": one.auroc})
+    return pd.DataFrame(rows)
 
 
 def as_they_are(seeds: list[int]) -> pd.DataFrame:
@@ -116,9 +109,12 @@ def as_they_are(seeds: list[int]) -> pd.DataFrame:
         for name in AS_THEY_ARE
         for seed in seeds
     }
-    return pd.DataFrame(
-        [errors_row(of, off) for of, off in {**found, "all": np.concatenate([*found.values()])}.items()]
-    )
+    found["all"] = np.concatenate([*found.values()])
+    rows = []
+    for of, off in found.items():
+        rotation, translation = off.mean(0)
+        rows.append({"sequence": of, "poses": len(off), "rotation": rotation, "translation": translation})
+    return pd.DataFrame(rows)
 
 
 def main(seeds: list[int]) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from p2p_lib.core import native
 from p2p_lib.core.findings import Finding
-from p2p_lib.core.packages import INSTALL, PIP, command, cotracker_folder
+from p2p_lib.core.packages import INSTALL, command, cotracker_folder
 from p2p_lib.core.paths import PROJECT, cache_dir, data_dir
 
 #: Distributions whose module has another name.
@@ -24,10 +24,10 @@ OPTIONAL = {
     "transformers": ("transformers", "segmentation and features by neural networks", INSTALL["transformers"]),
     "tapnet": ("tapnet", "2D trackers tapir and tapnextpp", INSTALL["tapnet"]),
     "torchvision": ("torchvision", "2D tracker tapnextpp", INSTALL["torchvision"]),
-    "rerun": ("rerun", "recordings to look at frame by frame, p2p view --rerun", PIP + "rerun-sdk"),
-    "rosbags": ("rosbags", "ROS 1 and 2 recordings, p2p convert", PIP + "rosbags"),
+    "rerun": ("rerun", "recordings to look at frame by frame, p2p view --rerun", INSTALL["rerun-sdk"]),
+    "rosbags": ("rosbags", "ROS 1 and 2 recordings, p2p convert", INSTALL["rosbags"]),
     "pyrealsense2": ("pyrealsense2", "RealSense cameras and recordings", INSTALL["pyrealsense2"]),
-    "dask": ("dask.distributed", "runs on a cluster", PIP + "'dask[distributed]'"),
+    "dask": ("dask.distributed", "runs on a cluster", INSTALL["distributed"]),
 }
 FREE_GB = 5.0
 # How long a package may take to load before something is taken to be wrong with it.

@@ -173,7 +173,7 @@ def load_or_run_quick(plans: Iterable[str], out: str | Path, profile: str) -> di
     full = {name: load_benchmark(name, out) for name in names} if profile == "full" else {}
     full = {name: benchmark for name, benchmark in full.items() if benchmark.counts()["done"]}
     quick = run_benchmarks([name for name in names if name not in full], out, "quick", progress=False)
-    return {name: full[name] for name in names if name in full} | {b.plan.name: b for b in quick}
+    return full | {b.plan.name: b for b in quick}
 
 
 def _run(outcomes: Iterator[tuple[Job, Outcome]], total: int, out: Path, progress: bool) -> dict[str, Outcome]:

@@ -23,9 +23,9 @@ import numpy as np
 from p2p_lib.benchmark.jobs import Job, library_version, open_planned
 from p2p_lib.benchmark.outcome import Outcome, run_path
 from p2p_lib.benchmark.scoring import chamfer, fault_done, scored
+from p2p_lib.core import packages
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
 from p2p_lib.core.files import replace_text
-from p2p_lib.core.packages import PIP, command
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.protocol import rate
 from p2p_lib.run import evaluate_tracker, run
@@ -142,21 +142,16 @@ def _end_with_parent() -> None:
 
 def _on_cluster(jobs: Sequence[Job], out: Path, scheduler: str) -> Iterator[tuple[Job, Outcome]]:
     """Dask distributes the runs; a worker that dies fails its run alone."""
+    distributed = packages.load("distributed", "--scheduler", "distributed")
     try:
-        from distributed import Client
-        from distributed import as_completed as completed
-    except ImportError:
-        fix = f"Run: {command(PIP + 'distributed')}"
-        raise MissingBackend("--scheduler", "the package distributed is not installed", fix) from None
-    try:
-        client = Client(scheduler, timeout=_CONNECT_S)
+        client = distributed.Client(scheduler, timeout=_CONNECT_S)
     except (OSError, ValueError, TimeoutError) as error:
         got = f"{scheduler} ({type(error).__name__})"
         raise BadInput("scheduler", got, "a Dask scheduler that answers", "Start one with: dask scheduler") from None
     with client:
         futures = [client.submit(perform, job, out, library_version(), pure=False) for job in jobs]
         by_key = {future.key: job for future, job in zip(futures, jobs, strict=True)}
-        for future in completed(futures):
+        for future in distributed.as_completed(futures):
             job, error = by_key[future.key], future.exception()
             reason = f"its worker was lost ({type(error).__name__})"
             yield job, Outcome(key=job.key, status="failed", reason=reason) if error else future.result()

@@ -71,8 +71,7 @@ class Job:
         """
         planned, method, prompts = self.sequence, self.method, None
         if uses_clicks(method) and planned.clicks:
-            clicks = {name: np.array(at) * method.scale for name, at in planned.clicks.items()}
-            prompts = [Prompt(name, planned.start, at) for name, at in clicks.items()]
+            prompts = [Prompt(name, planned.start, np.array(at) * method.scale) for name, at in planned.clicks.items()]
         objects = tuple(planned.objects) or (tuple(planned.clicks) if prompts else known)
         return RunOptions(
             **method.model_dump(include={"preset", "settings", "tracker", "detector", "masks"}),
@@ -116,10 +115,9 @@ def open_planned(job: Job) -> Sequence:
         sequence = replace(open_sequence(folder, "ycbmultitrack", masks=masks), name=planned.name)
     else:
         sequence = open_sequence(planned.name, masks=masks)
-    if planned.fault is not None:
-        fault, during = planned.fault, planned.during
+    if (fault := planned.fault) is not None:
         severity = 1.0 if fault.severity is None else fault.severity
-        sequence = Faulty(sequence, fault.name, severity, *during, seed=job.seed)
+        sequence = Faulty(sequence, fault.name, severity, *planned.during, seed=job.seed)
     return Resized(sequence, method.scale) if method.scale != 1 else sequence
 
 

@@ -169,8 +169,7 @@ class Plan(Strict):
     @property
     def data(self) -> list[str]:
         """What it needs in full below ``$P2P_DATA``: datasets, and models of rendered sequences."""
-        given = [s.name for s in self.full.sequence if not s.name.startswith((SYNTHETIC, "/"))]
-        names = [name.partition("/")[0] for name in given]
+        names = [s.name.partition("/")[0] for s in self.full.sequence if not s.name.startswith((SYNTHETIC, "/"))]
         models = [s.synthetic.get("models") for s in (*self.full.sequence, *self.methods("full"))]
         return list(dict.fromkeys([*names, *(str(m) for m in models if m)]))
 

@@ -30,9 +30,6 @@ MEAN, POOLED = "mean over sequences", "pooled over frames"
 #: What MEAN is called where all of it is of one sequence (:func:`p2p_lib.benchmark.scoring.run_rows`).
 MEAN_OF_ONE = "mean over objects"
 
-#: Of what a fault does.
-UNITS = {"mesh_off": "share"}
-
 #: The columns, in order. ``column`` is the paper's; ``key`` names the run's record; ``reason`` why there is no value.
 COLUMNS = (
     "plan profile method sequence object column seed metric form failures align value unit frames lost sequences "
@@ -81,21 +78,11 @@ def areas(errors_m: Mapping[str, np.ndarray], align: str) -> list[Number]:
     return numbers
 
 
-def chamfer(values_cm: Mapping[str, float]) -> list[Number]:
-    """The Chamfer distance in its forms."""
-    return [Number("Chamfer distance", form, "-", "first", "cm", cm) for form, cm in values_cm.items()]
-
-
 def returns(frames_to_recovery: Sequence[int | None]) -> list[Number]:
     """How often an object returned from complete occlusion, and how often it was recovered within so many frames."""
     recovered = recovered_within(frames_to_recovery)
     counts = {"all": len(frames_to_recovery)} | {f"recovered within {n} frames": k for n, k in recovered.items()}
     return [Number("returns", form, "-", "first", "events", count) for form, count in counts.items()]
-
-
-def fault(scores: Mapping[str, float]) -> list[Number]:
-    """What a fault did to an object."""
-    return [Number("fault", form, "-", "first", UNITS.get(form, "frames"), value) for form, value in scores.items()]
 
 
 def mean(numbers: Iterable[Number], failed: int = 0) -> list[Number]:
@@ -212,7 +199,12 @@ def _over_sequences(plan: Plan, profile: str, group: Results) -> list[Row]:
 
 def _numbers(obj: ObjectOutcome) -> list[Number]:
     found = [number for align in ALIGNMENTS for number in areas(obj.errors_m(align), align)]
-    return [*found, *chamfer(obj.chamfer_cm), *returns(obj.returns), *fault(obj.fault)]
+    found += [Number("Chamfer distance", form, "-", "first", "cm", cm) for form, cm in obj.chamfer_cm.items()]
+    found += returns(obj.returns)
+    for form, value in obj.fault.items():
+        unit = "share" if form == "mesh_off" else "frames"
+        found.append(Number("fault", form, "-", "first", unit, value))
+    return found
 
 
 def _head(plan: Plan, profile: str, job: Job, outcome: Outcome) -> Row:

@@ -22,6 +22,8 @@ INSTALL = {
     "transformers": PIP + "transformers",
     "rosbags": PIP + "rosbags",
     "pyrealsense2": PIP + "pyrealsense2",
+    "rerun-sdk": PIP + "rerun-sdk",
+    "distributed": PIP + "'dask[distributed]'",
     "tapnet": PIP + "einshape dm-tree einops && " + _TAPNET,
     # The one built for the torch that Open3D is built for; any other replaces torch.
     "torchvision": PIP + "--torch-backend=auto torchvision==0.28.0",

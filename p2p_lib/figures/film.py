@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from fractions import Fraction
 from pathlib import Path
 
@@ -70,7 +71,7 @@ def write_video(images: Iterable[np.ndarray], path: str | Path, fps: float = 30.
     return film.path
 
 
-class Film:
+class Film(AbstractContextManager):
     """A film that is being written, image by image, each at its time (see :func:`write_video`); a context manager.
 
     fps  about how many images a second are to come
@@ -110,9 +111,6 @@ class Film:
         frame = av.VideoFrame.from_ndarray(image, "rgb24")
         frame.pts, frame.time_base = round(time_s / _TICK), _TICK
         self._container.mux(self._stream.encode(frame))
-
-    def __enter__(self) -> Film:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None and self._shape is None:

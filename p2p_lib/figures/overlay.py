@@ -28,7 +28,7 @@ _GAP_PX = 4  # between the images of a montage
 _FONT, _SCALE, _RIM = cv2.FONT_HERSHEY_SIMPLEX, 0.45, "#101010"
 
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-#: The 12 edges of a box as pairs of rows of :func:`box_corners`: those that differ in one coordinate.
+#: The 12 edges of a box as pairs of its corners: those that differ in one coordinate.
 EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (_SIGNS[a] != _SIGNS[b]).sum() == 1])
 
 
@@ -49,7 +49,7 @@ class Box:
 
     def corners(self, T_cam_obj: np.ndarray) -> np.ndarray:
         """(..., 8, 3) its corners in the camera frame, at poses (..., 4, 4)."""
-        return se3.transform(T_cam_obj @ self.T_obj_box, box_corners(self.size_m))
+        return se3.transform(T_cam_obj @ self.T_obj_box, _SIGNS * np.asarray(self.size_m, float) / 2)
 
     @classmethod
     def around(cls, points: np.ndarray, T_obj_points: np.ndarray = se3.IDENTITY) -> Box:
@@ -70,28 +70,17 @@ def tight_box(mesh: trimesh.Trimesh) -> Box:
     return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
 
 
-def box_corners(size_m: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of a box about the origin."""
-    return _SIGNS * np.asarray(size_m, float) / 2
-
-
 def draw_box(
-    image: np.ndarray,
-    camera: Camera,
-    T_cam_box: np.ndarray,
-    size_m: np.ndarray,
-    colour: str,
-    width_px: int = 2,
-    dashed: bool = False,
+    image: np.ndarray, camera: Camera, T_cam_obj: np.ndarray, box: Box, colour: str, dashed: bool = False
 ) -> np.ndarray:
-    """A box's edges; those behind it are thin."""
-    p_cam = se3.transform(T_cam_box, box_corners(size_m))
-    front = _front_edges(T_cam_box, np.asarray(size_m, float))
+    """A box's edges; those behind it are thin, and so is a dashed box."""
+    p_cam, front = box.corners(T_cam_obj), _front_edges(T_cam_obj @ box.T_obj_box, box.size_m)
     behind, before = _segments(camera, p_cam[EDGES[~front]]), _segments(camera, p_cam[EDGES[front]])
     image = _stroke(image, behind, colour, 1, rim=0, strength=0.5)
-    if dashed:
-        image, before = _stroke(image, before, _RIM, width_px, rim=0, strength=0.5), _dashes(before)
-    return _stroke(image, before, colour, width_px, rim=0 if dashed else 0.6)
+    if not dashed:
+        return _stroke(image, before, colour, 2)
+    image = _stroke(image, before, _RIM, 1, rim=0, strength=0.5)
+    return _stroke(image, _dashes(before), colour, 1, rim=0)
 
 
 def draw_axes(image: np.ndarray, camera: Camera, T_cam_obj: np.ndarray, length_m: float) -> np.ndarray:
@@ -153,9 +142,9 @@ def draw_clicks(image: np.ndarray, prompts: Iterable[Prompt], colours: Mapping[s
     return image
 
 
-def draw_crosses(image: np.ndarray, uv_px: np.ndarray, colour: str, radius_px: float = 4) -> np.ndarray:
+def draw_crosses(image: np.ndarray, uv_px: np.ndarray, colour: str) -> np.ndarray:
     """Points (N, 2) as oblique crosses; NaN ones are left out."""
-    arms = radius_px * np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]]) / np.sqrt(2)
+    arms = 4 * np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]]) / np.sqrt(2)
     lines = np.asarray(uv_px, float).reshape(-1, 1, 1, 2) + arms
     return _stroke(image, lines[np.isfinite(lines).all((1, 2, 3))].reshape(-1, 2, 2), colour, 2, rim=1.0)
 
@@ -347,9 +336,8 @@ def _free_place(
     middle, centre = (left + right - w) / 2, (top + bottom - h) / 2
     wanted = [(middle, top - h - 4), (middle, bottom + 4), (right + 4, centre), (left - w - 4, centre)]
     wanted += [(middle, top - k * (h + 2) - 4) for k in (2, 3, 4)]
-    places = []
     for u, v in wanted:
         u, v = round(min(max(u, 0), shape[1] - w)), round(min(max(v, 0), shape[0] - h))
         if not any(u < x1 and x0 < u + w and v < y1 and y0 < v + h for x0, y0, x1, y1 in taken):
-            places.append((u, v))
-    return places[0] if places else (round(middle), round(top))
+            return u, v
+    return round(middle), round(top)

@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.core import se3
-from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core import packages, se3
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
 from p2p_lib.figures.playback import Playback
 
-INSTALL = "Run: .venv/bin/uv pip install --python .venv rerun-sdk"
 JPEG_QUALITY = 80
 #: Points of a frame, and the radii in metres of those points and of keypoints.
 POINTS, _POINT_M, _KEYPOINT_M, _AXES_M = 5000, 0.002, 0.002, 0.06
@@ -30,10 +28,7 @@ def write_rerun(run: str | Path, out: str | Path, sequence: Sequence | None = No
 
     Raises :class:`MissingBackend` without the package rerun-sdk.
     """
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise MissingBackend("rerun-sdk", f"writes Rerun recordings ({error})", INSTALL) from None
+    rr = packages.load("rerun", "--rerun", "rerun-sdk")
     playback, out = Playback.of(run, sequence), Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     stream = rr.RecordingStream("p2p", recording_id=f"{playback.run.info['sequence']}, {playback.run.path.name}")

@@ -177,8 +177,7 @@ class Scene:
         colour, true_box = self.colours[name], self._model_boxes.get(name)
         box = self._box(name, row)
         if true_box and obj.has_truth[row]:
-            T_cam_box = obj.T_cam_model[row] @ true_box.T_obj_box
-            image = overlay.draw_box(image, camera, T_cam_box, true_box.size_m, style.TRUTH, 1, dashed=True)
+            image = overlay.draw_box(image, camera, obj.T_cam_model[row], true_box, style.TRUTH, dashed=True)
         if not obj.has_pose[row]:
             return image
         past = slice(max(row - trail, 0), row + 1)
@@ -186,7 +185,7 @@ class Scene:
         centres = np.where((obj.map_id[past] == obj.map_id[row])[:, None], T_cam_box[:, :3, 3], np.nan)
         image = overlay.draw_trail(image, camera.project(centres), colour)
         if box:
-            image = overlay.draw_box(image, camera, T_cam_box[-1], box.size_m, colour)
+            image = overlay.draw_box(image, camera, obj.T_cam_obj[row], box, colour)
         length_m = 0.45 * float(np.max(box.size_m)) if box else 0.05
         return overlay.draw_axes(image, camera, T_cam_box[-1], length_m) if axes else image
 
@@ -218,22 +217,15 @@ def beside(scenes: Mapping[str, Scene], count: int, width_px: int = 300, axes: b
 
 
 def draw_live(
-    method: Point2Pose,
-    frame: Frame,
-    estimates: Mapping[str, PoseEstimate],
-    masks: Mapping[str, np.ndarray] | None = None,
-    title: str = "",
-    start_s: float = 0.0,
+    method: Point2Pose, frame: Frame, estimates: Mapping[str, PoseEstimate], title: str, start_s: float = 0.0
 ) -> np.ndarray:
     """The tracker's own view of a frame: masks, boxes, axes, statuses, and the map's keypoints (pending ones as rings).
 
-    masks    object to (H, W) bool (default: those that the tracker used)
     start_s  the time of the first frame, from which seconds are counted
     """
-    image, labels = frame.rgb, []
-    colours = style.object_colours(method.objects)
-    masks = masks or {name: mask for name, mask in method.masks.items() if mask is not None}
-    image = overlay.draw_masks(image, masks, colours, fill=_FILL)
+    colours, labels = style.object_colours(method.objects), []
+    masks = {name: mask for name, mask in method.masks.items() if mask is not None}
+    image = overlay.draw_masks(frame.rgb, masks, colours, fill=_FILL)
     for name, estimate in estimates.items():
         T_cam_obj, keypoints = estimate.T_cam_obj, method.objects[name].map
         if T_cam_obj is None or not len(keypoints):
@@ -241,13 +233,12 @@ def draw_live(
         uv_px = method.camera.project(se3.transform(T_cam_obj, keypoints.p_obj))
         image = overlay.draw_points(image, uv_px[~keypoints.promoted], colours[name], 3, filled=False)
         image = overlay.draw_points(image, uv_px[keypoints.promoted], colours[name], _POINT_PX)
-        box = Box.around(keypoints.p_obj)
-        image = overlay.draw_box(image, method.camera, T_cam_obj @ box.T_obj_box, box.size_m, colours[name])
+        image = overlay.draw_box(image, method.camera, T_cam_obj, Box.around(keypoints.p_obj), colours[name])
         image = overlay.draw_axes(image, method.camera, T_cam_obj, 0.06)
         low, high = np.nanmin(uv_px, 0), np.nanmax(uv_px, 0)
         text = _status(name, estimate.status, estimate.reason, estimate.confidence <= DOUBTED)
         labels.append(Label(text, colours[name], (*low, *high)))
-    return overlay.draw_labels(image, labels, f"{title}  {frame.time_s - start_s:.2f} s".strip())
+    return overlay.draw_labels(image, labels, f"{title}  {frame.time_s - start_s:.2f} s")
 
 
 def _status(name: str, status: str, reason: str, doubted: bool) -> str:

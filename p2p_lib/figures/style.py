@@ -6,9 +6,8 @@ vermillion are kept for statuses, whose strips are hatched besides, so that they
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
-from functools import wraps
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 from p2p_lib.core.types import Status
 from p2p_lib.evaluation.point_tracks import Outcome
@@ -78,19 +77,14 @@ def ink(colour: str) -> str:
     return "#000000" if luminance > 0.179 else "#FFFFFF"
 
 
-def applied() -> AbstractContextManager:
+@contextmanager
+def applied() -> Iterator[None]:
     """Matplotlib with this style inside the ``with``, untouched outside. Needed when drawing and when saving."""
     import matplotlib
 
-    return matplotlib.rc_context(_RC)
+    with matplotlib.rc_context(_RC):
+        yield
 
 
-def styled(plot: Callable) -> Callable:
-    """A function that draws with this style."""
-
-    @wraps(plot)
-    def draw(*args, **kwargs):
-        with applied():
-            return plot(*args, **kwargs)
-
-    return draw
+#: Decorates a function that draws with this style.
+styled = applied()

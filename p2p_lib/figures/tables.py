@@ -58,8 +58,7 @@ def number(value: float | None, spread: float | None = None, digits: int = 2) ->
     """A number with its spread behind a ±; a dash where there is none."""
     if value is None or value != value:
         return Cell()
-    shown = f"{value:.{digits}f}" + (f" ± {spread:.{digits}f}" if spread is not None else "")
-    return Cell(shown)
+    return Cell(f"{value:.{digits}f}" + (f" ± {spread:.{digits}f}" if spread is not None else ""))
 
 
 def emboldened(cells: Sequence[Cell], more_is_better: bool) -> list[Cell]:

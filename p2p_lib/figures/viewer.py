@@ -155,12 +155,11 @@ class _Scene:
 
     def _show_object(self, name: str, nodes: dict[str, Any], i: int, before: int | None) -> None:
         obj = self._playback.objects[name]
-        has = bool(obj.has_pose[i])
         for node, shown in (("frame", obj.has_pose), ("map", self._playback.of_kept_map(name))):
             if before is None or shown[i] != shown[before]:
                 nodes[node].visible = bool(shown[i])
         nodes["label"].text = f"{name}: {status_word(obj.status[i], obj.reason[i])}"
-        if has:
+        if obj.has_pose[i]:
             T = obj.T_cam_obj[i]
             x, y, z, w = se3.quaternion_xyzw(T)
             nodes["frame"].wxyz, nodes["frame"].position = (w, x, y, z), T[:3, 3]

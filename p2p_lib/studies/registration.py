@@ -186,7 +186,7 @@ def draw_tracks(moment: Moment, width_px: int = 720) -> np.ndarray:
     known = np.isfinite(moment.p_cam).all(1)
     for rows, colour in ((known & ~moment.right, _STRAYS), (known & moment.right, _FOLLOWS)):
         image = overlay.draw_trail(image, np.stack([before, now], 1)[rows], colour, 2)
-    image = overlay.draw_crosses(image, now[known & ~moment.right], _STRAYS, 4)
+    image = overlay.draw_crosses(image, now[known & ~moment.right], _STRAYS)
     image = overlay.draw_points(image, now[known & moment.right], _FOLLOWS, 3)
     return overlay.draw_caption(image, f"synthetic: mug turned by {moment.turned_deg:.0f} degrees")
 

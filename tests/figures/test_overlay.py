@@ -12,6 +12,7 @@ from p2p_lib.figures.overlay import EDGES, Box, Label
 
 CAMERA = Camera(615.0, 590.0, 321.3, 236.8, 640, 480)
 SIZE = np.array([0.10, 0.06, 0.15])
+BOX = Box(np.eye(4), SIZE)
 
 
 def picture(value=90):
@@ -33,7 +34,7 @@ def hidden_by_itself(T_cam_box, p_box):
 
 
 def test_edges_are_those_of_a_box():
-    corners = overlay.box_corners(SIZE)
+    corners = BOX.corners(np.eye(4))
     lengths = np.linalg.norm(corners[EDGES[:, 0]] - corners[EDGES[:, 1]], axis=1)
     assert np.allclose(np.sort(lengths), np.sort(np.repeat(SIZE, 4)))
     assert np.allclose(corners.max(0) - corners.min(0), SIZE) and len(np.unique(corners, axis=0)) == 8
@@ -42,8 +43,8 @@ def test_edges_are_those_of_a_box():
 @pytest.mark.parametrize("seed", range(12))
 def test_box_lies_where_the_camera_projects_it(seed):
     T = random_pose(seed)
-    image = overlay.draw_box(picture(), CAMERA, T, SIZE, "#FFFFFF", width_px=2)
-    corners = overlay.box_corners(SIZE)
+    image = overlay.draw_box(picture(), CAMERA, T, BOX, "#FFFFFF")
+    corners = BOX.corners(np.eye(4))
     share = np.linspace(0.05, 0.95, 19)[:, None]
     for a, b in EDGES:
         along = corners[a] + share * (corners[b] - corners[a])
@@ -64,7 +65,7 @@ def test_box_lies_where_the_camera_projects_it(seed):
 @pytest.mark.parametrize("seed", range(40))
 def test_front_edges_are_those_not_hidden_by_the_box(seed):
     T = random_pose(seed)
-    corners = overlay.box_corners(SIZE)
+    corners = BOX.corners(np.eye(4))
     middles = corners[EDGES].mean(1)
     expected = [not hidden_by_itself(T, p) for p in middles]
     assert overlay._front_edges(T, SIZE).tolist() == expected
@@ -77,7 +78,7 @@ def test_lines_are_cut_off_in_front_of_the_camera():
     assert np.allclose(a, CAMERA.project(line[0, 0]))
     assert np.allclose(b, CAMERA.project(line[0, 0] + share * (line[0, 1] - line[0, 0])))
     assert len(overlay._segments(CAMERA, line - [0, 0, 2.0])) == 0
-    around_the_camera = overlay.draw_box(picture(), CAMERA, np.eye(4), np.array([1.0, 1.0, 1.0]), "#FFFFFF")
+    around_the_camera = overlay.draw_box(picture(), CAMERA, np.eye(4), Box(np.eye(4), np.ones(3)), "#FFFFFF")
     assert around_the_camera.shape == (480, 640, 3)
 
 
@@ -96,8 +97,8 @@ def test_nothing_touches_the_picture_it_is_given():
     mask[100:200, 150:300] = True
     T, uv = random_pose(3), np.array([[10.0, 20.0], [np.nan, 3.0], [300.5, 200.25]])
     drawn = {
-        "box": overlay.draw_box(image, CAMERA, T, SIZE, "#0072B2"),
-        "dashed": overlay.draw_box(image, CAMERA, T, SIZE, "#FFFFFF", 1, dashed=True),
+        "box": overlay.draw_box(image, CAMERA, T, BOX, "#0072B2"),
+        "dashed": overlay.draw_box(image, CAMERA, T, BOX, "#FFFFFF", dashed=True),
         "axes": overlay.draw_axes(image, CAMERA, T, 0.1),
         "mask": overlay.draw_mask(image, mask, "#0072B2", fill=0.3),
         "points": overlay.draw_points(image, uv, "#0072B2"),

@@ -37,7 +37,7 @@ def box_edges(made, name, row):
     """Pixels along the front edges of the model's box at the truth."""
     obj, box = made.run.objects[name], Box.around(made.run.points[name])
     T = obj.T_cam_model[row] @ box.T_obj_box
-    ends = overlay.box_corners(box.size_m)[overlay.EDGES[overlay._front_edges(T, box.size_m)]]
+    ends = Box(np.eye(4), box.size_m).corners(np.eye(4))[overlay.EDGES[overlay._front_edges(T, box.size_m)]]
     along = ends[:, 0, None] + np.linspace(0.1, 0.9, 9)[:, None] * (ends[:, 1] - ends[:, 0])[:, None]
     return made.sequence.camera.project(se3.transform(T, along.reshape(-1, 3)))
 
@@ -178,7 +178,7 @@ def test_live_view_shows_the_keypoints(made):
     for name in made.sequence.objects:
         method.add_object(name, masks[name])
     estimates = method.step(frame)
-    image = draw_live(method, frame, estimates, masks, title=made.sequence.name)
+    image = draw_live(method, frame, estimates, title=made.sequence.name)
     colours = style.object_colours(made.sequence.objects)
     for name, obj in method.objects.items():
         uv = method.camera.project(se3.transform(estimates[name].T_cam_obj, obj.map.p_obj))
