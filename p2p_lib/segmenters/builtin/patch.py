@@ -11,6 +11,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.image import bounds
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import colour_codes
@@ -129,18 +130,19 @@ class Patch:
         h, w = self.box.shape
         return cv2.resize(values.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
 
-    def grid(self, uv_px: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of the image as nearest columns and rows of the grid; those outside it are left out."""
-        h, w = self.shape
-        at = (np.asarray(uv_px, float) - [self.box.left, self.box.top] + 0.5) / self.cell_px - 0.5
-        at = np.rint(at).astype(int)
-        return at[((at >= 0) & (at < [w, h])).all(1)]
-
     def dots(self, uv_px: np.ndarray, radius: int) -> np.ndarray:
-        """(h, w) bool: squares around pixels of the image."""
-        at, dots = self.grid(uv_px), np.zeros(self.shape, bool)
-        dots[at[:, 1], at[:, 0]] = True
+        """(h, w) bool: squares around pixels (N, 2) of the image; those outside the grid are left out."""
+        dots = np.zeros(self.shape, bool)
+        at = np.rint((uv_px - [self.box.left, self.box.top] + 0.5) / self.cell_px - 0.5).astype(int)
+        u, v = at[((at >= 0) & (at < self.shape[::-1])).all(1)].T
+        dots[v, u] = True
         return dilated(dots, radius)
+
+    def ends_px(self, region: np.ndarray) -> np.ndarray:
+        """(2, 2) x, y in the image where a region (h, w) bool begins, and where it has ended."""
+        rows, columns = bounds(region)
+        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
+        return ends * self.cell_px + [self.box.left, self.box.top]
 
     def nearer(self, one: np.ndarray, other: np.ndarray, like: float) -> np.ndarray:
         """(h, w) bool: the pixels that are nearer to ``one`` (h, w) bool than to ``other``, over like pixels.
@@ -238,6 +240,11 @@ def holding(part: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     holds[part[seeds]] = True
     holds[0] = False
     return holds[part]
+
+
+def only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The probabilities without the islands that hold no seed."""
+    return np.where(holding(parts_of(x > 0.5), seeds) | (x <= 0.5), x, 0)
 
 
 def support_plane(patch: Patch, where: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:

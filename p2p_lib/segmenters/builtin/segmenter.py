@@ -23,7 +23,7 @@ from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, of_plane_m, warped
-from p2p_lib.segmenters.builtin.motion import Motions, Past, scene_stays
+from p2p_lib.segmenters.builtin.motion import Past, scene_stays
 from p2p_lib.segmenters.builtin.patch import (
     Box,
     Patch,
@@ -31,11 +31,12 @@ from p2p_lib.segmenters.builtin.patch import (
     dilated,
     holding,
     middle,
+    only,
     parts_of,
     plane_heights,
     support_plane,
 )
-from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start, only
+from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start
 
 _NO_PX = np.zeros((0, 2))
 #: An object whose points agree is cut out in every third frame, in turns, and moved by the optical flow in between,
@@ -137,9 +138,7 @@ class BuiltinSegmenter:
             check_depth(prompt, frame)
         masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
         found: dict[str, tuple[Box, np.ndarray] | None] = {}
-        taken = np.zeros(frame.shape, bool)
-        for mask in masks.values():
-            taken |= mask
+        taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
         new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
         self._frames += 1
         in_turn = {name for turn, name in enumerate(self._targets) if (self._frames - turn) % _TURNS == 0}
@@ -183,7 +182,7 @@ class BuiltinSegmenter:
         label_of = {name: label for label, name in enumerate(self._targets, 1)}
         for prompt in new:
             others = {name: labels == label for name, label in label_of.items() if name != prompt.name}
-            cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, _NO_PX)
+            cutter = Cutter(frame, self.camera, self.config, np.random.default_rng(0), prompt, _NO_PX)
             doubt_start(cutter, labels == label_of[prompt.name], others)
         self._previous = frame
         return labels
@@ -220,7 +219,8 @@ class BuiltinSegmenter:
         self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray, moved: _Moved | None
     ) -> tuple[_Target, tuple[Box, np.ndarray] | None]:
         """Where an object is, outside what is ``taken`` (H, W) bool where it was absent; and it, with its past."""
-        target = replace(target, sure=self._sure(hint))
+        agreed = hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
+        target = replace(target, sure=agreed)
         if hint.gone:
             return target, None
         if moved is None or hint.sighted:  # what has been followed is not where the object was found
@@ -237,10 +237,7 @@ class BuiltinSegmenter:
 
     def _shared_out(self, frame: Frame, found: Mapping[str, tuple[Box, np.ndarray] | None]) -> np.ndarray:
         """The label image of what was found of every object: its probability in a box of the image."""
-        labels = np.zeros(frame.shape, np.int32)
-        if not found:
-            return labels
-        best = np.zeros(frame.shape, np.float32)
+        labels, best = np.zeros(frame.shape, np.int32), np.zeros(frame.shape, np.float32)
         for label, name in enumerate(self._targets, 1):
             if found.get(name) is not None:
                 box, x = found[name]
@@ -281,7 +278,8 @@ class BuiltinSegmenter:
         if not (core & (patch.depth_m > 0)).any():
             core |= moved.shown & (np.abs(patch.depth_m - target.seen.z_m) < _APART_M)
         plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
-        log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, target, hint))
+        motions = target.past.motions(frame, hint.T_cam_obj) if target.sure else None
+        log_odds, component = by_geometry(patch, core, plane, cfg, motions)
         stays = cfg.prior_weight * np.where(jumped | moved.shown, 0, 2 * prior - 1)
         stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours have as much to say
         # Parts that come into view are connected with those that were seen before.
@@ -297,28 +295,18 @@ class BuiltinSegmenter:
         """Whether an object that was seen is cut out anew, whatever its flow says."""
         return in_turn or not target.sure
 
-    def _sure(self, hint: Hint) -> bool:
-        """Whether enough points agree on a pose."""
-        return hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
-
-    def _motions(self, frame: Frame, target: _Target, hint: Hint) -> Motions | None:
-        """How an object moved; None where nobody knows."""
-        return target.past.motions(frame, hint.T_cam_obj) if self._sure(hint) else None
-
     def _with_room(self, frame: Frame, target: _Target, hint: Hint) -> _Target:
         """An object with room for parts that move with it, which may reach farther than all that it has shown."""
         cfg, px_m = self.config, self._focal_px / target.seen.z_m
         patch = Patch.of(frame, around(hint.uv_px.mean(0), cfg.reach_m * px_m, frame.shape), self.camera, cfg)
-        motions = self._motions(frame, target, hint)
+        motions = target.past.motions(frame, hint.T_cam_obj)
         if motions is None or not scene_stays(patch, motions):
             return target
         plane = support_plane(patch, patch.depth_m > 0, self._rng)
         _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions)
         if not component.any():
             return target
-        rows, columns = bounds(component)
-        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]]) * patch.cell_px
-        away_px = np.abs(ends + np.array([patch.box.left, patch.box.top]) - target.seen.centre_px).max(0)
+        away_px = np.abs(patch.ends_px(component) - target.seen.centre_px).max(0)
         return replace(target, room_m=away_px / px_m)
 
     def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> tuple[Box, np.ndarray] | None:
