@@ -62,12 +62,6 @@ class _Seen:
         """(2,) middle of the box."""
         return np.array([self.box.left + self.box.right, self.box.top + self.box.bottom]) / 2
 
-    def whole(self, shape: tuple[int, int]) -> np.ndarray:
-        """The mask as an image (H, W) float32."""
-        image = np.zeros(shape, np.float32)
-        image[self.box.slices] = self.mask
-        return image
-
 
 @dataclass(frozen=True, eq=False)
 class _Moved:
@@ -192,7 +186,7 @@ class BuiltinSegmenter:
         if target.given is None:
             return target
         frame, mask = target.given
-        target = self._updated(frame, target, _seen(frame, mask, self.config.min_px))
+        target = self._updated(frame, target, _seen(frame, mask, self.config.min_px, Box(0, 0, *mask.shape[::-1])))
         return replace(target, given=None, seen=target.seen if frame is self._previous else None)
 
     def _prompted(
@@ -259,9 +253,14 @@ class BuiltinSegmenter:
 
     def _moved(self, frame: Frame, target: _Target) -> _Moved:
         """What was seen of an object a frame ago, moved by the optical flow."""
-        patch = Patch.of(frame, self._box_of_all(target, frame.shape), self.camera, self.config)
+        seen, px_m = target.seen, self._focal_px / target.seen.z_m
+        # Room for all of it to either side of what showed.
+        half = np.maximum(target.size_m / 2, target.room_m) * px_m * (1 + self.config.margin) + ROOM_PX
+        patch = Patch.of(frame, around(seen.centre_px, half, frame.shape), self.camera, self.config)
         before = Patch.like(self._previous, patch.box, patch.cell_px, self.camera)
-        was = before.down(target.seen.whole(frame.shape))
+        image = np.zeros(frame.shape, np.float32)
+        image[seen.box.slices] = seen.mask
+        was = before.down(image)
         prior, z_before = warped(was, before, patch)
         likely, measured, known = prior > 0.5, patch.depth_m > 0, z_before > 0
         jumped = likely & measured & known & (np.abs(patch.depth_m - z_before) > patch.step_m)
@@ -362,12 +361,6 @@ class BuiltinSegmenter:
         v, u = np.nonzero(part == size.argmax())
         return np.stack([u + patch.box.left, v + patch.box.top], -1).astype(float)
 
-    def _box_of_all(self, target: _Target, shape: tuple[int, int]) -> Box:
-        """Where to look for an object that was seen: room for all of it to either side of what showed."""
-        seen, px_m = target.seen, self._focal_px / target.seen.z_m
-        half = np.maximum(target.size_m / 2, target.room_m) * px_m
-        return around(seen.centre_px, half * (1 + self.config.margin) + ROOM_PX, shape)
-
     def _updated(self, frame: Frame, target: _Target, seen: _Seen | None) -> _Target:
         """What is known of an object after a frame."""
         if seen is None:
@@ -382,18 +375,15 @@ class BuiltinSegmenter:
         return replace(target, seen=seen, colours=colours, size_m=np.maximum(size_m, target.size_m))
 
 
-def _seen(
-    frame: Frame, mask: np.ndarray, min_px: int, box: Box | None = None, z_m: float | None = None
-) -> _Seen | None:
-    """Where a mask (rows, columns) of a box, or of the image, lies; None where it is small.
+def _seen(frame: Frame, mask: np.ndarray, min_px: int, box: Box, z_m: float | None = None) -> _Seen | None:
+    """Where a mask (rows, columns) of a box lies; None where it is small.
 
     z_m  its depth where nothing of it is measured: it is nowhere where that is not known either
     """
-    left, top = (box.left, box.top) if box is not None else (0, 0)
     if np.count_nonzero(mask) < min_px:
         return None
     inner = rows, columns = bounds(mask)
-    box = Box(left + columns.start, top + rows.start, left + columns.stop, top + rows.stop)
+    box = Box(box.left + columns.start, box.top + rows.start, box.left + columns.stop, box.top + rows.stop)
     mask, depth_m = mask[inner], frame.depth_m[box.slices]
     measured = mask & (depth_m > 0)
     z_m = middle(depth_m[measured]) if np.count_nonzero(measured) >= min_px else z_m
