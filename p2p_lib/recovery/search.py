@@ -91,9 +91,8 @@ class ImageSearch:
 
     def about(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
         """The best pose near a proposed one; None where too little of the surface would be in the image."""
-        if len(sample.p_obj) < _FEWEST:
-            return None
-        if not in_image(self._camera.project(se3.transform(T_cam_obj, sample.p_obj)), self._depth_m.shape).any():
+        uv_px = self._camera.project(se3.transform(T_cam_obj, sample.p_obj))
+        if len(uv_px) < _FEWEST or not in_image(uv_px, self._depth_m.shape).any():
             return None
         poses = _shifted(T_cam_obj, _STEP_M, _STEPS)
         share = self._roughly(poses, sample)
