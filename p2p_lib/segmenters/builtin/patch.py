@@ -51,7 +51,7 @@ def around(centre: np.ndarray, half: np.ndarray, shape: tuple[int, int]) -> Box:
     size = np.array(shape[::-1])
     low = np.clip(np.floor(centre - half).astype(int), 0, size - 2)
     high = np.clip(np.ceil(centre + half).astype(int) + 1, low + 2, size)
-    return Box(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    return Box(*low.tolist(), *high.tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,13 +194,10 @@ class Patch:
 
 def _whole_cells(box: Box, cell_px: int, shape: tuple[int, int]) -> Box:
     """A box of whole cells around another, inside an image where that is possible."""
-    spans = []
-    for low, high, end in ((box.left, box.right, shape[1]), (box.top, box.bottom, shape[0])):
-        size = min(max(-(-(high - low) // cell_px), 2), end // cell_px) * cell_px
-        low = min(low, end - size)
-        spans.append((low, low + size))
-    (left, right), (top, bottom) = spans
-    return Box(left, top, right, bottom)
+    low, high, end = np.array([box.left, box.top]), np.array([box.right, box.bottom]), np.array(shape[::-1])
+    size = np.minimum(np.maximum(-(-(high - low) // cell_px), 2), end // cell_px) * cell_px
+    low = np.minimum(low, end - size)
+    return Box(*low.tolist(), *(low + size).tolist())
 
 
 def _averaged(image: np.ndarray, cell_px: int) -> np.ndarray:
