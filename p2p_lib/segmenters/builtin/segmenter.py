@@ -38,6 +38,8 @@ from p2p_lib.segmenters.builtin.patch import (
 )
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start
 
+#: An object's probability in a box of the image; None where nothing of it is found.
+_Found = tuple[Box, np.ndarray] | None
 _NO_PX = np.zeros((0, 2))
 #: An object whose points agree is cut out in every third frame, in turns, and moved by the optical flow in between,
 _TURNS = 3
@@ -131,7 +133,7 @@ class BuiltinSegmenter:
             check_prompt(prompt, self.camera)
             check_depth(prompt, frame)
         masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
-        found: dict[str, tuple[Box, np.ndarray] | None] = {}
+        found: dict[str, _Found] = {}
         taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
         new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
         self._frames += 1
@@ -155,10 +157,9 @@ class BuiltinSegmenter:
                 continue
             target = self._targets[name] = self._learnt(target)
             if name in said:
-                others_px = [p.points_px for n, p in said.items() if n != name]
-                found[name] = self._prompted(
-                    frame, target, said[name], np.concatenate([_NO_PX, *others_px]), hint(name), taken
-                )
+                others_px = np.concatenate([_NO_PX, *(p.points_px for n, p in said.items() if n != name)])
+                cutter = Cutter(frame, self.camera, self.config, self._rng, said[name], others_px)
+                found[name] = self._prompted(cutter, target, hint(name), taken)
                 self._targets[name] = _Target()  # its colours and its size are learnt anew
             else:
                 moved = None if target.seen is None else self._moved(frame, target)
@@ -189,17 +190,9 @@ class BuiltinSegmenter:
         target = self._updated(frame, target, _seen(frame, mask, self.config.min_px, Box(0, 0, *mask.shape[::-1])))
         return replace(target, given=None, seen=target.seen if frame is self._previous else None)
 
-    def _prompted(
-        self,
-        frame: Frame,
-        target: _Target,
-        prompt: Prompt,
-        others_px: np.ndarray,
-        hint: Hint,
-        taken: np.ndarray,
-    ) -> tuple[Box, np.ndarray] | None:
+    def _prompted(self, cutter: Cutter, target: _Target, hint: Hint, taken: np.ndarray) -> _Found:
         """By what is said of it, and for a correction by where it would have been taken for."""
-        cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, others_px)
+        frame, prompt = cutter.frame, cutter.prompt
         was = np.zeros(frame.shape, bool)
         moved = None if target.seen is None else self._moved(frame, target)
         found = None if prompt.box_px is not None else self._looked_for(frame, target, hint, taken, moved)[1]
@@ -211,7 +204,7 @@ class BuiltinSegmenter:
 
     def _looked_for(
         self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray, moved: _Moved | None
-    ) -> tuple[_Target, tuple[Box, np.ndarray] | None]:
+    ) -> tuple[_Target, _Found]:
         """Where an object is, outside what is ``taken`` (H, W) bool where it was absent; and it, with its past."""
         agreed = hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
         target = replace(target, sure=agreed)
@@ -229,8 +222,8 @@ class BuiltinSegmenter:
         """Forget an object."""
         del self._targets[name]
 
-    def _shared_out(self, frame: Frame, found: Mapping[str, tuple[Box, np.ndarray] | None]) -> np.ndarray:
-        """The label image of what was found of every object: its probability in a box of the image."""
+    def _shared_out(self, frame: Frame, found: Mapping[str, _Found]) -> np.ndarray:
+        """The label image of what was found of every object."""
         labels, best = np.zeros(frame.shape, np.int32), np.zeros(frame.shape, np.float32)
         for label, name in enumerate(self._targets, 1):
             if found.get(name) is not None:
@@ -308,7 +301,7 @@ class BuiltinSegmenter:
         away_px = np.abs(patch.ends_px(component) - target.seen.centre_px).max(0)
         return replace(target, room_m=away_px / px_m)
 
-    def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> tuple[Box, np.ndarray] | None:
+    def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> _Found:
         """Where enough of its points are back, or it is expected, on nothing ``taken`` (H, W) by another object."""
         cfg, uv_px = self.config, hint.uv_px[~in_mask(hint.uv_px, taken)]
         if target.colours is None:
