@@ -141,11 +141,7 @@ class Faulty:
 
 def _depth(change: Callable[[np.ndarray, Faulty, int], np.ndarray]) -> Fault:
     """Changes depth (H, W) in metres."""
-
-    def faulty(frame: Frame, of: Faulty, i: int) -> Frame:
-        return replace(frame, depth_m=change(frame.depth_m, of, i).astype(np.float32))
-
-    return Fault(frame=faulty)
+    return Fault(frame=lambda frame, of, i: replace(frame, depth_m=change(frame.depth_m, of, i).astype(np.float32)))
 
 
 def _colour(change: Callable[[np.ndarray, Faulty, int], np.ndarray]) -> Fault:
