@@ -86,14 +86,13 @@ class ImageSearch:
     """One frame, made ready for comparison."""
 
     def __init__(self, frame: Frame, camera: Camera, config: DepthConfig):
-        self._depth_m, self._camera, self._config = frame.depth_m, camera, config
-        self._lab = frame.lab
+        self._depth_m, self._lab, self._camera = frame.depth_m, frame.lab, camera
+        self._lens, self._noise = (camera.fx, camera.fy, camera.cx, camera.cy), (config.noise_m, config.noise_per_m2)
 
     def about(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
         """The best pose near a proposed one; None where too little of the surface would be in the image."""
-        if len(sample.p_obj) < _FEWEST:
-            return None
-        if not in_image(self._camera.project(se3.transform(T_cam_obj, sample.p_obj)), self._depth_m.shape).any():
+        uv_px = self._camera.project(se3.transform(T_cam_obj, sample.p_obj))
+        if len(uv_px) < _FEWEST or not in_image(uv_px, self._depth_m.shape).any():
             return None
         poses = _shifted(T_cam_obj, _STEP_M, _STEPS)
         share = self._roughly(poses, sample)
@@ -108,7 +107,7 @@ class ImageSearch:
     ) -> Sighting | None:
         """As :meth:`turned`, the best of those that differ from a pose by their turn."""
         found = self._turns(turns, cloud, sample)
-        other = [s for s in found if _turned_rad(T_cam_obj[None], s.T_cam_obj)[0] > _APART_RAD]
+        other = [s for s in found if se3.angle_rad(se3.inverse(T_cam_obj) @ s.T_cam_obj) > _APART_RAD]
         return max(other, key=lambda s: s.share, default=None)
 
     def _turns(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> list[Sighting]:
@@ -121,7 +120,7 @@ class ImageSearch:
         for k in np.argsort(-share):
             if np.isfinite(share[k]) and free[turn_of[k]]:
                 distinct.append(k)
-                free &= _turned_rad(turns, poses[k]) > _APART_RAD
+                free &= se3.angle_rad(se3.inverse(turns) @ poses[k]) > _APART_RAD
             if len(distinct) == _TRIED_TURNS:
                 break
         return self._all_aligned(poses[distinct], sample)
@@ -167,10 +166,9 @@ class ImageSearch:
 
     def _aligned(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> np.ndarray:
         """The pose moved until its points lie in the tangent planes of those measured at their pixels, robustly."""
-        camera = self._camera
         for _ in range(_ITERATIONS):
             arrays = np.ascontiguousarray(T_cam_obj), sample.p_obj, sample.n_obj, self._depth_m
-            A, b, centre = _normal_equations(*arrays, (camera.fx, camera.fy, camera.cx, camera.cy))
+            A, b, centre = _normal_equations(*arrays, self._lens)
             step = np.linalg.solve(A + _FREE, b)
             R = cv2.Rodrigues(step[:3])[0]
             T_cam_obj = se3.from_rt(R, centre - R @ centre + step[3:]) @ T_cam_obj
@@ -180,10 +178,8 @@ class ImageSearch:
         self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Shares (H,) as in :class:`Sighting`, -inf where unknown, points found (H, M) bool, and pixels (H, M, 2)."""
-        camera, config = self._camera, self._config
-        lens, noise = (camera.fx, camera.fy, camera.cx, camera.cy), (config.noise_m, config.noise_per_m2)
         arrays = np.ascontiguousarray(T_cam_obj), sample.p_obj, sample.n_obj, sample.lab, self._depth_m, self._lab
-        return _compare(*arrays, lens, noise, near_m, _FEWEST * len(sample) / _POINTS)
+        return _compare(*arrays, self._lens, self._noise, near_m, _FEWEST * len(sample) / _POINTS)
 
 
 @compiled
@@ -271,11 +267,6 @@ def laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.n
         facing = sample.n_obj @ T[:3, :3].T @ centre < 0
         T[:3, 3] = centre - T[:3, :3] @ sample.p_obj[facing if facing.any() else slice(None)].mean(0)
     return poses
-
-
-def _turned_rad(poses: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """(H,) angles between poses (H, 4, 4) and another."""
-    return se3.angle_rad(se3.inverse(poses) @ T)
 
 
 def _shifted(T_cam_obj: np.ndarray, step_m: float, count: int) -> np.ndarray:

@@ -110,9 +110,8 @@ def eight_objects(seed: int, frames: int = 90) -> Scenario:
         yaw = np.radians(40) * np.sin(2 * np.pi * np.arange(frames) / 120 + rng.uniform(0, 2 * np.pi))
         T = turned(wander(rng, frames, 0.01, 10.0, 120), yaw + rng.uniform(0, 2 * np.pi), place)
         bodies.append(Body(f"object_{k + 1}", kinds[k % 3](), T))
-    return Scenario(
-        VGA, standing(np.array([0.0, -0.62, 0.34]), np.array([0.0, 0.02, 0.14]), frames), tuple(bodies), room(rng)
-    )
+    T_world_cam = standing(np.array([0.0, -0.62, 0.34]), np.array([0.0, 0.02, 0.14]), frames)
+    return Scenario(VGA, T_world_cam, tuple(bodies), room(rng))
 
 
 def _on_the_table(

@@ -188,18 +188,13 @@ def _panned(rng: np.random.Generator, way: float) -> np.ndarray:
     """T_world_cam (300, 4, 4) in a hand: at the table, at its side, at the table again from another side."""
     frames = np.arange(_FRAMES)
     before, after = _AWAY_PLACES
-    place = through(
-        [0, 50, 95, 118, 178, 200, 250, 299],
-        [before, before + 8, before, before, *[after] * 2, after - 8, after],
-        frames,
-        4,
-    )
+    places = [before, before + 8, before, before, after, after, after - 8, after]
+    place = through([0, 50, 95, 118, 178, 200, 250, 299], places, frames, 4)
     pan = through([0, 95, 132, 164, 201, 299], [0, 0, _AWAY_PAN, _AWAY_PAN, 0, 0], frames, 3)
     middle, height = np.array([0.0, 0.0, 0.04]), np.radians(_AWAY_HEIGHT)
     about = np.radians(way * place)
-    eyes = middle + _AWAY_M * np.stack(
-        [np.sin(about) * np.cos(height), -np.cos(about) * np.cos(height), np.sin(height) + 0 * about], 1
-    )
+    level = np.stack([np.sin(about), -np.cos(about), np.zeros(_FRAMES)], 1)
+    eyes = middle + _AWAY_M * (np.cos(height) * level + [0, 0, np.sin(height)])
     T = np.stack([look_at(eye, middle) for eye in eyes])
     T[:, :3, :3] = se3.exp(np.radians(way * pan)[:, None] * np.array([0, 0, 1.0, 0, 0, 0]))[:, :3, :3] @ T[:, :3, :3]
     return T @ wander(rng, _FRAMES, 0.008, 1.5, 45)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 
 import cv2
@@ -12,29 +10,18 @@ import numpy as np
 from p2p_lib.synthetic import texture
 from p2p_lib.synthetic.labels import smooth_noise
 
+#: Light arriving from every direction of the world (z up), see :func:`p2p_lib.synthetic.texture.mipmap`: (H, W, 3),
+#: RGB, 255 = white paper in full light; columns are azimuth from -180 to 180 degrees (0 = +x, 90 = +y), rows elevation
+#: from 90 degrees (top) to -90. Blur does not reach across the seam at 180 degrees or around the poles.
+Environment = list[np.ndarray]
 
-@dataclass(frozen=True, eq=False)
-class Environment:
-    """Light arriving from every direction of the world (z up).
 
-    radiance  (H, W, 3) float32, RGB, 255 = white paper in full light; columns are azimuth from -180 to
-              180 degrees (0 = +x, 90 = +y), rows elevation from 90 degrees (top) to -90.
-              Blur does not reach across the seam at 180 degrees or around the poles
-    """
-
-    radiance: np.ndarray
-
-    @cached_property
-    def mipmap(self) -> list[np.ndarray]:
-        """The map at every size, see :func:`p2p_lib.synthetic.texture.mipmap`."""
-        return texture.mipmap(self.radiance)
-
-    def seen(self, direction: np.ndarray, spread_rad: np.ndarray) -> np.ndarray:
-        """Light (N, 3) from unit directions (N, 3), averaged over cones of that width (N,)."""
-        azimuth = np.arctan2(direction[:, 1], direction[:, 0])
-        elevation = np.arcsin(np.clip(direction[:, 2], -1, 1))
-        uv = np.stack([azimuth / (2 * np.pi) + 0.5, elevation / np.pi + 0.5], 1)
-        return texture.lookup(self.mipmap, uv, spread_rad / (np.pi / len(self.radiance)))
+def mirrored(environment: Environment, direction: np.ndarray, spread_rad: np.ndarray) -> np.ndarray:
+    """Light (N, 3) from unit directions (N, 3), averaged over cones of that width (N,)."""
+    azimuth = np.arctan2(direction[:, 1], direction[:, 0])
+    elevation = np.arcsin(np.clip(direction[:, 2], -1, 1))
+    uv = np.stack([azimuth / (2 * np.pi) + 0.5, elevation / np.pi + 0.5], 1)
+    return texture.lookup(environment, uv, spread_rad / (np.pi / len(environment[0])))
 
 
 def fresnel(reflectance: float, cosine: np.ndarray) -> np.ndarray:
@@ -60,7 +47,7 @@ def living_room(rng: np.random.Generator, windows: int = 2, height: int = 512) -
     for _ in range(3):
         at = int(rng.uniform(0.05, 0.6) * width), int(rng.uniform(8, 24) * per_deg)
         cv2.ellipse(page, at, (int(14 * per_deg), int(4 * per_deg)), 0, 0, 360, (3800, 3600, 3100), -1, cv2.LINE_AA)
-    return Environment(page)
+    return texture.mipmap(page)
 
 
 def _window(rng: np.random.Generator, page: np.ndarray, left: int, right: int, top: int, bottom: int) -> None:

@@ -29,41 +29,21 @@ _BOARD_SHARE = 0.7
 _LEFT = 60
 
 
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """When a fault acts: at frame ``index`` of the original, within its frames ``start`` to ``stop``."""
-
-    original: Sequence
-    index: int
-    start: int
-    stop: int
-    severity: float
-    seed: int
-
-    @property
-    def rng(self) -> np.random.Generator:
-        """Another one for each frame."""
-        return np.random.default_rng([self.seed, self.index])
-
-    @property
-    def before(self) -> int:
-        """The frame before all of it."""
-        return max(self.start - 1, 0)
-
-
 @dataclass(frozen=True)
 class Fault:
     """What a fault changes: images and time, masks (copies of the frame's), the camera, or which frames there are.
 
+    Each but the camera's is told the sequence that it is in, and the frame of the original.
+
     shown     the frame whose images and masks are delivered
-    left_out  the frames that are not there, (K,) indices: of the sequence, start, stop and severity
+    left_out  the frames that are not there, (K,) indices
     """
 
-    frame: Callable[[Frame, Moment], Frame] | None = None
-    masks: Callable[[Masks, Moment], Masks] | None = None
-    camera: Callable[[Camera, float], Camera] | None = None
-    shown: Callable[[Moment], int] = lambda at: at.index
-    left_out: Callable[[Sequence, int, int, float], np.ndarray] | None = None
+    frame: Callable[[Frame, Faulty, int], Frame] = lambda frame, of, i: frame
+    masks: Callable[[Masks, Faulty, int], Masks] = lambda masks, of, i: masks
+    camera: Callable[[Camera, float], Camera] = lambda camera, by: camera
+    shown: Callable[[Faulty, int], int] = lambda of, i: i
+    left_out: Callable[[Faulty], np.ndarray] = lambda of: np.zeros(0, int)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +72,7 @@ class Faulty:
     @cached_property
     def kept(self) -> np.ndarray:
         """The original's frames that are there."""
-        every, left_out = np.arange(len(self.original)), FAULTS[self.fault].left_out
-        if left_out is None:
-            return every
-        return np.setdiff1d(every, left_out(self.original, self.start, self.stop, self.severity))
+        return np.setdiff1d(np.arange(len(self.original)), FAULTS[self.fault].left_out(self))
 
     @property
     def during(self) -> tuple[int, int]:
@@ -106,8 +83,7 @@ class Faulty:
     @property
     def camera(self) -> Camera:
         """The camera as it is said to be."""
-        change = FAULTS[self.fault].camera
-        return change(self.original.camera, self.severity) if change else self.original.camera
+        return FAULTS[self.fault].camera(self.original.camera, self.severity)
 
     @property
     def times_s(self) -> np.ndarray:
@@ -127,25 +103,33 @@ class Faulty:
 
     def frame(self, i: int) -> Frame:
         """The i-th image with the fault, where it acts."""
-        at, fault = self._moment(i)
-        frame = self.original.frame(fault.shown(at))
-        frame = replace(frame, index=i, time_s=float(self.original.times_s[at.index]))
-        return fault.frame(frame, at) if fault.frame else frame
+        k, fault = self._acting(i)
+        frame = self.original.frame(fault.shown(self, k))
+        return fault.frame(replace(frame, index=i, time_s=float(self.original.times_s[k])), self, k)
 
     def masks(self, i: int) -> Masks | None:
         """The masks at frame i with the fault, where it acts."""
-        at, fault = self._moment(i)
-        masks = self.original.masks(fault.shown(at))
-        return fault.masks(masks, at) if fault.masks and masks is not None else masks
+        k, fault = self._acting(i)
+        masks = self.original.masks(fault.shown(self, k))
+        return None if masks is None else fault.masks(masks, self, k)
 
     def visible_px(self, i: int) -> dict[str, int] | None:
         """The original's."""
         return self.original.visible_px(int(self.kept[i]))
 
-    def _moment(self, i: int) -> tuple[Moment, Fault]:
+    def rng(self, k: int) -> np.random.Generator:
+        """Another one for each frame of the original."""
+        return np.random.default_rng([self.seed, k])
+
+    @property
+    def before(self) -> int:
+        """The frame before all of it."""
+        return max(self.start - 1, 0)
+
+    def _acting(self, i: int) -> tuple[int, Fault]:
         """What frame i is of the original, and the fault that acts there."""
-        at = Moment(self.original, int(self.kept[i]), self.start, self.stop, self.severity, self.seed)
-        return at, FAULTS[self.fault if self.start <= at.index < self.stop else "none"]
+        k = int(self.kept[i])
+        return k, FAULTS[self.fault if self.start <= k < self.stop else "none"]
 
     def __len__(self) -> int:
         return len(self.kept)
@@ -155,63 +139,55 @@ class Faulty:
         return getattr(self.original, name)
 
 
-def _depth(change: Callable[[np.ndarray, Moment], np.ndarray]) -> Fault:
+def _depth(change: Callable[[np.ndarray, Faulty, int], np.ndarray]) -> Fault:
     """Changes depth (H, W) in metres."""
-
-    def faulty(frame: Frame, at: Moment) -> Frame:
-        return replace(frame, depth_m=change(frame.depth_m, at).astype(np.float32))
-
-    return Fault(frame=faulty)
+    return Fault(frame=lambda frame, of, i: replace(frame, depth_m=change(frame.depth_m, of, i).astype(np.float32)))
 
 
-def _colour(change: Callable[[np.ndarray, Moment], np.ndarray]) -> Fault:
+def _colour(change: Callable[[np.ndarray, Faulty, int], np.ndarray]) -> Fault:
     """Changes colour (H, W, 3), 0 to 255."""
 
-    def faulty(frame: Frame, at: Moment) -> Frame:
-        return replace(frame, rgb=np.clip(np.rint(change(frame.rgb, at)), 0, 255).astype(np.uint8))
+    def faulty(frame: Frame, of: Faulty, i: int) -> Frame:
+        return replace(frame, rgb=np.clip(np.rint(change(frame.rgb, of, i)), 0, 255).astype(np.uint8))
 
     return Fault(frame=faulty)
 
 
-def _mask(change: Callable[[np.ndarray, Moment], np.ndarray]) -> Fault:
+def _mask(change: Callable[[np.ndarray, Faulty, int], np.ndarray]) -> Fault:
     """Changes each object's mask (H, W) bool."""
-    return Fault(masks=lambda masks, at: {name: change(mask, at) for name, mask in masks.items()})
-
-
-def _time(change: Callable[[float, Moment], float]) -> Fault:
-    return Fault(frame=lambda frame, at: replace(frame, time_s=change(frame.time_s, at)))
+    return Fault(masks=lambda masks, of, i: {name: change(mask, of, i) for name, mask in masks.items()})
 
 
 def _where_measured(depth_m: np.ndarray, new_m: np.ndarray | float) -> np.ndarray:
     return np.where(depth_m > 0, new_m, 0)
 
 
-def _wild(depth_m: np.ndarray, at: Moment) -> np.ndarray:
-    rng = at.rng
-    return np.where(rng.random(depth_m.shape) < at.severity, rng.choice(_WILD_M, depth_m.shape), depth_m)
+def _wild(depth_m: np.ndarray, of: Faulty, i: int) -> np.ndarray:
+    rng = of.rng(i)
+    return np.where(rng.random(depth_m.shape) < of.severity, rng.choice(_WILD_M, depth_m.shape), depth_m)
 
 
-def _wider(depth_m: np.ndarray, at: Moment) -> np.ndarray:
+def _wider(depth_m: np.ndarray, of: Faulty, i: int) -> np.ndarray:
     h, w = depth_m.shape
     seen = np.array([[0.75, 0, 0.125 * w + 12], [0, 0.75, 0.125 * h]])
     return cv2.warpAffine(depth_m, seen, (w, h), flags=cv2.INTER_NEAREST)
 
 
-def _plain(rgb: np.ndarray, at: Moment) -> np.ndarray:
+def _plain(rgb: np.ndarray, of: Faulty, i: int) -> np.ndarray:
     """Each object in the median of its colours, with noise."""
-    rgb, rng = rgb.astype(float), at.rng
-    for mask in (at.original.masks(at.index) or {}).values():
-        wide = _grown(mask, replace(at, severity=4))
+    rgb, rng = rgb.astype(float), of.rng(i)
+    for mask in (of.original.masks(i) or {}).values():
+        wide = _grown(mask, 4)
         if mask.any():
-            rgb[wide] = np.median(rgb[mask], 0) + rng.normal(0, at.severity, (int(wide.sum()), 3))
+            rgb[wide] = np.median(rgb[mask], 0) + rng.normal(0, of.severity, (int(wide.sum()), 3))
     return rgb
 
 
-def _on_objects(at: Moment) -> np.ndarray:
+def _on_objects(of: Faulty, i: int) -> np.ndarray:
     """(H, W) bool: the masks of all objects."""
-    camera = at.original.camera
+    camera = of.original.camera
     nothing = np.zeros((camera.height, camera.width), bool)
-    return np.logical_or.reduce([nothing, *(at.original.masks(at.index) or {}).values()])
+    return np.logical_or.reduce([nothing, *(of.original.masks(i) or {}).values()])
 
 
 def _shifted(image: np.ndarray, px: float) -> np.ndarray:
@@ -219,26 +195,26 @@ def _shifted(image: np.ndarray, px: float) -> np.ndarray:
     return cv2.warpAffine(image, np.array([[1.0, 0, px], [0, 1, 0]]), image.shape[::-1], flags=cv2.INTER_NEAREST)
 
 
-def _grown(mask: np.ndarray, at: Moment) -> np.ndarray:
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(at.severity) + 1,) * 2)
+def _grown(mask: np.ndarray, px: float) -> np.ndarray:
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(px) + 1,) * 2)
     return cv2.dilate(mask.astype(np.uint8), disk) > 0
 
 
-def _left_part(mask: np.ndarray, at: Moment) -> np.ndarray:
+def _left_part(mask: np.ndarray, of: Faulty, i: int) -> np.ndarray:
     """Without a share of its columns, the right ones."""
     columns = np.flatnonzero(mask.any(0))
-    return mask & (np.arange(mask.shape[1]) < np.quantile(columns, 1 - at.severity)) if len(columns) else mask
+    return mask & (np.arange(mask.shape[1]) < np.quantile(columns, 1 - of.severity)) if len(columns) else mask
 
 
-def _board(frame: Frame, at: Moment) -> Frame:
+def _board(frame: Frame, of: Faulty, i: int) -> Frame:
     """A board as wide as a share of the image, before the objects, from the left to the right; no mask knows of it."""
     h, w = frame.shape
-    objects = _on_objects(at)
+    objects = _on_objects(of, i)
     behind = frame.depth_m[(objects if objects.any() else True) & (frame.depth_m > 0)]
     near_m = _BOARD_SHARE * np.percentile(behind, 5) if len(behind) else 0.3
-    wide = max(int(at.severity * w), 1)
-    left = round((at.index - at.start + 0.5) / (at.stop - at.start) * (w + wide)) - wide
-    grain = np.random.default_rng(at.seed).integers(90, 170, (h // 8 + 1, wide // 8 + 1, 3), np.uint8)
+    wide = max(int(of.severity * w), 1)
+    left = round((i - of.start + 0.5) / (of.stop - of.start) * (w + wide)) - wide
+    grain = np.random.default_rng(of.seed).integers(90, 170, (h // 8 + 1, wide // 8 + 1, 3), np.uint8)
     texture = cv2.resize(grain, (wide, h))
     seen = np.arange(max(left, 0), min(left + wide, w))
     rgb, depth_m = frame.rgb.copy(), frame.depth_m.copy()
@@ -246,78 +222,78 @@ def _board(frame: Frame, at: Moment) -> Frame:
     return replace(frame, rgb=rgb, depth_m=depth_m)
 
 
-def _until_turned(sequence: Sequence, start: int, stop: int, severity: float) -> np.ndarray:
-    """The frames from ``start`` to where the first object with a truth is turned most, of those with 60 after them."""
-    for truth in sequence.truth.values():
+def _until_turned(of: Faulty) -> np.ndarray:
+    """The frames from its start to where the first object with a truth is turned most, of those with 60 after them."""
+    for truth in of.original.truth.values():
         seen = truth.labelled & np.isfinite(truth.T_cam_model).all((1, 2))
-        seen[: start + 1], seen[max(len(sequence) - _LEFT, 0) :] = False, False
+        seen[: of.start + 1], seen[max(len(of.original) - _LEFT, 0) :] = False, False
         if seen.any():
-            T_last = truth.T_cam_model[max(start - 1, 0)]
+            T_last = truth.T_cam_model[of.before]
             turned_rad = se3.angle_rad(se3.inverse(T_last) @ truth.T_cam_model[seen])
-            return np.arange(start, np.flatnonzero(seen)[turned_rad.argmax()])
-    return np.arange(start, stop)
+            return np.arange(of.start, np.flatnonzero(seen)[turned_rad.argmax()])
+    return np.arange(of.start, of.stop)
 
 
 #: Fault to what it does, with the unit of its severity where it has one.
 FAULTS: dict[str, Fault] = {
     "none": Fault(),
     # Depth as it was before all of it.
-    "depth frozen": _depth(lambda depth_m, at: at.original.frame(at.before).depth_m),
+    "depth frozen": _depth(lambda depth_m, of, i: of.original.frame(of.before).depth_m),
     # A factor.
-    "depth scaled": _depth(lambda depth_m, at: depth_m * at.severity),
+    "depth scaled": _depth(lambda depth_m, of, i: depth_m * of.severity),
     # Another factor in every image, which differs from 1 by so much at most: a network for single images.
-    "depth scaled anew": _depth(lambda depth_m, at: depth_m * at.rng.uniform(1 - at.severity, 1 + at.severity)),
+    "depth scaled anew": _depth(lambda depth_m, of, i: depth_m * of.rng(i).uniform(1 - of.severity, 1 + of.severity)),
     # Metres.
-    "depth offset": _depth(lambda depth_m, at: _where_measured(depth_m, np.maximum(depth_m + at.severity, 0))),
+    "depth offset": _depth(lambda depth_m, of, i: _where_measured(depth_m, np.maximum(depth_m + of.severity, 0))),
     # Pixels to the right.
-    "depth misaligned": _depth(lambda depth_m, at: _shifted(depth_m, at.severity)),
+    "depth misaligned": _depth(lambda depth_m, of, i: _shifted(depth_m, of.severity)),
     # As a D435's depth camera sees it: a wider view, and 15 mm beside the colour camera.
     "depth not registered": _depth(_wider),
     # Standard deviation, metres.
-    "depth noise": _depth(lambda z, at: _where_measured(z, np.abs(z + at.rng.normal(0, at.severity, z.shape)))),
+    "depth noise": _depth(lambda z, of, i: _where_measured(z, np.abs(z + of.rng(i).normal(0, of.severity, z.shape)))),
     # A share of the pixels.
-    "depth holes": _depth(lambda z, at: np.where(at.rng.random(z.shape) < at.severity, 0, z)),
+    "depth holes": _depth(lambda z, of, i: np.where(of.rng(i).random(z.shape) < of.severity, 0, z)),
     "depth wild": _depth(_wild),
     # Dark, shiny, transparent.
-    "depth missing on objects": _depth(lambda depth_m, at: np.where(_on_objects(at), 0, depth_m)),
-    "colour frozen": _colour(lambda rgb, at: at.original.frame(at.before).rgb),
-    "colour black": _colour(lambda rgb, at: np.zeros_like(rgb)),
+    "depth missing on objects": _depth(lambda depth_m, of, i: np.where(_on_objects(of, i), 0, depth_m)),
+    "colour frozen": _colour(lambda rgb, of, i: of.original.frame(of.before).rgb),
+    "colour black": _colour(lambda rgb, of, i: np.zeros_like(rgb)),
     # Standard deviation of the blur, pixels.
-    "colour blurred": _colour(lambda rgb, at: cv2.GaussianBlur(rgb, (0, 0), at.severity)),
+    "colour blurred": _colour(lambda rgb, of, i: cv2.GaussianBlur(rgb, (0, 0), of.severity)),
     # Standard deviation, grey levels.
-    "colour noise": _colour(lambda rgb, at: rgb + at.rng.normal(0, at.severity, rgb.shape)),
+    "colour noise": _colour(lambda rgb, of, i: rgb + of.rng(i).normal(0, of.severity, rgb.shape)),
     # Grey levels of red more and of blue less.
-    "colour cast": _colour(lambda rgb, at: rgb + at.severity * np.array([1.0, 0, -1])),
+    "colour cast": _colour(lambda rgb, of, i: rgb + of.severity * np.array([1.0, 0, -1])),
     # Standard deviation of a camera's noise on objects of one colour, grey levels.
     "colour plain on objects": _colour(_plain),
     # A factor.
-    "exposure": _colour(lambda rgb, at: rgb * at.severity),
+    "exposure": _colour(lambda rgb, of, i: rgb * of.severity),
     # Pixels to all sides.
-    "mask wide": _mask(_grown),
-    "mask whole image": _mask(lambda mask, at: np.ones_like(mask)),
-    "mask empty": _mask(lambda mask, at: np.zeros_like(mask)),
+    "mask wide": _mask(lambda mask, of, i: _grown(mask, of.severity)),
+    "mask whole image": _mask(lambda mask, of, i: np.ones_like(mask)),
+    "mask empty": _mask(lambda mask, of, i: np.zeros_like(mask)),
     # Empty in every second frame.
-    "mask flickers": _mask(lambda mask, at: mask & bool((at.index - at.start) % 2)),
+    "mask flickers": _mask(lambda mask, of, i: mask & bool((i - of.start) % 2)),
     # Pixels to the right.
-    "mask misplaced": _mask(lambda mask, at: _shifted(mask.astype(np.uint8), at.severity) > 0),
+    "mask misplaced": _mask(lambda mask, of, i: _shifted(mask.astype(np.uint8), of.severity) > 0),
     # The share that is missing.
     "mask cut": _mask(_left_part),
     # The share of the image that the board is wide.
     "board unmasked": Fault(frame=_board),
     "frames black": Fault(
-        frame=lambda frame, at: replace(frame, rgb=np.zeros_like(frame.rgb), depth_m=np.zeros_like(frame.depth_m))
+        frame=lambda frame, of, i: replace(frame, rgb=np.zeros_like(frame.rgb), depth_m=np.zeros_like(frame.depth_m))
     ),
-    "frames frozen": Fault(shown=lambda at: at.before),
+    "frames frozen": Fault(shown=lambda of, i: of.before),
     # Each frame twice: a recorder that was faster than its camera.
-    "frames twice": Fault(shown=lambda at: at.index - (at.index - at.start) % 2),
-    "frames dropped": Fault(left_out=lambda sequence, start, stop, severity: np.arange(start, stop)),
+    "frames twice": Fault(shown=lambda of, i: i - (i - of.start) % 2),
+    "frames dropped": Fault(left_out=lambda of: np.arange(of.start, of.stop)),
     # The share of the frames that is missing, evenly.
-    "frames thinned": Fault(left_out=lambda sequence, start, stop, by: np.arange(start, stop, 1 / by).astype(int)),
+    "frames thinned": Fault(left_out=lambda of: np.arange(of.start, of.stop, 1 / of.severity).astype(int)),
     # Until the object shows another side.
     "frames dropped, turned": Fault(left_out=_until_turned),
     # Seconds.
-    "time shifted": _time(lambda time_s, at: time_s + at.severity),
-    "time standing": _time(lambda time_s, at: float(at.original.times_s[at.before])),
+    "time shifted": Fault(frame=lambda frame, of, i: replace(frame, time_s=frame.time_s + of.severity)),
+    "time standing": Fault(frame=lambda frame, of, i: replace(frame, time_s=float(of.original.times_s[of.before]))),
     # A factor of both focal lengths; of the whole run, wherever the fault acts.
     "focal length off": Fault(camera=lambda camera, by: replace(camera, fx=camera.fx * by, fy=camera.fy * by)),
 }

@@ -68,9 +68,7 @@ def measured_depth(image: Rendering, camera: Camera, sensor: Sensor, rng: np.ran
     """Depth (H, W) float64 in metres as the sensor reports it; 0 = no measurement."""
     exact = image.depth_m
     H, W = exact.shape
-    hole = exact <= 0
-    if sensor.baseline_m:
-        hole |= _second_imager_blind(exact, camera.fx * sensor.baseline_m)
+    hole = (exact <= 0) | _second_imager_blind(exact, camera.fx * sensor.baseline_m)
     if sensor.edge_loss:
         hole |= _edges(exact, sensor.edge_m) & (rng.random((H, W), np.float32) < sensor.edge_loss)
     if sensor.grazing_deg:

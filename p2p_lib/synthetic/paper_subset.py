@@ -32,7 +32,6 @@ STAND_INS: dict[str, Callable[[np.random.Generator], Mesh]] = {
     "072-a_toy_airplane": partial(shapes.block, radius_m=0.07, height_m=0.14),
 }
 
-
 #: Objects of each sequence and how they move: ``circular`` (around the middle) or ``linear`` (to and fro).
 SEQUENCES = {
     "ycb_sugar_box": {"004_sugar_box": "linear"},

@@ -17,7 +17,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.raycasting import cast
 from p2p_lib.synthetic import texture
-from p2p_lib.synthetic.environment import Environment, fresnel
+from p2p_lib.synthetic.environment import Environment, fresnel, mirrored
 from p2p_lib.synthetic.shapes import Mesh
 
 _NEAR_M = 0.01
@@ -90,21 +90,19 @@ class _Hits:
 
     R_cam_model  (3, 3)
     pixel        (N,) flat indices
-    shown        (K,) the faces that show anywhere
-    planes       (K, 3, 3) ``planes[k] @ (u, v, 1)`` are the barycentric coordinates on face ``shown[k]`` over the depth
-    row          (N,) which of them each pixel shows
+    face         (N,) which face each shows
+    planes       (F, 3, 3) ``planes[f] @ (u, v, 1)`` are the barycentric coordinates on a face that shows over the depth
     """
 
     mesh: Mesh
     R_cam_model: np.ndarray
     pixel: np.ndarray
-    shown: np.ndarray
+    face: np.ndarray
     planes: np.ndarray
-    row: np.ndarray
 
     def select(self, pixels: np.ndarray) -> _Hits:
         """Some of the pixels, by a mask (N,)."""
-        return replace(self, pixel=self.pixel[pixels], row=self.row[pixels])
+        return replace(self, pixel=self.pixel[pixels], face=self.face[pixels])
 
 
 def _hits(mesh: Mesh, T_cam_model: np.ndarray, camera: Camera) -> tuple[_Hits, np.ndarray]:
@@ -116,17 +114,17 @@ def _hits(mesh: Mesh, T_cam_model: np.ndarray, camera: Camera) -> tuple[_Hits, n
     face = cast(mesh.ray_scene, T_model_cam[:3, 3], rays)["primitive_ids"].astype(np.int32)
     met = face >= 0  # -1 where a ray meets nothing
     pixel, face = pixel[met], face[met]
-    shows = np.bincount(face, minlength=len(mesh.faces)) > 0
-    shown, row = np.flatnonzero(shows), (np.cumsum(shows) - 1)[face]
+    shown = np.flatnonzero(np.bincount(face))
     a, b, c = np.moveaxis(p_cam[mesh.faces[shown]], 1, 0)
     # The inverse of a matrix of three columns is their cross products over the determinant.
     inverse = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], 1)
     inverse /= np.einsum("nc,nc->n", a, inverse[:, 0])[:, None, None]
-    planes = inverse @ np.linalg.inv(camera.K)
+    planes = np.zeros((len(mesh.faces), 3, 3))
+    planes[shown] = inverse @ np.linalg.inv(camera.K)
     v, u = np.divmod(pixel, camera.width)
     per_u, per_v, offset = planes.sum(1).T
-    depth_m = 1 / (per_u[row] * u + per_v[row] * v + offset[row])
-    return _Hits(mesh, T_cam_model[:3, :3], pixel, shown, planes, row), depth_m
+    depth_m = 1 / (per_u[face] * u + per_v[face] * v + offset[face])
+    return _Hits(mesh, T_cam_model[:3, :3], pixel, face, planes), depth_m
 
 
 def _pixels_around(p_cam: np.ndarray, camera: Camera) -> np.ndarray:
@@ -142,7 +140,7 @@ def _pixels_around(p_cam: np.ndarray, camera: Camera) -> np.ndarray:
 
 def _shade(seen: _Hits, camera: Camera, light: Light, T_cam_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colour (N, 3) and cosine of incidence (N,) of pixels."""
-    mesh, face, planes = seen.mesh, seen.shown[seen.row], seen.planes[seen.row]
+    mesh, face, planes = seen.mesh, seen.face, seen.planes[seen.face]
     v, u = np.divmod(seen.pixel, camera.width)
     over_z = planes[..., 0] * u[:, None] + planes[..., 1] * v[:, None] + planes[..., 2]
     inv_z = over_z.sum(1, keepdims=True)
@@ -166,13 +164,12 @@ def _shade(seen: _Hits, camera: Camera, light: Light, T_cam_world: np.ndarray) -
     lit = light.ambient + (1 - light.ambient) * np.maximum(0, side * (normal @ towards))
     colour = colour * lit[:, None].astype(np.float32)
     if light.environment is not None and mesh.reflectance.any():
-        share = np.where(
-            mesh.reflectance[face] > 0, fresnel(mesh.reflectance[face], np.einsum("nc,nc->n", -ray, normal)), 0
-        )
+        reflectance = mesh.reflectance[face]
+        share = np.where(reflectance > 0, fresnel(reflectance, np.einsum("nc,nc->n", -ray, normal)), 0)
         away = ray - 2 * np.einsum("nc,nc->n", ray, normal)[:, None] * normal
         spread_rad = 2 * change_per_px(normals) + light.roughness_rad
-        mirrored = light.environment.seen(away @ T_cam_world[:3, :3], spread_rad)
-        colour += share[:, None].astype(np.float32) * (mirrored - colour)
+        shown = mirrored(light.environment, away @ T_cam_world[:3, :3], spread_rad)
+        colour += share[:, None].astype(np.float32) * (shown - colour)
     return colour, np.abs(cosine).astype(np.float32)
 
 

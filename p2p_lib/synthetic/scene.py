@@ -65,9 +65,8 @@ def check(scenario: str, **limits: tuple[float, float, float]) -> None:
     """Raises :class:`BadInput` where a parameter of a scenario, (value, least, most), is beyond its limits."""
     if not all(low <= value <= high for value, low, high in limits.values()):
         got = ", ".join(f"{name} {value}" for name, (value, _, _) in limits.items())
-        raise BadInput(
-            scenario, got, ", ".join(f"{name} from {low} to {high}" for name, (_, low, high) in limits.items())
-        )
+        expected = ", ".join(f"{name} from {low} to {high}" for name, (_, low, high) in limits.items())
+        raise BadInput(scenario, got, expected)
 
 
 def room(rng: np.random.Generator) -> tuple[Mesh, ...]:

@@ -133,9 +133,8 @@ def box(rng: np.random.Generator, size_m: tuple[float, float, float], contrast: 
 def slab(rng: np.random.Generator, size_m: tuple[float, float, float]) -> Mesh:
     """A plain board of size (x, y, z), centred: an occluder."""
     x, y, z = (max(8, round(s * TEXELS_PER_M / 3)) for s in size_m)
-    return _six_sided(
-        size_m, [labels.cardboard(rng, w, h) for w, h in ((x, z), (y, z), (x, z), (y, z), (x, y), (x, y))]
-    )
+    panels = (x, z), (y, z), (x, z), (y, z), (x, y), (x, y)
+    return _six_sided(size_m, [labels.cardboard(rng, w, h) for w, h in panels])
 
 
 def can(rng: np.random.Generator, radius_m: float, height_m: float, contrast: float = 1.0, segments: int = 72) -> Mesh:
@@ -154,9 +153,8 @@ def can(rng: np.random.Generator, radius_m: float, height_m: float, contrast: fl
         corners = np.concatenate([flat * radius_m, np.full((segments, 3, 1), sign * height_m / 2)], -1)
         # Just inside the disc's edge, so that filtering does not mix in what lies outside.
         uv = flat * [sign, 1] * 0.98 / 2 + 0.5
-        patches.append(
-            Patch(corners, uv, np.broadcast_to([0.0, 0, sign], corners.shape), labels.lid(rng, disc, contrast))
-        )
+        normals = np.broadcast_to([0.0, 0, sign], corners.shape)
+        patches.append(Patch(corners, uv, normals, labels.lid(rng, disc, contrast)))
     return assembled(patches, [[0], [1, 2]], ground=0)
 
 
@@ -182,9 +180,8 @@ def block(rng: np.random.Generator, radius_m: float, height_m: float, contrast: 
         w, h = np.maximum(8, np.round(flat.max(0) * TEXELS_PER_M)).astype(int)
         fan = np.stack([[0, i, i + 1] for i in range(1, len(corners) - 1)])
         placed, normals = corners[fan] - [0, 0, height_m / 2], np.broadcast_to(out, (len(fan), 3, 3))
-        patches.append(
-            Patch(placed, flat[fan] / flat.max(0), normals, labels.label(rng, w, h, contrast, front=k % 2 == 0))
-        )
+        image = labels.label(rng, w, h, contrast, front=k % 2 == 0)
+        patches.append(Patch(placed, flat[fan] / flat.max(0), normals, image))
     return assembled(patches, [[k] for k in reversed(range(len(patches)))])
 
 

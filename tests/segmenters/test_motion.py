@@ -9,7 +9,7 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.motion import Motion, Motions, Past, agrees, parts_that_follow, scene_stays
+from p2p_lib.segmenters.builtin.motion import Motions, Past, agrees, parts_that_follow, scene_stays
 from p2p_lib.segmenters.builtin.patch import Box, Patch, holding, parts_of
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
@@ -52,7 +52,7 @@ def left(moved_m: float) -> np.ndarray:
 
 
 def motions_of(then: Frame, now: Frame, moved_m: float) -> Motions:
-    motion = Motion(then, np.linalg.inv(left(moved_m)))
+    motion = then, np.linalg.inv(left(moved_m))
     return Motions(now, motion, motion)
 
 
@@ -146,7 +146,7 @@ def test_what_came_to_the_object_later_is_not_a_part_of_it():
     patch, plate = patch_and_plate(now, moved_m)
     both = motions_of(then, now, moved_m)
     assert parts_that_follow(patch, parts_of(patch.smooth), plate, both).any()
-    later = Motions(now, both.recent, Motion(before, both.first.T_then_now))
+    later = Motions(now, both.recent, (before, both.first[1]))
     assert not parts_that_follow(patch, parts_of(patch.smooth), plate, later).any()
 
 
@@ -158,9 +158,10 @@ def test_the_first_frame_is_remembered_and_the_newest():
     kept = [frame.index for frame, _ in past.seen]
     assert kept[0] == 0 and kept[-1] == 55 and len(kept) < 10 and min(np.diff(kept)) >= 5
     motions = past.motions(scene_of_nothing(60), left(0.6))
-    np.testing.assert_allclose(motions.first.T_then_now, left(-0.6), atol=1e-12)
-    np.testing.assert_allclose(motions.recent.T_then_now, left(0.01 * motions.recent.then.index - 0.6), atol=1e-12)
-    assert 25 <= motions.recent.then.index <= 55
+    np.testing.assert_allclose(motions.first[1], left(-0.6), atol=1e-12)
+    then, T_then_now = motions.recent
+    np.testing.assert_allclose(T_then_now, left(0.01 * then.index - 0.6), atol=1e-12)
+    assert 25 <= then.index <= 55
     assert Past().motions(scene_of_nothing(0), left(0.0)) is None
 
 

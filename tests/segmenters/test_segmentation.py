@@ -453,8 +453,8 @@ def test_the_support_plane_is_found_among_other_things():
     patch = Patch.of(frame, around(np.array([160, 180.0]), np.array([150, 60.0]), frame.shape), CAMERA, CONFIG)
     plane = support_plane(patch, patch.depth_m > 0, np.random.default_rng(0))
     assert plane[:3] @ normal > np.cos(np.radians(2)) and abs(plane[3] - d) < 0.01
-    on_it = (patch.grid(np.array([[20.0, 200], [290, 200]]))).T
-    assert np.abs(plane_heights(patch, plane)[on_it[1], on_it[0]]).max() < 0.02
+    on_it = patch.dots(np.array([[20.0, 200], [290, 200]]), 0)
+    assert on_it.sum() == 2 and np.abs(plane_heights(patch, plane)[on_it]).max() < 0.02
 
 
 def test_no_plane_where_there_is_none():

@@ -8,8 +8,9 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.synthetic import shapes, solids
-from p2p_lib.synthetic.environment import Environment, fresnel, living_room
+from p2p_lib.synthetic.environment import fresnel, living_room
 from p2p_lib.synthetic.render import Light, render
+from p2p_lib.synthetic.texture import mipmap
 
 CAMERA = Camera(300.0, 310.0, 158.3, 121.7, 320, 240)
 
@@ -20,7 +21,7 @@ def smooth_room():
     elevation = np.pi / 2 - (np.arange(512) + 0.5) / 512 * np.pi
     x, y = (np.outer(np.cos(elevation), f(azimuth)) for f in (np.cos, np.sin))
     z = np.repeat(np.sin(elevation)[:, None], 1024, 1)
-    return Environment((100 + 90 * np.stack([x, y, z], -1)).astype(np.float32))
+    return mipmap(100 + 90 * np.stack([x, y, z], -1))
 
 
 def ball(reflectance, radius_m=0.06):

@@ -28,23 +28,15 @@ _SCENE_STRIDE = 24
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """How an object moved since an earlier frame.
+class Motions:
+    """How an object moved until ``now``: since a frame of the last second, and since the first that it was seen in.
 
-    T_then_now (4, 4) takes its points from the frame of the camera now to that of the camera then.
+    Each is that frame and T_then_now (4, 4), from the camera's frame of now to that of then.
     """
 
-    then: Frame
-    T_then_now: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Motions:
-    """How an object moved until ``now``: since a frame of the last second, and since the first that it was seen in."""
-
     now: Frame
-    recent: Motion
-    first: Motion
+    recent: tuple[Frame, np.ndarray]
+    first: tuple[Frame, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +59,7 @@ class Past:
             return None
         T_obj_cam, recent = se3.inverse(T_cam_obj), self.seen[1:] or self.seen
         both = recent[now.index % len(recent)], self.seen[0]
-        return Motions(now, *(Motion(then, T_then_obj @ T_obj_cam) for then, T_then_obj in both))
+        return Motions(now, *((then, T_then_obj @ T_obj_cam) for then, T_then_obj in both))
 
 
 def agrees(
@@ -93,19 +85,19 @@ def scene_stays(patch: Patch, motions: Motions) -> bool:
 
     Before a moving camera all that lies still moves alike; before a slow one, walls of one colour seem to have stayed.
     """
-    frame, then = motions.now, motions.recent.then
+    frame, (then, T_then_now) = motions.now, motions.recent
     around = np.ones(frame.shape, bool)
     around[patch.box.slices] = False
     v, u = np.mgrid[: frame.shape[0] : _SCENE_STRIDE, : frame.shape[1] : _SCENE_STRIDE]
     some = around[v, u] & (frame.depth_m[v, u] > 0)
     v, u = v[some], u[some]
     p_cam = patch.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
-    both = patch.camera.inside(patch.camera.project(se3.transform(motions.recent.T_then_now, p_cam)), -0.5)
+    both = patch.camera.inside(patch.camera.project(se3.transform(T_then_now, p_cam)), -0.5)
     p_cam, rgb = p_cam[both], frame.rgb[v, u][both]
     if len(p_cam) < _FEWEST:
         return False
     stayed, _ = agrees(p_cam, rgb, patch.camera, then, np.eye(4))
-    moved, _ = agrees(p_cam, rgb, patch.camera, then, motions.recent.T_then_now)
+    moved, _ = agrees(p_cam, rgb, patch.camera, then, T_then_now)
     return stayed.mean() > max(_STAYS, moved.mean())
 
 
@@ -128,9 +120,9 @@ def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, mot
     v, u = np.nonzero(beside[part])
     if not len(v) or not scene_stays(patch, motions):
         return np.zeros(patch.shape, bool)
-    p_cam, rgb, motion, first = patch.points()[v, u], patch.rgb[v, u], motions.recent, motions.first
-    moved, _ = agrees(p_cam, rgb, patch.camera, motion.then, motion.T_then_now)
-    stayed, _ = agrees(p_cam, rgb, patch.camera, motion.then, np.eye(4))
-    _, absent = agrees(p_cam, rgb, patch.camera, first.then, first.T_then_now)
+    p_cam, rgb = patch.points()[v, u], patch.rgb[v, u]
+    moved, _ = agrees(p_cam, rgb, patch.camera, *motions.recent)
+    stayed, _ = agrees(p_cam, rgb, patch.camera, motions.recent[0], np.eye(4))
+    _, absent = agrees(p_cam, rgb, patch.camera, *motions.first)
     moved, stayed, absent = (np.bincount(part[v, u], w, count) / np.maximum(size, 1) for w in (moved, stayed, absent))
     return (beside & (moved > _AGREES) & (stayed < _UNDECIDED) & (absent < _ABSENT))[part]

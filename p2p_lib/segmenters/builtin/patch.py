@@ -11,6 +11,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.image import bounds
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import colour_codes
@@ -50,7 +51,7 @@ def around(centre: np.ndarray, half: np.ndarray, shape: tuple[int, int]) -> Box:
     size = np.array(shape[::-1])
     low = np.clip(np.floor(centre - half).astype(int), 0, size - 2)
     high = np.clip(np.ceil(centre + half).astype(int) + 1, low + 2, size)
-    return Box(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    return Box(*low.tolist(), *high.tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,18 +130,19 @@ class Patch:
         h, w = self.box.shape
         return cv2.resize(values.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
 
-    def grid(self, uv_px: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of the image as nearest columns and rows of the grid; those outside it are left out."""
-        h, w = self.shape
-        at = (np.asarray(uv_px, float) - [self.box.left, self.box.top] + 0.5) / self.cell_px - 0.5
-        at = np.rint(at).astype(int)
-        return at[((at >= 0) & (at < [w, h])).all(1)]
-
     def dots(self, uv_px: np.ndarray, radius: int) -> np.ndarray:
-        """(h, w) bool: squares around pixels of the image."""
-        at, dots = self.grid(uv_px), np.zeros(self.shape, bool)
-        dots[at[:, 1], at[:, 0]] = True
+        """(h, w) bool: squares around pixels (N, 2) of the image; those outside the grid are left out."""
+        dots = np.zeros(self.shape, bool)
+        at = np.rint((uv_px - [self.box.left, self.box.top] + 0.5) / self.cell_px - 0.5).astype(int)
+        u, v = at[((at >= 0) & (at < self.shape[::-1])).all(1)].T
+        dots[v, u] = True
         return dilated(dots, radius)
+
+    def ends_px(self, region: np.ndarray) -> np.ndarray:
+        """(2, 2) x, y in the image where a region (h, w) bool begins, and where it has ended."""
+        rows, columns = bounds(region)
+        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
+        return ends * self.cell_px + [self.box.left, self.box.top]
 
     def nearer(self, one: np.ndarray, other: np.ndarray, like: float) -> np.ndarray:
         """(h, w) bool: the pixels that are nearer to ``one`` (h, w) bool than to ``other``, over like pixels.
@@ -192,13 +194,10 @@ class Patch:
 
 def _whole_cells(box: Box, cell_px: int, shape: tuple[int, int]) -> Box:
     """A box of whole cells around another, inside an image where that is possible."""
-    spans = []
-    for low, high, end in ((box.left, box.right, shape[1]), (box.top, box.bottom, shape[0])):
-        size = min(max(-(-(high - low) // cell_px), 2), end // cell_px) * cell_px
-        low = min(low, end - size)
-        spans.append((low, low + size))
-    (left, right), (top, bottom) = spans
-    return Box(left, top, right, bottom)
+    low, high, end = np.array([box.left, box.top]), np.array([box.right, box.bottom]), np.array(shape[::-1])
+    size = np.minimum(np.maximum(-(-(high - low) // cell_px), 2), end // cell_px) * cell_px
+    low = np.minimum(low, end - size)
+    return Box(*low.tolist(), *(low + size).tolist())
 
 
 def _averaged(image: np.ndarray, cell_px: int) -> np.ndarray:
@@ -238,6 +237,11 @@ def holding(part: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     holds[part[seeds]] = True
     holds[0] = False
     return holds[part]
+
+
+def only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The probabilities without the islands that hold no seed."""
+    return np.where(holding(parts_of(x > 0.5), seeds) | (x <= 0.5), x, 0)
 
 
 def support_plane(patch: Patch, where: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:

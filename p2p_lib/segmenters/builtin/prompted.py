@@ -20,16 +20,7 @@ from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, cut
-from p2p_lib.segmenters.builtin.patch import (
-    Box,
-    Patch,
-    around,
-    dilated,
-    holding,
-    parts_of,
-    plane_heights,
-    support_plane,
-)
+from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, only, plane_heights, support_plane
 
 #: Room around an object, besides a share of its size: small ones move by pixels too.
 ROOM_PX = 6
@@ -75,7 +66,7 @@ class Cutter:
         x = self._cut_out(patch, plane, clicks, dilated(seeds, 2), outside)
         whole = np.zeros(frame.shape, np.float32)
         whole[patch.box.slices] = patch.up(x)
-        patch = Patch.of(frame, self._fitting(patch, x > 0.5), self.camera, cfg)
+        patch = Patch.of(frame, self._room(*patch.ends_px(x > 0.5)), self.camera, cfg)
         was = patch.down(whole)
         x = self._cut_out(patch, plane, clicks, was > 0.5, was < 0.5, was)
         return patch.box, patch.up(x)
@@ -107,14 +98,13 @@ class Cutter:
         outside: np.ndarray,
         start: np.ndarray | None = None,
     ) -> np.ndarray:
-        """(h, w) probability of what is connected with the clicks; colours are those ``inside`` and ``outside``."""
+        """(h, w) probability of what is connected with the clicks, which count as certain.
+
+        Colours are those ``inside`` and ``outside``.
+        """
         seeds = patch.dots(clicks, 1)
         by_depth, _ = by_geometry(patch, seeds, plane, self.config)
-        colour = by_colour(patch, histogram(patch.codes[inside]), outside, self.config)
-        return self._settled(patch, by_depth + colour, seeds, start)
-
-    def _settled(self, patch: Patch, log_odds: np.ndarray, seeds: np.ndarray, start: np.ndarray | None) -> np.ndarray:
-        """(h, w) probability by the evidence, of what is connected with the seeds; clicks count as certain."""
+        log_odds = by_depth + by_colour(patch, histogram(patch.codes[inside]), outside, self.config)
         beside = patch.dots(self.prompt.negative_px, 0) & ~seeds
         if beside.any():
             log_odds = log_odds - _NOT_IT * patch.nearer(beside, seeds, _LIKE)
@@ -123,22 +113,10 @@ class Cutter:
             barred |= ~_within(patch, self.prompt.box_px)
         return only(cut(patch, log_odds, start=start, seeds=seeds, background=barred & ~seeds), seeds)
 
-    def _fitting(self, patch: Patch, inside: np.ndarray) -> Box:
-        """A box with room around what is ``inside`` a patch."""
-        rows, columns = bounds(inside)
-        corner = np.array([patch.box.left, patch.box.top])
-        low, high = np.array([columns.start, rows.start]), np.array([columns.stop, rows.stop])
-        return self._room(low * patch.cell_px + corner, high * patch.cell_px + corner)
-
     def _room(self, low: np.ndarray, high: np.ndarray) -> Box:
         """A box with room around the pixels from ``low`` to ``high`` (x, y)."""
         half = (high - low) / 2 * (1 + 2 * self.config.margin) + ROOM_PX
         return around((low + high) / 2, half, self.frame.shape)
-
-
-def only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The probabilities without the islands that hold no seed."""
-    return np.where(holding(parts_of(x > 0.5), seeds) | (x <= 0.5), x, 0)
 
 
 def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> None:
@@ -149,9 +127,8 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
     frame, name = cutter.frame, cutter.prompt.name
     who = f"{'clicks on' if len(cutter.prompt.points_px) else 'box around'} {name!r} in frame {frame.index}"
     if not mask.any():
-        return doubt(
-            who, "no object is found there", "Click in its middle, on parts that look different, or draw a box."
-        )
+        fix = "Click in its middle, on parts that look different, or draw a box."
+        return doubt(who, "no object is found there", fix)
     rows, columns = bounds(mask)
     corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
     patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)
@@ -161,11 +138,10 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
         height = np.median(np.abs(plane_heights(patch, plane)[inside]) / patch.sigma_m[inside])
         if height < _FLAT:
             got = f"{np.count_nonzero(mask)} pixels, flat in what is around it, as a table or a wall is"
-            return doubt(
-                who, got, "If it is not the object, click in the object's middle; else see that depth is in metres."
-            )
+            fix = "If it is not the object, click in the object's middle; else see that depth is in metres."
+            return doubt(who, got, fix)
     alone = np.zeros(frame.shape, bool)
-    box, x = replace(cutter, others_px=np.zeros((0, 2)), rng=np.random.default_rng(0)).start()
+    box, x = cutter.start()
     alone[box.slices] = x > 0.5
     for other, there in others.items():
         if there.any() and (alone & there).sum() > there.sum() / 2:

@@ -23,7 +23,7 @@ from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, of_plane_m, warped
-from p2p_lib.segmenters.builtin.motion import Motions, Past, scene_stays
+from p2p_lib.segmenters.builtin.motion import Past, scene_stays
 from p2p_lib.segmenters.builtin.patch import (
     Box,
     Patch,
@@ -31,12 +31,15 @@ from p2p_lib.segmenters.builtin.patch import (
     dilated,
     holding,
     middle,
+    only,
     parts_of,
     plane_heights,
     support_plane,
 )
-from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start, only
+from p2p_lib.segmenters.builtin.prompted import ROOM_PX, Cutter, doubt_start
 
+#: An object's probability in a box of the image; None where nothing of it is found.
+_Found = tuple[Box, np.ndarray] | None
 _NO_PX = np.zeros((0, 2))
 #: An object whose points agree is cut out in every third frame, in turns, and moved by the optical flow in between,
 _TURNS = 3
@@ -60,12 +63,6 @@ class _Seen:
     def centre_px(self) -> np.ndarray:
         """(2,) middle of the box."""
         return np.array([self.box.left + self.box.right, self.box.top + self.box.bottom]) / 2
-
-    def whole(self, shape: tuple[int, int]) -> np.ndarray:
-        """The mask as an image (H, W) float32."""
-        image = np.zeros(shape, np.float32)
-        image[self.box.slices] = self.mask
-        return image
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,10 +133,8 @@ class BuiltinSegmenter:
             check_prompt(prompt, self.camera)
             check_depth(prompt, frame)
         masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
-        found: dict[str, tuple[Box, np.ndarray] | None] = {}
-        taken = np.zeros(frame.shape, bool)
-        for mask in masks.values():
-            taken |= mask
+        found: dict[str, _Found] = {}
+        taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
         new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
         self._frames += 1
         in_turn = {name for turn, name in enumerate(self._targets) if (self._frames - turn) % _TURNS == 0}
@@ -162,10 +157,9 @@ class BuiltinSegmenter:
                 continue
             target = self._targets[name] = self._learnt(target)
             if name in said:
-                others_px = [p.points_px for n, p in said.items() if n != name]
-                found[name] = self._prompted(
-                    frame, target, said[name], np.concatenate([_NO_PX, *others_px]), hint(name), taken
-                )
+                others_px = np.concatenate([_NO_PX, *(p.points_px for n, p in said.items() if n != name)])
+                cutter = Cutter(frame, self.camera, self.config, self._rng, said[name], others_px)
+                found[name] = self._prompted(cutter, target, hint(name), taken)
                 self._targets[name] = _Target()  # its colours and its size are learnt anew
             else:
                 moved = None if target.seen is None else self._moved(frame, target)
@@ -183,7 +177,7 @@ class BuiltinSegmenter:
         label_of = {name: label for label, name in enumerate(self._targets, 1)}
         for prompt in new:
             others = {name: labels == label for name, label in label_of.items() if name != prompt.name}
-            cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, _NO_PX)
+            cutter = Cutter(frame, self.camera, self.config, np.random.default_rng(0), prompt, _NO_PX)
             doubt_start(cutter, labels == label_of[prompt.name], others)
         self._previous = frame
         return labels
@@ -193,20 +187,12 @@ class BuiltinSegmenter:
         if target.given is None:
             return target
         frame, mask = target.given
-        target = self._updated(frame, target, _seen(frame, mask, self.config.min_px))
+        target = self._updated(frame, target, _seen(frame, mask, self.config.min_px, Box(0, 0, *mask.shape[::-1])))
         return replace(target, given=None, seen=target.seen if frame is self._previous else None)
 
-    def _prompted(
-        self,
-        frame: Frame,
-        target: _Target,
-        prompt: Prompt,
-        others_px: np.ndarray,
-        hint: Hint,
-        taken: np.ndarray,
-    ) -> tuple[Box, np.ndarray] | None:
+    def _prompted(self, cutter: Cutter, target: _Target, hint: Hint, taken: np.ndarray) -> _Found:
         """By what is said of it, and for a correction by where it would have been taken for."""
-        cutter = Cutter(frame, self.camera, self.config, self._rng, prompt, others_px)
+        frame, prompt = cutter.frame, cutter.prompt
         was = np.zeros(frame.shape, bool)
         moved = None if target.seen is None else self._moved(frame, target)
         found = None if prompt.box_px is not None else self._looked_for(frame, target, hint, taken, moved)[1]
@@ -218,9 +204,10 @@ class BuiltinSegmenter:
 
     def _looked_for(
         self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray, moved: _Moved | None
-    ) -> tuple[_Target, tuple[Box, np.ndarray] | None]:
+    ) -> tuple[_Target, _Found]:
         """Where an object is, outside what is ``taken`` (H, W) bool where it was absent; and it, with its past."""
-        target = replace(target, sure=self._sure(hint))
+        agreed = hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
+        target = replace(target, sure=agreed)
         if hint.gone:
             return target, None
         if moved is None or hint.sighted:  # what has been followed is not where the object was found
@@ -235,12 +222,9 @@ class BuiltinSegmenter:
         """Forget an object."""
         del self._targets[name]
 
-    def _shared_out(self, frame: Frame, found: Mapping[str, tuple[Box, np.ndarray] | None]) -> np.ndarray:
-        """The label image of what was found of every object: its probability in a box of the image."""
-        labels = np.zeros(frame.shape, np.int32)
-        if not found:
-            return labels
-        best = np.zeros(frame.shape, np.float32)
+    def _shared_out(self, frame: Frame, found: Mapping[str, _Found]) -> np.ndarray:
+        """The label image of what was found of every object."""
+        labels, best = np.zeros(frame.shape, np.int32), np.zeros(frame.shape, np.float32)
         for label, name in enumerate(self._targets, 1):
             if found.get(name) is not None:
                 box, x = found[name]
@@ -262,9 +246,14 @@ class BuiltinSegmenter:
 
     def _moved(self, frame: Frame, target: _Target) -> _Moved:
         """What was seen of an object a frame ago, moved by the optical flow."""
-        patch = Patch.of(frame, self._box_of_all(target, frame.shape), self.camera, self.config)
+        seen, px_m = target.seen, self._focal_px / target.seen.z_m
+        # Room for all of it to either side of what showed.
+        half = np.maximum(target.size_m / 2, target.room_m) * px_m * (1 + self.config.margin) + ROOM_PX
+        patch = Patch.of(frame, around(seen.centre_px, half, frame.shape), self.camera, self.config)
         before = Patch.like(self._previous, patch.box, patch.cell_px, self.camera)
-        was = before.down(target.seen.whole(frame.shape))
+        image = np.zeros(frame.shape, np.float32)
+        image[seen.box.slices] = seen.mask
+        was = before.down(image)
         prior, z_before = warped(was, before, patch)
         likely, measured, known = prior > 0.5, patch.depth_m > 0, z_before > 0
         jumped = likely & measured & known & (np.abs(patch.depth_m - z_before) > patch.step_m)
@@ -281,7 +270,8 @@ class BuiltinSegmenter:
         if not (core & (patch.depth_m > 0)).any():
             core |= moved.shown & (np.abs(patch.depth_m - target.seen.z_m) < _APART_M)
         plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), self._rng)
-        log_odds, component = by_geometry(patch, core, plane, cfg, self._motions(frame, target, hint))
+        motions = target.past.motions(frame, hint.T_cam_obj) if target.sure else None
+        log_odds, component = by_geometry(patch, core, plane, cfg, motions)
         stays = cfg.prior_weight * np.where(jumped | moved.shown, 0, 2 * prior - 1)
         stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours have as much to say
         # Parts that come into view are connected with those that were seen before.
@@ -297,31 +287,21 @@ class BuiltinSegmenter:
         """Whether an object that was seen is cut out anew, whatever its flow says."""
         return in_turn or not target.sure
 
-    def _sure(self, hint: Hint) -> bool:
-        """Whether enough points agree on a pose."""
-        return hint.T_cam_obj is not None and len(hint.uv_px) >= self.config.find_points
-
-    def _motions(self, frame: Frame, target: _Target, hint: Hint) -> Motions | None:
-        """How an object moved; None where nobody knows."""
-        return target.past.motions(frame, hint.T_cam_obj) if self._sure(hint) else None
-
     def _with_room(self, frame: Frame, target: _Target, hint: Hint) -> _Target:
         """An object with room for parts that move with it, which may reach farther than all that it has shown."""
         cfg, px_m = self.config, self._focal_px / target.seen.z_m
         patch = Patch.of(frame, around(hint.uv_px.mean(0), cfg.reach_m * px_m, frame.shape), self.camera, cfg)
-        motions = self._motions(frame, target, hint)
+        motions = target.past.motions(frame, hint.T_cam_obj)
         if motions is None or not scene_stays(patch, motions):
             return target
         plane = support_plane(patch, patch.depth_m > 0, self._rng)
         _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions)
         if not component.any():
             return target
-        rows, columns = bounds(component)
-        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]]) * patch.cell_px
-        away_px = np.abs(ends + np.array([patch.box.left, patch.box.top]) - target.seen.centre_px).max(0)
+        away_px = np.abs(patch.ends_px(component) - target.seen.centre_px).max(0)
         return replace(target, room_m=away_px / px_m)
 
-    def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> tuple[Box, np.ndarray] | None:
+    def _find(self, frame: Frame, target: _Target, hint: Hint, taken: np.ndarray) -> _Found:
         """Where enough of its points are back, or it is expected, on nothing ``taken`` (H, W) by another object."""
         cfg, uv_px = self.config, hint.uv_px[~in_mask(hint.uv_px, taken)]
         if target.colours is None:
@@ -374,12 +354,6 @@ class BuiltinSegmenter:
         v, u = np.nonzero(part == size.argmax())
         return np.stack([u + patch.box.left, v + patch.box.top], -1).astype(float)
 
-    def _box_of_all(self, target: _Target, shape: tuple[int, int]) -> Box:
-        """Where to look for an object that was seen: room for all of it to either side of what showed."""
-        seen, px_m = target.seen, self._focal_px / target.seen.z_m
-        half = np.maximum(target.size_m / 2, target.room_m) * px_m
-        return around(seen.centre_px, half * (1 + self.config.margin) + ROOM_PX, shape)
-
     def _updated(self, frame: Frame, target: _Target, seen: _Seen | None) -> _Target:
         """What is known of an object after a frame."""
         if seen is None:
@@ -394,18 +368,15 @@ class BuiltinSegmenter:
         return replace(target, seen=seen, colours=colours, size_m=np.maximum(size_m, target.size_m))
 
 
-def _seen(
-    frame: Frame, mask: np.ndarray, min_px: int, box: Box | None = None, z_m: float | None = None
-) -> _Seen | None:
-    """Where a mask (rows, columns) of a box, or of the image, lies; None where it is small.
+def _seen(frame: Frame, mask: np.ndarray, min_px: int, box: Box, z_m: float | None = None) -> _Seen | None:
+    """Where a mask (rows, columns) of a box lies; None where it is small.
 
     z_m  its depth where nothing of it is measured: it is nowhere where that is not known either
     """
-    left, top = (box.left, box.top) if box is not None else (0, 0)
     if np.count_nonzero(mask) < min_px:
         return None
     inner = rows, columns = bounds(mask)
-    box = Box(left + columns.start, top + rows.start, left + columns.stop, top + rows.stop)
+    box = Box(box.left + columns.start, box.top + rows.start, box.left + columns.stop, box.top + rows.stop)
     mask, depth_m = mask[inner], frame.depth_m[box.slices]
     measured = mask & (depth_m > 0)
     z_m = middle(depth_m[measured]) if np.count_nonzero(measured) >= min_px else z_m
