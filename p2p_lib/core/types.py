@@ -6,16 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import Field, dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import cv2
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 #: What can be depth in any unit: so wide that ``p2p check`` still tells millimetres that were taken for metres.
 NEAREST_M, FARTHEST_M = 0.001, 1e4
@@ -119,7 +116,11 @@ class Tracks:
         return Tracks(ids, self.uv_px[at], self.visible[at], self.uncertainty[at])
 
 
-Arrays = TypeVar("Arrays", bound="DataclassInstance")
+class _Dataclass(Protocol):
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+Arrays = TypeVar("Arrays", bound=_Dataclass)
 #: Of a field of :class:`Rows`: what is joined has the first one's.
 SHARED = {"shared": True}
 
