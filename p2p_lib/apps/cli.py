@@ -191,7 +191,7 @@ def _eval_masks(a: argparse.Namespace) -> None:
     _SEQUENCE,
     run_options("settings", "seed", "tracker", "format", "depth_scale", "stop", models="meshes; else measured depth"),
     arg("--queries", type=int, default=256, metavar="N", help="points to follow (default 256)"),
-    arg("--search", choices=("picture", "masks"), default="picture", help="where invisible points are looked for"),
+    arg("--search", choices=("image", "masks"), default="image", help="where invisible points are looked for"),
     _JSON,
 )
 def _eval_tracks(a: argparse.Namespace) -> None:

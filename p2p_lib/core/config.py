@@ -64,10 +64,21 @@ class MethodConfig(_Checked):
         "The object frame starts at the camera (T_cam_obj = I) or at the centroid of the first masked cloud.",
         choices=("camera", "centroid"),
     )
-    motion: bool = _p(True, "Motion is evidence: last poses compete, jumps need support, keypoints have moved along.")
-    redetection: bool = _p(True, "Where few points are seen, their pose tells where to look for the others.")
-    scene: bool = _p(True, "An absent object is searched for by shape and colour where the scene says it was left.")
-    gates: str = _p("all", "A pose has to pass all gates of the life cycle, or none.", choices=("none", "all"))
+    motion: bool = _p(
+        True,
+        "The motion so far is evidence: last poses compete, others need more support, keypoints move along.",
+    )
+    redetection: bool = _p(
+        True, "Tracks that contradict the pose are rejected; where few are seen, it tells where to look for the others."
+    )
+    scene: bool = _p(
+        True, "Absent objects are searched for by shape and colour where scene or motion say, and in their masks."
+    )
+    gates: str = _p(
+        "all",
+        "Starts, poses, keyframes and second maps have to pass all gates and doubts of the life cycle, or none.",
+        choices=("none", "all"),
+    )
     noise: str = _p(
         "sensor",
         "Points have the noise of a depth sensor at their range, or one constant noise each in registration and graph.",
@@ -109,8 +120,8 @@ class TrackingConfig(_Checked):
     """Of the built-in tracker, but for ``forget_after``, which all trackers keep."""
 
     forget_after: int = _p(0, "SH(n): points are dropped after so many invisible frames; 0: never.", "frames", low=0)
-    window_px: int = _p(13, "Side of the Lucas-Kanade window.", "px", low=5, high=63)
-    templates: int = _p(5, "Templates kept of a point's appearance.", low=2, high=20)
+    window_px: int = _p(13, "The Lucas-Kanade window has this side.", "px", low=5, high=63)
+    templates: int = _p(5, "So many templates of a point's appearance are kept.", low=2, high=20)
     update_every: int = _p(3, "Templates, segments and landmarks are updated every so many frames.", "frames", low=1)
     update_scale_change: float = _p(1.35, "A new template is taken when the best one appears scaled by this.", low=1.01)
     update_ncc: float = _p(0.85, "A new template is taken when the best one correlates less.", low=0, high=1)
@@ -198,7 +209,9 @@ class KeypointMapConfig(_Checked):
     max_uncertainty: float = _p(0.3, "A more uncertain track verifies nothing.", "", "paper", low=0, high=1)
     max_scatter_m: float = _p(0.008, "A point is promoted below this median absolute deviation.", "m", "paper", low=0)
     pending_ttl: int = _p(30, "A point is dropped when it is pending for longer.", "frames", "release", low=1)
-    max_points: int = _p(300, "A map keeps at most so many keypoints.", "points", low=10)
+    max_points: int = _p(
+        300, "A map keeps so many keypoints and none that mostly disagrees; 0 keeps all.", "points", low=0
+    )
 
 
 @dataclass(frozen=True)
@@ -353,6 +366,9 @@ def parameters(config: Config, only: str | None = None) -> list[dict[str, Any]]:
         for f in fields(getattr(config, s))
         if key in ("", f.name)
     ]
+    for row in rows:
+        if _PRESETS[config.preset].get(row["key"]) == row["value"]:
+            row["source"] = "paper" if row["key"] in _TEXT else "release"
     if not rows:
         raise BadInput(f"key of {stage}", repr(key), ", ".join(f.name for f in fields(getattr(config, stage))))
     return rows
@@ -360,29 +376,36 @@ def parameters(config: Config, only: str | None = None) -> list[dict[str, Any]]:
 
 _STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.default))
 
-#: The paper's composition, with the release's values where the text is silent.
-_PAPER: dict[str, Any] = {
+#: What the paper's text says, or does without.
+_TEXT: dict[str, Any] = {
     "method.object_frame": "camera",
     "method.motion": False,
     "method.redetection": False,
     "method.scene": False,
     "method.gates": "none",
     "method.noise": "constant",
-    "sampling.max_visible": 50,
     "keypoint_map.cooldown": 0,
-    "registration.iterations": 100,
-    "registration.sample_size": 4,
+    "keypoint_map.max_points": 0,
     "selection.rule": "surface",
-    "tsdf.voxel_m": 0.005,
     "tsdf.carve": False,
     "refinement.residuals": "surface",
+    "factor_graph.max_keyframes": 0,
+}
+#: Where it is silent: the authors' released values.
+_RELEASE: dict[str, Any] = {
+    "depth.max_m": 2.0,
+    "sampling.max_visible": 50,
+    "registration.iterations": 100,
+    "registration.sample_size": 4,
+    "registration.max_uncertainty": 0.3,
+    "tsdf.voxel_m": 0.005,
+    "tsdf.max_voxels": 20_000_000,
     "refinement.max_points": 1500,
     "refinement.huber_m": 0.01,
     "factor_graph.bearing_sigma_rad": 0.01,
     "factor_graph.iterations": 20,
-    "factor_graph.max_keyframes": 0,
 }
-_PRESETS: dict[str, dict[str, Any]] = {"default": {}, "paper": _PAPER}
+_PRESETS: dict[str, dict[str, Any]] = {"default": {}, "paper": _TEXT | _RELEASE}
 
 
 def preset(name: str = "default", seed: int = 0) -> Config:

@@ -57,7 +57,7 @@ _SET = _typed(
     metavar="STAGE.KEY=VALUE",
 )
 _SEED = _typed("of every random choice (default 0)", type=int, metavar="N")
-_DEVICE = _typed("where surfaces are fused and refined: cpu (default), cuda or cuda:N")
+_DEVICE = _typed("where surfaces are kept and fused: cpu (default), cuda or cuda:N")
 _TRACKER = _typed(f"2D point tracker: {', '.join(TRACKERS)} (default {DEFAULT_TRACKER})", metavar="NAME")
 _DETECTOR = _typed(f"source of new points: {', '.join(DETECTORS)} (default {DEFAULT_DETECTOR})", metavar="NAME")
 #: Where masks come from, beside folders. A segmenter's name stands for clicks with that segmenter.

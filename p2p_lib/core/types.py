@@ -1,4 +1,4 @@
-"""The values that pass between the stages: frames, tracks, pose estimates."""
+"""The values that pass between the packages: frames, tracks, pose estimates."""
 
 from __future__ import annotations
 

@@ -58,9 +58,9 @@ class RosRecording:
             got = f"an unreadable recording ({in_a_line(error)})"
             raise BadInput(self.name, got, "a whole bag of ROS 1 or 2") from None
         of = {c.topic: c for c in self._reader.connections}
-        pictures = [topic for topic, c in of.items() if c.msgtype in _IMAGES]
-        depth = depth or _likeliest(pictures, "depth")
-        colour = colour or _likeliest([t for t in pictures if t != depth], "colour")
+        images = [topic for topic, c in of.items() if c.msgtype in _IMAGES]
+        depth = depth or _likeliest(images, "depth")
+        colour = colour or _likeliest([t for t in images if t != depth], "colour")
         info = _info_of(colour, [t for t, c in of.items() if c.msgtype == _INFO])
         for what, topic in (("colour", colour), ("depth", depth), ("camera_info of colour", info)):
             if topic not in of:

@@ -107,7 +107,7 @@ class TrackTask:
             "seed": self.seed,
             "queries": len(queries),
             "frames": len(sequence),
-            "search": "masks" if search else "whole picture",
+            "search": "masks" if search else "whole image",
             "truth": ", ".join(f"{name}: {'mesh' if name in scene.surfaces else 'depth'}" for name in scene.objects),
         }
         return TrackerScore(

@@ -143,10 +143,11 @@ class KeypointMap:
         stale = ~self.promoted & (self._age > cfg.pending_ttl)
         seen = self._agreed + self._disagreed
         wrong = self.promoted & (seen >= _RETIRE_AFTER) & (self._agreed < _RETIRE_SHARE * seen)
-        gone = stale | wrong
+        most = cfg.max_points or len(self)
+        gone = stale | (wrong & (cfg.max_points > 0))
         kept = np.flatnonzero(self.promoted & ~gone)
         usefulness = (self._agreed[kept] + 1) / (self._age[kept] + 1)
-        gone[kept[np.argsort(usefulness, kind="stable")[: max(len(kept) - cfg.max_points, 0)]]] = True
+        gone[kept[np.argsort(usefulness, kind="stable")[: max(len(kept) - most, 0)]]] = True
         removed, ids = self.keys[gone], self.ids[gone]
         for name in self._columns():
             setattr(self, name, getattr(self, name)[~gone])

@@ -223,7 +223,7 @@ class ObjectTracker:
         covariance, mapped = belief.at(T_cam_obj, model, most, told=True)  # a turn that nothing tells bends no map
         with self._stopwatch("map"):
             model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
-            trusted = not life.confirming and (belief.given_turn(covariance) >= MAPPED or not self._gates)
+            trusted = not self._gates or (not life.confirming and belief.given_turn(covariance) >= MAPPED)
             keyframe = due or (trusted and model.keyframe_due(obs, T_cam_obj, agrees))
         model.settle_surface()
         if keyframe:

@@ -294,7 +294,7 @@ class Point2Pose:
     def _apply(self, requests: Mapping[str, Requests]) -> None:
         """The one place where the shared tracker is changed, after all objects have been looked at."""
         rejected = np.concatenate([NO_IDS, *(request.reject for request in requests.values())])
-        if len(rejected):
+        if len(rejected) and self.config.method.redetection:
             self.tracker.reject(rejected)
         for name, request in requests.items():
             dropped = request.drop

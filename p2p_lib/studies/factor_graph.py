@@ -1,7 +1,7 @@
 """Notebook 05: an object that turns before the camera, as keyframes of noisy points for the factor graph.
 
-Simulated, so that the truth is known and hundreds of trials cost seconds. Noise, registration and covariances are
-those of the pipeline.
+Simulated, so that the truth is known and hundreds of trials cost seconds. Noise and registration are those of
+the pipeline; so is the covariance, where no surface refines the pose.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from p2p_lib.core import config
-from p2p_lib.core.config import Config, diff, from_toml, preset
+from p2p_lib.core.config import Config, diff, from_toml, parameters, preset
 from p2p_lib.core.errors import BadInput, MissingData
 
 STAGES = [f.name for f in dataclasses.fields(Config) if dataclasses.is_dataclass(f.default)]
@@ -65,6 +65,7 @@ PAPER_TEXT = {
     "method.object_frame": "camera",
     "method.motion": False,
     "method.redetection": False,
+    "method.scene": False,
     "method.gates": "none",
     "method.noise": "constant",
     "method.surface": True,
@@ -75,6 +76,7 @@ PAPER_TEXT = {
     "keypoint_map.streak": 3,
     "keypoint_map.max_uncertainty": 0.3,
     "keypoint_map.max_scatter_m": 0.008,
+    "keypoint_map.max_points": 0,
     "registration.method": "sequential_ransac",
     "selection.rule": "surface",
     "refinement.residuals": "surface",
@@ -86,6 +88,7 @@ PAPER_TEXT = {
 RELEASE = {
     "lifecycle.min_mask_px": 100,
     "depth.min_m": 0.1,
+    "depth.max_m": 2.0,
     "depth.edge_m": 0.01,
     "sampling.candidates": 512,
     "sampling.points": 30,
@@ -98,6 +101,8 @@ RELEASE = {
     "registration.inlier_m": 0.006,
     "registration.min_inliers": 5,
     "registration.max_hypotheses": 10,
+    "registration.max_uncertainty": 0.3,
+    "tsdf.max_voxels": 20_000_000,
     "tsdf.voxel_m": 0.005,
     "tsdf.truncation_voxels": 5.0,
     "refinement.iterations": 8,
@@ -129,6 +134,23 @@ def test_what_is_said_to_be_the_papers_or_the_releases_is(key):
 # --- presets and their difference --------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("name", "key", "source"),
+    [
+        ("paper", "tsdf.voxel_m", "release"),
+        ("paper", "method.motion", "paper"),
+        ("paper", "tsdf.truncation_voxels", "release"),
+        ("paper", "sampling.r_ideal_px", "ours"),
+        ("default", "tsdf.voxel_m", "ours"),
+    ],
+)
+def test_each_value_says_whose_it_is(name, key, source):
+    (row,) = parameters(preset(name), key)
+    assert row["source"] == source
+    changed = preset(name).with_values({"tsdf.voxel_m": 0.004})
+    assert parameters(changed, "tsdf.voxel_m")[0]["source"] == "ours"
+
+
 def test_default_is_the_dataclasses_own():
     assert preset() == preset("default") == Config()
     assert preset("paper").preset == "paper" and preset("paper", seed=7).seed == 7
@@ -149,7 +171,7 @@ def test_diff_is_the_difference():
 
 
 def test_nothing_is_replaced_by_itself():
-    assert set(config._PAPER) == set(diff())
+    assert set(config._PRESETS["paper"]) == set(diff())
 
 
 def test_unknown_presets_are_refused():

@@ -99,7 +99,7 @@ def test_the_command_prints_one_json_object(made, capsys):
     assert cli.main(words.split()) == 0
     plain = json.loads(capsys.readouterr().out)
     assert plain["tracker"] == "lk" and plain["queries"] == 8 and plain["seed"] == 2
-    assert plain["search"] == "whole picture" and plain["truth"] == "box: mesh, can: mesh"
+    assert plain["search"] == "whole image" and plain["truth"] == "box: mesh, can: mesh"
     assert plain["frames"] > 20 and cli.main([*words.split(), "--stop", "20"]) == 0
     assert json.loads(capsys.readouterr().out)["frames"] == 20
     assert set(plain["jaccard"]) == {"1_px", "2_px", "4_px", "8_px", "16_px"}

@@ -1,11 +1,14 @@
 """The fused volume on each device: near the exact surface, and on CUDA the same as on the CPU."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from p2p_lib.core.config import TsdfConfig
+from p2p_lib.core.config import TsdfConfig, preset
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.method import tsdf
+from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.method.tsdf_grid import TorchGrid
 from tests.method.analytic_scene import CAMERA, LUMP, around, render
@@ -32,6 +35,17 @@ def volume(request, monkeypatch):
         if request.param == "torch on the cpu":
             patch.setattr(tsdf, "CpuGrid", lambda size: TorchGrid(size, "cpu"))
         return fused(request.param.split()[-1])
+
+
+def test_the_device_of_the_configuration_is_that_of_every_objects_surface():
+    torch = pytest.importorskip("torch")
+    method = Point2Pose(CAMERA, replace(preset(), device="cuda"))
+    if not torch.cuda.is_available():
+        with pytest.raises(MissingBackend, match="cuda"):
+            method.add_object("lump")
+    else:
+        method.add_object("lump")
+        assert method.objects["lump"].model.surface._grid.device.type == "cuda"
 
 
 def test_the_surface_lies_on_the_shape(volume):

@@ -228,6 +228,13 @@ def test_keypoints_that_mostly_disagree_go(agreed, disagreed, goes):
     assert points.retire()[0].tolist() == ([0] if goes else [])
 
 
+def test_without_a_bound_every_keypoint_is_kept():
+    points = keypoints(400, replace(CFG, max_points=0))
+    for _ in range(20):
+        points.count(np.ones(400, bool), np.zeros(400, bool))
+    assert not len(points.retire()[0])
+
+
 def test_what_took_no_part_is_not_counted():
     points = keypoints(2)
     for _ in range(40):

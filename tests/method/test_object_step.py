@@ -470,6 +470,12 @@ def test_no_keyframe_before_a_return_is_confirmed():
     assert lump.see(turned(16)).estimate.keyframe
 
 
+def test_without_gates_a_return_makes_a_keyframe_at_once():
+    lump = settled(begun(**{"method.gates": "none"}), [2])
+    assert lump.see(turned(4), mask=np.zeros((CAMERA.height, CAMERA.width), bool)).estimate.T_cam_obj is None
+    assert lump.see(turned(16)).estimate.keyframe
+
+
 def test_points_follow_what_the_graph_finds():
     lump = settled(begun(), [5])
     before = dict(zip(lump.tracker.map.keys.tolist(), lump.tracker.map.p_obj.copy()))

@@ -12,6 +12,10 @@ from tests.method.test_pipeline import CAMERA, HIDDEN, Shy, film
 
 #: Where the film has no occasion for a key: other values of it, and settings that give it one.
 OCCASIONS = {
+    "depth.max_m": ((2.0, 0.6), {}),
+    "keypoint_map.max_points": ((0, 10), {}),
+    "registration.max_uncertainty": ((0.3, 0.0), {}),
+    "tsdf.max_voxels": ((20_000_000, 1000), {}),
     "keypoint_map.cooldown": ((0, 8), {"keypoint_map.keyframe_min_points": 200}),
     "factor_graph.max_keyframes": ((0, 3), {"keypoint_map.keyframe_angle_deg": 1.5}),
     "factor_graph.iterations": ((20, 1), {"keypoint_map.keyframe_angle_deg": 3.0}),
@@ -67,6 +71,22 @@ def test_every_key_in_which_the_presets_differ_changes_a_run(key):
     values, settings = OCCASIONS.get(key, (diff()[key], {}))
     one, other = (run(key, value, settings) for value in values)
     assert any(a.shape != b.shape or not np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other))
+
+
+def test_the_paper_rejects_no_track():
+    """What contradicts a pose, or lies beside the mask of an object that is away, is the tracker's to judge there."""
+
+    class Rejected(Lying):
+        def reject(self, ids):
+            told.append(ids)
+
+    told: list[np.ndarray] = []
+    for name, rejects in (("paper", False), ("default", True)):
+        method = Point2Pose(CAMERA, preset(name), Rejected())
+        method.add_object("left")
+        for frame, masks in film(board=True)[: HIDDEN.stop + 3]:
+            method.step(frame, {"left": masks["left"]})
+        assert bool(told) == rejects
 
 
 @pytest.mark.parametrize("key", ["range_sigma_m", "between_sigma_rad", "between_sigma_m", "bearing_sigma_rad"])
