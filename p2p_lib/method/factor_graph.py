@@ -81,7 +81,7 @@ class ObjectGraph:
         self._new: list[int] = []  # added since the last solve that went well
         self.next_key = 0  # of the keyframe to be added next
         self._joined: set[int] = set()  # keyframes of graphs that it has taken in
-        self._last: _Solution | None = None
+        self._known: tuple[np.ndarray | None, float, float] = None, 0.0, 0.0  # the covariance and the loss, solved last
         self._anchor = se3.IDENTITY
         importlib.import_module("gtsam")  # takes a second that no frame should wait for
 
@@ -181,7 +181,7 @@ class ObjectGraph:
         for key, T_obj_cam in solution.T_obj_cam.items():
             self._keyframes[key].T_obj_cam = T_obj_cam
         self._points |= solution.points
-        self._new, self._last = [], solution
+        self._new, self._known = [], (solution.covariance, solution.error_before, solution.error_after)
         result = self._result(True, solution.note)
         merge_keyframes(self._keyframes, self.config.max_keyframes)
         return result
@@ -221,18 +221,8 @@ class ObjectGraph:
         ids = np.array(sorted(self._points), np.int64)
         poses = [self._keyframes[k].T_obj_cam for k in keys.tolist()]
         p_obj = np.array([self._points[i] for i in ids.tolist()]).reshape(-1, 3)
-        last = self._last
-        return GraphResult(
-            ok,
-            reason,
-            keys,
-            se3.inverse(np.array(poses).reshape(-1, 4, 4)),
-            ids,
-            p_obj,
-            last.covariance if last else None,
-            last.error_before if last else 0.0,
-            last.error_after if last else 0.0,
-        )
+        T_cam_obj = se3.inverse(np.array(poses).reshape(-1, 4, 4))
+        return GraphResult(ok, reason, keys, T_cam_obj, ids, p_obj, *self._known)
 
 
 def _about(p_obj: np.ndarray, sigmas: np.ndarray) -> np.ndarray:

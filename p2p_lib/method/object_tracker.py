@@ -10,6 +10,7 @@ from __future__ import annotations
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -85,11 +86,6 @@ class ObjectTracker:
     def map(self) -> KeypointMap:
         """Its keypoints."""
         return self.known.map
-
-    @property
-    def map_id(self) -> int:
-        """Its number."""
-        return self.known.map_id
 
     @property
     def life(self) -> Lifecycle:
@@ -238,14 +234,18 @@ class ObjectTracker:
         self.life = life.placed(obs.frame.T_world_cam).moved(sure)
         if not belief.told and verdict.status is Status.TRACKED:
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNTOLD)
-        return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, keyframe), requests)
+        estimate = self._estimate(
+            obs, verdict, confidence=sure, covariance=covariance, inliers=best.hypothesis.support, keyframe=keyframe
+        )
+        return ObjectStep(estimate, requests)
 
     def _doubted(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
         """A pose from what contradicts itself: neither map nor surface learns from it, and no track is rejected."""
         self.life = self.life.with_pose(best.T_cam_obj, obs.frame.time_s, verdict, best.lead)
         self.model.settle_surface()
         covariance, sure = self._belief(obs, best).at(best.T_cam_obj, self.model, DOUBTED)
-        return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, False))
+        support = best.hypothesis.support
+        return ObjectStep(self._estimate(obs, verdict, confidence=sure, covariance=covariance, inliers=support))
 
     def _belief(self, obs: Observation, best: Candidate) -> Belief:
         return Belief.of(obs, best, self.known, self.observer, self.config)
@@ -294,7 +294,7 @@ class ObjectTracker:
             forgotten = NO_IDS if gone is None else gone.map.ids[gone.map.ids >= 0]
             if aside:
                 self.aside = self.known.lost()
-            self.known, self._relation = Known(self._new_model(), self.life, self.map_id + 1), Relation()
+            self.known, self._relation = Known(self._new_model(), self.life, self.known.map_id + 1), Relation()
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:
             verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")
@@ -303,7 +303,8 @@ class ObjectTracker:
         self.life = Lifecycle(verdict.status, T_cam_obj, obs.frame.time_s).placed(obs.frame.T_world_cam)
         self._trusted = obs
         # The first pose defines the object frame: it is right by definition, whatever the points are worth.
-        estimate = self._estimate(obs, verdict, len(self.map), 1.0, self.model.covariance, True)
+        covariance, inliers = self.model.covariance, len(self.map)
+        estimate = self._estimate(obs, verdict, confidence=1.0, covariance=covariance, inliers=inliers, keyframe=True)
         return ObjectStep(estimate, replace(requests, drop=forgotten))
 
     def _outgrown(self, obs: Observation) -> bool:
@@ -349,51 +350,36 @@ class ObjectTracker:
     def _joined(self, obs: Observation, best: Candidate, known: Candidate) -> ObjectStep:
         """Two maps that fit this frame become one, in the frame of the older; a keyframe ties what both have seen."""
         T_obj_aside = self._relation.mean
-        if self.aside.map_id < self.map_id:
+        if self.aside.map_id < self.known.map_id:
             life = self.life.in_frame(T_obj_aside)
             obs, best, known = self._exchanged(obs), known, best
             self.life, T_obj_aside = life, se3.inverse(T_obj_aside)
         gone, self.aside, self._relation = self.aside, None, Relation()
         self.model.join(gone.model, T_obj_aside)
         both = replace(best, hypothesis=agreeing_together(best.hypothesis, known.hypothesis))
-        verdict = Verdict(True, Status.RECOVERED, f"maps {self.map_id} and {gone.map_id} are one")
+        verdict = Verdict(True, Status.RECOVERED, f"maps {self.known.map_id} and {gone.map_id} are one")
         step = self._extend(seen_together(obs, obs.aside), both, verdict, due=True)
         return replace(step, estimate=replace(step.estimate, joined=(gone.map_id, T_obj_aside)))
-
-    def _estimate(
-        self, obs: Observation, verdict: Verdict, support: int, sure: float, covariance: np.ndarray, keyframe: bool
-    ) -> PoseEstimate:
-        """The estimate of an accepted frame, whose pose ``life`` has already taken in."""
-        return PoseEstimate(
-            self.name,
-            obs.frame.index,
-            obs.frame.time_s,
-            verdict.status,
-            self.life.T_cam_obj,
-            sure,
-            covariance,
-            reason=verdict.reason,
-            visible_points=int(obs.seen.sum()),
-            inliers=support,
-            last_T_cam_obj=self.life.T_cam_obj,
-            last_seen_s=self.life.seen_s,
-            keyframe=keyframe,
-            map_id=self.map_id,
-        )
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
         self.life = self.life.without_pose(status, obs.mask_px, self.known.carried(obs.frame.time_s))
         self._trusted = self._trusted if status is Status.LOST else None
         reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self.outlook.out_of_view else reason
-        estimate = PoseEstimate(
+        return ObjectStep(self._estimate(obs, Verdict(False, status, reason)))
+
+    def _estimate(self, obs: Observation, verdict: Verdict, **pose: Any) -> PoseEstimate:
+        """The estimate of a frame that ``life`` has already taken in; what it says of a ``pose`` where there is one."""
+        life = self.life
+        return PoseEstimate(
             self.name,
             obs.frame.index,
             obs.frame.time_s,
-            status,
-            reason=reason,
+            verdict.status,
+            life.T_cam_obj if life.has_pose else None,
+            reason=verdict.reason,
             visible_points=int(obs.seen.sum()),
-            last_T_cam_obj=self.life.T_cam_obj,
-            last_seen_s=self.life.seen_s,
-            map_id=self.map_id,
+            last_T_cam_obj=life.T_cam_obj,
+            last_seen_s=life.seen_s,
+            map_id=self.known.map_id,
+            **pose,
         )
-        return ObjectStep(estimate)

@@ -124,11 +124,6 @@ class _Linear:
     rms_m: float
     sigma_m: float
 
-    @property
-    def used(self) -> int:
-        """How many points count."""
-        return len(self.rows)
-
 
 def refine(
     T_cam_obj: np.ndarray,
@@ -234,7 +229,8 @@ class _Problem:
 
     def joint(self, at: _Linear) -> tuple[np.ndarray, np.ndarray]:
         """Information and gradient: the surface's in the directions it determines, the keypoints' in all."""
-        P, information = self.determined(at), self.effective_information(at)
+        held = at.directions[:, at.eigenvalues >= self.floor]
+        P, information = held @ held.T, self.effective_information(at)
         H, g = information * P @ at.H @ P, information * P @ at.g
         if self.keypoints is not None:
             H_k, g_k = self.keypoint_system(at.T)
@@ -243,17 +239,12 @@ class _Problem:
 
     def effective_information(self, at: _Linear) -> float:
         """Independent observations per squared metre: depth errors of neighbours are correlated."""
-        return min(at.used, _INDEPENDENT_POINTS) / at.sigma_m**2
+        return min(len(at.rows), _INDEPENDENT_POINTS) / at.sigma_m**2
 
     @property
     def floor(self) -> float:
         """The eigenvalue from which on a direction counts as determined by the shape; the paper moves all."""
         return self.config.min_eigenvalue if self.config.residuals == "surface_and_keypoints" else 0.0
-
-    def determined(self, at: _Linear) -> np.ndarray:
-        """Projection onto the directions that the shape holds."""
-        held = at.directions[:, at.eigenvalues >= self.floor]
-        return held @ held.T
 
     def step(self, H: np.ndarray, g: np.ndarray, damping: float) -> np.ndarray:
         """Damped Gauss-Newton step in the subspace that holds any information."""
@@ -278,7 +269,7 @@ class _Problem:
         Trimmed points and those off the observed surface cost what the trimming distance does.
         """
         loss = _huber_loss(new.distance_m, self.config.huber_m, at.cut_m)
-        total = self.effective_information(at) / at.used * loss
+        total = self.effective_information(at) / len(at.rows) * loss
         if self.keypoints is not None:
             k = self.keypoints
             off_m = se3.transform(se3.inverse(new.T), k.p_cam) - k.p_obj
@@ -298,7 +289,7 @@ class _Problem:
             se3.orthonormalised(at.T),
             (covariance + covariance.T) / 2,
             at.rms_m,
-            at.used / len(self.p_cam),
+            len(at.rows) / len(self.p_cam),
             tries,
             at.eigenvalues,
             at.directions.T,

@@ -133,7 +133,7 @@ def test_the_gradient_is_the_derivative_of_the_robust_cost():
     keypoints = Keypoints(p_obj, p_cam, np.full(12, 0.002))
     problem = refinement._Problem.about(T, cloud_of(LUMP, VIEW), Exact(LUMP), CONFIG, keypoints)
     at = problem.surface(T, widest_m=0.012)
-    assert (np.abs(at.distance_m) > CONFIG.huber_m).mean() > 0.12 and at.used == len(at.distance_m)
+    assert (np.abs(at.distance_m) > CONFIG.huber_m).mean() > 0.12 and len(at.rows) == len(at.distance_m)
 
     def cost(step):
         return problem.cost(problem.surface(problem.moved(T, step)), at)
