@@ -36,6 +36,9 @@ _RELATIVE_TOLERANCE = 1e-3
 # A variance above this means that nothing determines the direction: a turn, or ten metres.
 _UNDETERMINED = np.repeat([(2 * np.pi) ** 2, 10.0**2], 3)
 
+#: Of a solve: the newest keyframe's covariance (6, 6), and the loss before and after.
+_Known = tuple[np.ndarray | None, float, float]
+
 
 @dataclass(frozen=True, eq=False)
 class GraphResult:
@@ -61,16 +64,6 @@ class GraphResult:
     error_after: float
 
 
-@dataclass(eq=False)
-class _Solution:
-    T_obj_cam: dict[int, np.ndarray]
-    points: dict[int, np.ndarray]
-    covariance: np.ndarray | None
-    error_before: float
-    error_after: float
-    note: str
-
-
 class ObjectGraph:
     """Keyframes and keypoints of one object; ``add_keyframe``, then ``optimise``."""
 
@@ -81,7 +74,7 @@ class ObjectGraph:
         self._new: list[int] = []  # added since the last solve that went well
         self.next_key = 0  # of the keyframe to be added next
         self._joined: set[int] = set()  # keyframes of graphs that it has taken in
-        self._known: tuple[np.ndarray | None, float, float] = None, 0.0, 0.0  # the covariance and the loss, solved last
+        self._known: _Known = None, 0.0, 0.0
         self._anchor = se3.IDENTITY
         importlib.import_module("gtsam")  # takes a second that no frame should wait for
 
@@ -165,10 +158,9 @@ class ObjectGraph:
     def optimise(self) -> GraphResult:
         """Solves for all keyframes and keypoints. Never raises for what the data cannot determine: see ``ok``."""
         reason = self._why_not()
-        solution = None
         if not reason:
             try:
-                solution = _solve(self._keyframes, self._points, self._anchor, self.config)
+                poses, points, known = _solve(self._keyframes, self._points, self._anchor, self.config)
             except (RuntimeError, ValueError) as error:  # gtsam's, for an indeterminate system or impossible noise
                 reason = "gtsam: " + str(error).strip().splitlines()[0]
         if reason:
@@ -178,11 +170,11 @@ class ObjectGraph:
             self._new = []
             self._drop_unseen()
             return self._result(False, f"keyframe {left_out} left out: {reason}" if left_out else reason)
-        for key, T_obj_cam in solution.T_obj_cam.items():
+        for key, T_obj_cam in poses.items():
             self._keyframes[key].T_obj_cam = T_obj_cam
-        self._points |= solution.points
-        self._new, self._known = [], (solution.covariance, solution.error_before, solution.error_after)
-        result = self._result(True, solution.note)
+        self._points |= points
+        self._new, self._known = [], known
+        result = self._result(True, "no covariance: nothing anchors the graph" if known[0] is None else "")
         merge_keyframes(self._keyframes, self.config.max_keyframes)
         return result
 
@@ -237,8 +229,8 @@ def _is_covariance(covariance: np.ndarray | None) -> bool:
 
 def _solve(
     keyframes: dict[int, Keyframe], points: dict[int, np.ndarray], anchor: np.ndarray, config: FactorGraphConfig
-) -> _Solution:
-    """Levenberg-Marquardt over all variables (paper: "Solving the Optimization"), and the newest covariance."""
+) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], _Known]:
+    """Levenberg-Marquardt over all variables (paper: "Solving the Optimization"): T_obj_cam and points by key."""
     import gtsam
 
     first, newest = min(keyframes), max(keyframes)
@@ -267,15 +259,9 @@ def _solve(
     params.setOrdering(ordering)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
     error_before, solved = optimiser.error(), optimiser.optimize()
-    covariance, note = _covariance(graph, solved, ordering, newest)
-    return _Solution(
-        {key: solved.atPose3(_X + key).matrix() for key in keyframes},
-        {i: solved.atPoint3(_P + i) for i in points} if config.observations else {},
-        covariance,
-        error_before,
-        optimiser.error(),
-        note,
-    )
+    poses = {key: solved.atPose3(_X + key).matrix() for key in keyframes}
+    places = {i: solved.atPoint3(_P + i) for i in points} if config.observations else {}
+    return poses, places, (_covariance(graph, solved, ordering, newest), error_before, optimiser.error())
 
 
 def _robust(gaussian: Any, config: FactorGraphConfig) -> Any:
@@ -305,17 +291,17 @@ def _observations(key: int, keyframe: Keyframe, config: FactorGraphConfig) -> An
     return graph
 
 
-def _covariance(graph: Any, solved: Any, ordering: Any, newest: int) -> tuple[np.ndarray | None, str]:
-    """The newest keyframe's marginal covariance, from X's right tangent to that of T_cam_obj.
+def _covariance(graph: Any, solved: Any, ordering: Any, newest: int) -> np.ndarray | None:
+    """The newest keyframe's marginal covariance, from X's right tangent to that of T_cam_obj; None: nothing anchors it.
 
     T_cam_obj exp(eta) is the inverse of X exp(xi) for eta = -Ad_X xi.
     """
     try:
         marginal = graph.linearize(solved).eliminateMultifrontal(ordering).marginalCovariance(_X + newest)
     except (RuntimeError, ValueError):
-        return None, "no covariance: nothing anchors the graph"
+        return None
     A = se3.adjoint(solved.atPose3(_X + newest).matrix())
     covariance = A @ marginal @ A.T
     if not np.isfinite(covariance).all() or (np.diag(covariance) > _UNDETERMINED).any():
-        return None, "no covariance: nothing anchors the graph"
-    return (covariance + covariance.T) / 2, ""
+        return None
+    return (covariance + covariance.T) / 2

@@ -24,7 +24,7 @@ from p2p_lib.method.agreement import scene_ratio, size_ratio
 from p2p_lib.method.confidence import Belief
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.lifecycle import GATES, MAPPED, OUTLINE, Lifecycle, Verdict, off_size
-from p2p_lib.method.object_model import NO_IDS, Known, NewPoints, ObjectModel, Requests
+from p2p_lib.method.object_model import NO_IDS, Known, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.outlook import Outlook, hidden
 from p2p_lib.method.pose_finder import Candidate, PoseFinder
@@ -130,8 +130,8 @@ class ObjectTracker:
         """The object's share of a frame; mask (H, W) bool, None where it is not known, and everybody's tracks."""
         with self._stopwatch("observation"):
             sighted = None if sighting is None else sighting.T_cam_obj
-            obs = self.observer.observe(frame, mask, tracks.select(self.map.ids), sighted)
-            return self._with_aside(replace(obs, given=given, still=still), tracks)
+            obs = self.observer.observe(frame, mask, tracks.select(self.map.ids))
+            return self._with_aside(replace(obs, sighted=sighted, given=given, still=still), tracks)
 
     def seen_anew(self, obs: Observation, tracks: Tracks) -> Observation:
         """The observation again, with tracks that have been added to."""
@@ -226,8 +226,7 @@ class ObjectTracker:
             good = obs.seen & (agrees | ~self.map.promoted)
             if self._gates and not due:  # two maps that become one lie to each other as well as poses tell
                 good &= model.explained(obs, T_cam_obj)
-            new = self._sample(obs)
-            asked = model.insert_keyframe(obs, T_cam_obj, new, good, belief.of_frame, mapped)
+            asked = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), good, belief.of_frame, mapped)
             requests = replace(asked, reject=requests.reject)
         changed = keyframe or not belief.told
         covariance, sure = belief.at(T_cam_obj, model, most) if changed else (covariance, mapped)
@@ -250,8 +249,8 @@ class ObjectTracker:
     def _belief(self, obs: Observation, best: Candidate) -> Belief:
         return Belief.of(obs, best, self.known, self.observer, self.config)
 
-    def _sample(self, obs: Observation) -> NewPoints:
-        """New points where the objective wants them."""
+    def _sample(self, obs: Observation) -> tuple[np.ndarray, np.ndarray]:
+        """New points where the objective wants them: uv_px (M, 2) and p_cam (M, 3)."""
         with self._stopwatch("sampling"):
             cfg = self.config.sampling
             region = usable_region(obs.frame, obs.mask, self.config.depth.edge_m)
@@ -261,7 +260,7 @@ class ObjectTracker:
             candidates, p_cam = candidates.select(liftable), p_cam[liftable]
             count = min(cfg.points, cfg.max_visible - int(obs.seen.sum()))
             chosen = choose(candidates, obs.tracks.uv_px[obs.seen], count, cfg)
-            return NewPoints(candidates.uv_px[chosen], p_cam[chosen])
+            return candidates.uv_px[chosen], p_cam[chosen]
 
     # -- start, and frames without a pose ------------------------------------------------------
 
@@ -280,14 +279,14 @@ class ObjectTracker:
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < cfg.lifecycle.min_mask_px:
             return self._without_pose(obs, without, f"only {len(v)} mask pixels with depth")
-        points = self._sample(obs)
-        few, aside = len(points) < cfg.registration.min_inliers, not (self.model.empty or self._outgrown(obs))
+        uv_px, p_cam = self._sample(obs)
+        few, aside = len(p_cam) < cfg.registration.min_inliers, not (self.model.empty or self._outgrown(obs))
         if few and (aside or self.model.surface is None or not cfg.method.motion):
-            return self._without_pose(obs, without, f"only {len(points)} points to start from")
+            return self._without_pose(obs, without, f"only {len(p_cam)} points to start from")
         T_cam_obj = np.eye(4)
         if cfg.method.object_frame == "centroid":
-            p_cam = self.observer.camera.unproject(np.stack([u, v], -1), obs.frame.depth_m[v, u])
-            T_cam_obj[:3, 3] = np.median(p_cam, 0)
+            seen = self.observer.camera.unproject(np.stack([u, v], -1), obs.frame.depth_m[v, u])
+            T_cam_obj[:3, 3] = np.median(seen, 0)
         verdict, forgotten = Verdict(True, Status.TRACKED), NO_IDS
         if not self.model.empty:
             gone = self.aside if aside else self.known
@@ -297,8 +296,8 @@ class ObjectTracker:
             self.known, self._relation = Known(self._new_model(), self.life, self.known.map_id + 1), Relation()
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:
-            verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")
-        requests = self.model.insert_keyframe(obs, T_cam_obj, points, np.zeros(0, bool))
+            verdict = Verdict(True, Status.DEGRADED, f"only {len(p_cam)} points")
+        requests = self.model.insert_keyframe(obs, T_cam_obj, uv_px, p_cam, np.zeros(0, bool))
         self.model.adopt()
         self.life = Lifecycle(verdict.status, T_cam_obj, obs.frame.time_s).placed(obs.frame.T_world_cam)
         self._trusted = obs

@@ -73,14 +73,12 @@ class Observer:
     def __init__(self, camera: Camera, config: DepthConfig, cloud_points: int):
         self.camera, self.config, self.cloud_points = camera, config, cloud_points
 
-    def observe(
-        self, frame: Frame, mask: np.ndarray | None, tracks: Tracks, sighted: np.ndarray | None = None
-    ) -> Observation:
+    def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
         """The observation of an object whose points have these ``tracks``."""
         cloud = np.zeros((0, 3))
         if mask is not None:
             cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
-        return Observation(frame, mask, tracks, self._lifted(frame, mask, tracks), cloud, sighted)
+        return Observation(frame, mask, tracks, self._lifted(frame, mask, tracks), cloud)
 
     def with_tracks(self, obs: Observation, tracks: Tracks) -> Observation:
         """The observation with these tracks of the object's points instead of its own."""

@@ -340,8 +340,9 @@ class Point2Pose:
             return masks
         with self.stopwatch("segmentation"):
             sought = [name for name in self.segmenter.names if name in masks and masks[name] is None]
-            hints = _Hints(sought, lambda name: self._hint(self.objects[name], frame, sightings.get(name)))
-            self._apply({name: hints.requests(name) for name in sought if self.objects[name].outlook.sought})
+            hint = cache(lambda name: self._hint(self.objects[name], frame, sightings.get(name)))
+            hints = _Hints(sought, lambda name: hint(name)[0])
+            self._apply({name: hint(name)[1] for name in sought if self.objects[name].outlook.sought})
             labels = self.segmenter.segment(frame, said.values(), hints)
             label_of = {name: label for label, name in enumerate(self.segmenter.names, 1)}
             looked_after = [name for name, mask in masks.items() if mask is None and name in label_of]
@@ -383,19 +384,15 @@ def _check_unit(frame: Frame) -> None:
 
 
 class _Hints(Mapping[str, Hint]):
-    """The hints of some objects, each made when it is first asked for: they cost, and a segmenter needs but some."""
+    """The hints of some objects, each made when it is asked for: they cost, and a segmenter needs but some."""
 
-    def __init__(self, names: Sequence[str], make: Callable[[str], tuple[Hint, Requests]]):
-        self._names, self._make = names, cache(make)
+    def __init__(self, names: Sequence[str], make: Callable[[str], Hint]):
+        self._names, self._make = names, make
 
     def __getitem__(self, name: str) -> Hint:
         if name not in self._names:
             raise KeyError(name)
-        return self._make(name)[0]
-
-    def requests(self, name: str) -> Requests:
-        """What an object wants of the tracker before anybody segments."""
-        return self._make(name)[1]
+        return self._make(name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
