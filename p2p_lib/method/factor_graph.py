@@ -168,7 +168,8 @@ class ObjectGraph:
             for key in self._new:
                 del self._keyframes[key]
             self._new = []
-            self._drop_unseen()
+            seen = {i for keyframe in self._keyframes.values() for i in keyframe.ids.tolist()}
+            self._points = {i: p for i, p in self._points.items() if i in seen}
             return self._result(False, f"keyframe {left_out} left out: {reason}" if left_out else reason)
         for key, T_obj_cam in poses.items():
             self._keyframes[key].T_obj_cam = T_obj_cam
@@ -203,10 +204,6 @@ class ObjectGraph:
             if shared < _ANCHORING_POINTS:
                 return f"{shared} points shared with earlier keyframes and no relative pose"
         return ""
-
-    def _drop_unseen(self) -> None:
-        seen = {i for keyframe in self._keyframes.values() for i in keyframe.ids.tolist()}
-        self._points = {i: p for i, p in self._points.items() if i in seen}
 
     def _result(self, ok: bool, reason: str) -> GraphResult:
         keys = np.array(sorted(self._keyframes), np.int64)

@@ -21,14 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from p2p_lib.core.backends import (
-    DEFAULT_DETECTOR,
-    DEFAULT_SEGMENTER,
-    DEFAULT_TRACKER,
-    make_detector,
-    make_segmenter,
-    make_tracker,
-)
+from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import uninterrupted
 from p2p_lib.core.config import Config, preset
@@ -68,19 +61,19 @@ class Point2Pose:
         self,
         camera: Camera,
         config: Config | str | None = None,
-        tracker: str | PointTracker = DEFAULT_TRACKER,
-        detector: str = DEFAULT_DETECTOR,
-        segmenter: str | Segmenter = DEFAULT_SEGMENTER,
+        tracker: str | PointTracker = backends.DEFAULT_TRACKER,
+        detector: str = backends.DEFAULT_DETECTOR,
+        segmenter: str | Segmenter = backends.DEFAULT_SEGMENTER,
     ):
         self.camera = camera
         self.config = preset(config) if isinstance(config, str) else config or preset()
         if not isinstance(self.config, Config):
             raise BadInput("config", type(config).__name__, 'a Config, or the name of a preset: "default", "paper"')
         self._rng = np.random.default_rng(self.config.seed)
-        self.tracker = make_tracker(tracker, self.config.tracking, self._rng)
-        self.detector = make_detector(detector, self.config.sampling, self._rng)
+        self.tracker = backends.make_tracker(tracker, self.config.tracking, self._rng)
+        self.detector = backends.make_detector(detector, self.config.sampling, self._rng)
         rng = np.random.default_rng([self.config.seed, 1])
-        self.segmenter = make_segmenter(segmenter, camera, self.config.segmentation, rng)
+        self.segmenter = backends.make_segmenter(segmenter, camera, self.config.segmentation, rng)
         scene_rng = np.random.default_rng([self.config.seed, 2])
         self.scene = Scene(camera, self.config.depth, scene_rng) if self.config.method.scene else None
         self.objects: dict[str, ObjectTracker] = {}
@@ -140,14 +133,9 @@ class Point2Pose:
         self._said[name] = prompt
 
     def _begin(self, name: str) -> None:
+        rng = np.random.default_rng([self.config.seed, *name.encode()])
         self.objects[name] = ObjectTracker(
-            name,
-            self.camera,
-            self.config,
-            self.detector,
-            np.random.default_rng([self.config.seed, *name.encode()]),
-            self.stopwatch,
-            self._beside,
+            name, self.camera, self.config, self.detector, rng, self.stopwatch, self._beside
         )
 
     def remove_object(self, name: str) -> None:
@@ -258,8 +246,8 @@ class Point2Pose:
 
     def _sightings(self, frame: Frame, masks: Masks, objects: Mapping[str, ObjectTracker]) -> dict[str, Sighting]:
         """Sought objects that show by shape and colour; the tracker looks for their points there."""
-        sought = {name: obj for name, obj in objects.items() if obj.outlook.sought}
-        seen = {name: obj.observe(frame, masks[name], self.tracks) for name, obj in sought.items()}
+        sought = [name for name, obj in objects.items() if obj.outlook.sought]
+        seen = {name: objects[name].observe(frame, masks[name], self.tracks) for name in sought}
         looked = {name: objects[name].outlook.sighted(obs) for name, obs in seen.items()}
         found = {name: sighting for name, sighting in looked.items() if sighting is not None}
         self._suggest({name: objects[name].outlook.points_px(seen[name], at.T_cam_obj) for name, at in found.items()})

@@ -11,7 +11,7 @@ can join (texture holds what shape leaves free), and the result says how well ea
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -21,6 +21,9 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import RefinementConfig
 from p2p_lib.method import observability
+
+if TYPE_CHECKING:
+    from p2p_lib.method.tsdf import TsdfVolume
 
 #: Fewer points on the observed surface than this determine nothing.
 MIN_POINTS = 10
@@ -34,30 +37,9 @@ _TOLERANCE = 0.2
 _MAD_TRIM = 2.5
 #: Depth errors of neighbours are correlated: together, the points are worth so many independent ones.
 _INDEPENDENT_POINTS = 100
-#: Step of the numeric gradient (the release's).
-_GRADIENT_VOXELS = 0.5
 #: No map is exact to less than this share of its voxels, however little the points scatter.
 _SIGMA_FLOOR_VOXELS = 0.25
 _MAD_TO_SIGMA = 1.4826
-
-
-class Surface(Protocol):
-    """What refinement asks of a volume; :class:`p2p_lib.method.tsdf.TsdfVolume` is one."""
-
-    tau_m: float
-    voxel_m: float
-
-    def corners_m(self) -> np.ndarray:
-        """(8, 3) corners that bound it in the object frame."""
-        ...
-
-    def query(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance in metres and validity at points of the object frame."""
-        ...
-
-    def query_with_gradient(self, p_obj: np.ndarray, step_voxels: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same with the gradient in between."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +110,7 @@ class _Linear:
 def refine(
     T_cam_obj: np.ndarray,
     p_cam: np.ndarray,
-    volume: Surface,
+    volume: TsdfVolume,
     config: RefinementConfig,
     *,
     keypoints: Keypoints | None = None,
@@ -154,7 +136,7 @@ def refine(
 @dataclass(frozen=True, eq=False)
 class _Problem:
     p_cam: np.ndarray
-    volume: Surface
+    volume: TsdfVolume
     config: RefinementConfig
     keypoints: Keypoints | None
     centre: np.ndarray  # of the cloud, object frame
@@ -201,7 +183,7 @@ class _Problem:
         is taken from ``beside``, a pose nearby, where there is one: it hardly changes.
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
-        value, gradient, valid = self.volume.query_with_gradient(p_obj, _GRADIENT_VOXELS)
+        value, gradient, valid = self.volume.query_with_gradient(p_obj)
         huber_m, least_m = self.config.huber_m, max(self.config.huber_m, widest_m)
         # The least standard deviation of a distance, and where the distance is no longer known.
         floor_m, reach_m = _SIGMA_FLOOR_VOXELS * self.volume.voxel_m, 0.98 * self.volume.tau_m
@@ -383,7 +365,7 @@ def _keypoint_system(
     return H, g
 
 
-def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:
+def surface_distances(volume: TsdfVolume, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H, N) absolute TSDF value in metres of the points p_cam (N, 3) under poses (H, 4, 4).
 
     Its mean over the points is the paper's measure for choosing a hypothesis. A point that falls where nothing was
@@ -415,7 +397,7 @@ def _usable_keypoints(keypoints: Keypoints | None, config: RefinementConfig) -> 
 _STRIDE = 2
 
 
-def surface_distance(volume: Surface, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray) -> np.ndarray:
+def surface_distance(volume: TsdfVolume, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H, W) float32 signed distance of each measured pixel to the surface under a pose, in metres.
 
     Positive in front of it, infinite off the volume; NaN where it is not known. Every second pixel is asked, where

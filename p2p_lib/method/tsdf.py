@@ -33,6 +33,8 @@ _PADDING_M = 0.02
 _REGION_POINTS = 4000
 #: A jump in sorted depth that separates the object from whatever else the mask caught.
 _DEPTH_GAP_M = 0.05
+#: Step of the numeric gradient (the release's).
+_GRADIENT_VOXELS = 0.5
 #: Annotated poses of real datasets are rounded; fusing needs an affine map only, so they are taken as they come.
 _POSE_TOLERANCE = 5e-3
 #: Background nearer than this to the mask does not carve: mask and pose are good to a pixel or two.
@@ -226,11 +228,8 @@ class TsdfVolume:
         depth_m, mask = np.asarray(depth_m), np.asarray(mask, bool)
         want = (camera.height, camera.width)
         if depth_m.shape != want or mask.shape != want or np.shape(rgb) != (*want, 3):
-            raise BadInput(
-                "tsdf image",
-                f"depth {depth_m.shape}, mask {mask.shape}, rgb {np.shape(rgb)}",
-                f"{want} as the camera",
-            )
+            got = f"depth {depth_m.shape}, mask {mask.shape}, rgb {np.shape(rgb)}"
+            raise BadInput("tsdf image", got, f"{want} as the camera")
         rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         if len(rows) == 0:
             return None
@@ -358,17 +357,15 @@ class TsdfVolume:
         value, valid = self._sample(p_obj.reshape(-1, 3), np.zeros((1, 3)))
         return np.where(valid, value[0], 0.0).reshape(p_obj.shape[:-1]), valid.reshape(p_obj.shape[:-1])
 
-    def query_with_gradient(
-        self, p_obj: np.ndarray, step_voxels: float = 0.5
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Value in metres and its numeric gradient (no unit) by central differences over +- ``step_voxels``.
+    def query_with_gradient(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Value in metres and its numeric gradient (no unit) by central differences over +- half a voxel.
 
         Points (N, 3) to (value_m (N,), gradient (N, 3), valid (N,)); valid where the value and all six
         neighbours are, and both are 0 where not.
         """
-        offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * step_voxels
+        offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * _GRADIENT_VOXELS
         value, valid = self._sample(np.asarray(p_obj, float).reshape(-1, 3), offsets)
-        gradient = (value[1:4] - value[4:7]).T / (2 * step_voxels * self.voxel_m)
+        gradient = (value[1:4] - value[4:7]).T / (2 * _GRADIENT_VOXELS * self.voxel_m)
         return np.where(valid, value[0], 0.0), np.where(valid[:, None], gradient, 0.0), valid
 
     def _sample(self, p_obj: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

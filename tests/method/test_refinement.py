@@ -35,8 +35,8 @@ class Exact:
     def query(self, p):
         return np.clip(self.sdf(p), -self.tau_m, self.tau_m), np.isfinite(p).all(-1)
 
-    def query_with_gradient(self, p, step_voxels):
-        h = step_voxels * self.voxel_m
+    def query_with_gradient(self, p):
+        h = 0.5 * self.voxel_m
         gradient = [(self.query(p + h * e)[0] - self.query(p - h * e)[0]) / (2 * h) for e in np.eye(3)]
         value, valid = self.query(p)
         return value, np.stack(gradient, -1), valid
