@@ -129,9 +129,8 @@ class ObjectTracker:
     ) -> Observation:
         """The object's share of a frame; mask (H, W) bool, None where it is not known, and everybody's tracks."""
         with self._stopwatch("observation"):
-            sighted = None if sighting is None else sighting.T_cam_obj
             obs = self.observer.observe(frame, mask, tracks.select(self.map.ids))
-            return self._with_aside(replace(obs, sighted=sighted, given=given, still=still), tracks)
+            return self._with_aside(replace(obs, sighting=sighting, given=given, still=still), tracks)
 
     def seen_anew(self, obs: Observation, tracks: Tracks) -> Observation:
         """The observation again, with tracks that have been added to."""
@@ -140,7 +139,7 @@ class ObjectTracker:
     def _with_aside(self, obs: Observation, tracks: Tracks) -> Observation:
         if self.aside is None:
             return obs
-        same = replace(obs, sighted=None, aside=None)
+        same = replace(obs, sighting=None, aside=None)
         return replace(obs, aside=self.observer.with_tracks(same, tracks.select(self.aside.map.ids)))
 
     def step(self, obs: Observation) -> ObjectStep:

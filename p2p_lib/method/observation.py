@@ -15,6 +15,7 @@ from p2p_lib.core.depth import depth_noise_m, in_range, lift, off_edges
 from p2p_lib.core.image import bounds, in_mask
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.method.agreement import outline_share
+from p2p_lib.recovery.search import Sighting
 
 #: Depth this near the mask's border mixes the object with what is behind it.
 _BORDER_PX = 2
@@ -28,14 +29,14 @@ _HIDDEN_M = 0.015
 class Observation:
     """One frame's share of one object; rows are those of its keypoint map.
 
-    mask     (H, W) bool; None where no mask is known
-    tracks   of the map's points
-    p_cam    (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
-    cloud    (M, 3) depth points in the mask, camera frame
-    sighted  (4, 4) T_cam_obj where an absent object was found by shape and colour; None where it was not
-    given    whether the caller vouches for the mask; else the segmenter made it
-    still    whether the image is the same as for a while
-    aside    the same of a second map of the object, which is put aside; None where there is none
+    mask      (H, W) bool; None where no mask is known
+    tracks    of the map's points
+    p_cam     (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
+    cloud     (M, 3) depth points in the mask, camera frame
+    sighting  where an absent object was found by shape and colour; None where it was not
+    given     whether the caller vouches for the mask; else the segmenter made it
+    still     whether the image is the same as for a while
+    aside     the same of a second map of the object, which is put aside; None where there is none
     """
 
     frame: Frame
@@ -43,7 +44,7 @@ class Observation:
     tracks: Tracks
     p_cam: np.ndarray
     cloud: np.ndarray
-    sighted: np.ndarray | None = None
+    sighting: Sighting | None = None
     given: bool = True
     still: bool = False
     aside: Observation | None = None

@@ -337,7 +337,7 @@ class Point2Pose:
             return masks | {name: labels == label_of[name] for name in looked_after}
 
     def _hint(self, obj: ObjectTracker, frame: Frame, sighting: Sighting | None) -> tuple[Hint, Requests]:
-        return obj.outlook.hint(obj.observe(frame, None, self.tracks, sighting), sighting)
+        return obj.outlook.hint(obj.observe(frame, None, self.tracks, sighting))
 
     def _track(self, frame: Frame, masks: dict[str, np.ndarray | None]) -> Tracks:
         """All objects' points in a single pass of the 2D tracker."""

@@ -84,8 +84,8 @@ class PoseFinder:
             if use.sum() < _FEW_KEYPOINTS:
                 use = certain
             priors = known.life.motion_priors() or self._carried_on(obs, known) if with_motion else {}
-            if obs.sighted is not None:
-                priors = {"sighting": obs.sighted, **priors}
+            if obs.sighting is not None:
+                priors = {"sighting": obs.sighting.T_cam_obj, **priors}
             found = self._hypotheses(obs, known, use, priors)
             most = max((h.support for h in found), default=0)
             if priors and cfg.method != "svd" and most < cfg.contradicted * use.sum():

@@ -376,8 +376,8 @@ class TsdfVolume:
         value = self._grid.at(index, offsets)
         return value * self.tau_m, ~np.isnan(value.sum(0))
 
-    def mesh(self, min_weight: float = 1.0, min_component: float = 0.1) -> trimesh.Trimesh:
+    def mesh(self, min_component: float = 0.1) -> trimesh.Trimesh:
         """The zero level with vertex colours, see :func:`p2p_lib.method.mesh.extract`."""
         from p2p_lib.method.mesh import extract
 
-        return extract(self, min_weight, min_component)
+        return extract(self, min_component)

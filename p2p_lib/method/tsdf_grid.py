@@ -16,8 +16,6 @@ from p2p_lib.core.errors import MissingBackend
 if TYPE_CHECKING:
     import torch
 
-#: A weight below this is what rounding leaves of observations that were all taken out again.
-NO_WEIGHT = 1e-3
 #: A voxel nearer than this, m, is behind the camera.
 _BEHIND_M = 1e-6
 #: Voxels that torch handles at once: its temporaries take a hundred bytes of each.
@@ -125,8 +123,8 @@ def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, h
                 phi, at = min(d / tau_m, 1.0), (i - first[0], j - first[1], k - first[2])
                 total[at] += weight * phi
                 count[at] += weight
-                if weight < 0 and count[at] < NO_WEIGHT:
-                    total[at], count[at], value[at] = 0.0, 0.0, np.nan
+                if count[at] == 0:  # all were taken out again: what the total still holds is rounding
+                    total[at], value[at] = 0.0, np.nan
                 else:
                     value[at] = total[at] / count[at]
                 if phi < 1:
@@ -201,9 +199,7 @@ class TorchGrid(CpuGrid):
         total, count = self.total.view(-1), self.weight.view(-1)
         new_total, new_count = total[at].add_(phi.float(), alpha=weight), count[at].add_(weight)
         if weight < 0:
-            gone = new_count < NO_WEIGHT
-            new_total.masked_fill_(gone, 0.0)
-            new_count.masked_fill_(gone, 0.0)
+            new_total.masked_fill_(new_count == 0, 0.0)
         total[at], count[at] = new_total, new_count
         # 0 / 0 is NaN, which is what an unobserved voxel holds.
         self.value.view(-1)[at] = new_total / new_count
