@@ -114,8 +114,6 @@ def _merge(kept: Keyframe, gone: Keyframe) -> None:
     moved_sigma *= _MOVED_SIGMA
     ids = np.concatenate([kept.ids, gone.ids])
     p_cam, sigma = np.concatenate([kept.p_cam, moved]), np.concatenate([kept.sigma, moved_sigma])
-    if not len(ids):
-        return
     merged, row = np.unique(ids, return_inverse=True)
     information = sigma**-2
     total = _sums(row, information)

@@ -76,9 +76,8 @@ class Observer:
 
     def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
         """The observation of an object whose points have these ``tracks``."""
-        cloud = np.zeros((0, 3))
-        if mask is not None:
-            cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
+        nothing = np.zeros((0, 3))
+        cloud = nothing if mask is None else sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
         return Observation(frame, mask, tracks, self._lifted(frame, mask, tracks), cloud)
 
     def with_tracks(self, obs: Observation, tracks: Tracks) -> Observation:

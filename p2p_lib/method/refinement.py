@@ -158,7 +158,9 @@ class _Problem:
         damping, converged, tries = _DAMPING, False, 0
         # Wide at first: far from the solution, the few points that hold a direction look like outliers.
         at = self.surface(T, self.volume.tau_m / 2)
-        while tries < self.config.iterations and at is not None and not converged:
+        if at is None:
+            return Refinement(T, reason="the cloud lies beyond the surface's truncation")
+        while tries < self.config.iterations and not converged:
             tries += 1
             step = self.clipped(self.step(*self.joint(at), damping))
             nearby = at if np.linalg.norm(step) < self.volume.voxel_m else None
@@ -169,8 +171,6 @@ class _Problem:
                 at, damping = new, damping / _DAMPING_FACTOR
             else:
                 damping = max(damping, 1e-4) * _DAMPING_FACTOR**2
-        if at is None:
-            return Refinement(T, iterations=tries, reason="the cloud lies beyond the surface's truncation")
         eigenvalues, directions = self.eigen(at.rows, at.J)
         return self.result(replace(at, eigenvalues=eigenvalues, directions=directions), tries)
 
