@@ -80,20 +80,19 @@ class TsdfVolume:
         config: TsdfConfig,
         *,
         origin_m: np.ndarray | None = None,
-        shape: tuple[int, int, int] | None = None,
+        shape: tuple[int, ...] = (0, 0, 0),
         device: str = "cpu",
     ):
         self.config = config
         self.voxel_m, self.tau_m = config.voxel_m, config.voxel_m * config.truncation_voxels
-        self.grows = shape is None
+        self.grows = 0 in shape
         self.anchor_m = np.zeros(3) if origin_m is None else np.asarray(origin_m, float)
-        if shape is not None and np.prod(shape) > config.max_voxels:
+        if np.prod(shape) > config.max_voxels:
             raise BadInput("tsdf shape", "x".join(map(str, shape)), f"at most {config.max_voxels} voxels")
         self._views: dict[int, _View] = {}
         self._total = 0  # of all weights
         self.lo = np.zeros(3, int)
-        size = (0, 0, 0) if shape is None else tuple(map(int, shape))
-        self._grid = CpuGrid(size) if device == "cpu" else TorchGrid(size, device)
+        self._grid = CpuGrid(shape) if device == "cpu" else TorchGrid(shape, device)
 
     # -- state ---------------------------------------------------------------------------------
 
