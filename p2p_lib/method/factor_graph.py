@@ -11,7 +11,7 @@ State is kept as plain arrays, so that a solve that fails leaves nothing behind.
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,9 @@ _LAMBDA = 1e-4
 _RELATIVE_TOLERANCE = 1e-3
 # A variance above this means that nothing determines the direction: a turn, or ten metres.
 _UNDETERMINED = np.repeat([(2 * np.pi) ** 2, 10.0**2], 3)
+
+#: Of a solve: the newest keyframe's covariance (6, 6), and the loss before and after.
+_Known = tuple[np.ndarray | None, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +64,6 @@ class GraphResult:
     error_after: float
 
 
-@dataclass(eq=False)
-class _Solution:
-    T_obj_cam: dict[int, np.ndarray]
-    points: dict[int, np.ndarray]
-    covariance: np.ndarray | None
-    error_before: float
-    error_after: float
-    note: str = field(default="")
-
-
 class ObjectGraph:
     """Keyframes and keypoints of one object; ``add_keyframe``, then ``optimise``."""
 
@@ -79,9 +72,9 @@ class ObjectGraph:
         self._keyframes: dict[int, Keyframe] = {}
         self._points: dict[int, np.ndarray] = {}
         self._new: list[int] = []  # added since the last solve that went well
-        self._next_key = 0
+        self.next_key = 0  # of the keyframe to be added next
         self._joined: set[int] = set()  # keyframes of graphs that it has taken in
-        self._last: _Solution | None = None
+        self._known: _Known = None, 0.0, 0.0
         self._anchor = se3.IDENTITY
         importlib.import_module("gtsam")  # takes a second that no frame should wait for
 
@@ -89,11 +82,6 @@ class ObjectGraph:
     def keys(self) -> tuple[int, ...]:
         """The keyframes that are held, oldest first: those that were merged into others are not."""
         return tuple(sorted(self._keyframes))
-
-    @property
-    def next_key(self) -> int:
-        """The key of the keyframe to be added next."""
-        return self._next_key
 
     def add_keyframe(
         self,
@@ -122,10 +110,12 @@ class ObjectGraph:
         if not len(ids) == len(p_cam) == len(start) == len(np.unique(ids)):
             got = f"{len(np.unique(ids))} distinct of {len(ids)} ids, {len(p_cam)} p_cam, {len(start)} p_obj_init"
             raise BadInput("keyframe points", got, "distinct ids and a row for each")
-        sigma = np.stack([np.broadcast_to(s, ids.shape) for s in self._noise(sigma_rad, sigma_m)], -1)
+        sigma_rad = self.config.bearing_sigma_rad if sigma_rad is None else sigma_rad
+        sigma_m = self.config.range_sigma_m if sigma_m is None else sigma_m
+        sigma = np.stack([np.broadcast_to(s, ids.shape) for s in (sigma_rad, sigma_m)], -1)
         usable = np.isfinite(p_cam).all(1) & np.isfinite(start).all(1) & (np.linalg.norm(p_cam, axis=1) > 1e-6)
         usable &= (np.isfinite(sigma) & (sigma > 0)).all(1)
-        key, link = self._next_key, None
+        key, link = self.next_key, None
         if self._keyframes:
             link = self._link(T_obj_cam, start[usable], covariance)
         else:
@@ -134,7 +124,7 @@ class ObjectGraph:
         for i, p in zip(ids[usable].tolist(), start[usable], strict=True):
             self._points.setdefault(i, p)
         self._new.append(key)
-        self._next_key += 1
+        self.next_key += 1
         return key
 
     def join(self, other: ObjectGraph, T_obj_other: np.ndarray, point_shift: int) -> None:
@@ -143,7 +133,7 @@ class ObjectGraph:
         Ids of its points grow by ``point_shift``. A loose relative pose ties its first keyframe to the newest one here;
         keyframes to come that see points of both tie them well.
         """
-        shift, p_obj = self._next_key, se3.transform(T_obj_other, np.array([*other._points.values()]).reshape(-1, 3))
+        shift, p_obj = self.next_key, se3.transform(T_obj_other, np.array([*other._points.values()]).reshape(-1, 3))
         for key, k in other._keyframes.items():
             T_obj_cam, link = T_obj_other @ k.T_obj_cam, k.link
             if link is None:
@@ -153,7 +143,7 @@ class ObjectGraph:
             self._keyframes[key + shift] = Keyframe(T_obj_cam, k.ids + point_shift, k.p_cam, k.sigma, link)
         self._points |= {i + point_shift: p for i, p in zip(other._points, p_obj, strict=True)}
         self._joined |= {key + shift for key in other._keyframes}
-        self._next_key += other._next_key
+        self.next_key += other.next_key
 
     def forget(self, point_ids: np.ndarray) -> None:
         """Takes points and all their observations out of the graph (a keypoint that the map retired)."""
@@ -168,10 +158,9 @@ class ObjectGraph:
     def optimise(self) -> GraphResult:
         """Solves for all keyframes and keypoints. Never raises for what the data cannot determine: see ``ok``."""
         reason = self._why_not()
-        solution = None
         if not reason:
             try:
-                solution = _solve(self._keyframes, self._points, self._anchor, self.config)
+                poses, points, known = _solve(self._keyframes, self._points, self._anchor, self.config)
             except (RuntimeError, ValueError) as error:  # gtsam's, for an indeterminate system or impossible noise
                 reason = "gtsam: " + str(error).strip().splitlines()[0]
         if reason:
@@ -179,22 +168,16 @@ class ObjectGraph:
             for key in self._new:
                 del self._keyframes[key]
             self._new = []
-            self._drop_unseen()
+            seen = {i for keyframe in self._keyframes.values() for i in keyframe.ids.tolist()}
+            self._points = {i: p for i, p in self._points.items() if i in seen}
             return self._result(False, f"keyframe {left_out} left out: {reason}" if left_out else reason)
-        for key, T_obj_cam in solution.T_obj_cam.items():
+        for key, T_obj_cam in poses.items():
             self._keyframes[key].T_obj_cam = T_obj_cam
-        self._points |= solution.points
-        self._new, self._last = [], solution
-        result = self._result(True, solution.note)
+        self._points |= points
+        self._new, self._known = [], known
+        result = self._result(True, "no covariance: nothing anchors the graph" if known[0] is None else "")
         merge_keyframes(self._keyframes, self.config.max_keyframes)
         return result
-
-    def _noise(self, sigma_rad: np.ndarray | float | None, sigma_m: np.ndarray | float | None) -> tuple[Any, Any]:
-        cfg = self.config
-        return (
-            cfg.bearing_sigma_rad if sigma_rad is None else sigma_rad,
-            cfg.range_sigma_m if sigma_m is None else sigma_m,
-        )
 
     def _link(self, T_obj_cam: np.ndarray, p_obj: np.ndarray, covariance: np.ndarray | None) -> Link:
         """The relative pose to the newest keyframe; its noise moved from the object to X's right tangent."""
@@ -222,27 +205,13 @@ class ObjectGraph:
                 return f"{shared} points shared with earlier keyframes and no relative pose"
         return ""
 
-    def _drop_unseen(self) -> None:
-        seen = {i for keyframe in self._keyframes.values() for i in keyframe.ids.tolist()}
-        self._points = {i: p for i, p in self._points.items() if i in seen}
-
     def _result(self, ok: bool, reason: str) -> GraphResult:
         keys = np.array(sorted(self._keyframes), np.int64)
         ids = np.array(sorted(self._points), np.int64)
         poses = [self._keyframes[k].T_obj_cam for k in keys.tolist()]
         p_obj = np.array([self._points[i] for i in ids.tolist()]).reshape(-1, 3)
-        last = self._last
-        return GraphResult(
-            ok,
-            reason,
-            keys,
-            se3.inverse(np.array(poses).reshape(-1, 4, 4)),
-            ids,
-            p_obj,
-            last.covariance if last else None,
-            last.error_before if last else 0.0,
-            last.error_after if last else 0.0,
-        )
+        T_cam_obj = se3.inverse(np.array(poses).reshape(-1, 4, 4))
+        return GraphResult(ok, reason, keys, T_cam_obj, ids, p_obj, *self._known)
 
 
 def _about(p_obj: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
@@ -257,23 +226,23 @@ def _is_covariance(covariance: np.ndarray | None) -> bool:
 
 def _solve(
     keyframes: dict[int, Keyframe], points: dict[int, np.ndarray], anchor: np.ndarray, config: FactorGraphConfig
-) -> _Solution:
-    """Levenberg-Marquardt over all variables (paper: "Solving the Optimization"), and the newest covariance."""
+) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], _Known]:
+    """Levenberg-Marquardt over all variables (paper: "Solving the Optimization"): T_obj_cam and points by key."""
     import gtsam
 
     first, newest = min(keyframes), max(keyframes)
     graph, values, ordering = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Ordering()
     if config.prior:
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.full(6, _PRIOR_SIGMA))
-        graph.add(gtsam.PriorFactorPose3(_x(first), gtsam.Pose3(anchor), noise))
+        graph.add(gtsam.PriorFactorPose3(_X + first, gtsam.Pose3(anchor), noise))
     # Keypoints first: each is eliminated on its own, which leaves a small system of poses.
     for i in sorted(points) if config.observations else ():
-        values.insert(_p(i), points[i])
-        ordering.push_back(_p(i))
+        values.insert(_P + i, points[i])
+        ordering.push_back(_P + i)
     for key in sorted(keyframes):
         keyframe = keyframes[key]
-        values.insert(_x(key), gtsam.Pose3(keyframe.T_obj_cam))
-        ordering.push_back(_x(key))
+        values.insert(_X + key, gtsam.Pose3(keyframe.T_obj_cam))
+        ordering.push_back(_X + key)
         if config.between and keyframe.link:
             graph.add(_between(key, keyframe.link, config))
         if config.observations:
@@ -287,23 +256,9 @@ def _solve(
     params.setOrdering(ordering)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
     error_before, solved = optimiser.error(), optimiser.optimize()
-    covariance, note = _covariance(graph, solved, ordering, newest)
-    return _Solution(
-        {key: solved.atPose3(_x(key)).matrix() for key in keyframes},
-        {i: solved.atPoint3(_p(i)) for i in points} if config.observations else {},
-        covariance,
-        error_before,
-        optimiser.error(),
-        note,
-    )
-
-
-def _x(key: int) -> int:
-    return _X + key
-
-
-def _p(point_id: int) -> int:
-    return _P + point_id
+    poses = {key: solved.atPose3(_X + key).matrix() for key in keyframes}
+    places = {i: solved.atPoint3(_P + i) for i in points} if config.observations else {}
+    return poses, places, (_covariance(graph, solved, ordering, newest), error_before, optimiser.error())
 
 
 def _robust(gaussian: Any, config: FactorGraphConfig) -> Any:
@@ -317,7 +272,7 @@ def _between(key: int, link: Link, config: FactorGraphConfig) -> Any:
     import gtsam
 
     noise = _robust(gtsam.noiseModel.Gaussian.Covariance(link.covariance), config)
-    return gtsam.BetweenFactorPose3(_x(link.previous), _x(key), gtsam.Pose3(link.T_previous_this), noise)
+    return gtsam.BetweenFactorPose3(_X + link.previous, _X + key, gtsam.Pose3(link.T_previous_this), noise)
 
 
 def _observations(key: int, keyframe: Keyframe, config: FactorGraphConfig) -> Any:
@@ -329,21 +284,21 @@ def _observations(key: int, keyframe: Keyframe, config: FactorGraphConfig) -> An
     rows = zip(keyframe.ids.tolist(), keyframe.p_cam, range_m.tolist(), keyframe.sigma.tolist(), strict=True)
     for i, p_cam, distance, (sigma_rad, sigma_m) in rows:
         noise = _robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_rad, sigma_rad, sigma_m])), config)
-        graph.add(gtsam.BearingRangeFactor3D(_x(key), _p(i), gtsam.Unit3(p_cam), distance, noise))
+        graph.add(gtsam.BearingRangeFactor3D(_X + key, _P + i, gtsam.Unit3(p_cam), distance, noise))
     return graph
 
 
-def _covariance(graph: Any, solved: Any, ordering: Any, newest: int) -> tuple[np.ndarray | None, str]:
-    """The newest keyframe's marginal covariance, from X's right tangent to that of T_cam_obj.
+def _covariance(graph: Any, solved: Any, ordering: Any, newest: int) -> np.ndarray | None:
+    """The newest keyframe's marginal covariance, from X's right tangent to that of T_cam_obj; None: nothing anchors it.
 
     T_cam_obj exp(eta) is the inverse of X exp(xi) for eta = -Ad_X xi.
     """
     try:
-        marginal = graph.linearize(solved).eliminateMultifrontal(ordering).marginalCovariance(_x(newest))
+        marginal = graph.linearize(solved).eliminateMultifrontal(ordering).marginalCovariance(_X + newest)
     except (RuntimeError, ValueError):
-        return None, "no covariance: nothing anchors the graph"
-    A = se3.adjoint(solved.atPose3(_x(newest)).matrix())
+        return None
+    A = se3.adjoint(solved.atPose3(_X + newest).matrix())
     covariance = A @ marginal @ A.T
     if not np.isfinite(covariance).all() or (np.diag(covariance) > _UNDETERMINED).any():
-        return None, "no covariance: nothing anchors the graph"
-    return (covariance + covariance.T) / 2, ""
+        return None
+    return (covariance + covariance.T) / 2

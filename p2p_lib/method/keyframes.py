@@ -7,7 +7,7 @@ takes over what the other saw.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -47,7 +47,7 @@ class Keyframe:
     p_cam: np.ndarray
     sigma: np.ndarray
     link: Link | None
-    factors: Any = field(default=None)
+    factors: Any = None
 
     def replace_observations(self, ids: np.ndarray, p_cam: np.ndarray, sigma: np.ndarray) -> None:
         """Other observations instead of those there were."""
@@ -104,11 +104,8 @@ def remove(keyframes: dict[int, Keyframe], key: int) -> None:
             keyframe.link = None
             continue
         A = se3.adjoint(se3.inverse(after.T_previous_this))
-        keyframe.link = Link(
-            before.previous,
-            before.T_previous_this @ after.T_previous_this,
-            A @ before.covariance @ A.T + after.covariance,
-        )
+        T_previous_this = before.T_previous_this @ after.T_previous_this
+        keyframe.link = Link(before.previous, T_previous_this, A @ before.covariance @ A.T + after.covariance)
 
 
 def _merge(kept: Keyframe, gone: Keyframe) -> None:
@@ -117,8 +114,6 @@ def _merge(kept: Keyframe, gone: Keyframe) -> None:
     moved_sigma *= _MOVED_SIGMA
     ids = np.concatenate([kept.ids, gone.ids])
     p_cam, sigma = np.concatenate([kept.p_cam, moved]), np.concatenate([kept.sigma, moved_sigma])
-    if not len(ids):
-        return
     merged, row = np.unique(ids, return_inverse=True)
     information = sigma**-2
     total = _sums(row, information)

@@ -170,7 +170,7 @@ class Lifecycle:
         if confidence <= _SURE:
             return self
         known = self.motion is not None and self.motion.time_s < self.seen_s
-        go_on = self.motion.followed_by if known else Motion.begun
+        go_on = self.motion.followed_by if known else Motion
         return replace(self, motion=go_on(self.T_cam_obj, self.seen_s))
 
     def corrected(self, T_cam_obj: np.ndarray) -> Lifecycle:

@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from p2p_lib.method.tsdf import TsdfVolume
 
 
-def extract(volume: TsdfVolume, min_weight: float = 1.0, min_component: float = 0.1) -> trimesh.Trimesh:
+def extract(volume: TsdfVolume, min_component: float) -> trimesh.Trimesh:
     """The zero-crossing surface of a volume (paper: marching cubes on V(v) = 0), in the object frame.
 
-    Only cells whose eight voxels were observed with at least ``min_weight`` are meshed. Connected
-    components with less than ``min_component`` of the largest one's area are removed: depth noise.
-    Faces wind so that normals point outwards. An empty volume gives an empty mesh.
+    Only cells whose eight voxels were observed are meshed. Connected components with less than ``min_component`` of the
+    largest one's area are removed: depth noise. Faces wind so that normals point outwards. An empty volume gives an
+    empty mesh.
     """
     import trimesh
 
-    vertices, faces = _marching_cubes(volume, min_weight)
+    vertices, faces = _marching_cubes(volume)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if len(faces):
         component = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(faces))
@@ -52,11 +52,12 @@ def save(mesh: trimesh.Trimesh, path: str | Path) -> Path:
     return path
 
 
-def _marching_cubes(volume: TsdfVolume, min_weight: float) -> tuple[np.ndarray, np.ndarray]:
+def _marching_cubes(volume: TsdfVolume) -> tuple[np.ndarray, np.ndarray]:
     """Vertices in array indices (N, 3) and faces (M, 3), over fully observed cells."""
     from skimage.measure import marching_cubes
 
-    value, cells = volume.values(), volume.weights() >= min_weight
+    value = volume.values()
+    cells = ~np.isnan(value)
     value[~cells] = 1.0
     for axis in range(3):  # scikit-image looks at the mask of a cell's last corner only
         cells = cells & np.roll(cells, 1, axis)

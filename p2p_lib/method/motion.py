@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -23,17 +23,12 @@ class Motion:
 
     T_cam_obj  (4, 4) the newest of them
     time_s     its time
-    velocity   (6,) in the camera frame: of the turn, rad/s, and of the origin, m/s
+    velocity   (6,) in the camera frame: of the turn, rad/s, and of the origin, m/s; at rest until another pose follows
     """
 
     T_cam_obj: np.ndarray
     time_s: float
-    velocity: np.ndarray
-
-    @classmethod
-    def begun(cls, T_cam_obj: np.ndarray, time_s: float) -> Motion:
-        """At rest, until another pose follows."""
-        return cls(T_cam_obj, time_s, np.zeros(6))
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))
 
     def followed_by(self, T_cam_obj: np.ndarray, time_s: float) -> Motion:
         """With a later pose."""

@@ -46,17 +46,6 @@ class Requests:
     keys: np.ndarray = field(default_factory=lambda: NO_IDS)
 
 
-@dataclass(frozen=True, eq=False)
-class NewPoints:
-    """Points to be added at a keyframe: uv_px (M, 2) and p_cam (M, 3)."""
-
-    uv_px: np.ndarray
-    p_cam: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.uv_px)
-
-
 class ObjectModel:
     """Keypoints, surface and graph of one object; rows of observations are rows of ``map``.
 
@@ -199,31 +188,33 @@ class ObjectModel:
         self,
         obs: Observation,
         T_cam_obj: np.ndarray,
-        new: NewPoints,
+        uv_px: np.ndarray,
+        p_cam: np.ndarray,
         agrees: np.ndarray,
         covariance: np.ndarray | None = None,
         confidence: float = 1.0,
     ) -> Requests:
         """New points, a vertex of the graph, a view of the surface.
 
-        agrees      (N,) bool: points of the map whose observation the pose agrees with
-        covariance  (6, 6) of the pose relative to the map; None at the first keyframe
-        confidence  of the pose
+        uv_px, p_cam  (M, 2) and (M, 3) of points to be added
+        agrees        (N,) bool: points of the map whose observation the pose agrees with
+        covariance    (6, 6) of the pose relative to the map; None at the first keyframe
+        confidence    of the pose
 
         Returns what the tracker has to follow and to drop.
         """
-        p_obj = se3.transform(se3.inverse(T_cam_obj), new.p_cam)
-        keys = self._next_key + np.arange(len(new))
-        self._next_key += len(new)
-        seen = np.concatenate([self.map.keys[agrees], keys]), np.concatenate([obs.p_cam[agrees], new.p_cam])
-        self.map.add(keys, p_obj, self.empty, confidence, new.p_cam)
+        p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
+        keys = self._next_key + np.arange(len(p_cam))
+        self._next_key += len(p_cam)
+        seen = np.concatenate([self.map.keys[agrees], keys]), np.concatenate([obs.p_cam[agrees], p_cam])
+        self.map.add(keys, p_obj, self.empty, confidence, p_cam)
         self.views.add(T_cam_obj)
         self.seen_m2 = max(self.seen_m2, self._observer.area_m2(obs))
         self._since_keyframe = 0
         self._sample = None
         gone, drop = self.map.retire()
         self._solved = self._beside_after(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone)
-        return Requests(drop=drop, add_px=new.uv_px, keys=keys)
+        return Requests(drop=drop, add_px=uv_px, keys=keys)
 
     def _map_keyframe(
         self,

@@ -10,6 +10,7 @@ from __future__ import annotations
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from p2p_lib.method.agreement import scene_ratio, size_ratio
 from p2p_lib.method.confidence import Belief
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.lifecycle import GATES, MAPPED, OUTLINE, Lifecycle, Verdict, off_size
-from p2p_lib.method.object_model import NO_IDS, Known, NewPoints, ObjectModel, Requests
+from p2p_lib.method.object_model import NO_IDS, Known, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.outlook import Outlook, hidden
 from p2p_lib.method.pose_finder import Candidate, PoseFinder
@@ -87,11 +88,6 @@ class ObjectTracker:
         return self.known.map
 
     @property
-    def map_id(self) -> int:
-        """Its number."""
-        return self.known.map_id
-
-    @property
     def life(self) -> Lifecycle:
         """What the object has been through in it."""
         return self.known.life
@@ -133,9 +129,8 @@ class ObjectTracker:
     ) -> Observation:
         """The object's share of a frame; mask (H, W) bool, None where it is not known, and everybody's tracks."""
         with self._stopwatch("observation"):
-            sighted = None if sighting is None else sighting.T_cam_obj
-            obs = self.observer.observe(frame, mask, tracks.select(self.map.ids), sighted)
-            return self._with_aside(replace(obs, given=given, still=still), tracks)
+            obs = self.observer.observe(frame, mask, tracks.select(self.map.ids))
+            return self._with_aside(replace(obs, sighting=sighting, given=given, still=still), tracks)
 
     def seen_anew(self, obs: Observation, tracks: Tracks) -> Observation:
         """The observation again, with tracks that have been added to."""
@@ -144,7 +139,7 @@ class ObjectTracker:
     def _with_aside(self, obs: Observation, tracks: Tracks) -> Observation:
         if self.aside is None:
             return obs
-        same = replace(obs, sighted=None, aside=None)
+        same = replace(obs, sighting=None, aside=None)
         return replace(obs, aside=self.observer.with_tracks(same, tracks.select(self.aside.map.ids)))
 
     def step(self, obs: Observation) -> ObjectStep:
@@ -230,28 +225,31 @@ class ObjectTracker:
             good = obs.seen & (agrees | ~self.map.promoted)
             if self._gates and not due:  # two maps that become one lie to each other as well as poses tell
                 good &= model.explained(obs, T_cam_obj)
-            new = self._sample(obs)
-            asked = model.insert_keyframe(obs, T_cam_obj, new, good, belief.of_frame, mapped)
+            asked = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), good, belief.of_frame, mapped)
             requests = replace(asked, reject=requests.reject)
         changed = keyframe or not belief.told
         covariance, sure = belief.at(T_cam_obj, model, most) if changed else (covariance, mapped)
         self.life = life.placed(obs.frame.T_world_cam).moved(sure)
         if not belief.told and verdict.status is Status.TRACKED:
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNTOLD)
-        return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, keyframe), requests)
+        estimate = self._estimate(
+            obs, verdict, confidence=sure, covariance=covariance, inliers=best.hypothesis.support, keyframe=keyframe
+        )
+        return ObjectStep(estimate, requests)
 
     def _doubted(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
         """A pose from what contradicts itself: neither map nor surface learns from it, and no track is rejected."""
         self.life = self.life.with_pose(best.T_cam_obj, obs.frame.time_s, verdict, best.lead)
         self.model.settle_surface()
         covariance, sure = self._belief(obs, best).at(best.T_cam_obj, self.model, DOUBTED)
-        return ObjectStep(self._estimate(obs, verdict, best.hypothesis.support, sure, covariance, False))
+        support = best.hypothesis.support
+        return ObjectStep(self._estimate(obs, verdict, confidence=sure, covariance=covariance, inliers=support))
 
     def _belief(self, obs: Observation, best: Candidate) -> Belief:
         return Belief.of(obs, best, self.known, self.observer, self.config)
 
-    def _sample(self, obs: Observation) -> NewPoints:
-        """New points where the objective wants them."""
+    def _sample(self, obs: Observation) -> tuple[np.ndarray, np.ndarray]:
+        """New points where the objective wants them: uv_px (M, 2) and p_cam (M, 3)."""
         with self._stopwatch("sampling"):
             cfg = self.config.sampling
             region = usable_region(obs.frame, obs.mask, self.config.depth.edge_m)
@@ -261,7 +259,7 @@ class ObjectTracker:
             candidates, p_cam = candidates.select(liftable), p_cam[liftable]
             count = min(cfg.points, cfg.max_visible - int(obs.seen.sum()))
             chosen = choose(candidates, obs.tracks.uv_px[obs.seen], count, cfg)
-            return NewPoints(candidates.uv_px[chosen], p_cam[chosen])
+            return candidates.uv_px[chosen], p_cam[chosen]
 
     # -- start, and frames without a pose ------------------------------------------------------
 
@@ -280,30 +278,31 @@ class ObjectTracker:
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < cfg.lifecycle.min_mask_px:
             return self._without_pose(obs, without, f"only {len(v)} mask pixels with depth")
-        points = self._sample(obs)
-        few, aside = len(points) < cfg.registration.min_inliers, not (self.model.empty or self._outgrown(obs))
+        uv_px, p_cam = self._sample(obs)
+        few, aside = len(p_cam) < cfg.registration.min_inliers, not (self.model.empty or self._outgrown(obs))
         if few and (aside or self.model.surface is None or not cfg.method.motion):
-            return self._without_pose(obs, without, f"only {len(points)} points to start from")
+            return self._without_pose(obs, without, f"only {len(p_cam)} points to start from")
         T_cam_obj = np.eye(4)
         if cfg.method.object_frame == "centroid":
-            p_cam = self.observer.camera.unproject(np.stack([u, v], -1), obs.frame.depth_m[v, u])
-            T_cam_obj[:3, 3] = np.median(p_cam, 0)
+            seen = self.observer.camera.unproject(np.stack([u, v], -1), obs.frame.depth_m[v, u])
+            T_cam_obj[:3, 3] = np.median(seen, 0)
         verdict, forgotten = Verdict(True, Status.TRACKED), NO_IDS
         if not self.model.empty:
             gone = self.aside if aside else self.known
             forgotten = NO_IDS if gone is None else gone.map.ids[gone.map.ids >= 0]
             if aside:
                 self.aside = self.known.lost()
-            self.known, self._relation = Known(self._new_model(), self.life, self.map_id + 1), Relation()
+            self.known, self._relation = Known(self._new_model(), self.life, self.known.map_id + 1), Relation()
             verdict = Verdict(True, Status.RECOVERED, "a new map: the old one stays lost")
         if few:
-            verdict = Verdict(True, Status.DEGRADED, f"only {len(points)} points")
-        requests = self.model.insert_keyframe(obs, T_cam_obj, points, np.zeros(0, bool))
+            verdict = Verdict(True, Status.DEGRADED, f"only {len(p_cam)} points")
+        requests = self.model.insert_keyframe(obs, T_cam_obj, uv_px, p_cam, np.zeros(0, bool))
         self.model.adopt()
         self.life = Lifecycle(verdict.status, T_cam_obj, obs.frame.time_s).placed(obs.frame.T_world_cam)
         self._trusted = obs
         # The first pose defines the object frame: it is right by definition, whatever the points are worth.
-        estimate = self._estimate(obs, verdict, len(self.map), 1.0, self.model.covariance, True)
+        covariance, inliers = self.model.covariance, len(self.map)
+        estimate = self._estimate(obs, verdict, confidence=1.0, covariance=covariance, inliers=inliers, keyframe=True)
         return ObjectStep(estimate, replace(requests, drop=forgotten))
 
     def _outgrown(self, obs: Observation) -> bool:
@@ -349,51 +348,36 @@ class ObjectTracker:
     def _joined(self, obs: Observation, best: Candidate, known: Candidate) -> ObjectStep:
         """Two maps that fit this frame become one, in the frame of the older; a keyframe ties what both have seen."""
         T_obj_aside = self._relation.mean
-        if self.aside.map_id < self.map_id:
+        if self.aside.map_id < self.known.map_id:
             life = self.life.in_frame(T_obj_aside)
             obs, best, known = self._exchanged(obs), known, best
             self.life, T_obj_aside = life, se3.inverse(T_obj_aside)
         gone, self.aside, self._relation = self.aside, None, Relation()
         self.model.join(gone.model, T_obj_aside)
         both = replace(best, hypothesis=agreeing_together(best.hypothesis, known.hypothesis))
-        verdict = Verdict(True, Status.RECOVERED, f"maps {self.map_id} and {gone.map_id} are one")
+        verdict = Verdict(True, Status.RECOVERED, f"maps {self.known.map_id} and {gone.map_id} are one")
         step = self._extend(seen_together(obs, obs.aside), both, verdict, due=True)
         return replace(step, estimate=replace(step.estimate, joined=(gone.map_id, T_obj_aside)))
-
-    def _estimate(
-        self, obs: Observation, verdict: Verdict, support: int, sure: float, covariance: np.ndarray, keyframe: bool
-    ) -> PoseEstimate:
-        """The estimate of an accepted frame, whose pose ``life`` has already taken in."""
-        return PoseEstimate(
-            self.name,
-            obs.frame.index,
-            obs.frame.time_s,
-            verdict.status,
-            self.life.T_cam_obj,
-            sure,
-            covariance,
-            reason=verdict.reason,
-            visible_points=int(obs.seen.sum()),
-            inliers=support,
-            last_T_cam_obj=self.life.T_cam_obj,
-            last_seen_s=self.life.seen_s,
-            keyframe=keyframe,
-            map_id=self.map_id,
-        )
 
     def _without_pose(self, obs: Observation, status: Status, reason: str) -> ObjectStep:
         self.life = self.life.without_pose(status, obs.mask_px, self.known.carried(obs.frame.time_s))
         self._trusted = self._trusted if status is Status.LOST else None
         reason = f"{OUT_OF_VIEW}: {reason}" if status is Status.OCCLUDED and self.outlook.out_of_view else reason
-        estimate = PoseEstimate(
+        return ObjectStep(self._estimate(obs, Verdict(False, status, reason)))
+
+    def _estimate(self, obs: Observation, verdict: Verdict, **pose: Any) -> PoseEstimate:
+        """The estimate of a frame that ``life`` has already taken in; what it says of a ``pose`` where there is one."""
+        life = self.life
+        return PoseEstimate(
             self.name,
             obs.frame.index,
             obs.frame.time_s,
-            status,
-            reason=reason,
+            verdict.status,
+            life.T_cam_obj if life.has_pose else None,
+            reason=verdict.reason,
             visible_points=int(obs.seen.sum()),
-            last_T_cam_obj=self.life.T_cam_obj,
-            last_seen_s=self.life.seen_s,
-            map_id=self.map_id,
+            last_T_cam_obj=life.T_cam_obj,
+            last_seen_s=life.seen_s,
+            map_id=self.known.map_id,
+            **pose,
         )
-        return ObjectStep(estimate)

@@ -15,6 +15,7 @@ from p2p_lib.core.depth import depth_noise_m, in_range, lift, off_edges
 from p2p_lib.core.image import bounds, in_mask
 from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.method.agreement import outline_share
+from p2p_lib.recovery.search import Sighting
 
 #: Depth this near the mask's border mixes the object with what is behind it.
 _BORDER_PX = 2
@@ -28,14 +29,14 @@ _HIDDEN_M = 0.015
 class Observation:
     """One frame's share of one object; rows are those of its keypoint map.
 
-    mask     (H, W) bool; None where no mask is known
-    tracks   of the map's points
-    p_cam    (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
-    cloud    (M, 3) depth points in the mask, camera frame
-    sighted  (4, 4) T_cam_obj where an absent object was found by shape and colour; None where it was not
-    given    whether the caller vouches for the mask; else the segmenter made it
-    still    whether the image is the same as for a while
-    aside    the same of a second map of the object, which is put aside; None where there is none
+    mask      (H, W) bool; None where no mask is known
+    tracks    of the map's points
+    p_cam     (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
+    cloud     (M, 3) depth points in the mask, camera frame
+    sighting  where an absent object was found by shape and colour; None where it was not
+    given     whether the caller vouches for the mask; else the segmenter made it
+    still     whether the image is the same as for a while
+    aside     the same of a second map of the object, which is put aside; None where there is none
     """
 
     frame: Frame
@@ -43,7 +44,7 @@ class Observation:
     tracks: Tracks
     p_cam: np.ndarray
     cloud: np.ndarray
-    sighted: np.ndarray | None = None
+    sighting: Sighting | None = None
     given: bool = True
     still: bool = False
     aside: Observation | None = None
@@ -73,14 +74,11 @@ class Observer:
     def __init__(self, camera: Camera, config: DepthConfig, cloud_points: int):
         self.camera, self.config, self.cloud_points = camera, config, cloud_points
 
-    def observe(
-        self, frame: Frame, mask: np.ndarray | None, tracks: Tracks, sighted: np.ndarray | None = None
-    ) -> Observation:
+    def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
         """The observation of an object whose points have these ``tracks``."""
-        cloud = np.zeros((0, 3))
-        if mask is not None:
-            cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
-        return Observation(frame, mask, tracks, self._lifted(frame, mask, tracks), cloud, sighted)
+        nothing = np.zeros((0, 3))
+        cloud = nothing if mask is None else sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
+        return Observation(frame, mask, tracks, self._lifted(frame, mask, tracks), cloud)
 
     def with_tracks(self, obs: Observation, tracks: Tracks) -> Observation:
         """The observation with these tracks of the object's points instead of its own."""

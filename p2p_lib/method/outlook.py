@@ -95,7 +95,7 @@ class Outlook:
             return None
         return self.finder.shape.sighted(obs, self.known)
 
-    def hint(self, obs: Observation, sighting: Sighting | None = None) -> tuple[Hint, Requests]:
+    def hint(self, obs: Observation) -> tuple[Hint, Requests]:
         """Where this object should be, by its tracks and its model, before the frame is segmented.
 
         Also the tracks to reject: while the object is away, points that agree on no pose are somewhere else.
@@ -109,9 +109,9 @@ class Outlook:
             certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)
             requests = Requests(reject=known.map.ids[certain & ~agrees])
             enough = best is not None and best.support >= self.config.lifecycle.return_inliers
-            if sighting is not None and not enough:
-                uv_px = np.concatenate([obs.tracks.uv_px[agrees], sighting.uv_px])
-                return self._hint(obs.frame, uv_px, sighting.T_cam_obj, True), requests
+            if obs.sighting is not None and not enough:
+                uv_px = np.concatenate([obs.tracks.uv_px[agrees], obs.sighting.uv_px])
+                return self._hint(obs.frame, uv_px, obs.sighting.T_cam_obj, True), requests
             best = best if enough else None
         if best is None and self.aside is not None:
             by_aside, _ = replace(self, known=self.aside, aside=None).hint(obs.aside)

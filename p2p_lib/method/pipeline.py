@@ -21,14 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from p2p_lib.core.backends import (
-    DEFAULT_DETECTOR,
-    DEFAULT_SEGMENTER,
-    DEFAULT_TRACKER,
-    make_detector,
-    make_segmenter,
-    make_tracker,
-)
+from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import uninterrupted
 from p2p_lib.core.config import Config, preset
@@ -68,19 +61,19 @@ class Point2Pose:
         self,
         camera: Camera,
         config: Config | str | None = None,
-        tracker: str | PointTracker = DEFAULT_TRACKER,
-        detector: str = DEFAULT_DETECTOR,
-        segmenter: str | Segmenter = DEFAULT_SEGMENTER,
+        tracker: str | PointTracker = backends.DEFAULT_TRACKER,
+        detector: str = backends.DEFAULT_DETECTOR,
+        segmenter: str | Segmenter = backends.DEFAULT_SEGMENTER,
     ):
         self.camera = camera
         self.config = preset(config) if isinstance(config, str) else config or preset()
         if not isinstance(self.config, Config):
             raise BadInput("config", type(config).__name__, 'a Config, or the name of a preset: "default", "paper"')
         self._rng = np.random.default_rng(self.config.seed)
-        self.tracker = make_tracker(tracker, self.config.tracking, self._rng)
-        self.detector = make_detector(detector, self.config.sampling, self._rng)
+        self.tracker = backends.make_tracker(tracker, self.config.tracking, self._rng)
+        self.detector = backends.make_detector(detector, self.config.sampling, self._rng)
         rng = np.random.default_rng([self.config.seed, 1])
-        self.segmenter = make_segmenter(segmenter, camera, self.config.segmentation, rng)
+        self.segmenter = backends.make_segmenter(segmenter, camera, self.config.segmentation, rng)
         scene_rng = np.random.default_rng([self.config.seed, 2])
         self.scene = Scene(camera, self.config.depth, scene_rng) if self.config.method.scene else None
         self.objects: dict[str, ObjectTracker] = {}
@@ -140,14 +133,9 @@ class Point2Pose:
         self._said[name] = prompt
 
     def _begin(self, name: str) -> None:
+        rng = np.random.default_rng([self.config.seed, *name.encode()])
         self.objects[name] = ObjectTracker(
-            name,
-            self.camera,
-            self.config,
-            self.detector,
-            np.random.default_rng([self.config.seed, *name.encode()]),
-            self.stopwatch,
-            self._beside,
+            name, self.camera, self.config, self.detector, rng, self.stopwatch, self._beside
         )
 
     def remove_object(self, name: str) -> None:
@@ -258,8 +246,8 @@ class Point2Pose:
 
     def _sightings(self, frame: Frame, masks: Masks, objects: Mapping[str, ObjectTracker]) -> dict[str, Sighting]:
         """Sought objects that show by shape and colour; the tracker looks for their points there."""
-        sought = {name: obj for name, obj in objects.items() if obj.outlook.sought}
-        seen = {name: obj.observe(frame, masks[name], self.tracks) for name, obj in sought.items()}
+        sought = [name for name, obj in objects.items() if obj.outlook.sought]
+        seen = {name: objects[name].observe(frame, masks[name], self.tracks) for name in sought}
         looked = {name: objects[name].outlook.sighted(obs) for name, obs in seen.items()}
         found = {name: sighting for name, sighting in looked.items() if sighting is not None}
         self._suggest({name: objects[name].outlook.points_px(seen[name], at.T_cam_obj) for name, at in found.items()})
@@ -340,15 +328,16 @@ class Point2Pose:
             return masks
         with self.stopwatch("segmentation"):
             sought = [name for name in self.segmenter.names if name in masks and masks[name] is None]
-            hints = _Hints(sought, lambda name: self._hint(self.objects[name], frame, sightings.get(name)))
-            self._apply({name: hints.requests(name) for name in sought if self.objects[name].outlook.sought})
+            hint = cache(lambda name: self._hint(self.objects[name], frame, sightings.get(name)))
+            hints = _Hints(sought, lambda name: hint(name)[0])
+            self._apply({name: hint(name)[1] for name in sought if self.objects[name].outlook.sought})
             labels = self.segmenter.segment(frame, said.values(), hints)
             label_of = {name: label for label, name in enumerate(self.segmenter.names, 1)}
             looked_after = [name for name, mask in masks.items() if mask is None and name in label_of]
             return masks | {name: labels == label_of[name] for name in looked_after}
 
     def _hint(self, obj: ObjectTracker, frame: Frame, sighting: Sighting | None) -> tuple[Hint, Requests]:
-        return obj.outlook.hint(obj.observe(frame, None, self.tracks, sighting), sighting)
+        return obj.outlook.hint(obj.observe(frame, None, self.tracks, sighting))
 
     def _track(self, frame: Frame, masks: dict[str, np.ndarray | None]) -> Tracks:
         """All objects' points in a single pass of the 2D tracker."""
@@ -383,19 +372,15 @@ def _check_unit(frame: Frame) -> None:
 
 
 class _Hints(Mapping[str, Hint]):
-    """The hints of some objects, each made when it is first asked for: they cost, and a segmenter needs but some."""
+    """The hints of some objects, each made when it is asked for: they cost, and a segmenter needs but some."""
 
-    def __init__(self, names: Sequence[str], make: Callable[[str], tuple[Hint, Requests]]):
-        self._names, self._make = names, cache(make)
+    def __init__(self, names: Sequence[str], make: Callable[[str], Hint]):
+        self._names, self._make = names, make
 
     def __getitem__(self, name: str) -> Hint:
         if name not in self._names:
             raise KeyError(name)
-        return self._make(name)[0]
-
-    def requests(self, name: str) -> Requests:
-        """What an object wants of the tracker before anybody segments."""
-        return self._make(name)[1]
+        return self._make(name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

@@ -84,14 +84,16 @@ class PoseFinder:
             if use.sum() < _FEW_KEYPOINTS:
                 use = certain
             priors = known.life.motion_priors() or self._carried_on(obs, known) if with_motion else {}
-            if obs.sighted is not None:
-                priors = {"sighting": obs.sighted, **priors}
-            found = self._hypotheses(obs, known, use, priors)
+            if obs.sighting is not None:
+                priors = {"sighting": obs.sighting.T_cam_obj, **priors}
+            p_cam = np.where(use[:, None], obs.p_cam, np.nan)
+            found = self._hypotheses(known, p_cam, priors)
             most = max((h.support for h in found), default=0)
             if priors and cfg.method != "svd" and most < cfg.contradicted * use.sum():
                 # Most points are wrong, whichever: pending ones may tell, or those that agree with the surface.
-                found = self._hypotheses(obs, known, certain, priors)
-                found += self._along_surface(obs, known, certain, priors)
+                p_cam = np.where(certain[:, None], obs.p_cam, np.nan)
+                found = self._hypotheses(known, p_cam, priors)
+                found += self._along_surface(obs, known, p_cam, priors)
             return found or self._surface_only(known, priors)
 
     def _carried_on(self, obs: Observation, known: Known) -> dict[str, np.ndarray]:
@@ -104,22 +106,18 @@ class PoseFinder:
         near = np.linalg.norm(on_depth[:3, 3] - T_cam_obj[:3, 3]) < motion.reach_m(time_s)
         return {"motion": T_cam_obj} | ({"motion, on its depth": on_depth} if near else {})
 
-    def _hypotheses(
-        self, obs: Observation, known: Known, use: np.ndarray, priors: dict[str, np.ndarray]
-    ) -> list[Hypothesis]:
-        """Hypotheses from the points ``use`` (N,) alone."""
-        p_cam = np.where(use[:, None], obs.p_cam, np.nan)
+    def _hypotheses(self, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
+        """Hypotheses from the points measured at p_cam (N, 3), as far as they are finite."""
         cfg, sigma_m = self.config.registration, known.model.noise_m(p_cam)
         return registration.register(known.map.p_obj, p_cam, cfg, self._rng, sigma_m=sigma_m, priors=priors)
 
     def _along_surface(
-        self, obs: Observation, known: Known, use: np.ndarray, priors: dict[str, np.ndarray]
+        self, obs: Observation, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray]
     ) -> list[Hypothesis]:
         """The hypothesis that grows from where the surface alone leads."""
         start = self._refined(obs, known, list(priors.values())[-1])
         if not start.refined:
             return []
-        p_cam = np.where(use[:, None], obs.p_cam, np.nan)
         cfg, sigma_m = self.config.registration, known.model.noise_m(p_cam)
         return registration.refit(start.T_cam_obj, "surface", known.map.p_obj, p_cam, cfg, sigma_m)
 

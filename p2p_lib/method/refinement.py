@@ -11,7 +11,7 @@ can join (texture holds what shape leaves free), and the result says how well ea
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -21,6 +21,9 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import RefinementConfig
 from p2p_lib.method import observability
+
+if TYPE_CHECKING:
+    from p2p_lib.method.tsdf import TsdfVolume
 
 #: Fewer points on the observed surface than this determine nothing.
 MIN_POINTS = 10
@@ -34,30 +37,9 @@ _TOLERANCE = 0.2
 _MAD_TRIM = 2.5
 #: Depth errors of neighbours are correlated: together, the points are worth so many independent ones.
 _INDEPENDENT_POINTS = 100
-#: Step of the numeric gradient (the release's).
-_GRADIENT_VOXELS = 0.5
 #: No map is exact to less than this share of its voxels, however little the points scatter.
 _SIGMA_FLOOR_VOXELS = 0.25
 _MAD_TO_SIGMA = 1.4826
-
-
-class Surface(Protocol):
-    """What refinement asks of a volume; :class:`p2p_lib.method.tsdf.TsdfVolume` is one."""
-
-    tau_m: float
-    voxel_m: float
-
-    def corners_m(self) -> np.ndarray:
-        """(8, 3) corners that bound it in the object frame."""
-        ...
-
-    def query(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance in metres and validity at points of the object frame."""
-        ...
-
-    def query_with_gradient(self, p_obj: np.ndarray, step_voxels: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same with the gradient in between."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,16 +106,11 @@ class _Linear:
     rms_m: float
     sigma_m: float
 
-    @property
-    def used(self) -> int:
-        """How many points count."""
-        return len(self.rows)
-
 
 def refine(
     T_cam_obj: np.ndarray,
     p_cam: np.ndarray,
-    volume: Surface,
+    volume: TsdfVolume,
     config: RefinementConfig,
     *,
     keypoints: Keypoints | None = None,
@@ -159,7 +136,7 @@ def refine(
 @dataclass(frozen=True, eq=False)
 class _Problem:
     p_cam: np.ndarray
-    volume: Surface
+    volume: TsdfVolume
     config: RefinementConfig
     keypoints: Keypoints | None
     centre: np.ndarray  # of the cloud, object frame
@@ -181,7 +158,9 @@ class _Problem:
         damping, converged, tries = _DAMPING, False, 0
         # Wide at first: far from the solution, the few points that hold a direction look like outliers.
         at = self.surface(T, self.volume.tau_m / 2)
-        while tries < self.config.iterations and at is not None and not converged:
+        if at is None:
+            return Refinement(T, reason="the cloud lies beyond the surface's truncation")
+        while tries < self.config.iterations and not converged:
             tries += 1
             step = self.clipped(self.step(*self.joint(at), damping))
             nearby = at if np.linalg.norm(step) < self.volume.voxel_m else None
@@ -192,8 +171,6 @@ class _Problem:
                 at, damping = new, damping / _DAMPING_FACTOR
             else:
                 damping = max(damping, 1e-4) * _DAMPING_FACTOR**2
-        if at is None:
-            return Refinement(T, iterations=tries, reason="the cloud lies beyond the surface's truncation")
         eigenvalues, directions = self.eigen(at.rows, at.J)
         return self.result(replace(at, eigenvalues=eigenvalues, directions=directions), tries)
 
@@ -206,7 +183,7 @@ class _Problem:
         is taken from ``beside``, a pose nearby, where there is one: it hardly changes.
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
-        value, gradient, valid = self.volume.query_with_gradient(p_obj, _GRADIENT_VOXELS)
+        value, gradient, valid = self.volume.query_with_gradient(p_obj)
         huber_m, least_m = self.config.huber_m, max(self.config.huber_m, widest_m)
         # The least standard deviation of a distance, and where the distance is no longer known.
         floor_m, reach_m = _SIGMA_FLOOR_VOXELS * self.volume.voxel_m, 0.98 * self.volume.tau_m
@@ -234,7 +211,8 @@ class _Problem:
 
     def joint(self, at: _Linear) -> tuple[np.ndarray, np.ndarray]:
         """Information and gradient: the surface's in the directions it determines, the keypoints' in all."""
-        P, information = self.determined(at), self.effective_information(at)
+        held = at.directions[:, at.eigenvalues >= self.floor]
+        P, information = held @ held.T, self.effective_information(at)
         H, g = information * P @ at.H @ P, information * P @ at.g
         if self.keypoints is not None:
             H_k, g_k = self.keypoint_system(at.T)
@@ -243,17 +221,12 @@ class _Problem:
 
     def effective_information(self, at: _Linear) -> float:
         """Independent observations per squared metre: depth errors of neighbours are correlated."""
-        return min(at.used, _INDEPENDENT_POINTS) / at.sigma_m**2
+        return min(len(at.rows), _INDEPENDENT_POINTS) / at.sigma_m**2
 
     @property
     def floor(self) -> float:
         """The eigenvalue from which on a direction counts as determined by the shape; the paper moves all."""
         return self.config.min_eigenvalue if self.config.residuals == "surface_and_keypoints" else 0.0
-
-    def determined(self, at: _Linear) -> np.ndarray:
-        """Projection onto the directions that the shape holds."""
-        held = at.directions[:, at.eigenvalues >= self.floor]
-        return held @ held.T
 
     def step(self, H: np.ndarray, g: np.ndarray, damping: float) -> np.ndarray:
         """Damped Gauss-Newton step in the subspace that holds any information."""
@@ -278,7 +251,7 @@ class _Problem:
         Trimmed points and those off the observed surface cost what the trimming distance does.
         """
         loss = _huber_loss(new.distance_m, self.config.huber_m, at.cut_m)
-        total = self.effective_information(at) / at.used * loss
+        total = self.effective_information(at) / len(at.rows) * loss
         if self.keypoints is not None:
             k = self.keypoints
             off_m = se3.transform(se3.inverse(new.T), k.p_cam) - k.p_obj
@@ -298,7 +271,7 @@ class _Problem:
             se3.orthonormalised(at.T),
             (covariance + covariance.T) / 2,
             at.rms_m,
-            at.used / len(self.p_cam),
+            len(at.rows) / len(self.p_cam),
             tries,
             at.eigenvalues,
             at.directions.T,
@@ -392,7 +365,7 @@ def _keypoint_system(
     return H, g
 
 
-def surface_distances(volume: Surface, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:
+def surface_distances(volume: TsdfVolume, p_cam: np.ndarray, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H, N) absolute TSDF value in metres of the points p_cam (N, 3) under poses (H, 4, 4).
 
     Its mean over the points is the paper's measure for choosing a hypothesis. A point that falls where nothing was
@@ -424,7 +397,7 @@ def _usable_keypoints(keypoints: Keypoints | None, config: RefinementConfig) -> 
 _STRIDE = 2
 
 
-def surface_distance(volume: Surface, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray) -> np.ndarray:
+def surface_distance(volume: TsdfVolume, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H, W) float32 signed distance of each measured pixel to the surface under a pose, in metres.
 
     Positive in front of it, infinite off the volume; NaN where it is not known. Every second pixel is asked, where

@@ -64,7 +64,7 @@ def register(
     sigma_m  (N,) noise of each p_cam: the threshold grows with it and fits are weighted. None: one threshold for all
     priors   name to T_cam_obj (4, 4): poses that compete too, refit on the points that agree with them
     """
-    matches, usable = _finite_matches(p_obj, p_cam, sigma_m, config)
+    matches, usable = _Matches.of(p_obj, p_cam, sigma_m, config)
     if len(matches.p_obj) < max(3, config.min_inliers):
         return []
     if config.method == "svd":
@@ -84,7 +84,7 @@ def refit(
     sigma_m: np.ndarray | None = None,
 ) -> list[Hypothesis]:
     """The hypothesis that grows from a given pose, refit on the correspondences that agree with it; or none."""
-    matches, usable = _finite_matches(p_obj, p_cam, sigma_m, config)
+    matches, usable = _Matches.of(p_obj, p_cam, sigma_m, config)
     return [_in_all_rows(hypothesis, usable) for hypothesis in _from_priors(matches, {origin: T_cam_obj}, config)]
 
 
@@ -120,30 +120,19 @@ class _Matches:
     weight: np.ndarray
 
     @classmethod
-    def of(
-        cls, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray | None, config: RegistrationConfig
-    ) -> _Matches:
-        if sigma_m is None or not len(p_obj):
-            return cls(p_obj, p_cam, np.full(len(p_obj), config.inlier_m), np.ones(len(p_obj)))
-        limit = np.maximum(config.inlier_m, _INLIER_SIGMAS * sigma_m)
-        return cls(p_obj, p_cam, limit, (sigma_m.mean() / sigma_m) ** 2)
-
-    def residual_m(self, T_cam_obj: np.ndarray) -> np.ndarray:
-        """(..., n) of poses (..., 4, 4)."""
-        return robust.residual_m(T_cam_obj, self.p_obj, self.p_cam)
-
-
-def _finite_matches(
-    p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray | None, config: RegistrationConfig
-) -> tuple[_Matches, np.ndarray]:
-    """The rows that are finite, and (N,) bool which those are."""
-    p_obj, p_cam = np.asarray(p_obj, float).reshape(-1, 3), np.asarray(p_cam, float).reshape(-1, 3)
-    usable = np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1)
-    if sigma_m is not None:
-        sigma_m = np.asarray(sigma_m, float)
-        usable &= np.isfinite(sigma_m) & (sigma_m > 0)
-        sigma_m = sigma_m[usable]
-    return _Matches.of(p_obj[usable], p_cam[usable], sigma_m, config), usable
+    def of(cls, p_obj, p_cam, sigma_m, config: RegistrationConfig) -> tuple[_Matches, np.ndarray]:
+        """Of the rows that are finite; and (N,) bool which those are."""
+        p_obj, p_cam = np.asarray(p_obj, float).reshape(-1, 3), np.asarray(p_cam, float).reshape(-1, 3)
+        usable = np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1)
+        if sigma_m is not None:
+            usable &= np.isfinite(sigma_m) & (sigma_m > 0)
+        p_obj, p_cam = p_obj[usable], p_cam[usable]
+        limit, weight = np.full(len(p_obj), config.inlier_m), np.ones(len(p_obj))
+        if sigma_m is not None and len(p_obj):
+            sigma_m = sigma_m[usable]
+            limit = np.maximum(config.inlier_m, _INLIER_SIGMAS * sigma_m)
+            weight = (sigma_m.mean() / sigma_m) ** 2
+        return cls(p_obj, p_cam, limit, weight), usable
 
 
 def _determined(inertia_m2: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
@@ -194,13 +183,13 @@ def _from_priors(matches: _Matches, priors: Mapping[str, np.ndarray], config: Re
 
 def _svd_twice(matches: _Matches, config: RegistrationConfig) -> list[Hypothesis]:
     T, _ = fit_rigid_inertia(matches.p_obj, matches.p_cam)
-    kept = matches.residual_m(T) <= matches.limit_m
+    kept = robust.residual_m(T, matches.p_obj, matches.p_cam) <= matches.limit_m
     if kept.sum() < config.min_inliers:
         return []
     T, inertia = fit_rigid_inertia(matches.p_obj[kept], matches.p_cam[kept])
     if not _determined(inertia, matches.limit_m.mean()):
         return []
-    residual = matches.residual_m(T)
+    residual = robust.residual_m(T, matches.p_obj, matches.p_cam)
     return [Hypothesis(T, residual <= matches.limit_m, residual, "svd")]
 
 

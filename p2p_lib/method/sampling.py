@@ -49,13 +49,8 @@ def terms(score: np.ndarray, d_px: np.ndarray, config: SamplingConfig) -> Terms:
     return Terms(lam * score, (1 - lam) * spread, -config.cluster_weight * crowding)
 
 
-def objective(score: np.ndarray, d_px: np.ndarray, config: SamplingConfig) -> np.ndarray:
-    """J of candidates with score (N,) at distance d_px (N,) from everything chosen or stored."""
-    return terms(score, d_px, config).total
-
-
 def choose(candidates: Candidates, stored_px: np.ndarray, count: int, config: SamplingConfig) -> np.ndarray:
-    """Indices of up to ``count`` candidates in the order taken, greedily maximising :func:`objective`.
+    """Indices of up to ``count`` candidates in the order taken, greedily maximising J.
 
     ``stored_px`` (M, 2) are the map's points visible in this frame.
     """
@@ -66,7 +61,7 @@ def choose(candidates: Candidates, stored_px: np.ndarray, count: int, config: Sa
     chosen: list[int] = []
     free = np.ones(n, bool)
     for _ in range(min(count, n)):
-        J = np.where(free, objective(candidates.score, d, config), -np.inf)
+        J = np.where(free, terms(candidates.score, d, config).total, -np.inf)
         best = int(J.argmax())
         # The paper says K <= N_k, not when to stop short of K: here once crowding costs more than the best is worth.
         if J[best] <= 0:

@@ -1,13 +1,14 @@
 """Which pose hypothesis to go on with (paper: "Multi-Hypothesis Pose Generation and Selection").
 
-The paper takes the hypothesis whose dense points lie nearest to the surface: :func:`nearest_to_surface`. Ours,
-:func:`best_supported`, keeps the one that most keypoints agree with unless the surface prefers another one
-significantly.
+The paper takes the hypothesis whose dense points lie nearest to the surface (rule "surface"). Ours (rule "support")
+keeps the one that most keypoints agree with unless the surface prefers another one significantly: where that one is
+nearer by more than ``surface_sigmas`` standard errors and a small margin. The same points are compared under both
+poses, so the difference of each counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -34,32 +35,6 @@ def motion_weight(T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray])
     return 1 / (1 + (turned**2 + (moved / MOTION_M) ** 2).min(0))
 
 
-def nearest_to_surface(
-    best: int, distance_m: np.ndarray, scores: np.ndarray, config: SelectionConfig
-) -> tuple[int, str]:
-    """The hypothesis with the least mean distance to the surface; see :func:`select`."""
-    nearest = int(np.argmin(scores))
-    return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
-
-
-def best_supported(best: int, distance_m: np.ndarray, scores: np.ndarray, config: SelectionConfig) -> tuple[int, str]:
-    """The best supported hypothesis unless the surface prefers another; see :func:`select`.
-
-    It does where the other one is nearer by more than ``surface_sigmas`` standard errors and a small margin. The same
-    points are compared under both poses, so the difference of each counts.
-    """
-    nearest = int(np.argmin(scores))
-    nearer = distance_m[best] - distance_m[nearest]
-    chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
-    if scores[best] - scores[nearest] > max(chance, _MARGIN_M):
-        return nearest_to_surface(best, distance_m, scores, config)
-    return best, "most inliers, the surface does not tell the hypotheses apart"
-
-
-#: The rules by name: from the best supported row, distances (H, N) and mean distances (H,) to the row taken, and why.
-RULES: dict[str, Callable[..., tuple[int, str]]] = {"surface": nearest_to_surface, "support": best_supported}
-
-
 def select(
     hypotheses: Sequence[Hypothesis],
     distance_m: np.ndarray | None,
@@ -79,7 +54,14 @@ def select(
     best, scores = _best(hypotheses, weight), _scores(distance_m)
     if scores is None:
         return best, "most inliers, there is no surface yet"
-    return RULES[config.rule](best, distance_m, scores, config)
+    nearest = int(np.argmin(scores))
+    if config.rule == "support":
+        nearer = distance_m[best] - distance_m[nearest]
+        chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
+        preferred = scores[best] - scores[nearest] > max(chance, _MARGIN_M)
+        if not preferred:
+            return best, "most inliers, the surface does not tell the hypotheses apart"
+    return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
 
 
 def _best(hypotheses: Sequence[Hypothesis], weight: np.ndarray | None) -> int:

@@ -20,7 +20,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TsdfConfig
 from p2p_lib.core.errors import BadInput
-from p2p_lib.method.tsdf_grid import NO_WEIGHT, CpuGrid, Image, TorchGrid
+from p2p_lib.method.tsdf_grid import CpuGrid, Image, TorchGrid
 
 if TYPE_CHECKING:
     import trimesh
@@ -33,6 +33,8 @@ _PADDING_M = 0.02
 _REGION_POINTS = 4000
 #: A jump in sorted depth that separates the object from whatever else the mask caught.
 _DEPTH_GAP_M = 0.05
+#: Step of the numeric gradient (the release's).
+_GRADIENT_VOXELS = 0.5
 #: Annotated poses of real datasets are rounded; fusing needs an affine map only, so they are taken as they come.
 _POSE_TOLERANCE = 5e-3
 #: Background nearer than this to the mask does not carve: mask and pose are good to a pixel or two.
@@ -40,25 +42,15 @@ _CARVE_MARGIN_PX = 1
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
-    """One masked RGB-D observation, cut to its pixels, and the box of voxels it was fused into.
+class _View(Image):
+    """One masked RGB-D observation with a border of a pixel; its box is fixed, so that taking out mirrors putting in.
 
-    depth_m   (h+2, w+2) float32 with a border; -inf where nothing is to be fused
-    inside    (h+2, w+2) bool: measured and inside the mask; depth elsewhere only carves
-    rgbw      (4, h+2, w+2) uint8: colour and 1
     corner    column and row of the cut's first inner pixel
-    lo, hi    voxel box [lo, hi) in lattice indices; fixed when first fused, so that taking out mirrors putting in
     """
 
-    depth_m: np.ndarray
-    inside: np.ndarray
-    rgbw: np.ndarray
     corner: tuple[int, int]
     camera: Camera
     T_cam_obj: np.ndarray
-    weight: float
-    lo: np.ndarray
-    hi: np.ndarray
 
     @cached_property
     def centre_cam(self) -> np.ndarray:
@@ -88,20 +80,19 @@ class TsdfVolume:
         config: TsdfConfig,
         *,
         origin_m: np.ndarray | None = None,
-        shape: tuple[int, int, int] | None = None,
+        shape: tuple[int, ...] = (0, 0, 0),
         device: str = "cpu",
     ):
         self.config = config
         self.voxel_m, self.tau_m = config.voxel_m, config.voxel_m * config.truncation_voxels
-        self.grows = shape is None
+        self.grows = 0 in shape
         self.anchor_m = np.zeros(3) if origin_m is None else np.asarray(origin_m, float)
-        if shape is not None and np.prod(shape) > config.max_voxels:
+        if np.prod(shape) > config.max_voxels:
             raise BadInput("tsdf shape", "x".join(map(str, shape)), f"at most {config.max_voxels} voxels")
         self._views: dict[int, _View] = {}
-        self._total = 0.0  # of all weights
+        self._total = 0  # of all weights
         self.lo = np.zeros(3, int)
-        size = (0, 0, 0) if shape is None else tuple(map(int, shape))
-        self._grid = CpuGrid(size) if device == "cpu" else TorchGrid(size, device)
+        self._grid = CpuGrid(shape) if device == "cpu" else TorchGrid(shape, device)
 
     # -- state ---------------------------------------------------------------------------------
 
@@ -113,7 +104,7 @@ class TsdfVolume:
     @property
     def empty(self) -> bool:
         """Whether no voxel has been observed."""
-        return self._total < NO_WEIGHT
+        return self._total == 0
 
     @property
     def origin_m(self) -> np.ndarray:
@@ -155,7 +146,6 @@ class TsdfVolume:
         mask: np.ndarray,
         camera: Camera,
         T_cam_obj: np.ndarray,
-        weight: float = 1.0,
         key: int | None = None,
     ) -> int:
         """Fuse one masked RGB-D image; returns how many voxels it touched.
@@ -165,27 +155,26 @@ class TsdfVolume:
         the others take min(1, d / tau) into their weighted mean.
 
         depth_m (H, W) metres, 0 or not finite = invalid; rgb (H, W, 3) uint8; mask (H, W) bool.
-        ``weight=-1`` takes an equal image at an equal pose out again, exactly up to rounding as long as
-        the grid has not grown since. With ``key`` the observation is kept and can be moved
-        (:meth:`move`) or taken out (:meth:`remove`), whether or not the grid has grown.
+        With ``key`` the observation is kept and can be moved (:meth:`move`) or taken out (:meth:`remove`),
+        whether or not the grid has grown.
         An empty mask or one without any valid depth touches nothing.
 
         Raises :class:`BadInput` for arrays of other shapes or a pose that is not rigid.
         """
         T_cam_obj = se3.check("tsdf T_cam_obj", T_cam_obj, _POSE_TOLERANCE)
-        view = self._view(depth_m, rgb, mask, camera, T_cam_obj, weight)
+        view = self._view(depth_m, rgb, mask, camera, T_cam_obj)
         if view is None:
             return 0
         if key is not None:
             self.remove(key)
             self._views[key] = view
-        return self._fuse(view, view.weight)
+        return self._fuse(view, 1.0)
 
     def remove(self, key: int) -> bool:
         """Take a kept keyframe's observation out of the volume; False if there is none."""
         view = self._views.pop(key, None)
         if view is not None:
-            self._fuse(view, -view.weight)
+            self._fuse(view, -1.0)
         return view is not None
 
     def keep_only(self, keys: Iterable[int]) -> None:
@@ -214,7 +203,7 @@ class TsdfVolume:
         order = [i for i in np.argsort(-excess, kind="stable") if excess[i] > 1 and np.isfinite(T_new[i]).all()]
         for i in order[:limit]:
             view = self._views[known[i]]
-            self._fuse(view, -view.weight)
+            self._fuse(view, -1.0)
             self._put(known[i], view, T_new[i])
         return [known[i] for i in order[:limit]]
 
@@ -232,21 +221,18 @@ class TsdfVolume:
         self._grow(moved)
         lo, hi = self._frustum_box(moved)
         self._views[key] = moved = replace(moved, lo=lo, hi=hi)
-        self._fuse(moved, moved.weight)
+        self._fuse(moved, 1.0)
 
-    def _view(self, depth_m, rgb, mask, camera: Camera, T_cam_obj, weight: float) -> _View | None:
+    def _view(self, depth_m, rgb, mask, camera: Camera, T_cam_obj) -> _View | None:
         depth_m, mask = np.asarray(depth_m), np.asarray(mask, bool)
         want = (camera.height, camera.width)
         if depth_m.shape != want or mask.shape != want or np.shape(rgb) != (*want, 3):
-            raise BadInput(
-                "tsdf image",
-                f"depth {depth_m.shape}, mask {mask.shape}, rgb {np.shape(rgb)}",
-                f"{want} as the camera",
-            )
+            got = f"depth {depth_m.shape}, mask {mask.shape}, rgb {np.shape(rgb)}"
+            raise BadInput("tsdf image", got, f"{want} as the camera")
         rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         if len(rows) == 0:
             return None
-        image = (depth_m, rgb, mask, camera, T_cam_obj, weight)
+        image = (depth_m, rgb, mask, camera, T_cam_obj)
         view = self._cut(cols[0], rows[0], cols[-1] + 1, rows[-1] + 1, *image)
         if not view.inside.any():
             return None
@@ -256,8 +242,8 @@ class TsdfVolume:
         lo, hi = self._frustum_box(view)
         return replace(view, lo=lo, hi=hi)
 
-    def _cut(self, left, top, right, bottom, depth_m, rgb, mask, camera, T_cam_obj, weight: float) -> _View:
-        """The view of these columns and rows of a image."""
+    def _cut(self, left, top, right, bottom, depth_m, rgb, mask, camera, T_cam_obj) -> _View:
+        """The view of these columns and rows of an image."""
         cut = np.s_[top:bottom, left:right]
         depth, mask = np.asarray(depth_m[cut], np.float32), mask[cut]
         measured = (depth > 0) & (depth < np.inf)
@@ -266,7 +252,7 @@ class TsdfVolume:
         depth = np.pad(np.where(used, depth, -np.inf), 1, constant_values=-np.inf)
         rgbw = np.ones((4, *inside.shape), np.uint8)
         rgbw[:3, 1:-1, 1:-1] = np.moveaxis(np.asarray(rgb)[cut], -1, 0)
-        return _View(depth, inside, rgbw, (left, top), camera, T_cam_obj, float(weight), self.lo, self.lo)
+        return _View(depth, inside, rgbw, self.lo, self.lo, (left, top), camera, T_cam_obj)
 
     def _window(self, view: _View) -> tuple[int, int, int, int]:
         """Columns and rows [left, top, right, bottom) that the grid projects to, all where it reaches the camera."""
@@ -347,15 +333,15 @@ class TsdfVolume:
         return box_lo, np.clip(np.ceil(index.max(0)).astype(int) + 1, box_lo, hi)
 
     def _fuse(self, view: _View, weight: float) -> int:
-        """Fuse a view; pixel coordinates times depth are affine in the voxel's indices."""
+        """Fuse a view, or take it out with weight -1; returns how many voxels it touched."""
         if (view.hi <= view.lo).any():
             return 0
         cam = view.camera
         K = np.array([[cam.fx, 0, cam.cx - view.corner[0] + 1], [0, cam.fy, cam.cy - view.corner[1] + 1], [0, 0, 1.0]])
         A = K @ view.T_cam_obj[:3, :3] * self.voxel_m
         b = K @ se3.transform(view.T_cam_obj, self.anchor_m[None])[0]
-        image = Image(view.depth_m, view.inside, view.rgbw, A, b, view.lo, view.hi)
-        self._total += weight * (touched := self._grid.fuse(image, self.lo, weight, self.tau_m, self.config.carve))
+        touched = self._grid.fuse(view, A, b, self.lo, weight, self.tau_m, self.config.carve)
+        self._total += weight * touched
         return touched
 
     # -- asking --------------------------------------------------------------------------------
@@ -370,17 +356,15 @@ class TsdfVolume:
         value, valid = self._sample(p_obj.reshape(-1, 3), np.zeros((1, 3)))
         return np.where(valid, value[0], 0.0).reshape(p_obj.shape[:-1]), valid.reshape(p_obj.shape[:-1])
 
-    def query_with_gradient(
-        self, p_obj: np.ndarray, step_voxels: float = 0.5
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Value in metres and its numeric gradient (no unit) by central differences over +- ``step_voxels``.
+    def query_with_gradient(self, p_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Value in metres and its numeric gradient (no unit) by central differences over +- half a voxel.
 
         Points (N, 3) to (value_m (N,), gradient (N, 3), valid (N,)); valid where the value and all six
         neighbours are, and both are 0 where not.
         """
-        offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * step_voxels
+        offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * _GRADIENT_VOXELS
         value, valid = self._sample(np.asarray(p_obj, float).reshape(-1, 3), offsets)
-        gradient = (value[1:4] - value[4:7]).T / (2 * step_voxels * self.voxel_m)
+        gradient = (value[1:4] - value[4:7]).T / (2 * _GRADIENT_VOXELS * self.voxel_m)
         return np.where(valid, value[0], 0.0), np.where(valid[:, None], gradient, 0.0), valid
 
     def _sample(self, p_obj: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -391,8 +375,8 @@ class TsdfVolume:
         value = self._grid.at(index, offsets)
         return value * self.tau_m, ~np.isnan(value.sum(0))
 
-    def mesh(self, min_weight: float = 1.0, min_component: float = 0.1) -> trimesh.Trimesh:
+    def mesh(self, min_component: float = 0.1) -> trimesh.Trimesh:
         """The zero level with vertex colours, see :func:`p2p_lib.method.mesh.extract`."""
         from p2p_lib.method.mesh import extract
 
-        return extract(self, min_weight, min_component)
+        return extract(self, min_component)

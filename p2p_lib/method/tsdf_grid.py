@@ -16,8 +16,6 @@ from p2p_lib.core.errors import MissingBackend
 if TYPE_CHECKING:
     import torch
 
-#: A weight below this is what rounding leaves of observations that were all taken out again.
-NO_WEIGHT = 1e-3
 #: A voxel nearer than this, m, is behind the camera.
 _BEHIND_M = 1e-6
 #: Voxels that torch handles at once: its temporaries take a hundred bytes of each.
@@ -26,20 +24,17 @@ _AT_ONCE = 1 << 22
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A masked RGB-D image, cut to the pixels that count, as voxels see it.
+    """A masked RGB-D image, cut to the pixels that count, and the voxels that it may touch.
 
     depth_m   (h, w) float32, -inf on the border and wherever nothing is to be fused
     inside    (h, w) bool: measured on the object; depth elsewhere only carves
     rgbw      (4, h, w) uint8: colour and 1
-    A, b      (3, 3), (3,): u z, v z and z of lattice point (i, j, k) are A (i, j, k) + b
     lo, hi    (3,) int: the box [lo, hi) of the lattice that may be touched
     """
 
     depth_m: np.ndarray
     inside: np.ndarray
     rgbw: np.ndarray
-    A: np.ndarray
-    b: np.ndarray
     lo: np.ndarray
     hi: np.ndarray
 
@@ -71,13 +66,14 @@ class CpuGrid:
         """A NumPy copy of one of the arrays."""
         return array.copy()
 
-    def fuse(self, image: Image, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
+    def fuse(self, image: Image, A, b, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
         """Take an image into the means, or out with a negative weight; returns how many voxels it touched.
 
+        A, b   (3, 3), (3,): u z, v z and z of lattice point (i, j, k) are A (i, j, k) + b
         first  (3,) int: lattice indices of the first voxel
         """
         arrays = self.total, self.weight, self.value, self.colour
-        seen = image.depth_m, image.inside, image.rgbw, image.A, image.b, image.lo, image.hi
+        seen = image.depth_m, image.inside, image.rgbw, A, b, image.lo, image.hi
         return _fuse(*arrays, first, *seen, np.float32(weight), tau_m, carve)
 
     def at(self, index: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -127,8 +123,8 @@ def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, h
                 phi, at = min(d / tau_m, 1.0), (i - first[0], j - first[1], k - first[2])
                 total[at] += weight * phi
                 count[at] += weight
-                if weight < 0 and count[at] < NO_WEIGHT:
-                    total[at], count[at], value[at] = 0.0, 0.0, np.nan
+                if count[at] == 0:  # all were taken out again: what the total still holds is rounding
+                    total[at], value[at] = 0.0, np.nan
                 else:
                     value[at] = total[at] / count[at]
                 if phi < 1:
@@ -159,7 +155,7 @@ class TorchGrid(CpuGrid):
         """A NumPy copy of one of the tensors."""
         return array.cpu().numpy().copy()
 
-    def fuse(self, image: Image, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
+    def fuse(self, image: Image, A, b, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
         """As on the CPU."""
         import torch
 
@@ -172,7 +168,8 @@ class TorchGrid(CpuGrid):
         touched = 0
         for x in range(image.lo[0], image.hi[0], sheet):
             axes = ((x, min(x + sheet, image.hi[0])), (image.lo[1], image.hi[1]), (image.lo[2], image.hi[2]))
-            at, pixel, z = self._projected(image, first, [torch.arange(a, b, device=self.device) for a, b in axes])
+            voxels = [torch.arange(lo, hi, device=self.device) for lo, hi in axes]
+            at, pixel, z = self._projected(image.depth_m.shape, A, b, first, voxels)
             d = depth[pixel] - z
             hit = (d >= gate[pixel]).nonzero().view(-1)
             phi = (d[hit] / tau_m).clamp_(max=1.0)
@@ -182,17 +179,15 @@ class TorchGrid(CpuGrid):
             touched += len(hit)
         return touched
 
-    def _projected(
-        self, image: Image, first: np.ndarray, axes: list
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Of the voxels along these axes, flat: place in the grid, pixel in the image, and depth in metres.
+    def _projected(self, shape, A, b, first: np.ndarray, axes: list) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Of the voxels along these axes, flat: place in the grid, pixel in an image (h, w), and depth in metres.
 
         Whatever falls outside the image or behind the camera lands on its border, which holds no depth.
         """
         i, j, k = axes[0][:, None, None], axes[1][None, :, None], axes[2][None, None, :]
-        rows = zip(image.A.tolist(), image.b.tolist(), strict=True)
-        x, y, z = (a[0] * i.double() + a[1] * j.double() + b + a[2] * k.double() for a, b in rows)
-        height, width = image.depth_m.shape
+        rows = zip(A.tolist(), b.tolist(), strict=True)
+        x, y, z = (a[0] * i.double() + a[1] * j.double() + c + a[2] * k.double() for a, c in rows)
+        height, width = shape
         # Half a pixel more, cut off, is the nearest pixel.
         u, v = (x / z + 0.5).clamp_(0, width - 1).int(), (y / z + 0.5).clamp_(0, height - 1).int()
         pixel = v.mul_(width).add_(u).masked_fill_(z <= _BEHIND_M, 0)
@@ -204,9 +199,7 @@ class TorchGrid(CpuGrid):
         total, count = self.total.view(-1), self.weight.view(-1)
         new_total, new_count = total[at].add_(phi.float(), alpha=weight), count[at].add_(weight)
         if weight < 0:
-            gone = new_count < NO_WEIGHT
-            new_total.masked_fill_(gone, 0.0)
-            new_count.masked_fill_(gone, 0.0)
+            new_total.masked_fill_(new_count == 0, 0.0)
         total[at], count[at] = new_total, new_count
         # 0 / 0 is NaN, which is what an unobserved voxel holds.
         self.value.view(-1)[at] = new_total / new_count

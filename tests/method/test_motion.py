@@ -17,7 +17,7 @@ def turning(time_s: float) -> np.ndarray:
 
 
 def followed(times, noise=lambda: np.zeros(6)) -> Motion:
-    motion = Motion.begun(turning(times[0]), times[0])
+    motion = Motion(turning(times[0]), times[0])
     for time_s in times[1:]:
         motion = motion.followed_by(turning(time_s) @ se3.exp(noise()), time_s)
     return motion
@@ -44,7 +44,7 @@ def test_the_noise_of_single_poses_is_smoothed():
 
 
 def test_at_rest_it_stays():
-    motion = Motion.begun(turning(0.0), 0.0)
+    motion = Motion(turning(0.0), 0.0)
     np.testing.assert_allclose(motion.at(1.0), turning(0.0))
     assert motion.holds(1.0) and not motion.holds(2.0)
 

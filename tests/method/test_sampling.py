@@ -14,7 +14,7 @@ from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Frame
-from p2p_lib.method.sampling import choose, objective, usable_region
+from p2p_lib.method.sampling import choose, terms, usable_region
 
 DEFAULT = SamplingConfig()
 EDGE_M = 0.01
@@ -39,18 +39,18 @@ def papers_j(s: float, d: float, cfg: SamplingConfig) -> float:
 )
 def test_objective_is_the_papers(s, d, lam, beta, r_ideal, r_min):
     cfg = SamplingConfig(score_weight=lam, cluster_weight=beta, r_ideal_px=r_ideal, r_min_px=r_min)
-    assert objective(np.array([s]), np.array([d]), cfg)[0] == pytest.approx(papers_j(s, d, cfg), abs=1e-12)
+    assert terms(np.array([s]), np.array([d]), cfg).total[0] == pytest.approx(papers_j(s, d, cfg), abs=1e-12)
 
 
 def test_objective_at_its_landmarks():
     d = np.array([0, 2.5, 5, 10, 20, 40, np.inf])
-    np.testing.assert_allclose(objective(np.zeros(7), d, DEFAULT), [-0.5, 0.0875 - 0.25, 0.175, 0.35, 0.7, 0.7, 0.7])
-    np.testing.assert_allclose(objective(np.ones(7), d, DEFAULT) - objective(np.zeros(7), d, DEFAULT), 0.3)
+    np.testing.assert_allclose(terms(np.zeros(7), d, DEFAULT).total, [-0.5, 0.0875 - 0.25, 0.175, 0.35, 0.7, 0.7, 0.7])
+    np.testing.assert_allclose(terms(np.ones(7), d, DEFAULT).total - terms(np.zeros(7), d, DEFAULT).total, 0.3)
 
 
 def test_without_a_least_distance_there_is_no_crowding():
     cfg = replace(DEFAULT, r_min_px=0.0)
-    np.testing.assert_allclose(objective(np.array([1.0, 1.0]), np.array([0.0, 20.0]), cfg), [0.3, 1.0])
+    np.testing.assert_allclose(terms(np.array([1.0, 1.0]), np.array([0.0, 20.0]), cfg).total, [0.3, 1.0])
 
 
 # --- the greedy choice -------------------------------------------------------------------------

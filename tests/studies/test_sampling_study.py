@@ -13,7 +13,7 @@ from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.robust import fit_rigid
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.method.sampling import choose, objective
+from p2p_lib.method.sampling import choose, terms
 from p2p_lib.studies import sampling
 from p2p_lib.studies.sampling import (
     MapHistory,
@@ -119,7 +119,8 @@ def test_maps_show_the_terms_and_the_next_choice(crossing):
     crosses = [tuple(line.get_xydata()[0]) for line in axes[7].get_lines()]
     np.testing.assert_allclose(crosses[-1], candidates.uv_px[chosen[4]])
     dots = axes[3].collections[0].get_array()
-    np.testing.assert_allclose(np.sort(dots), np.sort(objective(candidates.score, np.full(len(dots), np.inf), config)))
+    objective = terms(candidates.score, np.full(len(dots), np.inf), config).total
+    np.testing.assert_allclose(np.sort(dots), np.sort(objective))
 
 
 def test_the_plot_of_choices_has_a_panel_a_measure():
