@@ -1,4 +1,4 @@
-"""The paper's method, and nothing else: one file per box of its overview figure.
+"""The paper's method, one file per box of its overview figure, and what preset ``default`` adds to these boxes.
 
 Look first at :mod:`~p2p_lib.method.pipeline` (all objects, one frame) and :mod:`~p2p_lib.method.object_tracker` (one
 object's step; ``pose_finder`` has its first half, up to the pose), then at the parts of that step in its order:
@@ -13,9 +13,9 @@ object's step; ``pose_finder`` has its first half, up to the pose), then at the 
 - extend: ``object_model`` holds map, surface (``tsdf``, ``tsdf_grid``, ``mesh``) and graph (``factor_graph``,
   ``keyframes``, ``keyframe_views``); ``sampling`` chooses new points; ``confidence`` says how well the pose is known.
 
-``outlook`` answers what the pipeline asks around this step: where the object should show, which tracks are elsewhere.
-An object that shows a side never seen has two maps for a while: ``two_maps`` says when they are one. ``motion``
-says where an absent object was going, ``shape_search`` looks for it by its surface.
+What follows is ours. ``outlook`` answers what the pipeline asks around this step: where the object should show, which
+tracks are elsewhere. An object that shows a side never seen has two maps for a while: ``two_maps`` says when they are
+one. ``motion`` says where an absent object was going, ``shape_search`` looks for it by its surface.
 
 The 2D tracker, the detector of candidates and the segmenter are parts that it is given; what it asks of them is in
 :mod:`p2p_lib.core.interfaces`. Where an absent object may lie it is told by :mod:`p2p_lib.recovery`.

@@ -101,7 +101,8 @@ class ObjectGraph:
         p_obj_init    (N, 3) where points that the graph does not know yet start from
         covariance    (6, 6) of the pose relative to the keyframe before, right tangent of T_cam_obj, as far
                       as it comes from elsewhere than these observations (the surface): what is counted
-                      twice makes the result too sure. None: the configured noise, at the object
+                      twice makes the result too sure, as the keypoints' small share in a refined pose's. None: the
+                      configured noise, at the object
         sigma_rad, sigma_m  noise of bearings and ranges, (N,) or one for all; configured values where None
         """
         T_obj_cam = se3.inverse(se3.check("keyframe T_cam_obj", T_cam_obj))

@@ -1,7 +1,8 @@
 """What an object has been through, as a value, and the gates that a pose has to pass to be believed.
 
-:class:`Lifecycle` never changes: each frame makes the next one. :data:`GATES` is the whole list of reasons for which
-a pose is refused. The paper refuses none; the gates are ours.
+:class:`Lifecycle` never changes: each frame makes the next one. :data:`GATES` is the list of reasons for which a pose
+is refused; of a map that was put aside :mod:`~p2p_lib.method.object_tracker` asks more. The paper refuses none:
+the gates are ours.
 """
 
 from __future__ import annotations

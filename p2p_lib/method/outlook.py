@@ -1,6 +1,7 @@
 """Where an object should show: what the pipeline asks around segmentation and 2D tracking (mostly not in the paper).
 
-Questions, without side effects: an object's step is :mod:`p2p_lib.method.object_tracker`.
+Questions, which change nothing of an object but the state of its random numbers: its step is
+:mod:`p2p_lib.method.object_tracker`.
 """
 
 from __future__ import annotations

@@ -280,7 +280,7 @@ class Point2Pose:
         return {name: self.objects[name].seen_anew(seen[name], self.tracks) for name in expected}
 
     def _apply(self, requests: Mapping[str, Requests]) -> None:
-        """The one place where the shared tracker is changed, after all objects have been looked at."""
+        """Hand what all objects ask for to the shared tracker: nobody's answer depends on who is asked first."""
         rejected = np.concatenate([NO_IDS, *(request.reject for request in requests.values())])
         if len(rejected) and self.config.method.redetection:
             self.tracker.reject(rejected)

@@ -227,6 +227,9 @@ def test_what_comes_out_where_its_motion_leads_is_known_by_its_colours():
     tiny = picture(2, [])
     tiny.rgb[card((255, 118), (8, 8))], tiny.depth_m[card((255, 118), (8, 8))] = (200, 40, 30), CARD_M
     assert not found(tiny).any(), "a few pixels"
+    speck = painted(2, back, (40, 160, 30))
+    speck.rgb[card((255, 118), (8, 8))] = 200, 40, 30
+    assert not found(speck).any(), "a few pixels of something else"
     behind = {"card": Hint(place=np.array([0.2, 0.0, -0.6, 0.3]))}
     assert not (copy.deepcopy(follow).segment(there, hints=behind) == 1).any()
     small, piece = picture(2, []), card((250, 115), (14, 12))
