@@ -152,21 +152,14 @@ class ObjectTracker:
         found = self.finder.register(obs, self.known)
         best, reason = self.finder.refine_and_select(obs, self.known, found)
         verdict = self._judge(obs, best, reason)
-        known = None if self.aside is None or obs.aside is None else self._known_again(obs.aside, self.aside)
-        if known is not None and not verdict.accepted:
-            obs, (best, verdict) = self._exchanged(obs), known
-        elif known is not None and not verdict.doubted:
-            T_obj_aside = se3.inverse(best.T_cam_obj) @ known[0].T_cam_obj
-            self._relation = self._relation.with_frame(T_obj_aside, self.aside.map.p_obj)
-            if self._relation.certain:
-                return self._joined(obs, best, known[0])
+        by_aside = self._by_aside(obs, best, verdict)
+        if by_aside is not None:
+            return by_aside
         if best is None or not verdict.accepted:
             if self._outgrown(obs) or self._turned_over(obs):
                 return self._initialise(obs)
             return self._without_pose(obs, verdict.status, verdict.reason)
-        if not verdict.doubted:
-            self._trusted = obs
-        return self._extend(obs, best, verdict)
+        return self._accepted(obs, best, verdict)
 
     # -- judge ---------------------------------------------------------------------------------
 
@@ -206,6 +199,12 @@ class ObjectTracker:
         return 1.0 if then is None or now is None or then < _SOME else now / then
 
     # -- extend --------------------------------------------------------------------------------
+
+    def _accepted(self, obs: Observation, best: Candidate, verdict: Verdict) -> ObjectStep:
+        """A frame whose pose stands."""
+        if not verdict.doubted:
+            self._trusted = obs
+        return self._extend(obs, best, verdict)
 
     def _extend(self, obs: Observation, best: Candidate, verdict: Verdict, due: bool = False) -> ObjectStep:
         """Take an accepted frame into the model, with a keyframe where one is due."""
@@ -327,6 +326,19 @@ class ObjectTracker:
         return plain and self._outline(obs) >= OUTLINE
 
     # -- two maps ------------------------------------------------------------------------------
+
+    def _by_aside(self, obs: Observation, best: Candidate | None, verdict: Verdict) -> ObjectStep | None:
+        """The step by the map that was put aside, where it alone knows the object, or the two become one; else None."""
+        known = None if self.aside is None or obs.aside is None else self._known_again(obs.aside, self.aside)
+        if known is None:
+            return None
+        if not verdict.accepted:
+            return self._accepted(self._exchanged(obs), *known)
+        if verdict.doubted:
+            return None
+        T_obj_aside = se3.inverse(best.T_cam_obj) @ known[0].T_cam_obj
+        self._relation = self._relation.with_frame(T_obj_aside, self.aside.map.p_obj)
+        return self._joined(obs, best, known[0]) if self._relation.certain else None
 
     def _known_again(self, obs: Observation, aside: Known) -> tuple[Candidate, Verdict] | None:
         """The pose by what was put aside, where points and surface say that it is this object; else None."""

@@ -1,4 +1,4 @@
-"""Point2Pose: the algorithm of the paper on one screen (paper: Fig. "Overview of the framework").
+"""Point2Pose: what becomes of a frame, for all objects (paper: Fig. "Overview of the framework").
 
 What a caller writes:
 
@@ -182,7 +182,7 @@ class Point2Pose:
 
     @uninterrupted()
     def _advance(self, frame: Frame, masks: Masks, said: dict[str, Prompt], still: bool) -> dict[str, PoseEstimate]:
-        """Track into a frame, then segment and estimate at the frame that the tracks are of."""
+        """Track into a frame, then estimate at the frame that the tracks are of: earlier where they come late."""
         self._waiting.append((frame, masks, said, still))
         answers = len(self._waiting) > self.tracker.latency_frames
         locating = self._locate(self._waiting[0][0]) if answers else None
@@ -196,10 +196,13 @@ class Point2Pose:
         if locating is not None:
             with self.stopwatch("scene"):
                 frame = replace(frame, T_world_cam=locating.result())
-        self.frame = frame
+        self.frame, self.tracks = frame, tracks
+        return self._estimate(frame, masks, said, still)
+
+    def _estimate(self, frame: Frame, masks: Masks, said: dict[str, Prompt], still: bool) -> dict[str, PoseEstimate]:
+        """One tracked frame: segment, observe, re-detect, each object's step; what they ask for is done last."""
         # An object added since then is not in that frame's masks yet. The order of the objects means nothing.
         objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
-        self.tracks = tracks
         sightings = self._sightings(frame, masks, objects)
         self.masks = self._segment(frame, masks, said, sightings)
         seen = {
@@ -211,12 +214,16 @@ class Point2Pose:
         steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
         self._apply({name: step.requests for name, step in steps.items()})
         estimates = {name: steps[name].estimate for name in self.objects if name in steps}
+        self._log(estimates)
+        return estimates
+
+    def _log(self, estimates: Mapping[str, PoseEstimate]) -> None:
+        """Say what has become of objects since the frame before."""
         for name, estimate in estimates.items():
             if estimate.status != self._status.get(name):
                 self._status[name] = estimate.status
                 why = f" ({estimate.reason})" if estimate.reason else ""
                 _LOG.info("frame %d: %s is %s%s", estimate.frame_index, name, estimate.status, why)
-        return estimates
 
     def _without_depth(self, frame: Frame) -> Frame:
         """A frame of which depth and colour are not of one moment: points can wait for depth."""
