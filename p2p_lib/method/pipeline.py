@@ -328,7 +328,7 @@ class Point2Pose:
 
     def _segment(self, frame: Frame, masks: Masks, said: dict[str, Prompt], sightings: Mapping[str, Sighting]) -> Masks:
         """Every object's mask: the one given, else the segmenter's, which learns from those that are given."""
-        masks = {name: mask for name, mask in masks.items() if name in self.objects}  # some may be gone again
+        masks = {name: mask for name, mask in sorted(masks.items()) if name in self.objects}  # some may be gone again
         said = {name: prompt for name, prompt in sorted(said.items()) if name in masks}
         said |= {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items() if mask is not None}
         if not self.segmenter.names and not said:
