@@ -1,4 +1,4 @@
-"""The paper's method, one file per box of its overview figure, and what preset ``default`` adds to these boxes.
+"""The paper's method, one file per box of its overview figure, and what preset "default" adds to these boxes.
 
 Look first at :mod:`~p2p_lib.method.pipeline` (all objects, one frame) and :mod:`~p2p_lib.method.object_tracker` (one
 object's step; ``pose_finder`` has its first half, up to the pose), then at the parts of that step in its order:
