@@ -520,7 +520,7 @@ def _config(a: argparse.Namespace) -> None:
         value += f" (paper: {row['paper']})" if a.diff else ""
         print(f"{row['key']} = {value}\n    {row['meaning']} [{row['source']}]")
     whose = "paper (its text), release (the authors' configuration) or ours"
-    print(f"In brackets, whose value the default is: {whose}. Change one with --set KEY=VALUE.")
+    print(f"In brackets, whose value it is: {whose}. Change one with --set KEY=VALUE.")
 
 
 @command("doctor", "check this installation and say how to mend it")
