@@ -37,7 +37,7 @@ _RELATIVE_TOLERANCE = 1e-3
 _UNDETERMINED = np.repeat([(2 * np.pi) ** 2, 10.0**2], 3)
 
 #: Of a solve: the newest keyframe's covariance (6, 6), and the loss before and after.
-_Known = tuple[np.ndarray | None, float, float]
+_Fit = tuple[np.ndarray | None, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class ObjectGraph:
         self._new: list[int] = []  # added since the last solve that went well
         self.next_key = 0  # of the keyframe to be added next
         self._joined: set[int] = set()  # keyframes of graphs that it has taken in
-        self._known: _Known = None, 0.0, 0.0
+        self._fit: _Fit = None, 0.0, 0.0
         self._anchor = se3.IDENTITY
         importlib.import_module("gtsam")  # takes a second that no frame should wait for
 
@@ -161,7 +161,7 @@ class ObjectGraph:
         reason = self._why_not()
         if not reason:
             try:
-                poses, points, known = _solve(self._keyframes, self._points, self._anchor, self.config)
+                poses, points, fit = _solve(self._keyframes, self._points, self._anchor, self.config)
             except (RuntimeError, ValueError) as error:  # gtsam's, for an indeterminate system or impossible noise
                 reason = "gtsam: " + str(error).strip().splitlines()[0]
         if reason:
@@ -175,8 +175,8 @@ class ObjectGraph:
         for key, T_obj_cam in poses.items():
             self._keyframes[key].T_obj_cam = T_obj_cam
         self._points |= points
-        self._new, self._known = [], known
-        result = self._result(True, "no covariance: nothing anchors the graph" if known[0] is None else "")
+        self._new, self._fit = [], fit
+        result = self._result(True, "no covariance: nothing anchors the graph" if fit[0] is None else "")
         merge_keyframes(self._keyframes, self.config.max_keyframes)
         return result
 
@@ -212,7 +212,7 @@ class ObjectGraph:
         poses = [self._keyframes[k].T_obj_cam for k in keys.tolist()]
         p_obj = np.array([self._points[i] for i in ids.tolist()]).reshape(-1, 3)
         T_cam_obj = se3.inverse(np.array(poses).reshape(-1, 4, 4))
-        return GraphResult(ok, reason, keys, T_cam_obj, ids, p_obj, *self._known)
+        return GraphResult(ok, reason, keys, T_cam_obj, ids, p_obj, *self._fit)
 
 
 def _about(p_obj: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
@@ -227,7 +227,7 @@ def _is_covariance(covariance: np.ndarray | None) -> bool:
 
 def _solve(
     keyframes: dict[int, Keyframe], points: dict[int, np.ndarray], anchor: np.ndarray, config: FactorGraphConfig
-) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], _Known]:
+) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], _Fit]:
     """Levenberg-Marquardt over all variables (paper: "Solving the Optimization"): T_obj_cam and points by key."""
     import gtsam
 
