@@ -350,7 +350,10 @@ def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str,
             frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
             for prompt in job.prompts.get(i, ()):
                 method.tell(prompt)
-            yield method.step(frame, {name: masks[name] for name in method.objects if name in masks})
+            estimates = method.step(frame, {name: masks[name] for name in method.objects if name in masks})
+            for error in method.refused.values():  # nobody is there to say something better
+                raise error
+            yield estimates
         yield from method.finish()
 
     for estimates in steps():

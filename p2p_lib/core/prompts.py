@@ -27,6 +27,8 @@ class Prompt:
     negative_px  (M, 2) pixels that are not of it
     box_px       (4,) left, top, right, bottom: all of the object is inside; None where nobody says
     mask         (H, W) bool: these pixels are the object, none where it is hidden; None where nobody says
+
+    The arrays are copied.
     """
 
     name: str
@@ -47,7 +49,7 @@ class Prompt:
             object.__setattr__(self, "box_px", _box(f"box around {self.name!r}", self.box_px))
         if self.mask is not None:
             mask = np.asarray(self.mask)
-            object.__setattr__(self, "mask", mask if mask.dtype == bool else mask > 0)
+            object.__setattr__(self, "mask", mask.copy() if mask.dtype == bool else mask > 0)
         if not len(self.points_px) and not len(self.negative_px) and self.box_px is None and self.mask is None:
             raise BadInput(f"clicks on {self.name!r}", "none", "at least one [x, y] in pixels, a box or a mask")
         if self.mask is not None and (len(self.points_px) or len(self.negative_px) or self.box_px is not None):

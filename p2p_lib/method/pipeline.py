@@ -88,6 +88,8 @@ class Point2Pose:
         self._standing = Standing()
         self._status: dict[str, Status] = {}
         self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
+        #: Of objects whose last prompt did not fit the frame that it was made on: why it was not used.
+        self.refused: dict[str, BadInput] = {}
         self._waiting: deque[tuple[Frame, Masks, dict[str, Prompt], bool]] = deque()  # frames without an answer yet
 
     def add_object(
@@ -105,7 +107,9 @@ class Point2Pose:
         box       (4,) left, top, right, bottom: all of it is inside in the next frame
 
         With none of them it is started by the first mask that ``step`` gets for it. Raises :class:`BadInput` for what
-        does not fit, and nothing has changed; ``step`` raises it for clicks where there is no depth.
+        does not fit, and nothing has changed. What shows to be unusable in the next frame itself, as clicks where no
+        depth was measured, is forgotten with that frame: :attr:`refused` and the reason of the object's estimates say
+        why, until :meth:`correct` says something better.
         """
         if name in self.objects:
             raise BadInput("add_object", repr(name), "a name not in use", f"In use: {', '.join(self.objects)}.")
@@ -131,6 +135,7 @@ class Point2Pose:
         if name not in self.objects:
             self._begin(name)
         self._said[name] = prompt
+        self.refused.pop(name, None)
 
     def _begin(self, name: str) -> None:
         rng = np.random.default_rng([self.config.seed, *name.encode()])
@@ -145,6 +150,7 @@ class Point2Pose:
         if len(ids := self.objects.pop(name).ids):
             self.tracker.drop(ids)
         self._said.pop(name, None)
+        self.refused.pop(name, None)
         if name in self.segmenter.names:
             self.segmenter.remove(name)
 
@@ -213,9 +219,15 @@ class Point2Pose:
         seen |= self._redetect(seen)
         steps = {name: obj.step(seen[name]) for name, obj in objects.items()}
         self._apply({name: step.requests for name, step in steps.items()})
-        estimates = {name: steps[name].estimate for name in self.objects if name in steps}
+        estimates = {name: self._explained(steps[name].estimate) for name in self.objects if name in steps}
         self._log(estimates)
         return estimates
+
+    def _explained(self, estimate: PoseEstimate) -> PoseEstimate:
+        """An estimate that says, where its object has not started, what was wrong with its prompt."""
+        if estimate.status != Status.INITIALISING or estimate.object not in self.refused:
+            return estimate
+        return replace(estimate, reason=str(self.refused[estimate.object]))
 
     def _log(self, estimates: Mapping[str, PoseEstimate]) -> None:
         """Say what has become of objects since the frame before."""
@@ -316,13 +328,14 @@ class Point2Pose:
         for name, prompt in given.items():
             if prompt.mask is not None and prompt.mask.all():
                 doubt(f"mask of {name!r}", f"the whole image in frame {frame.index}", "Is it inverted?")
-        for name, prompt in self._said.items():
-            check_depth(prompt, frame)
-            for other in given.values():
-                check_not_on(prompt, other, frame.index)
-            if name in given and prompt.mask is None:
-                fix = "Leave it out of the masks, or do not click on it."
-                raise BadInput(f"mask of {name!r}", f"a mask and clicks in frame {frame.index}", "one of them", fix)
+        for name in list(self._said):
+            try:
+                _check_said(self._said[name], frame, given)
+            except BadInput as error:
+                self.refused[name] = error
+                del self._said[name]
+                if name in self.segmenter.names:  # its estimates go on and cannot say so
+                    doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is not used. {error.fix}")
         given = {name: prompt for name, prompt in self._said.items() if prompt.mask is not None} | given
         return {name: given[name].mask if name in given else None for name in self.objects}
 
@@ -358,6 +371,16 @@ class Point2Pose:
             search = _either(known) if len(known) == len(masks) > 0 else None
             urgent = any(obj.outlook.awaited(masks[name]) for name, obj in self.objects.items())
             return self.tracker.track(frame, search, urgent)
+
+
+def _check_said(prompt: Prompt, frame: Frame, given: Mapping[str, Prompt]) -> None:
+    """Refuse what is said of an object in a frame where depth or the masks given with it say otherwise."""
+    check_depth(prompt, frame)
+    for other in given.values():
+        check_not_on(prompt, other, frame.index)
+    if prompt.name in given and prompt.mask is None:
+        fix = "Leave it out of the masks, or do not click on it."
+        raise BadInput(f"mask of {prompt.name!r}", f"a mask and clicks in frame {frame.index}", "one of them", fix)
 
 
 def _either(masks: Iterable[np.ndarray | None]) -> np.ndarray:
