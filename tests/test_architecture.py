@@ -10,6 +10,8 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 PACKAGE = PROJECT / "p2p_lib"
+#: What notebooks share stands beside them: it imports what it likes, and nothing imports it.
+STUDIES = sorted((PROJECT / "notebooks" / "studies").glob("*.py"))
 #: Lowest first; the packages of one layer do not import each other.
 LAYERS = [
     {"core"},
@@ -21,15 +23,14 @@ LAYERS = [
     {"run"},
     {"benchmark"},
     {"figures"},
-    {"studies"},
     {"apps"},
 ]
 HOMES = {
-    "gtsam": ["method/factor_graph.py"],
-    "numba": ["core/compiled.py"],
-    "matplotlib": ["figures/*.py", "studies/*.py"],
-    "open3d": ["core/native.py"],
-    "papermill": ["apps/notebooks.py"],
+    "gtsam": ["p2p_lib/method/factor_graph.py"],
+    "numba": ["p2p_lib/core/compiled.py"],
+    "matplotlib": ["p2p_lib/figures/*.py", "notebooks/studies/*.py"],
+    "open3d": ["p2p_lib/core/native.py"],
+    "papermill": ["notebooks/studies/runner.py"],
 }
 MACHINE = re.compile(r"(?<![\w./~-])/(work|tmp|root|farm|home/[a-z]\w*|opt|mnt|Users)/\w")
 REGISTRY = re.compile(r"https?://[^\s\"']*(/simple\b|/packages/[0-9a-f]{2}/|/whl/)|index-url[ =]+http|pypi\.org")
@@ -79,12 +80,13 @@ def test_imports_point_down(path):
     for module in imports(path):
         if module.startswith("p2p_lib.") and module != "p2p_lib.__version__" and part(module) != mine:
             assert layer[part(module)] < layer[mine], f"{mine} (layer {layer[mine]}) imports {module}"
+        assert module.partition(".")[0] != "studies", "notebooks are no part of the package"
 
 
 @pytest.mark.parametrize("library", HOMES)
 def test_heavy_library_has_one_home(library):
-    users = {path for path in sources() if library in {module.split(".")[0] for module in imports(path)}}
-    homes = {path for pattern in HOMES[library] for path in PACKAGE.glob(pattern)}
+    users = {path for path in [*sources(), *STUDIES] if library in {module.split(".")[0] for module in imports(path)}}
+    homes = {path for pattern in HOMES[library] for path in PROJECT.glob(pattern)}
     assert users <= homes, f"{library} is used outside its home: {sorted(map(str, users - homes))}"
 
 
@@ -124,12 +126,12 @@ def test_the_method_loads_neither_datasets_nor_downloads_nor_drawing(code, parts
 
 
 def test_every_module_imports_without_torch_open3d_and_plots():
-    """Importing any file of ours alone must not load them; figures and studies may plot."""
+    """Importing any file of ours alone must not load them; figures may plot."""
     names = [".".join(path.relative_to(PROJECT).with_suffix("").parts) for path in sources()]
     names = [
         name.removesuffix(".__init__")
         for name in names
-        if part(name) not in ("figures", "studies", "trackers", "detectors", "segmenters")
+        if part(name) not in ("figures", "trackers", "detectors", "segmenters")
     ]
     code = f"import importlib, sys\nfor n in {names!r}: importlib.import_module(n)\n"
     code += "print('LOADED', *[m for m in ('torch', 'open3d', 'matplotlib', 'papermill') if m in sys.modules])"

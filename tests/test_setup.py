@@ -62,15 +62,15 @@ def declared() -> dict[str, Requirement]:
 
 
 def imported() -> set[str]:
-    """Distributions that p2p_lib imports, by name, anywhere."""
+    """Distributions that the package or what stands beside the notebooks imports, by name, anywhere."""
     modules = set()
-    for path in (PROJECT / "p2p_lib").rglob("*.py"):
+    for path in [*(PROJECT / "p2p_lib").rglob("*.py"), *(PROJECT / "notebooks" / "studies").glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 modules |= {name.name.split(".")[0] for name in node.names}
             elif isinstance(node, ast.ImportFrom):
                 modules.add(node.module.split(".")[0])
-    return {PARTS.get(m) or DISTRIBUTIONS.get(m, m) for m in modules - set(sys.stdlib_module_names) - {"p2p_lib"}}
+    return {PARTS.get(m) or DISTRIBUTIONS.get(m, m) for m in modules - set(sys.stdlib_module_names) - {"p2p_lib", "studies"}}
 
 
 def test_declared_is_what_is_used():

@@ -6,6 +6,8 @@ import importlib
 import os
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -50,6 +52,20 @@ def load(module: str, backend: str, package: str) -> ModuleType:
         fix = f"Run: {command(INSTALL[package])}"
         missing = f"the package {package} cannot be loaded ({in_a_line(error)})"
         raise MissingBackend(backend, missing, fix) from error
+
+
+@contextmanager
+def needed_for(extra: str) -> Iterator[None]:
+    """What is imported inside belongs to this extra of the package: :class:`MissingBackend` where it is not there."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] in ("p2p_lib", "studies"):
+            raise
+        fix = f'Run: pip install "p2p_lib[{extra}]"'
+        raise MissingBackend(
+            error.name, f"this package is not installed; it comes with the extra {extra}", fix
+        ) from error
 
 
 def cotracker_folder() -> Path | None:

@@ -24,7 +24,7 @@ from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import evaluate
-from p2p_lib.studies.final_tables import paper_table
+from p2p_lib.figures.final_tables import paper_table
 
 
 def run_benchmark(plan, *where, **options):

@@ -29,8 +29,8 @@ from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, panels
 from p2p_lib.figures.provenance import Saved, save_figure
 from p2p_lib.figures.scenes import Scene
-from p2p_lib.studies.final_tables import SHIPPED
 from p2p_lib.synthetic.shapes import load_mesh
+from studies import SHIPPED
 
 #: What a fault should at most do: a share of the frames for lies, else what the column of the table is in.
 FAULT_GOALS = {"lies in it": 0.005, "lies after": 0.005, "longest": 5.0, "worst": 15.0, "mesh off (%)": 5.0}
@@ -38,7 +38,7 @@ FAULT_GOALS = {"lies in it": 0.005, "lies after": 0.005, "longest": 5.0, "worst"
 
 @style.styled
 def fault_picture(table: DataFrame) -> Figure:
-    """A row per fault of ``faults.csv`` (:func:`~p2p_lib.studies.final_tables.by_fault`): its numbers against goals.
+    """A row per fault of ``faults.csv`` (:func:`~p2p_lib.figures.final_tables.by_fault`): its numbers against goals.
 
     The colour is the number by its goal: from 0 to twice as much or more, or never good again. What misses it is
     bold, what has no number grey.

@@ -4,11 +4,11 @@ import re
 
 import pytest
 
-from p2p_lib.apps.notebooks import list_notebooks
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.paths import PROJECT
-from p2p_lib.figures.course import LESSONS, lesson
-from p2p_lib.figures.pipeline_diagram import STAGES
+from studies.course import LESSONS, lesson
+from studies.pipeline_diagram import STAGES
+from studies.runner import list_notebooks
 
 
 def test_the_course_is_the_notebooks_in_their_order():

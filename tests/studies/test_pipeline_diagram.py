@@ -4,11 +4,11 @@ import ast
 
 import pytest
 
-from p2p_lib.apps.notebooks import list_notebooks
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.paths import PROJECT
-from p2p_lib.figures.pipeline_diagram import STAGES, as_svg, pipeline_diagram
 from p2p_lib.method.pipeline import Point2Pose
+from studies.pipeline_diagram import STAGES, as_svg, pipeline_diagram
+from studies.runner import list_notebooks
 from tests.method.test_pipeline import CAMERA, film
 
 

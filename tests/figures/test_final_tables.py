@@ -13,9 +13,9 @@ from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome
 from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.benchmark.rows import shown_name
 from p2p_lib.datasets.paper_reported import FAIL, paper_reported
+from p2p_lib.figures.final_tables import paper_table, write_table
 from p2p_lib.figures.tables import Cell, Table, emboldened
-from p2p_lib.studies import final_tables
-from p2p_lib.studies.final_tables import paper_table, write_table
+from studies import final_figures
 
 MUSTARD = {"name": "ycbineoat/mustard0", "column": "mustard v1"}
 
@@ -140,14 +140,14 @@ def test_pairs_are_differences_run_against_run(tmp_path):
 
 def test_where_only_the_quick_form_ran_the_shipped_table_is_shown(tmp_path, monkeypatch):
     monkeypatch.setenv("P2P_TABLES", str(tmp_path / "out"))
-    monkeypatch.setattr(final_tables, "SHIPPED", tmp_path)
+    monkeypatch.setattr(final_figures, "SHIPPED", tmp_path)
     made = benchmark(tmp_path, {("Ours", "x"): [outcome(90)]})
     quick = replace(made, profile="quick")
-    assert final_tables.shown(quick).path == tmp_path / "out/final_p.csv", "none is shipped"
+    assert final_figures.shown_table(quick).path == tmp_path / "out/final_p.csv", "none is shipped"
     (tmp_path / "p.md").write_text("| the shipped one |")
-    assert "the shipped one" in final_tables.shown(quick)._repr_markdown_()
-    assert "nothing newer was run here" in final_tables.shown(quick)._repr_markdown_()
-    assert final_tables.shown(made).path == tmp_path / "out/final_p.csv", "a full run is newer"
+    assert "the shipped one" in final_figures.shown_table(quick)._repr_markdown_()
+    assert "nothing newer was run here" in final_figures.shown_table(quick)._repr_markdown_()
+    assert final_figures.shown_table(made).path == tmp_path / "out/final_p.csv", "a full run is newer"
 
 
 def test_seeds_show_their_spread(tmp_path):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.figures.pipeline_diagram import STAGES, as_svg, pipeline_diagram
+from studies.pipeline_diagram import STAGES, as_svg, pipeline_diagram
 
 
 @dataclass(frozen=True)

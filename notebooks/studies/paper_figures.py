@@ -17,7 +17,6 @@ from pandas import DataFrame
 from PIL import Image
 
 from p2p_lib.benchmark.benchmark import Benchmark
-from p2p_lib.core.paths import PROJECT
 from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.exchange import as_run, read_poses
 from p2p_lib.datasets.models import find_models
@@ -25,11 +24,12 @@ from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.figures import mesh_view, overlay, style
-from p2p_lib.figures.pipeline_diagram import pipeline_diagram
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.provenance import Saved, save_figure
 from p2p_lib.figures.scenes import Scene, beside
-from p2p_lib.studies.final_figures import rate_figure, scene_of
+from studies import CLONE
+from studies.final_figures import rate_figure, scene_of
+from studies.pipeline_diagram import pipeline_diagram
 
 PLAN = "paper_figures"
 _OURS, _MESHES, _RIVAL = "Ours", "Ours, YCB meshes", "Ours, SH(10)"
@@ -218,6 +218,6 @@ def _made(file: Path, on: str, day_of: Callable[[str], str]) -> tuple[str, str, 
 
 
 def _day(commit: str) -> str:
-    asked = ["git", "-C", str(PROJECT), "show", "-s", "--format=%cs", commit]
+    asked = ["git", "-C", str(CLONE), "show", "-s", "--format=%cs", commit]
     found = subprocess.run(asked, capture_output=True, text=True, check=False)
     return found.stdout.strip() if commit and found.returncode == 0 else ""

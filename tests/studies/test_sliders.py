@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.figures.sliders import save_sliders
+from studies.sliders import save_sliders
 
 SLIDERS = {"red": [0, 100, 200], "blue": [50, 250]}
 

@@ -1,4 +1,4 @@
-"""Notebook 09 and ``p2p benchmark``: a benchmark's tables in the paper's arrangements.
+"""``p2p benchmark`` and notebook 09: a benchmark's tables in the paper's arrangements.
 
 Ours are exact areas under the curve over 0 to 0.1 m, aligned at the first scored frame, frames without a pose counted
 as 0, mean over seeds ± their standard deviation; every other form is in the benchmark's ``results.csv``. Bold is the
@@ -8,9 +8,8 @@ best among methods without a CAD model, of those that ran on the whole of what t
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pandas import DataFrame
@@ -22,17 +21,12 @@ from p2p_lib.benchmark.outcome import Outcome
 from p2p_lib.benchmark.plan import Method
 from p2p_lib.benchmark.rows import AREAS, MEAN, POOLED, Row, shown_name
 from p2p_lib.core.files import replace_text
-from p2p_lib.core.paths import PROJECT
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.paper_reported import FAIL, paper_reported
 from p2p_lib.datasets.paper_reported import Table as Reported
 from p2p_lib.datasets.sequence import SYNTHETIC
 from p2p_lib.evaluation import metrics
-from p2p_lib.figures.provenance import Saved, save_table
 from p2p_lib.figures.tables import Cell, Table, emboldened, number
-
-if TYPE_CHECKING:
-    from IPython.display import Markdown
 
 #: The paper's metrics: what the benchmark calls them, their head, and whether more is better.
 METRICS = {
@@ -40,8 +34,6 @@ METRICS = {
     "add_auc": ("ADD AUC", "ADD (%)", True),
     "chamfer_cm": ("Chamfer distance", "CD (cm)", False),
 }
-#: The tables that come with the project.
-SHIPPED = PROJECT / "figures" / "tables"
 _AREAS = ("adds_auc", "add_auc")
 _AREA_HEADS = [METRICS[key][1] for key in _AREAS]
 _HOW = "Ours: exact area under the curve, aligned at the first scored frame, frames without a pose count as 0"
@@ -52,21 +44,6 @@ _NOT_IN_PAPER = Cell(note="not in the paper")
 def paper_table(benchmark: Benchmark) -> Table:
     """The table of a benchmark, arranged as its plan's ``kind`` says."""
     return KINDS[benchmark.plan.kind](Numbers(benchmark))
-
-
-def shown(benchmark: Benchmark, parameters: Mapping[str, object] | None = None) -> Saved | Markdown:
-    """A benchmark's table for a notebook; where only its quick form was run, the one that the project ships, if any.
-
-    Below a shipped one stands with which commit, seeds and parts it was run.
-    """
-    shipped = SHIPPED / f"{benchmark.plan.name}.md"
-    if benchmark.profile == "quick" and shipped.is_file():
-        from IPython.display import Markdown
-
-        text = shipped.read_text(encoding="utf-8")
-        return Markdown(f"*Shipped with the project: nothing newer was run here.*\n\n{text}")
-    name = f"final_{benchmark.plan.name}"
-    return save_table(paper_table(benchmark), name, sources=[benchmark], parameters=parameters)
 
 
 def write_table(benchmark: Benchmark) -> str:

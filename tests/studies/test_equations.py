@@ -6,7 +6,7 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from p2p_lib.figures.equations import mathml
+from studies.equations import mathml
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 

@@ -1,11 +1,13 @@
-"""The figures beside a benchmark's tables: errors, tracks, returns, reconstructions and rates of its runs."""
+"""Notebook 09: a benchmark's tables, and figures beside them: errors, tracks, returns, reconstructions and rates."""
 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -22,10 +24,31 @@ from p2p_lib.datasets.sequence import SYNTHETIC
 from p2p_lib.evaluation.consistency import reprojected
 from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.figures import mesh_view, overlay, style
+from p2p_lib.figures.final_tables import paper_table
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
+from p2p_lib.figures.provenance import Saved, save_table
 from p2p_lib.figures.scenes import Scene, beside
 from p2p_lib.synthetic.shapes import load_mesh
+from studies import SHIPPED
+
+if TYPE_CHECKING:
+    from IPython.display import Markdown
+
+
+def shown_table(benchmark: Benchmark, parameters: Mapping[str, object] | None = None) -> Saved | Markdown:
+    """A benchmark's table for a notebook; where only its quick form was run, the one that the project ships, if any.
+
+    Below a shipped one stands with which commit, seeds and parts it was run.
+    """
+    shipped = SHIPPED / f"{benchmark.plan.name}.md"
+    if benchmark.profile == "quick" and shipped.is_file():
+        from IPython.display import Markdown
+
+        text = shipped.read_text(encoding="utf-8")
+        return Markdown(f"*Shipped with the project: nothing newer was run here.*\n\n{text}")
+    name = f"final_{benchmark.plan.name}"
+    return save_table(paper_table(benchmark), name, sources=[benchmark], parameters=parameters)
 
 
 @style.styled

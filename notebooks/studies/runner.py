@@ -1,16 +1,14 @@
 """The notebooks of the suite: list, run headless, and collect what their last cells recorded.
 
 A notebook has one cell tagged ``parameters`` (literals alone, ``PROFILE`` among them) and ends with a cell tagged
-``checks`` that calls :func:`check` with what it claims: numbers, what they mean, and what they have to be. Whatever a
-run leaves behind is read back from the executed notebook, so that the gallery, the tests and a later visitor see the
-same.
+``checks`` that calls :func:`p2p_lib.figures.claims.check` with what it claims. Whatever a run leaves behind is read
+back from the executed notebook, so that the gallery, the tests and a later visitor see the same.
 """
 
 from __future__ import annotations
 
 import ast
 import logging
-import math
 import os
 import re
 import signal
@@ -18,73 +16,28 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, did_you_mean
-from p2p_lib.core.paths import PROJECT
-from p2p_lib.core.tables import as_html, as_text
-from p2p_lib.figures import course, equations
+from p2p_lib.figures.claims import CHECKS_MIME, Claim, Value
+from studies import CLONE, course, equations
 
 if TYPE_CHECKING:
     from nbformat import NotebookNode
 
+#: The folder of the notebooks.
+NOTEBOOKS = CLONE / "notebooks"
+
 #: ``quick``: bundled data, CPU. ``full``: the data and backends that are present. Each with what it takes on two cores.
 PROFILES = {"quick": "some minutes", "full": "a quarter of an hour without data of yours, hours with it"}
-CHECKS_MIME = "application/vnd.p2p.checks+json"
-Value = bool | int | float | str
 
 
 class NotebookFailed(P2PError):
     """A cell of a notebook raised: names the notebook, the cell as ``[n]``, and its message."""
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A number that a notebook reports, what it means, and what it has to be.
-
-    what      its name, with its unit in brackets
-    value     True is a claim that holds, False one that does not; a number without a bar and a text are told only
-    means     what it says to somebody who sees this line alone
-    at_least  the bar: ``value`` must not be below; ``at_most``, not above
-    """
-
-    what: str
-    value: Value
-    means: str
-    at_least: float | None = None
-    at_most: float | None = None
-
-    def __post_init__(self) -> None:
-        value = self.value.item() if hasattr(self.value, "item") else self.value
-        object.__setattr__(self, "value", value)
-        if not isinstance(value, Value) or (isinstance(value, float) and not math.isfinite(value)):
-            raise BadInput(f"claim {self.what!r}", repr(value), "a finite number, a bool or a string")
-
-    def __bool__(self) -> bool:
-        if isinstance(self.value, bool | str):
-            return self.value is not False
-        low, high = (-math.inf if self.at_least is None else self.at_least), self.at_most
-        return low <= self.value <= (math.inf if high is None else high)
-
-    @property
-    def bar(self) -> str:
-        """What the value has to be, in words; empty where it is told only."""
-        if isinstance(self.value, bool):
-            return "yes"
-        bars = (("at least", self.at_least), ("at most", self.at_most))
-        return " and ".join(f"{word} {limit:g}" for word, limit in bars if limit is not None)
-
-    @property
-    def row(self) -> dict[str, str]:
-        """The claim as a row of a table."""
-        good = ("holds" if self else "does not hold") if self.bar else "for information"
-        return {"what": self.what, "value": _shown(self.value), "has to be": self.bar or "-", "": good} | {
-            "what it means": self.means
-        }
 
 
 @dataclass(frozen=True)
@@ -109,24 +62,9 @@ class NotebookResult:
     error: str
 
 
-def check(*claims: Claim) -> None:
-    """Show and keep what a notebook's ``checks`` cell claims; AssertionError names every claim that does not hold."""
-    from IPython import get_ipython
-    from IPython.display import publish_display_data
-    from pandas import DataFrame
-
-    if get_ipython() is not None:
-        table = DataFrame([claim.row for claim in claims])
-        kept = [asdict(claim) for claim in claims]
-        publish_display_data({CHECKS_MIME: kept, "text/html": as_html(table, words=4), "text/plain": as_text(table)})
-    failed = [f"{claim.what}: {_shown(claim.value)}, not {claim.bar} ({claim.means})" for claim in claims if not claim]
-    if failed:
-        raise AssertionError("; ".join(failed))
-
-
 def list_notebooks(folder: Path | None = None, only: Sequence[str] = ()) -> list[Path]:
     """The notebooks ``NN_*.ipynb`` of a folder in order; ``only`` picks by number (``"03"``) or by name."""
-    folder = folder or PROJECT / "notebooks"
+    folder = folder or NOTEBOOKS
     found = sorted(folder.glob("[0-9][0-9]_*.ipynb"))
     if not found:
         raise MissingData(str(folder), "no notebooks NN_*.ipynb there", "Run from a clone of the repository.")
@@ -169,8 +107,8 @@ def run_notebooks(
     paths = list_notebooks(folder, only)
     given = {**(parameters or {}), "PROFILE": profile}
     plans = [(path, _fitting_parameters(path, given)) for path in paths]
-    home = (out or PROJECT / "out" / profile).resolve()
-    figures = PROJECT / "figures" if profile == "full" and out is None else home / "figures"
+    home = (out or CLONE / "out" / profile).resolve()
+    figures = CLONE / "figures" if profile == "full" and out is None else home / "figures"
     places = {"P2P_FIGURES": figures, "P2P_TABLES": home / "tables", "P2P_RUNS": home / "runs"}
     for place in (home / "notebooks", *places.values()):
         place.mkdir(parents=True, exist_ok=True)
@@ -304,6 +242,8 @@ def _kernel_manager(places: Mapping[str, Path], kernels: list[Any]) -> type:
         "OPEN3D_DISABLE_WEB_VISUALIZER": "true",
         "PYTHONHASHSEED": "0",
         "P2P_PROGRESS": "off",  # a bar of the notebook's own is blank in a page
+        # A copy of a notebook, elsewhere, finds what it shares with the others, too.
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(NOTEBOOKS), os.environ.get("PYTHONPATH")])),
     }
 
     class Manager(AsyncKernelManager):
@@ -383,12 +323,6 @@ def _failing_line(source: str, error: Mapping[str, Any]) -> str:
     plain = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(error["traceback"]))
     at = re.search(r"(?m)^-+> +(\d+) ", plain)
     return lines[min(int(at[1]), len(lines)) - 1 if at else 0].strip()
-
-
-def _shown(value: Value) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _counted(notebooks: Sequence[Any]) -> str:
