@@ -20,7 +20,7 @@ FEW = 5
 #: What is tracked is held or stands on a table: hardly longer, nor shorter, than this, m.
 LONGEST_M, SHORTEST_M = 0.6, 0.02
 #: A pose that puts keypoints so far from where they are seen, or moves them so much otherwise than they move, px.
-OFF_PX, JUMP_PX = 3.0, 8.0
+OFF_PX, JUMP_PX = 3.0, 12.0
 #: A silhouette that overlaps less with the mask does not fit; a surface is seen through where so much of it is.
 OVERLAP, THROUGH = 0.5, 0.1
 #: A mask that holds something so many times as long as usual holds something else besides.
