@@ -64,20 +64,9 @@ class MethodConfig(_Checked):
         "The object frame starts at the camera (T_cam_obj = I) or at the centroid of the first masked cloud.",
         choices=("camera", "centroid"),
     )
-    motion: bool = _p(
-        True,
-        "The motion so far is evidence: last poses compete, others need more support, keypoints move along.",
-    )
-    redetection: bool = _p(
-        True, "Tracks that contradict the pose are rejected; where few are seen, it tells where to look for the others."
-    )
-    scene: bool = _p(
-        True, "Absent objects are searched for by shape and colour where scene or motion say, and in their masks."
-    )
-    gates: str = _p(
+    mechanisms: str = _p(
         "all",
-        "Starts, poses, keyframes and second maps have to pass all gates and doubts of the life cycle, or none.",
-        choices=("none", "all"),
+        "These mechanisms of ours are composed around the paper's method: all, none, names, or all but names.",
     )
     noise: str = _p(
         "sensor",
@@ -379,10 +368,7 @@ _STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.def
 #: What the paper's text says, or does without.
 _TEXT: dict[str, Any] = {
     "method.object_frame": "camera",
-    "method.motion": False,
-    "method.redetection": False,
-    "method.scene": False,
-    "method.gates": "none",
+    "method.mechanisms": "none",
     "method.noise": "constant",
     "keypoint_map.cooldown": 0,
     "keypoint_map.max_points": 0,

@@ -1,4 +1,4 @@
-"""Which motions of a pose the shape determines, which it leaves free, and which of these the texture tells.
+"""Which motions of a pose the shape determines, and which it leaves free.
 
 A plane leaves three directions free and a tin one. Whether it does is told by the eigenvalues of the normal
 equations, but the normals of noisy depth scatter, and that scatter looks like shape. The products of two neighbours'
@@ -7,13 +7,7 @@ Jacobians, whose noise is independent, hold the shape without it.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
-
-from p2p_lib.core import se3
-from p2p_lib.core.camera import Camera
-from p2p_lib.core.image import nearest_px
-from p2p_lib.core.types import Frame
 
 #: The noise of the surface is independent this many voxels apart.
 PAIR_VOXELS = 3.0
@@ -21,8 +15,6 @@ PAIR_VOXELS = 3.0
 _CLEAR_OF_NOISE = 3.0
 #: Fewer pairs than this tell nothing.
 _MIN_PAIRS = 10
-#: Pixels to each side of a point that make its surroundings.
-_AROUND_PX = 5
 #: A unit tangent about the cloud's centre rotates, rather than shifts, if this much of it is rotation.
 _MOSTLY = 0.5
 
@@ -72,28 +64,3 @@ def rotations_in(tangents: np.ndarray) -> np.ndarray:
     _, size, mix = np.linalg.svd(tangents[:3])
     size, mix = size[size > _MOSTLY], mix[: len(size)][size > _MOSTLY]
     return tangents @ mix.T / size
-
-
-def contrast_along(
-    frame: Frame, camera: Camera, T_cam_obj: np.ndarray, p_cam: np.ndarray, turn: np.ndarray
-) -> np.ndarray:
-    """(N,) by how much a turn of the object, (6,) right tangent of a pose, would change the image around points (N, 3).
-
-    In grey levels: the standard deviation, around each point, of what a motion by two pixels changes. An edge along the
-    motion, as the rim of a tin, changes nothing, and neither does shading, which is even and stays where it is.
-    """
-    if not len(p_cam):
-        return np.zeros(0)
-    p_obj = se3.transform(se3.inverse(T_cam_obj), p_cam)
-    moved = p_cam + 1e-3 * (np.cross(turn[:3], p_obj) + turn[3:]) @ T_cam_obj[:3, :3].T
-    uv_px = camera.project(p_cam)
-    flow_px = camera.project(moved) - uv_px
-    flow_px /= np.maximum(np.linalg.norm(flow_px, axis=-1, keepdims=True), 1e-9)
-    u, v = nearest_px(uv_px, frame.shape)
-    cut = tuple(slice(max(at.min() - _AROUND_PX - 1, 0), at.max() + _AROUND_PX + 2) for at in (v, u))
-    grey = cv2.cvtColor(np.ascontiguousarray(frame.rgb[cut]), cv2.COLOR_RGB2GRAY)
-    y, x = np.mgrid[-_AROUND_PX : _AROUND_PX + 1, -_AROUND_PX : _AROUND_PX + 1].reshape(2, -1)
-    v = np.clip(v[:, None] - cut[0].start + y, 0, grey.shape[0] - 1)
-    u = np.clip(u[:, None] - cut[1].start + x, 0, grey.shape[1] - 1)
-    over_two_px = [cv2.Sobel(grey, cv2.CV_32F, *axis, ksize=3, scale=0.25)[v, u] for axis in ((1, 0), (0, 1))]
-    return sum(change * flow_px[:, [k]] for k, change in enumerate(over_two_px)).std(-1)

@@ -1,12 +1,10 @@
 """Does what camera and masks say agree with itself: measures from values alone (not in the paper).
 
-They know no truth. What follows of an object is in :data:`p2p_lib.method.lifecycle.DOUBTS`; depth and colour that are
-not of one moment are left out in :mod:`p2p_lib.method.pipeline`.
+They know no truth. What follows for an object is in :data:`p2p_lib.extended.gates.DOUBTS`; depth and colour that are
+not of one moment are left out in :mod:`p2p_lib.extended.frame_guard`.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -20,8 +18,6 @@ _APART_M, _KEYPOINTS = 0.02, 8
 _SAME_GREY = 12
 #: So much of an image has to look the same before it tells of the scene.
 _LOOKS_THE_SAME = 0.2
-#: Depth, colour or both may be that of a frame before for so long, s: some cameras deliver one more seldom.
-_STANDS_S = 0.08
 #: Where a mask ends, depth is compared so many pixels to either side of so many pixels at least; a step is larger, m.
 _BESIDE_PX, _OUTLINE, _DEPTH_STEP_M = 4, 20, 0.02
 #: The outline's direction is that from so many of its pixels before to so many behind.
@@ -74,31 +70,3 @@ def outline_share(frame: Frame, mask: np.ndarray) -> float | None:
     z = [frame.depth_m[nearest_px(at, mask.shape)[::-1]] for at in sides]
     steps = (inside & (np.abs(z[0] - z[1]) > _DEPTH_STEP_M))[~inside | (z[0] > 0) & (z[1] > 0)]
     return float(steps.mean()) if len(steps) >= _OUTLINE else None
-
-
-@dataclass(frozen=True, eq=False)
-class Standing:
-    """Since when the newest depth and the newest colour have been the same to the last bit: no sensor measures so.
-
-    first_depth, first_rgb  the first frames that had them; of nothing, none
-    """
-
-    first_depth: Frame | None = None
-    first_rgb: Frame | None = None
-
-    def with_frame(self, frame: Frame) -> Standing:
-        """After one more."""
-        return Standing(_first(self.first_depth, frame, "depth_m"), _first(self.first_rgb, frame, "rgb"))
-
-    def for_long(self, time_s: float) -> tuple[bool, bool]:
-        """Whether one has stood for a while though the other goes on: not of one moment; and whether both have."""
-        firsts = [first for first in (self.first_depth, self.first_rgb) if first is not None]
-        stand = sum(time_s - first.time_s > _STANDS_S for first in firsts)
-        return len(firsts) == 2 and stand == 1, stand == 2
-
-
-def _first(first: Frame | None, frame: Frame, image: str) -> Frame | None:
-    same = first is not None and np.array_equal(frame.sparse[image], first.sparse[image])
-    if same and np.array_equal(getattr(frame, image), getattr(first, image)):
-        return first
-    return frame if getattr(frame, image).any() else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -15,6 +16,8 @@ _NEWEST = 0.1
 _CARRIED_S = 1.5
 #: What it leaves open grows by this, m/s.
 _OPEN_M_S = 0.2
+#: This turn, or this move, off the motion so far halves the support of a hypothesis.
+MOTION_DEG, MOTION_M = 5.0, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,3 +55,16 @@ class Motion:
     def in_frame(self, T_old_new: np.ndarray) -> Motion:
         """The same of another object frame; T_old_new (4, 4) maps it to the one so far."""
         return Motion(self.T_cam_obj @ T_old_new, self.time_s, self.velocity)
+
+
+def motion_weight(T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray]) -> np.ndarray | None:
+    """(H,) by how much the support of poses counts less for being off the nearest of the priors; None without priors.
+
+    1 on a prior, 1/2 at ``MOTION_DEG`` or ``MOTION_M`` from it: heavy tails, because objects may be pushed at any time.
+    """
+    if not len(priors) or not len(T_cam_obj):
+        return None
+    off = se3.inverse(np.stack(priors))[:, None] @ np.stack(T_cam_obj)[None]
+    turned = np.degrees(se3.angle_rad(off)) / MOTION_DEG
+    moved = np.linalg.norm(np.stack(priors)[:, None, :3, 3] - np.stack(T_cam_obj)[None, :, :3, 3], axis=-1)
+    return 1 / (1 + (turned**2 + (moved / MOTION_M) ** 2).min(0))

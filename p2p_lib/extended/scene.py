@@ -1,7 +1,7 @@
 """The static background as a light map of corners, which tells how the camera has moved (not in the paper; ours).
 
 An object that lies still while the camera looks elsewhere is, when the camera returns, where the scene says: a
-hypothesis for :mod:`p2p_lib.method.pose_finder`, which points and surface have to confirm.
+hypothesis for :mod:`p2p_lib.extended.policy`, which points and surface have to confirm.
 """
 
 from __future__ import annotations
