@@ -408,6 +408,14 @@ def preset(name: str = "default", seed: int = 0) -> Config:
     return replace(Config().with_values(_PRESETS[name] | {"seed": seed}), preset=name)
 
 
+def as_config(config: Config | str) -> Config:
+    """The configuration, or the preset of this name."""
+    config = preset(config) if isinstance(config, str) else config
+    if not isinstance(config, Config):
+        raise BadInput("config", type(config).__name__, 'a Config, or the name of a preset: "default", "paper"')
+    return config
+
+
 def diff(a: str = "paper", b: str = "default") -> dict[str, tuple[Any, Any]]:
     """``{"stage.key": (value in a, value in b)}`` for every parameter that differs.
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.config import Config
+from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.extended.frame_guard import FrameGuard
@@ -93,7 +93,7 @@ class Point2Pose(pipeline.Point2Pose):
         detector: str = backends.DEFAULT_DETECTOR,
         segmenter: str | Segmenter = backends.DEFAULT_SEGMENTER,
     ):
-        config = pipeline.checked("default" if config is None else config)
+        config = as_config("default" if config is None else config)
         super().__init__(camera, config, tracker, detector, segmenter, compose(camera, config))
 
 

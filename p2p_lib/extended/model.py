@@ -15,10 +15,8 @@ from p2p_lib.method.object_model import ObjectModel, Requests
 class JoinableModel(ObjectModel):
     """A model that can take in another one; ``revision`` grows with every keyframe and with every model taken in."""
 
+    make_graph, make_views = BoundedGraph, AccumulatedViews
     revision = 0
-
-    def __init__(self, *parts: Any):
-        super().__init__(*parts, graph=BoundedGraph, views=AccumulatedViews)
 
     def insert_keyframe(self, *args: Any) -> Requests:
         """As in the paper."""

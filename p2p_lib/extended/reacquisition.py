@@ -13,13 +13,14 @@ from functools import cache
 
 import numpy as np
 
-from p2p_lib.core.interfaces import Hint
+from p2p_lib.core.image import either
+from p2p_lib.core.interfaces import Hint, LazyHints
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
 from p2p_lib.extended.scene import Scene
 from p2p_lib.extended.sight import Sight
 from p2p_lib.extended.two_maps import TwoMaps
-from p2p_lib.method.frontend import Asked, Frontend, Hints, Masks, either
+from p2p_lib.method.frontend import Asked, Frontend, Masks
 from p2p_lib.method.object_model import Requests
 
 #: The camera is located every so many frames: while all objects have poses, while one is away.
@@ -78,7 +79,7 @@ class Reacquisition(Frontend):
         hint = cache(lambda name: self._hint(self.objects[name], frame, self._sightings.get(name)))
         if "rejection" in self.on:
             self.apply({name: hint(name)[1] for name in sought if self.objects[name].outlook.sought})
-        return Hints(sought, lambda name: hint(name)[0])
+        return LazyHints(sought, lambda name: hint(name)[0])
 
     def _hint(self, obj: TwoMaps, frame: Frame, sighting: Sighting | None) -> tuple[Hint, Requests]:
         return obj.outlook.hint(obj.observe(frame, None, self.tracks, sighting))

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from functools import cache, reduce
 
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import check_metres
-from p2p_lib.core.interfaces import Hint, PointTracker, Segmenter
+from p2p_lib.core.image import either
+from p2p_lib.core.interfaces import Hint, LazyHints, PointTracker, Segmenter
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Tracks
@@ -92,7 +92,7 @@ class Frontend:
     def hints(self, frame: Frame, sought: Sequence[str]) -> Mapping[str, Hint]:
         """Where these objects should be."""
         objects = self.objects
-        return Hints(sought, lambda name: objects[name].hint(objects[name].observe(frame, None, self.tracks)))
+        return LazyHints(sought, lambda name: objects[name].hint(objects[name].observe(frame, None, self.tracks)))
 
     def observe(self, asked: Asked) -> Mapping[str, Observation]:
         """Every object's share of the frame."""
@@ -110,26 +110,3 @@ class Frontend:
                 dropped = np.concatenate([dropped, unused])
             if len(dropped):
                 self.tracker.drop(dropped)
-
-
-def either(masks: Iterable[np.ndarray | None]) -> np.ndarray:
-    """(H, W) bool: what any of some masks holds; None holds nothing."""
-    return reduce(np.logical_or, (mask for mask in masks if mask is not None))  # its ufunc would copy all of them first
-
-
-class Hints(Mapping[str, Hint]):
-    """The hints of some objects, each made when it is first asked for: they cost, and a segmenter needs but some."""
-
-    def __init__(self, names: Sequence[str], make: Callable[[str], Hint]):
-        self._names, self._make = names, cache(make)
-
-    def __getitem__(self, name: str) -> Hint:
-        if name not in self._names:
-            raise KeyError(name)
-        return self._make(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)

@@ -51,20 +51,14 @@ class ObjectModel:
     long it took: what comes out is the same whatever the number of threads.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        observer: Observer,
-        stopwatch: Stopwatch,
-        beside: Executor,
-        graph: Callable[..., ObjectGraph] = ObjectGraph,
-        views: Callable[[], KeyframeViews] = KeyframeViews,
-    ):
+    make_graph, make_views = ObjectGraph, KeyframeViews
+
+    def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch, beside: Executor):
         self.config = config
         self.map = KeypointMap(config.keypoint_map)
         self._surface = _volume(config) if config.method.surface else None
-        self._graph = graph(config.factor_graph) if config.method.graph else None
-        self.views = views()
+        self._graph = self.make_graph(config.factor_graph) if config.method.graph else None
+        self.views = self.make_views()
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
         self._observer, self._stopwatch, self._beside = observer, stopwatch, beside
         self._mapping: Future | None = None  # the newest of what runs beside, one after the other

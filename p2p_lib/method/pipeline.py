@@ -14,18 +14,18 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import uninterrupted
-from p2p_lib.core.config import Config, preset
+from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker, Segmenter
-from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
+from p2p_lib.core.objects import Objects
+from p2p_lib.core.prompts import Prompt, given_masks
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method.frontend import Asked, Frontend, Masks
@@ -48,7 +48,7 @@ class Parts:
     object: Callable[..., ObjectTracker] = ObjectTracker
 
 
-class Point2Pose:
+class Point2Pose(Objects):
     """Causal 6D tracking of any number of unknown rigid objects in one RGB-D stream.
 
     config  parameters, or the name of a preset
@@ -66,7 +66,7 @@ class Point2Pose:
         segmenter: str | Segmenter = backends.DEFAULT_SEGMENTER,
         parts: Parts | None = None,
     ):
-        self.camera, self.config = camera, checked(config)
+        self.camera, self.config = camera, as_config(config)
         if parts is None and self.config.method.mechanisms != "none":
             fix = "p2p_lib.Point2Pose composes them."
             raise BadInput("config method.mechanisms", repr(self.config.method.mechanisms), "none", fix)
@@ -82,7 +82,7 @@ class Point2Pose:
         self._beside = ThreadPoolExecutor(2, "p2p")
         self.front = self._parts.front(camera, tracker, segmenter, self.objects, self.stopwatch, self._beside)
         self._status: dict[str, Status] = {}
-        self._said: dict[str, Prompt] = {}  # what is said of objects in the frame to come
+        self._said: dict[str, Prompt] = {}  # in the frame to come
 
     @property
     def tracker(self) -> PointTracker:
@@ -146,6 +146,12 @@ class Point2Pose:
                 yield estimates
         self.front.waiting.clear()
 
+    def begin(self, name: str) -> None:
+        """A new object, without anything known of it."""
+        rng = np.random.default_rng([self.config.seed, *name.encode()])
+        made_of = self.camera, self.config, self.detector, rng, self.stopwatch, self._beside
+        self.objects[name] = self._parts.object(name, *made_of)
+
     def _log(self, estimates: Mapping[str, PoseEstimate]) -> None:
         """Say what has become of objects since the frame before."""
         for name, estimate in estimates.items():
@@ -153,65 +159,6 @@ class Point2Pose:
                 self._status[name] = estimate.status
                 why = f" ({estimate.reason})" if estimate.reason else ""
                 _LOG.info("frame %d: %s is %s%s", estimate.frame_index, name, estimate.status, why)
-
-    # -- the objects ---------------------------------------------------------------------------
-
-    def add_object(
-        self,
-        name: str,
-        mask: np.ndarray | None = None,
-        clicks: ArrayLike | None = None,
-        negative: ArrayLike | None = None,
-        box: ArrayLike | None = None,
-    ) -> None:
-        """Follow one more object from the next frame on. The segmenter finds it in every frame that brings no mask.
-
-        mask      (H, W) bool: its pixels in the next frame
-        clicks    (N, 2) pixels on it in the next frame; ``negative`` (M, 2) are not of it
-        box       (4,) left, top, right, bottom: all of it is inside in the next frame
-
-        With none of them it is started by the first mask that ``step`` gets for it. Raises :class:`BadInput` for what
-        does not fit, and nothing has changed; ``step`` raises it for clicks where there is no depth.
-        """
-        if name in self.objects:
-            raise BadInput("add_object", repr(name), "a name not in use", f"In use: {', '.join(self.objects)}.")
-        if mask is clicks is negative is box is None:
-            self._begin(name)
-        else:
-            self.tell(_prompt(name, mask=mask, clicks=clicks, negative=negative, box=box))
-
-    def correct(self, name: str, **said: ArrayLike | None) -> None:
-        """Mend an object's mask in the next frame; arguments as of :meth:`add_object`. The last correction counts."""
-        if name not in self.objects:
-            raise BadInput("correct", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        self.tell(_prompt(name, **said))
-
-    def tell(self, prompt: Prompt) -> None:
-        """What is said of an object in the next frame, whichever that is: starts the object, or corrects its mask."""
-        name, known = prompt.name, self.segmenter.names
-        check_prompt(prompt, self.camera)
-        check_apart((other for other in self._said.values() if other.name != name), prompt)
-        if name not in known and not prompt.starts:
-            what = "an empty mask" if prompt.mask is not None else "clicks beside it alone"
-            raise BadInput(f"object {name!r}", what, "a click on it, a box or at least one pixel of its mask")
-        if name not in self.objects:
-            self._begin(name)
-        self._said[name] = prompt
-
-    def _begin(self, name: str) -> None:
-        rng = np.random.default_rng([self.config.seed, *name.encode()])
-        made_of = self.camera, self.config, self.detector, rng, self.stopwatch, self._beside
-        self.objects[name] = self._parts.object(name, *made_of)
-
-    def remove_object(self, name: str) -> None:
-        """Stop following an object; its points are dropped from the tracker."""
-        if name not in self.objects:
-            raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        if len(ids := self.objects.pop(name).ids):
-            self.tracker.drop(ids)
-        self._said.pop(name, None)
-        if name in self.segmenter.names:
-            self.segmenter.remove(name)
 
     # -- the end -------------------------------------------------------------------------------
 
@@ -224,20 +171,3 @@ class Point2Pose:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def checked(config: Config | str) -> Config:
-    """The configuration, or the preset of this name."""
-    config = preset(config) if isinstance(config, str) else config
-    if not isinstance(config, Config):
-        raise BadInput("config", type(config).__name__, 'a Config, or the name of a preset: "default", "paper"')
-    return config
-
-
-def _prompt(name: str, **said: ArrayLike | None) -> Prompt:
-    """The prompt of the arguments of :meth:`Point2Pose.add_object`; TypeError for any other."""
-    field = {"mask": "mask", "clicks": "points_px", "negative": "negative_px", "box": "box_px"}
-    if unknown := sorted(set(said) - set(field)):
-        raise TypeError(f"unknown argument {unknown[0]!r}, expected some of {', '.join(field)}")
-    values: dict[str, Any] = {field[key]: value for key, value in said.items() if value is not None}
-    return Prompt(name, **values)

@@ -70,8 +70,8 @@ class Admission:
         return obs.seen & (self.agrees | ~model.map.promoted)
 
     def rated(self, model: ObjectModel) -> tuple[np.ndarray, float]:
-        """Covariance (6, 6) and confidence that are reported of the pose, by the model as it is now."""
-        return self.covariance, self.confidence
+        """Covariance (6, 6) and confidence that are reported of the pose: the map may be wrong, too, says the graph."""
+        return self.covariance + model.covariance, self.confidence
 
 
 @dataclass(eq=False)

@@ -63,10 +63,7 @@ def test_presets_choose_parameters_never_backends(key, name):
 #: What the paper's text says (main text and appendix).
 PAPER_TEXT = {
     "method.object_frame": "camera",
-    "method.motion": False,
-    "method.redetection": False,
-    "method.scene": False,
-    "method.gates": "none",
+    "method.mechanisms": "none",
     "method.noise": "constant",
     "method.surface": True,
     "method.graph": True,
@@ -138,7 +135,7 @@ def test_what_is_said_to_be_the_papers_or_the_releases_is(key):
     ("name", "key", "source"),
     [
         ("paper", "tsdf.voxel_m", "release"),
-        ("paper", "method.motion", "paper"),
+        ("paper", "method.mechanisms", "paper"),
         ("paper", "tsdf.truncation_voxels", "release"),
         ("paper", "sampling.r_ideal_px", "ours"),
         ("default", "tsdf.voxel_m", "ours"),
@@ -400,7 +397,7 @@ def test_files_that_cannot_be_read(tmp_path):
 
 def test_a_key_given_for_a_stage_names_its_stage():
     with pytest.raises(BadInput, match=r"Did you mean method\?"):
-        config.parameters(preset(), "gates")
-    assert [row["key"] for row in config.parameters(preset(), "method.gates")] == ["method.gates"]
-    with pytest.raises(BadInput, match=r"key of method: got 'gate', expected .*gates"):
-        config.parameters(preset(), "method.gate")
+        config.parameters(preset(), "mechanisms")
+    assert [row["key"] for row in config.parameters(preset(), "method.mechanisms")] == ["method.mechanisms"]
+    with pytest.raises(BadInput, match=r"key of method: got 'mechanism', expected .*mechanisms"):
+        config.parameters(preset(), "method.mechanism")

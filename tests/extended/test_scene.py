@@ -8,8 +8,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame, Status
-from p2p_lib.method.pipeline import Point2Pose
-from p2p_lib.recovery.scene import Scene, two_nearest
+from p2p_lib.extended.default import Point2Pose
+from p2p_lib.extended.scene import Scene, two_nearest
 
 CAMERA = Camera(260.0, 260.0, 160.0, 120.0, 320, 240)
 WALL_M = 1.2
@@ -103,7 +103,9 @@ def ball_before_the_wall(x_m: float, index: int) -> tuple[Frame, np.ndarray]:
 @pytest.mark.parametrize("with_scene", [True, False])
 def test_what_lies_still_is_back_when_the_camera_is(with_scene):
     """A ball without texture leaves the image and returns: no point tells where it is, the scene does."""
-    method = Point2Pose(CAMERA, preset().with_values({"method.scene": with_scene}))
+    method = Point2Pose(
+        CAMERA, preset().with_values({"method.mechanisms": "all" if with_scene else "all but scene, shape_search"})
+    )
     path = [*np.arange(0, 0.6, 0.03), *np.arange(0.57, -0.01, -0.03)]
     estimates = []
     for k, x_m in enumerate(path):

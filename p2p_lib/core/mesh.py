@@ -13,11 +13,14 @@ from p2p_lib.core.files import replacing
 if TYPE_CHECKING:
     import trimesh
 
-    from p2p_lib.method.tsdf import TsdfVolume
 
+def extract(
+    value: np.ndarray, colours: np.ndarray, origin_m: np.ndarray, voxel_m: float, min_component: float
+) -> trimesh.Trimesh:
+    """The zero-crossing surface of a volume (paper: marching cubes on V(v) = 0), in metres.
 
-def extract(volume: TsdfVolume, min_component: float) -> trimesh.Trimesh:
-    """The zero-crossing surface of a volume (paper: marching cubes on V(v) = 0), in the object frame.
+    value     (nx, ny, nz) of the voxels, NaN where unobserved; voxel (0, 0, 0) is at origin_m (3,)
+    colours   (nx, ny, nz, 4) sums of weighted red, green, blue, and of the weights
 
     Only cells whose eight voxels were observed are meshed. Connected components with less than ``min_component`` of the
     largest one's area are removed: depth noise. Faces wind so that normals point outwards. An empty volume gives an
@@ -25,15 +28,15 @@ def extract(volume: TsdfVolume, min_component: float) -> trimesh.Trimesh:
     """
     import trimesh
 
-    vertices, faces = _marching_cubes(volume)
+    vertices, faces = _marching_cubes(value.copy())
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if len(faces):
         component = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(faces))
         area = np.bincount(component, mesh.area_faces)
         mesh.update_faces((area >= min_component * area.max())[component])
         mesh.remove_unreferenced_vertices()
-        mesh.visual.vertex_colors = _colours(volume, mesh.vertices)
-        mesh.vertices = volume.origin_m + volume.voxel_m * mesh.vertices
+        mesh.visual.vertex_colors = _colours(colours, mesh.vertices)
+        mesh.vertices = origin_m + voxel_m * mesh.vertices
     return mesh
 
 
@@ -52,11 +55,10 @@ def save(mesh: trimesh.Trimesh, path: str | Path) -> Path:
     return path
 
 
-def _marching_cubes(volume: TsdfVolume) -> tuple[np.ndarray, np.ndarray]:
+def _marching_cubes(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices in array indices (N, 3) and faces (M, 3), over fully observed cells."""
     from skimage.measure import marching_cubes
 
-    value = volume.values()
     cells = ~np.isnan(value)
     value[~cells] = 1.0
     for axis in range(3):  # scikit-image looks at the mask of a cell's last corner only
@@ -70,11 +72,10 @@ def _marching_cubes(volume: TsdfVolume) -> tuple[np.ndarray, np.ndarray]:
     return vertices.astype(float), faces.astype(int)
 
 
-def _colours(volume: TsdfVolume, vertices: np.ndarray) -> np.ndarray:
+def _colours(sums: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """(N, 3) uint8 at array indices (N, 3): between the two voxels of each vertex's edge, by weight."""
     low, high = np.floor(vertices).astype(int), np.ceil(vertices).astype(int)
     share = (vertices - low).max(1)[:, None]
-    sums = volume.colours()
     mixed = sums[tuple(low.T)] * (1 - share) + sums[tuple(high.T)] * share
     rgb = mixed[:, :3] / np.maximum(mixed[:, 3:], 1e-6)
     return np.clip(np.round(rgb), 0, 255).astype(np.uint8)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.types import Frame
-from p2p_lib.method.observability import contrast_along
+from p2p_lib.extended.confidence import contrast_along
 from tests.method.analytic_scene import CAMERA
 
 SPIN = np.array([0, 0, 1.0, 0, 0, 0])

@@ -14,15 +14,21 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Status, Tracks
+from p2p_lib.extended.confidence import Belief
+from p2p_lib.extended.default import chosen, object_tracker
+from p2p_lib.extended.image_search import ImageSearch
+from p2p_lib.extended.outlook import Outlook
+from p2p_lib.extended.policy import OurPolicy, Proposal
+from p2p_lib.extended.sight import area_m2, expected_px
 from p2p_lib.method import refinement
-from p2p_lib.method.confidence import Belief
-from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
-from p2p_lib.method.outlook import Outlook
-from p2p_lib.method.pose_finder import Candidate
-from p2p_lib.recovery.search import ImageSearch
+from p2p_lib.method.object_tracker import ObjectStep
 from tests.method.analytic_scene import CAMERA, LUMP, look_from, render
 
 START = look_from((1.0, 0.2, 0.5))
+#: Without what judges poses and keeps frames from being learnt; without motion.
+UNGATED = "all but growing, outgrown, second_map, turns, return_gate, surface_gate, size, outline, still, texture"
+UNGATED += ", sure_keyframes, stray_points"
+UNMOVED = "all but motion_prior, motion_weight, motion_over_gaps, moving_points"
 NO_SURFACE = {"method__surface": False, "refinement__residuals": "none", "method__graph": False}
 
 
@@ -55,7 +61,8 @@ class Lump:
     def __init__(self, **settings):
         config = preset().with_values({key.replace("__", "."): value for key, value in settings.items()})
         rng = np.random.default_rng(0)
-        self.tracker = ObjectTracker("lump", CAMERA, config, Grid(), rng, Stopwatch(), ThreadPoolExecutor(1))
+        made_of = CAMERA, config, Grid(), rng, Stopwatch(), ThreadPoolExecutor(1)
+        self.tracker = object_tracker("lump", *made_of, on=chosen(config))
         self.p_model, self.steps, self.T_first = np.zeros((0, 3)), [], None
 
     def tracks(self, T_cam_model: np.ndarray) -> Tracks:
@@ -76,11 +83,11 @@ class Lump:
 
     def registered(self, obs) -> list:
         """Its candidate poses."""
-        return self.tracker.finder.register(obs, self.tracker.known)
+        return self.tracker.policy.propose(obs, self.tracker.known)
 
-    def belief(self, obs, best: Candidate) -> Belief:
+    def belief(self, obs, best: Proposal) -> Belief:
         """What a candidate rests on."""
-        return Belief.of(obs, best, self.tracker.known, self.tracker.observer, self.tracker.config)
+        return Belief.of(obs, best, self.tracker.known, self.tracker.policy)
 
     def hint(self, frame, tracks: Tracks):
         """Where it should be, before anybody segments."""
@@ -216,7 +223,7 @@ def test_pending_points_have_no_say_while_keypoints_suffice():
 )
 def test_what_stands_still_on_a_turning_object_is_no_keypoint(mirrored, motion, become_keypoints):
     """The paper asks of a point to be tight in the object, which a reflection is while the object turns slowly."""
-    lump, _ = pending_and_promoted(method__motion=motion)
+    lump, _ = pending_and_promoted(method__mechanisms="all" if motion else UNMOVED)
     before, keys = lump.tracks(turned(11)).uv_px, lump.steps[-1].requests.keys
     assert len(keys) > 10, "new points"
 
@@ -272,7 +279,7 @@ def test_last_poses_compete_with_what_samples_find():
     lump = settled(begun(**NO_SURFACE), [1, 2])
     obs = lump.observed(turned(3))
     empty = replace(lump.tracker.config.registration, iterations=1, sample_size=20)
-    lump.tracker.finder.config = replace(lump.tracker.config, registration=empty)
+    lump.tracker.policy.config = replace(lump.tracker.config, registration=empty)
     spoilt = moved_to(turned(40), lump, visible_first(int(obs.seen.sum()) // 2))
     found = {h.origin: h.support for h in lump.registered(lump.observed(turned(3), spoilt))}
     assert max(found.get("last pose", 0), found.get("constant velocity", 0)) > 5
@@ -314,7 +321,7 @@ def test_a_refused_return_leaves_the_object_lost():
 
 
 def test_without_any_pose_an_object_is_lost_where_its_mask_is_seen_and_else_hidden():
-    lump, nothing = settled(begun(**NO_SURFACE, method__motion=False), [2]), hide(lambda tracks: tracks.visible)
+    lump, nothing = settled(begun(**NO_SURFACE, method__mechanisms=UNMOVED), [2]), hide(lambda tracks: tracks.visible)
     assert lump.see(turned(3), nothing).estimate.status is Status.LOST
     unknown = replace(lump.observed(turned(3), nothing), mask=None)
     assert lump.tracker.step(unknown).estimate.status is Status.OCCLUDED
@@ -337,12 +344,12 @@ def test_what_shrinks_an_object_alone_is_no_fault_of_the_camera():
     lump = settled(begun(), [2])
     obs = lump.observed(turned(3))
     depth_m = np.where(obs.mask, obs.frame.depth_m, 1.2).astype(np.float32)
-    obs = lump.tracker._trusted = replace(obs, frame=replace(obs.frame, depth_m=depth_m))
+    obs = lump.tracker.policy.trusted = replace(obs, frame=replace(obs.frame, depth_m=depth_m))
     middle = np.nanmean(obs.p_cam, 0)
-    shrunk, best = replace(obs, p_cam=middle + 0.85 * (obs.p_cam - middle)), Candidate(lump.registered(obs)[0])
-    assert lump.tracker._size(shrunk, best) is None
+    shrunk, best = replace(obs, p_cam=middle + 0.85 * (obs.p_cam - middle)), Proposal(lump.registered(obs)[0])
+    assert lump.tracker.policy._size(shrunk, lump.tracker.known, best) is None
     everywhere = replace(shrunk, frame=replace(obs.frame, depth_m=0.85 * depth_m))
-    assert lump.tracker._size(everywhere, best)[0] == pytest.approx(0.85, abs=0.01)
+    assert lump.tracker.policy._size(everywhere, lump.tracker.known, best)[0] == pytest.approx(0.85, abs=0.01)
 
 
 def test_tracks_that_contradict_the_motion_are_rejected():
@@ -357,7 +364,7 @@ def test_tracks_that_contradict_the_motion_are_rejected():
 @pytest.mark.parametrize("gates", [True, False])
 def test_what_slides_over_the_object_does_not_enter_the_graph(gates):
     """As a reflection does, from keyframe to keyframe: the pose may be right, and yet the graph would follow it."""
-    lump, pending = pending_and_promoted(method__graph=True, method__gates="all" if gates else "none")
+    lump, pending = pending_and_promoted(method__graph=True, method__mechanisms="all" if gates else UNGATED)
     keys = lump.tracker.map.keys
     slide = moved_to(turned(35), lump, lambda tracks: pending & tracks.visible & (keys % 2 == 0))
     seen = keys[pending & lump.observed(turned(23), slide).seen]
@@ -369,8 +376,8 @@ def test_what_slides_over_the_object_does_not_enter_the_graph(gates):
 
 @pytest.mark.parametrize("gates", [True, False])
 def test_a_pose_that_is_hardly_believed_makes_no_keyframe(gates, monkeypatch):
-    lump = settled(begun(method__gates="all" if gates else "none"), [2])
-    monkeypatch.setattr("p2p_lib.method.confidence.confidence", lambda *_: 0.09)
+    lump = settled(begun(method__mechanisms="all" if gates else UNGATED), [2])
+    monkeypatch.setattr("p2p_lib.extended.confidence.confidence", lambda *_: 0.09)
     assert not any(lump.see(turned(deg)).estimate.keyframe for deg in (5, 8, 11, 14)) == gates
     monkeypatch.undo()
     assert lump.see(turned(26)).estimate.keyframe
@@ -419,7 +426,7 @@ def test_contradiction_lowers_the_confidence():
 
 def test_wrong_observations_stay_out_of_a_keyframe():
     """At a keyframe the graph gets the keypoints that agree; a wrong one would bend it, where no gate asks of noise."""
-    lump = settled(begun(method__gates="none"), [5])
+    lump = settled(begun(method__mechanisms=UNGATED), [5])
     tracks = lump.tracks(turned(12))
     wrong = lump.tracker.map.keys[visible_first(4)(tracks)]
     step = lump.see(turned(12), moved_to(turned(30), lump, visible_first(4)))
@@ -471,7 +478,7 @@ def test_no_keyframe_before_a_return_is_confirmed():
 
 
 def test_without_gates_a_return_makes_a_keyframe_at_once():
-    lump = settled(begun(**{"method.gates": "none"}), [2])
+    lump = settled(begun(**{"method.mechanisms": UNGATED}), [2])
     assert lump.see(turned(4), mask=np.zeros((CAMERA.height, CAMERA.width), bool)).estimate.T_cam_obj is None
     assert lump.see(turned(16)).estimate.keyframe
 
@@ -520,7 +527,7 @@ def test_a_keyframe_takes_what_the_graph_finds_unless_it_was_refused(ok):
 @pytest.mark.parametrize("noise", ["sensor", "constant"])
 def test_the_graph_gets_the_noise_of_the_sensor_and_of_registration(monkeypatch, noise):
     lump, known = settled(begun(method__noise=noise), [5]), 1e-6 * np.diag([1.0, 2, 3, 4, 5, 6])
-    monkeypatch.setattr("p2p_lib.method.confidence._of_frame", lambda *_: known)
+    monkeypatch.setattr(OurPolicy, "covariance", lambda *_: known)
     assert lump.see(turned(12)).estimate.keyframe
     keyframe = lump.tracker.model.graph._keyframes[max(lump.tracker.model.graph.keys)]
     by_range = 0.001 + 0.0025 * keyframe.p_cam[:, 2] ** 2
@@ -588,7 +595,7 @@ def test_a_turn_that_neither_shape_nor_texture_tells_is_said(monkeypatch):
     spin = np.array([[0, 0, 1.0, 0, 0, 0]])
     monkeypatch.setattr(refinement, "refine", lambda *a, **k: replace(inner(*a, **k), free_rotations=spin))
     plain = lump.see(turned(3)).estimate
-    assert plain.status is Status.DEGRADED and "turn" in plain.reason and plain.confidence < 0.5
+    assert plain.status is Status.DEGRADED and "rotation" in plain.reason and plain.confidence < 0.5
     assert np.degrees(np.sqrt(plain.covariance[2, 2])) > 30
     obs = lump.observed(turned(4))
     printed = np.random.default_rng(0).integers(0, 255, obs.frame.rgb.shape, np.uint8)
@@ -601,8 +608,8 @@ def test_the_covariance_of_refinement_goes_before_that_of_the_keypoints():
     obs, known = lump.observed(turned(3)), np.diag([1.0, 2, 3, 4, 5, 6])
     best = max(lump.registered(obs), key=lambda h: h.support)
     refined = refinement.Refinement(best.T_cam_obj, covariance=known)
-    np.testing.assert_array_equal(lump.belief(obs, Candidate(best, refined)).of_frame, known)
-    by_keypoints = lump.belief(obs, Candidate(best, refinement.Refinement(best.T_cam_obj))).of_frame
+    np.testing.assert_array_equal(lump.belief(obs, Proposal(best, refined)).of_frame, known)
+    by_keypoints = lump.belief(obs, Proposal(best, refinement.Refinement(best.T_cam_obj))).of_frame
     sigma_m = 0.001 + 0.0025 * np.median(obs.p_cam[best.inliers, 2]) ** 2
     mean_m = np.sqrt(np.diag(by_keypoints)[3:].max())
     assert sigma_m / np.sqrt(best.support) < mean_m < 10 * sigma_m, "about that of a mean of as many points"
@@ -613,7 +620,7 @@ def test_the_covariance_of_refinement_goes_before_that_of_the_keypoints():
 
 def test_an_object_with_next_to_no_texture_starts_on_its_surface():
     lump, points_alone = Lump(), Lump(**NO_SURFACE)
-    lump.tracker.detector = points_alone.tracker.detector = Pair()
+    lump.tracker.own.detector = points_alone.tracker.own.detector = Pair()
     assert points_alone.see(START).estimate.reason == "only 2 points to start from"
     assert lump.see(START).estimate.status is Status.DEGRADED
     lump.see(turned(3))
@@ -624,7 +631,7 @@ def test_an_object_that_still_comes_into_view_is_not_started():
     lump, (_, mask) = Lump(), render(LUMP, START)
     columns = np.flatnonzero(mask.any(0))
     sliver = mask & (np.arange(CAMERA.width) < columns[len(columns) // 2])
-    first, paper = Lump(), Lump(method__gates="none")
+    first, paper = Lump(), Lump(method__mechanisms=UNGATED)
     first.tracker.life = paper.tracker.life = replace(first.tracker.life, start_px=int(sliver.sum()))
     assert first.see(START).estimate.reason == "still coming into view"
     assert first.see(START).estimate.status is Status.TRACKED, "it has stopped growing"
@@ -663,7 +670,7 @@ def test_a_map_of_a_sliver_is_founded_anew_where_the_object_stays_lost_in_plain_
     assert deg < 0.5 and mm < 1
 
 
-@pytest.mark.parametrize(("columns", "settings"), [(-1, {}), (15, {"method__gates": "none"})])
+@pytest.mark.parametrize(("columns", "settings"), [(-1, {}), (15, {"method__mechanisms": UNGATED})])
 def test_a_map_of_all_that_is_seen_is_kept_and_so_is_the_papers(columns, settings):
     _, steps = stays_lost(columns, 12, **settings)
     assert {step.estimate.map_id for step in steps} == {0}
@@ -683,8 +690,8 @@ def test_no_map_is_founded_on_the_background():
         frame = Frame(len(lump.steps), len(lump.steps) / 30, np.zeros((*seen.shape, 3), np.uint8), depth_m)
         estimate = lump.tracker.step(lump.tracker.observe(frame, beside, lump.tracks(turned(9)))).estimate
         assert estimate.status is Status.LOST and estimate.map_id == 0
-    assert lump.tracker.observer.area_m2(lump.tracker.observe(frame, beside, lump.tracks(turned(9)))) > (
-        2 * lump.tracker.model.seen_m2
+    assert area_m2(lump.tracker.observer, lump.tracker.observe(frame, beside, lump.tracks(turned(9)))) > (
+        2 * lump.tracker.life.seen_m2
     ), "it looks larger than the object, being farther away"
 
 
@@ -746,12 +753,12 @@ def test_nothing_is_learnt_from_what_contradicts_itself(fault, word):
 @pytest.mark.parametrize(("share", "doubted"), [(0.9, True), (0.2, False), (0.0, False)])
 def test_an_outline_that_never_told_where_the_object_ends_does_not_now(share, doubted):
     lump = before_a_wall()
-    vars(lump.tracker._trusted)["outline_share"] = share  # as it was in the newest frame that was not doubted
+    vars(lump.tracker.policy.trusted)["outline_share"] = share  # as it was in the newest frame that was not doubted
     estimate = doubtful(lump, mask=dilated).estimate
     assert ("does not end where its depth does" in estimate.reason) == doubted != estimate.keyframe
 
 
-@pytest.mark.parametrize(("settings", "fault"), [({}, {}), ({"method__gates": "none"}, {"mask": dilated})])
+@pytest.mark.parametrize(("settings", "fault"), [({}, {}), ({"method__mechanisms": UNGATED}, {"mask": dilated})])
 def test_what_agrees_is_learnt_and_the_paper_doubts_nothing(settings, fault):
     lump = before_a_wall(**settings)
     step = doubtful(lump, **fault)
@@ -772,7 +779,7 @@ def about(deg: float) -> np.ndarray:
 def turned_over(detector=None, **settings) -> tuple[Lump, np.ndarray, list[ObjectStep]]:
     """Known from one side, then seen from another, where none of its points is found; the ids of those."""
     lump = later(settled(begun(**settings), [2, 4]))
-    lump.tracker.detector = detector or lump.tracker.detector
+    lump.tracker.own.detector = detector or lump.tracker.own.detector
     old = lump.tracker.map.ids.copy()
     return lump, old, [lump.see(about(150), hide(lambda tracks: np.isin(tracks.ids, old))) for _ in range(16)]
 
@@ -787,7 +794,7 @@ def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_bo
     for deg in range(153, 250, 4):  # in view, around to where it is known
         step = lump.see(about(deg), hide(lambda tracks: np.isin(tracks.ids, old)))
     assert step.estimate.map_id == 1 and step.estimate.joined is None
-    second, p_second = lump.tracker.map.ids.copy(), lump.tracker.model.seen_m2
+    second, p_second = lump.tracker.map.ids.copy(), lump.tracker.life.seen_m2
     T_in_second, met = step.estimate.T_cam_obj, []
     while not met or (met[-1].estimate.joined is None and len(met) < 40):
         deg += 4
@@ -801,7 +808,7 @@ def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_bo
     error = se3.inverse(about(249)) @ T_in_second @ se3.inverse(T_obj_joined) @ T_obj_model
     assert gone == 1 and np.degrees(se3.angle_rad(error)) < 1 and np.linalg.norm(error[:3, 3]) < 0.002
     model = lump.tracker.model
-    assert lump.tracker.aside is None and model.seen_m2 >= p_second
+    assert lump.tracker.other is None and lump.tracker.life.seen_m2 >= p_second
     assert {0} == {step.estimate.map_id for step in settled(lump, [deg + 2, deg + 4]).steps[-2:]}
     # Both sides are known now: with the points of the second map alone, and its surface.
     lump.see(about(deg), mask=np.zeros((CAMERA.height, CAMERA.width), bool))
@@ -817,9 +824,9 @@ def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_bo
 @pytest.mark.parametrize(("sure", "views", "room"), [(False, 1, True), (False, 2, False), (True, 1, False)])
 def test_a_map_aside_makes_room_where_it_knows_one_view_alone(sure, views, room):
     lump, old, _ = turned_over()
-    gone, second = lump.tracker.aside, lump.tracker.map.ids.copy()
+    gone, second = lump.tracker.other, lump.tracker.map.ids.copy()
     gone.model.views.T_cam_obj = np.repeat(START[None], views, 0)
-    lump.tracker.aside = gone if sure else replace(gone, life=replace(gone.life, motion=None))
+    gone.life = gone.life if sure else replace(gone.life, motion=None)
     lump.steps += [lump.steps[-1]] * 60
     steps = [lump.see(about(270), unseen) for _ in range(16)]
     begun = [step for step in steps if step.estimate.map_id == 2]
@@ -835,14 +842,14 @@ def test_where_the_first_map_fits_again_and_the_second_does_not_the_first_one_go
     back = lump.see(about(3), hide(lambda tracks: np.isin(tracks.ids, second)))
     assert back.estimate.map_id == 0 and back.estimate.status is Status.RECOVERED
     deg, mm = lump.off(about(3))
-    assert deg < 1 and mm < 1 and lump.tracker.aside.map_id == 1
+    assert deg < 1 and mm < 1 and lump.tracker.other.known.map_id == 1
     of_map = [lump.tracker.known_as(k) for k in range(3)]
-    assert of_map == [lump.tracker.known, lump.tracker.aside, None]
+    assert of_map == [lump.tracker.known, lump.tracker.other.known, None]
 
 
 def test_no_second_map_is_begun_on_few_points():
     lump, _, steps = turned_over(Pair())
-    assert lump.tracker.aside is None and steps[-1].estimate.reason == "only 2 points to start from"
+    assert lump.tracker.other is None and steps[-1].estimate.reason == "only 2 points to start from"
 
 
 def test_no_second_map_is_begun_while_the_object_still_comes_into_view():
@@ -900,7 +907,7 @@ def test_where_an_absent_object_is_expected_by_its_motion():
     T_cam_obj = turned(61) @ se3.inverse(lump.T_first[1]) @ lump.T_first[0]
     middle = se3.transform(T_cam_obj, lump.tracker.map.p_obj.mean(0, keepdims=True))[0]
     assert np.linalg.norm(place(61)[:3] - middle) < 0.003 and 0 < place(61)[3] < 0.02 and place(61, 2.0) is None
-    other = settled(begun(method__motion=False), range(1, 60))
+    other = settled(begun(method__mechanisms=UNMOVED), range(1, 60))
     other.see(turned(60), mask=NOTHING)
     assert other.outlook.hint(replace(other.observed(turned(61), unseen), mask=None))[0].place is None
 
@@ -935,12 +942,12 @@ def test_points_off_the_mask_are_no_observations_and_elsewhere_when_it_is_away()
 def test_an_object_is_awaited_from_when_its_mask_is_back():
     lump, nothing = settled(begun(), [2]), np.zeros((CAMERA.height, CAMERA.width), bool)
     full = ~nothing
-    assert not lump.outlook.awaited(full), "it is there"
+    assert not lump.tracker.awaited(full), "it is there"
     lump.see(turned(3), mask=nothing)
-    assert lump.outlook.awaited(full) and not lump.outlook.awaited(nothing) and not lump.outlook.awaited(None)
+    assert lump.tracker.awaited(full) and not lump.tracker.awaited(nothing) and not lump.tracker.awaited(None)
     sliver = nothing.copy()
     sliver[:2, :40] = True
-    assert not lump.outlook.awaited(sliver) and lump.see(turned(3), mask=sliver).estimate.status is Status.OCCLUDED
+    assert not lump.tracker.awaited(sliver) and lump.see(turned(3), mask=sliver).estimate.status is Status.OCCLUDED
 
 
 def test_few_points_say_where_the_others_show():
@@ -955,7 +962,7 @@ def test_few_points_say_where_the_others_show():
     assert lump.outlook.expected_px(lump.observed(turned(4))) is None, "enough are seen"
     assert lump.outlook.expected_px(replace(obs, frame=replace(obs.frame, index=4))) is None, "not in every frame"
     covered = replace(obs, frame=replace(obs.frame, depth_m=obs.frame.depth_m - np.float32(0.05)))
-    assert not np.isfinite(lump.tracker.observer.expected_px(covered, START, lump.tracker.map.p_obj)).any()
+    assert not np.isfinite(expected_px(lump.tracker.observer, covered, START, lump.tracker.map.p_obj)).any()
 
 
 def test_a_hint_rejects_what_agrees_on_no_pose_only_while_it_is_away():
@@ -1047,12 +1054,12 @@ def test_without_a_mask_an_object_is_sighted_where_its_motion_leads():
 
 def test_where_the_image_speaks_for_no_candidate_the_surface_chooses():
     lump = settled(begun(), [2])
-    obs, finder, known = lump.observed(turned(4), unseen), lump.tracker.finder, lump.tracker.known
+    obs, policy, known = lump.observed(turned(4), unseen), lump.tracker.policy, lump.tracker.known
     T_cam_obj = turned(4) @ se3.inverse(lump.T_first[1]) @ lump.T_first[0]
     poses = {"beside": se3.exp(np.array([0, 0, 0, 0.02, 0, 0])) @ T_cam_obj, "there": T_cam_obj}
-    beside, there = (Candidate(hypothesis) for hypothesis in finder._surface_only(known, poses))
+    beside, there = (Proposal(hypothesis) for hypothesis in policy._surface_only(known, poses))
     chosen = {
-        s: finder._select(obs, known, [replace(beside, sighting=s), replace(there, sighting=-0.1)])[0]
+        s: policy._best(obs, known, [replace(beside, sighting=s), replace(there, sighting=-0.1)])[0]
         for s in (None, 0.6)
     }
     assert chosen[None].hypothesis.origin == "there" and chosen[0.6].hypothesis.origin == "beside"
@@ -1081,5 +1088,5 @@ def test_questions_change_nothing():
     for _ in range(3):
         obs = lump.observed(turned(4))
         lump.outlook.misplaced(obs, obs.mask)
-        lump.outlook.awaited(obs.mask)
+        lump.tracker.awaited(obs.mask)
     np.testing.assert_array_equal(lump.see(turned(4)).estimate.T_cam_obj, other.see(turned(4)).estimate.T_cam_obj)

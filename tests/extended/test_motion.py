@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
-from p2p_lib.method.motion import Motion
+from p2p_lib.extended.motion import Motion
 
 
 def turning(time_s: float) -> np.ndarray:

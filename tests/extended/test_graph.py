@@ -4,7 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
-from p2p_lib.method.keyframes import Keyframe, Link, merge_keyframes, misfit, remove
+from p2p_lib.extended.graph import merge_keyframes, misfit, remove, seen_from
+from p2p_lib.method.factor_graph import Keyframe, Link
 
 
 def cameras(angles_deg: list[float], distance_m: float = 0.6) -> np.ndarray:
@@ -49,7 +50,7 @@ def test_observations_seen_from_elsewhere_keep_place_and_noise() -> None:
     T = cameras([0, 60])
     p_obj = np.array([[0.03, 0.02, -0.01]])
     exact = se3.transform(se3.inverse(T[0]), p_obj)
-    moved, sigma = keyframe(T[0], [7], exact).seen_from(T[1])
+    moved, sigma = seen_from(keyframe(T[0], [7], exact), T[1])
     np.testing.assert_allclose(moved, se3.transform(se3.inverse(T[1]), p_obj), atol=1e-12)
     range_m = np.linalg.norm(exact)
     ray = exact / range_m
@@ -102,3 +103,12 @@ def test_misfit_counts_standard_deviations() -> None:
     p, sigma = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0.5]]), np.tile([0.002, 0.004], (3, 1))
     seen = np.array([[0, 0, 0.508], [0.5 * np.sin(0.006), 0, 0.5 * np.cos(0.006)], [0, 0, 0.5]])
     np.testing.assert_allclose(misfit(p, seen, sigma), [2, 3, 0], atol=1e-9)
+
+
+def test_what_a_nearer_camera_sees_has_the_same_noise_across_and_a_wider_angle() -> None:
+    """Along one ray: bearing noise is across noise over the new distance."""
+    far, near = cameras([0], distance_m=0.8)[0], cameras([0], distance_m=0.4)[0]
+    p_cam = np.array([[0.0, 0.0, 0.8]])
+    moved, sigma = seen_from(keyframe(far, [3], p_cam), near)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 0.4, atol=1e-9)
+    np.testing.assert_allclose(sigma, [[2 * 0.0015, 0.003]], rtol=1e-6)

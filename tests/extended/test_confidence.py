@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from p2p_lib.method.confidence import confidence, pose_covariance
+from p2p_lib.extended.confidence import confidence, pose_covariance
 
 
 def covariance(largest_deg: float, metres: float = 0.001) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
-from p2p_lib.method.keyframe_views import KeyframeViews
+from p2p_lib.extended.views import AccumulatedViews
 
 AXIS = np.array([0.36, 0.48, 0.8])
 
@@ -15,7 +15,7 @@ def turned(deg: float) -> np.ndarray:
 
 
 def test_the_way_goes_by_the_views_and_back_again():
-    views = KeyframeViews()
+    views = AccumulatedViews()
     assert views.accumulated_rad(turned(20)) == 0 and views.turned_rad(turned(20)) == np.inf
     for deg in (0, 60, 120, 180, 240):
         views.add(turned(deg))
@@ -29,7 +29,7 @@ def test_the_way_goes_by_the_views_and_back_again():
 
 
 def test_the_cap_holds_and_takes_what_is_most_alike():
-    views = KeyframeViews(3)
+    views = AccumulatedViews(3)
     for deg in (0, 90, 180, 100):
         views.add(turned(deg))
     assert len(views) == 3

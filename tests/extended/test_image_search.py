@@ -10,9 +10,9 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame
-from p2p_lib.method.lifecycle import SIGHTED
+from p2p_lib.extended.gates import SIGHTED
+from p2p_lib.extended.image_search import ImageSearch, SurfaceSample
 from p2p_lib.method.observation import sample_cloud
-from p2p_lib.recovery.search import ImageSearch, SurfaceSample
 from tests.method import analytic_scene
 
 CAMERA = Camera(300.0, 300.0, 160.0, 120.0, 320, 240)

@@ -8,7 +8,8 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.types import Frame
-from p2p_lib.method.agreement import Standing, outline_share, scene_ratio, size_ratio
+from p2p_lib.extended.agreement import outline_share, scene_ratio, size_ratio
+from p2p_lib.extended.frame_guard import StaleFrames
 
 RNG = np.random.default_rng(0)
 P_OBJ = RNG.uniform(-0.05, 0.05, (30, 3))
@@ -81,7 +82,7 @@ def test_at_the_border_of_the_image_depth_has_no_step():
 
 def stood(frame: Frame, before: Frame) -> tuple[bool, bool]:
     """What is said of a frame that comes a tenth of a second after another."""
-    return Standing().with_frame(replace(before, time_s=0.0)).with_frame(replace(frame, time_s=0.1)).for_long(0.1)
+    return StaleFrames().with_frame(replace(before, time_s=0.0)).with_frame(replace(frame, time_s=0.1)).for_long(0.1)
 
 
 def test_half_an_image_stands_where_the_other_half_goes_on():
@@ -92,7 +93,7 @@ def test_half_an_image_stands_where_the_other_half_goes_on():
     noisy[3, 5] += 1e-4
     assert stood(replace(later, depth_m=noisy), before) == nothing, "to the last bit"
     assert stood(before, before) == whole
-    assert Standing().with_frame(before).with_frame(before).for_long(0.05) == nothing, "a camera may be slow"
+    assert StaleFrames().with_frame(before).with_frame(before).for_long(0.05) == nothing, "a camera may be slow"
     empty = np.zeros_like(later.depth_m)
     assert stood(replace(later, depth_m=empty), replace(before, depth_m=empty)) == nothing
     black = np.zeros_like(before.rgb)

@@ -5,10 +5,11 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
-from p2p_lib.method.factor_graph import ObjectGraph
+from p2p_lib.extended.gates import Judgement
+from p2p_lib.extended.graph import BoundedGraph
+from p2p_lib.extended.lifecycle import Lifecycle
+from p2p_lib.extended.two_maps import Relation
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import Lifecycle, Verdict
-from p2p_lib.method.two_maps import Relation
 from tests.method.analytic_scene import LUMP, around
 from tests.method.test_factor_graph import ALL, Turntable
 from tests.method.test_tsdf import fused
@@ -54,8 +55,8 @@ def test_joined_surfaces_are_that_of_all_views_in_one_frame():
 def test_joined_graphs_know_both_and_go_on_as_one():
     table = Turntable.made(2, 12, noise=0.0)
 
-    def grown(first: int, stop: int, T_obj: np.ndarray) -> ObjectGraph:
-        graph = ObjectGraph(ALL)
+    def grown(first: int, stop: int, T_obj: np.ndarray) -> BoundedGraph:
+        graph = BoundedGraph(ALL)
         for k in range(first, stop):
             T = table.T_cam_obj[k] @ T_obj
             seen = table.seen[k]
@@ -102,10 +103,12 @@ def test_joined_keypoints_keep_what_they_have_been_through():
 
 def test_a_life_told_in_another_frame_is_the_same():
     T = se3.exp(np.random.default_rng(0).normal(0, 0.3, (2, 6)))
-    life = Lifecycle("tracked", T[0], 0.0).placed(np.eye(4)).with_pose(T[1], 0.03, Verdict(True, "tracked"))
+    life = Lifecycle("tracked", T[0], 0.0).placed(np.eye(4)).with_verdict(T[1], 0.03, Judgement(True, "tracked"))
     T_other = T @ T_FIRST_SECOND
     other = (
-        Lifecycle("tracked", T_other[0], 0.0).placed(np.eye(4)).with_pose(T_other[1], 0.03, Verdict(True, "tracked"))
+        Lifecycle("tracked", T_other[0], 0.0)
+        .placed(np.eye(4))
+        .with_verdict(T_other[1], 0.03, Judgement(True, "tracked"))
     )
     moved = life.in_frame(T_FIRST_SECOND)
     for name in ("T_cam_obj", "T_previous", "T_world_obj"):
