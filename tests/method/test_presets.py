@@ -124,7 +124,7 @@ def functions_called(name: str, given: bool) -> set[str]:
                 method.step(frame, {"left": masks["left"]} if given else None)
         finally:
             sys.setprofile(None)
-                threading.setprofile(None)
+            threading.setprofile(None)
     return {Path(file).parent.name for file in files if "p2p_lib" in file}
 
 
