@@ -23,7 +23,7 @@ from p2p_lib.core.files import read_toml
 
 
 def _p(default: Any, meaning: str, unit: str = "", source: str = "ours", **bounds: Any) -> Any:
-    """A field with its meaning; ``low``/``high`` bound it (inclusive), ``choices`` lists strings."""
+    """A field with its meaning; ``low``/``high`` bound it (inclusive), ``choices`` lists strings, ``form`` is theirs."""
     return field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **bounds})
 
 
@@ -50,6 +50,8 @@ class _Checked:
                 raise BadInput(name, f"{value!r} ({type(value).__name__})", f"{_KINDS[kind]}: {meta['meaning']}")
             if "choices" in meta and value not in meta["choices"]:
                 raise BadInput(name, repr(value), "one of " + ", ".join(meta["choices"]))
+            if "form" in meta and not re.fullmatch(meta["form"], value.strip()):
+                raise BadInput(name, repr(value), meta["meaning"])
             if kind in (int, float) and not meta.get("low", float("-inf")) <= value <= meta.get("high", float("inf")):
                 bounds = f"{meta.get('low', '-inf')} to {meta.get('high', 'inf')} {meta['unit']}".strip()
                 raise BadInput(name, value, f"a value in {bounds}: {meta['meaning']}")
@@ -67,6 +69,7 @@ class MethodConfig(_Checked):
     mechanisms: str = _p(
         "all",
         "These mechanisms of ours are composed around the paper's method: all, none, names, or all but names.",
+        form=r"(all but )?[a-z_]+( *, *[a-z_]+)*",
     )
     noise: str = _p(
         "sensor",

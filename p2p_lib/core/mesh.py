@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,7 +35,8 @@ def extract(
         area = np.bincount(component, mesh.area_faces)
         mesh.update_faces((area >= min_component * area.max())[component])
         mesh.remove_unreferenced_vertices()
-        mesh.visual.vertex_colors = _colours(colours, mesh.vertices)
+        visual: Any = mesh.visual
+        visual.vertex_colors = _colours(colours, mesh.vertices)
         mesh.vertices = origin_m + voxel_m * mesh.vertices
     return mesh
 

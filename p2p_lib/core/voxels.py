@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -49,7 +49,7 @@ class CpuGrid:
         self.total, self.weight = self.full(size, 0.0), self.full(size, 0.0)
         self.colour, self.value = self.full((4, *size), 0.0), self.full(size, np.nan)
 
-    def full(self, size: tuple[int, ...], value: float) -> np.ndarray:
+    def full(self, size: tuple[int, ...], value: float) -> Any:
         """A new array."""
         return np.full(size, value, np.float32)
 
@@ -62,7 +62,7 @@ class CpuGrid:
             new[..., *box] = old
             setattr(self, name, new)
 
-    def host(self, array: np.ndarray) -> np.ndarray:
+    def host(self, array: Any) -> np.ndarray:
         """A NumPy copy of one of the arrays."""
         return array.copy()
 
@@ -145,13 +145,13 @@ class TorchGrid(CpuGrid):
         self.device = torch.device(device)
         super().__init__(size)
 
-    def full(self, size: tuple[int, ...], value: float) -> torch.Tensor:
+    def full(self, size: tuple[int, ...], value: float) -> Any:
         """A new tensor."""
         import torch
 
         return torch.full(size, value, device=self.device)
 
-    def host(self, array: torch.Tensor) -> np.ndarray:
+    def host(self, array: Any) -> np.ndarray:
         """A NumPy copy of one of the tensors."""
         return array.cpu().numpy().copy()
 

@@ -113,4 +113,5 @@ def compose(camera: Camera, config: Config) -> pipeline.Parts:
 
 def object_tracker(*paper: Any, on: Container[str] = frozenset(MECHANISMS)) -> TwoMaps:
     """An object with the mechanisms that are ``on``; ``paper`` are the arguments of :class:`ObjectTracker`."""
-    return TwoMaps(ObjectTracker(*paper, policy=partial(OurPolicy, on=on), model=JoinableModel))
+    own = partial(ObjectTracker, policy=partial(OurPolicy, on=on), model=JoinableModel)
+    return TwoMaps(own(*paper))

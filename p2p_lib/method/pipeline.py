@@ -14,7 +14,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class Parts:
 
     before: Callable[[Frame], Frame] | None = None
     front: Callable[..., Frontend] = Frontend
-    object: Callable[..., ObjectTracker] = ObjectTracker
+    object: Callable[..., Any] = ObjectTracker
 
 
 class Point2Pose(Objects):
