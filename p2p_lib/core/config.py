@@ -23,7 +23,7 @@ from p2p_lib.core.files import read_toml
 
 
 def _p(default: Any, meaning: str, unit: str = "", source: str = "ours", **bounds: Any) -> Any:
-    """A field with its meaning; ``low``/``high`` bound it (inclusive), ``choices`` lists strings, ``form`` is theirs."""
+    """A field with its meaning; ``low``/``high`` bound it (inclusive), ``choices`` lists strings."""
     return field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **bounds})
 
 

@@ -28,7 +28,7 @@ from p2p_lib.method.registration import Hypothesis
 #: A pose that nothing has told from others since a gap is compared again every so many frames.
 _COMPARE_EVERY = 5
 #: Where depth has steps at less of a mask's outline than this, it does not tell where the object ends.
-_SOME = 0.3
+_CLEAR_OUTLINE = 0.3
 #: A pose of less confidence makes no keyframe: what it places agrees with it for ever after. One that the surface
 #: alone determines well has more.
 MAPPED = 0.1
@@ -241,7 +241,7 @@ class OurPolicy(Policy):
         """What of the mask's outline lies where depth has steps, as a share of what did before any doubt."""
         before = self._before(obs)
         then, now = None if before is None else before.outline_share, obs.outline_share
-        return 1.0 if then is None or now is None or then < _SOME else now / then
+        return 1.0 if then is None or now is None or then < _CLEAR_OUTLINE else now / then
 
     # -- admit and request ---------------------------------------------------------------------
 

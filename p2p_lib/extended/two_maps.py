@@ -26,7 +26,7 @@ from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
 from p2p_lib.method.policy import Verdict
 from p2p_lib.method.registration import Hypothesis
 
-#: Two maps become one where so many frames, one after the other, say alike how they lie to each other: m, rad.
+#: Two maps become one where so many frames, one after the other, agree on the transformation between them: m, rad.
 _FRAMES, _ALIKE_M, _ALIKE_RAD = 5, 0.01, np.radians(5)
 #: An object whose mask grows by more than this factor from frame to frame is still coming into view.
 _GROWTH = 1.1

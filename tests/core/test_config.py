@@ -32,7 +32,7 @@ def value_of(cfg: Config, key: str):
 @EVERY_FIELD
 def test_metadata_is_complete(key):
     f, meta = FIELDS[key], FIELDS[key].metadata
-    assert set(meta) <= {"meaning", "unit", "source", "low", "high", "choices"}
+    assert set(meta) <= {"meaning", "unit", "source", "low", "high", "choices", "form"}
     assert re.fullmatch(r"[A-Z].{15,}[^ ]\.", meta["meaning"]), "a whole sentence"
     assert not re.search(r"seed|AUC|measured", meta["meaning"]), "what a value is worth stands in benchmarks/"
     assert meta["source"] in ("paper", "release", "ours")
@@ -319,7 +319,7 @@ def value_strategy(key: str) -> st.SearchStrategy:
         case float():
             return st.floats(low, high, allow_nan=False)
         case _:
-            return st.sampled_from(f.metadata["choices"])
+            return st.sampled_from(f.metadata.get("choices", ("all", "none", "all but size", "size, outline")))
 
 
 changes = st.dictionaries(st.sampled_from(sorted(FIELDS)), st.none()).flatmap(
