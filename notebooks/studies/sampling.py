@@ -23,9 +23,9 @@ from p2p_lib.core.interfaces import Candidates, PointTracker
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.evaluation.true_tracks import TrueScene
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.plots import WIDTH_IN, panels
-from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.method.registration import Hypothesis, covariance
 from p2p_lib.method.sampling import Terms, choose, distance_px, terms, usable_region
 

@@ -508,8 +508,10 @@ def _data_where(a: argparse.Namespace) -> None:
 )
 def _config(a: argparse.Namespace) -> None:
     from p2p_lib.core import config as configuration
+    from p2p_lib.extended.default import MECHANISMS, chosen
 
-    rows = configuration.parameters(RunOptions.of_arguments(a).config(), a.only)
+    config = RunOptions.of_arguments(a).config()
+    rows, on = configuration.parameters(config, a.only), chosen(config)
     if a.diff:
         paper = {key: left for key, (left, _) in configuration.diff().items()}
         rows = [{"key": r["key"], "paper": paper[r["key"]], **r} for r in rows if r["key"] in paper]
@@ -520,6 +522,8 @@ def _config(a: argparse.Namespace) -> None:
         value = f"{row['value']} {row['unit']}".strip()
         value += f" (paper: {row['paper']})" if a.diff else ""
         print(f"{row['key']} = {value}\n    {row['meaning']} [{row['source']}]")
+        for name, does in MECHANISMS.items() if row["key"] == "method.mechanisms" else ():
+            print(f"        {name}{'' if name in on else ' (left out)'}: {does}")
     whose = "paper (its text), release (the authors' configuration) or ours"
     print(f"In brackets, whose value it is: {whose}. Change one with --set KEY=VALUE.")
 

@@ -73,7 +73,7 @@ class TrackingNode:
 
     prompts     what is said of objects, see :func:`p2p_lib.datasets.prompts.load_prompts`
     publish     takes an estimate with a pose and the header of its colour image
-    config      parameters or the name of a preset, as :class:`p2p_lib.method.pipeline.Point2Pose` takes them
+    config      parameters or the name of a preset, as :class:`p2p_lib.extended.default.Point2Pose` takes them
     """
 
     def __init__(self, prompts: Any, publish: Any, config: Any = None):
@@ -84,7 +84,7 @@ class TrackingNode:
 
     def on_images(self, rgb: Any, depth: Any, info: Any) -> None:
         """One synchronised triple of messages; what is published is of an earlier one if the tracker is late."""
-        from p2p_lib.method.pipeline import Point2Pose
+        from p2p_lib.extended.default import Point2Pose
 
         if self.tracker is None:
             self.tracker = Point2Pose(camera_of(info), self.config)

@@ -6,7 +6,7 @@ import pytest
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.paths import PROJECT
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
 from studies.pipeline_diagram import STAGES, as_svg, pipeline_diagram
 from studies.runner import list_notebooks
 from tests.method.test_pipeline import CAMERA, film
