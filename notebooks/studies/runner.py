@@ -17,12 +17,14 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, did_you_mean
+from p2p_lib.core.packages import needed_for
 from p2p_lib.figures.claims import CHECKS_MIME, Claim, Value
 from studies import CLONE, course, equations
 
@@ -100,6 +102,9 @@ def run_notebooks(
     Raises :class:`BadInput` for unknown parameters before anything runs, and :class:`NotebookFailed` at the first
     notebook with a failing cell; what ran so far is on disk and in the gallery.
     """
+    with needed_for("notebooks"):
+        for package in ("jinja2", "nbconvert", "papermill"):
+            import_module(package)
     if profile not in PROFILES:
         raise BadInput("profile", repr(profile), "one of " + ", ".join(PROFILES))
     if jobs < 1:

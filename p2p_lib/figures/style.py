@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+from p2p_lib.core.packages import needed_for
 from p2p_lib.core.types import Status
 from p2p_lib.evaluation.point_tracks import Outcome
 
@@ -80,7 +81,8 @@ def ink(colour: str) -> str:
 @contextmanager
 def applied() -> Iterator[None]:
     """Matplotlib with this style inside the ``with``, untouched outside. Needed when drawing and when saving."""
-    import matplotlib
+    with needed_for("notebooks"):
+        import matplotlib
 
     with matplotlib.rc_context(_RC):
         yield
