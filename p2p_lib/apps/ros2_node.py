@@ -5,7 +5,7 @@ Start it with
     python -m p2p_lib.apps.ros2_node --ros-args -p prompts:=prompts.json -r rgb:=/camera/color/image_raw
 
 Needs ROS 2 (``rclpy``, ``cv_bridge``, ``message_filters``, ``tf2_ros``) on the Python that p2p_lib is installed for;
-``environment.md`` has the packages of a robot. It subscribes to ``rgb``, ``depth`` (registered to colour; 16UC1
+``environment.md`` has the light install for a robot. It subscribes to ``rgb``, ``depth`` (registered to colour; 16UC1
 millimetres or 32FC1 metres) and ``camera_info`` (rectified images: distortion is ignored), and publishes
 ``poses/<object>`` (PoseWithCovarianceStamped in the camera's optical frame) and the transform from it to
 ``<object>``, while there is a pose and only then. ``prompts.json`` is what ``p2p click`` writes; its frame 0 is the
