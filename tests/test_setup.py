@@ -25,7 +25,13 @@ LOCK = (PROJECT / "requirements.lock").read_text()
 REQUIRED = set("jupyterlab numpy torch opencv-python-headless gtsam open3d trimesh matplotlib pandas papermill".split())
 OURS = {"p2p_lib", "studies"}
 #: Import name to distribution, where they differ; and what comes as a part of another.
-DISTRIBUTIONS = {"rerun": "rerun-sdk", "cv2": "opencv-python-headless", "skimage": "scikit-image", "PIL": "pillow"}
+DISTRIBUTIONS = {
+    "fast_simplification": "fast-simplification",
+    "rerun": "rerun-sdk",
+    "cv2": "opencv-python-headless",
+    "skimage": "scikit-image",
+    "PIL": "pillow",
+}
 PARTS = {"IPython": "jupyterlab", "jupyter_client": "jupyterlab", "nbconvert": "jupyterlab", "nbformat": "papermill"}
 PARTS |= {"nbclient": "papermill", "jinja2": "jinja2"}
 

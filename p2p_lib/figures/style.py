@@ -16,7 +16,7 @@ from p2p_lib.evaluation.point_tracks import Outcome
 #: Objects, in the order in which a sequence names them.
 OBJECTS = ("#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#882255", "#6B4E23", "#222222")
 #: Statuses: fill and hatch. Tracked is the quiet one.
-STATUS: dict[Status, tuple[str, str]] = {
+STATUS: dict[str, tuple[str, str]] = {
     Status.INITIALISING: ("#FFFFFF", "...."),
     Status.TRACKED: ("#D9D9D9", ""),
     Status.DEGRADED: ("#F0E442", "\\\\\\\\"),
