@@ -73,8 +73,8 @@ def declared(*extras: str) -> dict[str, Requirement]:
     return {need.name: need for need in needs if need.name != "p2p-lib"} | (declared(*ours) if ours else {})
 
 
-def imported() -> set[str]:
-    """Distributions that the package or what stands beside the notebooks imports, by name, anywhere."""
+def imported(asked_for: bool = False) -> set[str]:
+    """Distributions that the package or what stands beside the notebooks imports; or also those asked for by a name."""
     modules = set()
     for path in [*(PROJECT / "p2p_lib").rglob("*.py"), *(PROJECT / "notebooks" / "studies").glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
@@ -82,6 +82,9 @@ def imported() -> set[str]:
                 modules |= {name.name.split(".")[0] for name in node.names}
             elif isinstance(node, ast.ImportFrom):
                 modules.add(node.module.split(".")[0])
+            elif asked_for and isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+                called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+                modules |= {str(node.args[0].value).split(".")[0]} if called in ("load", "import_module") else set()
     modules -= OURS | set(sys.stdlib_module_names)
     return {PARTS.get(module) or DISTRIBUTIONS.get(module, module) for module in modules}
 
@@ -91,7 +94,7 @@ def test_declared_is_what_is_used():
     known = declared() | declared(*extras)
     undeclared = imported() - known.keys()
     assert not undeclared, f"imported, not declared in pyproject.toml: {sorted(undeclared)}"
-    idle = known.keys() - imported() - {"jupyterlab", "libusb-package"}
+    idle = known.keys() - imported(asked_for=True) - {"jupyterlab", "libusb-package"}
     assert not idle, f"declared, imported nowhere: {sorted(idle)}"
 
 
