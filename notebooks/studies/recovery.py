@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -46,7 +47,7 @@ def excerpt(name: str, frames: range, seed: int, folder: Path) -> Video:
     bodies = tuple(replace(body, T_world_model=body.T_world_model[frames]) for body in whole.bodies)
     rmtree(folder, ignore_errors=True)
     write_scenario(folder, replace(whole, T_world_cam=whole.T_world_cam[frames], bodies=bodies), Sensor(), seed, name)
-    video = open_sequence(folder, "ycbmultitrack")
+    video: Any = open_sequence(folder, "ycbmultitrack")
     return replace(video, name=f"synthetic/{name}", times_s=frames.step * video.times_s)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.packages import load
 
 if TYPE_CHECKING:
     import torch
@@ -137,8 +138,7 @@ class TorchGrid(CpuGrid):
     """The same as torch's tensors on one of its devices."""
 
     def __init__(self, size: tuple[int, ...], device: str):
-        import torch
-
+        torch = load("torch", f"device {device}", "torch")
         if device.startswith("cuda") and not torch.cuda.is_available():
             fix = "Say --device cpu, or see environment.md for PyTorch with CUDA."
             raise MissingBackend(f"device {device}", "PyTorch finds no CUDA device here", fix)

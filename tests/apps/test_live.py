@@ -374,7 +374,7 @@ def test_realsense_is_named_by_open_camera(monkeypatch):
     from p2p_lib.core.errors import MissingBackend
 
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(MissingBackend, match=r"pyrealsense2 cannot be loaded .*uv pip install"):
+    with pytest.raises(MissingBackend, match=r"pyrealsense2 cannot be loaded .*pip install .p2p_lib"):
         open_camera("realsense")
 
 
