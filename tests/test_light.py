@@ -26,7 +26,7 @@ TRACK = """
 import cv2
 import numpy as np
 from p2p_lib import Camera, Frame, Point2Pose, preset
-from p2p_lib.method.mesh import save
+from p2p_lib.core.mesh import save
 
 camera, rng, STEP_PX, Z_M = Camera(300, 300, 159.5, 119.5, 320, 240), np.random.default_rng(0), 3, 0.6
 print_ = sum(cv2.resize(rng.integers(0, 256, (s, s, 3)).astype(np.float32), (100, 80)) for s in (5, 15, 40)) / 3
