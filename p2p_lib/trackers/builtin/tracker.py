@@ -93,7 +93,7 @@ class BuiltinTracker:
         self._frames += 1
         p, cfg, now = self._points, self.config, self._now
         recognition.follow(p, before, now, cfg)
-        self._segments.fit(p, now)
+        self._segments.follow(p, now, search)
         if urgent or self._frames % cfg.redetect_every == 0:
             self._segments.search(now, search)
         self._find_predicted(search)
@@ -103,6 +103,7 @@ class BuiltinTracker:
             recognition.update_templates(p, now, cfg, self._frames // cfg.update_every)
             self._segments.assign(p, np.flatnonzero(p.verified & (p.segment < 0)), now)
             self._segments.add_landmarks(p, now)
+        self._segments.remember(p, now, search)
         return self._tracks()
 
     def _tracks(self) -> Tracks:
@@ -130,7 +131,7 @@ class BuiltinTracker:
             where = predicted.uv_px[pick], predicted.warp[pick], predicted.sigma_px[pick]
             rows = rows[pick]
             recognition.find(p, rows, *where, self._now, cfg)
-        self._segments.fit(p, self._now, lost_only=True, sought=rows)
+        self._segments.fit_found(p, self._now, rows)
 
     def _reconcile(self, search: np.ndarray | None) -> None:
         """Compare points with their segments' predictions: what faces away or is hidden is invisible.
@@ -149,7 +150,9 @@ class BuiltinTracker:
         self._segments.update_positions(p, rows[seen & exposed & (p.coasting[rows] == 0)], self._now)
         gain = np.where(seen[:, None, None], cov @ inverse, _EYE)
         p.uv[rows] -= (gain @ off[..., None])[..., 0].astype(np.float32)
-        p.cov[rows] = np.where(seen[:, None, None], (_EYE - gain) @ cov, predicted.cov_px2 + _UNSEEN_PX**2 * _EYE)
+        # Corners that were matched are seen beside a point that is not.
+        unseen_px = np.where(self._segments.matched(p)[rows], _PREDICTION_PX, _UNSEEN_PX)[:, None, None]
+        p.cov[rows] = np.where(seen[:, None, None], (_EYE - gain) @ cov, predicted.cov_px2 + unseen_px**2 * _EYE)
         p.warp[rows[~seen]] = predicted.warp[~seen]
         p.verified[rows] = seen & exposed
         p.visible[rows] = exposed & (seen | (predicted.sigma_px < cfg.max_predicted_sigma_px))
