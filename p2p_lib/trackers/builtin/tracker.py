@@ -101,6 +101,7 @@ class BuiltinTracker:
         p.hidden_for = np.where(p.visible, 0, p.hidden_for + 1)
         if self._frames % cfg.update_every == 0:
             recognition.update_templates(p, now, cfg, self._frames // cfg.update_every)
+            recognition.sharpen_templates(p, np.flatnonzero(p.visible & ~p.verified & self._segments.posed(p)), now)
             self._segments.assign(p, np.flatnonzero(p.verified & (p.segment < 0)), now)
             self._segments.add_landmarks(p, now)
         self._segments.remember(p, now, search)
