@@ -129,7 +129,8 @@ class BuiltinTracker:
         if len(rows):
             predicted = self._segments.predict(p, rows, self._now)
             pick = np.flatnonzero(self._exposed(predicted, search) & (predicted.sigma_px < cfg.search_px))
-            where = predicted.uv_px[pick], predicted.warp[pick], predicted.sigma_px[pick]
+            sigma_px = np.hypot(predicted.sigma_px, _PREDICTION_PX * np.sqrt(p.chained[rows]))[pick]
+            where = predicted.uv_px[pick], predicted.warp[pick], sigma_px
             rows = rows[pick]
             recognition.find(p, rows, *where, self._now, cfg)
         self._segments.fit_found(p, self._now, rows)
@@ -151,9 +152,12 @@ class BuiltinTracker:
         self._segments.update_positions(p, rows[seen & exposed & (p.coasting[rows] == 0)], self._now)
         gain = np.where(seen[:, None, None], cov @ inverse, _EYE)
         p.uv[rows] -= (gain @ off[..., None])[..., 0].astype(np.float32)
-        # Corners that were matched are seen beside a point that is not.
-        unseen_px = np.where(self._segments.matched(p)[rows], _PREDICTION_PX, _UNSEEN_PX)[:, None, None]
+        # Corners that were matched are seen beside a point that is not, but from match to match errors add up.
+        p.chained[rows] = np.where(p.verified[rows], 0, p.chained[rows] + self._segments.matched(p)[rows])
+        chained = p.chained[rows]
+        unseen_px = np.where(chained > 0, _PREDICTION_PX * np.sqrt(chained), _UNSEEN_PX)[:, None, None]
         p.cov[rows] = np.where(seen[:, None, None], (_EYE - gain) @ cov, predicted.cov_px2 + unseen_px**2 * _EYE)
         p.warp[rows[~seen]] = predicted.warp[~seen]
         p.verified[rows] = seen & exposed
-        p.visible[rows] = exposed & (seen | (predicted.sigma_px < cfg.max_predicted_sigma_px))
+        sure = (predicted.sigma_px < cfg.max_predicted_sigma_px) & (chained <= cfg.linger_frames)
+        p.visible[rows] = exposed & (seen | sure)
