@@ -113,7 +113,7 @@ class MotionSegments:
                 segment.rejected_for = self.config.reject_frames
                 segment.hidden_for, segment.sight = self.config.linger_frames + 1, None
 
-    def follow(self, p: Points, now: Image, search: np.ndarray | None) -> None:
+    def fit(self, p: Points, now: Image, search: np.ndarray | None = None) -> None:
         """Fit poses to the points that were followed; where too few agree, to the corners of the frame before, too.
 
         Points that disagree are not verified. ``search`` (H, W): where objects are; None: anywhere.

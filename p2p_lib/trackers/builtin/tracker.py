@@ -37,7 +37,7 @@ class BuiltinTracker:
         """Begin a stream at this frame; without a camera, one with a common field of view is assumed."""
         h, w = frame.shape
         self._ids.start()
-        self._frames = 0
+        self._frames, self._search = 0, None
         self._points = Points.new(np.zeros((0, 2)), self.config.templates)
         self._segments = MotionSegments(self.config)
         self._camera = camera or Camera(0.95 * w, 0.95 * w, (w - 1) / 2, (h - 1) / 2, w, h)
@@ -51,6 +51,7 @@ class BuiltinTracker:
         self._points = joined([self._points, Points.new(uv, self.config.templates)])
         recognition.store_templates(self._points, new, self._now, 0)
         self._segments.assign(self._points, new, self._now)
+        self._segments.remember(self._points, self._now, self._search)
         return ids
 
     def drop(self, ids: np.ndarray) -> None:
@@ -90,10 +91,10 @@ class BuiltinTracker:
         """Follow all live queries into the next frame."""
         self._ids.check_started()
         before, self._now = self._now, Image.of(frame, self._camera)
-        self._frames += 1
+        self._frames, self._search = self._frames + 1, search
         p, cfg, now = self._points, self.config, self._now
         recognition.follow(p, before, now, cfg)
-        self._segments.follow(p, now, search)
+        self._segments.fit(p, now, search)
         if urgent or self._frames % cfg.redetect_every == 0:
             self._segments.search(now, search)
         self._find_predicted(search)
