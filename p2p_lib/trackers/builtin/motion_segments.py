@@ -13,13 +13,12 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.robust import consensus
-from p2p_lib.trackers.builtin import wide_baseline
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Landmarks, corners
 from p2p_lib.trackers.builtin.rigid_motion import PoseFit, Prediction, fit_pose, pose_distance_m, predict
 from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, planes_at
 from p2p_lib.trackers.builtin.tracked_points import Points
-from p2p_lib.trackers.builtin.wide_baseline import Matched, Sight, matched
+from p2p_lib.trackers.builtin.wide_baseline import Matched, Sight, inner, matched
 
 #: Covariance of a pose that matches have proposed: rad, m.
 _PROPOSED_COV = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
@@ -181,9 +180,8 @@ class MotionSegments:
         lost_lately = segment.hidden_for < self.config.linger_frames and not segment.rejected_for
         if then is None or not lost_lately or agreeing >= _FOLLOWED * len(then.uv_px):
             return None
-        region = then.region() if search is None else then.region() & search
-        found = corners(now, region, wide_baseline.CORNERS)
-        pairs = matched(then, found, self.config, self._rng)
+        region = then.region(now) if search is None else then.region(now) & inner(search)
+        pairs = matched(then, then.corners_in(now, region), self.config, self._rng)
         return pairs if pairs is not None and len(pairs) > agreeing else None
 
     def remember(self, p: Points, now: Image, search: np.ndarray | None) -> None:

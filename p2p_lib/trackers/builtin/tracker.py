@@ -134,7 +134,8 @@ class BuiltinTracker:
             where = predicted.uv_px[pick], predicted.warp[pick], sigma_px
             rows = rows[pick]
             recognition.find(p, rows, *where, self._now, cfg)
-        self._segments.fit_found(p, self._now, rows)
+        # What was badly predicted for long says nothing of whether its segment is there.
+        self._segments.fit_found(p, self._now, rows[p.chained[rows] <= cfg.linger_frames])
 
     def _reconcile(self, search: np.ndarray | None) -> None:
         """Compare points with their segments' predictions: what faces away or is hidden is invisible.

@@ -12,20 +12,35 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from p2p_lib.core import robust, se3
 from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.image import in_mask
 from p2p_lib.trackers.builtin.features import mutual_match
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Corners, corners
 
-#: Corners that are described in one frame: what a search may cost.
-CORNERS = 400
-#: A segment reaches so far beyond the hull of its points; it may move by this from frame to frame, px.
-_BESIDE_PX, _MOVES_PX = 6, 100
+#: Corners that are described on a segment, and where it may be in the next frame: what a search costs at most.
+CORNERS, _MOST = 400, 900
+#: A segment reaches so far beyond the hull of its points; it may move by these from frame to frame.
+_BESIDE_PX, _MOVES_PX, _MOVES_M = 6, 80, 0.08
+#: Corners nearer to the border of a region are of its outline, px.
+_BORDER_PX = 4
+#: A corner is on it that is nearer to one of its points than so many times their own distance, within these bounds.
+_SPACINGS, _NEAR_M = 2.0, (0.01, 0.03)
+#: Colours (CIELAB a, b) that differ by less than one or two of these are the same.
+_BIN = 6
 #: Samples of the search for the rigid motion, and pairs that have to agree on it.
 _SAMPLES, _AGREEING = 300, 8
+#: They agree within this and so many times the noise of depth, m.
+_AGREE_M, _AGREE_SIGMAS = 0.003, 2.0
+
+
+def inner(region: np.ndarray) -> np.ndarray:
+    """A region (H, W) without its border: an outline does not move with a round object that turns."""
+    return cv2.erode(region.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)) > 0
 
 
 @dataclass(eq=False)
@@ -43,23 +58,57 @@ class Sight:
     found: Corners | None = field(default=None, repr=False)
 
     @cached_property
-    def corners(self) -> Corners:
-        """The corners on the segment: inside the hull of its points."""
-        region = np.zeros(self.image.gray.shape, np.uint8)
-        cv2.fillConvexPoly(region, cv2.convexHull(np.rint(self.uv_px).astype(np.int32)), 1)
-        own = cv2.dilate(region, np.ones((2 * _BESIDE_PX + 1,) * 2, np.uint8)) > 0
-        own = own if self.search is None else own & self.search
-        if self.found is None:
-            return corners(self.image, own, CORNERS)
-        return self.found.select(in_mask(self.found.uv_px, own))
+    def own(self) -> np.ndarray:
+        """(H, W) bool: the segment, inside the hull of its points."""
+        hull = np.zeros(self.image.gray.shape, np.uint8)
+        cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(self.uv_px).astype(np.int32)), 1)
+        own = cv2.dilate(hull, np.ones((2 * _BESIDE_PX + 1,) * 2, np.uint8)) > 0
+        return own if self.search is None else own & inner(self.search)
 
-    def region(self) -> np.ndarray:
-        """(H, W) bool: where the segment can be one frame later."""
-        region = np.zeros(self.image.gray.shape, bool)
-        left, top = np.maximum(self.uv_px.min(0) - _MOVES_PX, 0).astype(int)
-        right, bottom = np.maximum(self.uv_px.max(0) + _MOVES_PX + 1, 0).astype(int)
-        region[top:bottom, left:right] = True
+    @cached_property
+    def corners(self) -> Corners:
+        """The corners on the segment: those near points of it in space, for a hand may be before it."""
+        found = self.found
+        if found is None:
+            found = corners(self.image, self.own, CORNERS)
+        else:
+            found = found.select(in_mask(found.uv_px, self.own))
+        z = self.image.depth_at(self.uv_px)
+        p_cam = self.image.camera.unproject(self.uv_px[z > 0], z[z > 0])
+        if len(p_cam) < 2:
+            return found.select(np.zeros(len(found.uv_px), bool))
+        tree = cKDTree(p_cam)
+        apart_m = np.clip(_SPACINGS * np.median(tree.query(p_cam, 2)[0][:, 1]), *_NEAR_M)
+        return found.select(tree.query(found.p_cam)[0] < apart_m)
+
+    def region(self, now: Image) -> np.ndarray:
+        """(H, W) bool: where the segment can be one frame later, by its place, its depth and its colours."""
+        h, w = now.gray.shape
+        left, top = np.clip(self.uv_px.min(0) - _MOVES_PX, 0, [w - 1, h - 1]).astype(int)
+        right, bottom = np.clip(self.uv_px.max(0) + _MOVES_PX + 1, 1, [w, h]).astype(int)
+        part = np.s_[top:bottom, left:right]
+        z = self.image.depth_at(self.uv_px)
+        z = z[z > 0]
+        region = np.zeros((h, w), bool)
+        if len(z):
+            depth_m = now.depth_m[part]
+            region[part] = (depth_m > z.min() - _MOVES_M) & (depth_m < z.max() + _MOVES_M) & self._coloured(now)[part]
         return region
+
+    def corners_in(self, now: Image, region: np.ndarray) -> Corners:
+        """The corners of a later frame in a region (H, W), as dense as on the segment, as far as the bound allows."""
+        dense = CORNERS * np.count_nonzero(region) / max(np.count_nonzero(self.own), 1)
+        return corners(now, region, int(np.clip(dense, CORNERS, _MOST)))
+
+    def _coloured(self, now: Image) -> np.ndarray:
+        """(H, W) bool: the pixels with about the colours of the segment."""
+        own = cv2.resize(self.own.astype(np.uint8), self.image.chroma.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
+        known = np.zeros((256 // _BIN,) * 2, np.uint8)
+        known[tuple((self.image.chroma[own] // _BIN).astype(int).T)] = 1
+        known = cv2.dilate(known, np.ones((3, 3), np.uint8))
+        a, b = (now.chroma // _BIN).astype(int).transpose(2, 0, 1)
+        near = cv2.dilate(known[a, b], np.ones((3, 3), np.uint8))
+        return cv2.resize(near, now.gray.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +137,8 @@ def matched(then: Sight, found: Corners, cfg: TrackingConfig, rng: np.random.Gen
     pairs = [mutual_match(a, b, cfg.match_ratio) for a, b in zip(*scales, strict=True)]
     which, corner = np.unique(np.concatenate(pairs, 1), axis=1)
     p_then, p_cam = own.p_cam[which], found.p_cam[corner]
-    limit_m = np.full(len(p_cam), cfg.segment_inlier_m)
+    # Tight: what stands still while a round object turns slowly is off by millimetres alone.
+    limit_m = np.maximum(_AGREE_M, _AGREE_SIGMAS * depth_noise_m(p_cam[:, 2]))
     T = robust.ransac(p_then, p_cam, limit_m, 3, _SAMPLES, rng) if len(p_cam) >= _AGREEING else None
     if T is None:
         return None
