@@ -17,7 +17,7 @@ from p2p_lib.method import registration
 from p2p_lib.method.object_model import Known, ObjectModel
 from p2p_lib.method.observability import contrast_along
 from p2p_lib.method.observation import Observation, Observer
-from p2p_lib.method.pose_finder import Candidate
+from p2p_lib.method.pose_finder import Candidate, took_part
 
 #: The noise of points is set for a poor sensor; what is left of the covariance, measured on ``synthetic/crossing``.
 _COVARIANCE_SCALE = 0.55
@@ -80,7 +80,7 @@ class Belief:
     @classmethod
     def of(cls, obs: Observation, best: Candidate, known: Known, observer: Observer, config: Config) -> Belief:
         """Of a candidate in the map ``known``."""
-        keypoints, agrees = known.keypoints(obs), best.hypothesis.inliers
+        keypoints, agrees = took_part(obs, known, config), best.hypothesis.inliers
         support = known.map.confidence[agrees].sum()
         agreement = (agrees & keypoints).sum() / max(keypoints.sum(), 1)
         told = config.method.gates != "all" or _told(obs, best, observer.camera, config)

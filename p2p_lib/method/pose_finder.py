@@ -26,6 +26,19 @@ _FEW_KEYPOINTS = 12
 _COMPARE_EVERY = 5
 
 
+def certain_of(obs: Observation, config: Config) -> np.ndarray:
+    """(N,) bool: points seen where the tracker is certain of them."""
+    return obs.seen & (obs.tracks.uncertainty <= config.registration.max_uncertainty)
+
+
+def took_part(obs: Observation, known: Known, config: Config) -> np.ndarray:
+    """(N,) bool: the points that register a frame: keypoints, and where these are few the pending ones, too."""
+    certain = certain_of(obs, config)
+    keypoints = certain & known.map.promoted
+    few = config.keypoint_map.keyframe_min_points if config.method.motion else _FEW_KEYPOINTS
+    return keypoints if keypoints.sum() >= few else certain
+
+
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A hypothesis, its pose refined on the surface, and what of the surface shows there, once they are known."""
@@ -79,10 +92,7 @@ class PoseFinder:
         """Candidate poses from the keypoints seen; with motion, from the last poses too."""
         cfg, with_motion = self.config.registration, self.config.method.motion
         with self._stopwatch("registration"):
-            certain = obs.seen & (obs.tracks.uncertainty <= cfg.max_uncertainty)
-            use = certain & known.map.promoted
-            if use.sum() < _FEW_KEYPOINTS:
-                use = certain
+            certain, use = certain_of(obs, self.config), took_part(obs, known, self.config)
             priors = known.life.motion_priors() or self._carried_on(obs, known) if with_motion else {}
             if obs.sighting is not None:
                 priors = {"sighting": obs.sighting.T_cam_obj, **priors}

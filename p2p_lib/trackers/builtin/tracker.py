@@ -17,6 +17,8 @@ from p2p_lib.trackers.ids import PointIds
 _EYE = np.eye(2)
 #: Errors of a prediction beyond its covariance, px: of a point that is seen, of one that is not.
 _PREDICTION_PX, _UNSEEN_PX = 0.5, 1.0
+#: Error of a point that each match adds while nothing else carries it, px.
+_CHAINED_PX = 0.35
 #: A point farther from its segment's prediction than this many variances is another one.
 _FAR_CHI2 = 16.0
 #: Cosine of surface normal and view below which a point counts as turned away.
@@ -130,7 +132,7 @@ class BuiltinTracker:
         if len(rows):
             predicted = self._segments.predict(p, rows, self._now)
             pick = np.flatnonzero(self._exposed(predicted, search) & (predicted.sigma_px < cfg.search_px))
-            sigma_px = np.hypot(predicted.sigma_px, _PREDICTION_PX * np.sqrt(p.chained[rows]))[pick]
+            sigma_px = np.hypot(predicted.sigma_px, _CHAINED_PX * np.sqrt(p.chained[rows]))[pick]
             where = predicted.uv_px[pick], predicted.warp[pick], sigma_px
             rows = rows[pick]
             recognition.find(p, rows, *where, self._now, cfg)
@@ -157,7 +159,7 @@ class BuiltinTracker:
         # Corners that were matched are seen beside a point that is not, but from match to match errors add up.
         p.chained[rows] = np.where(p.verified[rows], 0, p.chained[rows] + self._segments.matched(p)[rows])
         chained = p.chained[rows]
-        unseen_px = np.where(chained > 0, _PREDICTION_PX * np.sqrt(chained), _UNSEEN_PX)[:, None, None]
+        unseen_px = np.where(chained > 0, _CHAINED_PX * np.sqrt(chained), _UNSEEN_PX)[:, None, None]
         p.cov[rows] = np.where(seen[:, None, None], (_EYE - gain) @ cov, predicted.cov_px2 + unseen_px**2 * _EYE)
         p.warp[rows[~seen]] = predicted.warp[~seen]
         p.verified[rows] = seen & exposed

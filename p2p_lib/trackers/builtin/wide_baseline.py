@@ -34,7 +34,7 @@ _SPACINGS, _NEAR_M = 2.0, (0.01, 0.03)
 _BIN = 6
 #: Samples of the search for the rigid motion, and pairs that have to agree on it.
 _SAMPLES, _AGREEING = 300, 8
-#: They agree within this and so many times the noise of depth, m.
+#: They agree within this and so many times the noise of depth, m; what is off by little more is of it, too.
 _AGREE_M, _AGREE_SIGMAS = 0.003, 2.0
 
 
@@ -146,6 +146,6 @@ def matched(then: Sight, found: Corners, cfg: TrackingConfig, rng: np.random.Gen
     fit = robust.refit(T, p_then, p_cam, limit_m, np.ones(len(p_cam)), _AGREEING, everything)
     if fit is None:
         return None
-    agree = fit.inliers
+    agree = fit.residual_m <= np.maximum(cfg.segment_inlier_m, limit_m)
     p_seg = se3.transform(se3.inverse(then.T_cam_seg), p_then[agree])
     return Matched(fit.T_a_b @ then.T_cam_seg, p_seg, found.uv_px[corner[agree]], p_cam[agree, 2], found)
