@@ -12,13 +12,14 @@ from scipy.spatial import cKDTree
 from p2p_lib.core import se3
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.robust import consensus
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Landmarks, corners
 from p2p_lib.trackers.builtin.rigid_motion import PoseFit, Prediction, fit_pose, pose_distance_m, predict
 from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, planes_at
 from p2p_lib.trackers.builtin.tracked_points import Points
-from p2p_lib.trackers.builtin.wide_baseline import Matched, Sight, inner, matched
+from p2p_lib.trackers.builtin.wide_baseline import Matched, Sight, corners_of, matched
 
 #: Covariance of a pose that matches have proposed: rad, m.
 _PROPOSED_COV = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
@@ -118,13 +119,13 @@ class MotionSegments:
         Points that disagree are not verified. ``search`` (H, W): where objects are; None: anywhere.
         """
         p.leaving[:] = False
-        for s, segment in enumerate(self.segments):
-            at = np.flatnonzero(p.verified & (p.segment == s))
-            segment.rejected_for = max(segment.rejected_for - 1, 0)
-            fit = self._fitted(segment, p, at, now)
-            segment.matched = self._matched(segment, 0 if fit is None else np.count_nonzero(fit.agrees), now, search)
-            if segment.matched is not None:
-                fit = self._fitted(segment, p, at, now)
+        rows = [np.flatnonzero(p.verified & (p.segment == s)) for s in range(len(self.segments))]
+        for segment in self.segments:
+            segment.rejected_for, segment.matched = max(segment.rejected_for - 1, 0), None
+        fits = [self._fitted(segment, p, at, now) for segment, at in zip(self.segments, rows, strict=True)]
+        self._match(fits, now, search)
+        for segment, at, fit in zip(self.segments.copy(), rows, fits, strict=True):
+            fit = self._fitted(segment, p, at, now) if segment.matched else fit
             if fit is None:
                 segment.hidden_for += 1
                 continue
@@ -172,17 +173,23 @@ class MotionSegments:
         fit = fit_pose(start, *seen, now.camera)
         return replace(fit, agrees=fit.agrees[: len(at)]) if fit.agrees.sum() >= fewest else None
 
-    def _matched(
-        self, segment: MotionSegment, agreeing: int, now: Image, search: np.ndarray | None
-    ) -> Matched | None:
-        """Where corners show a segment that too few points were followed on, and more of them agree; else None."""
-        then = segment.sight
-        lost_lately = segment.hidden_for < self.config.linger_frames and not segment.rejected_for
-        if then is None or not lost_lately or agreeing >= _FOLLOWED * len(then.uv_px):
-            return None
-        region = then.region(now) if search is None else then.region(now) & inner(search)
-        pairs = matched(then, then.corners_in(now, region), self.config, self._rng)
-        return pairs if pairs is not None and len(pairs) > agreeing else None
+    def _match(self, fits: list[PoseFit | None], now: Image, search: np.ndarray | None) -> None:
+        """Look for corners of segments on which too few points were followed; kept where more of them agree."""
+        agreeing = [0 if fit is None else np.count_nonzero(fit.agrees) for fit in fits]
+        lost = [
+            (segment, count, segment.sight)
+            for segment, count in zip(self.segments, agreeing, strict=True)
+            if segment.sight is not None
+            and segment.hidden_for < self.config.linger_frames
+            and not segment.rejected_for
+            and count < _FOLLOWED * len(segment.sight.uv_px)
+        ]
+        if not lost:
+            return
+        found, regions = corners_of([then for _, _, then in lost], now, search)
+        for (segment, count, then), region in zip(lost, regions, strict=True):
+            pairs = matched(then, found.select(in_mask(found.uv_px, region)), self.config, self._rng)
+            segment.matched = pairs if pairs is not None and len(pairs) > count else None
 
     def remember(self, p: Points, now: Image, search: np.ndarray | None) -> None:
         """Where segments show in the newest frame: there they are searched for in the next one."""

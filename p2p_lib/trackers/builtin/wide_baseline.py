@@ -7,6 +7,7 @@ with those of the newest frame, both ways, and the rigid motion that most pairs 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -95,11 +96,6 @@ class Sight:
             region[part] = (depth_m > z.min() - _MOVES_M) & (depth_m < z.max() + _MOVES_M) & self._coloured(now)[part]
         return region
 
-    def corners_in(self, now: Image, region: np.ndarray) -> Corners:
-        """The corners of a later frame in a region (H, W), as dense as on the segment, as far as the bound allows."""
-        dense = CORNERS * np.count_nonzero(region) / max(np.count_nonzero(self.own), 1)
-        return corners(now, region, int(np.clip(dense, CORNERS, _MOST)))
-
     def _coloured(self, now: Image) -> np.ndarray:
         """(H, W) bool: the pixels with about the colours of the segment."""
         own = cv2.resize(self.own.astype(np.uint8), self.image.chroma.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
@@ -126,6 +122,23 @@ class Matched:
 
     def __len__(self) -> int:
         return len(self.p_seg)
+
+
+def corners_of(
+    sights: Sequence[Sight], now: Image, search: np.ndarray | None
+) -> tuple[Corners, list[np.ndarray]]:
+    """The corners of a later frame wherever segments can be, and the region (H, W) of each.
+
+    They are as dense as on the segments, as far as the bound allows. ``search`` (H, W) says where objects are.
+    """
+    regions = [then.region(now) for then in sights]
+    if search is not None:
+        inside = inner(search)
+        regions = [region & inside for region in regions]
+    anywhere = np.logical_or.reduce(regions)
+    segment_px = np.mean([np.count_nonzero(then.own) for then in sights])
+    limit = CORNERS * np.count_nonzero(anywhere) / max(segment_px, 1)
+    return corners(now, anywhere, int(np.clip(limit, CORNERS, _MOST))), regions
 
 
 def matched(then: Sight, found: Corners, cfg: TrackingConfig, rng: np.random.Generator) -> Matched | None:
