@@ -87,7 +87,7 @@ class Belief:
     @classmethod
     def of(cls, obs: Observation, best: Candidate, known: Known, policy: Policy, texture: bool = True) -> Belief:
         """Of a candidate in the map ``known``; ``texture``: whether it is asked whether that constrains free turns."""
-        keypoints, agrees = known.keypoints(obs), best.hypothesis.inliers
+        (keypoints, _), agrees = policy.correspondences(obs, known), best.hypothesis.inliers
         support = known.map.confidence[agrees].sum()
         agreement = (agrees & keypoints).sum() / max(keypoints.sum(), 1)
         config = policy.config

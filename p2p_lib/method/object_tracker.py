@@ -126,9 +126,8 @@ class ObjectTracker:
         model.settle_surface()
         if keyframe:
             rows = admission.rows(obs, model)
-            asked = model.insert_keyframe(
-                obs, T_cam_obj, *self._sample(obs), rows, admission.covariance, admission.confidence
-            )
+            rated = admission.covariance, admission.confidence, admission.fuse
+            asked = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), rows, *rated)
             requests = replace(asked, reject=requests.reject)
         covariance, sure = admission.rated(model)
         self.life = self.policy.followed(obs, self.known, best, admission, sure)

@@ -17,6 +17,8 @@ from p2p_lib.method.registration import Hypothesis
 
 #: A smaller difference of the mean distances tells nothing, however certain it is, m.
 _MARGIN_M = 2e-4
+#: A surface that no pose fits closer tells nothing either: it is bent, or depth and colour are not of one moment.
+_FITS_M = 0.004
 
 
 def select(
@@ -42,7 +44,7 @@ def select(
     if config.rule == "support":
         nearer = distance_m[best] - distance_m[nearest]
         chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
-        preferred = scores[best] - scores[nearest] > max(chance, _MARGIN_M)
+        preferred = scores[best] - scores[nearest] > max(chance, _MARGIN_M) and scores[nearest] < _FITS_M
         if not preferred:
             return best, "most inliers, the surface does not tell the hypotheses apart"
     return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
