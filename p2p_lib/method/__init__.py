@@ -12,7 +12,7 @@ object: find, then accept or absent), then at the parts of a step in its order:
   ``sampling`` chooses new points.
 
 What is ours is composed around these parts by :mod:`p2p_lib.extended`, which this package knows nothing of.
-``README.md`` beside this file lists where preset ``paper`` departs from the paper and its release.
+README.md beside this file lists where the paper's preset departs from the paper and its release.
 
 The 2D tracker, the detector of candidates and the segmenter are parts that it is given; what it asks of them is in
 :mod:`p2p_lib.core.interfaces`.

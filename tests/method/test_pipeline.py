@@ -377,7 +377,7 @@ def test_an_object_waits_until_its_mask_has_come_and_stopped_growing():
     assert_honest(estimates)
     at_once = track(
         frames,
-        config=quick().with_values({"method.mechanisms": "all but return_gate, surface_gate, turns, sure_keyframes"}),
+        config=quick().with_values({"method.mechanisms": "all but growing"}),
     )
     assert statuses(at_once, "right").index("tracked") < 11
 

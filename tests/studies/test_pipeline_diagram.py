@@ -15,7 +15,7 @@ from tests.method.test_pipeline import CAMERA, film
 def timed_stages() -> set[str]:
     """The names that the method gives its stopwatch."""
     found = set()
-    for path in (PROJECT / "p2p_lib" / "method").glob("*.py"):
+    for path in [p for room in ("method", "extended") for p in (PROJECT / "p2p_lib" / room).glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in ("stopwatch", "_stopwatch"):
                 found.add(node.args[0].value)
