@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,9 @@ def check_suffix(path: str | Path) -> None:
     """Refuse a film that could not be written, before anyone waits for it."""
     if Path(path).suffix not in SUFFIXES:
         raise BadInput("film", Path(path).name, f"a name that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+    if Path(path).suffix == ".mp4":
+        with needed_for("view"):
+            import_module("av")
 
 
 def write_video(images: Iterable[np.ndarray], path: str | Path, fps: float = 30.0) -> Path:
@@ -97,8 +101,7 @@ class Film(AbstractContextManager):
                 picture = picture.quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
             self._images.append((time_s, picture))
             return
-        with needed_for("view"):
-            import av
+        import av
 
         if self._container is None:
             # Without "bitexact" the file would name the builds that wrote it.
