@@ -5,16 +5,19 @@ Scores a 2D tracker by itself and any method's poses as well, and writes a run i
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from p2p_lib.core.config import Config
-from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt
+from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, doubt
 from p2p_lib.core.mesh import save as save_mesh
 from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
@@ -22,18 +25,25 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate, status_text
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import moving_scale
+from p2p_lib.datasets.cameras import Stream
 from p2p_lib.datasets.exchange import as_run, export, read_poses
+from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
+from p2p_lib.datasets.first_masks import FirstMasks
 from p2p_lib.datasets.keypoint_log import KeypointLog
+from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.evaluation.consistency import consistency
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.extended.default import Point2Pose
 
+#: Frames whose images are looked at when a run is judged at its end; ``p2p eval`` looks at more.
+RUN_LOOKS = 30
 #: So many clicks an object are drawn from its first mask.
 CLICKS = 3
 #: Two frames that take longer did more than track.
@@ -49,6 +59,7 @@ class RunResult:
     interrupted  whether Ctrl-C ended the run
     advice       what to do about objects that never had a pose, a line; "" where all had one
     tracked      whether any object ever had a pose
+    look_at      what to look at before the run is believed, a line each; none where nothing that it keeps is suspicious
     """
 
     path: Path
@@ -58,6 +69,7 @@ class RunResult:
     interrupted: bool
     advice: str = ""
     tracked: bool = True
+    look_at: tuple[str, ...] = ()
 
 
 def run(
@@ -99,7 +111,8 @@ def run(
     with writer:
         _say_what_was_there(writer, say)
         if not writer.complete:
-            _track(job, Keeper(writer, method, options.save_masks), progress)
+            prompts = [prompt for of_frame in job.prompts.values() for prompt in of_frame]
+            _track(job, Keeper(writer, method, options.save_masks, prompts), progress, say)
     interrupted = writer.info["stopped_by"] is not None
     if not writer.begun and not writer.earlier:
         nothing = (f"0 of {len(job.frames)} frames",)
@@ -109,15 +122,32 @@ def run(
 
 @dataclass(frozen=True, eq=False)
 class Keeper:
-    """Keeps what a tracker says as a run's folder: frame by frame poses, times and masks, and its maps at the end."""
+    """Keeps what a tracker says as a run's folder: frame by frame poses, times and masks, and its maps at the end.
+
+    masks    whether to keep the masks as images
+    prompts  what started the objects, to be drawn with their first masks
+    doubts   what was doubted meanwhile: a list that the caller fills (:func:`noted`)
+    """
 
     writer: RunWriter
     method: Point2Pose
     masks: bool = False
+    prompts: Iterable[Prompt] = ()
+    doubts: list[str] = field(default_factory=list)
     keypoints: KeypointLog = field(default_factory=KeypointLog)
 
-    def add(self, frame: Frame, estimates: Mapping[str, PoseEstimate]) -> None:
-        """The frame that has just been estimated."""
+    @cached_property
+    def mask_log(self) -> MaskLog:
+        """The masks so far, coarsely."""
+        return MaskLog(self.method.camera)
+
+    @cached_property
+    def first_masks(self) -> FirstMasks:
+        """The picture of what the objects were started with."""
+        return FirstMasks(self.writer.path / FIRST_MASKS, self.prompts)
+
+    def add(self, frame: Frame, estimates: Mapping[str, PoseEstimate]) -> list[str]:
+        """The frame that has just been estimated; which objects have their first mask in it."""
         method = self.method
         for name, obj in method.objects.items():
             seen = method.tracks.visible & np.isin(method.tracks.ids, obj.model.map.ids)
@@ -126,9 +156,13 @@ class Keeper:
         self.writer.add(frame, estimates, stages_ms.pop("total"), stages_ms)
         if self.masks:
             self.writer.add_masks(frame, method.masks)
+        for name, mask in method.masks.items():
+            if mask is not None:
+                self.mask_log.add(frame, name, mask)
+        return self.first_masks.add(frame, method.masks)
 
     def save_maps(self) -> None:
-        """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
+        """``meshes/<object>.ply``, each surface in its object's frame where there is one, and the two logs."""
         objects = self.method.objects.items()
         kept = {name: obj.known_as(self.writer.kept_map(name)) for name, obj in objects}
         models = {name: known.model for name, known in kept.items() if known is not None}
@@ -137,6 +171,36 @@ class Keeper:
                 save_mesh(mesh, self.writer.path / "meshes" / f"{name}.ply")
         maps = {name: (model.map.ids, model.map.p_obj, model.map.promoted) for name, model in models.items()}
         self.keypoints.save(self.writer.path, maps)
+        self.mask_log.save(self.writer.path)
+
+    def judge(self, sequence: sequences.Sequence | None = None) -> None:
+        """Have ``run.json`` say what was doubted, and what to look at before the run is believed; when all is kept.
+
+        sequence  whose images are looked at; None where they are gone
+        """
+        self.writer.info["doubts"] = list(dict.fromkeys(self.doubts))
+        self.writer.flush()
+        seen = (sequence, RUN_LOOKS) if sequence is not None else (Stream("", self.method.camera), 0)
+        found = consistency(load_run(self.writer.path), *seen)
+        told = {name: [suspicion.text for suspicion in of] for name, of in found.suspicions.items()}
+        self.writer.info["look_at"] = told
+
+
+@contextmanager
+def noted(doubts: list[str]) -> Iterator[None]:
+    """Keeps what is doubted inside (:class:`~p2p_lib.core.errors.Doubt`), which is shown as before."""
+    shown = warnings.showwarning
+
+    def note(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
+        if issubclass(category, Doubt):
+            doubts.append(str(message))
+        shown(message, category, *where, **how)
+
+    warnings.showwarning = note
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown
 
 
 def evaluate_tracker(
@@ -323,13 +387,15 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None
         say(f"{writer.path} held {writer.earlier}, which this one replaces.")
 
 
-def _track(job: _Job, keeper: Keeper, progress: bool) -> None:
+def _track(job: _Job, keeper: Keeper, progress: bool, say: Callable[[str], object]) -> None:
     """Every frame, and at the end the maps; Ctrl-C ends it early."""
     writer, method = keeper.writer, keeper.method
-    with progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
+    with noted(keeper.doubts), progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
         try:
             for frame, estimates in _estimates(method, job):
-                keeper.add(frame, estimates)
+                if (started := keeper.add(frame, estimates)) and progress:
+                    bar.clear()
+                    say(f"First masks of {', '.join(started)} in frame {frame.index}: {keeper.first_masks.path}")
                 now = ", ".join(f"{name} {estimate.status}" for name, estimate in estimates.items())
                 bar.set_postfix_str(now, refresh=False)
                 bar.update()
@@ -340,6 +406,7 @@ def _track(job: _Job, keeper: Keeper, progress: bool) -> None:
             writer.keep_whole_frames()
     if writer.begun:
         keeper.save_maps()
+        keeper.judge(job.sequence)
 
 
 def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
@@ -350,7 +417,10 @@ def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str,
             frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
             for prompt in job.prompts.get(i, ()):
                 method.tell(prompt)
-            yield method.step(frame, {name: masks[name] for name in method.objects if name in masks})
+            estimates = method.step(frame, {name: masks[name] for name in method.objects if name in masks})
+            for error in method.refused.values():  # nobody is there to say something better
+                raise error
+            yield estimates
         yield from method.finish()
 
     for estimates in steps():
@@ -368,7 +438,9 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
         not_scored = "the sequence has no truth (looked for in annotated_poses/ of a folder)"
     tracked = any(obj.has_pose.any() for obj in done.objects.values())
     advice = "" if interrupted else _advice(done, job)
-    return RunResult(out, evaluation, not_scored, summary(done, len(job.frames)), interrupted, advice, tracked)
+    look_at = [f"{name}: {text}" for name, of in (done.info.get("look_at") or {}).items() for text in of]
+    told = summary(done, len(job.frames)), interrupted, advice, tracked, tuple(look_at)
+    return RunResult(out, evaluation, not_scored, *told)
 
 
 def summary(run: Run, wanted: int) -> tuple[str, ...]:

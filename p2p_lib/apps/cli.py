@@ -55,6 +55,8 @@ def _run(a: argparse.Namespace) -> int:
     how = {"if_exists": a.if_exists or "refuse", "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
     print("\n".join(result.summary))
+    if result.look_at:
+        print("\n".join(["What to look at before it is believed:", *(f"  {line}" for line in result.look_at)]))
     if result.evaluation is not None:
         print(result.evaluation.as_table())
         print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
@@ -152,6 +154,7 @@ def _eval(a: argparse.Namespace) -> None:
 
 def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     """Against the truth; where there is none, or no model, against what the camera saw."""
+    from p2p_lib.datasets.mask_log import FILE as MASK_LOG
     from p2p_lib.datasets.models import given_models
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.evaluation.consistency import consistency
@@ -169,12 +172,12 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     elif given_models(options.models or {}, run.objects):
         warn("p2p eval: --models is not used, because the run has no truth.")
     _show(score or replace(consistency(run), not_scored=not_scored), a.json)
-    if not (score or a.json or (a.run / "masks").is_dir() or run.info["masks"] == "dataset"):
-        asked = RunOptions(**(run.info.get("options") or {}) | {"save_masks": True})
+    if not (score or a.json or (a.run / MASK_LOG).is_file()):
+        asked = RunOptions(**(run.info.get("options") or {}))
         again = " ".join(
             ["p2p run", run.info["path"] or run.info["sequence"], f"--out {a.run} --force", *asked.words()]
         )
-        warn(f"p2p eval: where seen and mask IoU are empty, because no masks were kept. Next: {again}")
+        warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. Next: {again}")
 
 
 @command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, _JSON, _MIN_VISIBLE)

@@ -27,7 +27,7 @@ from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
-from p2p_lib.run import Keeper, told
+from p2p_lib.run import Keeper, noted, told
 
 #: Made-up images that are tracked before a camera starts.
 _WARM_FRAMES = 4
@@ -162,13 +162,13 @@ def _kept(
     objects = tuple(dict.fromkeys(prompt.name for prompt in prompts))
     writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, if_exists=if_exists)
     writer.info |= told(method, options, prompts)
-    keeper, stopped = Keeper(writer, method, options.save_masks), None
+    keeper, stopped = Keeper(writer, method, options.save_masks, prompts), None
 
     def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
         writer.info["stop"] = frame.index + 1
         keeper.add(frame, estimates)
 
-    with writer:
+    with writer, noted(keeper.doubts):
         try:
             yield listen
         except KeyboardInterrupt as stop:
@@ -176,6 +176,7 @@ def _kept(
             writer.keep_whole_frames()
         if writer.begun:
             keeper.save_maps()
+            keeper.judge()
     if stopped:
         raise stopped
 

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.interfaces import PointTracker, Segmenter
-from p2p_lib.core.prompts import Prompt, check_apart, check_prompt
+from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
+from p2p_lib.core.types import Frame, PoseEstimate, Status
 
 
 class Objects:
-    """What a user adds, corrects and removes; whoever tracks them says what it is to ``begin`` one."""
+    """What a user adds, corrects and removes; whoever tracks them says what it is to ``begin`` one.
 
-    camera: Camera
-    objects: dict[str, Any]
-    _said: dict[str, Prompt]
+    refused  of objects whose last prompt did not fit the frame that it was made on: why it was not used
+    """
+
+    def __init__(self, camera: Camera):
+        self.camera = camera
+        self.objects: dict[str, Any] = {}
+        self.refused: dict[str, BadInput] = {}
+        self._said: dict[str, Prompt] = {}  # in the frame to come
 
     @property
     def tracker(self) -> PointTracker:
@@ -49,7 +57,9 @@ class Objects:
         box       (4,) left, top, right, bottom: all of it is inside in the next frame
 
         With none of them it is started by the first mask that ``step`` gets for it. Raises :class:`BadInput` for what
-        does not fit, and nothing has changed; ``step`` raises it for clicks where there is no depth.
+        does not fit, and nothing has changed. What shows to be unusable in the next frame itself, as clicks where no
+        depth was measured, is forgotten with that frame: ``refused`` and the reason of the object's estimates say why,
+        until :meth:`correct` says something better.
         """
         if name in self.objects:
             raise BadInput("add_object", repr(name), "a name not in use", f"In use: {', '.join(self.objects)}.")
@@ -75,6 +85,7 @@ class Objects:
         if name not in self.objects:
             self.begin(name)
         self._said[name] = prompt
+        self.refused.pop(name, None)
 
     def remove_object(self, name: str) -> None:
         """Stop following an object; its points are dropped from the tracker."""
@@ -83,8 +94,30 @@ class Objects:
         if len(ids := self.objects.pop(name).ids):
             self.tracker.drop(ids)
         self._said.pop(name, None)
+        self.refused.pop(name, None)
         if name in self.segmenter.names:
             self.segmenter.remove(name)
+
+    def take_said(
+        self, frame: Frame, masks: Mapping[str, np.ndarray | None]
+    ) -> tuple[dict[str, np.ndarray | None], dict[str, Prompt]]:
+        """Every object's mask in this frame, None for one to be found, and what is said of objects in it.
+
+        What was said until now belongs to this frame: what does not fit it is ``refused``, and stops nobody.
+        """
+        given, refused = given_masks(frame, masks, self._said, self.objects, self.camera)
+        said, self._said = {name: p for name, p in self._said.items() if name not in refused}, {}
+        self.refused |= refused
+        for name, error in refused.items():
+            if name in self.segmenter.names:  # its estimates go on and cannot say so
+                doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is not used. {error.fix}")
+        return given, said
+
+    def explained(self, estimate: PoseEstimate) -> PoseEstimate:
+        """An estimate that says, where its object has not started, what was wrong with its prompt."""
+        if estimate.status != Status.INITIALISING or estimate.object not in self.refused:
+            return estimate
+        return replace(estimate, reason=str(self.refused[estimate.object]))
 
 
 def _prompt(name: str, **said: ArrayLike | None) -> Prompt:

@@ -27,6 +27,8 @@ class Prompt:
     negative_px  (M, 2) pixels that are not of it
     box_px       (4,) left, top, right, bottom: all of the object is inside; None where nobody says
     mask         (H, W) bool: these pixels are the object, none where it is hidden; None where nobody says
+
+    The arrays are copied.
     """
 
     name: str
@@ -47,7 +49,7 @@ class Prompt:
             object.__setattr__(self, "box_px", _box(f"box around {self.name!r}", self.box_px))
         if self.mask is not None:
             mask = np.asarray(self.mask)
-            object.__setattr__(self, "mask", mask if mask.dtype == bool else mask > 0)
+            object.__setattr__(self, "mask", mask.copy() if mask.dtype == bool else mask > 0)
         if not len(self.points_px) and not len(self.negative_px) and self.box_px is None and self.mask is None:
             raise BadInput(f"clicks on {self.name!r}", "none", "at least one [x, y] in pixels, a box or a mask")
         if self.mask is not None and (len(self.points_px) or len(self.negative_px) or self.box_px is not None):
@@ -127,10 +129,11 @@ def given_masks(
     said: Mapping[str, Prompt],
     objects: Iterable[str],
     camera: Camera,
-) -> dict[str, np.ndarray | None]:
+) -> tuple[dict[str, np.ndarray | None], dict[str, BadInput]]:
     """Every object's mask in a frame, by ``masks`` and what is ``said`` of it; None for one that nobody gives.
 
-    Raises :class:`BadInput` for a frame of another size, masks of unknown objects, and what contradicts itself.
+    Also why what is said of some objects does not fit this frame: it is not used. Raises :class:`BadInput` for a frame
+    of another size and masks of unknown objects.
     """
     if not isinstance(frame, Frame):
         got = f"{type(frame).__name__} {getattr(frame, 'shape', '')}".strip()
@@ -147,15 +150,24 @@ def given_masks(
     for name, prompt in given.items():
         if prompt.mask is not None and prompt.mask.all():
             doubt(f"mask of {name!r}", f"the whole image in frame {frame.index}", "Is it inverted?")
+    refused = {}
     for name, prompt in said.items():
-        check_depth(prompt, frame)
-        for other in given.values():
-            check_not_on(prompt, other, frame.index)
-        if name in given and prompt.mask is None:
-            fix = "Leave it out of the masks, or do not click on it."
-            raise BadInput(f"mask of {name!r}", f"a mask and clicks in frame {frame.index}", "one of them", fix)
-    given = {name: prompt for name, prompt in said.items() if prompt.mask is not None} | given
-    return {name: given[name].mask if name in given else None for name in objects}
+        try:
+            _check_said(prompt, frame, given)
+        except BadInput as error:
+            refused[name] = error
+    given = {name: p for name, p in said.items() if p.mask is not None and name not in refused} | given
+    return {name: given[name].mask if name in given else None for name in objects}, refused
+
+
+def _check_said(prompt: Prompt, frame: Frame, given: Mapping[str, Prompt]) -> None:
+    """Refuse what is said of an object in a frame where depth or the masks given with it say otherwise."""
+    check_depth(prompt, frame)
+    for other in given.values():
+        check_not_on(prompt, other, frame.index)
+    if prompt.name in given and prompt.mask is None:
+        fix = "Leave it out of the masks, or do not click on it."
+        raise BadInput(f"mask of {prompt.name!r}", f"a mask and clicks in frame {frame.index}", "one of them", fix)
 
 
 def points_in_box(box_px: np.ndarray, frame: Frame) -> np.ndarray:

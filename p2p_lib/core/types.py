@@ -30,6 +30,8 @@ class Frame:
     time_s   seconds, increasing within a sequence
     T_world_cam  (4, 4) pose of the camera in a static world, where somebody knows it (a robot, SLAM)
 
+    The arrays are copied: a camera driver may refill the buffers that they came in.
+
     >>> rgb, depth_mm = np.zeros((480, 640, 3), np.uint8), np.full((480, 640), 700, np.uint16)
     >>> Frame(index=0, time_s=0.0, rgb=rgb, depth_m=depth_mm / np.float32(1000)).shape
     (480, 640)
@@ -60,12 +62,14 @@ class Frame:
         if not np.isfinite(self.time_s):
             raise BadInput(f"frame {self.index} time_s", self.time_s, "a finite time in seconds")
         if self.T_world_cam is not None:
-            object.__setattr__(self, "T_world_cam", se3.check(f"frame {self.index} T_world_cam", self.T_world_cam))
+            T_world_cam = se3.check(f"frame {self.index} T_world_cam", self.T_world_cam)
+            object.__setattr__(self, "T_world_cam", T_world_cam.copy())
+        object.__setattr__(self, "rgb", rgb.copy())
         # A sensor's NaN, infinity, negative and impossible readings all mean "no measurement", which is 0 here.
         with np.errstate(over="ignore"):
-            clean = depth.astype(np.float32, copy=False)
-        bad = ~((clean == 0) | (clean >= NEAREST_M) & (clean <= FARTHEST_M))
-        object.__setattr__(self, "depth_m", np.where(bad, np.float32(0), clean) if bad.any() else clean)
+            clean = depth.astype(np.float32)
+        clean[~((clean >= NEAREST_M) & (clean <= FARTHEST_M))] = 0
+        object.__setattr__(self, "depth_m", clean)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -5,13 +5,16 @@ It is written into a folder of its own, by one process at a time: nothing is del
 ::
 
     config.toml           every parameter
-    run.json              what ran on what: sequence, objects, tracker, masks, preset, seed, versions, commit
+    run.json              what ran on what: sequence, objects, tracker, masks, preset, seed, versions, commit; what was
+                          doubted meanwhile and, at the end, what to look at before it is believed
+    first_masks.png       what each object was started with (:mod:`p2p_lib.datasets.first_masks`)
     poses/<object>.txt    TUM: time_s tx ty tz qx qy qz qw of T_cam_obj; frames without a pose are left out,
                           and so are poses in maps that were given up since (``map_id`` in ``poses.npz``); poses in a
                           map that became part of the last one since are in its frame
     poses.npz             everything of every frame as it was said then, and the truth where the sequence has it
     meshes/<object>.ply   the reconstructed surface in the object frame, vertex colours (written at the end)
     keypoints.npz         2D tracks and keypoint maps (:mod:`p2p_lib.datasets.keypoint_log`; written at the end)
+    masks.npz             every mask, coarsely (:mod:`p2p_lib.datasets.mask_log`; written at the end)
     models.npz            the models' points, so that a run can be scored by itself
     timings.csv           milliseconds of every frame and stage
     masks/<object>/*.png  the masks that were used, 255 on the object (where asked for); named by frame index

@@ -140,7 +140,8 @@ def open_sequence(
 
 def reopen(info: Mapping[str, Any]) -> Sequence:
     """The sequence that a run was made on, as its ``run.json`` says; raises as :func:`open_sequence`."""
-    return open_sequence(info["path"] or info["sequence"], info["format"], seed=info["seed"])
+    depth_scale = (info.get("options") or {}).get("depth_scale")
+    return open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, info["seed"])
 
 
 def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:

@@ -6,15 +6,16 @@ vermillion are kept for statuses, whose strips are hatched besides, so that they
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
+from p2p_lib.core.colours import OBJECTS as OBJECTS
+from p2p_lib.core.colours import object_colours as object_colours
+from p2p_lib.core.colours import rgb as rgb
 from p2p_lib.core.packages import needed_for
 from p2p_lib.core.types import Status
 from p2p_lib.evaluation.point_tracks import Outcome
 
-#: Objects, in the order in which a sequence names them.
-OBJECTS = ("#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#882255", "#6B4E23", "#222222")
 #: Statuses: fill and hatch. Tracked is the quiet one.
 STATUS: dict[str, tuple[str, str]] = {
     Status.INITIALISING: ("#FFFFFF", "...."),
@@ -59,16 +60,6 @@ _RC = {
     "pdf.fonttype": 42,
     "svg.hashsalt": "p2p",
 }
-
-
-def object_colours(names: Iterable[str]) -> dict[str, str]:
-    """Object to its colour ``#RRGGBB``, by its place in the sequence; beyond seven objects they come round again."""
-    return {name: OBJECTS[k % len(OBJECTS)] for k, name in enumerate(names)}
-
-
-def rgb(colour: str) -> tuple[int, int, int]:
-    """``#RRGGBB`` as three numbers 0..255, red first."""
-    return tuple(bytes.fromhex(colour.removeprefix("#")))
 
 
 def ink(colour: str) -> str:

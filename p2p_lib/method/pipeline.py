@@ -25,7 +25,6 @@ from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.objects import Objects
-from p2p_lib.core.prompts import Prompt, given_masks
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method.frontend import Asked, Frontend, Masks
@@ -66,7 +65,8 @@ class Point2Pose(Objects):
         segmenter: str | Segmenter = backends.DEFAULT_SEGMENTER,
         parts: Parts | None = None,
     ):
-        self.camera, self.config = camera, as_config(config)
+        super().__init__(camera)
+        self.config = as_config(config)
         if parts is None and self.config.method.mechanisms != "none":
             fix = "p2p_lib.Point2Pose composes them."
             raise BadInput("config method.mechanisms", repr(self.config.method.mechanisms), "none", fix)
@@ -76,13 +76,11 @@ class Point2Pose(Objects):
         self.detector = backends.make_detector(detector, self.config.sampling, rng)
         rng = np.random.default_rng([seed, 1])
         segmenter = backends.make_segmenter(segmenter, camera, self.config.segmentation, rng)
-        self.objects: dict[str, ObjectTracker] = {}
         self.frame: Frame | None = None
         self.stopwatch = Stopwatch()
         self._beside = ThreadPoolExecutor(2, "p2p")
         self.front = self._parts.front(camera, tracker, segmenter, self.objects, self.stopwatch, self._beside)
         self._status: dict[str, Status] = {}
-        self._said: dict[str, Prompt] = {}  # in the frame to come
 
     @property
     def tracker(self) -> PointTracker:
@@ -126,14 +124,13 @@ class Point2Pose(Objects):
             seen = self.front.observe(tracked)
             steps = {name: self.objects[name].step(obs) for name, obs in seen.items()}
             self.front.apply({name: step.requests for name, step in steps.items()})
-            estimates = {name: steps[name].estimate for name in self.objects if name in steps}
+            estimates = {name: self.explained(steps[name].estimate) for name in self.objects if name in steps}
         self._log(estimates)
         return estimates
 
     def _asked(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> Asked:
         """The frame, with every object's checked mask in it: None for one that the segmenter has to find."""
-        given = given_masks(frame, masks, self._said, self.objects, self.camera)
-        said, self._said = self._said, {}
+        given, said = self.take_said(frame, masks)
         return Asked(self._parts.before(frame) if self._parts.before else frame, given, said)
 
     def finish(self) -> Iterator[dict[str, PoseEstimate]]:

@@ -57,7 +57,8 @@ def run(sequence: Path, out: Path, *more: str) -> int:
 
 
 def test_a_run_leaves_what_was_promised(done):
-    assert {p.name for p in done.iterdir()} >= {"config.toml", "run.json", "poses", "poses.npz", "timings.csv"}
+    files = {"config.toml", "run.json", "poses", "poses.npz", "timings.csv", "first_masks.png", "masks.npz"}
+    assert {p.name for p in done.iterdir()} >= files
     rows = np.loadtxt(done / "poses" / "object.txt")
     assert rows.shape == (FRAMES, 8)
     np.testing.assert_allclose(rows[:, 0], np.arange(FRAMES) / 30, atol=1e-6)
@@ -134,7 +135,8 @@ def test_progress_goes_where_it_does_not_disturb(sequence, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert f"{FRAMES}/{FRAMES}" in err and "object tracked" in err
     assert "frame/s" not in out and "\r" not in out
-    assert err.count("\n") == 1 and "\r" not in err, "a terminal's bar would fill a log file"
+    first, _ = err.splitlines()  # a terminal's bar would fill a log file
+    assert first == f"First masks of object in frame 0: {tmp_path / 'out' / 'first_masks.png'}" and "\r" not in err
 
 
 def test_replacing_a_run_is_said(sequence, tmp_path, capsys):
@@ -714,13 +716,31 @@ def test_an_object_of_ones_own_is_tracked_without_score(sequence, tmp_path, caps
     assert "my board: a pose in 8 of 8 frames" in capsys.readouterr().out
     assert cli.main(["eval", str(tmp_path / "out")]) == 0
     out, err = capsys.readouterr()
-    assert "my board" in out and err.count("\n") == 1 and "where seen and mask IoU are empty" in err
+    assert "my board" in out and "mask IoU" in out and err == ""
+    (tmp_path / "out" / "masks.npz").unlink()  # as of a run that was killed
+    assert cli.main(["eval", str(tmp_path / "out")]) == 0
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1 and "where seen and mask IoU are empty" in err
     again = shlex.split(err.partition("Next: p2p ")[2])
     assert cli.main([*again, *POINTS_ALONE]) == 0
     capsys.readouterr()
     assert cli.main(["eval", str(tmp_path / "out")]) == 0
-    out, err = capsys.readouterr()
-    assert err == "" and "mask IoU" in out
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_suspicious_is_said_at_the_end_kept_and_said_again(sequence, tmp_path, capsys):
+    """Clicks on the wall: what they start is flat, and much longer than anything that is held."""
+    out = tmp_path / "out"
+    assert run(sequence, out, *clicks(tmp_path, ("wall", 0, [[5, 5], [150, 110]]))) in (0, 2)
+    said = capsys.readouterr().out
+    told = json.loads((out / "run.json").read_text())
+    assert any("clicks on 'wall' in frame 0" in text for text in told["doubts"])
+    assert told["doubts"][0] in told["look_at"]["wall"]
+    assert "What to look at before it is believed:" in said
+    assert all(f"  wall: {text}" in said for text in told["look_at"]["wall"])
+    assert cli.main(["eval", str(out), "--json"]) == 0
+    judged = json.loads(capsys.readouterr().out)["objects"]["wall"]
+    assert judged["verdict"] == "look" and told["doubts"][0] in [found["text"] for found in judged["look_at"]]
 
 
 BAD_CLICKS = {

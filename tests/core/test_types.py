@@ -19,9 +19,12 @@ NO_POSES = pytest.mark.parametrize("status", sorted(set(Status) - WITH_POSE))
 # --- Frame -------------------------------------------------------------------------------------
 
 
-def test_frame_keeps_good_pictures_as_they_are():
-    frame = Frame(3, 0.1, RGB, DEPTH)
-    assert frame.rgb is RGB and frame.depth_m is DEPTH and frame.shape == (4, 6)
+def test_frame_keeps_good_pictures_as_they_are_whatever_becomes_of_the_buffers():
+    rgb, depth, T_world_cam = RGB.copy(), DEPTH.copy(), np.eye(4)
+    frame = Frame(3, 0.1, rgb, depth, T_world_cam)
+    rgb[:], depth[:], T_world_cam[:] = 7, 7, 7
+    assert (frame.rgb == RGB).all() and (frame.depth_m == DEPTH).all() and frame.shape == (4, 6)
+    assert (frame.T_world_cam == np.eye(4)).all()
 
 
 @pytest.mark.parametrize("reading", [np.nan, np.inf, -np.inf, -0.3, -1e-9, 1e15, 1e300, 1e-30])

@@ -7,10 +7,11 @@ import pytest
 import trimesh
 
 from p2p_lib.core import se3
-from p2p_lib.datasets.images import save_png
+from p2p_lib.core.image import in_mask
 from p2p_lib.datasets.keypoint_log import KeypointLog
+from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, load_points
-from p2p_lib.evaluation.consistency import HEADS, consistency, verdict
+from p2p_lib.evaluation.consistency import HEADS, consistency
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 OFF_PX = 2.0
@@ -30,17 +31,43 @@ def run(made, tmp_path_factory):
         maps[name] = np.arange(20), se3.transform(T_OBJ_MODEL, points), np.arange(20) < 15
         for i in range(len(made.sequence)):
             uv_px = camera.project(se3.transform(made.sequence.truth[name].T_cam_model[i], points))
-            log.add(i, name, np.arange(20), uv_px + np.array([OFF_PX, 0]))
+            seen = np.flatnonzero(in_mask(uv_px, made.sequence.masks(i)[name]))
+            log.add(i, name, seen, uv_px[seen] + np.array([OFF_PX, 0]))
     log.save(run.path, maps)
+    masks = MaskLog(camera)
     for i in range(len(made.sequence)):
         for name, mask in made.sequence.masks(i).items():
-            save_png(run.path / "masks" / name / f"{i:06d}.png", mask)
+            masks.add(made.sequence.frame(i), name, mask)
+    masks.save(run.path)
+    for file in ("run.json", "poses.npz"):
+        (run.path / file).write_bytes((made.run.path / file).read_bytes())
     return run
 
 
 @pytest.fixture(scope="module")
 def good(made, run):
     return consistency(run, made.sequence).objects
+
+
+def test_a_good_run_is_called_good_and_one_put_off_is_not(made, run):
+    """Of the box, four frames are wrong on purpose: too few of 40 to look at."""
+    found = consistency(run, made.sequence)
+    assert {found.verdict(name) for name in run.objects} == {"good"} and not found.look_at()
+    off = consistency(put_off(run, (0, np.radians(10), 0, 0.02, 0, 0)), made.sequence)
+    for name in run.objects:
+        assert off.verdict(name) == "look"
+        assert any("keypoints more than 3 px" in line for line in off.look_at() if line.startswith(f"look at {name}"))
+        told = off.as_dict()["objects"][name]
+        assert told["verdict"] == "look" and all(found["text"] and found["frames"] for found in told["look_at"])
+    assert all(line in off.as_table() for line in off.look_at())
+
+
+def test_what_was_doubted_when_it_was_made_is_to_be_looked_at(made, run):
+    doubts = ["clicks on 'box' in frame 0: 9 pixels, flat", "depth: all depth changes by 9 % from frame 3 to 4"]
+    found = consistency(replace(run, info=run.info | {"doubts": doubts}), made.sequence)
+    assert [s.text for s in found.suspicions["box"]] == doubts and [s.text for s in found.suspicions["can"]] == doubts[
+        1:
+    ]
 
 
 def put_off(run, xi):
@@ -79,8 +106,9 @@ def test_how_many_of_the_poses_are_doubted(made, run):
 
 def test_what_cannot_be_said_is_not(made, run, tmp_path):
     """Neither surfaces nor keypoints nor masks were kept: only how often there was a pose, and a doubted one."""
-    bare = replace(run, path=tmp_path, info=run.info | {"masks": "clicks"})
-    said = consistency(bare, made.sequence)
+    for file in ("run.json", "poses.npz"):
+        (tmp_path / file).write_bytes((made.run.path / file).read_bytes())
+    said = consistency(replace(run, path=tmp_path), made.sequence)
     for name, numbers in said.objects.items():
         assert {key for key, value in numbers.items() if np.isfinite(value)} == {"pose", "doubted"}
         assert said.as_dict()["objects"][name]["mask_iou"] is None
@@ -89,21 +117,3 @@ def test_what_cannot_be_said_is_not(made, run, tmp_path):
     assert unscored.as_dict()["truth"] is None and unscored.as_dict()["not_scored"] == "no model of 'box'"
     for head, says in HEADS.values():
         assert head in said.as_table() and says in said.as_table()
-
-
-@pytest.mark.parametrize(
-    ("worse", "word"),
-    [
-        ({}, "good"),
-        ({"reprojection_px": 4.5}, "look"),
-        ({"doubted": 60.0}, "look"),
-        ({"pose_where_seen": 50.0}, "look"),
-        ({"pose": 40.0}, "look"),
-        ({"pose": 40.0, "pose_where_seen": 100.0}, "good"),
-    ],
-)
-def test_a_verdict_in_a_word(worse, word):
-    """Numbers of a real run, those with poses 1 cm off, and NaN for what was not kept."""
-    numbers = dict.fromkeys(HEADS, float("nan")) | {"pose": 90.0, "doubted": 5.0, "reprojection_px": 0.6}
-    assert verdict(numbers | worse) == word
-    assert verdict(numbers | {"pose": 0.0}) == "look"

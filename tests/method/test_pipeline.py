@@ -695,10 +695,12 @@ def test_a_late_object_is_clicked_while_another_has_masks():
     assert {str(e.status) for e in estimates.values()} == {"tracked"}
     assert iou(method.masks["right"], masks["right"]) > 0.85
     method.correct("right", clicks=clicks_on(film()[14][1]["right"]))
-    with pytest.raises(BadInput, match="mask of 'right': got a mask and clicks in frame 14"):
-        method.step(film()[14][0], film()[14][1])
+    with pytest.warns(Doubt, match="correction of 'right': mask of 'right': a mask and clicks in frame 14. It is not"):
+        estimates = method.step(film()[14][0], film()[14][1])
+    assert {str(e.status) for e in estimates.values()} == {"tracked"}
+    np.testing.assert_array_equal(method.masks["right"], film()[14][1]["right"])
     method.remove_object("right")
-    assert set(method.step(film()[14][0], {"left": film()[14][1]["left"]})) == {"left"} == set(method.masks)
+    assert set(method.step(film()[15][0], {"left": film()[15][1]["left"]})) == {"left"} == set(method.masks)
 
 
 def test_clicks_that_do_not_fit_are_refused_and_leave_no_object_behind():
@@ -745,10 +747,13 @@ def test_a_click_on_anothers_mask_is_refused():
     method.remove_object("left")
     method.add_object("left")
     method.add_object("right", clicks=on_left)
-    with pytest.raises(BadInput, match=r"clicks on 'right': got \(\d+, \d+\) on the mask of 'left' in frame 0"):
-        method.step(frame, {"left": masks["left"]})
+    estimates = method.step(frame, {"left": masks["left"]})
+    assert str(estimates["left"].status) == "tracked" and str(estimates["right"].status) == "initialising"
+    assert "on the mask of 'left' in frame 0" in estimates["right"].reason
+    frame, masks = film()[1]
     method.correct("right", clicks=clicks_on(masks["right"]))  # the last word counts
     assert {str(e.status) for e in method.step(frame, {"left": masks["left"]}).values()} == {"tracked"}
+    assert not method.refused
     np.testing.assert_array_equal(method.masks["left"], masks["left"])
     assert iou(method.masks["right"], masks["right"]) > 0.85
 
@@ -787,19 +792,67 @@ def test_a_correction_mends_what_was_wrong():
         assert iou(method.masks["right"], masks["right"] & (frame.depth_m > 0)) > 0.85
 
 
-def test_clicks_without_depth_are_refused_before_anything_is_done():
-    method, (frame, masks) = Point2Pose(CAMERA, quick()), film()[0]
-    clicks = clicks_on(masks["left"])
-    x, y = clicks[1]
-    hole = frame.depth_m.copy()
-    hole[y - 4 : y + 5, x - 4 : x + 5] = 0
-    method.add_object("left", clicks=clicks)
-    with pytest.raises(BadInput, match=rf"clicks on 'left': got \({x}, {y}\) has no depth in frame 0"):
-        method.step(Frame(0, 0.0, frame.rgb, hole))
-    other = Point2Pose(CAMERA, quick())
-    other.add_object("left", clicks=clicks)
-    # A frame with depth is taken as if nothing had been.
-    assert_same([method.step(f) for f, _ in film()[:4]], [other.step(f) for f, _ in film()[:4]])
+def with_hole(frame: Frame, at: np.ndarray) -> Frame:
+    """A frame without depth around a pixel (x, y)."""
+    depth_m = frame.depth_m.copy()
+    depth_m[at[1] - 4 : at[1] + 5, at[0] - 4 : at[0] + 5] = 0
+    return Frame(frame.index, frame.time_s, frame.rgb, depth_m)
+
+
+def test_a_click_without_depth_stops_nobody_and_is_not_used_later():
+    """The others go on as if it had not been; the estimate says why there is none, until better clicks come."""
+    method, alone, frames = Point2Pose(CAMERA, quick()), Point2Pose(CAMERA, quick()), film()[:9]
+    for each in (method, alone):
+        each.add_object("left", clicks=clicks_on(frames[0][1]["left"]))
+    on_right = clicks_on(frames[2][1]["right"])
+    for k, (frame, masks) in enumerate(frames):
+        frame = with_hole(frame, on_right[1]) if k == 2 else frame
+        if k == 2:
+            method.add_object("right", clicks=on_right)
+        if k == 6:
+            method.correct("right", clicks=clicks_on(masks["right"]))
+            alone.add_object("right", clicks=clicks_on(masks["right"]))
+        estimates, expected = method.step(frame), alone.step(frame)
+        assert_same([{"left": estimates["left"]}], [{"left": expected["left"]}])
+        if 2 <= k < 6:
+            assert str(estimates["right"].status) == "initialising" and not method.masks["right"]
+            x, y = on_right[1]
+            why = f"clicks on 'right': got ({x}, {y}) has no depth in frame 2"
+            assert estimates["right"].reason.startswith(why) and str(method.refused["right"]).startswith(why)
+    assert str(estimates["right"].status) == "tracked" and not method.refused
+
+
+def test_a_correction_without_depth_is_doubted_and_changes_nothing():
+    method, alone, frames = Point2Pose(CAMERA, quick()), Point2Pose(CAMERA, quick()), film()[:6]
+    for each in (method, alone):
+        each.add_object("left", clicks=clicks_on(frames[0][1]["left"]))
+    for k, (frame, masks) in enumerate(frames):
+        at = clicks_on(masks["left"])
+        frame = with_hole(frame, at[1]) if k == 3 else frame
+        expected = alone.step(frame)
+        if k == 3:
+            method.correct("left", clicks=at)
+            with pytest.warns(Doubt, match=r"correction of 'left'.* has no depth in frame 3. It is not used"):
+                estimates = method.step(frame)
+        else:
+            estimates = method.step(frame)
+        assert_same([estimates], [expected])
+
+
+def test_buffers_that_a_camera_refills_change_nothing():
+    """One buffer each for colour, depth, the camera's pose and the masks, as a driver has them."""
+    fresh, reused, frames = Point2Pose(CAMERA, preset()), Point2Pose(CAMERA, preset()), film()
+    rgb, depth_m = np.empty_like(frames[0][0].rgb), np.empty_like(frames[0][0].depth_m)
+    mask, T_world_cam = np.empty(depth_m.shape, bool), np.empty((4, 4))
+    for each in (fresh, reused):
+        each.add_object("left")
+        each.add_object("right", clicks=clicks_on(frames[0][1]["right"]))
+    for frame, masks in frames:
+        rgb[:], depth_m[:], mask[:], T_world_cam[:] = frame.rgb, frame.depth_m, masks["left"], np.eye(4)
+        got = reused.step(Frame(frame.index, frame.time_s, rgb, depth_m, T_world_cam), {"left": mask})
+        expected = fresh.step(replace(frame, T_world_cam=np.eye(4)), {"left": masks["left"]})
+        rgb[:], depth_m[:], mask[:], T_world_cam[:] = 0, 0, True, np.nan
+        assert_same([got], [expected])
 
 
 def test_ctrl_c_in_the_middle_of_a_frame_is_heard_after_it(monkeypatch, ctrl_c):

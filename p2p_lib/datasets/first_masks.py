@@ -1,0 +1,113 @@
+"""``first_masks.png`` of a run: what the objects were started with, drawn as soon as it is there.
+
+The frame with every object's outline, clicks and box, and below it each object by itself, with its name and pixels:
+whoever sees that a mask is not the object stops there and clicks again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.colours import object_colours, rgb
+from p2p_lib.core.image import bounds
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.images import save_png
+
+FILE = "first_masks.png"
+_FONT, _WHITE = cv2.FONT_HERSHEY_SIMPLEX, (255, 255, 255)
+#: Of an object by itself: its height and the most of them in a row, px, and the room around it, a share of its size.
+_CLOSE_PX, _ACROSS, _ROOM = 240, 4, 0.3
+#: The outline of a larger object is thicker.
+_LARGE_PX = 10_000
+
+
+class FirstMasks:
+    """Collects each object's first mask with any pixels and draws them, frame below frame."""
+
+    def __init__(self, path: Path, prompts: Iterable[Prompt] = ()):
+        self.path = path
+        self._prompts, self._started, self._panels = list(prompts), [], []  # type: ignore[var-annotated]
+
+    def add(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> list[str]:
+        """The masks that served in a frame; which objects are new, whose picture is written then."""
+        new = {name: mask for name, mask in masks.items() if name not in self._started and mask is not None}
+        new = {name: mask for name, mask in new.items() if mask.any()}
+        if new:
+            self._started += new
+            colours = object_colours(self._started)
+            prompts = [prompt for prompt in self._prompts if prompt.name in new]
+            self._panels.append(_panel(frame, new, prompts, colours))
+            width = max(panel.shape[1] for panel in self._panels)
+            sheet = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0))) for p in self._panels]
+            save_png(self.path, np.concatenate(sheet))
+        return list(new)
+
+
+def _panel(
+    frame: Frame, masks: Mapping[str, np.ndarray], prompts: Iterable[Prompt], colours: Mapping[str, str]
+) -> np.ndarray:
+    """A frame with outlines and prompts, and below it each object by itself."""
+    image = frame.rgb.copy()
+    for name, mask in masks.items():
+        outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        thick = 1 if np.count_nonzero(mask) < _LARGE_PX else 2
+        cv2.drawContours(image, outlines, -1, rgb(colours[name]), thick)
+    # Enlarged before anything thick is drawn, so that it covers none of a small object.
+    parts = [_close(image, masks[name], name, prompts, colours[name]) for name in masks]
+    _draw_prompts(image, prompts, colours, 1.0, np.zeros(2))
+    _write(image, f"first masks, frame {frame.index}")
+    blank = [np.zeros_like(parts[0])] * (-len(parts) % _ACROSS if len(parts) > _ACROSS else 0)
+    parts = [*parts, *blank]
+    rows = [np.concatenate(parts[k : k + _ACROSS], 1) for k in range(0, len(parts), _ACROSS)]
+    width = max(image.shape[1], rows[0].shape[1])
+    return np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in (image, *rows)])
+
+
+def _close(image: np.ndarray, mask: np.ndarray, name: str, prompts: Iterable[Prompt], colour: str) -> np.ndarray:
+    """A square around one object, enlarged, with its clicks, its name and how many pixels it has."""
+    rows, columns = bounds(mask)
+    size = np.array([columns.stop - columns.start, rows.stop - rows.start])
+    side = int(np.ceil(size.max() * (1 + 2 * _ROOM)))
+    left, top = (np.array([columns.start, rows.start]) + (size - side) // 2).tolist()
+    around = cv2.copyMakeBorder(image, side, side, side, side, cv2.BORDER_CONSTANT)  # an object at the image's edge
+    part = around[top + side : top + 2 * side, left + side : left + 2 * side]
+    scale = _CLOSE_PX / side
+    part = cv2.resize(part, (_CLOSE_PX, _CLOSE_PX), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    own = [prompt for prompt in prompts if prompt.name == name]
+    _draw_prompts(part, own, {name: colour}, scale, np.array([left, top]))
+    _write(part, f"{name}: {np.count_nonzero(mask)} px", colour)
+    return part
+
+
+def _draw_prompts(
+    image: np.ndarray, prompts: Iterable[Prompt], colours: Mapping[str, str], scale: float, corner_px: np.ndarray
+) -> None:
+    """Clicks on an object as dots, those beside it as crosses, and boxes, in an image that begins at ``corner_px``."""
+
+    def at(uv_px: np.ndarray) -> list[tuple[int, int]]:
+        return [tuple(uv) for uv in np.rint((uv_px - corner_px + 0.5) * scale - 0.5).astype(int).tolist()]
+
+    for prompt in prompts:
+        colour = rgb(colours[prompt.name])
+        for uv in at(prompt.points_px):
+            cv2.circle(image, uv, 4, _WHITE, -1, cv2.LINE_AA)
+            cv2.circle(image, uv, 3, colour, -1, cv2.LINE_AA)
+        for uv in at(prompt.negative_px):
+            cv2.drawMarker(image, uv, _WHITE, cv2.MARKER_TILTED_CROSS, 10, 4)
+            cv2.drawMarker(image, uv, colour, cv2.MARKER_TILTED_CROSS, 10, 2)
+        if prompt.box_px is not None:
+            cv2.rectangle(image, *at(prompt.box_px.reshape(2, 2)), colour, 1)
+
+
+def _write(image: np.ndarray, text: str, colour: str = "#101010") -> None:
+    """Words in the upper left corner, as small as they have to be."""
+    scale = 0.5
+    (width, height), base = cv2.getTextSize(text, _FONT, scale, 1)
+    scale *= min(1.0, (image.shape[1] - 8) / width)
+    cv2.rectangle(image, (0, 0), (min(width + 8, image.shape[1]), height + base + 4), rgb(colour), -1)
+    cv2.putText(image, text, (4, height + 2), _FONT, scale, _WHITE, 1, cv2.LINE_AA)

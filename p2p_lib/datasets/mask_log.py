@@ -1,0 +1,137 @@
+"""``masks.npz`` of a run: the mask of each object in each frame, coarsely, and how large in metres what it holds is.
+
+Written at the end of a run beside ``keypoints.npz``, so that ``p2p eval`` can judge a run whose masks were not kept as
+images. Every :data:`CELL_PX`-th pixel of every such row is kept, as bits: about 100 bytes an object and frame.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import load_arrays, replacing
+from p2p_lib.core.types import Frame
+
+FILE = "masks.npz"
+#: One pixel of a square of this side is kept.
+CELL_PX = 4
+#: The pixels of an image that are kept.
+CELLS = np.s_[::CELL_PX, ::CELL_PX]
+#: Of what a mask holds, so much is left out at each end when it is measured: depth is wild at an object's edges.
+_ENDS = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectMasks:
+    """One object's masks over the n frames in which one was known, an empty one included.
+
+    frame_index  (n,)
+    px           (n,) pixels of the whole mask
+    box          (n, 4) top, left, rows and columns of the cells that it covers
+    bits         (b,) uint8: the cells in these boxes, row by row, each frame's from a new byte on
+    size_m       (n,) length of what the mask holds along its longest axis, by depth; NaN where nothing was measured
+    centre_m     (n, 3) median of its points in the camera frame
+    """
+
+    frame_index: np.ndarray
+    px: np.ndarray
+    box: np.ndarray
+    bits: np.ndarray
+    size_m: np.ndarray
+    centre_m: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.frame_index)
+        shapes = {"frame_index": (n,), "px": (n,), "box": (n, 4), "size_m": (n,), "centre_m": (n, 3)}
+        for key, shape in shapes.items():
+            if (got := getattr(self, key)).shape != shape or got.dtype.kind not in "iuf":
+                raise BadInput(f"masks: {key}", f"shape {got.shape} {got.dtype}", f"numbers {shape}")
+        if self.bits.dtype != np.uint8 or self.bits.shape != (self._ends[-1],):
+            raise BadInput("masks: bits", f"shape {self.bits.shape} {self.bits.dtype}", f"{self._ends[-1]} bytes")
+
+    @property
+    def _ends(self) -> np.ndarray:
+        """(n + 1,) where in ``bits`` the frames begin and end."""
+        return np.concatenate([[0], np.cumsum(-(-self.box[:, 2:].astype(int).prod(1) // 8))])
+
+    def row(self, frame: int) -> int | None:
+        """Which of the n a frame is; None where no mask was known."""
+        at = int(np.searchsorted(self.frame_index, frame))
+        return at if at < len(self.frame_index) and self.frame_index[at] == frame else None
+
+    def cells(self, row: int, shape: tuple[int, int]) -> np.ndarray:
+        """(h, w) bool: the mask of one of the n frames at the pixels :data:`CELLS` of an image of this shape."""
+        mask = np.zeros(shape, bool)[CELLS].copy()
+        top, left, rows, columns = self.box[row].tolist()
+        bits = np.unpackbits(self.bits[slice(*self._ends[row : row + 2])], count=rows * columns)
+        mask[top : top + rows, left : left + columns] = bits.reshape(rows, columns)
+        return mask
+
+
+class _Row(NamedTuple):
+    frame_index: int
+    px: int
+    box: tuple[int, int, int, int]
+    bits: np.ndarray
+    size_m: float
+    centre_m: np.ndarray
+
+
+class MaskLog:
+    """Collects masks frame by frame; :meth:`save` writes them."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._rows: dict[str, list[_Row]] = defaultdict(list)
+
+    def add(self, frame: Frame, name: str, mask: np.ndarray) -> None:
+        """The mask (H, W) bool of an object that served in a frame."""
+        cells = mask[CELLS]
+        at = np.argwhere(cells)
+        low, high = (at.min(0), at.max(0) + 1) if len(at) else (np.zeros(2, int), np.zeros(2, int))
+        bits = np.packbits(cells[low[0] : high[0], low[1] : high[1]])
+        depth_m = frame.depth_m[CELLS][cells]
+        measured = depth_m > 0
+        p_cam = self._camera.unproject(CELL_PX * at[measured, ::-1], depth_m[measured])
+        box = (*low.tolist(), *(high - low).tolist())
+        self._rows[name].append(_Row(frame.index, int(np.count_nonzero(mask)), box, bits, *_measured(p_cam)))
+
+    def save(self, folder: Path) -> None:
+        """Write the file."""
+        arrays = {}
+        for name, rows in self._rows.items():
+            columns = dict(zip(_Row._fields, zip(*rows, strict=True), strict=True))
+            arrays[f"{name}/bits"] = np.concatenate([np.zeros(0, np.uint8), *columns.pop("bits")])
+            kinds = {"frame_index": np.int32, "px": np.int32, "box": np.int16}
+            arrays |= {f"{name}/{key}": np.array(v, kinds.get(key, np.float32)) for key, v in columns.items()}
+        with replacing(folder / FILE) as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def load_masks(folder: str | Path) -> dict[str, ObjectMasks]:
+    """Object to its masks; empty for a run that was killed before it could write them, and for older ones."""
+    path = Path(folder) / FILE
+    arrays = load_arrays(path)
+    names = dict.fromkeys(key.rsplit("/", 1)[0] for key in arrays)
+    try:
+        return {n: ObjectMasks(*(arrays[f"{n}/{f.name}"] for f in fields(ObjectMasks))) for n in names}
+    except (KeyError, TypeError) as error:
+        raise BadInput(str(path), f"an archive without {error}", "arrays as p2p run wrote them") from None
+
+
+def _measured(p_cam: np.ndarray) -> tuple[float, np.ndarray]:
+    """The length of points (N, 3) along their longest axis without the outermost at both ends, and their median."""
+    if len(p_cam) < 3:
+        return float("nan"), np.full(3, np.nan)
+    centre_m = np.median(p_cam, axis=0)
+    low, high = np.quantile(p_cam[:, 2], [_ENDS, 1 - _ENDS])
+    near = p_cam[(p_cam[:, 2] >= low) & (p_cam[:, 2] <= high)]
+    axis = np.linalg.eigh(np.cov(near.T))[1][:, -1] if len(near) > 3 else np.array([1.0, 0, 0])
+    along_m = np.quantile(p_cam @ axis, [_ENDS, 1 - _ENDS])
+    return float(np.ptp(along_m)) / (1 - 2 * _ENDS), centre_m

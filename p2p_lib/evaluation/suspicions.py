@@ -1,0 +1,212 @@
+"""What makes a run suspect without any truth: a few rules, each of which counts frames (``p2p eval``, ``p2p run``).
+
+A rule says which frames of an object speak against it, and among which frames; when their share is above the rule's
+limit, somebody has to look. The limits separate runs that were measured, good ones and bad ones: see
+``benchmarks/verdicts.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from p2p_lib.core.types import DOUBTED
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
+
+#: Fewer keypoints in a frame neither carry a pose nor say where the object is.
+FEW = 5
+#: What is tracked is held or stands on a table: hardly longer, nor shorter, than this, m.
+LONGEST_M, SHORTEST_M = 0.6, 0.02
+#: A pose that puts keypoints so far from where they are seen, or moves them so much otherwise than they move, px.
+OFF_PX, JUMP_PX = 3.0, 8.0
+#: A silhouette that overlaps less with the mask does not fit; a surface is seen through where so much of it is.
+OVERLAP, THROUGH = 0.5, 0.1
+#: A mask that holds something so many times as long as usual holds something else besides.
+GROWN = 1.3
+#: Parts of a first mask that are apart, the smaller one this share of it.
+APART = 0.1
+#: Away for good is so much of the end of a run, at least so many frames; away too long, so much of all.
+_GONE_FRAMES, _GONE_SHARE, _AWAY_SHARE = 30, 0.1, 0.5
+#: So few frames may be chance, however short the run.
+_CHANCE = 2
+#: Stretches of frames that are named.
+_NAMED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What speaks for and against one object in the n frames of a run; NaN where nothing is known.
+
+    frame_index   (n,)
+    has_pose      (n,) bool, in the map that is kept; elsewhere (n,) bool: a pose, in a map that was given up
+    confidence    (n,)
+    mask_px       (n,) pixels of the mask that served, size_m (n,) the length of what it holds
+    keypoints     (n,) how many of the object's own were seen, inside (n,) the share of them in its mask
+    off_px        (n,) median distance of these from where the pose puts them
+    jump_px       (n,) how differently from what was seen the poses moved them since the frame before
+    overlap       (n,) of silhouette and mask, through (n,) the share of the surface behind which depth was measured
+    told          what was doubted when the run was made, in words
+    apart         the share of the first mask that is apart from its largest part
+    """
+
+    frame_index: np.ndarray
+    has_pose: np.ndarray
+    elsewhere: np.ndarray
+    confidence: np.ndarray
+    mask_px: np.ndarray
+    size_m: np.ndarray
+    keypoints: np.ndarray
+    inside: np.ndarray
+    off_px: np.ndarray
+    jump_px: np.ndarray
+    overlap: np.ndarray
+    through: np.ndarray
+    told: tuple[str, ...] = ()
+    apart: float = 0.0
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(n,) bool: the mask is large enough to count."""
+        return np.nan_to_num(self.mask_px) >= MIN_VISIBLE_PX
+
+    @property
+    def carried(self) -> np.ndarray:
+        """(n,) bool: seen, and with a pose."""
+        return self.seen & self.has_pose
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """Why somebody should look at an object: a rule's name, a line for people, and the frames that it counted."""
+
+    rule: str
+    text: str
+    frames: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """Frames ``against`` an object, among those that ``count``: too many are more than ``limit`` (a share)."""
+
+    name: str
+    text: str
+    limit: float
+    against: Callable[[Evidence], np.ndarray]
+    count: Callable[[Evidence], np.ndarray]
+
+
+def _known(key: str) -> Callable[[Evidence], np.ndarray]:
+    return lambda e: np.isfinite(getattr(e, key))
+
+
+_RULES = (
+    _Rule("lost", "no pose where its mask is", 0.1, lambda e: ~e.has_pose, lambda e: e.seen),
+    _Rule("doubted", "poses doubted", 0.5, lambda e: e.confidence <= DOUBTED, lambda e: e.has_pose),
+    _Rule(
+        "maps",
+        "poses in a map that never met the one that is kept",
+        0.05,
+        lambda e: e.elsewhere,
+        lambda e: e.has_pose | e.elsewhere,
+    ),
+    _Rule(
+        "no keypoints",
+        f"a pose and a mask, and fewer than {FEW} of its own keypoints in view",
+        0.3,
+        lambda e: e.keypoints < FEW,
+        lambda e: e.carried & np.isfinite(e.keypoints),
+    ),
+    _Rule(
+        "outside",
+        "its own keypoints are seen outside its mask",
+        0.05,
+        lambda e: e.inside < 0.5,
+        lambda e: e.seen & np.isfinite(e.inside) & (e.keypoints >= FEW),
+    ),
+    _Rule(
+        "keypoints off",
+        f"keypoints more than {OFF_PX:g} px from where the pose puts them",
+        0.25,
+        lambda e: e.off_px > OFF_PX,
+        _known("off_px"),
+    ),
+    _Rule("jumps", "poses jump, what is seen does not", 0.02, lambda e: e.jump_px > JUMP_PX, _known("jump_px")),
+    _Rule(
+        "silhouette",
+        "the reconstructed surface does not cover the mask, or covers more",
+        0.2,
+        lambda e: e.overlap < OVERLAP,
+        _known("overlap"),
+    ),
+    _Rule(
+        "seen through",
+        "depth is measured behind the reconstructed surface",
+        0.5,
+        lambda e: e.through > THROUGH,
+        _known("through"),
+    ),
+    _Rule(
+        "grown",
+        f"the mask holds something {GROWN:g} times as long as it mostly does",
+        0.05,
+        lambda e: e.size_m > GROWN * median_of_known(e.size_m[e.seen]),
+        lambda e: e.seen & np.isfinite(e.size_m),
+    ),
+)
+
+
+def suspicions(e: Evidence) -> tuple[Suspicion, ...]:
+    """Everything that speaks against an object's part of a run; none: nothing that a run keeps does."""
+    found = [Suspicion("start", text) for text in e.told]
+    if e.apart > APART:
+        found.append(Suspicion("start", f"{100 * e.apart:.0f} % of its first mask lies apart: two objects?"))
+    found += [s for s in (_absent(e), _size(e)) if s is not None]
+    for rule in _RULES:
+        count = rule.count(e)
+        wrong = count & rule.against(e)
+        if wrong.sum() > max(rule.limit * count.sum(), _CHANCE):
+            share = f"{100 * wrong.sum() / count.sum():.0f} %"
+            found.append(_suspicion(rule.name, f"{rule.text} ({share})", e, wrong, count))
+    return tuple(found)
+
+
+def median_of_known(values: np.ndarray) -> float:
+    """Of those that are known; NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _absent(e: Evidence) -> Suspicion | None:
+    """Away at the end, or for most of the run: a run cannot tell what is out of view from what it does not find."""
+    if not e.has_pose.any():
+        return _suspicion("absent", "never a pose", e, ~e.has_pose)
+    away = ~e.seen & ~e.has_pose
+    back = np.flatnonzero(~away)[-1] + 1
+    last = np.arange(len(away)) >= back
+    if last.sum() > max(_GONE_FRAMES, _GONE_SHARE * len(away)):
+        return _suspicion("absent", "not found again; is it out of view to the end?", e, last)
+    if away.mean() > _AWAY_SHARE:
+        return _suspicion("absent", f"away ({100 * away.mean():.0f} %); is it out of view there?", e, away)
+    return None
+
+
+def _size(e: Evidence) -> Suspicion | None:
+    known = e.seen & np.isfinite(e.size_m)
+    if not known.any() or SHORTEST_M <= (size_m := float(np.median(e.size_m[known]))) <= LONGEST_M:
+        return None
+    than = f"longer than {100 * LONGEST_M:g}" if size_m > LONGEST_M else f"shorter than {100 * SHORTEST_M:g}"
+    text = f"its mask holds something {100 * size_m:.0f} cm long, {than} cm: more than it, or depth in another unit?"
+    return _suspicion("size", text, e, known & ((e.size_m > LONGEST_M) | (e.size_m < SHORTEST_M)), known)
+
+
+def _suspicion(rule: str, text: str, e: Evidence, wrong: np.ndarray, count: np.ndarray | None = None) -> Suspicion:
+    """One of frames ``wrong`` (n,) bool; those between two of them that do not ``count`` are named with them."""
+    at = np.flatnonzero(wrong if count is None else count)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong[at], [False]]).astype(int)))
+    ends = [(int(e.frame_index[at[a]]), int(e.frame_index[at[b - 1]])) for a, b in edges.reshape(-1, 2)]
+    longest = sorted(sorted(ends, key=lambda end: end[0] - end[1])[:_NAMED])
+    named = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in longest)
+    more = f" and {len(ends) - _NAMED} more stretches" if len(ends) > _NAMED else ""
+    return Suspicion(rule, f"{text}: frames {named}{more}", tuple(e.frame_index[wrong].tolist()))

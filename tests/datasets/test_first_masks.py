@@ -1,0 +1,50 @@
+"""The picture of what objects were started with: written once an object has pixels, with all that started so far."""
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.colours import OBJECTS, rgb
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.first_masks import FirstMasks
+
+H, W = 120, 160
+GRAY = 90
+
+
+def picture(index: int) -> Frame:
+    return Frame(index, index / 30, np.full((H, W, 3), GRAY, np.uint8), np.ones((H, W), np.float32))
+
+
+def square(top: int, left: int, size: int = 30) -> np.ndarray:
+    mask = np.zeros((H, W), bool)
+    mask[top : top + size, left : left + size] = True
+    return mask
+
+
+def read(path) -> np.ndarray:
+    return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+
+
+def test_each_object_is_drawn_in_the_frame_that_it_starts_in(tmp_path):
+    path = tmp_path / "first.png"
+    firsts = FirstMasks(path, [Prompt("cup", 0, [[65, 65]], negative_px=[[20, 100]]), Prompt("box", 3, [[10, 40]])])
+    assert firsts.add(picture(0), {"cup": None, "box": np.zeros((H, W), bool)}) == [] and not path.exists()
+    assert firsts.add(picture(1), {"cup": square(50, 50), "box": None}) == ["cup"]
+    image, cup, box = read(path), np.array(rgb(OBJECTS[0])), np.array(rgb(OBJECTS[1]))
+    assert (image[50, 50:80] == cup).all() and (image[50:80, 79] == cup).all(), "the outline, where the mask is"
+    assert (image[65, 65] == cup).all() and (image[100, 20] == cup).all(), "clicks on it and beside it"
+    assert (image[55:60, 55:60] == GRAY).all() and (image[30:48, 40:120] == GRAY).all(), "and nothing elsewhere"
+    before = path.read_bytes()
+    assert firsts.add(picture(2), {"cup": square(10, 10), "box": None}) == [] and path.read_bytes() == before
+    assert firsts.add(picture(3), {"cup": square(10, 10), "box": square(30, 0)}) == ["box"]
+    both = read(path)
+    np.testing.assert_array_equal(both[: len(image), : image.shape[1]], image)
+    assert (both[len(image) + 30, 0:30] == box).all(), "at the image's edge"
+
+
+def test_eight_objects_fit(tmp_path):
+    masks = {f"a long name of object {k}": square(10 + 50 * (k // 4), 5 + 35 * (k % 4), 20) for k in range(8)}
+    assert len(FirstMasks(tmp_path / "first.png").add(picture(0), masks)) == 8
+    image = read(tmp_path / "first.png")
+    assert image.shape == (H + 2 * 240, 4 * 240, 3)

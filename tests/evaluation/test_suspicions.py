@@ -1,0 +1,104 @@
+"""Each rule by itself: evidence that is spotless, and one thing after the other that is not."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from p2p_lib.evaluation.suspicions import Evidence, suspicions
+
+N = 100
+ROWS = np.arange(N)
+
+
+def spotless() -> Evidence:
+    full = np.ones(N)
+    numbers = {"mask_px": 5000, "size_m": 0.15, "keypoints": 40, "inside": 1, "off_px": 0.5, "jump_px": 0.2}
+    numbers |= {"overlap": 0.9, "through": 0.01, "confidence": 0.9}
+    numbers = {key: value * full for key, value in numbers.items()}
+    return Evidence(frame_index=10 + ROWS, has_pose=full > 0, elsewhere=full < 0, **numbers)
+
+
+def with_some(e: Evidence, share: float, **wrong: float) -> Evidence:
+    """The same with these values in a share of the frames, the 21st and those after it."""
+    at = (ROWS >= 20) & (ROWS < 20 + round(share * N))
+    return replace(e, **{key: np.where(at, value, getattr(e, key)) for key, value in wrong.items()})
+
+
+#: What is wrong in some frames, the rule that says so, and shares of the frames with and without which it does.
+WRONG = {
+    "lost": ({"has_pose": False}, 0.05, 0.2),
+    "doubted": ({"confidence": 0.5}, 0.4, 0.6),
+    "no keypoints": ({"keypoints": 4}, 0.2, 0.4),
+    "outside": ({"inside": 0.2}, 0.03, 0.1),
+    "keypoints off": ({"off_px": 5}, 0.15, 0.4),
+    "jumps": ({"jump_px": 20}, 0.02, 0.05),
+    "silhouette": ({"overlap": 0.3}, 0.1, 0.3),
+    "seen through": ({"through": 0.3}, 0.4, 0.6),
+    "grown": ({"size_m": 0.25}, 0.03, 0.1),
+    "size": ({"size_m": 0.9}, 0.04, 0.6),
+}
+
+
+def test_nothing_speaks_against_what_is_spotless():
+    assert suspicions(spotless()) == ()
+
+
+@pytest.mark.parametrize("rule", WRONG)
+def test_a_rule_counts_frames_and_names_them(rule):
+    wrong, few, many = WRONG[rule]
+    assert rule not in {s.rule for s in suspicions(with_some(spotless(), few, **wrong))}
+    (found,) = [s for s in suspicions(with_some(spotless(), many, **wrong)) if s.rule == rule]
+    assert found.frames == tuple(range(30, 30 + round(many * N)))
+    assert f"frames 30 to {29 + round(many * N)}" in found.text
+
+
+def test_maps_that_never_met():
+    e = with_some(spotless(), 0.2, has_pose=False, elsewhere=True)
+    assert "maps" in {s.rule for s in suspicions(e)}
+    assert "maps" not in {s.rule for s in suspicions(with_some(spotless(), 0.04, has_pose=False, elsewhere=True))}
+
+
+def gone(rows: np.ndarray) -> Evidence:
+    e = spotless()
+    return replace(e, has_pose=e.has_pose & ~rows, mask_px=np.where(rows, 0, e.mask_px))
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ((ROWS > 30) & (ROWS < 70), ""),
+        ((ROWS > 30) & (ROWS < 90), "away (59 %); is it out of view there?: frames 41 to 99"),
+        (ROWS >= 85, ""),
+        (ROWS >= 60, "not found again; is it out of view to the end?: frames 70 to 109"),
+        (ROWS >= 0, "never a pose: frames 10 to 109"),
+    ],
+)
+def test_what_is_away_may_be_lost(rows, says):
+    """Short absences are what an object is followed through; nothing tells a long one from a loss but looking."""
+    assert [s.text for s in suspicions(gone(rows)) if s.rule == "absent"] == [says] * bool(says)
+
+
+def test_how_it_started():
+    found = suspicions(replace(spotless(), told=("clicks on 'cup': flat",), apart=0.4))
+    assert [s.rule for s in found] == ["start", "start"] and "40 % of its first mask lies apart" in found[1].text
+
+
+def test_stretches_are_named_across_frames_that_do_not_count():
+    """Silhouettes are looked at in some frames only: those between two that do not fit are named with them."""
+    overlap = np.where(ROWS % 10 == 0, 0.9, np.nan)
+    overlap[[20, 30, 40, 70]] = 0.1
+    (found,) = suspicions(replace(spotless(), overlap=overlap))
+    assert found.text.endswith("(40 %): frames 30 to 50, 80") and found.frames == (30, 40, 50, 80)
+
+
+def test_what_is_not_known_is_not_held_against_anybody():
+    unknown = {f.name for f in fields(Evidence)} - {
+        "frame_index",
+        "has_pose",
+        "elsewhere",
+        "confidence",
+        "told",
+        "apart",
+    }
+    assert suspicions(replace(spotless(), **{key: np.full(N, np.nan) for key in unknown})) == ()
