@@ -20,6 +20,7 @@ _HUB = "import torch; torch.hub.load('facebookresearch/co-tracker', 'cotracker3_
 #: What has to be typed, by package.
 INSTALL = {
     "transformers": PIP + "transformers",
+    "onnxruntime": PIP + "onnxruntime",
     "rosbags": PIP + "rosbags",
     "pyrealsense2": PIP + "pyrealsense2",
     "rerun-sdk": PIP + "rerun-sdk",

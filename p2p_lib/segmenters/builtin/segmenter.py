@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -104,13 +105,32 @@ class _Target:
     given: tuple[Frame, np.ndarray] | None = None
 
 
+class Refiner(Protocol):
+    """What mends the masks of :class:`BuiltinSegmenter`, see :class:`p2p_lib.segmenters.sam2.Sam2Refiner`."""
+
+    name: str
+
+    def refine(
+        self,
+        frame: Frame,
+        prompts: Mapping[str, Prompt],
+        found: Mapping[str, np.ndarray],
+        hints: Mapping[str, Hint],
+    ) -> dict[str, np.ndarray]:
+        """Better masks (H, W) bool of some of the objects in this frame; the others' stay as they were ``found``."""
+
+
 class BuiltinSegmenter:
-    """The segmenter without weights."""
+    """The segmenter without weights.
 
-    name = "builtin"
+    refiner  mends what it has made of a frame, before that is labelled and learnt from
+    """
 
-    def __init__(self, camera: Camera, config: SegmentationConfig, rng: np.random.Generator):
-        self.camera, self.config, self._rng = camera, config, rng
+    def __init__(
+        self, camera: Camera, config: SegmentationConfig, rng: np.random.Generator, refiner: Refiner | None = None
+    ):
+        self.name = "builtin" if refiner is None else refiner.name
+        self.camera, self.config, self._rng, self._refiner = camera, config, rng, refiner
         self._focal_px = np.array([camera.fx, camera.fy])
         self._targets: dict[str, _Target] = {}
         self._previous: Frame | None = None
@@ -170,6 +190,7 @@ class BuiltinSegmenter:
             if found[name] is not None:
                 box, x = found[name]
                 taken[box.slices] |= x > 0.5
+        found |= self._refined(frame, said, found, hints or {})
         labels = self._shared_out(frame, found)
         for label, name in enumerate(self._targets, 1):
             if name in masks:
@@ -181,6 +202,21 @@ class BuiltinSegmenter:
             doubt_start(cutter, labels == label_of[prompt.name], others)
         self._previous = frame
         return labels
+
+    def _refined(
+        self, frame: Frame, said: Mapping[str, Prompt], found: Mapping[str, _Found], hints: Mapping[str, Hint]
+    ) -> dict[str, _Found]:
+        """What the refiner makes of what was found, where it has something to say."""
+        if self._refiner is None:
+            return {}
+        masks = {name: np.zeros(frame.shape, bool) for name in found}
+        for name, claim in found.items():
+            if claim is not None:
+                masks[name][claim[0].slices] = claim[1] > 0.5
+        prompts = {name: prompt for name, prompt in said.items() if prompt.mask is None}
+        refined = self._refiner.refine(frame, prompts, masks, hints)
+        whole = Box(0, 0, *frame.shape[::-1])
+        return {name: (whole, mask.astype(np.float32)) for name, mask in refined.items()}
 
     def _learnt(self, target: _Target) -> _Target:
         """What is known of an object with what the mask that was given of it tells."""
