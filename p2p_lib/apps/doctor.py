@@ -22,6 +22,7 @@ MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-image": "sk
 #: Optional backend: module, what it serves, remedy.
 OPTIONAL = {
     "transformers": ("transformers", "segmentation and features by neural networks", INSTALL["transformers"]),
+    "onnxruntime": ("onnxruntime", "SAM 2 on a CPU: first masks, --masks sam2", INSTALL["onnxruntime"]),
     "tapnet": ("tapnet", "2D trackers tapir and tapnextpp", INSTALL["tapnet"]),
     "torchvision": ("torchvision", "2D tracker tapnextpp", INSTALL["torchvision"]),
     "rerun": ("rerun", "recordings to look at frame by frame, p2p view --rerun", INSTALL["rerun-sdk"]),

@@ -187,9 +187,9 @@ class SegmentationConfig(_Checked):
         choices=("auto", "builtin", "sam2"),
     )
     sam2_every: int = _p(
-        10, "With --masks sam2, SAM 2 looks at every so many frames; 0: beside the tracking.", "frames", low=0
+        10, "With --masks sam2, SAM 2 looks at every so many frames; 0: whenever it is ready.", "frames", low=0
     )
-    sam2_threads: int = _p(0, "So many threads run SAM 2; 0: as many as there are cores.", low=0)
+    sam2_threads: int = _p(0, "So many threads run SAM 2; 0: one for each core.", low=0)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
 
 import numpy as np
@@ -19,18 +20,24 @@ def builtin(camera: Camera, config: SegmentationConfig, rng: np.random.Generator
     """
     if config.first_masks == "builtin" or (config.first_masks == "auto" and not _available()):
         return BuiltinSegmenter(camera, config, rng)
-    from p2p_lib.segmenters.sam2 import Sam2Refiner, shared_network
-
-    network = shared_network(config.sam2_threads, at_once=config.first_masks == "sam2")
-    return BuiltinSegmenter(camera, config, rng, Sam2Refiner(network, camera))
+    return _with_sam2(camera, config, rng, None, config.first_masks == "sam2")
 
 
 def sam2(camera: Camera, config: SegmentationConfig, rng: np.random.Generator) -> BuiltinSegmenter:
     """The built-in segmenter, anchored by SAM 2; :class:`MissingBackend` says what to fetch or install."""
+    return _with_sam2(camera, config, rng, config.sam2_every, True)
+
+
+def _with_sam2(
+    camera: Camera, config: SegmentationConfig, rng: np.random.Generator, every: int | None, at_once: bool
+) -> BuiltinSegmenter:
+    """Beside the tracking the network leaves half of the cores alone, unless it is told otherwise."""
     from p2p_lib.segmenters.sam2 import Sam2Refiner, shared_network
 
-    network = shared_network(config.sam2_threads, at_once=True)
-    return BuiltinSegmenter(camera, config, rng, Sam2Refiner(network, camera, config.sam2_every))
+    beside = config.sam2_every == 0
+    threads = config.sam2_threads or (max(1, (os.cpu_count() or 2) // 2) if beside else 0)
+    network = shared_network(threads, at_once)
+    return BuiltinSegmenter(camera, config, rng, Sam2Refiner(network, camera, config, every, beside))
 
 
 def _available() -> bool:

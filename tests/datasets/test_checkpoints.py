@@ -50,7 +50,7 @@ def test_manifests_of_all_models_say_what_they_must():
         ("trackers.tapnextpp", "tapnet"),
         ("trackers.cotracker", "co-tracker"),
         ("detectors.superpoint", "transformers"),
-        ("segmenters.sam2", "transformers"),
+        ("segmenters.sam2_video", "transformers"),
     ],
 )
 def test_every_adapter_states_the_version_that_it_was_last_run_with(module, package):

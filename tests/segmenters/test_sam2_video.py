@@ -17,7 +17,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.manifests import manifest
 from p2p_lib.method.pipeline import Point2Pose
-from p2p_lib.segmenters import sam2
+from p2p_lib.segmenters import sam2_video
 
 CAMERA = Camera(150.0, 150.0, 80, 60, 160, 120)
 SIDE = 128
@@ -85,7 +85,7 @@ def model():
     return Sam2VideoModel(config).eval()
 
 
-class Watched(sam2.Sam2Segmenter):
+class Watched(sam2_video.Sam2VideoSegmenter):
     """Keeps the logits that the model gave."""
 
     def __init__(self, model):
@@ -131,7 +131,7 @@ def test_memory_stays_bounded(model):
         tensors = [t for kind in outputs.values() for o in kind.values() for t in o.values() if hasattr(t, "nbytes")]
         return sum(t.nbytes for t in tensors) / 1e6
 
-    ours, sizes = sam2.Sam2Segmenter(model, CAMERA), []
+    ours, sizes = sam2_video.Sam2VideoSegmenter(model, CAMERA), []
     for k, frame in enumerate(film(14)):
         ours.segment(frame, () if k else [CUP])
         sizes.append(megabytes(ours))
@@ -145,12 +145,12 @@ def test_points_and_pictures_are_the_official_processors(model):
     from transformers import Sam2VideoProcessor
 
     official = Sam2VideoProcessor._normalize_coordinates(None, SIDE, torch.tensor(CLICKS), (120, 160)).numpy()
-    ours = sam2.Sam2Segmenter(model, CAMERA)._points(CUP)["point_coords"].numpy()[0, 0]
+    ours = sam2_video.Sam2VideoSegmenter(model, CAMERA)._points(CUP)["point_coords"].numpy()[0, 0]
     assert np.abs(ours - official).max() <= 0.5
     grey = np.full((120, 160, 3), 128, np.uint8)
-    pixels = sam2.Sam2Segmenter(model, CAMERA)._pixels(grey).numpy()
+    pixels = sam2_video.Sam2VideoSegmenter(model, CAMERA)._pixels(grey).numpy()
     assert pixels.shape == (1, 3, SIDE, SIDE)
-    expected = (128 / 255 - np.array(sam2.MEAN)) / np.array(sam2.DEVIATION)
+    expected = (128 / 255 - np.array(sam2_video.MEAN)) / np.array(sam2_video.DEVIATION)
     np.testing.assert_allclose(pixels[0].mean((1, 2)), expected, atol=1e-5)
 
 
@@ -193,7 +193,7 @@ def half(left: bool) -> np.ndarray:
 @needs_transformers
 def test_labels_are_the_likelier_objects_and_absent_ones_have_none():
     answers = [(half(True), 3.0), (half(False), 3.0), (half(True), -1.0), (half(False) + 9, 2.0), (half(True) * 2, 2.0)]
-    ours, frames = sam2.Sam2Segmenter(Says(answers), CAMERA), film(3)
+    ours, frames = sam2_video.Sam2VideoSegmenter(Says(answers), CAMERA), film(3)
     both = ours.segment(frames[0], [Prompt("a", points_px=CLICKS), Prompt("b", points_px=CLICKS + 10)])
     assert both.shape == (120, 160) and both.dtype == np.int32 and ours.names == ("a", "b")
     assert (both[:, :78] == 1).all() and (both[:, 82:] == 2).all()
@@ -220,7 +220,7 @@ def test_what_is_said_reaches_the_network_as_the_official_processor_says_it(mode
         def __init__(self):  # without an image processor, which wants torchvision
             self.target_size, self.point_pad_value = SIDE, -10
 
-    ours = sam2.Sam2Segmenter(model, CAMERA)
+    ours = sam2_video.Sam2VideoSegmenter(model, CAMERA)
     said = Prompt("cup", points_px=CLICKS, negative_px=[[10, 20]], box_px=(60, 40, 100, 90))
     official = Sam2VideoInferenceSession(video_height=120, video_width=160, dtype=torch.float32)
     clicks = [[[*CLICKS.tolist(), [10.0, 20.0]]]]
@@ -269,7 +269,7 @@ def test_a_mask_is_taken_as_it_is_and_the_network_goes_on_from_the_newest(model)
 
 @needs_transformers
 def test_the_pipeline_takes_it(model):
-    method = Point2Pose(CAMERA, preset(), segmenter=sam2.Sam2Segmenter(model, CAMERA))
+    method = Point2Pose(CAMERA, preset(), segmenter=sam2_video.Sam2VideoSegmenter(model, CAMERA))
     frames = film(4)
     method.add_object("cup", clicks=CLICKS)
     for k, frame in enumerate(frames):
@@ -285,7 +285,7 @@ def test_clicks_without_depth_are_refused(model):
     frame = film(1)[0]
     hole = Frame(0, 0.0, frame.rgb, np.zeros_like(frame.depth_m))
     with pytest.raises(BadInput, match=r"\(80, 60\) has no depth"):
-        sam2.Sam2Segmenter(model, CAMERA).segment(hole, [CUP])
+        sam2_video.Sam2VideoSegmenter(model, CAMERA).segment(hole, [CUP])
 
 
 # --- without the package or the weights --------------------------------------------------------
@@ -294,14 +294,14 @@ def test_clicks_without_depth_are_refused(model):
 def test_it_says_what_to_install_or_fetch(monkeypatch):
     monkeypatch.delenv("P2P_DATA", raising=False)
     with pytest.raises(MissingBackend) as error:
-        make_segmenter("sam2", CAMERA, preset().segmentation, np.random.default_rng(0))
+        make_segmenter("sam2_video", CAMERA, preset().segmentation, np.random.default_rng(0))
     if importlib.util.find_spec("transformers") is None:
         assert "pip install" in str(error.value) and "transformers" in str(error.value)
     else:
-        assert "p2p data fetch sam2" in str(error.value)
+        assert "p2p data fetch sam2_video" in str(error.value)
 
 
 def test_the_manifest_names_its_licence_and_option():
-    of = manifest("sam2")
-    assert "Apache" in of.licence and of.used_by == "--masks sam2"
+    of = manifest("sam2_video")
+    assert "Apache" in of.licence and of.used_by == "--masks sam2_video"
     assert {f.path for f in of.files} == {"model.safetensors", "config.json"}
