@@ -198,8 +198,15 @@ def test_the_image_is_encoded_in_every_nth_frame_once_for_all_objects(network):
     of = segmenter(network, every=3)
     of.segment(frame_of(), prompts())
     for k in range(1, 8):
-        of.segment(frame_of(k))
+        of.segment(frame_of(k, k))
     assert (len(network._encoder.fed), len(network._decoder.fed)) == (3, 6) and of.name == "sam2"
+
+
+def test_who_clicks_on_one_image_again_and_again_waits_once(network):
+    for said in (prompts()[:1], prompts(), prompts()):
+        segmenter(network).segment(frame_of(), said)
+    segmenter(network).segment(frame_of(1, 2), prompts())
+    assert (len(network._encoder.fed), len(network._decoder.fed)) == (2, 7)
 
 
 def test_a_correction_beside_the_object_keeps_the_rest_of_it(network):
