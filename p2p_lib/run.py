@@ -15,6 +15,7 @@ import numpy as np
 
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt
+from p2p_lib.core.mesh import save as save_mesh
 from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
@@ -31,8 +32,7 @@ from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
-from p2p_lib.method.mesh import save as save_mesh
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
 
 #: So many clicks an object are drawn from its first mask.
 CLICKS = 3

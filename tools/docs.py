@@ -1,6 +1,6 @@
 """The API reference as pages that need nothing else, from the docstrings: ``make docs`` fills out/docs.
 
-What users call comes first: the names of ``p2p_lib`` itself. Behind it are all modules but those of the notebooks.
+What users call comes first: the names of ``p2p_lib`` itself. Behind it are all modules.
 """
 
 import sys
@@ -14,14 +14,13 @@ import pdoc
 import p2p_lib
 
 ROOT = Path(__file__).resolve().parents[1]
-LEFT_OUT = "p2p_lib.studies"  # what one notebook each needs
 
 
 def modules():
     """``p2p_lib`` itself and its packages, each of which brings its modules along."""
     found = ["p2p_lib"]
     for module in iter_modules(p2p_lib.__path__, "p2p_lib."):
-        if module.name not in (LEFT_OUT, "p2p_lib.__main__"):
+        if module.name != "p2p_lib.__main__":
             found.append(module.name)
             part = import_module(module.name)
             if hasattr(part, "__all__"):  # which pdoc takes to be all there is

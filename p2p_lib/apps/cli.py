@@ -219,8 +219,8 @@ def _benchmark(a: argparse.Namespace) -> int:
     from p2p_lib.apps.readiness import overview, present_plans, readiness, what_to_fetch
     from p2p_lib.benchmark import read_plan, run_benchmarks
     from p2p_lib.core.paths import data_dir
+    from p2p_lib.figures.final_tables import paper_table, write_table
     from p2p_lib.figures.provenance import save_table
-    from p2p_lib.studies.final_tables import paper_table, write_table
 
     if a.list:
         wide = get_terminal_size((10_000, 24)).columns  # elsewhere than on a terminal lines stay whole
@@ -266,12 +266,13 @@ def _benchmark(a: argparse.Namespace) -> int:
     _QUIET,
 )
 def _figures(a: argparse.Namespace) -> None:
+    from p2p_lib.apps.clone import study
     from p2p_lib.benchmark import run_benchmarks
     from p2p_lib.core.paths import benchmark_dir, figure_dir
-    from p2p_lib.studies.paper_figures import PLAN, draw_all
 
-    (runs,) = run_benchmarks([PLAN], a.out or benchmark_dir("full"), progress=not a.quiet)
-    for saved in draw_all(runs, figure_dir(), a.poses):
+    figures = study("paper_figures")
+    (runs,) = run_benchmarks([figures.PLAN], a.out or benchmark_dir("full"), progress=not a.quiet)
+    for saved in figures.draw_all(runs, figure_dir(), a.poses):
         print(saved.path)
 
 
@@ -340,10 +341,10 @@ def _film(a: argparse.Namespace) -> None:
     arg("--parameter", action="append", metavar="NAME=VALUE", help="change a notebook parameter; repeatable"),
 )
 def _notebooks(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.notebooks import run_notebooks
+    from p2p_lib.apps.clone import study
 
     parameters = pairs(a.parameter or (), "--parameter", "NAME=VALUE")
-    run_notebooks(a.profile, only=names(a.only) or (), jobs=a.jobs, parameters=parameters)
+    study("runner").run_notebooks(a.profile, only=names(a.only) or (), jobs=a.jobs, parameters=parameters)
 
 
 # --- data ----------------------------------------------------------------------------------------
@@ -508,8 +509,10 @@ def _data_where(a: argparse.Namespace) -> None:
 )
 def _config(a: argparse.Namespace) -> None:
     from p2p_lib.core import config as configuration
+    from p2p_lib.extended.default import MECHANISMS, chosen
 
-    rows = configuration.parameters(RunOptions.of_arguments(a).config(), a.only)
+    config = RunOptions.of_arguments(a).config()
+    rows, on = configuration.parameters(config, a.only), chosen(config)
     if a.diff:
         paper = {key: left for key, (left, _) in configuration.diff().items()}
         rows = [{"key": r["key"], "paper": paper[r["key"]], **r} for r in rows if r["key"] in paper]
@@ -520,6 +523,8 @@ def _config(a: argparse.Namespace) -> None:
         value = f"{row['value']} {row['unit']}".strip()
         value += f" (paper: {row['paper']})" if a.diff else ""
         print(f"{row['key']} = {value}\n    {row['meaning']} [{row['source']}]")
+        for name, does in MECHANISMS.items() if row["key"] == "method.mechanisms" else ():
+            print(f"        {name}{'' if name in on else ' (left out)'}: {does}")
     whose = "paper (its text), release (the authors' configuration) or ours"
     print(f"In brackets, whose value it is: {whose}. Change one with --set KEY=VALUE.")
 

@@ -24,9 +24,9 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate, status_text
 from p2p_lib.datasets.cameras import DEFAULT_BACKLOG, LiveCamera, Newest, Stream
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
-from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.run import Keeper, told
 
 #: Made-up images that are tracked before a camera starts.

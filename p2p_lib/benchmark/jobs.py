@@ -33,7 +33,7 @@ from p2p_lib.synthetic.faults import Faulty
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 # What only shows results cannot change them.
-_WITHOUT = {"figures", "studies", "apps"}
+_WITHOUT = {"figures", "apps"}
 _NUMERICS = ("numpy", "scipy", "opencv-python-headless", "gtsam")
 
 

@@ -140,7 +140,7 @@ class Plan(Strict):
 
     name     of its file
     paper    LaTeX label of the paper's table that it re-creates, "" for none
-    kind     how its table is arranged (see :mod:`p2p_lib.studies.final_tables`)
+    kind     how its table is arranged (see :mod:`p2p_lib.figures.final_tables`)
     chamfer  whether reconstructions are scored as well
     tracks   whether the 2D trackers are scored by themselves as well
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from p2p_lib.core import packages
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, in_a_line
 from p2p_lib.core.paths import data_dir
 from p2p_lib.datasets.inventory import require
@@ -40,9 +41,8 @@ def load_weights(name: str) -> dict[str, torch.Tensor]:
     """The state dict of a PyTorch checkpoint of one file, on the CPU. Nothing but tensors is read."""
     import pickle
 
-    import torch
-
     (path,) = checked_files(name)
+    torch = packages.load("torch", name, "torch")
     try:
         read = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:

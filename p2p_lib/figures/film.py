@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.packages import needed_for
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures.playback import Playback
@@ -96,7 +97,8 @@ class Film(AbstractContextManager):
                 picture = picture.quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
             self._images.append((time_s, picture))
             return
-        import av
+        with needed_for("view"):
+            import av
 
         if self._container is None:
             # Without "bitexact" the file would name the builds that wrote it.

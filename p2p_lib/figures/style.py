@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+from p2p_lib.core.packages import needed_for
 from p2p_lib.core.types import Status
 from p2p_lib.evaluation.point_tracks import Outcome
 
 #: Objects, in the order in which a sequence names them.
 OBJECTS = ("#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#882255", "#6B4E23", "#222222")
 #: Statuses: fill and hatch. Tracked is the quiet one.
-STATUS: dict[Status, tuple[str, str]] = {
+STATUS: dict[str, tuple[str, str]] = {
     Status.INITIALISING: ("#FFFFFF", "...."),
     Status.TRACKED: ("#D9D9D9", ""),
     Status.DEGRADED: ("#F0E442", "\\\\\\\\"),
@@ -80,7 +81,8 @@ def ink(colour: str) -> str:
 @contextmanager
 def applied() -> Iterator[None]:
     """Matplotlib with this style inside the ``with``, untouched outside. Needed when drawing and when saving."""
-    import matplotlib
+    with needed_for("notebooks"):
+        import matplotlib
 
     with matplotlib.rc_context(_RC):
         yield

@@ -38,6 +38,7 @@ _SPATIAL = ("maskmem_features", "maskmem_pos_enc")
 
 def load(camera: Camera, config: SegmentationConfig, rng: np.random.Generator | None = None) -> Sam2VideoSegmenter:
     """The segmenter with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
+    packages.load("torch", "sam2_video", "transformers")
     transformers = packages.load("transformers", "sam2_video", "transformers")
     folder = checkpoints.checked_files("sam2_video")[0].parent
     # Nothing but tensors is in a file of this kind, and nothing is fetched from elsewhere.

@@ -12,23 +12,22 @@ import numpy as np
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from p2p_lib.apps.notebooks import (
-    Claim,
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.figures.claims import Claim, check
+from studies.course import LESSONS
+from studies.runner import (
     NotebookFailed,
     NotebookResult,
-    check,
     list_notebooks,
     notebook_parameters,
     read_result,
     run_notebooks,
 )
-from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.figures.course import LESSONS
 
 SUITE = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 MAX_CELL_LINES = 15
 PARAMETERS = "PROFILE = 'quick'\nSEED: int = 0\nSCALE = 1.0\nNAME = 'a'"
-CHECKS = """from p2p_lib.apps.notebooks import Claim, check
+CHECKS = """from p2p_lib.figures.claims import Claim, check
 check(
     Claim("seed", SEED, "what is drawn"),
     Claim("scale [mm]", SCALE, "how large it is", at_least=0.5),
@@ -63,7 +62,7 @@ def source_problems(source: str) -> list[str]:
     except SyntaxError:
         return [*problems, "is not plain Python (no shell, no magics)"]
     if any(isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) for node in nodes):
-        problems.append("defines a function or class (it belongs in p2p_lib)")
+        problems.append("defines a function or class (it belongs in notebooks/studies)")
     modules = [name.name for node in nodes if isinstance(node, ast.Import) for name in node.names]
     modules += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
     if {module.split(".")[0] for module in modules} & {"os", "subprocess"}:
@@ -79,7 +78,7 @@ def course_problems(path: Path) -> list[str]:
     code = [cell.source for cell in cells if cell.cell_type == "code"]
     text = [cell.source for cell in cells if cell.cell_type == "markdown"]
     names = [one.name for one in LESSONS]
-    problems = [] if code[0].endswith(f'\nlesson("{path.stem[:2]}")') else ["does not begin with its lesson"]
+    problems = [] if f'lesson("{path.stem[:2]}")' in code[0] else ["does not begin with its lesson"]
     problems += [f"{call} without a caption" for source in code for call in uncaptioned(source)]
     if len(answers(path)) < 2:
         problems.append(f"has {len(answers(path))} exercises with an answer in code, not two or more")

@@ -10,7 +10,7 @@ from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.evaluation.consistency import reprojected
 from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.figures.provenance import describe
-from p2p_lib.studies import final_figures
+from studies import final_figures
 
 
 def test_histograms_hold_every_scored_frame_once(whole):

@@ -8,7 +8,7 @@ from p2p_lib.core.backends import DETECTORS, make_detector
 from p2p_lib.core.config import SamplingConfig, preset
 from p2p_lib.core.types import Frame
 from p2p_lib.method.sampling import choose
-from p2p_lib.studies.sampling import CHOICES
+from studies.sampling import CHOICES
 
 DEFAULT = SamplingConfig()
 EMBEDDED = pytest.mark.parametrize("name", ["corners", "uniform", "farthest", "orb"])

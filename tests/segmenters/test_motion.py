@@ -10,7 +10,7 @@ from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.motion import Motions, Past, agrees, parts_that_follow, scene_stays
-from p2p_lib.segmenters.builtin.patch import Box, Patch, holding, parts_of
+from p2p_lib.segmenters.builtin.patch import Box, Patch, components_touching, connected_components
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
@@ -56,16 +56,24 @@ def motions_of(then: Frame, now: Frame, moved_m: float) -> Motions:
     return Motions(now, motion, motion)
 
 
+def plate_in(patch: Patch, moved_m: float) -> np.ndarray:
+    """(h, w) bool: the plate's component of a patch."""
+    seeds = patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9
+    return components_touching(connected_components(patch.smooth), seeds)
+
+
 def patch_and_plate(frame: Frame, moved_m: float) -> tuple[Patch, np.ndarray]:
     patch = Patch.of(frame, Box(60, 60, 220, 180), CAMERA, CONFIG)
-    return patch, holding(parts_of(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
+    return patch, components_touching(
+        connected_components(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9
+    )
 
 
 def test_a_part_that_moves_along_is_told_from_a_neighbour_that_stays():
     then, now, moved_m = scene(0, 0.0), scene(30, 0.05), 0.05
     patch, plate = patch_and_plate(now, moved_m)
     motions = motions_of(then, now, moved_m)
-    parts = parts_that_follow(patch, parts_of(patch.smooth), plate, motions)
+    parts = parts_that_follow(patch, connected_components(patch.smooth), plate, motions)
     part, neighbour = (
         patch.down(at(*a).astype(np.float32)) > 0.5 for a in ((PART, moved_m, PART_M), (NEIGHBOUR, 0, PART_M))
     )
@@ -84,10 +92,12 @@ def test_what_may_as_well_have_stood_still_is_no_part():
         frame.rgb[board & ~plate], frame.depth_m[board & ~plate] = 120, PART_M
         frames.append(frame)
     patch = Patch.of(frames[1], Box(40, 40, 280, 200), CAMERA, CONFIG)
-    plate = holding(parts_of(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
+    plate = components_touching(
+        connected_components(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9
+    )
     motions = motions_of(*frames, moved_m)
     assert scene_stays(patch, motions)
-    assert not parts_that_follow(patch, parts_of(patch.smooth), plate, motions).any()
+    assert not parts_that_follow(patch, connected_components(patch.smooth), plate, motions).any()
 
 
 @pytest.mark.parametrize("wall", ["printed", "plain"])
@@ -99,9 +109,11 @@ def test_a_camera_that_moves_past_what_lies_still_tells_nothing(wall):
         frame.rgb[frame.depth_m == np.float32(WALL_M)] = 120
     patch, _ = patch_and_plate(now, moved_m)
     motions = motions_of(then, now, moved_m)
-    plate = holding(parts_of(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9)
+    plate = components_touching(
+        connected_components(patch.smooth), patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9
+    )
     assert not scene_stays(patch, motions)
-    assert not parts_that_follow(patch, parts_of(patch.smooth), plate, motions).any()
+    assert not parts_that_follow(patch, connected_components(patch.smooth), plate, motions).any()
 
 
 def test_points_agree_with_an_earlier_frame_at_their_depth_and_in_their_colour():
@@ -145,9 +157,9 @@ def test_what_came_to_the_object_later_is_not_a_part_of_it():
     before.rgb[empty], before.depth_m[empty] = _texture(9)[empty], WALL_M
     patch, plate = patch_and_plate(now, moved_m)
     both = motions_of(then, now, moved_m)
-    assert parts_that_follow(patch, parts_of(patch.smooth), plate, both).any()
+    assert parts_that_follow(patch, connected_components(patch.smooth), plate, both).any()
     later = Motions(now, both.recent, (before, both.first[1]))
-    assert not parts_that_follow(patch, parts_of(patch.smooth), plate, later).any()
+    assert not parts_that_follow(patch, connected_components(patch.smooth), plate, later).any()
 
 
 def test_the_first_frame_is_remembered_and_the_newest():

@@ -16,7 +16,7 @@ from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.manifests import manifest
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.segmenters import sam2_video
 
 CAMERA = Camera(150.0, 150.0, 80, 60, 160, 120)

@@ -17,7 +17,14 @@ from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.method.refinement import surface_distance
 from p2p_lib.segmenters.builtin.colours import colour_codes, evidence, histogram
-from p2p_lib.segmenters.builtin.patch import Patch, around, holding, parts_of, plane_heights, support_plane
+from p2p_lib.segmenters.builtin.patch import (
+    Patch,
+    around,
+    components_touching,
+    connected_components,
+    plane_heights,
+    support_plane,
+)
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
 CAMERA = Camera(300.0, 310.0, 158.3, 121.7, 320, 240)
@@ -490,7 +497,7 @@ def test_connected_parts_are_those_with_seeds():
     region[2:5, 2:6] = region[2:5, 10:14] = True
     seeds = np.zeros_like(region)
     seeds[3, 3] = seeds[8, 8] = True
-    found = holding(parts_of(region), seeds)
+    found = components_touching(connected_components(region), seeds)
     assert found[2:5, 2:6].all() and found.sum() == 12
 
 

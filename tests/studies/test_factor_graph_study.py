@@ -6,7 +6,7 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.core.depth import depth_noise_m
-from p2p_lib.studies.factor_graph import (
+from studies.factor_graph import (
     consistency,
     optimise,
     optimise_online,

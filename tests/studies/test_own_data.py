@@ -15,10 +15,10 @@ from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.prompts import prompts_in
 from p2p_lib.evaluation.consistency import surface_fit
 from p2p_lib.figures import mesh_view, overlay, style
-from p2p_lib.studies import own_data
-from p2p_lib.studies.own_data import errors_against
-from p2p_lib.studies.surface import carton
 from p2p_lib.synthetic.render import render
+from studies import own_data
+from studies.own_data import errors_against
+from studies.surface import carton
 
 V, U = np.mgrid[:120, :160]
 DISC, WIDE = (np.hypot(U - 80, V - 60) <= radius for radius in (30, 38))

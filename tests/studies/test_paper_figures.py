@@ -14,8 +14,8 @@ from p2p_lib.core.paths import PROJECT
 from p2p_lib.datasets.download import sha256
 from p2p_lib.datasets.paper_reported import paper_reported
 from p2p_lib.figures.provenance import save_figure
-from p2p_lib.studies.final_figures import rate_figure
-from p2p_lib.studies.paper_figures import ITEMS, index
+from studies.final_figures import rate_figure
+from studies.paper_figures import ITEMS, index
 
 FIGURES = PROJECT / "figures"
 

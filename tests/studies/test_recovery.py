@@ -9,8 +9,8 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.evaluation.confidence import Judged, judge
 from p2p_lib.evaluation.recovery import RecoveryEvent
 from p2p_lib.figures.scenes import Scene
-from p2p_lib.studies import recovery
 from p2p_lib.synthetic.scenarios import SCENARIOS
+from studies import recovery
 
 EVENT = RecoveryEvent(hidden_frame=16, return_frame=21, frames_to_recovery=1)
 

@@ -6,7 +6,7 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
 from p2p_lib.method.refinement import surface_distances
-from p2p_lib.studies.registration import mug_moment, ways_to_decide
+from studies.registration import mug_moment, ways_to_decide
 
 CONFIG = preset("default")
 

@@ -14,8 +14,8 @@ from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.robust import fit_rigid
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.method.sampling import choose, terms
-from p2p_lib.studies import sampling
-from p2p_lib.studies.sampling import (
+from studies import sampling
+from studies.sampling import (
     MapHistory,
     Situation,
     compare_choices,

@@ -9,9 +9,9 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import TsdfConfig, preset
 from p2p_lib.figures.mesh_view import draw_mesh
 from p2p_lib.method.observation import sample_cloud
-from p2p_lib.studies import surface
 from p2p_lib.synthetic.noise import PERFECT
 from p2p_lib.synthetic.scene import VGA
+from studies import surface
 
 trimesh = pytest.importorskip("trimesh")
 CONFIG = preset("default")

@@ -14,8 +14,8 @@ from p2p_lib.core.types import Frame, Tracks
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.run import run
-from p2p_lib.studies import texture
-from p2p_lib.studies.texture import RecordedTracker
+from studies import texture
+from studies.texture import RecordedTracker
 
 FRAMES = 14
 

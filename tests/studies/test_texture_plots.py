@@ -12,8 +12,8 @@ from p2p_lib.datasets.runs import load_run
 from p2p_lib.figures import overlay
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.run import run
-from p2p_lib.studies import texture
-from p2p_lib.studies.texture import RecordedTracker
+from studies import texture
+from studies.texture import RecordedTracker
 
 FRAMES = 14
 

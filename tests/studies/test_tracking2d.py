@@ -9,7 +9,7 @@ from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.point_tracks import Outcome
 from p2p_lib.evaluation.tracker_score import TrackTask
 from p2p_lib.figures import overlay, style
-from p2p_lib.studies import tracking2d as tracks
+from studies import tracking2d as tracks
 
 
 @pytest.fixture(scope="module")

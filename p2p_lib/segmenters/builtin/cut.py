@@ -1,6 +1,6 @@
-"""Evidence for and against a pixel's being of an object, and the cut that it leads to; on a patch's grid.
+"""Per-pixel foreground log-odds on a patch's grid, and the cut that they lead to.
 
-All evidence is log odds, positive for the object, and adds up.
+Log-odds of different evidence add up; they are positive for the object.
 """
 
 from __future__ import annotations
@@ -13,7 +13,14 @@ from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import evidence, histogram
 from p2p_lib.segmenters.builtin.motion import Motions, parts_that_follow
-from p2p_lib.segmenters.builtin.patch import Patch, dilated, holding, middle, parts_of, plane_heights
+from p2p_lib.segmenters.builtin.patch import (
+    Patch,
+    approximate_median,
+    components_touching,
+    connected_components,
+    dilated,
+    plane_heights,
+)
 
 #: Weight of a pixel's certain evidence beside a tie to a like neighbour.
 _EVIDENCE = 0.06
@@ -29,8 +36,8 @@ _PLANE_SLACK_M = 0.003
 _SMALLEST_FLOW = 32
 
 
-def of_plane_m(sigma_m: np.ndarray | float) -> np.ndarray | float:
-    """Up to which height what is measured with this noise may be of the plane below it."""
+def max_plane_height_m(sigma_m: np.ndarray | float) -> np.ndarray | float:
+    """Height below which a pixel measured with this noise counts as plane."""
     return (_STANDS_OUT + 0.5) * sigma_m + _PLANE_SLACK_M
 
 
@@ -52,19 +59,20 @@ def by_geometry(
     at = seeds & measured
     if not at.any():
         return log_odds, nothing
-    log_odds[measured & (np.abs(patch.depth_m - middle(patch.depth_m[at])) > config.reach_m)] -= config.geometry_weight
+    from_seeds_m = np.abs(patch.depth_m - approximate_median(patch.depth_m[at]))
+    log_odds[measured & (from_seeds_m > config.reach_m)] -= config.geometry_weight
     free = patch.smooth
     if plane is not None:
-        height, sigma_m = plane_heights(patch, plane), middle(patch.sigma_m[at])
-        above_m = middle(height[at])
+        height, sigma_m = plane_heights(patch, plane), approximate_median(patch.sigma_m[at])
+        above_m = approximate_median(height[at])
         if abs(above_m) < _STANDS_OUT * sigma_m:
             return log_odds, nothing  # flat: depth does not tell it from what it lies on
         if above_m > 0:
-            low = height < min(above_m / 2, of_plane_m(sigma_m))
+            low = height < min(above_m / 2, max_plane_height_m(sigma_m))
             log_odds[measured & low] -= config.geometry_weight
             free = free & ~low
-    part = parts_of(free)
-    component = holding(part, seeds)
+    part = connected_components(free)
+    component = components_touching(part, seeds)
     if motions is not None:
         parts = parts_that_follow(patch, part, component, motions)
         component |= parts

@@ -104,7 +104,7 @@ def scene_stays(patch: Patch, motions: Motions) -> bool:
 def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
     """(h, w) bool: parts beside an object's component (h, w) bool that moved as it did and did not stay.
 
-    part  (h, w) int, see :func:`p2p_lib.segmenters.builtin.patch.parts_of`
+    part  (h, w) int, see :func:`p2p_lib.segmenters.builtin.patch.connected_components`
 
     What was not there in the first frame, a hand that took the object, is not of it.
     """

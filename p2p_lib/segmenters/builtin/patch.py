@@ -60,7 +60,7 @@ class Patch:
 
     cell_px   side of a cell in pixels: a whole number, by which images are scaled several times faster than by another
     rgb       (h, w, 3) uint8, averaged
-    depth_m   (h, w) reading in the middle, 0 = not measured
+    depth_m   (h, w) reading at the centre, 0 = not measured
     sigma_m   (h, w) noise of the depth
     """
 
@@ -211,7 +211,7 @@ def _middles(image: np.ndarray, cell_px: int) -> np.ndarray:
     return image[cell_px // 2 :: cell_px, cell_px // 2 :: cell_px].copy()
 
 
-def middle(values: np.ndarray) -> float:
+def approximate_median(values: np.ndarray) -> float:
     """The median of values (N,), of some hundreds of them where there are many: it costs more than all else here."""
     return float(np.median(values[:: 1 + len(values) // _ENOUGH]))
 
@@ -226,22 +226,22 @@ def dilated(region: np.ndarray, radius: int) -> np.ndarray:
     return cv2.dilate(region.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
 
 
-def parts_of(region: np.ndarray) -> np.ndarray:
-    """(h, w) int: the number of each connected part of a region (h, w) bool, 0 outside it."""
+def connected_components(region: np.ndarray) -> np.ndarray:
+    """(h, w) int: the number of each connected component of a region (h, w) bool, 0 outside it."""
     return cv2.connectedComponents(region.astype(np.uint8), connectivity=4)[1]
 
 
-def holding(part: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """(h, w) bool: the parts, see :func:`parts_of`, that hold a seed."""
+def components_touching(part: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the components, see :func:`connected_components`, that hold a seed."""
     holds = np.zeros(part.max() + 1, bool)
     holds[part[seeds]] = True
     holds[0] = False
     return holds[part]
 
 
-def only(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The probabilities without the islands that hold no seed."""
-    return np.where(holding(parts_of(x > 0.5), seeds) | (x <= 0.5), x, 0)
+def keep_seeded_components(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The probabilities (h, w) without the components that hold no seed (h, w) bool."""
+    return np.where(components_touching(connected_components(x > 0.5), seeds) | (x <= 0.5), x, 0)
 
 
 def support_plane(patch: Patch, where: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:

@@ -1,6 +1,6 @@
-"""An object cut out by what somebody says of it: clicks on it and beside it, or a box around it.
+"""An object cut out by a prompt: clicks on it and beside it, or a box around it.
 
-It starts an object, or corrects what was made of it so far.
+A prompt starts an object, or corrects its mask.
 """
 
 from __future__ import annotations
@@ -20,12 +20,21 @@ from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, cut
-from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, only, plane_heights, support_plane
+from p2p_lib.segmenters.builtin.patch import (
+    Box,
+    Patch,
+    around,
+    dilated,
+    keep_seeded_components,
+    plane_heights,
+    support_plane,
+)
 
 #: Room around an object, besides a share of its size: small ones move by pixels too.
 ROOM_PX = 6
 #: About so many pixels of a mask stand for what is right about it.
 _MIDDLE = 40
+NO_PX = np.zeros((0, 2))
 #: Standard deviations of depth below which an object's median height above the plane around it is none.
 _FLAT = 2.0
 #: A box is drawn a little too tight now and then, by this share of its size.
@@ -111,7 +120,7 @@ class Cutter:
         barred = beside | patch.dots(self.others_px, 1) | patch.border()
         if self.prompt.box_px is not None:
             barred |= ~_within(patch, self.prompt.box_px)
-        return only(cut(patch, log_odds, start=start, seeds=seeds, background=barred & ~seeds), seeds)
+        return keep_seeded_components(cut(patch, log_odds, start=start, seeds=seeds, background=barred & ~seeds), seeds)
 
     def _room(self, low: np.ndarray, high: np.ndarray) -> Box:
         """A box with room around the pixels from ``low`` to ``high`` (x, y)."""
@@ -120,7 +129,7 @@ class Cutter:
 
 
 def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> None:
-    """Warn where what was started with a mask (H, W) bool is most likely no object of its own.
+    """Warn if the prompt that started an object with a mask (H, W) bool selected background or another object.
 
     others  object to mask (H, W) bool, of the other objects in this frame
     """

@@ -1,0 +1,81 @@
+"""An object that was absent: found where its tracked points are back, or by its colours where its motion leads."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from p2p_lib.core.depth import depths_at
+from p2p_lib.core.image import in_mask
+from p2p_lib.core.interfaces import Hint
+from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, max_plane_height_m
+from p2p_lib.segmenters.builtin.patch import (
+    Patch,
+    around,
+    components_touching,
+    connected_components,
+    dilated,
+    keep_seeded_components,
+    plane_heights,
+    support_plane,
+)
+from p2p_lib.segmenters.builtin.prompted import NO_PX, ROOM_PX
+from p2p_lib.segmenters.builtin.target import Target
+from p2p_lib.segmenters.builtin.view import Claim, View
+
+#: A component of this many pixels, likelier by this much in the object's colours (nats), is the expected object.
+_MIN_COMPONENT_PX, _MIN_LIKELIER = 80, 1.0
+
+
+def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
+    """Where enough of its points are back, or it is expected, on nothing ``taken`` (H, W) by another object."""
+    frame, cfg, uv_px = view.frame, view.config, hint.uv_px[~in_mask(hint.uv_px, taken)]
+    if target.colours is None:
+        return None
+    expected = len(uv_px) < cfg.find_points and hint.place is not None
+    if expected:
+        uv_px = _coloured_px(view, target, hint.place, taken)
+    if len(uv_px) < cfg.find_points:
+        return None
+    z_m = float(np.nanmedian(depths_at(uv_px, frame)))
+    low, high = uv_px.min(0), uv_px.max(0)
+    half = np.maximum(target.size_m * view.focal_px / z_m * (0.5 + cfg.margin), high - low) + ROOM_PX
+    patch = Patch.of(frame, around((low + high) / 2, half, frame.shape), view.camera, cfg)
+    barred = patch.down(taken.astype(np.float32)) > 0.5
+    seeds = patch.dots(uv_px, 0 if expected else 1) & (patch.depth_m > 0) & ~barred
+    surface = by_surface(patch, hint, cfg)
+    outside = ~dilated(seeds | (surface > 0), 3)
+    plane = support_plane(patch, (patch.depth_m > 0) & outside, view.rng)
+    log_odds, component = by_geometry(patch, seeds, plane, cfg)
+    colour = by_colour(patch, target.colours, outside & ~component, cfg)
+    background = (patch.border() | barred) & ~seeds
+    x = keep_seeded_components(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
+    own_colours = colour[x > 0.5]
+    return (patch.box, patch.up(x)) if len(own_colours) and (hint.sighted or own_colours.mean() > 0) else None
+
+
+def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarray) -> np.ndarray:
+    """(N, 2) pixels near the place of a hint that show the object's colours; none where its surroundings do too."""
+    frame, centre_m, within_m = view.frame, place[:3], target.size_m.max() / 2 + place[3]
+    (centre_px,) = view.camera.project(centre_m[None])
+    if not view.camera.inside(centre_px, -0.5):
+        return NO_PX
+    half = within_m * view.focal_px / centre_m[2] + ROOM_PX
+    patch = Patch.like(frame, around(centre_px, half, frame.shape), 1, view.camera)
+    measured = patch.depth_m > 0
+    near = measured & (patch.squared_distances_m2(centre_m) < within_m**2)
+    if np.count_nonzero(near) < _MIN_COMPONENT_PX:
+        return NO_PX
+    colour = by_colour(patch, target.colours, measured & ~near, view.config)
+    plane, free = support_plane(patch, measured, view.rng), patch.smooth
+    if plane is not None:
+        free = free & (plane_heights(patch, plane) > max_plane_height_m(patch.sigma_m))
+    # What is connected with another object belongs to that one, whatever its mask has left out.
+    like = near & (colour > 0) & free & ~components_touching(connected_components(free), taken[patch.box.slices])
+    component = np.where(like, connected_components(dilated(like, 1)), 0)
+    size = np.bincount(component.ravel())
+    likelier = np.bincount(component.ravel(), colour.ravel()) / np.maximum(size, 1)
+    size[(likelier < _MIN_LIKELIER) | (size < _MIN_COMPONENT_PX)], size[0] = 0, 0
+    if not size.any():
+        return NO_PX
+    v, u = np.nonzero(component == size.argmax())
+    return np.stack([u + patch.box.left, v + patch.box.top], -1).astype(float)

@@ -1,0 +1,97 @@
+"""An object that was seen a frame ago: its mask moved by the optical flow, then cut out anew around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from p2p_lib.core.interfaces import Hint
+from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
+from p2p_lib.segmenters.builtin.motion import scene_stays
+from p2p_lib.segmenters.builtin.patch import Patch, around, dilated, keep_seeded_components, support_plane
+from p2p_lib.segmenters.builtin.prompted import ROOM_PX
+from p2p_lib.segmenters.builtin.target import Target
+from p2p_lib.segmenters.builtin.view import Claim, View
+
+#: The flow is doubted where more of the mask jumped in depth, its area changed by more, or more of it has no depth.
+_MAX_JUMPED, _MAX_AREA_CHANGE, _MAX_UNMEASURED = 0.03, 0.1, 0.25
+#: What shows again after nothing of an object was measured is near to where it was.
+_REAPPEARS_WITHIN_M = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """An object's mask of a frame ago, moved by the optical flow: on a patch of this frame, its probability (h, w).
+
+    jumped    (h, w) bool: its depth changed, so that something else has come before it or it has gone
+    shown     (h, w) bool: it has a depth and had none; that of the object or of what has come before it
+    doubtful  whether the flow alone says too little
+    """
+
+    patch: Patch
+    prior: np.ndarray
+    jumped: np.ndarray
+    shown: np.ndarray
+    doubtful: bool
+
+    @property
+    def claim(self) -> Claim:
+        """The mask as the flow moved it."""
+        return self.patch.box, self.patch.up(self.prior)
+
+
+def predict(view: View, target: Target) -> Prediction:
+    """Move the mask of an object that was seen a frame ago by the optical flow."""
+    frame, cfg, seen = view.frame, view.config, target.seen
+    px_m = view.focal_px / seen.z_m
+    # Room for all of it to either side of what showed.
+    half = np.maximum(target.size_m / 2, target.room_m) * px_m * (1 + cfg.margin) + ROOM_PX
+    patch = Patch.of(frame, around(seen.centre_px, half, frame.shape), view.camera, cfg)
+    before = Patch.like(view.previous, patch.box, patch.cell_px, view.camera)
+    image = np.zeros(frame.shape, np.float32)
+    image[seen.box.slices] = seen.mask
+    was = before.down(image)
+    prior, z_before = warped(was, before, patch)
+    likely, measured, known = prior > 0.5, patch.depth_m > 0, z_before > 0
+    jumped = likely & measured & known & (np.abs(patch.depth_m - z_before) > patch.step_m)
+    shown = likely & measured & ~known
+    area, blind = np.count_nonzero(likely), np.count_nonzero(likely & ~measured) + np.count_nonzero(shown)
+    changed = abs(area - np.count_nonzero(was > 0.5)) > _MAX_AREA_CHANGE * area
+    doubtful = changed or np.count_nonzero(jumped) > _MAX_JUMPED * area or blind > _MAX_UNMEASURED * area
+    return Prediction(patch, prior, jumped, shown, doubtful)
+
+
+def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Claim:
+    """Cut the object out around its predicted mask."""
+    cfg, patch, prior, jumped = view.config, predicted.patch, predicted.prior, predicted.jumped
+    core = (prior > 0.8) & ~(jumped | predicted.shown)
+    if not (core & (patch.depth_m > 0)).any():
+        core |= predicted.shown & (np.abs(patch.depth_m - target.seen.z_m) < _REAPPEARS_WITHIN_M)
+    plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), view.rng)
+    motions = target.past.motions(view.frame, hint.T_cam_obj) if target.confident else None
+    log_odds, component = by_geometry(patch, core, plane, cfg, motions)
+    stays = cfg.prior_weight * np.where(jumped | predicted.shown, 0, 2 * prior - 1)
+    stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours have as much to say
+    # Parts that come into view are connected with those that were seen before.
+    log_odds += np.where(component, np.maximum(stays, 0), stays)
+    log_odds[jumped] -= cfg.geometry_weight
+    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
+    x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
+    beside = dilated((x > 0.5) & (patch.depth_m > 0), 1)
+    return patch.box, patch.up(np.where((patch.depth_m > 0) | (prior > 0.5) | beside, x, 0))
+
+
+def with_room(view: View, target: Target, hint: Hint) -> Target:
+    """An object with room for parts that move with it, which may reach farther than all that it has shown."""
+    cfg, px_m = view.config, view.focal_px / target.seen.z_m
+    patch = Patch.of(view.frame, around(hint.uv_px.mean(0), cfg.reach_m * px_m, view.frame.shape), view.camera, cfg)
+    motions = target.past.motions(view.frame, hint.T_cam_obj)
+    if motions is None or not scene_stays(patch, motions):
+        return target
+    plane = support_plane(patch, patch.depth_m > 0, view.rng)
+    _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions)
+    if not component.any():
+        return target
+    away_px = np.abs(patch.ends_px(component) - target.seen.centre_px).max(0)
+    return replace(target, room_m=away_px / px_m)
