@@ -25,7 +25,7 @@ def builtin(camera: Camera, config: SegmentationConfig, rng: np.random.Generator
 
 def sam2(camera: Camera, config: SegmentationConfig, rng: np.random.Generator) -> BuiltinSegmenter:
     """The built-in segmenter, anchored by SAM 2; :class:`MissingBackend` says what to fetch or install."""
-    return _with_sam2(camera, config, rng, config.sam2_every, True)
+    return _with_sam2(camera, config, rng, max(1, config.sam2_every), True)
 
 
 def _with_sam2(

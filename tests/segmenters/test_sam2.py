@@ -17,7 +17,7 @@ from p2p_lib.core.errors import BadInput, Doubt, MissingBackend
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters import anchored
+from p2p_lib.segmenters import anchored, sam2, sam2_image
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 from p2p_lib.segmenters.sam2 import Question, Sam2Refiner
 from p2p_lib.segmenters.sam2_image import MASK_SIDE, SIDE, MaskCandidates, Sam2Image
@@ -281,6 +281,22 @@ def test_where_the_weights_are_prompts_are_its_own_unless_told_otherwise(monkeyp
     }
     assert make_segmenter("builtin", CAMERA, config["auto"], rng).name == "builtin+sam2"
     assert make_segmenter("builtin", CAMERA, config["builtin"], rng).name == "builtin"
+
+
+@pytest.mark.parametrize("name", ["builtin", "sam2"])
+def test_as_p2p_live_wants_it_it_works_beside_the_tracking(monkeypatch, network, name):
+    monkeypatch.setattr(anchored, "_available", lambda: True)
+    monkeypatch.setattr(sam2_image, "load", lambda threads: network)
+    sam2._network.cache_clear()
+    config = preset().with_values({"segmentation.sam2_every": 0}).segmentation
+    of = make_segmenter(name, CAMERA, config, np.random.default_rng(0))
+    assert iou(of.segment(frame_of(), prompts()) == 1, mask_of(RED_PX)) > 0.95
+    of.segment(frame_of(1, 1))
+    working = of._refiner._working
+    assert (set() if working is None else set(working.answers.result(10))) == (
+        {"red", "green"} if name == "sam2" else set()
+    )
+    sam2._network.cache_clear()
 
 
 def test_an_unknown_source_of_first_masks_is_refused():
