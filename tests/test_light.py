@@ -172,6 +172,6 @@ def test_every_extra_is_known_and_said():
     declared = set(PYPROJECT["optional-dependencies"]) - {"all", "dev"}
     assert declared == set(EXTRAS)
     (everything,) = map(Requirement, PYPROJECT["optional-dependencies"]["all"])
-    assert everything.extras == declared - {"rerun", "sam2"}
+    assert everything.extras == declared - {"rerun", "sam2", "sam2-video"}
     page = (PROJECT / "environment.md").read_text()
     assert not [name for name in declared if f"`{name}`" not in page]

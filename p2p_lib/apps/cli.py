@@ -453,12 +453,13 @@ def _data_info(a: argparse.Namespace) -> None:
     "download into $P2P_DATA, check and unpack; unpack what was had by hand",
     _DATASET,
     arg("--only", metavar="PART,PART", help="only the files whose names contain one of these"),
+    arg("--from", dest="source", type=Path, metavar="FILE", help="take them from a file, folder or archive you have"),
     _QUIET,
 )
 def _data_fetch(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.inventory import fetch, manifest
 
-    for line in fetch(manifest(a.dataset), names(a.only) or (), not a.quiet):
+    for line in fetch(manifest(a.dataset), names(a.only) or (), not a.quiet, a.source):
         print(line, flush=True)
 
 

@@ -87,9 +87,10 @@ def track_live(
         raise BadInput("stop", options.stop, "the number of an image from 1", "Leave it out to end with Ctrl-C.")
     if backlog < 0:
         raise BadInput("backlog", backlog, "how many images may wait, from 0")
+    config = config.with_values({"segmentation.sam2_every": 0})  # no image waits for it
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
-    if options.tracker.startswith("builtin") and masks.segmenter == DEFAULT_SEGMENTER:
-        _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector))
+    if options.tracker.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
+        _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
     with ExitStack() as kept:
         listeners = [lambda _, estimates: [on_estimate(estimate) for estimate in estimates.values()]]
         if overlay is not None:

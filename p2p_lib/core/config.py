@@ -173,6 +173,15 @@ class SegmentationConfig(_Checked):
     surface_weight: float = _p(1.5, "These are the log odds by lying on the reconstructed surface.", low=0)
     find_points: int = _p(8, "So many agreeing tracked points say where an absent object is back.", "points", low=3)
     min_px: int = _p(40, "An object of fewer pixels is absent.", "px", low=1)
+    first_masks: str = _p(
+        "auto",
+        "Prompts become masks by the built-in segmenter, by SAM 2, or by SAM 2 where its weights are there.",
+        choices=("auto", "builtin", "sam2"),
+    )
+    sam2_every: int = _p(
+        10, "With --masks sam2, SAM 2 looks at every so many frames; 0: whenever it is ready.", "frames", low=0
+    )
+    sam2_threads: int = _p(0, "So many threads run SAM 2; 0: one for each core.", low=0)
 
 
 @dataclass(frozen=True)

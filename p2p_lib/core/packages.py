@@ -29,7 +29,8 @@ EXTRAS = {
     "ros": "ROS 1 and 2 recordings, p2p convert",
     "realsense": "RealSense cameras and recordings, p2p live and p2p convert",
     "rerun": "recordings to look at frame by frame, p2p view --rerun",
-    "sam2": "segmentation and features by neural networks",
+    "sam2": "SAM 2 on a CPU: masks of prompts, --masks sam2",
+    "sam2-video": "segmentation and features by PyTorch networks: --masks sam2_video, --detector superpoint",
 }
 
 
@@ -40,7 +41,8 @@ def extra(name: str) -> str:
 
 #: What has to be typed, by package.
 INSTALL = {
-    "transformers": extra("sam2"),
+    "onnxruntime": extra("sam2"),
+    "transformers": extra("sam2-video"),
     "rosbags": extra("ros"),
     "pyrealsense2": extra("realsense"),
     "rerun-sdk": extra("rerun"),

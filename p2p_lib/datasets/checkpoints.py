@@ -9,7 +9,7 @@ from p2p_lib.core import packages
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, in_a_line
 from p2p_lib.core.paths import data_dir
 from p2p_lib.datasets.inventory import require
-from p2p_lib.datasets.manifests import manifest
+from p2p_lib.datasets.manifests import folder_of, manifest
 
 if TYPE_CHECKING:
     import torch
@@ -27,6 +27,14 @@ def checked_files(name: str) -> list[Path]:
         return require(manifest(name))
     except MissingData as error:
         raise MissingBackend(name, f"its checkpoint is missing, {error.expected}", error.fix) from None
+
+
+def are_there(name: str) -> bool:
+    """Whether the files of the checkpoint ``name`` lie in their places; what is in them is not looked at."""
+    if data_dir() is None:
+        return False
+    of = manifest(name)
+    return all((folder_of(of) / file.path).is_file() for file in of.files)
 
 
 def load_weights(name: str) -> dict[str, torch.Tensor]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.finding import find
 from p2p_lib.segmenters.builtin.following import Prediction, follow, predict, with_room
+from p2p_lib.segmenters.builtin.patch import Box
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter, doubt_start
 from p2p_lib.segmenters.builtin.target import Target, seen_in
 from p2p_lib.segmenters.builtin.view import Claim, View
@@ -32,13 +34,32 @@ _TURNS = 3
 _NO_HINT = Hint()
 
 
+class Refiner(Protocol):
+    """Replaces masks of :class:`BuiltinSegmenter`, see :class:`p2p_lib.segmenters.sam2.Sam2Refiner`."""
+
+    name: str
+
+    def refine(
+        self,
+        frame: Frame,
+        prompts: Mapping[str, Prompt],
+        masks: Mapping[str, np.ndarray],
+        hints: Mapping[str, Hint],
+    ) -> dict[str, np.ndarray]:
+        """Better masks (H, W) bool of some of the objects in this frame; the others keep theirs."""
+
+
 class BuiltinSegmenter:
-    """The segmenter without weights. Implements :class:`p2p_lib.core.interfaces.Segmenter`."""
+    """The segmenter without weights. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
 
-    name = "builtin"
+    refiner  may replace what is claimed for an object in a frame, before it is labelled and learnt from
+    """
 
-    def __init__(self, camera: Camera, config: SegmentationConfig, rng: np.random.Generator):
-        self.camera, self.config, self._rng = camera, config, rng
+    def __init__(
+        self, camera: Camera, config: SegmentationConfig, rng: np.random.Generator, refiner: Refiner | None = None
+    ):
+        self.name = "builtin" if refiner is None else refiner.name
+        self.camera, self.config, self._rng, self._refiner = camera, config, rng, refiner
         self._targets: dict[str, Target] = {}
         self._previous: Frame | None = None
         self._frames = 0
@@ -73,6 +94,7 @@ class BuiltinSegmenter:
             else:
                 self._targets[name], claims[name] = self._locate(view, name, said, hints, taken, name in due)
                 _mark(taken, claims[name])
+        claims |= self._refined(frame, said, claims, hints)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
         self._doubt_starts(view, labels, new)
@@ -140,6 +162,19 @@ class BuiltinSegmenter:
         target = with_room(view, target, hint)
         claim = follow(view, target, hint, predicted)
         return replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj)), claim
+
+    def _refined(
+        self, frame: Frame, said: Mapping[str, Prompt], claims: Mapping[str, Claim], hints: Mapping[str, Hint]
+    ) -> dict[str, Claim]:
+        """The claims that the refiner replaces."""
+        if self._refiner is None:
+            return {}
+        masks = {name: np.zeros(frame.shape, bool) for name in claims}
+        for name, claim in claims.items():
+            _mark(masks[name], claim)
+        prompts = {name: prompt for name, prompt in said.items() if prompt.mask is None}
+        refined, whole = self._refiner.refine(frame, prompts, masks, hints), Box(0, 0, *frame.shape[::-1])
+        return {name: (whole, mask.astype(np.float32)) for name, mask in refined.items()}
 
     @staticmethod
     def _cuts(target: Target, due: bool) -> bool:
