@@ -39,7 +39,7 @@ def cluttered_desk(seed: int, frames: int = 210, fastest_deg: float = 5.0) -> Sc
     light = Light(tuple(rng.uniform([-0.7, -0.6, 0.8], [0.7, 0.4, 1.2])), ambient=0.6, shadow=rng.uniform(0.25, 0.45))
     top = _desk_top(rng, [(mesh, T) for _, mesh, T, _ in arranged], light)
     T_world_cam = _carried(rng, frames, fastest_deg)
-    return Scenario(KINECT, T_world_cam, tuple(bodies), (_office(rng, top),), light, shutter_s=1 / 50)
+    return Scenario(KINECT, T_world_cam, tuple(bodies), (_office(rng, top),), light, shutter_s=1 / 70)
 
 
 def _things(rng: np.random.Generator) -> list[tuple[str, Mesh, bool]]:
