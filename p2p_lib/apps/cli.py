@@ -418,7 +418,12 @@ def _convert(a: argparse.Namespace) -> None:
     arg("--out", type=Path, metavar="DIR", help="a new folder for the sequence"),
     arg("--seed", type=int, default=0, metavar="N", help="of labels, paths and noise (default 0)"),
     arg("--noise", default="realsense", metavar="NAME", help="exact, realsense (default) or hard"),
-    arg("--models", type=Path, metavar="DIR", help="YCB models for the ycb_ scenarios (default: stand-ins)"),
+    arg(
+        "--models",
+        type=Path,
+        metavar="DIR",
+        help="YCB models, for ycb_, in_hand and thin_ scenarios (default: procedural ones)",
+    ),
     arg("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop"),
 )
 def _synth(a: argparse.Namespace) -> None:
