@@ -214,9 +214,8 @@ class ObjectModel:
             result = self._graph.optimise()
             self._graph.forget(gone)
             T_cam_obj = result.T_cam_obj[-1] if result.ok else T_cam_obj
-        if self._surface is not None:
-            if result is not None:
-                self._surface.keep_only(result.keys)
+        if self._surface is not None and result is not None:
+            self._surface.keep_only(result.keys)
         if self._surface is not None and fuse:
             image = obs.frame.depth_m, obs.frame.rgb, self._observer.measured(obs), self._observer.camera
             self._surface.integrate(*image, T_cam_obj, key=vertex)
