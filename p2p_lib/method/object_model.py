@@ -193,7 +193,6 @@ class ObjectModel:
         agrees: np.ndarray,
         covariance: np.ndarray | None = None,
         confidence: float = 1.0,
-        fuse: bool = True,
     ) -> Requests:
         """New points, a vertex of the graph, a view of the surface.
 
@@ -201,7 +200,6 @@ class ObjectModel:
         agrees        (N,) bool: points of the map whose observation the pose agrees with
         covariance    (6, 6) of the pose relative to the map; None at the first keyframe
         confidence    of the pose
-        fuse          whether the surface takes the view in
 
         Returns what the tracker has to follow and to drop.
         """
@@ -215,7 +213,7 @@ class ObjectModel:
         self._since_keyframe = 0
         self._sample = None
         gone, drop = self.map.retire()
-        self._solved = self._beside_after(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone, fuse)
+        self._solved = self._beside_after(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone)
         return Requests(drop=drop, add_px=uv_px, keys=keys)
 
     def _map_keyframe(
@@ -226,7 +224,6 @@ class ObjectModel:
         p_cam: np.ndarray,
         covariance: np.ndarray | None,
         gone: np.ndarray,
-        fuse: bool,
     ) -> GraphResult | None:
         """Solve the graph with a new vertex, and fuse its view where the graph has it.
 
@@ -251,7 +248,6 @@ class ObjectModel:
         if self._surface is not None:
             if result is not None:
                 self._surface.keep_only(result.keys)
-        if self._surface is not None and fuse:
             image = obs.frame.depth_m, obs.frame.rgb, self._observer.measured(obs), self._observer.camera
             self._surface.integrate(*image, T_cam_obj, key=vertex)
         return result

@@ -32,8 +32,6 @@ from p2p_lib.method.sampling import choose, usable_region
 from p2p_lib.method.two_maps import Relation, agreeing_together, seen_together
 from p2p_lib.recovery.search import Sighting
 
-#: What turns faster from frame to frame bends the surface: its depth and its colour are of two moments.
-_FAST_DEG = 6.0
 #: An object whose mask grows by more than this factor from frame to frame is still coming into view.
 _GROWTH = 1.1
 #: A map is founded anew where an object has been lost for so many frames and shows more than this of what it knows.
@@ -218,8 +216,7 @@ class ObjectTracker:
         belief, most = self._belief(obs, best), DOUBTED if life.doubted else 1.0
         covariance, mapped = belief.at(T_cam_obj, model, most, told=True)  # a turn that nothing tells bends no map
         with self._stopwatch("map"):
-            moved = self.life.moved_from_last(T_cam_obj)
-            model.observe(obs, T_cam_obj, agrees, moved)
+            model.observe(obs, T_cam_obj, agrees, self.life.moved_from_last(T_cam_obj))
             trusted = not self._gates or (not life.confirming and belief.given_turn(covariance) >= MAPPED)
             keyframe = due or (trusted and model.keyframe_due(obs, T_cam_obj, agrees))
         model.settle_surface()
@@ -227,8 +224,7 @@ class ObjectTracker:
             good = obs.seen & (agrees | ~self.map.promoted)
             if self._gates and not due:  # two maps that become one lie to each other as well as poses tell
                 good &= model.explained(obs, T_cam_obj)
-            fuse = not self._gates or moved is None or moved[1] < _FAST_DEG
-            asked = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), good, belief.of_frame, mapped, fuse)
+            asked = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), good, belief.of_frame, mapped)
             requests = replace(asked, reject=requests.reject)
         changed = keyframe or not belief.told
         covariance, sure = belief.at(T_cam_obj, model, most) if changed else (covariance, mapped)

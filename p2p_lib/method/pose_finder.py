@@ -32,10 +32,14 @@ def certain_of(obs: Observation, config: Config) -> np.ndarray:
 
 
 def took_part(obs: Observation, known: Known, config: Config) -> np.ndarray:
-    """(N,) bool: the points that register a frame: keypoints, and where these are few the pending ones, too."""
+    """(N,) bool: the points that register a frame: keypoints, and where these are few the pending ones, too.
+
+    While an object is followed, fast turns leave few keypoints sooner than they leave few points.
+    """
     certain = certain_of(obs, config)
     keypoints = certain & known.map.promoted
-    few = config.keypoint_map.keyframe_min_points if config.method.motion else _FEW_KEYPOINTS
+    followed = config.method.motion and not known.life.unconfirmed
+    few = config.keypoint_map.keyframe_min_points if followed else _FEW_KEYPOINTS
     return keypoints if keypoints.sum() >= few else certain
 
 

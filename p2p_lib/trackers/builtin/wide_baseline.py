@@ -1,8 +1,8 @@
 """Wide-baseline matching: how a rigid motion segment moved where short steps fail, by the corners of two frames.
 
 A fast turn, a fast camera or blur leaves nothing for Lucas-Kanade, whose steps are short, and little for templates.
-Corners described on the surface are still the same: those of the segment in the frame where it was seen last are matched
-with those of the newest frame, both ways, and the rigid motion that most pairs agree on in 3D is the segment's.
+Corners described on the surface are still the same: those of the segment in the frame where it was seen last are
+matched with those of the newest frame, both ways, and the rigid motion that most pairs agree on in 3D is the segment's.
 """
 
 from __future__ import annotations
@@ -124,9 +124,7 @@ class Matched:
         return len(self.p_seg)
 
 
-def corners_of(
-    sights: Sequence[Sight], now: Image, search: np.ndarray | None
-) -> tuple[Corners, list[np.ndarray]]:
+def corners_of(sights: Sequence[Sight], now: Image, search: np.ndarray | None) -> tuple[Corners, list[np.ndarray]]:
     """The corners of a later frame wherever segments can be, and the region (H, W) of each.
 
     They are as dense as on the segments, as far as the bound allows. ``search`` (H, W) says where objects are.
