@@ -67,7 +67,7 @@ class Belief:
     slides          whether it leaves more free than that
     told            whether the texture at the points that agree tells these turns
     support         keypoints that agree, each counted by the confidence of the pose that placed it
-    agreement       their share of the keypoints seen
+    agreement       their share of the points that took part
     """
 
     of_frame: np.ndarray
@@ -80,10 +80,11 @@ class Belief:
     @classmethod
     def of(cls, obs: Observation, best: Candidate, known: Known, observer: Observer, config: Config) -> Belief:
         """Of a candidate in the map ``known``."""
-        keypoints, agrees = took_part(obs, known, config), best.hypothesis.inliers
+        ours, agrees = config.method.gates == "all", best.hypothesis.inliers
+        keypoints = took_part(obs, known, config) if ours else known.keypoints(obs)
         support = known.map.confidence[agrees].sum()
         agreement = (agrees & keypoints).sum() / max(keypoints.sum(), 1)
-        told = config.method.gates != "all" or _told(obs, best, observer.camera, config)
+        told = not ours or _told(obs, best, observer.camera, config)
         free, held = best.refined.free_rotations, best.refined.eigenvalues
         slides = held is not None and (held < config.refinement.min_eigenvalue).sum() > len(free)
         return cls(_of_frame(obs, best, known, observer), free, slides, told, support, agreement)
