@@ -8,7 +8,7 @@ import pytest
 
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.types import Frame
-from p2p_lib.trackers.builtin import features, recognition, wide_baseline
+from p2p_lib.trackers.builtin import features, motion_segments, recognition, wide_baseline
 from p2p_lib.trackers.builtin.landmarks import corners
 from p2p_lib.trackers.builtin.tracker import BuiltinTracker
 from tests.trackers.made_up import CAMERA, DEPTH_M, SHAPE, grid, image, started, texture
@@ -57,7 +57,7 @@ def test_a_step_that_is_too_large_for_short_steps_is_followed(turn_deg, shift_px
 
 def test_what_is_followed_is_not_matched(monkeypatch):
     """Matching costs as much as all the rest of a frame."""
-    monkeypatch.setattr(wide_baseline, "matched", lambda *_: pytest.fail("matched"))
+    monkeypatch.setattr(motion_segments, "matched", lambda *_: pytest.fail("matched"))
     tracker = BuiltinTracker(CFG)
     tracker.start(frame(0, seen(moved(0))), CAMERA)
     tracker.add(UV)
