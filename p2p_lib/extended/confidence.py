@@ -74,7 +74,7 @@ class Belief:
     slides          whether it leaves more free than that
     constrained     whether the texture at the points that agree constrains these turns
     support         keypoints that agree, each counted by the confidence of the pose that placed it
-    agreement       their share of the keypoints seen
+    agreement       their share of the points that took part
     """
 
     of_frame: np.ndarray

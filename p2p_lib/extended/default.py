@@ -42,7 +42,7 @@ MECHANISMS = {
     "motion_weight": "A hypothesis needs more support the farther it is from the motion so far.",
     "motion_over_gaps": "For a while after its last pose an object is expected where its motion leads.",
     "moving_points": "A point becomes a keypoint only if it moves with the object.",
-    "pending_points": "Points that are not keypoints yet help to register while a keyframe is due for want of points.",
+    "pending_points": "While an object is followed, points that are no keypoints yet help to register it.",
     "turns": "The pose of a return is compared with other turns that look alike.",
     # Inside: gates.
     "return_gate": "A return needs many agreeing points, or shape and colour.",
@@ -54,7 +54,6 @@ MECHANISMS = {
     "confidence": "Each pose gets a confidence, which weighs the points that it places.",
     "texture": "A turn that shape leaves free has to be constrained by texture.",
     "sure_keyframes": "A pose that is hardly believed, or a return to be confirmed, makes no keyframe.",
-    "slow_views": "The surface takes in no view of an object that turns fast.",
     "stray_points": "A point that is seen far from where the pose has it stays out of the graph.",
 }
 ALL, NONE, ALL_BUT = "all", "none", "all but "

@@ -32,8 +32,6 @@ _CLEAR_OUTLINE = 0.3
 #: A pose of less confidence makes no keyframe: what it places agrees with it for ever after. One that the surface
 #: alone determines well has more.
 MAPPED = 0.1
-#: What turns faster from frame to frame bends the surface: its depth and its colour are of two moments.
-_FAST_DEG = 6.0
 #: Why a pose is degraded that nothing contradicts.
 _UNCONSTRAINED = "rotation not constrained by shape or texture"
 
@@ -94,8 +92,6 @@ class OurPolicy(Policy):
     def __init__(self, *paper: object, on: Container[str]):
         super().__init__(*paper, life=Lifecycle())
         self.on = on
-        if "pending_points" in on:
-            self.few_keypoints = self.config.keypoint_map.keyframe_min_points
         self.shape = ShapeSearch(self.observer, self.config, self.stopwatch, "shape_search" in on)
         self.trusted: Sight | None = None  # the newest without a doubt; None once it was hidden since
 
@@ -118,6 +114,12 @@ class OurPolicy(Policy):
                 found = self.register(known, p_cam, priors)
                 found += self._along_surface(obs, known, p_cam, priors)
             return found or self._surface_only(known, priors)
+
+    def few_keypoints(self, known: Known) -> int:
+        """While an object is followed, fast turns leave few keypoints sooner than they leave few points."""
+        if "pending_points" in self.on and not known.life.unconfirmed:
+            return self.config.keypoint_map.keyframe_min_points
+        return super().few_keypoints(known)
 
     def _motion_priors(self, obs: Sight, known: Known) -> dict[str, np.ndarray]:
         """Where the object is by its motion: name to T_cam_obj."""
@@ -256,8 +258,6 @@ class OurPolicy(Policy):
         most = DOUBTED if verdict.doubted or life.doubted else 1.0
         kept = {"life": life, "T_cam_obj": best.T_cam_obj, "belief": belief, "most": most}
         kept |= {"learns": not verdict.doubted, "in_camera": "moving_points" in self.on}
-        moved = known.life.moved_from_last(best.T_cam_obj)
-        kept["fuse"] = "slow_views" not in self.on or moved is None or moved[1] < _FAST_DEG
         if "stray_points" in self.on and not verdict.joins:  # two maps that become one lie as far off as poses tell
             sigma_m = self.observer.noise_m(obs.p_cam)
             bearing_rad = np.full_like(sigma_m, self.config.factor_graph.bearing_sigma_rad)

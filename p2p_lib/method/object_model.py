@@ -161,7 +161,6 @@ class ObjectModel:
         agrees: np.ndarray,
         covariance: np.ndarray | None = None,
         confidence: float = 1.0,
-        fuse: bool = True,
     ) -> Requests:
         """New points, a vertex of the graph, a view of the surface.
 
@@ -169,7 +168,6 @@ class ObjectModel:
         agrees        (N,) bool: points of the map whose observation the pose agrees with
         covariance    (6, 6) of the pose relative to the map; None at the first keyframe
         confidence    of the pose
-        fuse          whether the surface takes the view in
 
         Returns what the tracker has to follow and to drop.
         """
@@ -181,7 +179,7 @@ class ObjectModel:
         self.views.add(T_cam_obj)
         self._since_keyframe = 0
         gone, drop = self.map.retire()
-        self._solved = self._beside_after(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone, fuse)
+        self._solved = self._beside_after(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone)
         return Requests(drop=drop, add_px=uv_px, keys=keys)
 
     def _map_keyframe(
@@ -192,7 +190,6 @@ class ObjectModel:
         p_cam: np.ndarray,
         covariance: np.ndarray | None,
         gone: np.ndarray,
-        fuse: bool,
     ) -> GraphResult | None:
         """Solve the graph with a new vertex, and fuse its view where the graph has it.
 
@@ -214,9 +211,9 @@ class ObjectModel:
             result = self._graph.optimise()
             self._graph.forget(gone)
             T_cam_obj = result.T_cam_obj[-1] if result.ok else T_cam_obj
-        if self._surface is not None and result is not None:
-            self._surface.keep_only(result.keys)
-        if self._surface is not None and fuse:
+        if self._surface is not None:
+            if result is not None:
+                self._surface.keep_only(result.keys)
             image = obs.frame.depth_m, obs.frame.rgb, self._observer.measured(obs), self._observer.camera
             self._surface.integrate(*image, T_cam_obj, key=vertex)
         return result

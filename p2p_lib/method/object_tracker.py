@@ -126,7 +126,7 @@ class ObjectTracker:
         model.settle_surface()
         if keyframe:
             rows = admission.rows(obs, model)
-            rated = admission.covariance, admission.confidence, admission.fuse
+            rated = admission.covariance, admission.confidence
             asked = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), rows, *rated)
             requests = replace(asked, reject=requests.reject)
         covariance, sure = admission.rated(model)

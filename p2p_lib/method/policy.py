@@ -52,7 +52,6 @@ class Admission:
     learns      whether the keypoint map takes the frame in
     keyframe    whether it may become a keyframe
     in_camera   whether a point must move with the object to become a keypoint
-    fuse        whether the surface takes in the view of a keyframe
     """
 
     verdict: Verdict
@@ -62,7 +61,6 @@ class Admission:
     learns: bool = True
     keyframe: bool = True
     in_camera: bool = False
-    fuse: bool = True
 
     def rows(self, obs: Observation, model: ObjectModel) -> np.ndarray:
         """(N,) bool: points whose observations enter the graph at a keyframe: those that agree, and the pending."""
@@ -82,7 +80,6 @@ class Policy:
     rng: np.random.Generator
     stopwatch: Stopwatch
     life: Life = field(default_factory=Life)  # of an object that has not been seen
-    few_keypoints: int = 12  # with fewer visible keypoints, pending ones help to register (the release's)
 
     # -- propose -------------------------------------------------------------------------------
 
@@ -96,7 +93,11 @@ class Policy:
         """(N,) bool each: the points to register, and all that are certain enough for it."""
         certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)
         use = certain & known.map.promoted
-        return (use if use.sum() >= self.few_keypoints else certain), certain
+        return (use if use.sum() >= self.few_keypoints(known) else certain), certain
+
+    def few_keypoints(self, known: Known) -> int:
+        """With fewer visible keypoints, pending ones help to register (the release's)."""
+        return 12
 
     def register(
         self, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray] | None = None

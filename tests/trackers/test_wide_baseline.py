@@ -8,7 +8,7 @@ import pytest
 
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.types import Frame
-from p2p_lib.trackers.builtin import features, recognition, wide_baseline
+from p2p_lib.trackers.builtin import features, motion_segments, recognition, wide_baseline
 from p2p_lib.trackers.builtin.landmarks import corners
 from p2p_lib.trackers.builtin.tracker import BuiltinTracker
 from tests.trackers.made_up import CAMERA, DEPTH_M, SHAPE, grid, image, started, texture
@@ -57,12 +57,48 @@ def test_a_step_that_is_too_large_for_short_steps_is_followed(turn_deg, shift_px
 
 def test_what_is_followed_is_not_matched(monkeypatch):
     """Matching costs as much as all the rest of a frame."""
-    monkeypatch.setattr(wide_baseline, "matched", lambda *_: pytest.fail("matched"))
+    monkeypatch.setattr(motion_segments, "matched", lambda *_: pytest.fail("matched"))
     tracker = BuiltinTracker(CFG)
     tracker.start(frame(0, seen(moved(0))), CAMERA)
     tracker.add(UV)
     for k in range(1, 6):
         assert tracker.track(frame(k, seen(moved(k, (3 * k, 0))))).visible.all()
+
+
+def test_corners_of_an_outline_do_not_count():
+    """They stand still while a round object turns."""
+    now, search = image(), np.zeros(SHAPE, bool)
+    search[60:180, 90:230] = True
+    p, segments = started(UV, now)
+    segments.remember(p, now, search)
+    (then,) = (segment.sight for segment in segments.segments)
+    found, _ = wide_baseline.corners_of([then], now, search)
+    for at in (found.uv_px, then.corners.uv_px):
+        assert len(at) and (np.abs(at - [159.5, 119.5]) < [67, 57]).all()
+
+
+def test_what_is_before_it_is_not_of_it():
+    """A hand inside the hull of the points, 4 cm nearer."""
+    depth = np.full(SHAPE, DEPTH_M, np.float32)
+    p, segments = started(UV, image())
+    p.visible[(np.abs(p.uv - [160, 120]) < 25).all(1)] = False
+    depth[95:145, 135:185] -= 0.04
+    segments.remember(p, image(depth_m=depth), None)
+    (then,) = (segment.sight for segment in segments.segments)
+    at = then.corners.p_cam
+    assert len(at) > 20 and at[:, 2].min() > DEPTH_M - 0.01
+
+
+def test_it_is_searched_for_where_depth_and_colour_fit():
+    p, segments = started(UV, image())
+    segments.remember(p, image(), None)
+    (then,) = (segment.sight for segment in segments.segments)
+    red, depth = texture().copy(), np.full(SHAPE, DEPTH_M, np.float32)
+    red[:, :120, 1] //= 3
+    depth[:, 200:] += 0.2
+    region = then.region(image(red, depth))
+    assert region[100:140, 130:190].all()
+    assert region[:, 80:100].mean() < 0.2 and not region[:, 200:].any()
 
 
 def test_another_texture_is_no_match():

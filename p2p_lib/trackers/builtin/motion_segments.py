@@ -31,9 +31,11 @@ _REPEATS = 4.0
 _PLACED_PX, _OBSERVED_PX = 0.2, 0.3
 #: A neighbouring pixel's depth may be read: depth noise of an observation is larger than the sensor's by this.
 _DEPTH_NOISE = 1.5
-#: A segment is matched where fewer than this share of the points are followed that were seen on it. Errors of matches.
-_FOLLOWED, _MATCHED_PX, _MATCHED_M = 0.5, 1.5, 0.001
 _EYE2, _EYE3 = np.eye(2), np.eye(3)
+#: A segment is matched where fewer than this share of the points are followed that were seen on it.
+_FOLLOWED = 0.5
+#: Covariance of a matched corner on its segment (m^2), and of where it is seen (px^2).
+_MATCHED_M2, _MATCHED_PX2 = 0.001**2 * _EYE3, 1.5**2 * _EYE2
 _NO_ROWS = np.zeros(0, np.int64)
 
 
@@ -164,11 +166,8 @@ class MotionSegments:
         seen = [p.p_seg[at], p.map_cov[at], p.uv[at].astype(float), p.cov[at].astype(float), now.depth_at(p.uv[at])]
         if pairs is not None:
             start, fewest = pairs.T_cam_seg, 0.0
-            noise = (
-                np.tile(_MATCHED_M**2 * _EYE3, (len(pairs), 1, 1)),
-                np.tile(_MATCHED_PX**2 * _EYE2, (len(pairs), 1, 1)),
-            )
-            more = pairs.p_seg, noise[0], pairs.uv_px, noise[1], pairs.z_m
+            noise_m2, noise_px2 = (np.repeat(cov[None], len(pairs), 0) for cov in (_MATCHED_M2, _MATCHED_PX2))
+            more = pairs.p_seg, noise_m2, pairs.uv_px, noise_px2, pairs.z_m
             seen = [np.concatenate(column) for column in zip(seen, more, strict=True)]
         fewest = max(self.config.segment_min_points, fewest)
         if len(seen[0]) < fewest:
