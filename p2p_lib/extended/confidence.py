@@ -93,8 +93,7 @@ class Belief:
         config = policy.config
         bounds = config.tracking.textureless_contrast, config.lifecycle.return_inliers
         constrained = not texture or _constrained(obs, best, policy.observer.camera, *bounds)
-        free, held = best.refined.free_rotations, best.refined.eigenvalues
-        slides = held is not None and (held < config.refinement.min_eigenvalue).sum() > len(free)
+        free, slides = best.refined.free_rotations, may_slide(best, config.refinement.min_eigenvalue)
         return cls(policy.covariance(obs, known, best), free, slides, constrained, support, agreement)
 
     def at(
@@ -148,3 +147,9 @@ def contrast_along(
     u = np.clip(u[:, None] - cut[1].start + x, 0, grey.shape[1] - 1)
     over_two_px = [cv2.Sobel(grey, cv2.CV_32F, *axis, ksize=3, scale=0.25)[v, u] for axis in ((1, 0), (0, 1))]
     return sum(change * flow_px[:, [k]] for k, change in enumerate(over_two_px)).std(-1)
+
+
+def may_slide(best: Candidate, min_eigenvalue: float) -> bool:
+    """Whether a refined pose may move along the surface without leaving it, besides turns."""
+    held = best.refined.eigenvalues
+    return held is not None and bool((held < min_eigenvalue).sum() > len(best.refined.free_rotations))

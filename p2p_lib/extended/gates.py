@@ -21,6 +21,8 @@ _SIZE, _SIZE_SIGMAS = 0.05, 3.0
 #: A mask is doubted of whose outline less than this share lies where depth has steps, of what did before. One that
 #: stays so for this many frames is taken for right.
 OUTLINE, _LONGEST_DOUBT = 0.45, 60
+#: So many points fix a pose.
+_FIXED_BY = 3
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class Evidence:
     outline        what of its mask's outline lies where depth has steps, as a share of what did before any doubt
     still          whether the same image has come again and again
     carried        whether its motion before the gap still says where it is
+    slides         whether the pose may move along the surface without leaving it, as that of something flat
     """
 
     support: int
@@ -45,6 +48,7 @@ class Evidence:
     outline: float = 1.0
     still: bool = False
     carried: bool = False
+    slides: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,12 @@ def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: Life
     return "too few points, and the surface does not fit either" if nothing else ""
 
 
+def _few_points_on_flat(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+    """What is flat lies on a table as well as on itself: its own points have to say where."""
+    free = evidence.slides and evidence.support < _FIXED_BY and (evidence.sighting or 0.0) < SIGHTED
+    return f"only {evidence.support} points agree, and the surface leaves free where it is" if free else ""
+
+
 def _mask_off_steps(life: Lifecycle, evidence: Evidence) -> str:
     off = evidence.outline < OUTLINE and life.doubted_frames < _LONGEST_DOUBT
     return "its mask does not end where its depth does any more" if off else ""
@@ -122,4 +132,5 @@ DOUBTS: dict[str, Callable[[Lifecycle, Evidence], str]] = {
 GATES: dict[str, Callable[[Lifecycle, Evidence, LifecycleConfig], str]] = {
     "return_gate": _few_points_on_return,
     "surface_gate": _no_points_and_off_surface,
+    "sliding_gate": _few_points_on_flat,
 }

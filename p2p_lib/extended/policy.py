@@ -12,7 +12,7 @@ import numpy as np
 
 from p2p_lib.core.types import DOUBTED, Status
 from p2p_lib.extended.agreement import scene_ratio, size_ratio
-from p2p_lib.extended.confidence import Belief
+from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.gates import SIGHTED, Evidence, Judgement, judge, off_size
 from p2p_lib.extended.graph import explained
 from p2p_lib.extended.image_search import laid_on
@@ -217,7 +217,8 @@ class OurPolicy(Policy):
         size = self._size(obs, known, best) if "size" in self.on else None
         outline = self.outline(obs) if "outline" in self.on else 1.0
         carried = self.carried(known, obs.frame.time_s)
-        evidence = replace(best.evidence, size=size, outline=outline, still=obs.still, carried=carried)
+        slides = "sliding_gate" in self.on and may_slide(best, self.config.refinement.min_eigenvalue)
+        evidence = replace(best.evidence, size=size, outline=outline, still=obs.still, carried=carried, slides=slides)
         return judge(known.life, evidence, self.on, self.config.lifecycle)
 
     def judge_other(self, obs: Sight, known: Known, best: Proposal) -> Judgement:

@@ -246,6 +246,13 @@ def test_pending_points_help_where_few_keypoints_are_seen():
     assert lump.see(turned(12), hide(few)).estimate.inliers > 12
 
 
+def test_pending_points_help_sooner_while_an_object_is_followed():
+    """Eighteen keypoints are enough for a return, and too few to be alone with where a fast turn hides the others."""
+    lump, pending = pending_and_promoted()
+    some = lambda tracks: ~pending & (np.cumsum(~pending & tracks.visible) > 18)  # noqa: E731
+    assert lump.see(turned(12), hide(some)).estimate.inliers > 18
+
+
 def test_where_keypoints_contradict_each_other_pending_points_and_the_surface_propose():
     lump, pending = pending_and_promoted()
     rng = np.random.default_rng(3)
