@@ -266,7 +266,8 @@ def _kernel_manager(places: Mapping[str, Path], kernels: list[Any]) -> type:
 
         def kill(self) -> None:
             provisioner: Any = self.provisioner
-            os.killpg(os.getpgid(provisioner.pid), signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it has ended by itself
+                os.killpg(os.getpgid(provisioner.pid), signal.SIGKILL)
 
     return Manager
 

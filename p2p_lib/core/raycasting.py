@@ -21,10 +21,13 @@ def cast(scene: Any, eye: np.ndarray, rays: np.ndarray) -> dict[str, np.ndarray]
     """Where rays (N, 3) of any length from one eye (3,) meet a scene first.
 
     ``t_hit`` (N,) is in lengths of the ray, infinite where it meets nothing; ``primitive_ids`` (N,) says which face, -1
-    where none.
+    where none; ``primitive_normals`` (N, 3) is its unit normal by the order of its corners, 0 where none.
     """
     rays = np.asarray(rays, np.float32)
     eyes = np.tile(np.asarray(eye, np.float32), (len(rays), 1))
     found = scene.run(eyes, rays, query="INTERSECT", output=True)
     met = found["primID"] >= 0
-    return {"t_hit": np.where(met, found["tfar"], np.float32(np.inf)), "primitive_ids": found["primID"]}
+    normals = np.where(met[:, None], found["Ng"], np.float32(0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    t_hit = np.where(met, found["tfar"], np.float32(np.inf))
+    return {"t_hit": t_hit, "primitive_ids": found["primID"], "primitive_normals": normals}
