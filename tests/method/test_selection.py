@@ -7,8 +7,9 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
+from p2p_lib.extended.motion import MOTION_DEG, MOTION_M, motion_weight
 from p2p_lib.method.registration import Hypothesis
-from p2p_lib.method.selection import MOTION_DEG, MOTION_M, motion_weight, select
+from p2p_lib.method.selection import select
 
 DEFAULT, PAPER = preset("default").selection, preset("paper").selection
 
