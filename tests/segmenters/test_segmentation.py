@@ -461,7 +461,7 @@ def test_the_support_plane_is_found_among_other_things():
     depth += np.random.default_rng(0).normal(0, 0.002, depth.shape).astype(np.float32) * (depth > 0)
     frame = Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), np.maximum(depth, 0))
     patch = Patch.of(frame, around(np.array([160, 180.0]), np.array([150, 60.0]), frame.shape), CAMERA, CONFIG)
-    plane = support_plane(patch, patch.depth_m > 0, np.random.default_rng(0))
+    plane = support_plane(patch, patch.depth_m > 0)
     assert plane[:3] @ normal > np.cos(np.radians(2)) and abs(plane[3] - d) < 0.01
     on_it = patch.dots(np.array([[20.0, 200], [290, 200]]), 0)
     assert on_it.sum() == 2 and np.abs(plane_heights(patch, plane)[on_it]).max() < 0.02
@@ -471,8 +471,8 @@ def test_no_plane_where_there_is_none():
     depth = np.random.default_rng(0).uniform(0.4, 2, (240, 320)).astype(np.float32)
     frame = Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), depth)
     patch = Patch.of(frame, around(np.array([160, 120.0]), np.array([100, 100.0]), frame.shape), CAMERA, CONFIG)
-    assert support_plane(patch, patch.depth_m > 0, np.random.default_rng(0)) is None
-    assert support_plane(patch, np.zeros(patch.shape, bool), np.random.default_rng(0)) is None
+    assert support_plane(patch, patch.depth_m > 0) is None
+    assert support_plane(patch, np.zeros(patch.shape, bool)) is None
 
 
 def test_patches_keep_places():

@@ -44,7 +44,7 @@ def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
     seeds = patch.dots(uv_px, 0 if expected else 1) & (patch.depth_m > 0) & ~barred
     surface = by_surface(patch, hint, cfg)
     outside = ~dilated(seeds | (surface > 0), 3)
-    plane = support_plane(patch, (patch.depth_m > 0) & outside, view.rng)
+    plane = support_plane(patch, (patch.depth_m > 0) & outside)
     log_odds, component = by_geometry(patch, seeds, plane, cfg)
     colour = by_colour(patch, target.colours, outside & ~component, cfg)
     background = (patch.border() | barred) & ~seeds
@@ -66,7 +66,7 @@ def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarra
     if np.count_nonzero(near) < _MIN_COMPONENT_PX:
         return NO_PX
     colour = by_colour(patch, target.colours, measured & ~near, view.config)
-    plane, free = support_plane(patch, measured, view.rng), patch.smooth
+    plane, free = support_plane(patch, measured), patch.smooth
     if plane is not None:
         free = free & (plane_heights(patch, plane) > max_plane_height_m(patch.sigma_m))
     # What is connected with another object belongs to that one, whatever its mask has left out.

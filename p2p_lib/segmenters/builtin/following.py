@@ -68,7 +68,7 @@ def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Cla
     core = (prior > 0.8) & ~(jumped | predicted.shown)
     if not (core & (patch.depth_m > 0)).any():
         core |= predicted.shown & (np.abs(patch.depth_m - target.seen.z_m) < _REAPPEARS_WITHIN_M)
-    plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), view.rng)
+    plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2))
     motions = target.past.motions(view.frame, hint.T_cam_obj) if target.confident else None
     log_odds, component = by_geometry(patch, core, plane, cfg, motions)
     stays = cfg.prior_weight * np.where(jumped | predicted.shown, 0, 2 * prior - 1)
@@ -89,7 +89,7 @@ def with_room(view: View, target: Target, hint: Hint) -> Target:
     motions = target.past.motions(view.frame, hint.T_cam_obj)
     if motions is None or not scene_stays(patch, motions):
         return target
-    plane = support_plane(patch, patch.depth_m > 0, view.rng)
+    plane = support_plane(patch, patch.depth_m > 0)
     _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions)
     if not component.any():
         return target

@@ -37,8 +37,8 @@ class BuiltinSegmenter:
 
     name = "builtin"
 
-    def __init__(self, camera: Camera, config: SegmentationConfig, rng: np.random.Generator):
-        self.camera, self.config, self._rng = camera, config, rng
+    def __init__(self, camera: Camera, config: SegmentationConfig, rng: np.random.Generator | None = None):
+        self.camera, self.config = camera, config
         self._targets: dict[str, Target] = {}
         self._previous: Frame | None = None
         self._frames = 0
@@ -62,7 +62,7 @@ class BuiltinSegmenter:
         said, hints = {prompt.name: prompt for prompt in prompts}, hints or {}
         _check(frame, said, self.camera)
         self._frames += 1
-        view = View(frame, self._previous, self.camera, self.config, self._rng)
+        view = View(frame, self._previous, self.camera, self.config)
         new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
         masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
         due, claims = self._due(), {}
@@ -107,7 +107,7 @@ class BuiltinSegmenter:
         target = self._targets.get(name, Target()).with_learnt(view.previous, view.focal_px, view.config)
         if name in said:
             others_px = np.concatenate([NO_PX, *(p.points_px for n, p in said.items() if n != name)])
-            cutter = Cutter(view.frame, view.camera, view.config, view.rng, said[name], others_px)
+            cutter = Cutter(view.frame, view.camera, view.config, said[name], others_px)
             claim = self._segment_prompt(view, cutter, target, hints.get(name, _NO_HINT), taken)
             return Target(), claim  # its colours and its size are learnt anew
         predicted = None if target.seen is None else predict(view, target)
@@ -174,7 +174,7 @@ class BuiltinSegmenter:
         label_of = {name: label for label, name in enumerate(self._targets, 1)}
         for prompt in new:
             others = {name: labels == label for name, label in label_of.items() if name != prompt.name}
-            cutter = Cutter(view.frame, view.camera, view.config, np.random.default_rng(0), prompt, NO_PX)
+            cutter = Cutter(view.frame, view.camera, view.config, prompt, NO_PX)
             doubt_start(cutter, labels == label_of[prompt.name], others)
 
 
