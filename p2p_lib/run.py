@@ -19,9 +19,11 @@ from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate, status_text
+from p2p_lib.datasets import first_masks
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import moving_scale
 from p2p_lib.datasets.exchange import as_run, export, read_poses
+from p2p_lib.datasets.first_masks import FirstMasks
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
@@ -115,6 +117,7 @@ class Keeper:
     method: Point2Pose
     masks: bool = False
     keypoints: KeypointLog = field(default_factory=KeypointLog)
+    first_masks: FirstMasks = field(default_factory=FirstMasks)
 
     def add(self, frame: Frame, estimates: Mapping[str, PoseEstimate]) -> None:
         """The frame that has just been estimated."""
@@ -126,6 +129,8 @@ class Keeper:
         self.writer.add(frame, estimates, stages_ms.pop("total"), stages_ms)
         if self.masks:
             self.writer.add_masks(frame, method.masks)
+        if self.first_masks.add(frame, method.masks) and self.writer.begun:
+            self.first_masks.save(self.writer.path)
 
     def save_maps(self) -> None:
         """``meshes/<object>.ply``, each surface in its object's frame where there is one, and ``keypoints.npz``."""
@@ -368,7 +373,10 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
         not_scored = "the sequence has no truth (looked for in annotated_poses/ of a folder)"
     tracked = any(obj.has_pose.any() for obj in done.objects.values())
     advice = "" if interrupted else _advice(done, job)
-    return RunResult(out, evaluation, not_scored, summary(done, len(job.frames)), interrupted, advice, tracked)
+    lines = summary(done, len(job.frames))
+    if (out / first_masks.FILE).is_file():
+        lines += (f"the masks that objects were started with: {out / first_masks.FILE}",)
+    return RunResult(out, evaluation, not_scored, lines, interrupted, advice, tracked)
 
 
 def summary(run: Run, wanted: int) -> tuple[str, ...]:

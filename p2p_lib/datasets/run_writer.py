@@ -16,6 +16,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import append, file_name, read_text, replace_text, replacing, writing_alone
 from p2p_lib.core.options import differing
 from p2p_lib.core.types import Frame, PoseEstimate, Status
+from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
 from p2p_lib.datasets.images import save_png
 from p2p_lib.datasets.keypoint_log import FILE as KEYPOINTS
 from p2p_lib.datasets.models import load_points
@@ -320,7 +321,17 @@ def _clear(out: Path, info: Mapping[str, Any]) -> None:
     poses = [f"poses/{name}.txt" for name in info["objects"]]
     meshes = [f"meshes/{name}.ply" for name in info["objects"]]
     # First the one without which there is no run: two are never mixed, whenever a kill comes.
-    for pattern in ("poses.npz", *poses, *meshes, *masks, "config.toml", "models.npz", "timings.csv", KEYPOINTS):
+    for pattern in (
+        "poses.npz",
+        *poses,
+        *meshes,
+        *masks,
+        "config.toml",
+        "models.npz",
+        "timings.csv",
+        FIRST_MASKS,
+        KEYPOINTS,
+    ):
         for path in out.glob(pattern):
             if not path.parent.is_symlink():
                 path.unlink()
