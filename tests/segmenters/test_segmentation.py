@@ -535,3 +535,34 @@ def test_distances_to_a_known_surface():
     assert np.isinf(distance[v, 25]), "off the volume nothing of the object can be"
     p_obj = CAMERA.unproject(np.array([u + 20.0, v + 10]), 0.52) - T_cam_obj[:3, 3]
     assert distance[v + 10, u + 20] == pytest.approx(np.linalg.norm(p_obj) - 0.1, abs=3e-3)
+
+
+# --- a mask that is not the object's -----------------------------------------------------------
+
+
+def _leap(to: tuple[int, int]) -> list[Frame]:
+    """A red card that lies still, and then is elsewhere on a green wall from one frame to the next."""
+    frames = []
+    for k, at in enumerate([(100, 80)] * 3 + [to] * 3):
+        frame = picture(k, [(at, 2)])
+        frame.rgb[:], frame.rgb[card(at)] = (60, 120, 60), (200, 60, 50)
+        frames.append(frame)
+    return frames
+
+
+def test_what_leaps_is_found_by_its_colours_near_to_where_it_was():
+    """The flow cannot follow it: what it leaves behind has other colours, and the object is not far."""
+    follow = segmenter()
+    for k, frame in enumerate(_leap((158, 96))):
+        found = follow.segment(frame, () if k else on(card=(100, 80))) == 1
+    assert iou(found, card((158, 96))) > 0.85
+
+
+def test_a_place_without_the_colours_is_not_the_object_though_it_is_sighted_there():
+    """A shape says that it is back where only the wall is: it is followed where it is."""
+    follow, frames = segmenter(), _leap((100, 80))
+    for k, frame in enumerate(frames[:4]):
+        follow.segment(frame, () if k else on(card=(100, 80)))
+    wall_px = np.stack(np.meshgrid(np.arange(20, 60, 6), np.arange(150, 200, 6)), -1).reshape(-1, 2).astype(float)
+    found = follow.segment(frames[4], hints={"card": Hint(wall_px, T_cam_obj=np.eye(4), sighted=True)}) == 1
+    assert iou(found, card((100, 80))) > 0.85

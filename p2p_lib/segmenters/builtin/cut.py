@@ -26,6 +26,8 @@ from p2p_lib.segmenters.builtin.patch import (
 _EVIDENCE = 0.06
 #: Log-odds that weigh as much as a tie to a like neighbour where the outline is sharp, and the weight of certainty.
 _TIE, _CERTAIN = 10.0, 50.0
+#: Mean log-odds of a mask's colours below which it is not the object.
+_STRANGE = -1.0
 #: Measured points this near to the reconstructed surface are on it, and twice as far before it are not.
 _ON_SURFACE_M = 0.008
 #: Less of a component than this on the patch's border is an accident.
@@ -89,6 +91,13 @@ def by_geometry(
 def by_colour(patch: Patch, own: np.ndarray, outside: np.ndarray, config: SegmentationConfig) -> np.ndarray:
     """Each pixel's colour is likelier among the object's ``own`` (4096,) shares, or ``outside`` (h, w) bool."""
     return config.colour_weight * evidence(own, histogram(patch.codes[outside]))[patch.codes]
+
+
+def strange(patch: Patch, mask: np.ndarray, own: np.ndarray) -> bool:
+    """Whether a mask (h, w) bool shows the colours of what surrounds it, not the object's ``own`` (4096,) shares."""
+    if mask.all() or not mask.any():
+        return False
+    return bool(evidence(own, histogram(patch.codes[~mask]))[patch.codes[mask]].mean() < _STRANGE)
 
 
 def by_surface(patch: Patch, hint: Hint, config: SegmentationConfig) -> np.ndarray:

@@ -21,7 +21,7 @@ from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.finding import find
+from p2p_lib.segmenters.builtin.finding import find, near_last
 from p2p_lib.segmenters.builtin.following import Prediction, follow, predict, with_room
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter, doubt_start
 from p2p_lib.segmenters.builtin.target import Target, seen_in
@@ -134,12 +134,17 @@ class BuiltinSegmenter:
         if hint.gone:
             return target, None
         if predicted is None or hint.sighted:  # what has been followed is not where the object was found
-            return target, find(view, target, hint, taken)
-        if not (target.confident and target.past.due(view.frame)):
-            return target, follow(view, target, hint, predicted)
-        target = with_room(view, target, hint)
+            claim = find(view, target, hint, taken)
+            if predicted is None or claim is not None:
+                return target, claim
+            target, hint = replace(target, confident=False), Hint()  # nor is it where it was sighted
+        due = target.confident and target.past.due(view.frame)
+        target = with_room(view, target, hint) if due else target
         claim = follow(view, target, hint, predicted)
-        return replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj)), claim
+        if claim is None:  # it has moved faster than the flow: it is not far from where it was
+            return target, find(view, target, near_last(view, target, hint), taken)
+        past = target.past.with_frame(view.frame, hint.T_cam_obj) if due else target.past
+        return replace(target, past=past), claim
 
     @staticmethod
     def _cuts(target: Target, due: bool) -> bool:
