@@ -7,6 +7,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
+from p2p_lib import Point2Pose
 from p2p_lib.apps.click import clicked_masks
 from p2p_lib.core.backends import make_segmenter
 from p2p_lib.core.camera import Camera
@@ -14,7 +15,6 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.depth_offset import depth_offset_px, with_depth_moved
 from p2p_lib.segmenters.builtin.patch import Box, Patch, plane_heights, support_plane
