@@ -20,7 +20,7 @@ from p2p_lib.core.tables import as_markdown
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.sequence import Sequence, open_sequence
 from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M, Judged, pooled
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.synthetic.generate import scenario_dir
 
 BLURRED = {"axial_per_m": 0.02, "exposure": 0.2, "shutter_share": 0.8, "read_levels": 10.0}

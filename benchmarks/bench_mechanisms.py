@@ -2,8 +2,9 @@
 
     python benchmarks/bench_mechanisms.py OUT SEQUENCE ... [--mechanisms A,B] [--clicks] [--stop N]
 
-A mechanism is an entry of ``mechanisms.toml``: one text of the library, and what it is replaced with to switch the
-mechanism off. Each run is a process of its own with a patched copy of the library. ``OUT/runs.jsonl`` keeps a line per
+A mechanism is one of ``p2p_lib.extended.default`` by its name, left out by ``method.mechanisms``, or an entry of
+``mechanisms.toml``: one text of the library, and what it is replaced with to switch the mechanism off. Each run is a
+process of its own, with a copy of the library that is patched for an entry. ``OUT/runs.jsonl`` keeps a line per
 run and no run is done twice; ``OUT/table.md`` and ``OUT/table.csv`` compare with the unchanged method. SEQUENCE is what
 ``p2p run`` takes, with masks, truth and models; ``--clicks`` starts from one click per object instead of masks. Of each
 the first ``--stop`` frames are taken.
@@ -32,6 +33,7 @@ import pandas as pd
 from common import squared_errors
 
 from p2p_lib.core.tables import as_markdown
+from p2p_lib.extended.default import MECHANISMS
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "tools"))
@@ -46,12 +48,13 @@ SUMS = ["frames", "lost", "confidently_wrong"]
 MEANS = ["add", "adds", "brier", "rotation_error2", "translation_error2"]
 
 
-def track(sequence: str, clicks: bool, stop: int | None, out: Path) -> None:
+def track(sequence: str, clicks: bool, stop: int | None, without: str, out: Path) -> None:
     """Follow every object of a sequence with the library that is imported; its estimates go to the file ``out``."""
     from p2p_lib import Point2Pose, open_sequence, preset
 
     seq = open_sequence(sequence)
-    method, first = Point2Pose(seq.camera, preset("default")), seq.masks(0) or {}
+    config = preset().with_values({"method.mechanisms": f"all but {without}" if without else "all"})
+    method, first = Point2Pose(seq.camera, config), seq.masks(0) or {}
     for name in seq.objects:
         if not clicks:
             method.add_object(name)
@@ -152,11 +155,12 @@ def run_once(
     """A run without the mechanism, scored by the library as it is; ``failed`` says with which error it ended."""
     with tempfile.TemporaryDirectory() as scratch:
         shutil.copytree(ROOT / "p2p_lib", Path(scratch) / "p2p_lib")
-        if mechanism is not None:
+        if mechanism is not None and "file" in mechanism:
             switch_off(mechanism, Path(scratch))
         out = Path(scratch) / "tracked.npz"
         command = [sys.executable, __file__, str(out), sequence, "--track", *(["--clicks"] if clicks else [])]
         command += [] if stop is None else ["--stop", str(stop)]
+        command += ["--without", mechanism["name"]] if mechanism is not None and "file" not in mechanism else []
         done = subprocess.run(command, env=os.environ | {"PYTHONPATH": scratch}, capture_output=True, text=True)
         if done.returncode:
             return {"failed": done.stderr.strip().splitlines()[-1]}
@@ -188,14 +192,18 @@ def main() -> None:
     parser.add_argument("--clicks", action="store_true", help="from one click per object instead of masks")
     parser.add_argument("--stop", type=int, metavar="N", help="this many frames of each")
     parser.add_argument("--track", action="store_true", help="one sequence with the library that is imported, into OUT")
+    parser.add_argument("--without", default="", metavar="NAME", help="with --track: leave out this mechanism")
     asked = parser.parse_args()
     if asked.track:
-        return track(*asked.sequences, asked.clicks, asked.stop, asked.out)
+        return track(*asked.sequences, asked.clicks, asked.stop, asked.without, asked.out)
     asked.out.mkdir(parents=True, exist_ok=True)
     log = asked.out / "runs.jsonl"
     runs = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     done = {(run["mechanism"], run["sequence"]) for run in runs}
-    for mechanism in [None, *read_mechanisms([name for name in asked.mechanisms.split(",") if name])]:
+    names = [name for name in asked.mechanisms.split(",") if name]
+    composed = [{"name": name} for name in MECHANISMS if name in names or not names]
+    patched = [name for name in names if name not in MECHANISMS]
+    for mechanism in [None, *composed, *(read_mechanisms(patched) if patched or not names else [])]:
         for sequence in asked.sequences:
             what = {
                 "mechanism": mechanism["name"] if mechanism else UNCHANGED,

@@ -20,9 +20,9 @@ from p2p_lib.core import se3
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures import style
 from p2p_lib.figures.plots import WIDTH_IN, panels
-from p2p_lib.method.pipeline import Point2Pose
 
 PASSES = 3
 #: Loops are compiled in the first two frames, which count in no rate.

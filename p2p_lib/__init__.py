@@ -22,13 +22,13 @@ if TYPE_CHECKING:  # what _WHERE says, for type checkers and editors
     from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
     from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
     from p2p_lib.datasets.sequence import open_sequence
-    from p2p_lib.method.pipeline import Point2Pose
+    from p2p_lib.extended.default import Point2Pose
 
 logging.getLogger("p2p_lib").addHandler(logging.NullHandler())  # whoever wants to read it says so
 __version__ = "0.1.0"
 
 _NAMES = {
-    "p2p_lib.method.pipeline": ["Point2Pose"],
+    "p2p_lib.extended.default": ["Point2Pose"],
     "p2p_lib.datasets.sequence": ["open_sequence"],
     "p2p_lib.core.camera": ["Camera"],
     "p2p_lib.core.config": ["Config", "preset"],

@@ -18,6 +18,7 @@ import numpy as np
 
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, doubt
+from p2p_lib.core.mesh import save as save_mesh
 from p2p_lib.core.options import MaskSource, RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
@@ -39,8 +40,7 @@ from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
-from p2p_lib.method.mesh import save as save_mesh
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
 
 #: Frames whose images are looked at when a run is judged at its end; ``p2p eval`` looks at more.
 RUN_LOOKS = 30

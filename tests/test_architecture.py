@@ -1,9 +1,11 @@
 """Packages keep their layers, heavy libraries are used in one place each, and nothing tells of the machine."""
 
 import ast
+import io
 import re
 import subprocess
 import sys
+import tokenize
 from pathlib import Path
 
 import pytest
@@ -15,8 +17,8 @@ STUDIES = sorted((PROJECT / "notebooks" / "studies").glob("*.py"))
 #: Lowest first; the packages of one layer do not import each other.
 LAYERS = [
     {"core"},
-    {"recovery"},
     {"method", "datasets"},
+    {"extended"},
     {"synthetic"},
     {"trackers", "detectors", "segmenters"},
     {"evaluation"},
@@ -83,6 +85,39 @@ def test_imports_point_down(path):
         assert module.partition(".")[0] != "studies", "notebooks are no part of the package"
 
 
+def test_the_papers_method_knows_core_alone_and_can_be_read_in_one_sitting():
+    files, told = sorted((PACKAGE / "method").rglob("*.py")), re.compile(r"aside|gates|doubt|outlook", re.IGNORECASE)
+    for path in files:
+        ours = {part(module) for module in imports(path) if module.startswith("p2p_lib.")}
+        assert ours <= {"core", "method"}, f"{path} imports {ours}"
+        assert not told.search(path.read_text()), f"{path} tells of what is not the paper's"
+    assert sum(map(lines_of_code, files)) <= 1800
+
+
+def lines_of_code(path: Path) -> int:
+    """Lines that hold more than docstrings and comments."""
+    tree, source = ast.parse(path.read_text()), path.read_bytes()
+    told: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            told |= set(range(node.body[0].lineno, node.body[0].end_lineno + 1))
+    held: set[int] = set()
+    for token in tokenize.tokenize(io.BytesIO(source).readline):
+        if token.type in (tokenize.NAME, tokenize.NUMBER, tokenize.STRING, tokenize.OP):
+            held |= set(range(token.start[0], token.end[0] + 1))
+    return len(held - told)
+
+
+def test_an_answer_to_a_user_of_the_paper_needs_nothing_of_ours():
+    code = "import sys\nimport numpy as np\nfrom p2p_lib.method.pipeline import Point2Pose\n"
+    code += "from p2p_lib.core.camera import Camera\nfrom p2p_lib.core.types import Frame\n"
+    code += "frame = Frame(0, 0.0, np.zeros((60, 80, 3), np.uint8), np.ones((60, 80), np.float32))\n"
+    code += "with Point2Pose(Camera(80, 80, 40, 30, 80, 60), 'paper') as method:\n"
+    code += "    method.add_object('cup')\n    method.step(frame, {'cup': np.eye(60, 80) < 1})\n"
+    code += "print(*sys.modules)"
+    assert not [module for module in answer(code).split() if module.startswith("p2p_lib.extended")]
+
+
 @pytest.mark.parametrize("library", HOMES)
 def test_heavy_library_has_one_home(library):
     users = {path for path in [*sources(), *STUDIES] if library in {module.split(".")[0] for module in imports(path)}}
@@ -111,16 +146,16 @@ def test_the_package_is_imported_at_once():
     assert float(answer(code)) < 0.3, "seconds of processor time"
 
 
-METHOD = "import p2p_lib.method.pipeline as pipeline"
+METHOD = "import p2p_lib.extended.default as pipeline"
 MADE = METHOD + "\nfrom p2p_lib import Camera\npipeline.Point2Pose(Camera(300, 300, 160, 120, 320, 240))"
 
 
 @pytest.mark.parametrize(("code", "parts"), [(METHOD, 0), (MADE, 3)], ids=["imported", "made with what is built in"])
 def test_the_method_loads_neither_datasets_nor_downloads_nor_drawing(code, parts):
-    allowed = {"core", "recovery", "method", *("trackers", "detectors", "segmenters")[:parts]}
+    allowed = {"core", "method", "extended", *("trackers", "detectors", "segmenters")[:parts]}
     loaded = answer(f"import sys\n{code}\nprint(*sys.modules)").split()
     ours = {module.split(".")[1] for module in loaded if module.startswith("p2p_lib.")}
-    assert {"core", "method", "recovery"} <= ours <= allowed
+    assert {"core", "method", "extended"} <= ours <= allowed
     unwanted = {"pooch", "requests", "urllib3", "tqdm", "pydantic", "PIL", *LAZY} - {"scipy"}
     assert not unwanted & set(loaded)
 

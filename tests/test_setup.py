@@ -23,8 +23,15 @@ PROJECT = Path(__file__).resolve().parents[1]
 PYPROJECT = tomllib.loads((PROJECT / "pyproject.toml").read_text())
 LOCK = (PROJECT / "requirements.lock").read_text()
 REQUIRED = set("jupyterlab numpy torch opencv-python-headless gtsam open3d trimesh matplotlib pandas papermill".split())
+OURS = {"p2p_lib", "studies"}
 #: Import name to distribution, where they differ; and what comes as a part of another.
-DISTRIBUTIONS = {"rerun": "rerun-sdk", "cv2": "opencv-python-headless", "skimage": "scikit-image", "PIL": "pillow"}
+DISTRIBUTIONS = {
+    "fast_simplification": "fast-simplification",
+    "rerun": "rerun-sdk",
+    "cv2": "opencv-python-headless",
+    "skimage": "scikit-image",
+    "PIL": "pillow",
+}
 PARTS = {"IPython": "jupyterlab", "jupyter_client": "jupyterlab", "nbconvert": "jupyterlab", "nbformat": "papermill"}
 PARTS |= {"nbclient": "papermill", "jinja2": "jinja2"}
 
@@ -57,12 +64,17 @@ def call(checkout: Path, **environment: str) -> subprocess.CompletedProcess:
     )
 
 
-def declared() -> dict[str, Requirement]:
-    return {need.name: need for need in map(Requirement, PYPROJECT["project"]["dependencies"])}
+def declared(*extras: str) -> dict[str, Requirement]:
+    """What the package requires, and what these extras and those that they consist of add."""
+    needs = list(map(Requirement, PYPROJECT["project"]["dependencies"])) if not extras else []
+    for extra in extras:
+        needs += map(Requirement, PYPROJECT["project"]["optional-dependencies"][extra])
+    ours = [name for need in needs if need.name == "p2p-lib" for name in need.extras]
+    return {need.name: need for need in needs if need.name != "p2p-lib"} | (declared(*ours) if ours else {})
 
 
-def imported() -> set[str]:
-    """Distributions that the package or what stands beside the notebooks imports, by name, anywhere."""
+def imported(asked_for: bool = False) -> set[str]:
+    """Distributions that the package or what stands beside the notebooks imports; or also those asked for by a name."""
     modules = set()
     for path in [*(PROJECT / "p2p_lib").rglob("*.py"), *(PROJECT / "notebooks" / "studies").glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
@@ -70,17 +82,26 @@ def imported() -> set[str]:
                 modules |= {name.name.split(".")[0] for name in node.names}
             elif isinstance(node, ast.ImportFrom):
                 modules.add(node.module.split(".")[0])
-    return {PARTS.get(m) or DISTRIBUTIONS.get(m, m) for m in modules - set(sys.stdlib_module_names) - {"p2p_lib", "studies"}}
+            elif asked_for and isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+                called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+                modules |= {str(node.args[0].value).split(".")[0]} if called in ("load", "import_module") else set()
+    modules -= OURS | set(sys.stdlib_module_names)
+    return {PARTS.get(module) or DISTRIBUTIONS.get(module, module) for module in modules}
 
 
 def test_declared_is_what_is_used():
-    assert declared().keys() >= REQUIRED
-    optional_needs = PYPROJECT["project"]["optional-dependencies"].values()
-    extras = {Requirement(need).name for needs in optional_needs for need in needs}
-    optional = imported() - declared().keys() - extras
-    assert not optional, f"imported, not declared in pyproject.toml: {sorted(optional)}"
-    idle = declared().keys() - imported() - REQUIRED - {"libusb-package"}
+    extras = PYPROJECT["project"]["optional-dependencies"].keys() - {"dev"}
+    known = declared() | declared(*extras)
+    undeclared = imported() - known.keys()
+    assert not undeclared, f"imported, not declared in pyproject.toml: {sorted(undeclared)}"
+    idle = known.keys() - imported(asked_for=True) - {"jupyterlab", "libusb-package"}
     assert not idle, f"declared, imported nowhere: {sorted(idle)}"
+
+
+def test_the_set_up_installs_what_the_project_is_built_on():
+    """All of it is used above: jupyterlab by ``make lab``."""
+    assert (declared() | declared("all")).keys() >= REQUIRED
+    assert declared("dev").keys() >= declared("all").keys(), "what make lock resolves, and make setup installs"
 
 
 def test_lock_pins_everything_declared_and_names_no_host():
@@ -90,8 +111,7 @@ def test_lock_pins_everything_declared_and_names_no_host():
         pin = Requirement(line)
         assert re.fullmatch(r"==[\w.+]+", str(pin.specifier)), f"not pinned: {line}"
         pins.setdefault(pin.name, []).append(pin)
-    dev = map(Requirement, PYPROJECT["project"]["optional-dependencies"]["dev"])
-    for need in [*declared().values(), *dev]:
+    for need in (declared() | declared("dev")).values():
         assert need.name in pins, f"{need.name}: run make lock"
         for pin in pins[need.name]:
             version = str(pin.specifier).removeprefix("==")
@@ -243,11 +263,11 @@ def test_the_quickstart_installs_what_it_lacks(monkeypatch):
     asked = []
     shell = SimpleNamespace(run_line_magic=lambda *words: asked.append(words))
     monkeypatch.setattr(IPython, "get_ipython", lambda: shell)
-    exec(first.partition("\nfrom p2p_lib")[0], {})
+    exec(first, {})
     assert not asked, "it is installed here"
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    exec(first.partition("\nfrom p2p_lib")[0], {})
-    assert asked == [("pip", f"install -q {PYPROJECT['project']['name']}")]
+    exec(first, {})
+    assert asked == [("pip", f"install -q '{PYPROJECT['project']['name']}[notebooks,view]'")]
 
 
 def test_the_container_is_given_what_the_set_up_reads(bootstrap, tmp_path):

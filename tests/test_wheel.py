@@ -6,11 +6,14 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import zipfile
+from email import message_from_bytes
 from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
 
 from p2p_lib.core.paths import cache_dir
 from p2p_lib.datasets.runs import load_run
@@ -21,10 +24,11 @@ SOURCES = ("p2p_lib", "data_manifests", "pyproject.toml", "README.md", "LICENSE"
 FRAMES = 6
 
 
-def ran(*words: object, **more) -> str:
+def ran(*words: object, code: int = 0, **more) -> str:
+    """What a program prints, or says on standard error where it is to end with another code."""
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, timeout=1800, **more)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stderr if code else done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +66,9 @@ def p2p(wheel, tmp_path_factory):
         "--no-index",
         wheel,
     )
-    return lambda *words: ran(home / "env" / "bin" / words[0], *words[1:], cwd=home / "empty", env=env)
+    return lambda *words, code=0: ran(
+        home / "env" / "bin" / words[0], *words[1:], code=code, cwd=home / "empty", env=env
+    )
 
 
 def test_the_wheel_has_all_that_is_no_source(wheel):
@@ -71,6 +77,26 @@ def test_the_wheel_has_all_that_is_no_source(wheel):
     assert {str(path.relative_to(PROJECT)) for path in ours} <= set(listed)
     manifests = {str(path.relative_to(PROJECT)) for path in (PROJECT / "data_manifests").rglob("*.json")}
     assert manifests <= {name.partition("share/p2p_lib/")[2] for name in listed}
+
+
+def test_the_wheel_requires_what_tracks_and_holds_nothing_of_the_notebooks(wheel):
+    with zipfile.ZipFile(wheel) as whole:
+        listed = whole.namelist()
+        said = message_from_bytes(whole.read(next(name for name in listed if name.endswith(".dist-info/METADATA"))))
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    required = {Requirement(need).name for need in said.get_all("Requires-Dist") if "extra ==" not in need}
+    assert required == {Requirement(need).name for need in project["dependencies"]}
+    assert set(said.get_all("Provides-Extra")) == set(project["optional-dependencies"])
+    assert not [name for name in listed if "studies" in name or name.endswith(".ipynb")]
+
+
+def test_commands_of_a_clone_say_that_they_need_one(p2p):
+    for command in (("notebooks", "--only", "03"), ("figures",)):
+        said = p2p("p2p", *command, code=2)
+        assert said.splitlines() == [
+            f"p2p {command[0]}: notebooks: they are not part of the installed package. "
+            "Clone the repository and call this inside it."
+        ]
 
 
 def test_the_first_commands_of_the_readme(p2p, tmp_path):

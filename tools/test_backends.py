@@ -15,7 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 VENV, HOME = ROOT / ".venv-backends", ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
-TESTS = ("tests/trackers/test_official.py", "tests/segmenters/test_sam2.py", "tests/detectors/test_superpoint.py")
+TESTS = ("tests/trackers/test_official.py", "tests/segmenters/test_sam2_video.py", "tests/detectors/test_superpoint.py")
 TORCHVISION = "torchvision==0.28.0"
 #: Without their dependencies: those of tapnet's JAX version are gigabytes that the PyTorch version does not use.
 ALONE = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -85,7 +86,7 @@ def simulate_turn(
     m = np.arange(keyframes)
     turned = se3.exp(np.radians(step_deg) * m[:, None] * [0, 1.0, 0, 0, 0, 0])
     sway = se3.exp(np.radians(15) * np.stack([np.sin(m / 5), 0 * m, np.sin(m / 7)] + [0 * m] * 3, -1))
-    T_cam_obj = se3.from_rt(np.eye(3), [0.0, 0.0, 0.55]) @ sway @ turned
+    T_cam_obj = se3.from_rt(np.eye(3), np.array([0.0, 0.0, 0.55])) @ sway @ turned
     exact = se3.transform(T_cam_obj, p_obj)
     range_m = np.linalg.norm(exact, axis=-1, keepdims=True)
     facing = -np.einsum("mij,nj,mni->mn", T_cam_obj[:, :3, :3], normal, exact / range_m)
@@ -138,6 +139,7 @@ def optimise_online(turn: Turn, registered: Solved, config: Config) -> list[Solv
 def _growing_graph(turn: Turn, registered: Solved, config: Config) -> Iterator[ObjectGraph]:
     """The graph after each keyframe was added, as the pipeline adds it."""
     graph = ObjectGraph(config.factor_graph)
+    assert registered.covariance is not None, "registration always has one"
     for m, ids in enumerate(map(np.flatnonzero, turn.seen)):
         graph.add_keyframe(
             registered.T_cam_obj[m],
@@ -175,7 +177,7 @@ def outlier_trials(seeds: Iterable[int], config: Config, outliers: float) -> Dat
     return DataFrame(rows)
 
 
-def consistency(trials: int, config: Config, seed: int = 0, **turn: object) -> np.ndarray:
+def consistency(trials: int, config: Config, seed: int = 0, **turn: Any) -> np.ndarray:
     """(trials, 2) normalised squared errors of the newest keyframe, rotation and translation, by its covariance.
 
     Each is e^T Sigma^-1 e of three numbers, distributed as chi square of 3 if the covariance is honest: median 2.37.

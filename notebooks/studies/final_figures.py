@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -57,7 +57,7 @@ def rate_figure(table: Path) -> Figure:
     rows = read_csv(table).set_index("Setting")
     time_ms = rows["processor, files included (ms)"].dropna().rename(lambda name: name.partition(",")[0])
     whole = time_ms.iloc[0]
-    panels_of = {
+    panels_of: dict[str, dict[Any, float]] = {
         "objects": {int(k.split()[0]): v for k, v in time_ms.items() if "object" in k},
         "tracks an object": {int(k.split()[0]): v for k, v in time_ms.items() if "tracks" in k} | {60: whole},
         "megapixels": {np.prod([int(n) for n in k.split("x")]) / 1e6: v for k, v in time_ms.items() if "x" in k}
@@ -94,7 +94,7 @@ def error_histograms(benchmark: Benchmark) -> Figure:
     """ADD and ADD-S of each method over all scored frames, aligned at the first; what has no pose stands apart."""
     figure, axes = panels(2, (WIDTH_IN, 3.2), side_by_side=True)
     for axis, (key, title) in zip(axes, (("add_m", "ADD"), ("adds_m", "ADD-S")), strict=True):
-        errors = defaultdict(list)
+        errors: dict[str, list] = defaultdict(list)
         for job, outcome in benchmark.results:
             errors[job.method.name] += [1e3 * obj.errors_m("first")[key] for obj in outcome.objects.values()]
         for colour, name in zip(style.METHODS, filter(errors.get, benchmark.methods), strict=False):
@@ -162,7 +162,8 @@ def reconstruction_sheet(benchmark: Benchmark, method: str) -> np.ndarray:
         file = run.path / "meshes" / f"{name}.ply"
         if not file.is_file() or name not in models:
             continue
-        surface, truth = read_mesh(file), load_mesh(models[name])
+        surface: Any = read_mesh(file)
+        truth: Any = load_mesh(models[name])
         truth = replace(truth, vertices=se3.transform(score.T_obj_model, truth.vertices), normals=None)
         chamfer_cm = benchmark.chamfer_cm(method, "", name)
         distance = "" if chamfer_cm is None else f", CD {10 * chamfer_cm:.1f} mm"

@@ -52,7 +52,8 @@ def fault_picture(table: DataFrame) -> Figure:
     image = axis.imshow(np.ma.masked_invalid(of_goal.clip(upper=2)), shades, vmin=0, vmax=2, aspect="auto")
     for (row, column), ratio in np.ndenumerate(of_goal.to_numpy()):
         shown = str(table[of_goal.columns[column]].iloc[row])
-        dark = {"color": style.ink(to_hex(image.to_rgba(min(ratio, 2.0)))), "weight": "bold" if ratio > 1 else "normal"}
+        shade = to_hex(image.to_rgba(min(float(ratio), 2.0)))
+        dark = {"color": style.ink(shade), "weight": "bold" if ratio > 1 else "normal"}
         axis.text(column, row, shown, ha="center", va="center", fontsize=7.5, **dark)
     rows = [
         f"{fault} (failed: {n})" if n not in ("0", 0) else fault for fault, n in zip(table["Fault"], table["failed"])
@@ -143,6 +144,7 @@ def findings_table(findings: Mapping[str, Sequence[Any]]) -> DataFrame:
 
 def story(playback: Playback, prompts: Sequence[Prompt], rows: Sequence[int], width_px: int = 430) -> np.ndarray:
     """Clicks, poses and surfaces on one sheet: the clicked image, the run at some rows, each object reconstructed."""
+    assert playback.sequence is not None
     boxes = {name: overlay.tight_box(mesh) for name, mesh in playback.meshes.items()}
     scene = Scene(playback.sequence, playback.run, boxes=boxes, truth=False)
     region_px = scene.region()

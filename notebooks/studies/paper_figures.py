@@ -11,6 +11,7 @@ import json
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pandas import DataFrame
@@ -113,17 +114,17 @@ def framework(runs: Benchmark) -> np.ndarray:
         "track, lift": tracked,
         "fuse": surfaces,
     }
-    strip = [
+    images = [
         overlay.draw_caption(overlay.zoomed(image, video.camera, region_px, width_px)[0], title)
         for title, image in shown.items()
     ]
     pose = overlay.draw_caption(scene.draw(row, region_px, width_px, trail=0, words=False), "register, refine")
-    strip = overlay.montage([*strip, pose], 6)
+    strip = overlay.montage([*images, pose], 6)
     with io.BytesIO() as page, style.applied():
         pipeline_diagram().savefig(page, format="png", dpi=200)
-        diagram = Image.open(page).convert("RGB")
-        size = strip.shape[1], round(diagram.height * strip.shape[1] / diagram.width)
-        diagram = np.array(diagram.resize(size, Image.Resampling.LANCZOS))
+        wide: Any = Image.open(page).convert("RGB")
+        size = strip.shape[1], round(wide.height * strip.shape[1] / wide.width)
+        diagram = np.array(wide.resize(size, Image.Resampling.LANCZOS))
     return np.concatenate([diagram, _marked(strip, "one rendered frame")])
 
 

@@ -44,14 +44,14 @@ class Stage:
 #: order in which a frame that becomes a keyframe meets them.
 STAGES = {
     "tracking": Stage("track points", "trackers/", "01", (1, 2)),
-    "scene": Stage("locate camera", "recovery/scene.py", "07", (4, 2), True),
-    "search": Stage("search", "recovery/search.py", "07", (3, 2), True),
+    "scene": Stage("locate camera", "extended/scene.py", "07", (4, 2), True),
+    "search": Stage("search", "extended/image_search.py", "07", (3, 2), True),
     "segmentation": Stage("segment", "segmenters/", "10", (2, 2)),
     "observation": Stage("lift to 3D", "method/observation.py", "10", (0, 1)),
     "registration": Stage("register", "method/registration.py", "03", (1, 1)),
     "refinement": Stage("refine", "method/refinement.py", "04", (2, 1)),
     "selection": Stage("select", "method/selection.py", "03", (3, 1)),
-    "judging": Stage("judge", "method/lifecycle.py", "07", (4, 1), True),
+    "judging": Stage("judge", "extended/gates.py", "07", (4, 1), True),
     "map": Stage("keypoint map", "method/keypoint_map.py", "02", (1, 0)),
     "sampling": Stage("sample points", "method/sampling.py", "02", (0, 0)),
     "graph": Stage("factor graph", "method/factor_graph.py", "05", (2.15, 0)),

@@ -10,11 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from pandas import DataFrame, Series
 
+from p2p_lib.core import se3
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.datasets.sequence import open_sequence
@@ -46,8 +48,17 @@ def excerpt(name: str, frames: range, seed: int, folder: Path) -> Video:
     bodies = tuple(replace(body, T_world_model=body.T_world_model[frames]) for body in whole.bodies)
     rmtree(folder, ignore_errors=True)
     write_scenario(folder, replace(whole, T_world_cam=whole.T_world_cam[frames], bodies=bodies), Sensor(), seed, name)
-    video = open_sequence(folder, "ycbmultitrack")
+    video: Any = open_sequence(folder, "ycbmultitrack")
     return replace(video, name=f"synthetic/{name}", times_s=frames.step * video.times_s)
+
+
+def fastest(name: str, seed: int, before: int = 20, after: int = 12) -> tuple[range, np.ndarray]:
+    """Frames of ``synthetic/NAME`` about its first body's largest turn, and the turn after each (degrees)."""
+    T_world_model = SCENARIOS[name](seed).bodies[0].T_world_model
+    turn_deg = np.degrees(se3.angle_rad(se3.inverse(T_world_model[:-1]) @ T_world_model[1:]))
+    worst = int(turn_deg.argmax())
+    frames = range(max(0, worst - before), min(worst + after, len(turn_deg)))
+    return frames, turn_deg[frames]
 
 
 @style.styled

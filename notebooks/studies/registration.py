@@ -127,7 +127,8 @@ def ways_to_decide(moment: Moment, config: Config, seed: int = 0) -> dict[str, n
     T = np.stack([h.T_cam_obj for h in hypotheses])
     inliers = [Keypoints(*(values[h.inliers] for values in (*points, sigma_m))) for h in hypotheses]
     volume = moment.cloud, moment.surface, config.refinement
-    T_refined = np.stack([refine(*pair, *volume, keypoints=k).T_cam_obj for *pair, k in zip(T, inliers, strict=True)])
+    pairs = zip(T, inliers, strict=True)
+    T_refined = np.stack([refine(start, *volume, keypoints=k).T_cam_obj for start, k in pairs])
     off_m, refined_m = (surface_distances(moment.surface, moment.cloud, P) for P in (T, T_refined))
     return {
         "SVD, outliers out, SVD": single[0].T_cam_obj if single else np.full((4, 4), np.nan),

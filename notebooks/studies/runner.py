@@ -17,12 +17,14 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, did_you_mean
+from p2p_lib.core.packages import needed_for
 from p2p_lib.figures.claims import CHECKS_MIME, Claim, Value
 from studies import CLONE, course, equations
 
@@ -100,6 +102,9 @@ def run_notebooks(
     Raises :class:`BadInput` for unknown parameters before anything runs, and :class:`NotebookFailed` at the first
     notebook with a failing cell; what ran so far is on disk and in the gallery.
     """
+    with needed_for("notebooks"):
+        for package in ("jinja2", "nbconvert", "papermill"):
+            import_module(package)
     if profile not in PROFILES:
         raise BadInput("profile", repr(profile), "one of " + ", ".join(PROFILES))
     if jobs < 1:
@@ -144,8 +149,9 @@ def notebook_parameters(path: Path) -> dict[str, Value]:
     source = "\n".join(cell.source for cell in _read(path).cells if "parameters" in cell.metadata.get("tags", []))
     values = {}
     try:
+        statement: Any
         for statement in ast.parse(source).body:
-            target = statement.target if isinstance(statement, ast.AnnAssign) else statement.targets[0]
+            target: Any = statement.target if isinstance(statement, ast.AnnAssign) else statement.targets[0]
             values[target.id] = ast.literal_eval(statement.value)
     except (SyntaxError, ValueError, AttributeError, TypeError):
         raise BadInput(f"{path.name}: parameters", repr(source), "lines of the form NAME = literal") from None
@@ -252,14 +258,16 @@ def _kernel_manager(places: Mapping[str, Path], kernels: list[Any]) -> type:
             self._folder = tempfile.TemporaryDirectory(prefix="p2p-")  # goes with the manager
             self.transport, self.ip = "ipc", str(Path(self._folder.name) / "kernel")
 
-        async def start_kernel(self, **options: Any) -> None:
+        async def start_kernel(self, **options: Any) -> None:  # type: ignore[override]
             # What a cell raises is in the notebook; a kernel logs besides that it was interrupted when it is shut down.
             quiet = [*options.pop("extra_arguments", ()), "--log-level=CRITICAL"]
             await super().start_kernel(**options | {"extra_arguments": quiet, "env": {**os.environ, **environment}})
             kernels.append(self)
 
         def kill(self) -> None:
-            os.killpg(os.getpgid(self.provisioner.pid), signal.SIGKILL)
+            provisioner: Any = self.provisioner
+            with suppress(ProcessLookupError):  # it has ended by itself
+                os.killpg(os.getpgid(provisioner.pid), signal.SIGKILL)
 
     return Manager
 

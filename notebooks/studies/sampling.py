@@ -23,9 +23,9 @@ from p2p_lib.core.interfaces import Candidates, PointTracker
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.evaluation.true_tracks import TrueScene
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.plots import WIDTH_IN, panels
-from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.method.registration import Hypothesis, covariance
 from p2p_lib.method.sampling import Terms, choose, distance_px, terms, usable_region
 
@@ -48,6 +48,13 @@ _RIM = [withStroke(linewidth=2.4, foreground="black")]
 _IN_SIGHT_M = 0.01
 
 
+def mask_of(video: Video, name: str, index: int) -> np.ndarray:
+    """(H, W) bool of an object in a frame that has masks."""
+    masks = video.masks(index)
+    assert masks is not None, "the sequences of this notebook have masks"
+    return masks[name]
+
+
 class Situation:
     """One object in one frame, before any point is chosen; with the default parameters and ``settings``.
 
@@ -56,7 +63,7 @@ class Situation:
 
     def __init__(self, video: Video, name: str, index: int, settings: Mapping[str, Any] | None = None):
         self.video, self.name, self.config = video, name, preset().with_values(dict(settings or {}))
-        self.frame, self.mask = video.frame(index), video.masks(index)[name]
+        self.frame, self.mask = video.frame(index), mask_of(video, name, index)
         self.usable = usable_region(self.frame, self.mask, self.config.depth.edge_m)
 
     def candidates(self, detector: str = "corners", seed: int = 0) -> Candidates:
@@ -191,7 +198,7 @@ class MapHistory:
 def follow_map(sequence: Video, name: str, frames: int, tracker: str = "builtin", seed: int = 0) -> MapHistory:
     """Run the pipeline on one object of a sequence with truth and write down what becomes of its points."""
     method = Point2Pose(sequence.camera, preset(seed=seed), tracker=tracker)
-    method.add_object(name, mask=sequence.masks(0)[name])
+    method.add_object(name, mask=mask_of(sequence, name, 0))
     keyframe, poses, maps = np.zeros(frames, bool), np.full((frames, 4, 4), np.nan), []
     for t in range(frames):
         masks = sequence.masks(t) or {}
@@ -363,7 +370,7 @@ def promotion_moments(history: MapHistory) -> list[int]:
 def promotion_sheet(video: Video, history: MapHistory, frames: Sequence[int]) -> np.ndarray:
     """The part of the map in sight at a few frames of the video: pending points are rings, keypoints dots."""
     colour, points = style.object_colours(video.objects)[history.name], history.points
-    box = overlay.region_around(np.any([video.masks(t)[history.name] for t in frames], axis=0), video.camera)
+    box = overlay.region_around(np.any([mask_of(video, history.name, t) for t in frames], axis=0), video.camera)
     images = []
     for t in frames:
         frame, promoted = video.frame(t), (points.promoted <= t).to_numpy()

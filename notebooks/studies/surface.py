@@ -57,6 +57,7 @@ class Body:
 
     def distance_m(self, p: np.ndarray) -> np.ndarray:
         """Exact signed distance (...) of points (..., 3), outside positive."""
+        assert self.beyond_m is not None
         beyond = self.beyond_m(p)
         return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
 
@@ -282,7 +283,7 @@ def basin_of_convergence(
 
     Depth points p_cam (N, 3) alone, without keypoints.
     """
-    starts = [perturbed(T_true, *by, np.random.default_rng([seed, k])) for k, by in enumerate(off)]
+    starts = [perturbed(T_true, deg, mm, np.random.default_rng([seed, k])) for k, (deg, mm) in enumerate(off)]
     return np.array([se3.error_deg_mm(refine(T, p_cam, volume, config).T_cam_obj, T_true) for T in starts])
 
 
@@ -296,7 +297,8 @@ def spin_errors(
 ) -> np.ndarray:
     """(n,) degrees of spin about the body's z axis that are left of ``start_deg``, one per cloud of depth points."""
     start = T_true @ se3.exp(np.r_[0, 0, np.radians(start_deg), 0, 0, 0])
-    pairs = zip(clouds, keypoints or [None] * len(clouds), strict=True)
+    of_cloud: Sequence[Keypoints | None] = keypoints or [None] * len(clouds)
+    pairs = zip(clouds, of_cloud, strict=True)
     found = np.stack([refine(start, p_cam, volume, config, keypoints=points).T_cam_obj for p_cam, points in pairs])
     return np.degrees(se3.log(se3.inverse(T_true) @ found)[:, 2])
 
@@ -314,7 +316,8 @@ def label_points(
 @style.styled
 def onto_the_surface(volume: TsdfVolume, p_cam: np.ndarray, poses: Mapping[str, np.ndarray]) -> Figure:
     """The slice z = 0 through the fused surface, with the measured points within 6 mm of it as each pose puts them."""
-    points = slice_points(*around_surface(volume, 0.0), 0.0)
+    low_m, high_m = around_surface(volume, 0.0)
+    points = slice_points(low_m, high_m, 0.0)
     figure, axes = panels(len(poses), (4.2 * len(poses), 4.0), side_by_side=True)
     for axis, (name, T_cam_obj) in zip(axes, poses.items(), strict=True):
         shown = draw_slice(axis, points, seen_distance(volume, points), volume.tau_m)
@@ -354,7 +357,7 @@ def basins(errors: Mapping[str, np.ndarray], off: np.ndarray, limit: tuple[float
     bins = np.linspace(0, off[:, 1].max(), 7)
     of = np.digitize(off[:, 1], bins[1:-1])
     for axis, colour, (name, found) in zip(axes, style.METHODS, errors.items(), strict=False):
-        back = (found <= limit).all(-1)
+        back = np.atleast_1d((found <= limit).all(-1))
         for rows, mark, shade in ((back, "o", colour), (~back, "x", style.STATUS["lost"][0])):
             axis.plot(off[rows, 1], off[rows, 0], mark, color=shade, markersize=4, alpha=0.8)
         axis.set(xlabel="start off by [mm]", title=f"{name}: {back.sum()} of {len(back)} back")

@@ -98,10 +98,10 @@ class RecordedTracker:
             frame = scene.sequence.frame(index)
             ids.append(new_ids)
             points = joined([points, scene.lift(frame, scene.owners(frame, uv_px), uv_px)])
-        ids, found = np.concatenate(ids), []
+        known, found = np.concatenate(ids), []
         for index, tracks in self._answers:
             tracks = tracks.select(tracks.ids[tracks.visible])
-            mine = points.select(np.searchsorted(ids, tracks.ids))
+            mine = points.select(np.searchsorted(known, tracks.ids))
             sight = scene.see(scene.sequence.frame(index), mine)
             error_px = np.linalg.norm(tracks.uv_px - sight.uv_px, axis=1)
             columns = {"frame": index, "u_px": tracks.uv_px[:, 0], "v_px": tracks.uv_px[:, 1], "error_px": error_px}
@@ -167,7 +167,8 @@ def visible_texture(rgb: np.ndarray, mask: np.ndarray) -> float:
 def fading_label(contrast: float, frames: int, seed: int = 0) -> Video:
     """``synthetic/fading_label`` at a contrast of its print: for one seed all else is the same."""
     folder = scenario_dir("fading_label", seed, contrast=float(contrast), frames=frames)
-    return replace(open_sequence(folder, "ycbmultitrack"), name=f"synthetic/fading_label {seed}, contrast {contrast:g}")
+    video: Any = open_sequence(folder, "ycbmultitrack")
+    return replace(video, name=f"synthetic/fading_label {seed}, contrast {contrast:g}")
 
 
 def present(names: Iterable[str], left_out: str = "") -> dict[str, Video | str]:
@@ -240,7 +241,11 @@ def rank_correlation(
 def correlate(windows: DataFrame, seed: int = 0) -> tuple[RankCorrelation, RankCorrelation]:
     """Texture with track error, and texture with ADD AUC, over windows; those of one object belong together."""
     groups = windows.sequence + ": " + windows.object
-    return tuple(rank_correlation(windows.texture, windows[key], groups, seed) for key in ("track_px", "add_auc"))
+    to_tracks, to_poses = (windows[key] for key in ("track_px", "add_auc"))
+    return (
+        rank_correlation(windows.texture, to_tracks, groups, seed),
+        rank_correlation(windows.texture, to_poses, groups, seed),
+    )
 
 
 def correlation_table(windows: Mapping[str, DataFrame], seed: int = 0) -> DataFrame:

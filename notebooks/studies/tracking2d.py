@@ -115,7 +115,7 @@ class TrackScene:
         """Objects and spans [start, stop) of frames in which truth sees none of their points, by their start."""
         found = []
         for name, points in self._points.items():
-            spans = status_intervals(self.score.truth.visible[:, points].any(1))
+            spans = status_intervals(np.any(self.score.truth.visible[:, points], 1))
             found += [(name, a, b) for seen, a, b in spans if seen == "False" and a > 0 and b - a >= _MIN_ABSENCE]
         return sorted(found, key=lambda span: span[1])
 

@@ -418,7 +418,12 @@ def _convert(a: argparse.Namespace) -> None:
     arg("--out", type=Path, metavar="DIR", help="a new folder for the sequence"),
     arg("--seed", type=int, default=0, metavar="N", help="of labels, paths and noise (default 0)"),
     arg("--noise", default="realsense", metavar="NAME", help="exact, realsense (default) or hard"),
-    arg("--models", type=Path, metavar="DIR", help="YCB models for the ycb_ scenarios (default: stand-ins)"),
+    arg(
+        "--models",
+        type=Path,
+        metavar="DIR",
+        help="YCB models, for ycb_, in_hand and thin_ scenarios (default: procedural ones)",
+    ),
     arg("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop"),
 )
 def _synth(a: argparse.Namespace) -> None:
@@ -453,12 +458,13 @@ def _data_info(a: argparse.Namespace) -> None:
     "download into $P2P_DATA, check and unpack; unpack what was had by hand",
     _DATASET,
     arg("--only", metavar="PART,PART", help="only the files whose names contain one of these"),
+    arg("--from", dest="source", type=Path, metavar="FILE", help="take them from a file, folder or archive you have"),
     _QUIET,
 )
 def _data_fetch(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.inventory import fetch, manifest
 
-    for line in fetch(manifest(a.dataset), names(a.only) or (), not a.quiet):
+    for line in fetch(manifest(a.dataset), names(a.only) or (), not a.quiet, a.source):
         print(line, flush=True)
 
 
@@ -511,8 +517,10 @@ def _data_where(a: argparse.Namespace) -> None:
 )
 def _config(a: argparse.Namespace) -> None:
     from p2p_lib.core import config as configuration
+    from p2p_lib.extended.default import MECHANISMS, chosen
 
-    rows = configuration.parameters(RunOptions.of_arguments(a).config(), a.only)
+    config = RunOptions.of_arguments(a).config()
+    rows, on = configuration.parameters(config, a.only), chosen(config)
     if a.diff:
         paper = {key: left for key, (left, _) in configuration.diff().items()}
         rows = [{"key": r["key"], "paper": paper[r["key"]], **r} for r in rows if r["key"] in paper]
@@ -523,6 +531,8 @@ def _config(a: argparse.Namespace) -> None:
         value = f"{row['value']} {row['unit']}".strip()
         value += f" (paper: {row['paper']})" if a.diff else ""
         print(f"{row['key']} = {value}\n    {row['meaning']} [{row['source']}]")
+        for name, does in MECHANISMS.items() if row["key"] == "method.mechanisms" else ():
+            print(f"        {name}{'' if name in on else ' (left out)'}: {does}")
     whose = "paper (its text), release (the authors' configuration) or ours"
     print(f"In brackets, whose value it is: {whose}. Change one with --set KEY=VALUE.")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import platform
 import re
@@ -14,41 +13,45 @@ from pathlib import Path
 
 from p2p_lib.core import native
 from p2p_lib.core.findings import Finding
-from p2p_lib.core.packages import INSTALL, command, cotracker_folder
+from p2p_lib.core.packages import EXTRAS, INSTALL, command, cotracker_folder, extra
 from p2p_lib.core.paths import PROJECT, cache_dir, data_dir
 
 #: Distributions whose module has another name.
-MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-image": "skimage"}
-#: Optional backend: module, what it serves, remedy.
-OPTIONAL = {
-    "transformers": ("transformers", "segmentation and features by neural networks", INSTALL["transformers"]),
-    "tapnet": ("tapnet", "2D trackers tapir and tapnextpp", INSTALL["tapnet"]),
-    "torchvision": ("torchvision", "2D tracker tapnextpp", INSTALL["torchvision"]),
-    "rerun": ("rerun", "recordings to look at frame by frame, p2p view --rerun", INSTALL["rerun-sdk"]),
-    "rosbags": ("rosbags", "ROS 1 and 2 recordings, p2p convert", INSTALL["rosbags"]),
-    "pyrealsense2": ("pyrealsense2", "RealSense cameras and recordings", INSTALL["pyrealsense2"]),
-    "dask": ("dask.distributed", "runs on a cluster", INSTALL["distributed"]),
-}
-FREE_GB = 5.0
+MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-image": "skimage", "rerun-sdk": "rerun"}
+#: What no extra brings: what it serves.
+OPTIONAL = {"tapnet": "2D trackers tapir and tapnextpp", "torchvision": "2D tracker tapnextpp"}
+#: Room for the results of a clone's notebooks, and of some runs.
+CLONE_GB, FREE_GB = 5.0, 1.0
 # How long a package may take to load before something is taken to be wrong with it.
 IMPORT_TIMEOUT_S = 180
 
 
 def run_doctor() -> list[Finding]:
-    """Python, required packages (really imported, in a process of their own), libraries, GPU, backends, data."""
-    required = required_packages()
+    """Python, packages (really imported, in a process of their own), libraries, GPU, data, disk.
+
+    An extra that is not installed is left out on purpose: optional, as one line. What is installed has to work.
+    """
+    extras = {name: packages_of(name) for name in EXTRAS}
+    there = {name: [package for package in of if _installed(package)] for name, of in extras.items()}
+    names = packages_of() + sorted({package for of in there.values() for package in of})
     # Together they take seconds; where that fails each is imported by itself, which tells which it is.
-    fine = not _fails("\n".join(map(_loading, required)))
-    imports = [_package(name, "" if fine else None) for name in required]
-    libraries = [_library(library, package) for library, package in native.SYSTEM_LIBRARIES.items()]
-    optional = [_optional(name, *about) for name, about in OPTIONAL.items()]
-    return [_python(), *imports, *libraries, _kernel(), _gpu(), *optional, _cotracker(), _data(), _cache(), _disk()]
+    fine = not _fails("\n".join(map(_loading, names)))
+    imports = [_package(name, "" if fine else None) for name in names]
+    optional = [_extra(name, sorted(set(of) - set(there[name]))) for name, of in extras.items()]
+    optional += [_optional(name, serves) for name, serves in OPTIONAL.items()]
+    libraries = [_library(*pair) for pair in native.SYSTEM_LIBRARIES.items() if _installed("open3d")]
+    kernel = [_kernel()] if _installed("jupyterlab") else []
+    return [_python(), *imports, *libraries, *kernel, *optional, _gpu(), _cotracker(), _data(), _cache(), _disk()]
 
 
-def required_packages() -> list[str]:
-    """The distributions that this package requires, as its own metadata says."""
-    needs = metadata.requires("p2p-lib") or []
-    return sorted(re.match(r"[A-Za-z0-9._-]+", need)[0] for need in needs if "extra ==" not in need)
+def packages_of(extra: str = "") -> list[str]:
+    """The distributions that this package requires, or that one of its extras adds, as its own metadata says."""
+    found = set()
+    for need in metadata.requires("p2p-lib") or []:
+        name, marker = re.match(r"[A-Za-z0-9._-]+", need)[0], re.search(r"""extra == ['"]([\w-]+)""", need)
+        if (marker[1] if marker else "") == extra and name != "p2p-lib":
+            found.add(name)
+    return sorted(found)
 
 
 def _python() -> Finding:
@@ -64,12 +67,17 @@ def _loading(name: str) -> str:
     return f"import {MODULES.get(name, name.replace('-', '_'))}"
 
 
+def _setup(name: str) -> str:
+    """What installs a package anew: in a clone the set-up, elsewhere pip."""
+    return "make setup" if (PROJECT / "notebooks").is_dir() else command(f"{{pip}} install --force-reinstall {name}")
+
+
 def _package(name: str, error: str | None = None) -> Finding:
     """A required package; ``error`` is what ended its import, None where nobody has tried."""
     if name == "libusb-package" and native.loads("libusb-1.0.so.0"):
         return Finding.whether(True, name, "not needed: the system has libusb")
     error = _fails(_loading(name)) if error is None else error
-    remedy = error.partition("Run: ")[2] or "make setup"
+    remedy = error.partition("Run: ")[2] or _setup(name)
     return Finding.whether(not error, name, error or metadata.version(name), remedy)
 
 
@@ -105,17 +113,29 @@ def _gpu() -> Finding:
         found = "none; everything runs on the CPU"
         return Finding.whether(False, "GPU", found, "nothing to do without an NVIDIA GPU", optional=True)
     name = re.sub(r" \(UUID.*", "", listed[0])
+    if not _installed("torch"):
+        return Finding.whether(False, "GPU", f"{name}; torch is not installed", command(extra("torch")), optional=True)
     error = _fails("import torch, sys; sys.exit(None if torch.cuda.is_available() else f'torch {torch.__version__}')")
     found = f"{name}; {error or 'torch uses it'}"
     return Finding.whether(not error, "GPU", found, "P2P_TORCH=cuda make setup", optional=True)
 
 
-def _optional(name: str, module: str, serves: str, remedy: str) -> Finding:
+def _extra(name: str, lacking: list[str]) -> Finding:
+    found = EXTRAS[name] + (f"; not installed: {', '.join(lacking)}" if lacking else "")
+    return Finding.whether(not lacking, f"extra {name}", found, command(extra(name)), optional=True)
+
+
+def _optional(name: str, serves: str) -> Finding:
+    there = _installed(name)
+    remedy = command(INSTALL[name])
+    return Finding.whether(there, name, serves + ("" if there else "; not installed"), remedy, optional=True)
+
+
+def _installed(name: str) -> bool:
     try:
-        there = importlib.util.find_spec(module) is not None
-    except ModuleNotFoundError:  # its parent package is missing
-        there = False
-    return Finding.whether(there, name, serves + ("" if there else "; not installed"), command(remedy), optional=True)
+        return bool(metadata.version(name))
+    except metadata.PackageNotFoundError:
+        return False
 
 
 def _cotracker() -> Finding:
@@ -142,6 +162,7 @@ def _cache() -> Finding:
 
 
 def _disk() -> Finding:
-    free_gb = shutil.disk_usage(PROJECT).free / 1e9
-    remedy = f"free {FREE_GB:.0f} GB beside the project"
-    return Finding.whether(free_gb >= FREE_GB, "disk", f"{free_gb:.0f} GB free", remedy)
+    in_clone = (PROJECT / "notebooks").is_dir()
+    needed, where = (CLONE_GB, PROJECT) if in_clone else (FREE_GB, Path.cwd())
+    free_gb = shutil.disk_usage(where).free / 1e9
+    return Finding.whether(free_gb >= needed, "disk", f"{free_gb:.0f} GB free", f"free {needed:.0f} GB in {where}")

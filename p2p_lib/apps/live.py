@@ -24,9 +24,9 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate, status_text
 from p2p_lib.datasets.cameras import DEFAULT_BACKLOG, LiveCamera, Newest, Stream
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
-from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.run import Keeper, noted, told
 
 #: Made-up images that are tracked before a camera starts.
@@ -87,9 +87,10 @@ def track_live(
         raise BadInput("stop", options.stop, "the number of an image from 1", "Leave it out to end with Ctrl-C.")
     if backlog < 0:
         raise BadInput("backlog", backlog, "how many images may wait, from 0")
+    config = config.with_values({"segmentation.sam2_every": 0})  # no image waits for it
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
-    if options.tracker.startswith("builtin") and masks.segmenter == DEFAULT_SEGMENTER:
-        _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector))
+    if options.tracker.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
+        _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
     with ExitStack() as kept:
         listeners = [lambda _, estimates: [on_estimate(estimate) for estimate in estimates.values()]]
         if overlay is not None:

@@ -5,7 +5,7 @@ Start it with
     python -m p2p_lib.apps.ros2_node --ros-args -p prompts:=prompts.json -r rgb:=/camera/color/image_raw
 
 Needs ROS 2 (``rclpy``, ``cv_bridge``, ``message_filters``, ``tf2_ros``) on the Python that p2p_lib is installed for;
-``environment.md`` has the packages of a robot. It subscribes to ``rgb``, ``depth`` (registered to colour; 16UC1
+``environment.md`` has the light install for a robot. It subscribes to ``rgb``, ``depth`` (registered to colour; 16UC1
 millimetres or 32FC1 metres) and ``camera_info`` (rectified images: distortion is ignored), and publishes
 ``poses/<object>`` (PoseWithCovarianceStamped in the camera's optical frame) and the transform from it to
 ``<object>``, while there is a pose and only then. ``prompts.json`` is what ``p2p click`` writes; its frame 0 is the
@@ -14,6 +14,7 @@ first image that arrives.
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import MissingBackend, P2PError
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.ros_messages import read_depth_m, read_rgb, seconds
 
@@ -73,7 +75,7 @@ class TrackingNode:
 
     prompts     what is said of objects, see :func:`p2p_lib.datasets.prompts.load_prompts`
     publish     takes an estimate with a pose and the header of its colour image
-    config      parameters or the name of a preset, as :class:`p2p_lib.method.pipeline.Point2Pose` takes them
+    config      parameters or the name of a preset, as :class:`p2p_lib.extended.default.Point2Pose` takes them
     """
 
     def __init__(self, prompts: Any, publish: Any, config: Any = None):
@@ -84,7 +86,7 @@ class TrackingNode:
 
     def on_images(self, rgb: Any, depth: Any, info: Any) -> None:
         """One synchronised triple of messages; what is published is of an earlier one if the tracker is late."""
-        from p2p_lib.method.pipeline import Point2Pose
+        from p2p_lib.extended.default import Point2Pose
 
         if self.tracker is None:
             self.tracker = Point2Pose(camera_of(info), self.config)
@@ -105,8 +107,12 @@ def main() -> None:
     """Spin the node until it is shut down. What ROS brings is imported here alone."""
     from p2p_lib.datasets.prompts import load_prompts
 
-    rclpy, filters, tf2 = map(import_module, ("rclpy", "message_filters", "tf2_ros"))
-    sensors, geometry = map(import_module, ("sensor_msgs.msg", "geometry_msgs.msg"))
+    try:
+        rclpy, filters, tf2 = map(import_module, ("rclpy", "message_filters", "tf2_ros"))
+        sensors, geometry = map(import_module, ("sensor_msgs.msg", "geometry_msgs.msg"))
+    except ModuleNotFoundError as error:
+        fix = "Source its setup.bash, with an environment that sees the system's packages: environment.md."
+        raise MissingBackend("ros2_node", f"{error.name} of ROS 2 is not to be found", fix) from None
     rclpy.init()
     node = rclpy.create_node("point2pose")
     path = node.declare_parameter("prompts", "prompts.json").value
@@ -135,4 +141,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except P2PError as error:
+        sys.exit(str(error))

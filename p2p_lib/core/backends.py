@@ -31,8 +31,9 @@ DETECTORS = {
 }
 #: Segmenters by the name that --masks takes, as module:callable(camera, config, rng).
 SEGMENTERS = {
-    "builtin": "p2p_lib.segmenters.builtin.segmenter:BuiltinSegmenter",
-    "sam2": "p2p_lib.segmenters.sam2:load",
+    "builtin": "p2p_lib.segmenters.anchored:builtin",
+    "sam2": "p2p_lib.segmenters.anchored:sam2",
+    "sam2_video": "p2p_lib.segmenters.sam2_video:load",
 }
 #: What runs when none is named.
 DEFAULT_TRACKER, DEFAULT_DETECTOR, DEFAULT_SEGMENTER = "builtin", "corners", "builtin"

@@ -50,6 +50,8 @@ class _Checked:
                 raise BadInput(name, f"{value!r} ({type(value).__name__})", f"{_KINDS[kind]}: {meta['meaning']}")
             if "choices" in meta and value not in meta["choices"]:
                 raise BadInput(name, repr(value), "one of " + ", ".join(meta["choices"]))
+            if "form" in meta and not re.fullmatch(meta["form"], value.strip()):
+                raise BadInput(name, repr(value), meta["meaning"])
             if kind in (int, float) and not meta.get("low", float("-inf")) <= value <= meta.get("high", float("inf")):
                 bounds = f"{meta.get('low', '-inf')} to {meta.get('high', 'inf')} {meta['unit']}".strip()
                 raise BadInput(name, value, f"a value in {bounds}: {meta['meaning']}")
@@ -64,20 +66,10 @@ class MethodConfig(_Checked):
         "The object frame starts at the camera (T_cam_obj = I) or at the centroid of the first masked cloud.",
         choices=("camera", "centroid"),
     )
-    motion: bool = _p(
-        True,
-        "The motion so far is evidence: last poses compete, others need more support, keypoints move along.",
-    )
-    redetection: bool = _p(
-        True, "Tracks that contradict the pose are rejected; where few are seen, it tells where to look for the others."
-    )
-    scene: bool = _p(
-        True, "Absent objects are searched for by shape and colour where scene or motion say, and in their masks."
-    )
-    gates: str = _p(
+    mechanisms: str = _p(
         "all",
-        "Starts, poses, keyframes and second maps have to pass all gates and doubts of the life cycle, or none.",
-        choices=("none", "all"),
+        "These mechanisms of ours are composed around the paper's method: all, none, names, or all but names.",
+        form=r"(all but )?[a-z_]+( *, *[a-z_]+)*",
     )
     noise: str = _p(
         "sensor",
@@ -181,6 +173,15 @@ class SegmentationConfig(_Checked):
     surface_weight: float = _p(1.5, "These are the log odds by lying on the reconstructed surface.", low=0)
     find_points: int = _p(8, "So many agreeing tracked points say where an absent object is back.", "points", low=3)
     min_px: int = _p(40, "An object of fewer pixels is absent.", "px", low=1)
+    first_masks: str = _p(
+        "auto",
+        "Prompts become masks by the built-in segmenter, by SAM 2, or by SAM 2 where its weights are there.",
+        choices=("auto", "builtin", "sam2"),
+    )
+    sam2_every: int = _p(
+        10, "With --masks sam2, SAM 2 looks at every so many frames; 0: whenever it is ready.", "frames", low=0
+    )
+    sam2_threads: int = _p(0, "So many threads run SAM 2; 0: one for each core.", low=0)
 
 
 @dataclass(frozen=True)
@@ -379,10 +380,7 @@ _STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.def
 #: What the paper's text says, or does without.
 _TEXT: dict[str, Any] = {
     "method.object_frame": "camera",
-    "method.motion": False,
-    "method.redetection": False,
-    "method.scene": False,
-    "method.gates": "none",
+    "method.mechanisms": "none",
     "method.noise": "constant",
     "keypoint_map.cooldown": 0,
     "keypoint_map.max_points": 0,
@@ -420,6 +418,14 @@ def preset(name: str = "default", seed: int = 0) -> Config:
     if not isinstance(name, str) or name not in _PRESETS:
         raise BadInput("preset", repr(name), f"one of {', '.join(_PRESETS)}", did_you_mean(str(name), _PRESETS))
     return replace(Config().with_values(_PRESETS[name] | {"seed": seed}), preset=name)
+
+
+def as_config(config: Config | str) -> Config:
+    """The configuration, or the preset of this name."""
+    config = preset(config) if isinstance(config, str) else config
+    if not isinstance(config, Config):
+        raise BadInput("config", type(config).__name__, 'a Config, or the name of a preset: "default", "paper"')
+    return config
 
 
 def diff(a: str = "paper", b: str = "default") -> dict[str, tuple[Any, Any]]:

@@ -8,11 +8,16 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import DepthConfig
+from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.image import nearest_px
 from p2p_lib.core.types import Frame
 
 # Holds the slope back where few or collinear readings would let noise choose it; nine readings outweigh it twelvefold.
 _RIDGE = 0.5
+#: Few depth cameras see half of their pixels farther than this, m.
+_FAR_M = 50.0
+#: The share of pixels among which the nearest may be wild.
+_NEAREST = 0.05
 #: What depth cameras have about: the built-in tracker and segmenter assume it of any.
 USUAL = DepthConfig()
 
@@ -25,6 +30,19 @@ def depth_noise_m(z_m: np.ndarray, config: DepthConfig = USUAL) -> np.ndarray:
 def in_range(depth_m: np.ndarray, config: DepthConfig) -> np.ndarray:
     """(H, W) bool: measured, and neither too near nor too far."""
     return (depth_m >= config.min_m) & (depth_m <= config.max_m)
+
+
+def check_metres(frame: Frame) -> None:
+    """Refuse depth that cannot be in metres, since nothing is near; warn of what hardly is."""
+    measured = frame.depth_m[frame.depth_m > 0]
+    if not len(measured):
+        return
+    near_m, middle_m = np.quantile(measured, [_NEAREST, 0.5]).tolist()
+    what, fix = f"depth of frame {frame.index}", "Is it in millimetres? Give metres (p2p: --depth-scale 0.001)."
+    if near_m > _FAR_M:
+        raise BadInput(what, f"{near_m:.0f} m and more", f"objects nearer than {_FAR_M:g} m", fix)
+    if middle_m > _FAR_M:
+        doubt(what, f"{middle_m:.0f} m in the middle", fix)
 
 
 def off_edges(depth_m: np.ndarray, edge_m: float) -> np.ndarray:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from functools import reduce
+
 import cv2
 import numpy as np
 
@@ -35,3 +38,8 @@ def bounds(mask: np.ndarray, margin_px: int = 0) -> tuple[slice, slice]:
     spans = ((top, height, mask.shape[0]), (left, width, mask.shape[1]))
     rows, columns = (slice(max(at - margin_px, 0), min(at + size + margin_px, end)) for at, size, end in spans)
     return rows, columns
+
+
+def either(masks: Iterable[np.ndarray | None]) -> np.ndarray:
+    """(H, W) bool: what any of some masks holds; None holds nothing."""
+    return reduce(np.logical_or, (mask for mask in masks if mask is not None))  # its ufunc would copy all of them first

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Protocol
 
 import numpy as np
@@ -96,6 +97,24 @@ class Hint:
     sighted: bool = False
     gone: bool = False
     place: np.ndarray | None = None
+
+
+class LazyHints(Mapping[str, Hint]):
+    """The hints of some objects, each made when it is first asked for: they cost, and a segmenter needs but some."""
+
+    def __init__(self, names: Sequence[str], make: Callable[[str], Hint]):
+        self._names, self._make = names, cache(make)
+
+    def __getitem__(self, name: str) -> Hint:
+        if name not in self._names:
+            raise KeyError(name)
+        return self._make(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
 
 
 class Segmenter(Protocol):

@@ -11,7 +11,8 @@ import os
 import shutil
 from types import ModuleType
 
-from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.errors import MissingBackend, in_a_line
+from p2p_lib.core.packages import INSTALL, command
 
 #: Shared library of the system: the Debian/Ubuntu package that holds it.
 SYSTEM_LIBRARIES = {
@@ -65,4 +66,4 @@ def load_open3d() -> ModuleType:
     except (ImportError, OSError) as error:
         if missing := missing_libraries():
             raise MissingBackend("open3d", f"needs {', '.join(missing)}", f"Run: {install_command(missing)}") from error
-        raise MissingBackend("open3d", str(error), "Run: make setup") from error
+        raise MissingBackend("open3d", in_a_line(error), f"Run: {command(INSTALL['open3d'])}") from error

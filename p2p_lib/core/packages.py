@@ -1,4 +1,4 @@
-"""Third-party packages that are loaded only when asked for by name, and the commands that install them."""
+"""Third-party packages that one can do without, and the commands that install them."""
 
 from __future__ import annotations
 
@@ -14,29 +14,55 @@ from types import ModuleType
 from p2p_lib.core.errors import MissingBackend, in_a_line
 from p2p_lib.core.paths import PROJECT
 
-PIP = "{uv} pip install --python {python} "
+_PIP = "{pip} install "
 # Without its dependencies: those of the JAX version are gigabytes that the PyTorch version does not use.
-_TAPNET = PIP + "--no-deps 'tapnet @ git+https://github.com/google-deepmind/tapnet'"
+_TAPNET = _PIP + "--no-deps 'tapnet @ git+https://github.com/google-deepmind/tapnet'"
 _HUB = "import torch; torch.hub.load('facebookresearch/co-tracker', 'cotracker3_online', pretrained=False)"
+
+#: The extras of this package, and what each serves; ``all`` is those of the first lines, up to ``realsense``.
+EXTRAS = {
+    "notebooks": "notebooks and their figures: make lab, p2p notebooks, p2p figures",
+    "view": "p2p view, and films as .mp4",
+    "torch": "surfaces on a GPU (--device cuda), and all networks",
+    "open3d": "scores of reconstructions in p2p benchmark, Azure Kinect recordings",
+    "dask": "runs on a cluster, p2p benchmark --scheduler",
+    "ros": "ROS 1 and 2 recordings, p2p convert",
+    "realsense": "RealSense cameras and recordings, p2p live and p2p convert",
+    "rerun": "recordings to look at frame by frame, p2p view --rerun",
+    "sam2": "SAM 2 on a CPU: masks of prompts, --masks sam2",
+    "sam2-video": "segmentation and features by PyTorch networks: --masks sam2_video, --detector superpoint",
+}
+
+
+def extra(name: str) -> str:
+    """The template of the command that adds an extra to the installed package."""
+    return _PIP + f'"p2p_lib[{name}]"'
+
 
 #: What has to be typed, by package.
 INSTALL = {
-    "transformers": PIP + "transformers",
-    "rosbags": PIP + "rosbags",
-    "pyrealsense2": PIP + "pyrealsense2",
-    "rerun-sdk": PIP + "rerun-sdk",
-    "distributed": PIP + "'dask[distributed]'",
-    "tapnet": PIP + "einshape dm-tree einops && " + _TAPNET,
+    "onnxruntime": extra("sam2"),
+    "transformers": extra("sam2-video"),
+    "rosbags": extra("ros"),
+    "pyrealsense2": extra("realsense"),
+    "rerun-sdk": extra("rerun"),
+    "distributed": extra("dask"),
+    "open3d": extra("open3d"),
+    "torch": extra("torch"),
+    "tapnet": _PIP + "einshape dm-tree einops && " + _TAPNET,
     # The one built for the torch that Open3D is built for; any other replaces torch.
-    "torchvision": PIP + "--torch-backend=auto torchvision==0.28.0",
+    "torchvision": "{uv} pip install --python {python} --torch-backend=auto torchvision==0.28.0",
     "co-tracker": '{python} -c "' + _HUB + '"',
 }
 
 
 def command(template: str) -> str:
     """A template of :data:`INSTALL` for this very Python."""
-    uv = shutil.which("uv", path=str(Path(sys.executable).parent)) or "uv"
-    return template.format(uv=from_here(uv), python=from_here(sys.executable))
+    here = Path(sys.executable).parent
+    uv, pip = (shutil.which(name, path=str(here)) for name in ("uv", "pip"))
+    python = from_here(sys.executable)
+    pip = "pip" if pip and pip == shutil.which("pip") else f"{python} -m pip"
+    return template.format(uv=from_here(uv or "uv"), python=python, pip=pip)
 
 
 def from_here(path: str) -> str:
@@ -55,17 +81,16 @@ def load(module: str, backend: str, package: str) -> ModuleType:
 
 
 @contextmanager
-def needed_for(extra: str) -> Iterator[None]:
-    """What is imported inside belongs to this extra of the package: :class:`MissingBackend` where it is not there."""
+def needed_for(name: str) -> Iterator[None]:
+    """What is imported inside comes with this extra: :class:`MissingBackend` where it is not installed."""
     try:
         yield
     except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] in ("p2p_lib", "studies"):
+        module = (error.name or "").partition(".")[0]
+        if module in ("", "p2p_lib", "studies"):
             raise
-        fix = f'Run: pip install "p2p_lib[{extra}]"'
-        raise MissingBackend(
-            error.name, f"this package is not installed; it comes with the extra {extra}", fix
-        ) from error
+        what = f"not installed; it comes with the extra {name} ({EXTRAS[name]})"
+        raise MissingBackend(module, what, f"Run: {command(extra(name))}") from error
 
 
 def cotracker_folder() -> Path | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depths_at
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame
 
@@ -121,6 +121,53 @@ def check_not_on(prompt: Prompt, other: Prompt, frame_index: int) -> None:
     if other.name != prompt.name and other.mask is not None and (on := in_mask(prompt.points_px, other.mask)).any():
         got = f"{_pixel(prompt.points_px[on][0])} on the mask of {other.name!r} in frame {frame_index}"
         raise BadInput(f"clicks on {prompt.name!r}", got, "pixels of this object alone")
+
+
+def given_masks(
+    frame: Frame,
+    masks: Mapping[str, np.ndarray | None],
+    said: Mapping[str, Prompt],
+    objects: Iterable[str],
+    camera: Camera,
+) -> tuple[dict[str, np.ndarray | None], dict[str, BadInput]]:
+    """Every object's mask in a frame, by ``masks`` and what is ``said`` of it; None for one that nobody gives.
+
+    Also why what is said of some objects does not fit this frame: it is not used. Raises :class:`BadInput` for a frame
+    of another size and masks of unknown objects.
+    """
+    if not isinstance(frame, Frame):
+        got = f"{type(frame).__name__} {getattr(frame, 'shape', '')}".strip()
+        raise BadInput("frame", got, "Frame(index, time_s, rgb, depth_m)", "Colour needs its depth and its time.")
+    if frame.shape != (camera.height, camera.width):
+        got = f"{frame.shape[1]}x{frame.shape[0]}"
+        raise BadInput(f"frame {frame.index}", got, f"{camera.width}x{camera.height} as the camera")
+    if unknown := sorted(set(masks) - set(objects)):
+        known = ", ".join(objects) or "none yet"
+        raise BadInput("masks", f"unknown object {unknown[0]!r}", f"objects added before: {known}")
+    given = {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items() if mask is not None}
+    for name, prompt in given.items():
+        check_mask(name, prompt.mask, camera)
+    for name, prompt in given.items():
+        if prompt.mask is not None and prompt.mask.all():
+            doubt(f"mask of {name!r}", f"the whole image in frame {frame.index}", "Is it inverted?")
+    refused = {}
+    for name, prompt in said.items():
+        try:
+            _check_said(prompt, frame, given)
+        except BadInput as error:
+            refused[name] = error
+    given = {name: p for name, p in said.items() if p.mask is not None and name not in refused} | given
+    return {name: given[name].mask if name in given else None for name in objects}, refused
+
+
+def _check_said(prompt: Prompt, frame: Frame, given: Mapping[str, Prompt]) -> None:
+    """Refuse what is said of an object in a frame where depth or the masks given with it say otherwise."""
+    check_depth(prompt, frame)
+    for other in given.values():
+        check_not_on(prompt, other, frame.index)
+    if prompt.name in given and prompt.mask is None:
+        fix = "Leave it out of the masks, or do not click on it."
+        raise BadInput(f"mask of {prompt.name!r}", f"a mask and clicks in frame {frame.index}", "one of them", fix)
 
 
 def points_in_box(box_px: np.ndarray, frame: Frame) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Rays against triangle meshes, by Open3D's ray caster (Embree, float32)."""
+"""Rays against triangle meshes, by Embree (float32)."""
 
 from __future__ import annotations
 
@@ -6,19 +6,28 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.core.native import load_open3d
-
 
 def ray_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """An Open3D ``RaycastingScene`` of one mesh (V, 3), (F, 3) in its own frame."""
-    # One thread: frames and tests already run side by side.
-    scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(np.asarray(vertices, np.float32), np.asarray(faces, np.uint32))
+    """An Embree scene of one mesh (V, 3), (F, 3) in its own frame."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.asarray(vertices, np.float32), np.asarray(faces, np.int32))
     return scene
 
 
 def cast(scene: Any, eye: np.ndarray, rays: np.ndarray) -> dict[str, np.ndarray]:
-    """Open3D's answer for rays (N, 3) of any length from one eye (3,): ``t_hit``, ``primitive_ids`` and so on."""
-    lines = np.empty((len(rays), 6), np.float32)
-    lines[:, :3], lines[:, 3:] = eye, rays
-    return {key: value.numpy() for key, value in scene.cast_rays(load_open3d().core.Tensor(lines)).items()}
+    """Where rays (N, 3) of any length from one eye (3,) meet a scene first.
+
+    ``t_hit`` (N,) is in lengths of the ray, infinite where it meets nothing; ``primitive_ids`` (N,) says which face, -1
+    where none; ``primitive_normals`` (N, 3) is its unit normal by the order of its corners, 0 where none.
+    """
+    rays = np.asarray(rays, np.float32)
+    eyes = np.tile(np.asarray(eye, np.float32), (len(rays), 1))
+    found = scene.run(eyes, rays, query="INTERSECT", output=True)
+    met = found["primID"] >= 0
+    normals = np.where(met[:, None], found["Ng"], np.float32(0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    t_hit = np.where(met, found["tfar"], np.float32(np.inf))
+    return {"t_hit": t_hit, "primitive_ids": found["primID"], "primitive_normals": normals}

@@ -10,7 +10,7 @@ import shutil
 import stat
 import tarfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -24,10 +24,16 @@ _MEMBER_BYTES = 512
 _Member = tuple[str, int, str, Callable[[], IO[bytes] | None] | None]
 
 
-def unpack(archive: str | Path, folder: str | Path, progress: Callable[[int], object] | None = None) -> dict[str, int]:
+def unpack(
+    archive: str | Path,
+    folder: str | Path,
+    progress: Callable[[int], object] | None = None,
+    only: Collection[str] | None = None,
+) -> dict[str, int]:
     """Unpack a .zip or .tar (.gz, .bz2, .xz) into a folder; returns path below it to bytes, for every file.
 
     progress  called with the bytes of each file once it is written
+    only      file names: files that are called otherwise stay packed
 
     Raises :class:`BadInput` naming the archive and the member where it would leave the folder, holds anything
     but files and folders, is damaged, or needs more room than there is.
@@ -40,6 +46,8 @@ def unpack(archive: str | Path, folder: str | Path, progress: Callable[[int], ob
     left = largest = UNPACKED_RATIO * archive.stat().st_size + UNPACKED_BYTES
     try:
         for name, size, refused, open_member in _members(archive):
+            if only is not None and PurePosixPath(name).name not in only:
+                continue
             target = _target(archive, folder, name, refused)
             left -= size + _MEMBER_BYTES
             if left < 0:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from p2p_lib.core import packages
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, in_a_line
 from p2p_lib.core.paths import data_dir
 from p2p_lib.datasets.inventory import require
-from p2p_lib.datasets.manifests import manifest
+from p2p_lib.datasets.manifests import folder_of, manifest
 
 if TYPE_CHECKING:
     import torch
@@ -28,13 +29,20 @@ def checked_files(name: str) -> list[Path]:
         raise MissingBackend(name, f"its checkpoint is missing, {error.expected}", error.fix) from None
 
 
+def are_there(name: str) -> bool:
+    """Whether the files of the checkpoint ``name`` lie in their places; what is in them is not looked at."""
+    if data_dir() is None:
+        return False
+    of = manifest(name)
+    return all((folder_of(of) / file.path).is_file() for file in of.files)
+
+
 def load_weights(name: str) -> dict[str, torch.Tensor]:
     """The state dict of a PyTorch checkpoint of one file, on the CPU. Nothing but tensors is read."""
     import pickle
 
-    import torch
-
     (path,) = checked_files(name)
+    torch = packages.load("torch", name, "torch")
     try:
         read = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:

@@ -7,8 +7,11 @@ Nothing is downloaded but by :func:`fetch`. What was fetched, or found in its pl
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import tempfile
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pydantic import BaseModel
@@ -35,7 +38,7 @@ class _Record:
     """What ``.p2p-NAME.json`` of a manifest's folder says of its files: sha256, bytes, and which were unpacked."""
 
     def __init__(self, of: Manifest):
-        self.folder = folder_of(of)
+        self.of, self.folder = of, folder_of(of)
         self._path = self.folder / f".p2p-{of.name}.json"
         self._files: dict[str, dict[str, Any]] = {}
         if self._path.is_file():
@@ -59,10 +62,13 @@ class _Record:
 # --- fetching --------------------------------------------------------------------------------------
 
 
-def fetch(of: Manifest, only: tuple[str, ...] = (), progress: bool = True) -> Iterator[str]:
+def fetch(
+    of: Manifest, only: tuple[str, ...] = (), progress: bool = True, source: str | Path | None = None
+) -> Iterator[str]:
     """Download, check, record and unpack the files of a manifest; yields a line about each as it is done.
 
-    only  parts of file names; by default all files
+    only    parts of file names; by default all files
+    source  one of the files, or a folder or an archive with them by their names: nothing is downloaded then
 
     An archive that lies in its place already, had by hand, is recorded and unpacked just so. Raises
     :class:`MissingData` with what to do where something must be requested by hand.
@@ -71,6 +77,8 @@ def fetch(of: Manifest, only: tuple[str, ...] = (), progress: bool = True) -> It
     if only and not chosen:
         raise BadInput("--only", ",".join(only), "part of one of " + ", ".join(file.path for file in of.files))
     record, by_hand = _Record(of), []
+    if source is not None:
+        _take(chosen, record, Path(source).expanduser())
     for file in chosen:
         here = (record.folder / file.path).is_file()
         if record.unpacked(file) and not here:
@@ -82,6 +90,29 @@ def fetch(of: Manifest, only: tuple[str, ...] = (), progress: bool = True) -> It
     if by_hand or not of.files:
         listed = f"{', '.join(by_hand)} must be had by hand and put into {record.folder}"
         raise MissingData(of.name, listed if by_hand else "must be had by hand", f"{of.how_to_get} Page: {of.page}")
+
+
+def _take(files: list[RemoteFile], record: _Record, source: Path) -> None:
+    """Copy files from where the user has them to their places, if they are those that the manifest means."""
+    wanted = {PurePosixPath(file.path).name: file for file in files}
+    record.folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=record.folder, prefix=".p2p-") as unpacked:
+        if source.is_file() and source.name not in wanted:
+            unpack(source, unpacked, only=wanted)
+        looked_in = Path(unpacked) if source.is_file() and source.name not in wanted else source
+        found = {path.name: path for path in ([source] if looked_in.is_file() else sorted(looked_in.rglob("*")))}
+        for name, file in wanted.items():
+            if name not in found or not found[name].is_file():
+                fix = f"See p2p data info {record.of.name} for where it is published."
+                raise MissingData(str(source), f"no file {name} in it", fix)
+            expected = record.sha256(file)
+            if expected not in (None, digest := sha256(found[name])):
+                raise BadInput(str(source), f"{name} of sha256 {digest}", f"sha256 {expected}", "It was not taken.")
+            target = record.folder / file.path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            part = target.with_name(f".{target.name}.part")
+            shutil.copyfile(found[name], part)
+            os.replace(part, target)
 
 
 def _fetch_one(file: RemoteFile, record: _Record, progress: bool) -> str:

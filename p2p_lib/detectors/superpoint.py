@@ -29,6 +29,7 @@ _MARGIN_PX = 64
 def load(config: SamplingConfig, rng: np.random.Generator | None = None) -> SuperPointDetector:
     """The detector with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
     folder = checkpoints.checked_files("superpoint")[0].parent
+    packages.load("torch", "superpoint", "transformers")
     module = packages.load("transformers", "superpoint", "transformers")
     # safetensors hold tensors and nothing else; local_files_only: nothing is downloaded here.
     model = module.SuperPointForKeypointDetection.from_pretrained(folder, local_files_only=True, use_safetensors=True)

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.packages import needed_for
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures.playback import Playback
@@ -58,6 +60,9 @@ def check_suffix(path: str | Path) -> None:
     """Refuse a film that could not be written, before anyone waits for it."""
     if Path(path).suffix not in SUFFIXES:
         raise BadInput("film", Path(path).name, f"a name that ends in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+    if Path(path).suffix == ".mp4":
+        with needed_for("view"):
+            import_module("av")
 
 
 def write_video(images: Iterable[np.ndarray], path: str | Path, fps: float = 30.0) -> Path:

@@ -10,6 +10,7 @@ import numpy as np
 from pandas import Series
 
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.packages import needed_for
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.evaluation import metrics
@@ -32,7 +33,8 @@ def panels(
     count: int, size_in: tuple[float, float], ratios: list[float] | None = None, side_by_side: bool = False
 ) -> tuple[Figure, list[Axes]]:
     """A figure without global state, and its axes below each other (sharing time) or side by side."""
-    from matplotlib.figure import Figure
+    with needed_for("notebooks"):
+        from matplotlib.figure import Figure
 
     figure = Figure(size_in, layout="constrained")
     if side_by_side:

@@ -24,6 +24,7 @@ from PIL import Image
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.packages import needed_for
 from p2p_lib.core.tables import as_html, as_markdown
 from p2p_lib.datasets.provenance import provenance
 from p2p_lib.datasets.runs import Run
@@ -97,7 +98,8 @@ def save_video(
     parameters: Mapping[str, Any] | None = None,
 ) -> Saved:
     """Write images as a film (see :func:`write_video`) with its note; shown embedded."""
-    from IPython.display import Video
+    with needed_for("notebooks"):
+        from IPython.display import Video
 
     sources = list(sources)
     target = _target(paths.figure_dir(), name, _is_quick(sources, parameters))

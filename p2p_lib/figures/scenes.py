@@ -13,11 +13,11 @@ from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate, status_word
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import Evaluation
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box, Label
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import gaps
-from p2p_lib.method.pipeline import Point2Pose
 
 #: How strongly a mask tints its inside, and the radius of a keypoint.
 _FILL, _POINT_PX = 0.15, 2.5

@@ -12,11 +12,12 @@ from contextlib import contextmanager
 from p2p_lib.core.colours import OBJECTS as OBJECTS
 from p2p_lib.core.colours import object_colours as object_colours
 from p2p_lib.core.colours import rgb as rgb
+from p2p_lib.core.packages import needed_for
 from p2p_lib.core.types import Status
 from p2p_lib.evaluation.point_tracks import Outcome
 
 #: Statuses: fill and hatch. Tracked is the quiet one.
-STATUS: dict[Status, tuple[str, str]] = {
+STATUS: dict[str, tuple[str, str]] = {
     Status.INITIALISING: ("#FFFFFF", "...."),
     Status.TRACKED: ("#D9D9D9", ""),
     Status.DEGRADED: ("#F0E442", "\\\\\\\\"),
@@ -71,7 +72,8 @@ def ink(colour: str) -> str:
 @contextmanager
 def applied() -> Iterator[None]:
     """Matplotlib with this style inside the ``with``, untouched outside. Needed when drawing and when saving."""
-    import matplotlib
+    with needed_for("notebooks"):
+        import matplotlib
 
     with matplotlib.rc_context(_RC):
         yield

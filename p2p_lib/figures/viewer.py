@@ -9,6 +9,9 @@ status. The page is made with viser.
 from __future__ import annotations
 
 import html
+import io
+import sys
+from contextlib import AbstractContextManager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.core.native import load_open3d
+from p2p_lib.core.packages import needed_for
 from p2p_lib.core.types import status_word
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
@@ -37,11 +40,10 @@ _SWATCH = '<span style="background:{colour};border:1px solid #888;padding:0 6px"
 
 def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS) -> str:
     """The whole page as HTML: it works offline, from a file, and inside another page."""
-    from IPython.utils.capture import capture_output
-    from viser import ViserServer
+    with needed_for("view"):
+        from viser import ViserServer
 
-    # Viser prints when it starts and stops, even with verbose=False, and in a notebook it displays that.
-    with capture_output(stderr=False):
+    with _silent():
         server = ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
             scene = _Scene(server, playback, points)
@@ -57,6 +59,15 @@ def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS)
             server.stop()
     end = page.rindex("</body>") if "</body>" in page else len(page)
     return page[:end] + _legend(playback, len(rows), points) + page[end:]
+
+
+def _silent() -> AbstractContextManager:
+    """Viser prints when it starts and stops, even with verbose=False, and in a notebook it displays that."""
+    if "IPython" not in sys.modules:
+        return redirect_stdout(io.StringIO())
+    from IPython.utils.capture import capture_output
+
+    return capture_output(stderr=False)
 
 
 def write_page(run: str | Path, out: str | Path | None = None, sequence: Sequence | None = None) -> Path:
@@ -179,17 +190,16 @@ class _Scene:
 def _thinned(mesh: Any) -> Any:
     """A surface of at most so many faces, as a trimesh."""
     import trimesh
+    from scipy.spatial import cKDTree
 
     if len(mesh.faces) <= _FACES:
         return mesh
-    open3d = load_open3d()
-    vectors = open3d.utility.Vector3dVector
-    whole = open3d.geometry.TriangleMesh(vectors(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces))
-    whole.vertex_colors = vectors(mesh.visual.vertex_colors[:, :3] / 255)
-    thin = whole.simplify_quadric_decimation(_FACES)
-    colours = np.rint(255 * np.asarray(thin.vertex_colors)).astype(np.uint8)
-    faces = np.asarray(thin.triangles)
-    return trimesh.Trimesh(np.asarray(thin.vertices), faces, vertex_colors=colours, process=False)
+    with needed_for("view"):
+        from fast_simplification import simplify
+
+    vertices, faces = simplify(np.asarray(mesh.vertices), np.asarray(mesh.faces), target_count=_FACES)
+    colours = mesh.visual.vertex_colors[cKDTree(mesh.vertices).query(vertices)[1]]
+    return trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
 
 
 def _legend(playback: Playback, shown: int, points: int) -> str:

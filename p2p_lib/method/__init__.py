@@ -1,22 +1,19 @@
-"""The paper's method, one file per box of its overview figure, and what preset "default" adds to these boxes.
+"""The paper's method, one file per box of its overview figure; it imports nothing but :mod:`p2p_lib.core`.
 
 Look first at :mod:`~p2p_lib.method.pipeline` (all objects, one frame) and :mod:`~p2p_lib.method.object_tracker` (one
-object's step; ``pose_finder`` has its first half, up to the pose), then at the parts of that step in its order:
+object: find, then accept or absent), then at the parts of a step in its order:
 
-- observe: ``observation`` lifts the object's 2D points and takes its dense cloud;
-- register: ``registration`` gives pose hypotheses against the keypoints of ``keypoint_map``;
-- refine: ``refinement`` moves poses onto the surface of ``tsdf``; ``observability`` says which motions its shape
-  determines;
-- select: ``selection``;
-- judge: ``lifecycle`` holds an object's state, every gate and every doubt; ``agreement`` says whether camera and masks
-  agree with themselves;
-- extend: ``object_model`` holds map, surface (``tsdf``, ``tsdf_grid``, ``mesh``) and graph (``factor_graph``,
-  ``keyframes``, ``keyframe_views``); ``sampling`` chooses new points; ``confidence`` says how well the pose is known.
+- track, segment, observe: ``frontend`` does it for all objects, ``observation`` lifts one object's 2D points and takes
+  its dense cloud;
+- propose: ``registration`` gives pose hypotheses against the keypoints of ``keypoint_map``;
+- choose: ``selection``, then ``refinement`` moves the pose onto the surface of ``tsdf``;
+- judge, admit, request: ``policy`` has the paper's answers, to these questions and to the two before;
+- extend: ``object_model`` holds map, surface (``tsdf``), graph (``factor_graph``) and views (``keyframe_views``);
+  ``sampling`` chooses new points.
 
-What follows is ours. ``outlook`` answers what the pipeline asks around this step: where the object should show, which
-tracks are elsewhere. An object that shows a side never seen has two maps for a while: ``two_maps`` says when they are
-one. ``motion`` says where an absent object was going, ``shape_search`` looks for it by its surface.
+What is ours is composed around these parts by :mod:`p2p_lib.extended`, which this package knows nothing of.
+README.md beside this file lists where the paper's preset departs from the paper and its release.
 
 The 2D tracker, the detector of candidates and the segmenter are parts that it is given; what it asks of them is in
-:mod:`p2p_lib.core.interfaces`. Where an absent object may lie it is told by :mod:`p2p_lib.recovery`.
+:mod:`p2p_lib.core.interfaces`.
 """

@@ -11,7 +11,7 @@ State is kept as plain arrays, so that a solve that fails leaves nothing behind.
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig
 from p2p_lib.core.errors import BadInput
-from p2p_lib.method.keyframes import Keyframe, Link, merge_keyframes
 
 # gtsam's keys: a letter in the highest byte.
 _X, _P = ord("x") << 56, ord("p") << 56
@@ -27,14 +26,48 @@ _X, _P = ord("x") << 56, ord("p") << 56
 _ANCHORING_POINTS = 3
 # Noise of the prior on the first pose (rad, m): it defines the object frame, so there is next to none.
 _PRIOR_SIGMA = 1e-4
-# Noise of the relative pose that ties a graph to the one it joins (rad, m): next to none beside what points say.
-_JOINED_SIGMAS = np.repeat([0.05, 0.01], 3)
 # Levenberg-Marquardt's first lambda. (The release starts at 0.1 and makes more steps, to the same minimum.)
 _LAMBDA = 1e-4
 # A smaller relative decrease of the loss ends Levenberg-Marquardt.
 _RELATIVE_TOLERANCE = 1e-3
 # A variance above this means that nothing determines the direction: a turn, or ten metres.
 _UNDETERMINED = np.repeat([(2 * np.pi) ** 2, 10.0**2], 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A relative pose from registration (paper: X~ of L_reg).
+
+    previous         key of the keyframe it starts from
+    T_previous_this  (4, 4) X_previous^-1 X_this
+    covariance       (6, 6), right tangent of X_this
+    """
+
+    previous: int
+    T_previous_this: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """One keyframe: X_m = T_obj_cam (4, 4) and the observations p_cam (N, 3) of the points ``ids`` (N,).
+
+    sigma    (N, 2) noise of bearing (rad) and range (m)
+    link     to the keyframe before; None for the first
+    factors  the observations in the solver's own form, made once; None when they have changed
+    """
+
+    T_obj_cam: np.ndarray
+    ids: np.ndarray
+    p_cam: np.ndarray
+    sigma: np.ndarray
+    link: Link | None
+    factors: Any = None
+
+    def replace_observations(self, ids: np.ndarray, p_cam: np.ndarray, sigma: np.ndarray) -> None:
+        """Other observations instead of those there were."""
+        self.ids, self.p_cam, self.sigma, self.factors = ids, p_cam, sigma, None
+
 
 #: Of a solve: the newest keyframe's covariance (6, 6), and the loss before and after.
 _Fit = tuple[np.ndarray | None, float, float]
@@ -45,7 +78,7 @@ class GraphResult:
     """What the graph knows after a solve; after a failed one, what it knew before.
 
     ok, reason             whether the newest keyframe was solved for; else why it was left out
-    keys (M,)              as returned by ``add_keyframe``; keyframes merged into others are no longer listed
+    keys (M,)              as returned by ``add_keyframe``
     T_cam_obj (M, 4, 4)    poses of those keyframes
     point_ids (N,), p_obj (N, 3)  keypoints, sorted by id
     covariance             (6, 6) of the newest keyframe, right tangent of T_cam_obj in the object
@@ -73,14 +106,13 @@ class ObjectGraph:
         self._points: dict[int, np.ndarray] = {}
         self._new: list[int] = []  # added since the last solve that went well
         self.next_key = 0  # of the keyframe to be added next
-        self._joined: set[int] = set()  # keyframes of graphs that it has taken in
         self._fit: _Fit = None, 0.0, 0.0
         self._anchor = se3.IDENTITY
         importlib.import_module("gtsam")  # takes a second that no frame should wait for
 
     @property
     def keys(self) -> tuple[int, ...]:
-        """The keyframes that are held, oldest first: those that were merged into others are not."""
+        """The keyframes that are held, oldest first."""
         return tuple(sorted(self._keyframes))
 
     def add_keyframe(
@@ -128,24 +160,6 @@ class ObjectGraph:
         self.next_key += 1
         return key
 
-    def join(self, other: ObjectGraph, T_obj_other: np.ndarray, point_shift: int) -> None:
-        """Take in another graph of the same object, whose frame maps to this one's by T_obj_other (4, 4).
-
-        Ids of its points grow by ``point_shift``. A loose relative pose ties its first keyframe to the newest one here;
-        keyframes to come that see points of both tie them well.
-        """
-        shift, p_obj = self.next_key, se3.transform(T_obj_other, np.array([*other._points.values()]).reshape(-1, 3))
-        for key, k in other._keyframes.items():
-            T_obj_cam, link = T_obj_other @ k.T_obj_cam, k.link
-            if link is None:
-                link = self._link(T_obj_cam, p_obj, _about(p_obj, _JOINED_SIGMAS))
-            else:
-                link = replace(link, previous=link.previous + shift)
-            self._keyframes[key + shift] = Keyframe(T_obj_cam, k.ids + point_shift, k.p_cam, k.sigma, link)
-        self._points |= {i + point_shift: p for i, p in zip(other._points, p_obj, strict=True)}
-        self._joined |= {key + shift for key in other._keyframes}
-        self.next_key += other.next_key
-
     def forget(self, point_ids: np.ndarray) -> None:
         """Takes points and all their observations out of the graph (a keypoint that the map retired)."""
         gone = np.asarray(point_ids, np.int64)
@@ -176,20 +190,21 @@ class ObjectGraph:
             self._keyframes[key].T_obj_cam = T_obj_cam
         self._points |= points
         self._new, self._fit = [], fit
-        result = self._result(True, "no covariance: nothing anchors the graph" if fit[0] is None else "")
-        merge_keyframes(self._keyframes, self.config.max_keyframes)
-        return result
+        return self._result(True, "no covariance: nothing anchors the graph" if fit[0] is None else "")
 
     def _link(self, T_obj_cam: np.ndarray, p_obj: np.ndarray, covariance: np.ndarray | None) -> Link:
         """The relative pose to the newest keyframe; its noise moved from the object to X's right tangent."""
         if not _is_covariance(covariance):
             sigmas = np.repeat([self.config.between_sigma_rad, self.config.between_sigma_m], 3)
-            covariance = _about(p_obj, sigmas)
-        # A new pose is one in this graph's frame, of which a graph that has just been joined knows little.
-        previous = max(self._keyframes.keys() - self._joined)
+            covariance = about(p_obj, sigmas)
+        previous = self._newest()
         relative = se3.inverse(self._keyframes[previous].T_obj_cam) @ T_obj_cam
         A = se3.adjoint(se3.inverse(T_obj_cam))
         return Link(previous, relative, A @ covariance @ A.T)
+
+    def _newest(self) -> int:
+        """The keyframe that a new one is tied to."""
+        return max(self._keyframes)
 
     def _why_not(self) -> str:
         """What keeps the graph from being solved, as far as its structure tells; empty if nothing does."""
@@ -215,7 +230,7 @@ class ObjectGraph:
         return GraphResult(ok, reason, keys, T_cam_obj, ids, p_obj, *self._fit)
 
 
-def _about(p_obj: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+def about(p_obj: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
     """(6, 6) covariance of a motion with sigmas (6,) about the middle of points p_obj (N, 3)."""
     A = se3.adjoint(se3.from_rt(np.eye(3), p_obj.mean(0) if len(p_obj) else np.zeros(3)))
     return A @ np.diag(sigmas**2) @ A.T

@@ -1,9 +1,4 @@
-"""From where one object has been seen: the poses of its keyframes, and the accumulated rotation up to each of them.
-
-A new view asks for a keyframe (appendix, "Sampling Criteria"). And a map is made view by view: each is registered to
-what the one beside it saw, so that small errors with one cause add up. On a round body, whose shape does not determine
-its turn, the keypoints all drift a little as it rotates; no sum over independent points shows that.
-"""
+"""From where one object has been seen: the poses of its keyframes (appendix, "Sampling Criteria")."""
 
 from __future__ import annotations
 
@@ -16,40 +11,31 @@ _MOST = 1000
 
 
 class KeyframeViews:
-    """Keyframe poses T_cam_obj (N, 4, 4) as registered."""
+    """Keyframe poses T_cam_obj (N, 4, 4) as registered: a new view asks for a keyframe."""
 
     def __init__(self, most: int = _MOST):
         self._most = most
         self.T_cam_obj = np.zeros((0, 4, 4))
-        self._accumulated_rad = np.zeros(0)
 
     def __len__(self) -> int:
         return len(self.T_cam_obj)
 
     def turned_rad(self, T_cam_obj: np.ndarray) -> float:
         """The turn to the nearest of the views; infinite before the first."""
-        return self._nearest(T_cam_obj)[0]
-
-    def accumulated_rad(self, T_cam_obj: np.ndarray) -> float:
-        """How far the object has turned since the first view, along the views that lead here; 0 before it."""
-        turned, row = self._nearest(T_cam_obj)
-        return turned + self._accumulated_rad[row] if len(self) else 0.0
-
-    def some(self, most: int) -> np.ndarray:
-        """(M, 4, 4) of the views, evenly chosen where there are more than ``most``."""
-        return self.T_cam_obj[np.unique(np.linspace(0, len(self) - 1, min(len(self), most)).astype(int))]
+        return self.nearest(T_cam_obj)[0]
 
     def add(self, T_cam_obj: np.ndarray) -> None:
         """One more view; beyond the cap it replaces the one that it is most like."""
-        accumulated = self.accumulated_rad(T_cam_obj)
         if len(self) >= self._most:
-            row = self._nearest(T_cam_obj)[1]
-            self.T_cam_obj = np.delete(self.T_cam_obj, row, 0)
-            self._accumulated_rad = np.delete(self._accumulated_rad, row)
+            self.remove(self.nearest(T_cam_obj)[1])
         self.T_cam_obj = np.concatenate([self.T_cam_obj, T_cam_obj[None]])
-        self._accumulated_rad = np.append(self._accumulated_rad, accumulated)
 
-    def _nearest(self, T_cam_obj: np.ndarray) -> tuple[float, int]:
+    def remove(self, row: int) -> None:
+        """Forget a view."""
+        self.T_cam_obj = np.delete(self.T_cam_obj, row, 0)
+
+    def nearest(self, T_cam_obj: np.ndarray) -> tuple[float, int]:
+        """The turn to the nearest of the views, and which it is; infinite and -1 without any."""
         if not len(self):
             return np.inf, -1
         turned = se3.angle_rad(se3.inverse(self.T_cam_obj) @ T_cam_obj)

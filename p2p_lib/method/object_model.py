@@ -1,25 +1,22 @@
-"""What is known of one object: its keypoint map, its surface, its graph, and the views of its keyframes."""
+"""What is known of one object: its keypoint map, surface and graph, the views of its keyframes, and its newest pose."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import Status
+from p2p_lib.core.types import WITH_POSE, Status
 from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
 from p2p_lib.method.keyframe_views import KeyframeViews
-from p2p_lib.method.keyframes import misfit
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.lifecycle import Lifecycle
 from p2p_lib.method.observation import Observation, Observer
-from p2p_lib.recovery.search import SurfaceSample
 
 if TYPE_CHECKING:
     from p2p_lib.method.tsdf import TsdfVolume
@@ -27,8 +24,8 @@ if TYPE_CHECKING:
 NO_IDS = np.zeros(0, np.int64)
 #: A frame with a larger move or turn verifies no point (appendix, "Point Promotion Strategy").
 _STABLE_M, _STABLE_DEG = 0.01, 2.0
-#: No noise explains an observation that is off by more standard deviations, poses a little off included.
-_STRAY_SIGMAS = 8.0
+#: A return is marked as recovered for so many frames; for more while few points agree.
+CONFIRM_FRAMES, CONFIRM_LONGER = 5, 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,20 +51,20 @@ class ObjectModel:
     long it took: what comes out is the same whatever the number of threads.
     """
 
+    make_graph, make_views = ObjectGraph, KeyframeViews
+
     def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch, beside: Executor):
         self.config = config
         self.map = KeypointMap(config.keypoint_map)
         self._surface = _volume(config) if config.method.surface else None
-        self._graph = ObjectGraph(config.factor_graph) if config.method.graph else None
-        self.views = KeyframeViews()
+        self._graph = self.make_graph(config.factor_graph) if config.method.graph else None
+        self.views = self.make_views()
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
-        self.seen_m2 = 0.0  # the most that a keyframe showed
         self._observer, self._stopwatch, self._beside = observer, stopwatch, beside
         self._mapping: Future | None = None  # the newest of what runs beside, one after the other
         self._solved: Future[GraphResult | None] | None = None  # by the graph, to be adopted
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
         self._since_keyframe, self._next_key = 0, 0
-        self._sample: SurfaceSample | None = None  # of the surface as it is
 
     @property
     def empty(self) -> bool:
@@ -124,57 +121,28 @@ class ObjectModel:
         """Whether depth can be compared with a surface."""
         return self.surface is not None and not self.surface.empty
 
-    @property
-    def sample(self) -> SurfaceSample:
-        """Points of the surface, for the search by shape and colour."""
-        if self._sample is None:
-            self._sample = SurfaceSample.of(self.surface.mesh())
-        return self._sample
-
     def noise_m(self, p_cam: np.ndarray) -> np.ndarray | None:
         """(N,) standard deviation of measured points by the sensor's model; None where one noise is assumed for all."""
         return self._observer.noise_m(p_cam) if self.config.method.noise == "sensor" else None
 
-    def join(self, other: ObjectModel, T_obj_other: np.ndarray) -> None:
-        """Take in what another model knows of the same object; T_obj_other (4, 4) maps its frame to this one's.
-
-        Its points come behind the map's own.
-        """
-        self.map.join(other.map, T_obj_other, self._next_key)
-        vertices = 0 if self.graph is None else self.graph.next_key
-        if self.graph is not None:
-            self.graph.join(other.graph, T_obj_other, self._next_key)
-        if self.surface is not None:
-            self._beside_after(self._surface.join, other.surface, T_obj_other, vertices)
-        for T_cam_obj in other.views.T_cam_obj @ se3.inverse(T_obj_other):
-            self.views.add(T_cam_obj)
-        self.seen_m2 = max(self.seen_m2, other.seen_m2)
-        self._next_key += other._next_key
-        self._sample = None
-
     def observe(
-        self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray, moved: tuple[float, float] | None
+        self,
+        obs: Observation,
+        T_cam_obj: np.ndarray,
+        agrees: np.ndarray,
+        moved: tuple[float, float] | None,
+        in_camera: bool = False,
     ) -> None:
         """Take an accepted frame into the map: count the keypoints that agree (N,), verify the pending ones.
 
-        moved  metres and degrees since the frame before, None after a gap: "Pose Stability" of the appendix
+        moved      metres and degrees since the frame before, None after a gap: "Pose Stability" of the appendix
+        in_camera  whether points must move with the object: see :meth:`KeypointMap.observe`
         """
         stable = moved is not None and moved[0] < _STABLE_M and moved[1] < _STABLE_DEG
         self.map.count(obs.seen & self.map.promoted, agrees)
         p_obj = se3.transform(se3.inverse(T_cam_obj), obs.p_cam)
-        p_cam = obs.p_cam if self.config.method.motion else None
-        self.map.observe(p_obj, obs.tracks.uncertainty, stable, p_cam)
+        self.map.observe(p_obj, obs.tracks.uncertainty, stable, obs.p_cam if in_camera else None)
         self._since_keyframe += 1
-
-    def explained(self, obs: Observation, T_cam_obj: np.ndarray) -> np.ndarray:
-        """(N,) bool: points of the map that are seen where a pose has them, as far as noise can say.
-
-        Others would bend the graph, whose robust loss never lets go of them: what is mirrored in an object slides over
-        it, a little from keyframe to keyframe, and takes poses and keypoints along.
-        """
-        sigma_m = self._observer.noise_m(obs.p_cam)
-        sigma = np.stack([np.full_like(sigma_m, self.config.factor_graph.bearing_sigma_rad), sigma_m], -1)
-        return misfit(se3.transform(T_cam_obj, self.map.p_obj), obs.p_cam, sigma) <= _STRAY_SIGMAS
 
     def keyframe_due(self, obs: Observation, T_cam_obj: np.ndarray, agrees: np.ndarray) -> bool:
         """The appendix's "Sampling Criteria": a new view of the object, or too few points left."""
@@ -209,9 +177,7 @@ class ObjectModel:
         seen = np.concatenate([self.map.keys[agrees], keys]), np.concatenate([obs.p_cam[agrees], p_cam])
         self.map.add(keys, p_obj, self.empty, confidence, p_cam)
         self.views.add(T_cam_obj)
-        self.seen_m2 = max(self.seen_m2, self._observer.area_m2(obs))
         self._since_keyframe = 0
-        self._sample = None
         gone, drop = self.map.retire()
         self._solved = self._beside_after(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone)
         return Requests(drop=drop, add_px=uv_px, keys=keys)
@@ -263,11 +229,59 @@ class ObjectModel:
 
 
 @dataclass(frozen=True, eq=False)
+class Life:
+    """The state of one object between two frames, as a value: each frame makes the next one.
+
+    status      of the newest frame
+    T_cam_obj   newest pose, of whatever frame; None before the first
+    seen_s      its time
+    confirming  frames for which a return is still marked as recovered
+    """
+
+    status: Status = Status.INITIALISING
+    T_cam_obj: np.ndarray | None = None
+    seen_s: float = float("nan")
+    confirming: int = 0
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the newest frame has a pose."""
+        return self.status in WITH_POSE
+
+    @property
+    def sought(self) -> bool:
+        """Whether it is absent, or back with few points."""
+        return not self.has_pose or (self.confirming > 0 and self.status is Status.DEGRADED)
+
+    @property
+    def returning(self) -> bool:
+        """Whether a pose in the next frame would be marked as recovered."""
+        return not self.has_pose or self.confirming > 1
+
+    def with_pose(self, T_cam_obj: np.ndarray, time_s: float, status: Status) -> Life:
+        """The state after a frame with a pose."""
+        longest = CONFIRM_LONGER if status is Status.DEGRADED else CONFIRM_FRAMES
+        left = min(max(self.confirming - 1, 0), longest) if self.has_pose else longest
+        return replace(self, status=status, T_cam_obj=T_cam_obj, seen_s=time_s, confirming=left)
+
+    def corrected(self, T_cam_obj: np.ndarray) -> Self:
+        """With the newest pose as the graph has it: what comes next starts from there."""
+        return replace(self, T_cam_obj=T_cam_obj)
+
+    def moved_from_last(self, T_cam_obj: np.ndarray) -> tuple[float, float] | None:
+        """Metres and degrees from the pose of the frame before to another (4, 4); None after a gap."""
+        if not self.has_pose:
+            return None
+        moved_m = np.linalg.norm(T_cam_obj[:3, 3] - self.T_cam_obj[:3, 3])
+        return float(moved_m), float(np.degrees(se3.angle_rad(se3.inverse(self.T_cam_obj) @ T_cam_obj)))
+
+
+@dataclass(frozen=True, eq=False)
 class Known:
     """What is known of an object in one object frame: a model, and what it has been through since that was begun."""
 
     model: ObjectModel
-    life: Lifecycle = field(default_factory=Lifecycle)
+    life: Life = field(default_factory=Life)
     map_id: int = 0
 
     @property
@@ -278,20 +292,6 @@ class Known:
     def keypoints(self, obs: Observation) -> np.ndarray:
         """(N,) bool: the promoted points that are seen."""
         return obs.seen & self.map.promoted
-
-    def carried(self, time_s: float) -> bool:
-        """Whether its motion so far still says where the object is at this time."""
-        life = self.life
-        return self.model.config.method.motion and life.motion is not None and life.motion.holds(time_s)
-
-    @property
-    def first_view_alone(self) -> bool:
-        """Whether it is known from the view that it began with, and never was sure of another pose."""
-        return self.life.motion is None and len(self.model.views) == 1
-
-    def lost(self) -> Known:
-        """The same after a frame in which the object was not found by it."""
-        return replace(self, life=self.life.without_pose(Status.LOST))
 
 
 def _volume(config: Config) -> TsdfVolume:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -14,15 +14,11 @@ from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import depth_noise_m, in_range, lift, off_edges
 from p2p_lib.core.image import bounds, in_mask
 from p2p_lib.core.types import Frame, Tracks
-from p2p_lib.method.agreement import outline_share
-from p2p_lib.recovery.search import Sighting
 
 #: Depth this near the mask's border mixes the object with what is behind it.
 _BORDER_PX = 2
 #: A larger step in the 3x3 neighbourhood of a pixel of the cloud is an edge, m.
 _CLOUD_EDGE_M = 0.02
-#: A keypoint farther from the depth measured at its pixel is hidden, m.
-_HIDDEN_M = 0.015
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +29,6 @@ class Observation:
     tracks    of the map's points
     p_cam     (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
     cloud     (M, 3) depth points in the mask, camera frame
-    sighting  where an absent object was found by shape and colour; None where it was not
-    given     whether the caller vouches for the mask; else the segmenter made it
-    still     whether the image is the same as for a while
-    aside     the same of a second map of the object, which is put aside; None where there is none
     """
 
     frame: Frame
@@ -44,10 +36,6 @@ class Observation:
     tracks: Tracks
     p_cam: np.ndarray
     cloud: np.ndarray
-    sighting: Sighting | None = None
-    given: bool = True
-    still: bool = False
-    aside: Observation | None = None
 
     @property
     def seen(self) -> np.ndarray:
@@ -58,11 +46,6 @@ class Observation:
     def mask_px(self) -> int | None:
         """Pixels of the mask; None where no mask is known."""
         return None if self.mask is None else int(np.count_nonzero(self.mask))
-
-    @cached_property
-    def outline_share(self) -> float | None:
-        """What of the mask's outline lies where depth has steps; None where nobody knows."""
-        return None if self.mask is None else outline_share(self.frame, self.mask)
 
 
 class Observer:
@@ -78,13 +61,10 @@ class Observer:
         """The observation of an object whose points have these ``tracks``."""
         nothing = np.zeros((0, 3))
         cloud = nothing if mask is None else sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
-        return Observation(frame, mask, tracks, self._lifted(frame, mask, tracks), cloud)
+        return Observation(frame, mask, tracks, self.lifted(frame, mask, tracks), cloud)
 
-    def with_tracks(self, obs: Observation, tracks: Tracks) -> Observation:
-        """The observation with these tracks of the object's points instead of its own."""
-        return replace(obs, tracks=tracks, p_cam=self._lifted(obs.frame, obs.mask, tracks))
-
-    def _lifted(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> np.ndarray:
+    def lifted(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> np.ndarray:
+        """(N, 3) where tracks are in the camera frame; NaN where not visible, outside the mask, or without depth."""
         p_cam, rows = np.full((len(tracks), 3), np.nan), np.flatnonzero(tracks.visible)
         if mask is not None:
             rows = rows[in_mask(tracks.uv_px[rows], mask)]
@@ -103,37 +83,9 @@ class Observer:
         """(H, W) bool: pixels of the mask with a depth within range."""
         return observation.mask & in_range(observation.frame.depth_m, self.config)
 
-    def area_m2(self, observation: Observation) -> float:
-        """What is measured of the object, as an area across the line of sight."""
-        z = observation.frame.depth_m[self.measured(observation)]
-        return float((z.astype(float) ** 2).sum() / (self.camera.fx * self.camera.fy))
-
-    def cut_off(self, observation: Observation) -> bool:
-        """Whether the mask ends where depth does: at the border of the image, or of what of it is registered.
-
-        An object before nothing that is measured does so on all four sides, and is whole.
-        """
-        seen, measured = bounds(self.measured(observation)), bounds(observation.frame.depth_m > 0)
-        both = list(zip(seen, measured, strict=True))
-        sides = [one.start <= whole.start + _BORDER_PX for one, whole in both]
-        sides += [one.stop >= whole.stop - _BORDER_PX for one, whole in both]
-        return any(sides) and not all(sides)
-
-    def expected_px(self, obs: Observation, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> np.ndarray:
-        """(N, 2) where points p_obj (N, 3) show under a pose.
-
-        NaN for those outside the mask, and for those that the measured depth contradicts: something hides them, the
-        object itself included.
-        """
-        p_cam = se3.transform(T_cam_obj, p_obj)
-        uv_px = self.camera.project(p_cam)
-        at = np.flatnonzero((p_cam[:, 2] > 0) & self.camera.inside(uv_px))
-        u, v = np.rint(uv_px[at]).astype(int).T
-        inside = True if obs.mask is None else obs.mask[v, u]
-        at = at[inside & (np.abs(obs.frame.depth_m[v, u] - p_cam[at, 2]) < _HIDDEN_M)]
-        expected = np.full_like(uv_px, np.nan)
-        expected[at] = uv_px[at]
-        return expected
+    def in_image(self, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> np.ndarray:
+        """(N,) bool: the points p_obj (N, 3) that a pose puts into the image, whatever may hide them."""
+        return self.camera.inside(self.camera.project(se3.transform(T_cam_obj, p_obj)), -0.5)
 
 
 def sample_cloud(depth_m: np.ndarray, mask: np.ndarray, camera: Camera, max_points: int) -> np.ndarray:

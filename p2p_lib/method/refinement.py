@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from p2p_lib.core import se3
+from p2p_lib.core import observability, se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import RefinementConfig
-from p2p_lib.method import observability
 
 if TYPE_CHECKING:
     from p2p_lib.method.tsdf import TsdfVolume
@@ -91,7 +90,7 @@ class _Linear:
     used, J (n, 6) the derivatives of their distances. H and g are means over them; rotations are scaled by the cloud's
     radius, so that everything is in metres.
 
-    eigenvalues (6,) and directions (6, 6), columns, are those of :func:`p2p_lib.method.observability.eigen`.
+    eigenvalues (6,) and directions (6, 6), columns, are those of :func:`p2p_lib.core.observability.eigen`.
     """
 
     T: np.ndarray

@@ -12,27 +12,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from p2p_lib.core import se3
 from p2p_lib.core.config import SelectionConfig
 from p2p_lib.method.registration import Hypothesis
 
 #: A smaller difference of the mean distances tells nothing, however certain it is, m.
 _MARGIN_M = 2e-4
-#: This turn, or this move, off the motion so far halves the support of a hypothesis.
-MOTION_DEG, MOTION_M = 5.0, 0.02
-
-
-def motion_weight(T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray]) -> np.ndarray | None:
-    """(H,) by how much the support of poses counts less for being off the nearest of the priors; None without priors.
-
-    1 on a prior, 1/2 at ``MOTION_DEG`` or ``MOTION_M`` from it: heavy tails, because objects may be pushed at any time.
-    """
-    if not len(priors) or not len(T_cam_obj):
-        return None
-    off = se3.inverse(np.stack(priors))[:, None] @ np.stack(T_cam_obj)[None]
-    turned = np.degrees(se3.angle_rad(off)) / MOTION_DEG
-    moved = np.linalg.norm(np.stack(priors)[:, None, :3, 3] - np.stack(T_cam_obj)[None, :, :3, 3], axis=-1)
-    return 1 / (1 + (turned**2 + (moved / MOTION_M) ** 2).min(0))
+#: A surface that no pose fits closer tells nothing either: it is bent, or depth and colour are not of one moment.
+_FITS_M = 0.004
 
 
 def select(
@@ -58,7 +44,7 @@ def select(
     if config.rule == "support":
         nearer = distance_m[best] - distance_m[nearest]
         chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
-        preferred = scores[best] - scores[nearest] > max(chance, _MARGIN_M)
+        preferred = scores[best] - scores[nearest] > max(chance, _MARGIN_M) and scores[nearest] < _FITS_M
         if not preferred:
             return best, "most inliers, the surface does not tell the hypotheses apart"
     return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"

@@ -1,6 +1,6 @@
 """3D reconstruction: one truncated signed distance volume per object (paper: 3D Reconstruction, appendix).
 
-A dense grid in the object frame, in memory or on a CUDA device (:mod:`p2p_lib.method.tsdf_grid`).
+A dense grid in the object frame, in memory or on a CUDA device (:mod:`p2p_lib.core.voxels`).
 The grid grows in blocks with the object and never beyond ``max_voxels``, whatever a wild depth pixel
 asks for. Every sum of the weighted mean is kept apart from its weight, so an observation can be taken
 out again and put back where the factor graph has moved its keyframe.
@@ -20,7 +20,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TsdfConfig
 from p2p_lib.core.errors import BadInput
-from p2p_lib.method.tsdf_grid import CpuGrid, Image, TorchGrid
+from p2p_lib.core.voxels import CpuGrid, Image, TorchGrid
 
 if TYPE_CHECKING:
     import trimesh
@@ -376,7 +376,7 @@ class TsdfVolume:
         return value * self.tau_m, ~np.isnan(value.sum(0))
 
     def mesh(self, min_component: float = 0.1) -> trimesh.Trimesh:
-        """The zero level with vertex colours, see :func:`p2p_lib.method.mesh.extract`."""
-        from p2p_lib.method.mesh import extract
+        """The zero level with vertex colours, see :func:`p2p_lib.core.mesh.extract`."""
+        from p2p_lib.core.mesh import extract
 
-        return extract(self, min_component)
+        return extract(self.values(), self.colours(), self.origin_m, self.voxel_m, min_component)

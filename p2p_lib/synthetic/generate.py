@@ -25,10 +25,20 @@ from p2p_lib.core.paths import cache_dir
 from p2p_lib.datasets.bop import write_models, write_scene
 from p2p_lib.datasets.sequence import SYNTHETIC, open_sequence
 from p2p_lib.datasets.ycbmultitrack import write_truth
-from p2p_lib.synthetic.noise import NOISE, Sensor, kept_frames, measured_colour, measured_depth, measured_mask
+from p2p_lib.synthetic.exposure import exposed
+from p2p_lib.synthetic.noise import (
+    NOISE,
+    Sensor,
+    in_motion,
+    kept_frames,
+    measured_colour,
+    measured_depth,
+    measured_mask,
+)
 from p2p_lib.synthetic.render import Rendering
 from p2p_lib.synthetic.scenarios import SCENARIOS
-from p2p_lib.synthetic.scene import FPS, Scenario
+from p2p_lib.synthetic.scene import Scenario
+from p2p_lib.synthetic.shadows import shadowed
 from p2p_lib.synthetic.shapes import Mesh
 
 _MODEL_POINTS = 6000
@@ -71,7 +81,7 @@ def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, 
         shown = {"unit": "frame", "delay": 2.0, "leave": False, "disable": None}
         visible = list(tqdm(done, title, len(frames), **shown))
     np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
-    np.savetxt(folder / "times.txt", frames / FPS, fmt="%.6f")
+    np.savetxt(folder / "times.txt", frames / scenario.fps, fmt="%.6f")
     for k, body in labelled.items():
         T_cam_model = se3.inverse(scenario.T_world_cam[frames]) @ body.T_world_model[frames]
         uv_px = scenario.camera.project(se3.transform(T_cam_model, body.mesh.vertices))
@@ -123,14 +133,19 @@ def photograph(
     ``room`` is the empty scene at this frame's camera pose, where the caller already has it.
     """
     rng = np.random.default_rng([seed, 2, t])
+    if room is not None and scenario.light.shadow:
+        # As they are in the middle of the exposure: the edges of a shadow are soft as it is.
+        room = shadowed(room, scenario.placed(t), scenario.camera, scenario.T_world_cam[t], scenario.light)
     exact = scenario.rendered(t, room)
-    rgb = exact.rgb
-    if sensor.shutter_share > 0:
-        times = t + sensor.shutter_share * (np.arange(sensor.blur_samples) + 0.5) / sensor.blur_samples
-        rgb = np.mean([scenario.rendered(s, room).rgb for s in np.minimum(times, scenario.frames - 1)], 0)
+    own = sensor.motion_blur * scenario.shutter_s * scenario.fps
+    rgb, during = exposed(scenario, t, min(max(sensor.shutter_share, own), 1.0), int(sensor.blur_samples), exact, room)
     phase = np.random.default_rng([seed, 3]).uniform(0, 2 * np.pi)
-    gain = 1 + sensor.exposure * np.sin(2 * np.pi * t / (4 * FPS) + phase)
+    gain = 1 + sensor.exposure * np.sin(2 * np.pi * t / (4 * scenario.fps) + phase)
     depth_m = measured_depth(exact, scenario.camera, sensor, rng)
+    if own > 0 and during:
+        # The imagers of depth have a bright projector of their own: half the time is enough.
+        half = during[len(during) // 4 : -(len(during) // 4) or None]
+        depth_m = in_motion(depth_m, half, sensor, np.random.default_rng([seed, 7, t]))
     return measured_colour(rgb, sensor, gain, rng), depth_m, exact
 
 

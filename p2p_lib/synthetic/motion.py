@@ -70,3 +70,24 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 def standing(eye: np.ndarray, target: np.ndarray, frames: int) -> np.ndarray:
     """T_world_cam (frames, 4, 4) of an upright camera that stands still."""
     return np.broadcast_to(look_at(eye, target), (frames, 4, 4))
+
+
+def minimum_jerk(frames: int) -> np.ndarray:
+    """How much of its way a hand has gone at frames 0 to ``frames``, (frames + 1,) (Flash and Hogan, 1985)."""
+    s = np.arange(frames + 1) / frames
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def carried(T0: np.ndarray, T1: np.ndarray, frames: int, pivot: np.ndarray) -> np.ndarray:
+    """Poses (frames, 4, 4) after T0 up to T1 at minimum jerk; the point ``pivot`` of the model goes straight."""
+    s = minimum_jerk(frames)[1:]
+    R = T0[:3, :3] @ se3.exp(s[:, None] * np.r_[se3.so3_log(T0[:3, :3].T @ T1[:3, :3]), 0, 0, 0])[:, :3, :3]
+    start, end = (T[:3, :3] @ pivot + T[:3, 3] for T in (T0, T1))
+    return se3.from_rt(R, start + s[:, None] * (end - start) - R @ pivot)
+
+
+def spun(T: np.ndarray, deg: float, axis: np.ndarray, pivot: np.ndarray) -> np.ndarray:
+    """A pose turned about an axis (any length) in the world through the model's point ``pivot``."""
+    R = se3.exp(np.r_[np.radians(deg) * axis / np.linalg.norm(axis), 0, 0, 0])[:3, :3]
+    middle = T[:3, :3] @ pivot + T[:3, 3]
+    return se3.from_rt(R @ T[:3, :3], middle + R @ (T[:3, 3] - middle))

@@ -39,7 +39,8 @@ class Sensor:
     shot_levels: float = _effect(2.5, "that at full brightness, added in variance")
     exposure: float = _effect(0.04, "largest relative change of brightness over time, which is slow", 0.9)
     shutter_share: float = _effect(0.0, "share of the frame time that the shutter is open: motion blur", 1)
-    blur_samples: int = _effect(6, "images averaged for it, at least 1")
+    blur_samples: int = _effect(10, "images rendered for it at most; each is smeared along its own motion")
+    motion_blur: float = _effect(1.0, "share taken of the shutter time that a scene asks for by itself", 1)
     mask_px: float = _effect(0.0, "standard deviation of the displacement of mask outlines, which wobble smoothly")
     mask_loss: float = _effect(0.0, "probability that an object's mask is missing in a frame", 1)
     drop: float = _effect(0.0, "probability that a frame is missing; the first never is", 1)
@@ -50,6 +51,9 @@ class Sensor:
             if not np.isfinite(value) or not low <= value <= high:
                 raise BadInput(f"sensor {f.name}", value, f"a number from {low} to {high}: {f.metadata['meaning']}")
 
+
+#: An edge may pass so many pixels between two of the instants at which a moving image is known.
+_PASSED_PX = 11
 
 #: Exact depth and clean colour.
 PERFECT = Sensor(**{f.name: 1 if f.name == "blur_samples" else 0 for f in fields(Sensor)})
@@ -83,6 +87,35 @@ def measured_depth(image: Rendering, camera: Camera, sensor: Sensor, rng: np.ran
         steps = np.round(np.divide(unit, depth, out=np.zeros((H, W)), where=depth > 0))
         depth = np.divide(unit, steps, out=np.zeros((H, W)), where=steps > 0)
     return np.where(hole, 0.0, depth)
+
+
+def in_motion(
+    measured_m: np.ndarray, during_m: list[np.ndarray], sensor: Sensor, rng: np.random.Generator
+) -> np.ndarray:
+    """Measured depth (H, W) given the exact one at several instants while the imagers' shutters were open.
+
+    Where an edge passed meanwhile there is nothing (as often as beside any edge), what was there for a part of the
+    time, or, in a fifth of the pixels, a mixture of near and far; all in patches, because stereo matches windows.
+    """
+    inverse = [np.divide(1.0, z, out=np.zeros_like(z), where=z > 0) for z in during_m]
+    near, far = np.maximum.reduce(inverse), np.minimum.reduce(inverse)
+    # On a slope depth changes as well, but no edge passes.
+    edges = np.logical_or.reduce([_edges(z, sensor.edge_m) for z in during_m]).astype(np.uint8)
+    passed = cv2.dilate(edges, np.ones((_PASSED_PX, _PASSED_PX), np.uint8)) > 0
+    v, u = np.nonzero(passed & (near - far > sensor.edge_m * near * far))
+    every = np.stack([a[v, u] for a in inverse])
+    patchy = [_even(_correlated(*measured_m.shape, 2 * sensor.correlation_px, rng)[v, u]) for _ in range(2)]
+    seen = every[(patchy[0] * len(every)).astype(int), np.arange(len(v))]
+    seen = np.where(rng.random(len(v)) < 0.2, every.mean(0), seen)
+    seen[patchy[1] < sensor.edge_loss] = 0
+    depth = measured_m.copy()
+    depth[v, u] = np.divide(1.0, seen, out=np.zeros_like(seen), where=seen > 0)
+    return depth
+
+
+def _even(normal: np.ndarray) -> np.ndarray:
+    """Normal values as their share of smaller ones, in [0, 1), by a logistic curve."""
+    return np.clip(1 / (1 + np.exp(-1.702 * normal)), 0, 1 - 1e-9)
 
 
 def measured_colour(rgb: np.ndarray, sensor: Sensor, gain: float, rng: np.random.Generator) -> np.ndarray:

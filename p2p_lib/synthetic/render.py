@@ -29,6 +29,7 @@ class Light:
 
     towards      points from the scene to the light (any length)
     ambient      share of the light that comes from everywhere
+    shadow       share of the light that is lost on the room where bodies cover all of the lamp; 0 = no shadows
     environment  what glossy surfaces mirror, and how blurred (glaze: a degree); None = nothing
     """
 
@@ -36,6 +37,7 @@ class Light:
     ambient: float = 0.5
     environment: Environment | None = None
     roughness_rad: float = 0.02
+    shadow: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from p2p_lib.synthetic import ablations, absences, paper_subset
+from p2p_lib.synthetic import ablations, absences, desk, in_hand, paper_subset, tools
 from p2p_lib.synthetic.scene import Scenario
 
 #: Each takes the seed first and its own keyword parameters.
@@ -28,9 +28,15 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
         absences.half_hidden_start,
         absences.other_side,
         absences.look_away,
+        in_hand.in_hand,
+        in_hand.in_hand_10fps,
+        desk.cluttered_desk,
+        tools.thin_tools,
     )
 }
 SCENARIOS |= {name: partial(paper_subset.paper_sequence, parts=parts) for name, parts in paper_subset.SEQUENCES.items()}
+
+SCENARIOS |= tools.SCENARIOS
 
 
 def describe(name: str) -> str:
@@ -38,4 +44,6 @@ def describe(name: str) -> str:
     if name in paper_subset.SEQUENCES:
         parts = " and ".join(f"{model} ({motion})" for model, motion in paper_subset.SEQUENCES[name].items())
         return f"as in the paper's synthetic subset: {parts}, {paper_subset.FRAMES} frames."
+    if name in tools.SCENARIOS:
+        return f"as thin_tools, the tool: {name.removeprefix('thin_')}."
     return SCENARIOS[name].__doc__.splitlines()[0]

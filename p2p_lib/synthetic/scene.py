@@ -30,7 +30,13 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A scene in time. World: z up, the table top is z = 0. ``T_world_cam`` (T, 4, 4); ``objects``: what they are."""
+    """A scene in time. World: z up, the table top is z = 0.
+
+    T_world_cam  (T, 4, 4)
+    objects      what they are
+    fps          frames a second
+    shutter_s    for how long the shutter is open in this light; 0 = too short for motion to show
+    """
 
     camera: Camera
     T_world_cam: np.ndarray
@@ -38,6 +44,8 @@ class Scenario:
     room: tuple[Mesh, ...]
     light: Light = field(default_factory=Light)
     objects: str = "procedural"
+    fps: float = FPS
+    shutter_s: float = 0.0
 
     @property
     def frames(self) -> int:
@@ -46,16 +54,19 @@ class Scenario:
 
     def rendered(self, t: float, room: Rendering | None = None) -> Rendering:
         """The scene at a frame, or between two; ``room`` is :meth:`empty` there, where the caller has it already."""
-        bodies = [(body.mesh, _at(body.T_world_model, t)) for body in self.bodies]
-        return render(bodies, self.camera, _at(self.T_world_cam, t), self.light, room or self.empty(t))
+        return render(self.placed(t), self.camera, at_time(self.T_world_cam, t), self.light, room or self.empty(t))
+
+    def placed(self, t: float) -> list[tuple[Mesh, np.ndarray]]:
+        """Each body's mesh and T_world_model."""
+        return [(body.mesh, at_time(body.T_world_model, t)) for body in self.bodies]
 
     def empty(self, t: float) -> Rendering:
         """The scene without its bodies; nothing in it carries a label."""
         walls = [(mesh, se3.IDENTITY) for mesh in self.room]
-        return render(walls, self.camera, _at(self.T_world_cam, t), self.light)
+        return render(walls, self.camera, at_time(self.T_world_cam, t), self.light)
 
 
-def _at(T: np.ndarray, t: float) -> np.ndarray:
+def at_time(T: np.ndarray, t: float) -> np.ndarray:
     """The pose at a fractional frame."""
     k = int(t)
     return T[k] if t == k else se3.interpolate(T[k], T[k + 1], t - k)

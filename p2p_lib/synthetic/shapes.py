@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.raycasting import ray_scene
 from p2p_lib.synthetic import labels, texture
@@ -65,6 +66,12 @@ class Mesh:
     def mipmap(self) -> list[np.ndarray]:
         """The texture at every size, see :func:`p2p_lib.synthetic.texture.mipmap`."""
         return texture.mipmap(self.texture)
+
+    @cached_property
+    def ball(self) -> tuple[np.ndarray, float]:
+        """Middle (3,) and radius of a ball around it."""
+        middle = (self.vertices.max(0) + self.vertices.min(0)) / 2
+        return middle, float(np.linalg.norm(self.vertices - middle, axis=1).max())
 
     @cached_property
     def ray_scene(self) -> Any:
@@ -127,14 +134,14 @@ def box(rng: np.random.Generator, size_m: tuple[float, float, float], contrast: 
     x, y, z = (max(8, round(s * TEXELS_PER_M)) for s in size_m)
     sides = [labels.label(rng, w, z, contrast, front) for w, front in ((x, True), (y, False), (x, True), (y, False))]
     ends = [labels.label(rng, x, y, contrast, front) for front in (True, False)]
-    return _six_sided(size_m, sides + ends)
+    return six_sided(size_m, sides + ends)
 
 
 def slab(rng: np.random.Generator, size_m: tuple[float, float, float]) -> Mesh:
     """A plain board of size (x, y, z), centred: an occluder."""
     x, y, z = (max(8, round(s * TEXELS_PER_M / 3)) for s in size_m)
     panels = (x, z), (y, z), (x, z), (y, z), (x, y), (x, y)
-    return _six_sided(size_m, [labels.cardboard(rng, w, h) for w, h in panels])
+    return six_sided(size_m, [labels.cardboard(rng, w, h) for w, h in panels])
 
 
 def can(rng: np.random.Generator, radius_m: float, height_m: float, contrast: float = 1.0, segments: int = 72) -> Mesh:
@@ -192,6 +199,30 @@ def plane(image: np.ndarray, corners_m: np.ndarray) -> Mesh:
     return Mesh(np.asarray(corners_m, float), faces, uv[faces], image)
 
 
+def joined(parts: Sequence[tuple[Mesh, np.ndarray]]) -> Mesh:
+    """One mesh of several at poses (4, 4), each in its frame; their textures stand one on the other."""
+    W, H = max(m.texture.shape[1] for m, _ in parts), sum(m.texture.shape[0] for m, _ in parts)
+    page, top, count = np.full((H, W, 3), 128, np.uint8), 0, 0
+    vertices, faces, uv, normals, mirrors = [], [], [], [], []
+    for mesh, T in parts:
+        h, w = mesh.texture.shape[:2]
+        page[top : top + h, :w] = mesh.texture
+        uv.append((mesh.uv * [w, h] + [0, H - top - h]) / [W, H])
+        vertices.append(se3.transform(T, mesh.vertices))
+        normals.append(mesh.normals @ T[:3, :3].T)
+        faces.append(mesh.faces + count)
+        mirrors.append(mesh.reflectance)
+        top, count = top + h, count + len(mesh.vertices)
+    return Mesh(
+        *(np.concatenate(a) for a in (vertices, faces, uv)), page, *(np.concatenate(a) for a in (normals, mirrors))
+    )
+
+
+def moved(mesh: Mesh, T: np.ndarray) -> Mesh:
+    """The mesh with its vertices moved by T (4, 4): part of a room."""
+    return replace(mesh, vertices=se3.transform(T, mesh.vertices), normals=mesh.normals @ T[:3, :3].T)
+
+
 def load_mesh(path: str | Path) -> Mesh:
     """Any mesh with a texture that trimesh reads (metres), such as a YCB ``textured.obj``."""
     import trimesh
@@ -219,8 +250,8 @@ def grid(across: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([low_left, low_right, top_right], 1), np.stack([low_left, top_right, top_left], 1)])
 
 
-def _six_sided(size_m: tuple[float, float, float], panels: list[np.ndarray]) -> Mesh:
-    """A box of panels -y, +x, +y, -x, top, bottom; faces of about 1 cm, so that vertices cover the surface."""
+def six_sided(size_m: tuple[float, float, float], panels: list[np.ndarray]) -> Mesh:
+    """A box of panels (images) -y, +x, +y, -x, top, bottom; faces of about 1 cm, so that vertices cover the surface."""
     x, y, z = np.eye(3)
     size, patches = np.asarray(size_m, float), []
     for (right, up), panel in zip([(x, z), (y, z), (-x, z), (-y, z), (x, y), (-x, y)], panels, strict=True):

@@ -29,14 +29,32 @@ def mug(rng: np.random.Generator, radius_m: float, height_m: float, reflectance:
     glaze[:] = rng.uniform(28, 70, 3)
     _print_marks(rng, glaze, marks, int(height_m * TEXELS_PER_M))
     body = revolved(profile, glaze)
-    t = np.linspace(-1.0, 1.0, 17)
-    bow = np.stack([np.cos(t * np.pi / 2) ** 0.6 * 0.75 * radius_m, np.zeros_like(t), t * 0.30 * height_m], 1)
-    outside = profile[1:26]
-    # Both ends end inside the wall, which is 4 mm thick.
-    bow[:, 0] += np.interp(bow[:, 2], outside[:, 1], outside[:, 0]) - 0.002
-    handle = tube(bow, 0.008, _speckled(rng))
+    handle = tube(_mug_handle(profile, radius_m, height_m), 0.008, _speckled(rng))
     mirrors = np.repeat([reflectance, 0.0], [len(body.corners), len(handle.corners)])
     return replace(assembled([body, handle], [[0], [1]], ground=96), reflectance=mirrors)
+
+
+def speckled_mug(rng: np.random.Generator, radius_m: float = 0.042, height_m: float = 0.102) -> Mesh:
+    """A mug of glazed, speckled clay around the z axis, centred, its handle towards +x; a bare foot and one stamp.
+
+    The speckles are all alike: near by they hold points, and blurred they are gone.
+    """
+    profile = _mug_profile(radius_m, height_m)
+    length = np.linalg.norm(np.diff(profile, axis=0), axis=1).sum()
+    around, along = round(2 * np.pi * radius_m * TEXELS_PER_M), round(length * TEXELS_PER_M)
+    glaze = cv2.cvtColor(
+        np.uint8([[[rng.integers(0, 180), rng.integers(90, 170), rng.integers(80, 150)]]]), cv2.COLOR_HSV2RGB
+    )
+    clay = _speckles(rng, around, along, glaze[0, 0], 0.05)
+    tall, foot = round(height_m * TEXELS_PER_M), round(radius_m * 0.62 * TEXELS_PER_M)
+    clay[along - foot - round(0.10 * tall) :] = _speckles(
+        rng, around, foot + round(0.10 * tall), (206, 190, 160), 0.006
+    )
+    _stamp(rng, clay, (around // 2, along - foot - tall // 2), round(0.26 * tall))
+    bow = _mug_handle(profile, radius_m, height_m)
+    handle = tube(bow, 0.0075, _speckles(rng, 160, 512, glaze[0, 0], 0.05))
+    mesh = assembled([revolved(profile, clay), handle], [[0], [1]], ground=96)
+    return replace(mesh, reflectance=np.full(len(mesh.faces), 0.03))
 
 
 def hand(rng: np.random.Generator) -> Mesh:
@@ -47,10 +65,10 @@ def hand(rng: np.random.Generator) -> Mesh:
     skin = np.clip(tone * (1 + 0.08 * blotches), 0, 255).astype(np.uint8)
     fingers = [(-0.0285, 0.066), (-0.0095, 0.078), (0.0095, 0.073), (0.0285, 0.058)]
     limbs = [
-        _limb(skin, 0.030, 0.30, (0, 0, -0.20), (1.0, 0.8, 1.0)),
-        _limb(skin, 0.046, 0.112, (0, 0, -0.035), (1.0, 0.35, 1.0)),
-        _limb(skin, 0.011, 0.075, (-0.050, 0, -0.025), lean_rad=-0.5),
-        *(_limb(skin, 0.0105, 2 * tall, (x, 0, 0.016)) for x, tall in fingers),
+        limb(skin, 0.030, 0.30, (0, 0, -0.20), (1.0, 0.8, 1.0)),
+        limb(skin, 0.046, 0.112, (0, 0, -0.035), (1.0, 0.35, 1.0)),
+        limb(skin, 0.011, 0.075, (-0.050, 0, -0.025), lean_rad=-0.5),
+        *(limb(skin, 0.0105, 2 * tall, (x, 0, 0.016)) for x, tall in fingers),
     ]
     corners, uv, normals = (np.concatenate([getattr(p, a) for p in limbs]) for a in ("corners", "uv", "normals"))
     return assembled([Patch(size * corners, uv, normals, skin)])
@@ -109,6 +127,40 @@ def _mug_profile(radius_m: float, height_m: float) -> np.ndarray:
     return np.concatenate([[[0, -h]], outside, inside, [[0, inside[-1, 1]]]])
 
 
+def _mug_handle(profile: np.ndarray, radius_m: float, height_m: float) -> np.ndarray:
+    """A handle's middle line (17, 3); both ends end inside the wall, which is 4 mm thick."""
+    t = np.linspace(-1.0, 1.0, 17)
+    bow = np.stack([np.cos(t * np.pi / 2) ** 0.6 * 0.75 * radius_m, np.zeros_like(t), t * 0.30 * height_m], 1)
+    outside = profile[1:26]
+    bow[:, 0] += np.interp(bow[:, 2], outside[:, 1], outside[:, 0]) - 0.002
+    return bow
+
+
+def _speckles(rng: np.random.Generator, width: int, height: int, glaze: tuple, share: float) -> np.ndarray:
+    """Glaze (height, width, 3) uint8 with a cloud in it, and light and dark specks that cover about ``share`` of it."""
+    page = np.float32(glaze) * (1 + 0.08 * labels.smooth_noise(rng, width, height, (4, 4), 4))[..., None]
+    for size, shade in ((3, 225), (5, 210), (8, 230), (5, 30)):
+        n = round(share * width * height / 4 / (0.8 * size**2))
+        specks = np.zeros((height, width), np.float32)
+        specks[rng.integers(0, height, n), rng.integers(0, width, n)] = 1
+        specks = cv2.dilate(specks, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))[..., None]
+        page += 0.75 * specks * (shade - page)
+    return np.clip(page, 0, 255).astype(np.uint8)
+
+
+def _stamp(rng: np.random.Generator, page: np.ndarray, at: tuple[int, int], radius: int) -> None:
+    """A round seal with rings, a word and a few drawn leaves, in pale ink."""
+    ink = tuple(int(c) for c in rng.uniform(185, 225, 3))
+    cv2.circle(page, at, radius, ink, -1, cv2.LINE_AA)
+    dark = tuple(int(0.4 * c) for c in ink)
+    for share in (0.92, 0.70):
+        cv2.circle(page, at, int(share * radius), dark, 3, cv2.LINE_AA)
+    for turn in rng.uniform(0, 360, 7):
+        middle = at[0] + int(0.35 * radius * np.cos(turn)), at[1] + int(0.35 * radius * np.sin(turn))
+        cv2.ellipse(page, middle, (radius // 4, radius // 9), turn, 0, 360, dark, 2, cv2.LINE_AA)
+    cv2.putText(page, "KILN", (at[0] - radius // 2, at[1] + radius // 5), 4, radius / 60, dark, 3, cv2.LINE_AA)
+
+
 def _print_marks(rng: np.random.Generator, glaze: np.ndarray, marks: int, tall: int) -> None:
     """Small prints, evenly around the belly at different heights; the outside starts at the image's bottom."""
     along, around = glaze.shape[:2]
@@ -134,7 +186,14 @@ def _speckled(rng: np.random.Generator, width: int = 128, height: int = 512) -> 
     return page
 
 
-def _limb(
+def capsule(
+    image: np.ndarray, radius_m: float, length_m: float, squash: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Mesh:
+    """A capsule along z, centred, with an image wrapped around it; ``squash`` flattens it along its axes."""
+    return assembled([limb(image, radius_m, length_m, (0, 0, 0), squash)])
+
+
+def limb(
     skin: np.ndarray,
     radius_m: float,
     length_m: float,

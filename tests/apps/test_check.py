@@ -245,8 +245,14 @@ def click(u, v):
 
 
 def test_a_click_on_the_background_is_worth_a_look(good):
-    finding = found(good, "box: mask", **click(230, 240))
-    assert finding.level is Level.LOOK and re.match(r"it covers \d+ % of the image, over 0\.[34]", finding.text)
+    finding = found(good, "box: clicks", **click(230, 240))
+    assert finding.level is Level.LOOK and "flat in what is around it, as a table or a wall is" in finding.text
+
+
+def test_clicks_all_over_the_background_are_worth_a_look(good):
+    clicks = {"prompts": [Prompt("box", 0, np.array([[100.0, 400], [500, 420], [320, 320]]))]}
+    finding = found(good, "box: mask", **clicks)
+    assert finding.level is Level.LOOK and re.match(r"it covers \d+ % of the image, over 0\.\d+ m", finding.text)
     assert "table or wall" in finding.fix
 
 
@@ -260,7 +266,10 @@ def test_clicks_of_two_objects_on_one_body_are_worth_a_look(good):
 
 def test_a_click_that_segments_nothing_is_said_once(good, recwarn):
     (wrong,) = alarms(check_folder(good, **click(5, 5)))
-    assert (wrong.name, wrong.level) == ("box: mask", Level.WRONG) and wrong.text.startswith("nothing was segmented")
+    assert (wrong.name, wrong.level) == (
+        "box: mask",
+        Level.WRONG,
+    ) and "were segmented at the clicks on it" in wrong.text
     assert "Click elsewhere" in wrong.fix and not len(recwarn)
 
 

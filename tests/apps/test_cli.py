@@ -21,7 +21,7 @@ from p2p_lib.apps import cli
 from p2p_lib.core.errors import MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.runs import load_run
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.run import summary
 from tests.fixtures.sliding_board import DEPTH_M, H, K, W, write_sequence
 

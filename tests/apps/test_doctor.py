@@ -10,6 +10,7 @@ from p2p_lib.apps.doctor import run_doctor
 from p2p_lib.core import native
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.findings import Finding, Level, as_lines
+from p2p_lib.core.packages import EXTRAS
 
 
 @pytest.fixture(scope="module")
@@ -18,9 +19,10 @@ def checks() -> dict[str, Finding]:
 
 
 def test_every_required_package_is_imported_for_real(checks):
-    required = doctor.required_packages()
-    assert {"torch", "open3d", "gtsam", "opencv-python-headless", "papermill"} <= set(required)
-    assert not {"pytest", "ruff"} & set(required)
+    light, extras = doctor.packages_of(), [doctor.packages_of(name) for name in EXTRAS]
+    assert {"numpy", "gtsam", "opencv-python-headless"} <= set(light) and not {"torch", "pytest"} & set(light)
+    assert {"torch", "open3d", "papermill"} <= set().union(*extras)
+    required = [name for of in (light, *extras) for name in of if doctor._installed(name)]
     missing = [library for library in native.SYSTEM_LIBRARIES if not checks[library].fine]
     for name in set(required) - {"libusb-package"}:
         if name == "open3d" and missing:
@@ -33,6 +35,7 @@ def test_looks_at_everything_promised(checks):
     promised = {
         *native.SYSTEM_LIBRARIES,
         *doctor.OPTIONAL,
+        *(f"extra {name}" for name in EXTRAS),
         "Python",
         "GPU",
         "cotracker",
@@ -45,7 +48,20 @@ def test_looks_at_everything_promised(checks):
 
 
 def test_no_optional_part_is_called_required(checks):
-    assert Level.WRONG not in {checks[name].level for name in (*doctor.OPTIONAL, "cotracker", "GPU", "$P2P_DATA")}
+    names = (*doctor.OPTIONAL, *(f"extra {name}" for name in EXTRAS), "cotracker", "GPU", "$P2P_DATA")
+    assert Level.WRONG not in {checks[name].level for name in names}
+
+
+def test_what_was_left_out_on_purpose_is_not_wrong(monkeypatch):
+    """A light install, for which all else is out of reach."""
+    light = set(doctor.packages_of())
+    monkeypatch.setattr(doctor, "_installed", lambda name: name in light)
+    monkeypatch.setattr(native, "loads", lambda library: False)
+    found = {finding.name: finding for finding in run_doctor()}
+    assert not [finding for finding in found.values() if finding.level is Level.WRONG]
+    assert not {"torch", "Jupyter kernel", *native.SYSTEM_LIBRARIES} & found.keys()
+    view = found["extra view"]
+    assert view.fix.endswith('pip install "p2p_lib[view]"') and "not installed: av, " in view.text
 
 
 def test_a_broken_package_is_found_with_its_last_words(monkeypatch):

@@ -28,8 +28,8 @@ from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.prompts import save_prompts
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import write_film
-from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.run import run
 from tests.apps.test_cli import POINTS_ALONE
 from tests.fixtures.sliding_board import H, K, W, write_sequence
@@ -374,7 +374,7 @@ def test_realsense_is_named_by_open_camera(monkeypatch):
     from p2p_lib.core.errors import MissingBackend
 
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(MissingBackend, match=r"pyrealsense2 cannot be loaded .*uv pip install"):
+    with pytest.raises(MissingBackend, match=r"pyrealsense2 cannot be loaded .*pip install .p2p_lib"):
         open_camera("realsense")
 
 

@@ -17,7 +17,7 @@ def test_a_plan_says_which_rows_can_run(nothing):
     assert title.split()[0] == "long_range"
     assert ours.startswith("  Ours; Ours, SH(10): 4 of 5 sequences; else: ycbmultitrack_real:")
     assert papers.startswith(
-        "  paper_full; paper_sh10: 0 of 5 sequences; else: no weights of sam2, superpoint, tapir. Run:"
+        "  paper_full; paper_sh10: 0 of 5 sequences; else: no weights of sam2_video, superpoint, tapir. Run:"
     )
 
 

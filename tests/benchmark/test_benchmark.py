@@ -193,7 +193,7 @@ def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp
 
 
 def test_a_cluster_finds_the_same_table(whole, plan, tmp_path, capsys):
-    distributed = pytest.importorskip("distributed", reason="extra cluster is not installed")
+    distributed = pytest.importorskip("distributed", reason="extra dask is not installed")
     cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
     with cluster:
         address = cluster.scheduler_address
@@ -206,7 +206,7 @@ def test_a_cluster_finds_the_same_table(whole, plan, tmp_path, capsys):
 
 
 def test_a_scheduler_that_does_not_answer_is_named(plan, tmp_path, monkeypatch):
-    pytest.importorskip("distributed", reason="extra cluster is not installed")
+    pytest.importorskip("distributed", reason="extra dask is not installed")
     monkeypatch.setattr("p2p_lib.benchmark.execution._CONNECT_S", 1)
     with pytest.raises(BadInput, match=r"scheduler: got tcp://127\.0\.0\.1:9 .*expected a Dask scheduler that answers"):
         run_benchmark(plan, tmp_path, "quick", scheduler="tcp://127.0.0.1:9", progress=False)

@@ -75,9 +75,9 @@ def test_what_is_not_there_says_why_and_costs_nothing(monkeypatch):
     jobs = jobs_of(read_plan("ycbineoat"), "full")
     assert len(jobs) == 2 * 27 and not any(job.key for job in jobs)
     assert {"below $P2P_DATA, which is not set" in job.reason for job in jobs if job.method.name == "Ours"} == {True}
-    fetch = "; ".join(f"p2p data fetch {name}" for name in ("sam2", "superpoint", "tapir"))
+    fetch = "; ".join(f"p2p data fetch {name}" for name in ("sam2_video", "superpoint", "tapir"))
     asked = {job.reason for job in jobs if job.method.name == "paper_full"}
-    assert asked == {f"no weights of sam2, superpoint, tapir. Run: {fetch}"}
+    assert asked == {f"no weights of sam2_video, superpoint, tapir. Run: {fetch}"}
     (real,) = {job.reason for job in jobs_of(read_plan("ycbmultitrack_real"), "full")}
     assert "P2P_DATA" in real
 
@@ -88,7 +88,7 @@ def test_the_papers_own_configuration_stands_in_every_table_beside_ours():
         own = [method for method in plan.method if method.name.startswith("paper_")]
         assert own or not plan.paper
         for method in own:
-            assert (method.preset, method.tracker, method.masks, method.gpu) == ("paper", "tapir", "sam2", True)
+            assert (method.preset, method.tracker, method.masks, method.gpu) == ("paper", "tapir", "sam2_video", True)
             assert method.detector == "superpoint" or "uniform" in method.name
             beside = {other.paper for other in plan.method if other not in own}
             assert not plan.paper or method.paper in beside, f"{name}: {method.name}"
@@ -96,7 +96,7 @@ def test_the_papers_own_configuration_stands_in_every_table_beside_ours():
 
 def test_weights_without_a_gpu_are_not_enough(tmp_path, monkeypatch):
     monkeypatch.setenv("P2P_DATA", str(tmp_path))
-    for name in ("sam2", "superpoint", "tapir"):
+    for name in ("sam2_video", "superpoint", "tapir"):
         for file in manifest(name).files:
             path = tmp_path / manifest(name).folder / file.path
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -32,7 +32,7 @@ def value_of(cfg: Config, key: str):
 @EVERY_FIELD
 def test_metadata_is_complete(key):
     f, meta = FIELDS[key], FIELDS[key].metadata
-    assert set(meta) <= {"meaning", "unit", "source", "low", "high", "choices"}
+    assert set(meta) <= {"meaning", "unit", "source", "low", "high", "choices", "form"}
     assert re.fullmatch(r"[A-Z].{15,}[^ ]\.", meta["meaning"]), "a whole sentence"
     assert not re.search(r"seed|AUC|measured", meta["meaning"]), "what a value is worth stands in benchmarks/"
     assert meta["source"] in ("paper", "release", "ours")
@@ -56,17 +56,14 @@ def test_presets_choose_parameters_never_backends(key, name):
     """A backend is a name: the only words a preset holds are choices of the method's own."""
     value = value_of(preset(name), key)
     if isinstance(value, str):
-        assert value in FIELDS[key].metadata["choices"]
+        assert value in FIELDS[key].metadata.get("choices", ("all", "none"))
     assert key.split(".")[1] not in ("tracker", "detector", "segmenter", "masks", "backend", "device")
 
 
 #: What the paper's text says (main text and appendix).
 PAPER_TEXT = {
     "method.object_frame": "camera",
-    "method.motion": False,
-    "method.redetection": False,
-    "method.scene": False,
-    "method.gates": "none",
+    "method.mechanisms": "none",
     "method.noise": "constant",
     "method.surface": True,
     "method.graph": True,
@@ -138,7 +135,7 @@ def test_what_is_said_to_be_the_papers_or_the_releases_is(key):
     ("name", "key", "source"),
     [
         ("paper", "tsdf.voxel_m", "release"),
-        ("paper", "method.motion", "paper"),
+        ("paper", "method.mechanisms", "paper"),
         ("paper", "tsdf.truncation_voxels", "release"),
         ("paper", "sampling.r_ideal_px", "ours"),
         ("default", "tsdf.voxel_m", "ours"),
@@ -322,7 +319,7 @@ def value_strategy(key: str) -> st.SearchStrategy:
         case float():
             return st.floats(low, high, allow_nan=False)
         case _:
-            return st.sampled_from(f.metadata["choices"])
+            return st.sampled_from(f.metadata.get("choices", ("all", "none", "all but size", "size, outline")))
 
 
 changes = st.dictionaries(st.sampled_from(sorted(FIELDS)), st.none()).flatmap(
@@ -400,7 +397,7 @@ def test_files_that_cannot_be_read(tmp_path):
 
 def test_a_key_given_for_a_stage_names_its_stage():
     with pytest.raises(BadInput, match=r"Did you mean method\?"):
-        config.parameters(preset(), "gates")
-    assert [row["key"] for row in config.parameters(preset(), "method.gates")] == ["method.gates"]
-    with pytest.raises(BadInput, match=r"key of method: got 'gate', expected .*gates"):
-        config.parameters(preset(), "method.gate")
+        config.parameters(preset(), "mechanisms")
+    assert [row["key"] for row in config.parameters(preset(), "method.mechanisms")] == ["method.mechanisms"]
+    with pytest.raises(BadInput, match=r"key of method: got 'mechanism', expected .*mechanisms"):
+        config.parameters(preset(), "method.mechanism")

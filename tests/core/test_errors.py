@@ -5,9 +5,9 @@ import pickle
 import numpy as np
 import pytest
 
+from p2p_lib.core.depth import check_metres
 from p2p_lib.core.errors import BadInput, Doubt, MissingBackend, MissingData, P2PError
 from p2p_lib.core.types import Frame
-from p2p_lib.method.pipeline import _check_unit
 
 EVERY = [
     BadInput("depth", "3x2", "640x480", "Register it first."),
@@ -31,7 +31,7 @@ def test_each_is_also_what_python_calls_it():
 def test_a_doubt_names_the_line_that_called_the_library():
     frame = Frame(0, 0.0, np.zeros((8, 8, 3), np.uint8), np.where(np.arange(64) < 20, 1, 99).reshape(8, 8) / 1.0)
     with pytest.warns(Doubt) as said:
-        _check_unit(frame)
+        check_metres(frame)
     assert said[0].filename == __file__
 
 

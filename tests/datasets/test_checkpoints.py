@@ -50,7 +50,7 @@ def test_manifests_of_all_models_say_what_they_must():
         ("trackers.tapnextpp", "tapnet"),
         ("trackers.cotracker", "co-tracker"),
         ("detectors.superpoint", "transformers"),
-        ("segmenters.sam2", "transformers"),
+        ("segmenters.sam2_video", "transformers"),
     ],
 )
 def test_every_adapter_states_the_version_that_it_was_last_run_with(module, package):
@@ -138,7 +138,7 @@ def test_a_missing_checkpoint_names_the_commands(name, tmp_path, monkeypatch):
         ("no_such.tapir_model", "tapnet", ["einshape", "--no-deps 'tapnet @ git+https://github.com/google-deepmind/"]),
         ("no_such.torchvision", "torchvision", ["torchvision==", "--torch-backend=auto"]),
         ("no_such.predictor", "co-tracker", ["torch.hub.load('facebookresearch/co-tracker'", "pretrained=False"]),
-        ("no_such.transformers", "transformers", ["pip install --python", "transformers"]),
+        ("no_such.transformers", "transformers", ['pip install "p2p_lib[sam2-video]"']),
     ],
 )
 def test_a_missing_package_names_the_command(module, package, words):

@@ -300,7 +300,7 @@ def test_what_a_ros_recording_lacks_is_named(ros, tmp_path):
 def test_without_rosbags_it_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     (tmp_path / "a.mcap").write_text("")
-    with pytest.raises(MissingBackend, match=r"ROS recordings: the package rosbags .*uv pip install"):
+    with pytest.raises(MissingBackend, match=r"ROS recordings: the package rosbags .*pip install .p2p_lib"):
         convert(tmp_path / "a.mcap", tmp_path / "out")
 
 

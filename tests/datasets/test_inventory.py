@@ -260,3 +260,33 @@ def test_the_commands(tiny, server, tmp_path, capsys, monkeypatch):
     code, _, err = p2p("fetch", "tiny")
     assert code == 2 and "export P2P_DATA=DIR" in err
     assert "$P2P_DATA is not set" in p2p("list")[1]
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "archive"])
+def test_files_that_one_has_are_taken_checked_and_nothing_is_asked(tiny, server, tmp_path, kind):
+    """A file by its name, a folder or an archive that holds it somewhere: the same as if it had been downloaded."""
+    own = tmp_path / "own"
+    path = own / "package" / "dist" / "one.tar.gz"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(server.data)
+    source = {"file": path, "folder": own, "archive": own / "pack.tgz"}[kind]
+    if kind == "archive":
+        with tarfile.open(source, "w:gz") as tar:
+            tar.add(path, "package/dist/one.tar.gz")
+        path.unlink()
+    [line] = fetch(tiny(), source=source)
+    assert "8 files unpacked" in line and not server.asked
+    assert (tmp_path / "data/tiny/archives/one.tar.gz").read_bytes() == server.data
+
+
+def test_what_is_not_the_file_that_is_meant_is_not_taken(tiny, server, tmp_path):
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "one.tar.gz").write_bytes(b"something else")
+    known = tiny(sha256=hashlib.sha256(server.data).hexdigest())
+    with pytest.raises(BadInput, match=r"expected sha256 \w+. It was not taken"):
+        fetch(known, source=own)
+    (own / "one.tar.gz").unlink()
+    with pytest.raises(MissingData, match=r"no file one.tar.gz in it"):
+        fetch(known, source=own)
+    assert not list((tmp_path / "data/tiny").rglob("*.gz"))

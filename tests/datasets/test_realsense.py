@@ -121,7 +121,7 @@ def test_what_cannot_be_used_is_refused(tmp_path):
 def test_without_the_library_it_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     (tmp_path / "a.bag").write_text("/device_0/sensor_0/Color_0/image/data")
-    with pytest.raises(MissingBackend, match=r"RealSense cameras and recordings: .* pyrealsense2 .*uv pip install"):
+    with pytest.raises(MissingBackend, match=r"RealSense cameras and .* pyrealsense2 .*pip install .p2p_lib"):
         convert(tmp_path / "a.bag", tmp_path / "out")
     with pytest.raises(MissingData, match=r"b\.bag: no such recording"):
         realsense.RealSenseCamera(tmp_path / "b.bag")

@@ -13,7 +13,7 @@ from p2p_lib.core.types import WITH_POSE
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.true_tracks import TrueScene, draw_queries
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
 
 EXACT = OracleConfig(noise_px=0)
 

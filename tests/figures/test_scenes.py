@@ -11,13 +11,13 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets.run_writer import RunWriter
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import gaps
 from p2p_lib.figures.scenes import Scene, draw_live
 from p2p_lib.figures.viewer import scene_page
-from p2p_lib.method.pipeline import Point2Pose
 from tests.figures.test_viewer import told, unpacked
 
 

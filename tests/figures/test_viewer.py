@@ -188,7 +188,7 @@ def test_without_rerun_it_says_how_to_get_it(folder, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
     from p2p_lib.figures.rerun_file import write_rerun
 
-    with pytest.raises(MissingBackend, match=r"--rerun: the package rerun-sdk .*uv pip install"):
+    with pytest.raises(MissingBackend, match=r"--rerun: the package rerun-sdk .*pip install .p2p_lib\[rerun\]"):
         write_rerun(folder, folder / "x.rrd")
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from p2p_lib.core.config import TsdfConfig, preset
 from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.voxels import TorchGrid
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.method import tsdf
-from p2p_lib.method.pipeline import Point2Pose
 from p2p_lib.method.tsdf import TsdfVolume
-from p2p_lib.method.tsdf_grid import TorchGrid
 from tests.method.analytic_scene import CAMERA, LUMP, around, render
 
 CONFIG = TsdfConfig(voxel_m=0.004)

@@ -10,6 +10,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig, preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.robust import fit_rigid
+from p2p_lib.extended.graph import BoundedGraph
 from p2p_lib.method import factor_graph
 from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
 
@@ -64,7 +65,7 @@ def measured(p_cam: np.ndarray, noise: float, rng: np.random.Generator) -> np.nd
 
 def run(world: Turntable, config: FactorGraphConfig) -> tuple[ObjectGraph, GraphResult, np.ndarray]:
     """All keyframes in turn, each registered to the map as it stands; also the poses that went in."""
-    graph, result, known, given = ObjectGraph(config), None, {}, []
+    graph, result, known, given = BoundedGraph(config), None, {}, []
     for ids, p_cam, truth in zip(world.seen, world.p_cam, world.T_cam_obj, strict=True):
         shared = [k for k, i in enumerate(ids.tolist()) if i in known]
         T = fit_rigid(np.array([known[ids[k]] for k in shared]), p_cam[shared]) if known else truth
@@ -369,7 +370,7 @@ def test_hostile_numbers_never_raise_nor_reach_the_result() -> None:
     """Wild but finite observations and starts: either solved with finite numbers, or left out with a reason."""
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        graph = ObjectGraph(replace(DEFAULT, between=bool(seed % 2), prior=bool(seed % 3), max_keyframes=seed % 4))
+        graph = BoundedGraph(replace(DEFAULT, between=bool(seed % 2), prior=bool(seed % 3), max_keyframes=seed % 4))
         for _ in range(6):
             ids = rng.permutation(20)[:8]
             scale = 10.0 ** rng.integers(-6, 9)

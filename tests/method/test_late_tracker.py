@@ -10,12 +10,14 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.types import Tracks
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.run import run
 
 FRAMES = range(0, 60, 4)
 # A late tracker cannot look again in a frame that is past: on time, it must not either.
-CONFIG = preset().with_values({"method.surface": False, "method.graph": False, "method.redetection": False})
+CONFIG = preset().with_values(
+    {"method.mechanisms": "all but redetection, rejection", "method.surface": False, "method.graph": False}
+)
 
 
 class Late:

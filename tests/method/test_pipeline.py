@@ -15,8 +15,8 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, Status
-from p2p_lib.method.lifecycle import CONFIRM_FRAMES
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
+from p2p_lib.extended.lifecycle import CONFIRM_FRAMES
 from p2p_lib.synthetic import shapes
 from p2p_lib.synthetic.noise import Sensor, measured_colour, measured_depth
 from p2p_lib.synthetic.render import render
@@ -42,6 +42,7 @@ TRUTH = {
     "left": path([-0.11, 0.01, 0.55], [0.0012, -0.0005, 0.0006], 32),
     "right": path([0.10, 0.0, 0.6], [-0.0008, 0.0008, -0.0008], -28),
 }
+UNSOUGHT = {"method.mechanisms": "all but redetection, rejection"}
 HIDDEN = range(9, 14)  # frames in which a board stands before everything, in the film that has one
 
 
@@ -274,7 +275,7 @@ class Shy(BuiltinTracker):
 def test_a_few_points_tell_where_the_others_are(seeking, left):
     """A rigid triple gives a pose, the pose places, and the tracker points there: back at once, with many."""
     tracker, frames = Shy(left), [(f, {"left": m["left"]}) for f, m in film(board=True)]
-    method = Point2Pose(CAMERA, quick(**{"method.redetection": seeking}), tracker)
+    method = Point2Pose(CAMERA, quick(**({} if seeking else UNSOUGHT)), tracker)
     method.add_object("left")
     estimates = [method.step(f, m) for f, m in frames[: HIDDEN.stop + 1]]
     back = estimates[-1]["left"]
@@ -301,7 +302,7 @@ def test_a_return_that_is_not_confirmed_is_taken_back():
             self.left = 99 if frame.index < HIDDEN.stop + 2 else 5
             return super().track(frame, search, urgent)
 
-    told = run_with(Fading(99), film(board=True)[: HIDDEN.stop + 3], quick(**{"method.redetection": False}))
+    told = run_with(Fading(99), film(board=True)[: HIDDEN.stop + 3], quick(**UNSOUGHT))
     before, taken = told[HIDDEN.start - 1], told[-1]
     assert [e.status for e in told[-3:]] == [Status.RECOVERED, Status.RECOVERED, Status.LOST]
     np.testing.assert_array_equal(taken.last_T_cam_obj, before.T_cam_obj)
@@ -374,7 +375,10 @@ def test_an_object_waits_until_its_mask_has_come_and_stopped_growing():
     assert statuses(estimates, "right") == ["initialising"] * 11 + ["tracked"] * 5
     assert "coming into view" in estimates[9]["right"].reason
     assert_honest(estimates)
-    at_once = track(frames, config=quick().with_values({"method.gates": "none"}))
+    at_once = track(
+        frames,
+        config=quick().with_values({"method.mechanisms": "all but growing"}),
+    )
     assert statuses(at_once, "right").index("tracked") < 11
 
 
@@ -887,6 +891,6 @@ def test_where_the_segmenter_finds_nothing_only_tracks_on_others_are_misplaced()
         (masks["left"], None, len(ids)),  # on another
         (masks["right"], nothing, len(ids)),  # it is said to be hidden
     ):
-        method.masks = {"left": nothing, "right": found}
-        requests = method._misplaced(seen, {"left": given, "right": masks["right"]})
+        method.front.masks = {"left": nothing, "right": found}
+        requests = method.front._misplaced(seen, {"left": given, "right": masks["right"]})
         assert len(np.intersect1d(requests["left"].reject, ids)) == rejected and len(ids) > 10

@@ -1,15 +1,22 @@
 """The two presets are compositions: every key in which they differ changes a run, and means what it says."""
 
+import sys
+import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from p2p_lib.core.config import diff, preset
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.core.errors import BadInput
+from p2p_lib.extended.default import Point2Pose
+from p2p_lib.method import pipeline
 from p2p_lib.trackers.builtin.tracker import BuiltinTracker
-from tests.method.test_pipeline import CAMERA, HIDDEN, Shy, film
+from tests.method.test_pipeline import CAMERA, HIDDEN, film
 
+#: Without priors of any kind, which make up for samples.
+STILL = "all but motion_prior, motion_weight, motion_over_gaps, scene, shape_search"
 #: Where the film has no occasion for a key: other values of it, and settings that give it one.
 OCCASIONS = {
     "depth.max_m": ((2.0, 0.6), {}),
@@ -20,14 +27,10 @@ OCCASIONS = {
     "factor_graph.max_keyframes": ((0, 3), {"keypoint_map.keyframe_angle_deg": 1.5}),
     "factor_graph.iterations": ((20, 1), {"keypoint_map.keyframe_angle_deg": 3.0}),
     "sampling.max_visible": ((50, 60), {"sampling.points": 60}),
-    "registration.iterations": ((100, 1), {"method.motion": False}),
-    "registration.sample_size": ((4, 3), {"method.motion": False, "registration.iterations": 1, "method.scene": False}),
+    "registration.iterations": ((100, 1), {"method.mechanisms": STILL}),
+    "registration.sample_size": ((4, 3), {"method.mechanisms": STILL, "registration.iterations": 1}),
     "refinement.huber_m": ((0.01, 0.0005), {}),
-    "method.gates": (("none", "all"), {"method.redetection": False, "method.scene": False, "method.motion": False}),
-    "method.scene": ((False, True), {"method.redetection": False}),
 }
-#: A tracker that finds so few points again tells these.
-FEW_POINTS = {"method.redetection": 5, "method.gates": 6, "method.scene": 6}
 
 
 class Lying(BuiltinTracker):
@@ -47,9 +50,7 @@ class Lying(BuiltinTracker):
 
 def tracker_for(key: str):
     """One that gives the key an occasion."""
-    if key in FEW_POINTS:
-        return Shy(FEW_POINTS[key])
-    contradictory = ("method.motion", "selection.", "registration.", "refinement.", "factor_graph.iterations")
+    contradictory = ("method.mechanisms", "selection.", "registration.", "refinement.", "factor_graph.iterations")
     return Lying() if key.startswith(contradictory) else "builtin"
 
 
@@ -103,3 +104,57 @@ def test_constant_noise_reaches_the_graph(key):
             method.step(frame, {"left": masks["left"]})
         found.append(method.objects["left"].map.p_obj)
     assert not np.array_equal(*found)
+
+
+def functions_called(name: str, given: bool) -> set[str]:
+    """Files of the library whose functions a preset calls while it tracks an object that a board hides."""
+    files: set[str] = set()
+
+    def heard(frame, event, _):
+        if event == "call":
+            files.add(frame.f_code.co_filename)
+
+    with Point2Pose(CAMERA, preset(name)) as method:
+        frames = film(board=True)[: HIDDEN.stop + 3]
+        method.add_object("left", mask=None if given else frames[0][1]["left"])
+        threading.setprofile(heard)  # of the threads that it starts
+        sys.setprofile(heard)
+        try:
+            for frame, masks in frames:
+                method.step(frame, {"left": masks["left"]} if given else None)
+        finally:
+            sys.setprofile(None)
+            threading.setprofile(None)
+    return {Path(file).parent.name for file in files if "p2p_lib" in file}
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["masks", "one mask"])
+def test_nothing_of_ours_is_called_under_paper(given):
+    assert {"method", "core"} <= (called := functions_called("paper", given)) and "extended" not in called
+    assert "extended" in functions_called("default", given)
+
+
+@pytest.mark.parametrize("name", ["paper", "default"])
+def test_the_paper_composed_is_the_paper_alone(name):
+    """p2p_lib.Point2Pose under ``paper`` gives what p2p_lib.method.pipeline gives; for ``default`` it refuses."""
+    if name == "default":
+        with pytest.raises(BadInput, match=r"method\.mechanisms: got 'all', expected none"):
+            pipeline.Point2Pose(CAMERA, preset(name))
+        return
+    poses = []
+    for make in (Point2Pose, pipeline.Point2Pose):
+        with make(CAMERA, preset(name)) as method:
+            method.add_object("left")
+            poses.append([method.step(f, {"left": m["left"]})["left"].T_cam_obj for f, m in film()[:8]])
+    np.testing.assert_array_equal(*poses)
+
+
+@pytest.mark.parametrize("name", ["paper", "default"])
+def test_the_threads_end_with_the_method(name):
+    before = set(threading.enumerate())
+    with Point2Pose(CAMERA, preset(name)) as method:
+        method.add_object("left")
+        for frame, masks in film()[:2]:
+            method.step(frame, {"left": masks["left"]})
+        assert set(threading.enumerate()) - before, "it has threads"
+    assert not {thread for thread in threading.enumerate() if thread not in before and thread.name.startswith("p2p")}

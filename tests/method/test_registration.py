@@ -425,3 +425,17 @@ def test_refit_grows_from_a_pose_what_agrees_with_it() -> None:
     assert found.origin == "surface" and found.support == 14 and not found.inliers[:45].any()
     assert error_deg_m(found.T_cam_obj, T)[0] < 0.5
     assert registration.refit(random_pose(rng), "surface", p_obj, p_cam, DEFAULT, depth_noise_m(p_cam[:, 2])) == []
+
+
+def test_the_covariance_of_few_points_counts_the_degrees_of_freedom_that_the_pose_takes():
+    """Eight points leave 18 of 24: the mean of chi squared over them is 1, so that only larger residuals inflate it."""
+    rng, sigma_m = np.random.default_rng(4), 0.002
+    p_obj = rng.uniform(-0.05, 0.05, (8, 3))
+    plain = None
+    for excess in (1.0, 2.0):
+        residual = rng.normal(size=(8, 3))
+        residual *= sigma_m * np.sqrt(excess * (3 * 8 - 6) / (residual**2).sum())
+        found = Hypothesis(np.eye(4), np.ones(8, bool), np.linalg.norm(residual, axis=1), "made up")
+        told = registration.covariance(found, p_obj, p_obj + residual, sigma_m)
+        plain = told if plain is None else plain
+    np.testing.assert_allclose(told, 2 * plain, rtol=1e-3)

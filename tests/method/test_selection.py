@@ -7,8 +7,9 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
+from p2p_lib.extended.motion import MOTION_DEG, MOTION_M, motion_weight
 from p2p_lib.method.registration import Hypothesis
-from p2p_lib.method.selection import MOTION_DEG, MOTION_M, motion_weight, select
+from p2p_lib.method.selection import select
 
 DEFAULT, PAPER = preset("default").selection, preset("paper").selection
 
@@ -26,10 +27,10 @@ def test_the_paper_takes_the_least_mean_distance():
 def test_ours_goes_by_the_surface_only_beyond_chance(sigmas, gap, wins):
     """Points whose preference is even but for a shift of the mean: the shift counts in its standard errors."""
     noise = np.random.default_rng(0).normal(0, 1, 400)
-    noise = (noise - noise.mean()) / noise.std() * 5e-3
-    nearer = noise + gap * 5e-3 / np.sqrt(400)
+    noise = (noise - noise.mean()) / noise.std() * 2.5e-3
+    nearer = noise + gap * 2.5e-3 / np.sqrt(400)
     config = replace(DEFAULT, surface_sigmas=sigmas)
-    row, reason = select([made(80), made(12)], np.stack([0.05 + nearer, np.full(400, 0.05)]), config)
+    row, reason = select([made(80), made(12)], np.stack([0.003 + nearer, np.full(400, 0.003)]), config)
     assert row == int(wins) and ("nearest" in reason) == wins
 
 
@@ -37,6 +38,14 @@ def test_ours_goes_by_the_surface_only_beyond_chance(sigmas, gap, wins):
 def test_ours_needs_a_margin_too(gap_m, wins):
     distance_m = np.tile([[0.002], [0.002 - gap_m]], 50)  # certain, but is it enough?
     assert select([made(80), made(12)], distance_m, DEFAULT)[0] == int(wins)
+
+
+@pytest.mark.parametrize(("nearest_m", "wins"), [(0.003, True), (0.006, False)])
+def test_a_surface_that_no_pose_fits_does_not_choose(nearest_m, wins):
+    """It is bent, or depth and colour are not of one moment: many points that agree are more than that."""
+    distance_m = np.tile([[nearest_m + 0.002], [nearest_m]], 50)
+    assert select([made(80), made(12)], distance_m, DEFAULT)[0] == int(wins)
+    assert select([made(80), made(12)], distance_m, PAPER)[0] == 1
 
 
 @pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=["default", "paper"])

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from p2p_lib.core import mesh as meshes
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TsdfConfig
 from p2p_lib.core.errors import BadInput
-from p2p_lib.method import mesh as meshes
 from p2p_lib.method.tsdf import BLOCK, TsdfVolume
 from tests.method.analytic_scene import CAMERA, LUMP, around, ball, box, look_from, render
 

@@ -1,307 +1,346 @@
-"""The SAM 2 adapter against the official classes with random weights; skipped where ``transformers`` is not there.
+"""SAM 2's image part: what it is told, which of its candidates is taken, when it is asked, and with the real weights.
 
-What the weights would say is not looked at: coordinates, memory and absence are, and they do not depend on it.
+A stand-in of known behaviour sees what one colour is: its candidates are that, that with all that is green, everything.
 """
 
-import importlib.util
+import warnings
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
-from p2p_lib.core import packages
 from p2p_lib.core.backends import make_segmenter
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
-from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.errors import BadInput, Doubt, MissingBackend
+from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.manifests import manifest
-from p2p_lib.method.pipeline import Point2Pose
-from p2p_lib.segmenters import sam2
+from p2p_lib.segmenters import anchored, sam2, sam2_image
+from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
+from p2p_lib.segmenters.sam2 import Question, Sam2Refiner
+from p2p_lib.segmenters.sam2_image import MASK_SIDE, SIDE, MaskCandidates, Sam2Image
 
-CAMERA = Camera(150.0, 150.0, 80, 60, 160, 120)
-SIDE = 128
-CLICKS = np.array([[80.0, 60], [70, 50]])
-CUP = Prompt("cup", points_px=CLICKS)
-
-needs_transformers = pytest.mark.skipif(
-    importlib.util.find_spec("transformers") is None,
-    reason=f"transformers is not installed: {packages.command(packages.INSTALL['transformers'])}",
-)
+CAMERA = Camera(300.0, 300.0, 128, 96, 256, 192)
+GREY, RED, GREEN = (90, 90, 90), (220, 40, 40), (40, 200, 40)
+AT_RED, AT_GREEN = [[80.0, 60], [70, 80], [90, 90]], [[180.0, 60]]
+RED_PX, GREEN_PX = np.s_[50:110, 60:100], np.s_[40:100, 150:210]
 
 
-def film(count: int) -> list[Frame]:
+def mask_of(part, shift=0):
+    mask = np.zeros((192, 256), bool)
+    mask[part] = True
+    return np.roll(mask, shift, 1)
+
+
+def frame_of(index=0, shift=0):
+    """A red and a green board 40 cm before a grey wall; ``shift`` px to the right."""
+    rgb, depth_m = np.full((192, 256, 3), GREY, np.uint8), np.full((192, 256), 1.0, np.float32)
+    for part, colour in ((RED_PX, RED), (GREEN_PX, GREEN)):
+        mask = mask_of(part, shift)
+        rgb[mask], depth_m[mask] = colour, 0.6
+    return Frame(index, index / 30, rgb, depth_m)
+
+
+class Encoder:
+    """Passes the image on, smaller."""
+
+    def __init__(self):
+        self.fed = []
+
+    def get_outputs(self):
+        return [SimpleNamespace(name="image_embed")]
+
+    def run(self, names, feed):
+        self.fed.append(feed["image"])
+        small = cv2.resize(feed["image"][0].transpose(1, 2, 0), (MASK_SIDE,) * 2, interpolation=cv2.INTER_AREA)
+        return [small.transpose(2, 0, 1)[None]]
+
+
+class Decoder:
+    def __init__(self):
+        self.fed, self.scores = [], (0.9, 0.8, 0.7)
+
+    def run(self, names, feed):
+        self.fed.append(feed)
+        image, points, kinds = (
+            feed["image_embed"][0].transpose(1, 2, 0),
+            feed["point_coords"][0],
+            feed["point_labels"][0],
+        )
+        u, v = (points[np.isin(kinds, (1, 2))][0] * MASK_SIDE / SIDE).astype(int)
+        near = np.abs(image - image[v, u]).sum(-1) < 1.5
+        green = (image[..., 1] > image[..., 0] + 1) & (image[..., 1] > image[..., 2] + 1)
+        logits = np.where(np.stack([near, near | green, np.ones_like(near)]), 9.0, -9.0).astype(np.float32)
+        return logits[None], np.array([self.scores], np.float32)
+
+
+@pytest.fixture
+def network():
+    return Sam2Image(Encoder(), Decoder())
+
+
+#: Of the frame in which nothing has moved.
+FEATURES = Sam2Image(Encoder(), Decoder()).features(frame_of().rgb)
+
+
+def iou(one, other):
+    return (one & other).sum() / (one | other).sum()
+
+
+# --- the network ----------------------------------------------------------------------------------
+
+
+def test_the_network_is_fed_as_its_publisher_says(network):
+    frame, half = frame_of(), np.zeros((192, 256), bool)
+    half[:, 128:] = True
+    prompt = Prompt("a", points_px=AT_RED, negative_px=AT_GREEN, box_px=[-0.5, -0.5, 127.5, 95.5])
+    network.candidates(network.features(frame.rgb), prompt, half)
+    (image,), (fed,) = network._encoder.fed, network._decoder.fed
+    assert image.shape == (1, 3, 1024, 1024) and image.dtype == np.float32
+    expected = (np.array(GREY) / 255 - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)
+    assert np.allclose(image[0, :, 0, 0], expected, atol=1e-5)
+    assert fed["point_labels"].tolist() == [[2, 3, 1, 1, 1, 0]]
+    corners, first = fed["point_coords"][0, :2], fed["point_coords"][0, 2]
+    assert corners.tolist() == [[0, 0], [512, 512]] and np.allclose(first, np.array([80.5, 60.5]) * [4, 1024 / 192])
+    assert fed["has_mask_input"].tolist() == [1] and np.sign(fed["mask_input"][0, 0, 0, [0, 255]]).tolist() == [-1, 1]
+    network.candidates(network.features(frame.rgb), Prompt("a", points_px=AT_RED))
+    assert network._decoder.fed[-1]["has_mask_input"].tolist() == [0]
+
+
+def test_masks_are_those_of_the_image_and_stable_where_their_edge_is_sharp():
+    sharp, soft = np.full((2, 256, 256), -5.0, np.float32)
+    sharp[64:128, 64:192] = 5
+    soft[64:128, 64:192] = 0.5
+    offered = MaskCandidates(np.stack([sharp, soft]), np.zeros(2), (192, 256))
+    truth = mask_of(np.s_[48:96, 64:192])
+    assert all(iou(mask, truth) > 0.97 for mask in offered.masks())
+    assert offered.stability().tolist() == [1, 0]
+
+
+# --- which candidate ------------------------------------------------------------------------------
+
+
+def offered(*masks, score):
+    logits = [cv2.resize(np.where(m, 9.0, -9.0).astype(np.float32), (256, 256)) for m in masks]
+    return MaskCandidates(np.stack(logits), np.array(score), (192, 256))
+
+
+def test_another_objects_click_rules_a_candidate_out():
+    red, both = mask_of(RED_PX), mask_of(RED_PX) | mask_of(GREEN_PX)
+    two = offered(red, both, score=[0.7, 0.99])
+    prompt = Prompt("red", points_px=AT_RED)
+    assert iou(Question.of_prompt(prompt, both, np.zeros((0, 2))).answer(two, FEATURES), both) > 0.95
+    assert iou(Question.of_prompt(prompt, both, np.array(AT_GREEN)).answer(two, FEATURES), red) > 0.95
+
+
+def test_nothing_is_taken_where_nothing_fits():
+    question = Question.of_prompt(Prompt("red", points_px=AT_RED), mask_of(RED_PX), np.zeros((0, 2)))
+    assert question.answer(offered(mask_of(GREEN_PX), score=[0.99]), FEATURES) is None
+    assert question.answer(offered(mask_of(RED_PX), score=[0.1]), FEATURES) is None
+    assert question.answer(offered(mask_of(RED_PX), score=[0.9]), FEATURES) is not None
+
+
+def test_of_like_candidates_the_followed_mask_decides():
+    red, part = mask_of(RED_PX), mask_of(np.s_[50:110, 60:92])
+    two = offered(red, part, score=[0.8, 0.85])
+    for followed, expected in ((red, red), (part, part)):
+        question = Question.of_followed("red", followed, Hint(), np.zeros((0, 2)))
+        assert iou(question.answer(two, FEATURES), expected) > 0.95
+
+
+def test_a_mask_without_the_objects_keypoints_is_not_believed():
+    """The mask has moved to the green board, the keypoints that agree are on the red one."""
+    hint = Hint(uv_px=np.array(AT_RED))
+    question = Question.of_followed("red", mask_of(GREEN_PX), hint, np.zeros((0, 2)))
+    assert question.expected is None and len(question.prompt.points_px) == 3
+    two = offered(mask_of(GREEN_PX), mask_of(RED_PX), score=[0.99, 0.8])
+    assert iou(question.answer(two, FEATURES), mask_of(RED_PX)) > 0.95
+    assert Question.of_followed("red", np.zeros((192, 256), bool), Hint(), np.zeros((0, 2))) is None
+
+
+def test_specks_and_pinholes_go_and_a_handle_stays():
+    mask = mask_of(np.s_[50:150, 50:150])
+    mask[80:120, 100:130] = False
+    dirty = mask.copy()
+    dirty[10:14, 10:14], dirty[60:63, 60:63] = True, False
+    question = Question.of_prompt(Prompt("a", points_px=[[55, 55]]), mask, np.zeros((0, 2)))
+    assert iou(question.answer(offered(dirty, score=[0.9]), FEATURES), mask) > 0.97
+    assert not question.answer(offered(dirty, score=[0.9]), FEATURES)[10:14, 10:14].any()
+
+
+# --- in the segmenter -----------------------------------------------------------------------------
+
+
+def segmenter(network, every=None, config=None):
+    config = config or preset().segmentation
+    return BuiltinSegmenter(
+        CAMERA, config, np.random.default_rng(0), Sam2Refiner(lambda: network, CAMERA, config, every)
+    )
+
+
+def prompts():
+    return [Prompt("red", points_px=AT_RED), Prompt("green", points_px=AT_GREEN)]
+
+
+def test_prompts_become_its_masks_and_are_followed_from_there(network):
+    of = segmenter(network)
+    network._decoder.scores = (0.7, 0.8, 0.9)  # it holds both boards for one thing, and likelier everything
+    labels = of.segment(frame_of(), prompts())
+    assert iou(labels == 1, mask_of(RED_PX)) > 0.95 and iou(labels == 2, mask_of(GREEN_PX)) > 0.95
+    labels = of.segment(frame_of(1, 3))
+    assert iou(labels == 1, mask_of(RED_PX, 3)) > 0.9
+    assert len(network._encoder.fed) == 1 and of.name == "builtin+sam2"
+
+
+def test_the_image_is_encoded_in_every_nth_frame_once_for_all_objects(network):
+    of = segmenter(network, every=3)
+    of.segment(frame_of(), prompts())
+    for k in range(1, 8):
+        of.segment(frame_of(k, k))
+    assert (len(network._encoder.fed), len(network._decoder.fed)) == (3, 6) and of.name == "sam2"
+
+
+def test_who_clicks_on_one_image_again_and_again_waits_once(network):
+    for said in (prompts()[:1], prompts(), prompts()):
+        segmenter(network).segment(frame_of(), said)
+    segmenter(network).segment(frame_of(1, 2), prompts())
+    assert (len(network._encoder.fed), len(network._decoder.fed)) == (2, 7)
+
+
+def test_a_correction_beside_the_object_keeps_the_rest_of_it(network):
+    of = segmenter(network)
+    of.segment(frame_of(), prompts())
+    labels = of.segment(frame_of(1), [Prompt("red", negative_px=[[150.0, 150]])])
+    assert iou(labels == 1, mask_of(RED_PX)) > 0.9
+    kinds = network._decoder.fed[-1]["point_labels"][0]
+    assert (kinds == 1).sum() == 3 and (kinds == 0).sum() == 1
+
+
+def test_the_built_in_mask_stays_where_no_candidate_fits(network):
+    network._decoder.scores = (0.1, 0.1, 0.1)
+    labels = segmenter(network).segment(frame_of(), prompts())
+    alone = BuiltinSegmenter(CAMERA, preset().segmentation, np.random.default_rng(0)).segment(frame_of(), prompts())
+    assert np.array_equal(labels, alone) and labels.any()
+
+
+def test_doubts_are_about_the_mask_that_is_used(network):
+    """A flat poster: depth says nothing, and the built-in segmenter by itself doubts what it finds."""
+    flat = frame_of()
+    flat = Frame(0, 0.0, flat.rgb, np.full((192, 256), 0.8, np.float32))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", Doubt)
+        labels = segmenter(network).segment(flat, [Prompt("red", points_px=AT_RED)])
+    assert iou(labels == 1, mask_of(RED_PX)) > 0.95
+    assert len(said) == 1 and f"{(labels == 1).sum()} pixels, flat" in str(said[0].message)
+
+
+def test_beside_the_tracking_an_answer_arrives_later_where_the_object_is_then(network):
+    """It works at frame 1 while the boards move on by 12 px, which are 2.4 cm at 60 cm."""
+    from threading import Event
+
+    go, T_obj = Event(), np.eye(4)
+    of = Sam2Refiner(lambda: (go.wait(10), network)[1], CAMERA, preset().segmentation, every=1, beside=True)
+    go.set()
+    first = of.refine(frame_of(), {"red": prompts()[0]}, {"red": mask_of(RED_PX)}, {})
+    assert iou(first["red"], mask_of(RED_PX)) > 0.95  # nothing is followed yet: it is waited for
+    go.clear()
+    poor = mask_of(np.s_[60:100, 60:100])
+    at_red, moved = Hint(uv_px=np.array(AT_RED), T_cam_obj=T_obj), T_obj.copy()
+    moved[0, 3] = 12 / 300 * 0.6
+    assert of.refine(frame_of(1), {}, {"red": poor}, {"red": at_red}) == {}
+    asked = of._working.answers
+    go.set()
+    asked.result(10)
+    now = Hint(uv_px=np.array(AT_RED) + np.array([12, 0]), T_cam_obj=moved)
+    came = of.refine(frame_of(2, 12), {}, {"red": np.roll(poor, 12, 1)}, {"red": now})
+    assert iou(came["red"], mask_of(RED_PX, 12)) > 0.95
+    of._working.answers.result(10)
+    wrong = Hint(uv_px=now.uv_px, T_cam_obj=T_obj)  # it has not moved, says the pose, and nothing of it is there
+    assert of.refine(frame_of(3, 100), {}, {"red": poor}, {"red": wrong}) == {}
+
+
+# --- by name --------------------------------------------------------------------------------------
+
+
+def test_without_weights_the_built_in_segmenter_is_alone_and_sam2_says_what_to_fetch(monkeypatch, tmp_path):
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    config, rng = preset().segmentation, np.random.default_rng(0)
+    assert make_segmenter("builtin", CAMERA, config, rng).name == "builtin"
+    for name, changed in (("sam2", {}), ("builtin", {"segmentation.first_masks": "sam2"})):
+        with pytest.raises(MissingBackend, match=r"onnxruntime|p2p data fetch sam2"):
+            make_segmenter(name, CAMERA, preset().with_values(changed).segmentation, rng)
+
+
+def test_where_the_weights_are_prompts_are_its_own_unless_told_otherwise(monkeypatch):
+    monkeypatch.setattr(anchored, "_available", lambda: True)
     rng = np.random.default_rng(0)
-    depth = np.full((120, 160), 0.7, np.float32)
-    return [Frame(k, k / 30, rng.integers(0, 256, (120, 160, 3), np.uint8), depth) for k in range(count)]
-
-
-@pytest.fixture(scope="module")
-def model():
-    """The official class, small, with random weights."""
-    import torch
-    from transformers import Sam2VideoConfig, Sam2VideoModel
-
-    hiera = {
-        "model_type": "sam2_hiera_det_model",
-        "hidden_size": 12,
-        "num_attention_heads": 1,
-        "image_size": [SIDE, SIDE],
-        "blocks_per_stage": [1, 1, 2, 1],
-        "embed_dim_per_stage": [12, 24, 48, 96],
-        "num_attention_heads_per_stage": [1, 1, 2, 2],
-        "window_size_per_stage": [8, 4, 4, 4],
-        "global_attention_blocks": [3],
-        "window_positional_embedding_background_size": [7, 7],
+    config = {
+        name: preset().with_values({"segmentation.first_masks": name}).segmentation for name in ("auto", "builtin")
     }
-    vision = {
-        "model_type": "sam2_vision_model",
-        "backbone_config": hiera,
-        "backbone_channel_list": [96, 48, 24, 12],
-        "backbone_feature_sizes": [[32, 32], [16, 16], [8, 8]],
-        "fpn_hidden_size": 128,
-    }
-    small = {"mlp_dim": 32, "num_attention_heads": 2, "iou_head_hidden_dim": 32}
-    torch.manual_seed(0)
-    config = Sam2VideoConfig(
-        vision_config=vision,
-        prompt_encoder_config={"hidden_size": 128, "image_size": SIDE},
-        mask_decoder_config={"hidden_size": 128, **small},
-        image_size=SIDE,
-        memory_attention_hidden_size=128,
-        memory_attention_num_layers=1,
-        memory_attention_feed_forward_hidden_size=32,
-        memory_attention_rope_feat_sizes=[8, 8],
-        memory_encoder_hidden_size=128,
-        memory_encoder_output_channels=64,
-        mask_downsampler_embed_dim=128,
-        memory_fuser_embed_dim=128,
-        memory_fuser_intermediate_dim=32,
-        memory_fuser_num_layers=1,
-        # Few enough for a short film to outlast them.
-        num_maskmem=3,
-        max_object_pointers_in_encoder=4,
+    assert make_segmenter("builtin", CAMERA, config["auto"], rng).name == "builtin+sam2"
+    assert make_segmenter("builtin", CAMERA, config["builtin"], rng).name == "builtin"
+
+
+@pytest.mark.parametrize("name", ["builtin", "sam2"])
+def test_as_p2p_live_wants_it_it_works_beside_the_tracking(monkeypatch, network, name):
+    monkeypatch.setattr(anchored, "_available", lambda: True)
+    monkeypatch.setattr(sam2_image, "load", lambda threads: network)
+    sam2._network.cache_clear()
+    config = preset().with_values({"segmentation.sam2_every": 0}).segmentation
+    of = make_segmenter(name, CAMERA, config, np.random.default_rng(0))
+    assert iou(of.segment(frame_of(), prompts()) == 1, mask_of(RED_PX)) > 0.95
+    of.segment(frame_of(1, 1))
+    working = of._refiner._working
+    assert (set() if working is None else set(working.answers.result(10))) == (
+        {"red", "green"} if name == "sam2" else set()
     )
-    return Sam2VideoModel(config).eval()
+    sam2._network.cache_clear()
 
 
-class Watched(sam2.Sam2Segmenter):
-    """Keeps the logits that the model gave."""
-
-    def __init__(self, model):
-        super().__init__(model, CAMERA)
-        self.logits = []
-        model.register_forward_hook(self._note)
-
-    def _note(self, _module, _inputs, output):
-        if hasattr(output, "object_score_logits") and hasattr(output, "frame_idx"):
-            self.logits.append((output.pred_masks.numpy().copy(), float(output.object_score_logits)))
+def test_an_unknown_source_of_first_masks_is_refused():
+    with pytest.raises(BadInput, match="auto, builtin, sam2"):
+        preset().with_values({"segmentation.first_masks": "sam3"})
 
 
-@needs_transformers
-def test_trimmed_memory_changes_nothing(model):
-    """Frame by frame the same as an official session that keeps everything."""
-    import torch
-    from transformers import Sam2VideoInferenceSession
+def test_real_weights_cut_out_a_mug_in_a_hand(shared_data):
+    from p2p_lib.datasets.prompts import load_prompts
+    from p2p_lib.datasets.sequence import open_sequence
 
-    ours, frames = Watched(model), film(10)
-    for k, frame in enumerate(frames):
-        ours.segment(frame, () if k else [CUP])
-    told, ours.logits = ours.logits, []
-    session = Sam2VideoInferenceSession(video_height=120, video_width=160, dtype=torch.float32)
-    at = session.obj_id_to_idx(1)
-    points = torch.tensor((CLICKS + 0.5) * SIDE / [160, 120] - 0.5).float()[None, None]
-    labels = torch.ones(1, 1, 2, dtype=torch.int32)
-    session.add_point_inputs(at, 0, {"point_coords": points, "point_labels": labels})
-    session.obj_with_new_inputs = [1]
-    for k, frame in enumerate(frames):
-        output = model(inference_session=session, frame=ours._pixels(frame.rgb))
-        np.testing.assert_allclose(told[k][0], output.pred_masks.numpy(), atol=1e-5)
-    assert len(session.processed_frames) == 10  # what it would keep by itself
-    (kept,) = ours._sessions.values()
-    assert not kept.processed_frames
-    assert len(kept.output_dict_per_obj[0]["non_cond_frame_outputs"]) <= 4
+    if not anchored._available():
+        pytest.skip("no weights of sam2, or no onnxruntime. Run: p2p data fetch sam2")
+    folder = shared_data / "real_hand" / "mug_in_hand"
+    sequence = open_sequence(folder)
+    config = preset().with_values({"segmentation.first_masks": "sam2"}).segmentation
+    of = make_segmenter("builtin", sequence.camera, config, np.random.default_rng(0))
+    labels = of.segment(sequence.frame(0), load_prompts(shared_data / "prompts" / "mug_in_hand.json"))
+    truth = cv2.imread(str(sorted((folder / "reference_masks" / "mug").glob("*.png"))[0]), 0) > 0
+    assert iou(labels == 1, truth) > 0.95
 
 
-@needs_transformers
-def test_memory_stays_bounded(model):
-    def megabytes(segmenter) -> float:
-        (session,) = segmenter._sessions.values()
-        outputs = session.output_dict_per_obj[0]
-        tensors = [t for kind in outputs.values() for o in kind.values() for t in o.values() if hasattr(t, "nbytes")]
-        return sum(t.nbytes for t in tensors) / 1e6
-
-    ours, sizes = sam2.Sam2Segmenter(model, CAMERA), []
-    for k, frame in enumerate(film(14)):
-        ours.segment(frame, () if k else [CUP])
-        sizes.append(megabytes(ours))
-    assert sizes[13] == sizes[9] > 0
+def test_another_thing_is_not_the_object_however_well_it_is_followed(network):
+    """The object has left, its mask has slid onto the green board: nothing of that looks like the object."""
+    refiner = Sam2Refiner(lambda: network, CAMERA, preset().segmentation, every=1)
+    refiner.refine(frame_of(), {"red": prompts()[0]}, {"red": mask_of(RED_PX)}, {})
+    stays = refiner.refine(frame_of(1), {}, {"red": mask_of(RED_PX)}, {})
+    assert iou(stays["red"], mask_of(RED_PX)) > 0.95
+    assert not refiner.refine(frame_of(2), {}, {"red": mask_of(GREEN_PX)}, {})["red"].any()
 
 
-@needs_transformers
-def test_points_and_pictures_are_the_official_processors(model):
-    """Points to half a pixel of the network, whose processor takes a pixel's corner for its centre."""
-    import torch
-    from transformers import Sam2VideoProcessor
+def test_a_mask_that_has_spread_is_mended_by_the_answer_before():
+    """The followed mask has taken in a strip beside the object; the newest answer, as the object has moved, has not."""
+    red, wider = mask_of(RED_PX), mask_of(np.s_[50:110, 60:115])
 
-    official = Sam2VideoProcessor._normalize_coordinates(None, SIDE, torch.tensor(CLICKS), (120, 160)).numpy()
-    ours = sam2.Sam2Segmenter(model, CAMERA)._points(CUP)["point_coords"].numpy()[0, 0]
-    assert np.abs(ours - official).max() <= 0.5
-    grey = np.full((120, 160, 3), 128, np.uint8)
-    pixels = sam2.Sam2Segmenter(model, CAMERA)._pixels(grey).numpy()
-    assert pixels.shape == (1, 3, SIDE, SIDE)
-    expected = (128 / 255 - np.array(sam2.MEAN)) / np.array(sam2.DEVIATION)
-    np.testing.assert_allclose(pixels[0].mean((1, 2)), expected, atol=1e-5)
+    class Undecided(Sam2Image):
+        def candidates(self, features, prompt, mask=None):
+            return offered(red, wider, score=[0.85, 0.9])
 
-
-class Says:
-    """Stands in for the model: masks and scores as told, on the network's quarter grid."""
-
-    class config:
-        image_size, num_maskmem, max_object_pointers_in_encoder = SIDE, 3, 4
-
-    def __init__(self, answers):
-        self.answers = list(answers)
-
-    def to(self, _device):
-        return self
-
-    def eval(self):
-        return self
-
-    def get_image_features(self, pixels, return_dict):
-        from types import SimpleNamespace
-
-        return SimpleNamespace(fpn_hidden_states=[pixels], fpn_position_encoding=[pixels])
-
-    def __call__(self, inference_session, frame, frame_idx):
-        from types import SimpleNamespace
-
-        import torch
-
-        logits, score = self.answers.pop(0)
-        masks, scores = torch.tensor(logits)[None, None].float(), torch.tensor([[score]]).float()
-        return SimpleNamespace(pred_masks=masks, object_score_logits=scores)
-
-
-def half(left: bool) -> np.ndarray:
-    logits = np.full((32, 32), -5.0)
-    logits[:, :16] = 5.0
-    return logits if left else logits[:, ::-1].copy()
-
-
-@needs_transformers
-def test_labels_are_the_likelier_objects_and_absent_ones_have_none():
-    answers = [(half(True), 3.0), (half(False), 3.0), (half(True), -1.0), (half(False) + 9, 2.0), (half(True) * 2, 2.0)]
-    ours, frames = sam2.Sam2Segmenter(Says(answers), CAMERA), film(3)
-    both = ours.segment(frames[0], [Prompt("a", points_px=CLICKS), Prompt("b", points_px=CLICKS + 10)])
-    assert both.shape == (120, 160) and both.dtype == np.int32 and ours.names == ("a", "b")
-    assert (both[:, :78] == 1).all() and (both[:, 82:] == 2).all()
-    # "a" is absent now, and "b" everywhere.
-    assert (ours.segment(frames[1]) == 2).all()
-    ours.remove("a")
-    assert ours.names == ("b",)
-    assert set(np.unique(ours.segment(frames[2])[:, :78])) == {1}
-
-
-def mask_of(left: int, top: int, right: int, bottom: int) -> np.ndarray:
-    mask = np.zeros((120, 160), bool)
-    mask[top:bottom, left:right] = True
-    return mask
-
-
-@needs_transformers
-def test_what_is_said_reaches_the_network_as_the_official_processor_says_it(model):
-    """A box is two clicks, its corners; clicks beside the object have another label; a mask is what it is."""
-    import torch
-    from transformers import Sam2VideoInferenceSession, Sam2VideoProcessor
-
-    class Processor(Sam2VideoProcessor):
-        def __init__(self):  # without an image processor, which wants torchvision
-            self.target_size, self.point_pad_value = SIDE, -10
-
-    ours = sam2.Sam2Segmenter(model, CAMERA)
-    said = Prompt("cup", points_px=CLICKS, negative_px=[[10, 20]], box_px=(60, 40, 100, 90))
-    official = Sam2VideoInferenceSession(video_height=120, video_width=160, dtype=torch.float32)
-    clicks = [[[*CLICKS.tolist(), [10.0, 20.0]]]]
-    box = [[[60.0, 40.0, 100.0, 90.0]]]
-    Processor().process_new_points_or_boxes_for_video_frame(
-        official, 0, [1], input_points=clicks, input_labels=[[[1, 1, 0]]], input_boxes=box, original_size=(120, 160)
-    )
-    expected, got = official.point_inputs_per_obj[0][0], ours._points(said)
-    assert got["point_labels"].flatten().tolist() == expected["point_labels"].flatten().tolist() == [2, 3, 1, 1, 0]
-    apart = got["point_coords"].numpy().reshape(-1, 2) - expected["point_coords"].numpy().reshape(-1, 2)
-    assert np.abs(apart).max() <= 0.5
-    mask = mask_of(60, 40, 100, 90)
-    Processor().process_new_mask_for_video_frame(official, 0, [1], [mask])
-    np.testing.assert_array_equal(ours._mask(mask).numpy(), official.mask_inputs_per_obj[0][0].numpy())
-
-
-@needs_transformers
-def test_a_mask_is_taken_as_it_is_and_the_network_goes_on_from_the_newest(model):
-    """As an official session that is given the mask in its frame."""
-    import torch
-    from transformers import Sam2VideoInferenceSession
-
-    ours, frames = Watched(model), film(4)
-    first, newest = mask_of(20, 20, 60, 60), mask_of(60, 40, 100, 90)
-    for frame, mask in zip(frames, (first, newest)):
-        np.testing.assert_array_equal(ours.segment(frame, [Prompt("cup", mask=mask)]) == 1, mask)
-    assert not ours.logits  # it has not been needed yet
-    ours.segment(frames[2])
-    ours.segment(frames[3], [Prompt("cup", negative_px=[[10, 20]])])
-    told, ours.logits = ours.logits, []
-    session = Sam2VideoInferenceSession(video_height=120, video_width=160, dtype=torch.float32)
-    at = session.obj_id_to_idx(1)
-    session.add_mask_inputs(at, 0, ours._mask(newest))
-    session.obj_with_new_inputs = [1]
-    for k, frame in enumerate(frames[1:]):
-        if k == 2:
-            session.frames_tracked_per_obj[at][k] = {"reverse": False}
-            session.add_point_inputs(at, k, ours._points(Prompt("cup", negative_px=[[10, 20]])))
-            session.obj_with_new_inputs = [1]
-        output = model(inference_session=session, frame=ours._pixels(frame.rgb), frame_idx=k)
-        np.testing.assert_allclose(told[k][0], output.pred_masks.numpy(), atol=1e-5)
-    # Nothing has been seen of an object whose first mask is empty.
-    assert not (ours.segment(frames[3], [Prompt("late", mask=np.zeros_like(first))]) == 2).any()
-    assert not (ours.segment(frames[3]) == 2).any() and ours.names == ("cup", "late")
-
-
-@needs_transformers
-def test_the_pipeline_takes_it(model):
-    method = Point2Pose(CAMERA, preset(), segmenter=sam2.Sam2Segmenter(model, CAMERA))
-    frames = film(4)
-    method.add_object("cup", clicks=CLICKS)
-    for k, frame in enumerate(frames):
-        if k == 2:
-            method.add_object("late", clicks=CLICKS - 5)
-        assert set(method.step(frame)) == ({"cup"} if k < 2 else {"cup", "late"})
-    method.remove_object("cup")
-    assert set(method.step(frames[3])) == {"late"}
-
-
-@needs_transformers
-def test_clicks_without_depth_are_refused(model):
-    frame = film(1)[0]
-    hole = Frame(0, 0.0, frame.rgb, np.zeros_like(frame.depth_m))
-    with pytest.raises(BadInput, match=r"\(80, 60\) has no depth"):
-        sam2.Sam2Segmenter(model, CAMERA).segment(hole, [CUP])
-
-
-# --- without the package or the weights --------------------------------------------------------
-
-
-def test_it_says_what_to_install_or_fetch(monkeypatch):
-    monkeypatch.delenv("P2P_DATA", raising=False)
-    with pytest.raises(MissingBackend) as error:
-        make_segmenter("sam2", CAMERA, preset().segmentation, np.random.default_rng(0))
-    if importlib.util.find_spec("transformers") is None:
-        assert "pip install" in str(error.value) and "transformers" in str(error.value)
-    else:
-        assert "p2p data fetch sam2" in str(error.value)
-
-
-def test_the_manifest_names_its_licence_and_option():
-    of = manifest("sam2")
-    assert "Apache" in of.licence and of.used_by == "--masks sam2"
-    assert {f.path for f in of.files} == {"model.safetensors", "config.json"}
+    for T_cam_obj, kept in ((np.eye(4), red), (None, wider)):
+        refiner = Sam2Refiner(lambda: Undecided(Encoder(), Decoder()), CAMERA, preset().segmentation, every=4)
+        prompt = Prompt("red", points_px=AT_RED, negative_px=[[110.0, 60]])
+        assert iou(refiner.refine(frame_of(), {"red": prompt}, {"red": red}, {})["red"], red) > 0.95
+        hints = {"red": Hint(uv_px=np.array(AT_RED), T_cam_obj=T_cam_obj)}
+        for k in range(1, 4):
+            assert refiner.refine(frame_of(k), {}, {"red": red}, hints) == {}
+        assert iou(refiner.refine(frame_of(4), {}, {"red": wider}, hints)["red"], kept) > 0.95

@@ -461,7 +461,7 @@ def test_the_support_plane_is_found_among_other_things():
     depth += np.random.default_rng(0).normal(0, 0.002, depth.shape).astype(np.float32) * (depth > 0)
     frame = Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), np.maximum(depth, 0))
     patch = Patch.of(frame, around(np.array([160, 180.0]), np.array([150, 60.0]), frame.shape), CAMERA, CONFIG)
-    plane = support_plane(patch, patch.depth_m > 0, np.random.default_rng(0))
+    plane = support_plane(patch, patch.depth_m > 0)
     assert plane[:3] @ normal > np.cos(np.radians(2)) and abs(plane[3] - d) < 0.01
     on_it = patch.dots(np.array([[20.0, 200], [290, 200]]), 0)
     assert on_it.sum() == 2 and np.abs(plane_heights(patch, plane)[on_it]).max() < 0.02
@@ -471,8 +471,8 @@ def test_no_plane_where_there_is_none():
     depth = np.random.default_rng(0).uniform(0.4, 2, (240, 320)).astype(np.float32)
     frame = Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), depth)
     patch = Patch.of(frame, around(np.array([160, 120.0]), np.array([100, 100.0]), frame.shape), CAMERA, CONFIG)
-    assert support_plane(patch, patch.depth_m > 0, np.random.default_rng(0)) is None
-    assert support_plane(patch, np.zeros(patch.shape, bool), np.random.default_rng(0)) is None
+    assert support_plane(patch, patch.depth_m > 0) is None
+    assert support_plane(patch, np.zeros(patch.shape, bool)) is None
 
 
 def test_patches_keep_places():
@@ -535,3 +535,34 @@ def test_distances_to_a_known_surface():
     assert np.isinf(distance[v, 25]), "off the volume nothing of the object can be"
     p_obj = CAMERA.unproject(np.array([u + 20.0, v + 10]), 0.52) - T_cam_obj[:3, 3]
     assert distance[v + 10, u + 20] == pytest.approx(np.linalg.norm(p_obj) - 0.1, abs=3e-3)
+
+
+# --- a mask that is not the object's -----------------------------------------------------------
+
+
+def _leap(to: tuple[int, int]) -> list[Frame]:
+    """A red card that lies still, and then is elsewhere on a green wall from one frame to the next."""
+    frames = []
+    for k, at in enumerate([(100, 80)] * 3 + [to] * 3):
+        frame = picture(k, [(at, 2)])
+        frame.rgb[:], frame.rgb[card(at)] = (60, 120, 60), (200, 60, 50)
+        frames.append(frame)
+    return frames
+
+
+def test_what_leaps_is_found_by_its_colours_near_to_where_it_was():
+    """The flow cannot follow it: what it leaves behind has other colours, and the object is not far."""
+    follow = segmenter()
+    for k, frame in enumerate(_leap((158, 96))):
+        found = follow.segment(frame, () if k else on(card=(100, 80))) == 1
+    assert iou(found, card((158, 96))) > 0.85
+
+
+def test_a_place_without_the_colours_is_not_the_object_though_it_is_sighted_there():
+    """A shape says that it is back where only the wall is: it is followed where it is."""
+    follow, frames = segmenter(), _leap((100, 80))
+    for k, frame in enumerate(frames[:4]):
+        follow.segment(frame, () if k else on(card=(100, 80)))
+    wall_px = np.stack(np.meshgrid(np.arange(20, 60, 6), np.arange(150, 200, 6)), -1).reshape(-1, 2).astype(float)
+    found = follow.segment(frames[4], hints={"card": Hint(wall_px, T_cam_obj=np.eye(4), sighted=True)}) == 1
+    assert iou(found, card((100, 80))) > 0.85

@@ -6,7 +6,7 @@ import pytest
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.paths import PROJECT
-from p2p_lib.method.pipeline import Point2Pose
+from p2p_lib.extended.default import Point2Pose
 from studies.pipeline_diagram import STAGES, as_svg, pipeline_diagram
 from studies.runner import list_notebooks
 from tests.method.test_pipeline import CAMERA, film
@@ -15,7 +15,7 @@ from tests.method.test_pipeline import CAMERA, film
 def timed_stages() -> set[str]:
     """The names that the method gives its stopwatch."""
     found = set()
-    for path in (PROJECT / "p2p_lib" / "method").glob("*.py"):
+    for path in [p for room in ("method", "extended") for p in (PROJECT / "p2p_lib" / room).glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in ("stopwatch", "_stopwatch"):
                 found.add(node.args[0].value)

@@ -52,7 +52,7 @@ def test_a_segment_needs_a_fair_share_of_the_points_that_were_searched_for(found
     (segment,) = segments.segments
     segment.hidden_for = hidden_for
     p.verified[found:] = False
-    segments.fit(p, image(), lost_only=True, sought=np.arange(24))
+    segments.fit_found(p, image(), np.arange(24))
     assert segment.posed == posed and p.verified.sum() == (found if posed else 0)
 
 

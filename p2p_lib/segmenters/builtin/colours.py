@@ -21,9 +21,13 @@ def colour_codes(rgb: np.ndarray) -> np.ndarray:
     return (q[..., 0] * _BINS + q[..., 1]) * _BINS + q[..., 2]
 
 
-def histogram(codes: np.ndarray) -> np.ndarray:
-    """(4096,) shares of the colours of some pixels, each bled a little into its neighbours; zeros for none."""
-    counts = np.bincount(codes, minlength=_COLOURS).reshape(_BINS, _BINS, _BINS) / max(codes.size, 1)
+def histogram(codes: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """(4096,) shares of the colours of some pixels, each bled a little into its neighbours; zeros for none.
+
+    codes, weights  (N,) the pixels' colours, and how much each pixel counts; all alike where that is None
+    """
+    total = codes.size if weights is None else weights.sum()
+    counts = np.bincount(codes, weights, _COLOURS).reshape(_BINS, _BINS, _BINS) / max(total, 1e-9)
     for _ in range(3):  # along one axis at a time; each turn brings the next one to the front
         counts = np.tensordot(counts, _BLUR, (0, 1))
     return counts.ravel()

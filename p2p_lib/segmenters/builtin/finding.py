@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
-from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, max_plane_height_m
+from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, max_plane_height_m, strange
 from p2p_lib.segmenters.builtin.patch import (
     Patch,
     around,
@@ -24,6 +26,8 @@ from p2p_lib.segmenters.builtin.view import Claim, View
 
 #: A component of this many pixels, likelier by this much in the object's colours (nats), is the expected object.
 _MIN_COMPONENT_PX, _MIN_LIKELIER = 80, 1.0
+#: So far an object may leap from one frame to the next, m.
+_LEAP_M = 0.15
 
 
 def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
@@ -44,13 +48,23 @@ def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
     seeds = patch.dots(uv_px, 0 if expected else 1) & (patch.depth_m > 0) & ~barred
     surface = by_surface(patch, hint, cfg)
     outside = ~dilated(seeds | (surface > 0), 3)
-    plane = support_plane(patch, (patch.depth_m > 0) & outside, view.rng)
+    plane = support_plane(patch, (patch.depth_m > 0) & outside)
     log_odds, component = by_geometry(patch, seeds, plane, cfg)
     colour = by_colour(patch, target.colours, outside & ~component, cfg)
     background = (patch.border() | barred) & ~seeds
     x = keep_seeded_components(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
     own_colours = colour[x > 0.5]
-    return (patch.box, patch.up(x)) if len(own_colours) and (hint.sighted or own_colours.mean() > 0) else None
+    if not len(own_colours) or strange(patch, x > 0.5, target.colours):
+        return None
+    return (patch.box, patch.up(x)) if hint.sighted or own_colours.mean() > 0 else None
+
+
+def near_last(view: View, target: Target, hint: Hint) -> Hint:
+    """A hint that expects an object where it was seen last, unless it says itself where that is."""
+    if hint.place is not None or len(hint.uv_px) >= view.config.find_points:
+        return hint
+    centre_m = view.camera.unproject(target.seen.centre_px[None], np.array([target.seen.z_m]))[0]
+    return replace(hint, place=np.append(centre_m, _LEAP_M))
 
 
 def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarray) -> np.ndarray:
@@ -66,7 +80,7 @@ def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarra
     if np.count_nonzero(near) < _MIN_COMPONENT_PX:
         return NO_PX
     colour = by_colour(patch, target.colours, measured & ~near, view.config)
-    plane, free = support_plane(patch, measured, view.rng), patch.smooth
+    plane, free = support_plane(patch, measured), patch.smooth
     if plane is not None:
         free = free & (plane_heights(patch, plane) > max_plane_height_m(patch.sigma_m))
     # What is connected with another object belongs to that one, whatever its mask has left out.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from p2p_lib.core.interfaces import Hint
-from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, warped
+from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, strange, warped
 from p2p_lib.segmenters.builtin.motion import scene_stays
 from p2p_lib.segmenters.builtin.patch import Patch, around, dilated, keep_seeded_components, support_plane
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX
@@ -26,6 +26,7 @@ class Prediction:
 
     jumped    (h, w) bool: its depth changed, so that something else has come before it or it has gone
     shown     (h, w) bool: it has a depth and had none; that of the object or of what has come before it
+    left      whether what lay behind it shows where it should be: it is not covered but has left
     doubtful  whether the flow alone says too little
     """
 
@@ -33,6 +34,7 @@ class Prediction:
     prior: np.ndarray
     jumped: np.ndarray
     shown: np.ndarray
+    left: bool
     doubtful: bool
 
     @property
@@ -59,16 +61,20 @@ def predict(view: View, target: Target) -> Prediction:
     area, blind = np.count_nonzero(likely), np.count_nonzero(likely & ~measured) + np.count_nonzero(shown)
     changed = abs(area - np.count_nonzero(was > 0.5)) > _MAX_AREA_CHANGE * area
     doubtful = changed or np.count_nonzero(jumped) > _MAX_JUMPED * area or blind > _MAX_UNMEASURED * area
-    return Prediction(patch, prior, jumped, shown, doubtful)
+    left = np.count_nonzero(jumped & (patch.depth_m > z_before)) > area / 2
+    return Prediction(patch, prior, jumped, shown, left, doubtful)
 
 
 def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Claim:
-    """Cut the object out around its predicted mask."""
+    """Cut the object out around its predicted mask.
+
+    None where it has left: what shows there has the colours of its surroundings, or lies behind it.
+    """
     cfg, patch, prior, jumped = view.config, predicted.patch, predicted.prior, predicted.jumped
     core = (prior > 0.8) & ~(jumped | predicted.shown)
     if not (core & (patch.depth_m > 0)).any():
         core |= predicted.shown & (np.abs(patch.depth_m - target.seen.z_m) < _REAPPEARS_WITHIN_M)
-    plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2), view.rng)
+    plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2))
     motions = target.past.motions(view.frame, hint.T_cam_obj) if target.confident else None
     log_odds, component = by_geometry(patch, core, plane, cfg, motions)
     stays = cfg.prior_weight * np.where(jumped | predicted.shown, 0, 2 * prior - 1)
@@ -79,7 +85,9 @@ def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Cla
     log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
     x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
     beside = dilated((x > 0.5) & (patch.depth_m > 0), 1)
-    return patch.box, patch.up(np.where((patch.depth_m > 0) | (prior > 0.5) | beside, x, 0))
+    x = np.where((patch.depth_m > 0) | (prior > 0.5) | beside, x, 0)
+    elsewhere = strange(patch, x > 0.5, target.colours) or (predicted.left and not (x > 0.5).any())
+    return None if elsewhere else (patch.box, patch.up(x))
 
 
 def with_room(view: View, target: Target, hint: Hint) -> Target:
@@ -89,7 +97,7 @@ def with_room(view: View, target: Target, hint: Hint) -> Target:
     motions = target.past.motions(view.frame, hint.T_cam_obj)
     if motions is None or not scene_stays(patch, motions):
         return target
-    plane = support_plane(patch, patch.depth_m > 0, view.rng)
+    plane = support_plane(patch, patch.depth_m > 0)
     _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions)
     if not component.any():
         return target

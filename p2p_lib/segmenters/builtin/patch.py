@@ -21,7 +21,12 @@ _SLANT_M = 0.004
 #: So many values tell their median.
 _ENOUGH = 400
 #: Points that tell of a support plane, and planes that are tried.
-_PLANE_POINTS, _PLANES = 250, 50
+_PLANE_POINTS, _PLANES = 250, 150
+#: Twice the area of the smallest triangle that tells a plane, m2.
+_SMALLEST_M2 = 1e-3
+#: The points of each plane: steps of an irrational share of all of them, which repeat no pattern (Roberts 2018).
+_STEPS = np.array([0.8191725134, 0.6710436067, 0.5497004779])
+_TRIPLES = ((0.5 + np.arange(_PLANES) * _STEPS[:, None]) % 1 * _PLANE_POINTS).astype(int)
 #: A plane that holds less than this share of the pixels supports nothing.
 _SUPPORTS = 0.2
 
@@ -244,28 +249,38 @@ def keep_seeded_components(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     return np.where(components_touching(connected_components(x > 0.5), seeds) | (x <= 0.5), x, 0)
 
 
-def support_plane(patch: Patch, where: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-    """(4,) n, d with n . p = d and n towards the camera: the plane of at least a fifth of the pixels; else None."""
+def support_plane(patch: Patch, where: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray | None:
+    """(4,) n, d with n . p = d and n towards the camera: the plane of at least a fifth of the pixels; else None.
+
+    where   (h, w) bool, the pixels that may be of it
+    weight  (h, w) how much each counts; all alike where it is None
+
+    Planes through three of some evenly spread pixels are compared, the best is fitted. Nothing is left to chance.
+    """
     at = np.flatnonzero(where)
     if len(at) < 100:
         return None
-    v, u = np.divmod(at[rng.integers(0, len(at), _PLANE_POINTS)], patch.shape[1])
+    v, u = np.divmod(at[np.linspace(0, len(at) - 1, _PLANE_POINTS).astype(int)], patch.shape[1])
     x, y = patch.rays()
     z = patch.depth_m[v, u].astype(float)
     p = np.stack([x[u] * z, y[v] * z, z], -1)
+    share = np.ones(len(p)) if weight is None else weight[v, u].astype(float)
+    share /= share.sum()
     within = 2 * patch.sigma_m[v, u]
-    a, b, c = p[rng.integers(0, len(p), (3, _PLANES))]
+    a, b, c = p[_TRIPLES]
     n = np.cross(b - a, c - a)
-    n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
+    length = np.linalg.norm(n, axis=1, keepdims=True)
+    n /= np.maximum(length, 1e-9)
     off = np.abs(p @ n.T - (n * a).sum(1))
-    best = (off < within[:, None]).sum(0).argmax()
+    inliers_of = np.where(length[:, 0] > _SMALLEST_M2, share @ (off < within[:, None]), 0)
+    best = inliers_of.argmax()
     inliers = off[:, best] < within
     for _ in range(3):
-        if inliers.mean() < _SUPPORTS:
+        if share @ inliers < _SUPPORTS:
             return None
-        centre = p[inliers].mean(0)
+        centre = share[inliers] @ p[inliers] / share[inliers].sum()
         q = p[inliers] - centre
-        normal = np.linalg.eigh(q.T @ q)[1][:, 0]
+        normal = np.linalg.eigh(q.T @ (q * share[inliers, None]))[1][:, 0]
         d = normal @ centre
         inliers = np.abs(p @ normal - d) < within
     return np.append(normal, d) * (-1 if d > 0 else 1)

@@ -18,8 +18,8 @@ from p2p_lib.core.errors import doubt
 from p2p_lib.core.image import bounds
 from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.colours import histogram
-from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, cut
+from p2p_lib.segmenters.builtin.cut import cut
+from p2p_lib.segmenters.builtin.depth_offset import depth_offset_px, with_depth_moved
 from p2p_lib.segmenters.builtin.patch import (
     Box,
     Patch,
@@ -28,6 +28,15 @@ from p2p_lib.segmenters.builtin.patch import (
     keep_seeded_components,
     plane_heights,
     support_plane,
+)
+from p2p_lib.segmenters.builtin.start_evidence import (
+    Clicked,
+    Height,
+    by_connection,
+    by_distance,
+    by_shares,
+    filled,
+    tolerant,
 )
 
 #: Room around an object, besides a share of its size: small ones move by pixels too.
@@ -43,6 +52,12 @@ _TIGHT = 0.05
 _LIKE = 0.1
 #: Log odds of what lies nearer to a click beside the object than to one on it: more than geometry says.
 _NOT_IT = 3.0
+#: Two things are parted by an edge where their outline's ties, which are 1 between like pixels, are less in the mean.
+_TIED = 0.02
+#: Depth may end this many pixels beside the outline that colour shows.
+_TOLERANCE_PX = 3.0
+#: Cuts in the wide box and in the one that fits; a click beside the object counts as this many pixels of background.
+_ROUNDS, _ROUNDS_MORE, _OTHERS = 3, 2, 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +70,6 @@ class Cutter:
     frame: Frame
     camera: Camera
     config: SegmentationConfig
-    rng: np.random.Generator
     prompt: Prompt
     others_px: np.ndarray
 
@@ -63,21 +77,28 @@ class Cutter:
         """From clicks or a box: in a wide box at low resolution, then in one that fits."""
         cfg, frame, around_px = self.config, self.frame, self.prompt.box_px
         clicks = self.prompt.points_px if len(self.prompt.points_px) else points_in_box(around_px, frame)
+        z_m = float(np.nanmedian(depths_at(clicks, frame)))
         if around_px is None:
-            reach_px = cfg.reach_m * np.array([self.camera.fx, self.camera.fy]) / np.nanmedian(depths_at(clicks, frame))
+            reach_px = cfg.reach_m * np.array([self.camera.fx, self.camera.fy]) / z_m
             box = around(clicks.mean(0), np.maximum(reach_px, 2 * np.ptp(clicks, 0)), frame.shape)
         else:
             box = self._room(around_px[:2], around_px[2:])
-        patch = Patch.of(frame, box, self.camera, cfg)
-        plane = support_plane(patch, patch.depth_m > 0, self.rng)
-        seeds = patch.dots(clicks, 1)
-        outside = ~dilated(seeds, min(seeds.shape) // 6) if around_px is None else ~_within(patch, around_px)
-        x = self._cut_out(patch, plane, clicks, dilated(seeds, 2), outside)
-        whole = np.zeros(frame.shape, np.float32)
-        whole[patch.box.slices] = patch.up(x)
-        patch = Patch.of(frame, self._room(*patch.ends_px(x > 0.5)), self.camera, cfg)
-        was = patch.down(whole)
-        x = self._cut_out(patch, plane, clicks, was > 0.5, was < 0.5, was)
+        moved = replace(self, frame=with_depth_moved(frame, depth_offset_px(frame, box)))
+        patch = Patch.of(moved.frame, box, self.camera, cfg)
+        clicked = Clicked.of(patch, clicks, z_m)
+        height = Height.of(patch, clicked)
+        connected = by_connection(patch, clicked, height) + self._nearer_to_others(patch, clicked)
+        prior = clicked.prior_beside(connected)
+        x = moved._cut_out(patch, clicked, prior, by_distance(patch, z_m, cfg) + height.log_odds + connected)
+        whole, there = np.zeros((2, *frame.shape), np.float32)
+        whole[patch.box.slices], there[patch.box.slices] = patch.up(x), patch.up(connected)
+        fits = self._room(*patch.ends_px(x > 0.5))
+        patch = Patch.of(moved.frame, fits, self.camera, replace(cfg, side_px=2 * cfg.side_px))
+        clicked = Clicked.of(patch, clicks, z_m)
+        height = height.on(patch, clicked)
+        connected = patch.down(there)
+        geometry = by_distance(patch, z_m, cfg) + height.log_odds + connected
+        x = moved._cut_out(patch, clicked, clicked.prior_beside(connected) / 2, geometry, patch.down(whole))
         return patch.box, patch.up(x)
 
     def correct(self, was: np.ndarray, known_px: np.ndarray) -> tuple[Box, np.ndarray]:
@@ -99,28 +120,38 @@ class Cutter:
         return replace(self, prompt=replace(self.prompt, points_px=points_px)).start()
 
     def _cut_out(
-        self,
-        patch: Patch,
-        plane: np.ndarray | None,
-        clicks: np.ndarray,
-        inside: np.ndarray,
-        outside: np.ndarray,
-        start: np.ndarray | None = None,
+        self, patch: Patch, clicked: Clicked, prior: np.ndarray, geometry: np.ndarray, x: np.ndarray | None = None
     ) -> np.ndarray:
         """(h, w) probability of what is connected with the clicks, which count as certain.
 
-        Colours are those ``inside`` and ``outside``.
+        The colours of object and background are learnt from each cut for the next one; before the first, from
+        what lies around the clicks and what lies beyond. ``x`` (h, w) is a cut on another patch.
         """
-        seeds = patch.dots(clicks, 1)
-        by_depth, _ = by_geometry(patch, seeds, plane, self.config)
-        log_odds = by_depth + by_colour(patch, histogram(patch.codes[inside]), outside, self.config)
-        beside = patch.dots(self.prompt.negative_px, 0) & ~seeds
-        if beside.any():
-            log_odds = log_odds - _NOT_IT * patch.nearer(beside, seeds, _LIKE)
-        barred = beside | patch.dots(self.others_px, 1) | patch.border()
+        seeds, cfg = clicked.seeds, self.config
+        others = patch.dots(self._others_px, 1) & ~seeds
+        fixed = prior + tolerant(filled(geometry, patch.depth_m > 0), _TOLERANCE_PX / patch.cell_px)
+        barred = others | patch.border()
         if self.prompt.box_px is not None:
             barred |= ~_within(patch, self.prompt.box_px)
-        return keep_seeded_components(cut(patch, log_odds, start=start, seeds=seeds, background=barred & ~seeds), seeds)
+        own, other = (clicked.near, clicked.beyond + _OTHERS * others) if x is None else (x, 1 - x)
+        for _ in range(_ROUNDS if x is None else _ROUNDS_MORE):
+            log_odds = fixed + by_shares(patch, own, other, cfg)
+            x = cut(patch, log_odds, start=x, seeds=seeds, background=barred & ~seeds, sharp=True)
+            x = keep_seeded_components(x, seeds)
+            own, other = np.maximum(2 * x - 1, 0) + clicked.hull / 2, np.maximum(1 - 2 * x, 0)
+        return x
+
+    @property
+    def _others_px(self) -> np.ndarray:
+        """(K, 2) clicks that are not on the object: beside it, and on others."""
+        return np.concatenate([self.prompt.negative_px, self.others_px])
+
+    def _nearer_to_others(self, patch: Patch, clicked: Clicked) -> np.ndarray:
+        """(h, w) log-odds of what lies nearer to a click that is not on the object than to one on it."""
+        others = patch.dots(self._others_px, 0) & ~clicked.seeds
+        if not others.any():
+            return np.zeros(patch.shape, np.float32)
+        return np.where(patch.nearer(others, clicked.seeds, _LIKE), np.float32(-_NOT_IT), 0)
 
     def _room(self, low: np.ndarray, high: np.ndarray) -> Box:
         """A box with room around the pixels from ``low`` to ``high`` (x, y)."""
@@ -141,7 +172,7 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
     rows, columns = bounds(mask)
     corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
     patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)
-    plane = support_plane(patch, patch.depth_m > 0, np.random.default_rng(0))
+    plane = support_plane(patch, patch.depth_m > 0)
     inside = (patch.down(mask.astype(np.float32)) > 0.5) & (patch.depth_m > 0)
     if plane is not None and inside.any():
         height = np.median(np.abs(plane_heights(patch, plane)[inside]) / patch.sigma_m[inside])
@@ -150,12 +181,23 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
             fix = "If it is not the object, click in the object's middle; else see that depth is in metres."
             return doubt(who, got, fix)
     alone = np.zeros(frame.shape, bool)
-    box, x = cutter.start()
+    box, x = replace(cutter, others_px=NO_PX).start()
     alone[box.slices] = x > 0.5
     for other, there in others.items():
-        if there.any() and (alone & there).sum() > there.sum() / 2:
+        taken = there.any() and (alone & there).sum() > there.sum() / 2
+        if taken and _touch_unparted(patch, inside, patch.down(there.astype(np.float32)) > 0.5):
             fix = "If both are one body, leave one out; else give each clicks beside it (negative), on the other."
             doubt(who, f"most of {other!r} belongs to what is clicked", fix)
+
+
+def _touch_unparted(patch: Patch, one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two masks (h, w) bool touch, and not along an edge of colour or depth alone."""
+    right, below = patch.edge_weights
+    tie = np.ones(patch.shape, np.float32)
+    tie[:, :-1] = np.minimum(tie[:, :-1], right)
+    tie[:-1] = np.minimum(tie[:-1], below)
+    tied = cv2.erode(tie, np.ones((3, 3), np.uint8))[dilated(one, 1) & dilated(other, 1)]
+    return bool(len(tied)) and tied.mean() > _TIED
 
 
 def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:

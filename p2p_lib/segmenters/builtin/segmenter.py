@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -21,8 +22,9 @@ from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.finding import find
+from p2p_lib.segmenters.builtin.finding import find, near_last
 from p2p_lib.segmenters.builtin.following import Prediction, follow, predict, with_room
+from p2p_lib.segmenters.builtin.patch import Box
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter, doubt_start
 from p2p_lib.segmenters.builtin.target import Target, seen_in
 from p2p_lib.segmenters.builtin.view import Claim, View
@@ -32,13 +34,36 @@ _TURNS = 3
 _NO_HINT = Hint()
 
 
+class Refiner(Protocol):
+    """Replaces masks of :class:`BuiltinSegmenter`, see :class:`p2p_lib.segmenters.sam2.Sam2Refiner`."""
+
+    name: str
+
+    def refine(
+        self,
+        frame: Frame,
+        prompts: Mapping[str, Prompt],
+        masks: Mapping[str, np.ndarray],
+        hints: Mapping[str, Hint],
+    ) -> dict[str, np.ndarray]:
+        """Better masks (H, W) bool of some of the objects in this frame; the others keep theirs."""
+
+
 class BuiltinSegmenter:
-    """The segmenter without weights. Implements :class:`p2p_lib.core.interfaces.Segmenter`."""
+    """The segmenter without weights. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
 
-    name = "builtin"
+    refiner  may replace what is claimed for an object in a frame, before it is labelled and learnt from
+    """
 
-    def __init__(self, camera: Camera, config: SegmentationConfig, rng: np.random.Generator):
-        self.camera, self.config, self._rng = camera, config, rng
+    def __init__(
+        self,
+        camera: Camera,
+        config: SegmentationConfig,
+        rng: np.random.Generator | None = None,
+        refiner: Refiner | None = None,
+    ):
+        self.name = "builtin" if refiner is None else refiner.name
+        self.camera, self.config, self._refiner = camera, config, refiner
         self._targets: dict[str, Target] = {}
         self._previous: Frame | None = None
         self._frames = 0
@@ -62,7 +87,7 @@ class BuiltinSegmenter:
         said, hints = {prompt.name: prompt for prompt in prompts}, hints or {}
         _check(frame, said, self.camera)
         self._frames += 1
-        view = View(frame, self._previous, self.camera, self.config, self._rng)
+        view = View(frame, self._previous, self.camera, self.config)
         new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
         masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
         due, claims = self._due(), {}
@@ -73,6 +98,7 @@ class BuiltinSegmenter:
             else:
                 self._targets[name], claims[name] = self._locate(view, name, said, hints, taken, name in due)
                 _mark(taken, claims[name])
+        claims |= self._refined(frame, said, claims, hints)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
         self._doubt_starts(view, labels, new)
@@ -107,7 +133,7 @@ class BuiltinSegmenter:
         target = self._targets.get(name, Target()).with_learnt(view.previous, view.focal_px, view.config)
         if name in said:
             others_px = np.concatenate([NO_PX, *(p.points_px for n, p in said.items() if n != name)])
-            cutter = Cutter(view.frame, view.camera, view.config, view.rng, said[name], others_px)
+            cutter = Cutter(view.frame, view.camera, view.config, said[name], others_px)
             claim = self._segment_prompt(view, cutter, target, hints.get(name, _NO_HINT), taken)
             return Target(), claim  # its colours and its size are learnt anew
         predicted = None if target.seen is None else predict(view, target)
@@ -134,12 +160,30 @@ class BuiltinSegmenter:
         if hint.gone:
             return target, None
         if predicted is None or hint.sighted:  # what has been followed is not where the object was found
-            return target, find(view, target, hint, taken)
-        if not (target.confident and target.past.due(view.frame)):
-            return target, follow(view, target, hint, predicted)
-        target = with_room(view, target, hint)
+            claim = find(view, target, hint, taken)
+            if predicted is None or claim is not None:
+                return target, claim
+            target, hint = replace(target, confident=False), Hint()  # nor is it where it was sighted
+        due = target.confident and target.past.due(view.frame)
+        target = with_room(view, target, hint) if due else target
         claim = follow(view, target, hint, predicted)
-        return replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj)), claim
+        if claim is None:  # it has moved faster than the flow: it is not far from where it was
+            return target, find(view, target, near_last(view, target, hint), taken)
+        past = target.past.with_frame(view.frame, hint.T_cam_obj) if due else target.past
+        return replace(target, past=past), claim
+
+    def _refined(
+        self, frame: Frame, said: Mapping[str, Prompt], claims: Mapping[str, Claim], hints: Mapping[str, Hint]
+    ) -> dict[str, Claim]:
+        """The claims that the refiner replaces."""
+        if self._refiner is None:
+            return {}
+        masks = {name: np.zeros(frame.shape, bool) for name in claims}
+        for name, claim in claims.items():
+            _mark(masks[name], claim)
+        prompts = {name: prompt for name, prompt in said.items() if prompt.mask is None}
+        refined, whole = self._refiner.refine(frame, prompts, masks, hints), Box(0, 0, *frame.shape[::-1])
+        return {name: (whole, mask.astype(np.float32)) for name, mask in refined.items()}
 
     @staticmethod
     def _cuts(target: Target, due: bool) -> bool:
@@ -174,7 +218,7 @@ class BuiltinSegmenter:
         label_of = {name: label for label, name in enumerate(self._targets, 1)}
         for prompt in new:
             others = {name: labels == label for name, label in label_of.items() if name != prompt.name}
-            cutter = Cutter(view.frame, view.camera, view.config, np.random.default_rng(0), prompt, NO_PX)
+            cutter = Cutter(view.frame, view.camera, view.config, prompt, NO_PX)
             doubt_start(cutter, labels == label_of[prompt.name], others)
 
 

@@ -23,7 +23,6 @@ class View:
     previous: Frame | None
     camera: Camera
     config: SegmentationConfig
-    rng: np.random.Generator
 
     @property
     def focal_px(self) -> np.ndarray:

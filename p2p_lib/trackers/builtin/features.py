@@ -138,3 +138,18 @@ def match(wanted: np.ndarray, found: np.ndarray, uv_px: np.ndarray, ratio: float
     distance = np.sqrt(np.maximum(2 - 2 * np.stack(similarities, 1), 0))
     which, rank = np.nonzero(distance[:, :_PLACES] < ratio * distance[:, _PLACES:])
     return which, np.stack(best, 1)[which, rank]
+
+
+def mutual_match(wanted: np.ndarray, found: np.ndarray, ratio: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of descriptors wanted (Q, SIZE) and found (M, SIZE) that are each other's nearest.
+
+    The nearest one of those wanted is nearer than ``ratio`` times the next.
+    """
+    similarity = wanted @ found.T
+    rows, best = np.arange(len(wanted)), similarity.argmax(1)
+    mutual = similarity.argmax(0)[best] == rows
+    nearest = similarity[rows, best]
+    similarity[rows, best] = -1
+    gap, next_gap = (np.sqrt(np.maximum(2 - 2 * s, 0)) for s in (nearest, similarity.max(1)))
+    good = mutual & (gap < ratio * next_gap)
+    return rows[good], best[good]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -12,12 +12,14 @@ from scipy.spatial import cKDTree
 from p2p_lib.core import se3
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.robust import consensus
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Landmarks, corners
 from p2p_lib.trackers.builtin.rigid_motion import PoseFit, Prediction, fit_pose, pose_distance_m, predict
 from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, planes_at
 from p2p_lib.trackers.builtin.tracked_points import Points
+from p2p_lib.trackers.builtin.wide_baseline import Matched, Sight, corners_of, matched
 
 #: Covariance of a pose that matches have proposed: rad, m.
 _PROPOSED_COV = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
@@ -30,6 +32,10 @@ _PLACED_PX, _OBSERVED_PX = 0.2, 0.3
 #: A neighbouring pixel's depth may be read: depth noise of an observation is larger than the sensor's by this.
 _DEPTH_NOISE = 1.5
 _EYE2, _EYE3 = np.eye(2), np.eye(3)
+#: A segment is matched where fewer than this share of the points are followed that were seen on it.
+_FOLLOWED = 0.5
+#: Covariance of a matched corner on its segment (m^2), and of where it is seen (px^2).
+_MATCHED_M2, _MATCHED_PX2 = 0.001**2 * _EYE3, 1.5**2 * _EYE2
 _NO_ROWS = np.zeros(0, np.int64)
 
 
@@ -41,6 +47,8 @@ class MotionSegment:
     hidden_for    frames since the pose was known
     rejected      (M, 3) points in the camera's frame where it was found wrongly: a look-alike may be there
     rejected_for  frames for which it is not searched for around them
+    sight         the newest frame in which it had a pose; None before it has points enough to be searched for
+    matched       what corners of that frame have been matched with in the newest one; None where nothing
     """
 
     fit: PoseFit
@@ -49,6 +57,8 @@ class MotionSegment:
     rejected: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     rejected_for: int = 0
     landmarks: Landmarks = field(default_factory=Landmarks)
+    sight: Sight | None = None
+    matched: Matched | None = None
 
     @property
     def posed(self) -> bool:
@@ -79,6 +89,10 @@ class MotionSegments:
         """(N,) points on segments whose pose is known, or was ``within`` so many frames."""
         return np.array([segment.hidden_for <= within for segment in self.segments] + [False])[p.segment]
 
+    def matched(self, p: Points) -> np.ndarray:
+        """(N,) points on segments that corners of the frame before show in the newest one."""
+        return np.array([segment.matched is not None for segment in self.segments] + [False])[p.segment]
+
     def predict(self, p: Points, rows: np.ndarray, now: Image) -> Prediction:
         """Where these points of segments are by their segments' poses."""
         of, fits = p.segment[rows], [segment.fit for segment in self.segments]
@@ -99,44 +113,93 @@ class MotionSegments:
             if (own & wrong).sum() > 0.5 * own.sum():
                 segment.rejected = se3.transform(segment.fit.T_cam_seg, p.p_seg[own & wrong])
                 segment.rejected_for = self.config.reject_frames
-                segment.hidden_for = self.config.linger_frames + 1
+                segment.hidden_for, segment.sight = self.config.linger_frames + 1, None
 
-    def fit(self, p: Points, now: Image, lost_only: bool = False, sought: np.ndarray = _NO_ROWS) -> None:
-        """Fit poses to the points that were followed or found; points that disagree are not verified.
+    def fit(self, p: Points, now: Image, search: np.ndarray | None = None) -> None:
+        """Fit poses to the points that were followed; where too few agree, to the corners of the frame before, too.
 
-        ``sought`` (M,) are the rows that were searched for where segments predict them. ``lost_only``: a segment with a
-        pose keeps it, unless hardly any of its points are found there.
+        Points that disagree are not verified. ``search`` (H, W): where objects are; None: anywhere.
         """
-        p.leaving &= lost_only
+        p.leaving[:] = False
+        rows = [np.flatnonzero(p.verified & (p.segment == s)) for s in range(len(self.segments))]
+        for segment in self.segments:
+            segment.rejected_for, segment.matched = max(segment.rejected_for - 1, 0), None
+        fits = [self._fitted(segment, p, at, now) for segment, at in zip(self.segments, rows, strict=True)]
+        self._match(fits, now, search)
+        for segment, at, fit in zip(self.segments.copy(), rows, fits, strict=True):
+            fit = self._fitted(segment, p, at, now) if segment.matched else fit
+            if fit is None:
+                segment.hidden_for += 1
+                continue
+            segment.before = segment.fit.T_cam_seg if segment.posed else fit.T_cam_seg
+            segment.fit, segment.hidden_for = fit, 0
+            p.verified[at[~fit.agrees]] = False
+            if segment.matched is None:  # else they were left behind
+                self._split(p, at[~fit.agrees], now)
+
+    def fit_found(self, p: Points, now: Image, sought: np.ndarray) -> None:
+        """Fit poses of lost segments to the points that were found among those sought, rows (M,), where predicted.
+
+        A segment with a pose keeps it, unless hardly any of its points are found there.
+        """
         for s, segment in enumerate(self.segments):
             at = np.flatnonzero(p.verified & (p.segment == s))
             own = sought[p.segment[sought] == s]
             fewest = _MIN_FOUND * (len(at) + np.count_nonzero(~p.verified[own]))
-            if lost_only and segment.posed:
+            if segment.posed and segment.matched is None:
                 if len(at) < fewest:
                     segment.hidden_for, p.verified[at] = 1, False
                 continue
-            if not lost_only:
-                segment.rejected_for = max(segment.rejected_for - 1, 0)
             fit = self._fitted(segment, p, at, now, fewest)
             if fit is not None:
-                segment.before = segment.fit.T_cam_seg if segment.posed else fit.T_cam_seg
+                segment.before = segment.before if segment.posed else fit.T_cam_seg
                 segment.fit, segment.hidden_for = fit, 0
                 p.verified[at[~fit.agrees]] = False
-                self._split(p, at[~fit.agrees], now)
-            elif lost_only:  # what was found at a pose that is refused is refused with it
+            elif not segment.posed:  # what was found at a pose that is refused is refused with it
                 p.verified[own] = False
-            else:
-                segment.hidden_for += 1
 
-    def _fitted(self, segment: MotionSegment, p: Points, at: np.ndarray, now: Image, fewest: float) -> PoseFit | None:
-        """The pose of a segment by its points at these rows; None where too few, or than ``fewest``, agree on one."""
+    def _fitted(
+        self, segment: MotionSegment, p: Points, at: np.ndarray, now: Image, fewest: float = 0.0
+    ) -> PoseFit | None:
+        """The pose of a segment by its points at these rows, and by the corners matched: None where too few agree."""
+        start, pairs = segment.extrapolated, segment.matched
+        seen = [p.p_seg[at], p.map_cov[at], p.uv[at].astype(float), p.cov[at].astype(float), now.depth_at(p.uv[at])]
+        if pairs is not None:
+            start, fewest = pairs.T_cam_seg, 0.0
+            noise_m2, noise_px2 = (np.repeat(cov[None], len(pairs), 0) for cov in (_MATCHED_M2, _MATCHED_PX2))
+            more = pairs.p_seg, noise_m2, pairs.uv_px, noise_px2, pairs.z_m
+            seen = [np.concatenate(column) for column in zip(seen, more, strict=True)]
         fewest = max(self.config.segment_min_points, fewest)
-        if len(at) < fewest:
+        if len(seen[0]) < fewest:
             return None
-        uv, cov, z = p.uv[at].astype(float), p.cov[at].astype(float), now.depth_at(p.uv[at])
-        fit = fit_pose(segment.extrapolated, p.p_seg[at], p.map_cov[at], uv, cov, z, now.camera)
-        return fit if fit.agrees.sum() >= fewest else None
+        fit = fit_pose(start, *seen, now.camera)
+        return replace(fit, agrees=fit.agrees[: len(at)]) if fit.agrees.sum() >= fewest else None
+
+    def _match(self, fits: list[PoseFit | None], now: Image, search: np.ndarray | None) -> None:
+        """Look for corners of segments on which too few points were followed; kept where more of them agree."""
+        agreeing = [0 if fit is None else np.count_nonzero(fit.agrees) for fit in fits]
+        lost = [
+            (segment, count, segment.sight)
+            for segment, count in zip(self.segments, agreeing, strict=True)
+            if segment.sight is not None
+            and segment.hidden_for < self.config.linger_frames
+            and not segment.rejected_for
+            and count < _FOLLOWED * len(segment.sight.uv_px)
+        ]
+        if not lost:
+            return
+        found, regions = corners_of([then for _, _, then in lost], now, search)
+        for (segment, count, then), region in zip(lost, regions, strict=True):
+            pairs = matched(then, found.select(in_mask(found.uv_px, region)), self.config, self._rng)
+            segment.matched = pairs if pairs is not None and len(pairs) > count else None
+
+    def remember(self, p: Points, now: Image, search: np.ndarray | None) -> None:
+        """Where segments show in the newest frame: there they are searched for in the next one."""
+        for s, segment in enumerate(self.segments):
+            own = p.visible & (p.segment == s)
+            if segment.posed and np.count_nonzero(own) >= 2 * self.config.segment_min_points:
+                found = None if segment.matched is None else segment.matched.found
+                segment.sight = Sight(now, p.uv[own], segment.fit.T_cam_seg, search, found)
 
     def _split(self, p: Points, strays: np.ndarray, now: Image) -> None:
         """Points that leave their segment together stay verified, and are a new segment once they are far enough.
@@ -194,7 +257,8 @@ class MotionSegments:
         cfg = self.config
         for s, segment in enumerate(self.segments):
             rows = np.flatnonzero(p.visible & (p.segment == s))
-            if not segment.posed or len(rows) < 2 * cfg.segment_min_points:
+            # What is fast is blurred: nothing to be remembered by.
+            if not segment.posed or segment.matched or len(rows) < 2 * cfg.segment_min_points:
                 continue
             T_seg_cam = se3.inverse(segment.fit.T_cam_seg)
             view = T_seg_cam[:3, 3] - segment.fit.centre

@@ -18,6 +18,8 @@ _EYE = np.eye(2, dtype=np.float32)
 _COAST_NCC, _COAST_SIGMA_PX = 0.4, 0.7
 #: An older template is preferred to one that is less distorted by no more than this.
 _OLDER_DISTORTION = 0.1
+#: A place with so many times the contrast of a template is that point without blur.
+_SHARPER = 1.4
 
 
 def follow(p: Points, before: Image, now: Image, cfg: TrackingConfig) -> None:
@@ -107,12 +109,28 @@ def update_templates(p: Points, now: Image, cfg: TrackingConfig, turn: int) -> N
     store_templates(p, at[changed | (p.ncc[at] < cfg.update_ncc)], now, turn)
 
 
-def store_templates(p: Points, rows: np.ndarray, now: Image, turn: int) -> None:
-    """Store the present appearance of these points; in a full set it replaces one in ``turn``, never the first."""
+def sharpen_templates(p: Points, at: np.ndarray, now: Image) -> None:
+    """Replace the template of points at these rows that was taken in blur: there is more contrast where they are now.
+
+    They are predicted well, and not recognised.
+    """
+    if not len(at):
+        return
+    k, _ = best_template(p, at)
+    blurred = p.templates.fine.contrast[p.template[at, k]] * _SHARPER < take(now.fine, p.uv[at]).contrast
+    store_templates(p, at[blurred], now, k=k[blurred])
+
+
+def store_templates(p: Points, rows: np.ndarray, now: Image, turn: int = 0, k: np.ndarray | None = None) -> None:
+    """Store the present appearance of these points, in the places ``k`` (M,) of their sets, if given.
+
+    Else behind those there are; in a full set it replaces one in ``turn``, never the first.
+    """
     if not len(rows):
         return
-    room, count = p.template.shape[1], (p.template[rows] >= 0).sum(1)
-    k = np.where(count < room, count, 1 + turn % (room - 1))
+    if k is None:
+        room, count = p.template.shape[1], (p.template[rows] >= 0).sum(1)
+        k = np.where(count < room, count, 1 + turn % (room - 1))
     uv = p.uv[rows]
     p.template_warp[rows, k], p.template_cov[rows, k] = p.warp[rows], p.cov[rows]
     p.template_unwarp[rows, k] = np.linalg.inv(p.warp[rows])

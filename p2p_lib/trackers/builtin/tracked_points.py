@@ -28,6 +28,7 @@ class Points(Rows):
     hidden_for: np.ndarray  # (N,) frames
     ncc: np.ndarray  # (N,) correlation with the template last recognised
     coasting: np.ndarray  # (N,) frames since a template was last recognised
+    chained: np.ndarray  # (N,) frames in which matched corners alone carried it since it was placed or recognised
     template_warp: np.ndarray  # (N, K, 2, 2)
     template_unwarp: np.ndarray  # (N, K, 2, 2) its inverse
     template_cov: np.ndarray  # (N, K, 2, 2) of the point's position in the template
@@ -53,6 +54,7 @@ class Points(Rows):
             hidden_for=np.zeros(n, np.int64),
             ncc=np.ones(n, np.float32),
             coasting=np.zeros(n, np.int64),
+            chained=np.zeros(n, np.int64),
             template_warp=np.tile(_EYE, (n, k, 1, 1)),
             template_unwarp=np.tile(_EYE, (n, k, 1, 1)),
             template_cov=np.zeros((n, k, 2, 2), np.float32),

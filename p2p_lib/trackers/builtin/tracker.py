@@ -17,6 +17,8 @@ from p2p_lib.trackers.ids import PointIds
 _EYE = np.eye(2)
 #: Errors of a prediction beyond its covariance, px: of a point that is seen, of one that is not.
 _PREDICTION_PX, _UNSEEN_PX = 0.5, 1.0
+#: Error of a point that each match adds while nothing else carries it, px.
+_CHAINED_PX = 0.35
 #: A point farther from its segment's prediction than this many variances is another one.
 _FAR_CHI2 = 16.0
 #: Cosine of surface normal and view below which a point counts as turned away.
@@ -37,7 +39,7 @@ class BuiltinTracker:
         """Begin a stream at this frame; without a camera, one with a common field of view is assumed."""
         h, w = frame.shape
         self._ids.start()
-        self._frames = 0
+        self._frames, self._search = 0, None
         self._points = Points.new(np.zeros((0, 2)), self.config.templates)
         self._segments = MotionSegments(self.config)
         self._camera = camera or Camera(0.95 * w, 0.95 * w, (w - 1) / 2, (h - 1) / 2, w, h)
@@ -51,6 +53,7 @@ class BuiltinTracker:
         self._points = joined([self._points, Points.new(uv, self.config.templates)])
         recognition.store_templates(self._points, new, self._now, 0)
         self._segments.assign(self._points, new, self._now)
+        self._segments.remember(self._points, self._now, self._search)
         return ids
 
     def drop(self, ids: np.ndarray) -> None:
@@ -90,10 +93,10 @@ class BuiltinTracker:
         """Follow all live queries into the next frame."""
         self._ids.check_started()
         before, self._now = self._now, Image.of(frame, self._camera)
-        self._frames += 1
+        self._frames, self._search = self._frames + 1, search
         p, cfg, now = self._points, self.config, self._now
         recognition.follow(p, before, now, cfg)
-        self._segments.fit(p, now)
+        self._segments.fit(p, now, search)
         if urgent or self._frames % cfg.redetect_every == 0:
             self._segments.search(now, search)
         self._find_predicted(search)
@@ -101,8 +104,10 @@ class BuiltinTracker:
         p.hidden_for = np.where(p.visible, 0, p.hidden_for + 1)
         if self._frames % cfg.update_every == 0:
             recognition.update_templates(p, now, cfg, self._frames // cfg.update_every)
+            recognition.sharpen_templates(p, np.flatnonzero(p.visible & ~p.verified & self._segments.posed(p)), now)
             self._segments.assign(p, np.flatnonzero(p.verified & (p.segment < 0)), now)
             self._segments.add_landmarks(p, now)
+        self._segments.remember(p, now, search)
         return self._tracks()
 
     def _tracks(self) -> Tracks:
@@ -127,10 +132,12 @@ class BuiltinTracker:
         if len(rows):
             predicted = self._segments.predict(p, rows, self._now)
             pick = np.flatnonzero(self._exposed(predicted, search) & (predicted.sigma_px < cfg.search_px))
-            where = predicted.uv_px[pick], predicted.warp[pick], predicted.sigma_px[pick]
+            sigma_px = np.hypot(predicted.sigma_px, _CHAINED_PX * np.sqrt(p.chained[rows]))[pick]
+            where = predicted.uv_px[pick], predicted.warp[pick], sigma_px
             rows = rows[pick]
             recognition.find(p, rows, *where, self._now, cfg)
-        self._segments.fit(p, self._now, lost_only=True, sought=rows)
+        # What was badly predicted for long says nothing of whether its segment is there.
+        self._segments.fit_found(p, self._now, rows[p.chained[rows] <= cfg.linger_frames])
 
     def _reconcile(self, search: np.ndarray | None) -> None:
         """Compare points with their segments' predictions: what faces away or is hidden is invisible.
@@ -149,7 +156,12 @@ class BuiltinTracker:
         self._segments.update_positions(p, rows[seen & exposed & (p.coasting[rows] == 0)], self._now)
         gain = np.where(seen[:, None, None], cov @ inverse, _EYE)
         p.uv[rows] -= (gain @ off[..., None])[..., 0].astype(np.float32)
-        p.cov[rows] = np.where(seen[:, None, None], (_EYE - gain) @ cov, predicted.cov_px2 + _UNSEEN_PX**2 * _EYE)
+        # Corners that were matched are seen beside a point that is not, but from match to match errors add up.
+        p.chained[rows] = np.where(p.verified[rows], 0, p.chained[rows] + self._segments.matched(p)[rows])
+        chained = p.chained[rows]
+        unseen_px = np.where(chained > 0, _CHAINED_PX * np.sqrt(chained), _UNSEEN_PX)[:, None, None]
+        p.cov[rows] = np.where(seen[:, None, None], (_EYE - gain) @ cov, predicted.cov_px2 + unseen_px**2 * _EYE)
         p.warp[rows[~seen]] = predicted.warp[~seen]
         p.verified[rows] = seen & exposed
-        p.visible[rows] = exposed & (seen | (predicted.sigma_px < cfg.max_predicted_sigma_px))
+        sure = (predicted.sigma_px < cfg.max_predicted_sigma_px) & (chained <= cfg.linger_frames)
+        p.visible[rows] = exposed & (seen | sure)

@@ -1,0 +1,129 @@
+"""Objects come and go: who is followed, and what is said of them before a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput, doubt
+from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
+from p2p_lib.core.types import Frame, PoseEstimate, Status
+
+
+class Objects:
+    """What a user adds, corrects and removes; whoever tracks them says what it is to ``begin`` one.
+
+    refused  of objects whose last prompt did not fit the frame that it was made on: why it was not used
+    """
+
+    def __init__(self, camera: Camera):
+        self.camera = camera
+        self.objects: dict[str, Any] = {}
+        self.refused: dict[str, BadInput] = {}
+        self._said: dict[str, Prompt] = {}  # in the frame to come
+
+    @property
+    def tracker(self) -> PointTracker:
+        """The 2D tracker."""
+        raise NotImplementedError
+
+    @property
+    def segmenter(self) -> Segmenter:
+        """What finds the objects in frames without their masks."""
+        raise NotImplementedError
+
+    def begin(self, name: str) -> None:
+        """A new object, without anything known of it."""
+        raise NotImplementedError
+
+    def add_object(
+        self,
+        name: str,
+        mask: np.ndarray | None = None,
+        clicks: ArrayLike | None = None,
+        negative: ArrayLike | None = None,
+        box: ArrayLike | None = None,
+    ) -> None:
+        """Follow one more object from the next frame on. The segmenter finds it in every frame that brings no mask.
+
+        mask      (H, W) bool: its pixels in the next frame
+        clicks    (N, 2) pixels on it in the next frame; ``negative`` (M, 2) are not of it
+        box       (4,) left, top, right, bottom: all of it is inside in the next frame
+
+        With none of them it is started by the first mask that ``step`` gets for it. Raises :class:`BadInput` for what
+        does not fit, and nothing has changed. What shows to be unusable in the next frame itself, as clicks where no
+        depth was measured, is forgotten with that frame: ``refused`` and the reason of the object's estimates say why,
+        until :meth:`correct` says something better.
+        """
+        if name in self.objects:
+            raise BadInput("add_object", repr(name), "a name not in use", f"In use: {', '.join(self.objects)}.")
+        if mask is clicks is negative is box is None:
+            self.begin(name)
+        else:
+            self.tell(_prompt(name, mask=mask, clicks=clicks, negative=negative, box=box))
+
+    def correct(self, name: str, **said: ArrayLike | None) -> None:
+        """Mend an object's mask in the next frame; arguments as of :meth:`add_object`. The last correction counts."""
+        if name not in self.objects:
+            raise BadInput("correct", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+        self.tell(_prompt(name, **said))
+
+    def tell(self, prompt: Prompt) -> None:
+        """What is said of an object in the next frame, whichever that is: starts the object, or corrects its mask."""
+        name, known = prompt.name, self.segmenter.names
+        check_prompt(prompt, self.camera)
+        check_apart((other for other in self._said.values() if other.name != name), prompt)
+        if name not in known and not prompt.starts:
+            what = "an empty mask" if prompt.mask is not None else "clicks beside it alone"
+            raise BadInput(f"object {name!r}", what, "a click on it, a box or at least one pixel of its mask")
+        if name not in self.objects:
+            self.begin(name)
+        self._said[name] = prompt
+        self.refused.pop(name, None)
+
+    def remove_object(self, name: str) -> None:
+        """Stop following an object; its points are dropped from the tracker."""
+        if name not in self.objects:
+            raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+        if len(ids := self.objects.pop(name).ids):
+            self.tracker.drop(ids)
+        self._said.pop(name, None)
+        self.refused.pop(name, None)
+        if name in self.segmenter.names:
+            self.segmenter.remove(name)
+
+    def take_said(
+        self, frame: Frame, masks: Mapping[str, np.ndarray | None]
+    ) -> tuple[dict[str, np.ndarray | None], dict[str, Prompt]]:
+        """Every object's mask in this frame, None for one to be found, and what is said of objects in it.
+
+        What was said until now belongs to this frame: what does not fit it is ``refused``, and stops nobody.
+        """
+        given, refused = given_masks(frame, masks, self._said, self.objects, self.camera)
+        said, self._said = {name: p for name, p in self._said.items() if name not in refused}, {}
+        self.refused |= refused
+        for name, error in refused.items():
+            if name in self.segmenter.names:  # its estimates go on and cannot say so
+                doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is not used. {error.fix}")
+        return given, said
+
+    def explained(self, estimate: PoseEstimate) -> PoseEstimate:
+        """An estimate that says, where its object has not started, what was wrong with its prompt."""
+        if estimate.status != Status.INITIALISING or estimate.object not in self.refused:
+            return estimate
+        return replace(estimate, reason=str(self.refused[estimate.object]))
+
+
+def _prompt(name: str, **said: ArrayLike | None) -> Prompt:
+    """The prompt of the arguments of :meth:`Point2Pose.add_object`; TypeError for any other."""
+    field = {"mask": "mask", "clicks": "points_px", "negative": "negative_px", "box": "box_px"}
+    if unknown := sorted(set(said) - set(field)):
+        raise TypeError(f"unknown argument {unknown[0]!r}, expected some of {', '.join(field)}")
+    values: dict[str, Any] = {field[key]: value for key, value in said.items() if value is not None}
+    return Prompt(name, **values)

@@ -1,0 +1,119 @@
+"""The one list of what is ours: preset ``default`` composes it around the paper's method.
+
+Taking a mechanism out is deleting its line here; leaving it out of one run is its name in ``method.mechanisms``:
+``all but NAME``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from functools import partial
+from typing import Any
+
+from p2p_lib.core import backends
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import Config, as_config
+from p2p_lib.core.errors import BadInput, did_you_mean
+from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.extended.frame_guard import FrameGuard
+from p2p_lib.extended.model import JoinableModel
+from p2p_lib.extended.policy import OurPolicy
+from p2p_lib.extended.reacquisition import Reacquisition
+from p2p_lib.extended.scene import Scene
+from p2p_lib.extended.two_maps import TwoMaps
+from p2p_lib.method import pipeline
+from p2p_lib.method.object_tracker import ObjectTracker
+
+#: Name to what it does.
+MECHANISMS = {
+    # Before a frame: frame_guard.
+    "moments": "Depth counts as missing where it is not of the moment of its colour.",
+    # Around track and segment: reacquisition, outlook.
+    "scene": "The static scene says how the camera moved, and so where an object is that was left lying.",
+    "shape_search": "An absent object is looked for by the shape and colour of its surface.",
+    "redetection": "Where few keypoints are seen, a pose says where the tracker has to look for the others.",
+    "rejection": "Tracks that contradict their object's pose or mask are rejected.",
+    # Around an object: two_maps.
+    "growing": "No map is begun of an object that still comes into view.",
+    "outgrown": "A map of a sliver, or of what never was followed, is founded anew where its object stays lost.",
+    "second_map": "A second map is begun of an object that shows a side that nobody knows.",
+    # Inside: policy, motion.
+    "motion_prior": "The last pose and even motion propose poses, and the surface alone may follow them.",
+    "motion_weight": "A hypothesis needs more support the farther it is from the motion so far.",
+    "motion_over_gaps": "For a while after its last pose an object is expected where its motion leads.",
+    "moving_points": "A point becomes a keypoint only if it moves with the object.",
+    "pending_points": "While an object is followed, points that are no keypoints yet help to register it.",
+    "turns": "The pose of a return is compared with other turns that look alike.",
+    # Inside: gates.
+    "return_gate": "A return needs many agreeing points, or shape and colour.",
+    "surface_gate": "A pose without agreeing points needs a surface that fits.",
+    "sliding_gate": "Of something flat, whose surface leaves free where it is, points have to agree with a pose.",
+    "size": "Nothing is learnt where depth shows the object and the scene in another size.",
+    "outline": "Nothing is learnt where the mask does not end where depth has steps.",
+    "still": "Nothing is learnt while the camera gives the same image again and again.",
+    # Inside: confidence, graph.
+    "confidence": "Each pose gets a confidence, which weighs the points that it places.",
+    "texture": "A turn that shape leaves free has to be constrained by texture.",
+    "sure_keyframes": "A pose that is hardly believed, or a return to be confirmed, makes no keyframe.",
+    "stray_points": "A point that is seen far from where the pose has it stays out of the graph.",
+}
+ALL, NONE, ALL_BUT = "all", "none", "all but "
+
+
+def chosen(config: Config) -> frozenset[str]:
+    """The mechanisms that ``method.mechanisms`` names; :class:`BadInput` for one that is not in the list.
+
+    >>> from p2p_lib.core.config import preset
+    >>> some = preset().with_values({"method.mechanisms": "all but size, outline"})
+    >>> sorted(chosen(preset()) - chosen(some)), chosen(preset("paper"))
+    (['outline', 'size'], frozenset())
+    """
+    said = config.method.mechanisms.strip()
+    if said in (ALL, NONE):
+        return frozenset(MECHANISMS if said == ALL else ())
+    names = {name.strip() for name in said.removeprefix(ALL_BUT).split(",")}
+    for name in sorted(names - set(MECHANISMS)):
+        expected = f"all, none, or names, or all but names, of {', '.join(MECHANISMS)}"
+        raise BadInput("config method.mechanisms", repr(name), expected, did_you_mean(name, MECHANISMS))
+    return frozenset(set(MECHANISMS) - names if said.startswith(ALL_BUT) else names)
+
+
+class Point2Pose(pipeline.Point2Pose):
+    """Causal 6D tracking of any number of unknown rigid objects in one RGB-D stream.
+
+    config  parameters, or the name of a preset (default: ``default``)
+
+    What becomes of the objects is logged as ``p2p_lib``. :meth:`close` ends its threads, and so does the end of a
+    ``with`` block.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config | str | None = None,
+        tracker: str | PointTracker = backends.DEFAULT_TRACKER,
+        detector: str = backends.DEFAULT_DETECTOR,
+        segmenter: str | Segmenter = backends.DEFAULT_SEGMENTER,
+    ):
+        config = as_config("default" if config is None else config)
+        super().__init__(camera, config, tracker, detector, segmenter, compose(camera, config))
+
+
+def compose(camera: Camera, config: Config) -> pipeline.Parts:
+    """What the method is made of, by ``method.mechanisms``; where that names none, the paper's parts alone."""
+    on = chosen(config)
+    if not on:
+        return pipeline.Parts()
+    scene = None
+    if "scene" in on:
+        import numpy as np
+
+        scene = Scene(camera, config.depth, np.random.default_rng([config.seed, 2]))
+    front = partial(Reacquisition, on=on, scene=scene)
+    return pipeline.Parts(FrameGuard("moments" in on), front, partial(object_tracker, on=on))
+
+
+def object_tracker(*paper: Any, on: Container[str] = frozenset(MECHANISMS)) -> TwoMaps:
+    """An object with the mechanisms that are ``on``; ``paper`` are the arguments of :class:`ObjectTracker`."""
+    own = partial(ObjectTracker, policy=partial(OurPolicy, on=on), model=JoinableModel)
+    return TwoMaps(own(*paper))

@@ -1,0 +1,86 @@
+"""Before a frame: is it newer than the one before, and are its depth and its colour of one moment?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from p2p_lib.core.errors import doubt
+from p2p_lib.core.types import Frame
+
+#: Depth, colour or both may be that of a frame before for so long, s: some cameras deliver one more seldom.
+_STANDS_S = 0.08
+
+
+class StillFrame(Frame):
+    """A frame of a camera that gives the same image again and again."""
+
+
+class FrameGuard:
+    """Looks at every frame before anything else does.
+
+    moments  whether depth counts as missing where it is not of the moment of its colour
+    """
+
+    def __init__(self, moments: bool = True):
+        self._moments = moments
+        self._time_s: float | None = -np.inf  # of the frame before; None once it is said that time runs backwards
+        self._stale = StaleFrames()
+        self._newest: Frame | None = None
+
+    def __call__(self, frame: Frame) -> Frame:
+        """The frame to go on with."""
+        if frame is self._newest:  # the last one again, which ends a stream
+            return frame
+        self._check_time(frame)
+        self._stale = self._stale.with_frame(frame)
+        half, still = self._stale.for_long(frame.time_s)
+        if half and self._moments:
+            frame = _without_depth(frame)
+        self._newest = StillFrame(**{f.name: getattr(frame, f.name) for f in fields(frame)}) if still else frame
+        return self._newest
+
+    def _check_time(self, frame: Frame) -> None:
+        """Warn, once, of frames that come in another order than they were taken."""
+        if self._time_s is not None and frame.time_s <= self._time_s:
+            got = f"{frame.time_s:.6f} s after {self._time_s:.6f} s"
+            doubt(f"time of frame {frame.index}", got, "It did not go on: give frames as they were taken.")
+            self._time_s = None
+        elif self._time_s is not None:
+            self._time_s = frame.time_s
+
+
+def _without_depth(frame: Frame) -> Frame:
+    """A frame of which depth and colour are not of one moment: points can wait for depth."""
+    got = "one is the same image again and again while the other goes on"
+    doubt("depth and colour", got, "Until both go on, depth counts as missing.")
+    return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+
+
+@dataclass(frozen=True, eq=False)
+class StaleFrames:
+    """Since when the newest depth and the newest colour have been the same to the last bit: no sensor measures so.
+
+    first_depth, first_rgb  the first frames that had them; of nothing, none
+    """
+
+    first_depth: Frame | None = None
+    first_rgb: Frame | None = None
+
+    def with_frame(self, frame: Frame) -> StaleFrames:
+        """After one more."""
+        return StaleFrames(_first(self.first_depth, frame, "depth_m"), _first(self.first_rgb, frame, "rgb"))
+
+    def for_long(self, time_s: float) -> tuple[bool, bool]:
+        """Whether one has stood for a while though the other goes on: not of one moment; and whether both have."""
+        firsts = [first for first in (self.first_depth, self.first_rgb) if first is not None]
+        stand = sum(time_s - first.time_s > _STANDS_S for first in firsts)
+        return len(firsts) == 2 and stand == 1, stand == 2
+
+
+def _first(first: Frame | None, frame: Frame, image: str) -> Frame | None:
+    same = first is not None and np.array_equal(frame.sparse[image], first.sparse[image])
+    if same and np.array_equal(getattr(frame, image), getattr(first, image)):
+        return first
+    return frame if getattr(frame, image).any() else None

@@ -1,0 +1,136 @@
+"""Does a pose stand, and is it learnt from: the gates that refuse it, and what makes it doubtful.
+
+:data:`GATES` is the list of reasons for which a pose is refused, :data:`DOUBTS` that of reasons for which nothing is
+learnt from it: camera and masks contradict themselves. Each is one mechanism by its name. The paper refuses none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container
+from dataclasses import dataclass
+
+from p2p_lib.core.config import LifecycleConfig
+from p2p_lib.core.types import Status
+from p2p_lib.extended.lifecycle import Lifecycle
+from p2p_lib.method.policy import Verdict
+
+#: Shape and colour have found an object where this share of its surface shows.
+SIGHTED, SIGHTED_STILL = 0.5, 0.3
+#: Another size is one that is off by this and so many standard deviations.
+_SIZE, _SIZE_SIGMAS = 0.05, 3.0
+#: A mask is doubted of whose outline less than this share lies where depth has steps, of what did before. One that
+#: stays so for this many frames is taken for right.
+OUTLINE, _LONGEST_DOUBT = 0.45, 60
+#: So many points fix a pose.
+_FIXED_BY = 3
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for the pose of a frame.
+
+    support        keypoints that agree with it
+    surface_share  share of the depth points that lie on the surface under it; None where no surface was asked
+    sighting       share of the surface that shows in the image where and as it should; None where nobody has looked
+    lead           share of that which is more than where it is turned otherwise; None where nobody has compared
+    size           times as large as its keypoint map it is measured, and the standard deviation; None: few are seen
+    outline        what of its mask's outline lies where depth has steps, as a share of what did before any doubt
+    still          whether the same image has come again and again
+    carried        whether its motion before the gap still says where it is
+    slides         whether the pose may move along the surface without leaving it, as that of something flat
+    """
+
+    support: int
+    surface_share: float | None
+    sighting: float | None = None
+    lead: float | None = None
+    size: tuple[float, float] | None = None
+    outline: float = 1.0
+    still: bool = False
+    carried: bool = False
+    slides: bool = False
+
+
+@dataclass(frozen=True)
+class Judgement(Verdict):
+    """Whether a pose stands, and what may be made of it.
+
+    doubted  whether what it rests on contradicts itself: a pose that nothing is learnt from
+    proven   whether enough speaks for it to confirm a return: more than a surface that fits where the motion leads
+    joins    whether by it two maps become one
+    """
+
+    doubted: bool = False
+    proven: bool = True
+    joins: bool = False
+
+
+def judge(life: Lifecycle, evidence: Evidence, on: Container[str], config: LifecycleConfig) -> Judgement:
+    """The verdict on a pose: refused by the first gate ``on`` that refuses it, else accepted."""
+    for name, gate in GATES.items():
+        if name in on and (reason := gate(life, evidence, config)):
+            return Judgement(False, Status.LOST, reason)
+    for name, contradiction in DOUBTS.items():
+        if name in on and (reason := contradiction(life, evidence)):
+            return Judgement(True, Status.DEGRADED, reason, doubted=True)
+    if evidence.support < config.return_inliers:
+        proven = "return_gate" not in on or evidence.sighting is None or _sighted(life, evidence)
+        return Judgement(True, Status.DEGRADED, f"only {evidence.support} points agree", proven=proven)
+    return Judgement(True, Status.RECOVERED if life.returning else Status.TRACKED)
+
+
+def _sighted(life: Lifecycle, evidence: Evidence) -> bool:
+    return (evidence.sighting or 0.0) >= (SIGHTED_STILL if life.has_pose else SIGHTED)
+
+
+def _few_points_on_return(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+    on_its_way = evidence.carried and (evidence.surface_share or 0.0) >= config.surface_only_share
+    found = _sighted(life, evidence) or on_its_way
+    few = life.unconfirmed and evidence.support < config.return_inliers and not found
+    return f"only {evidence.support} points agree on a return" if few else ""
+
+
+def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+    off = (evidence.surface_share or 0.0) < config.surface_only_share
+    nothing = not evidence.support and off and not _sighted(life, evidence)
+    return "too few points, and the surface does not fit either" if nothing else ""
+
+
+def _few_points_on_flat(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+    """What is flat lies on a table as well as on itself: its own points have to say where."""
+    free = evidence.slides and evidence.support < _FIXED_BY and (evidence.sighting or 0.0) < SIGHTED
+    return f"only {evidence.support} points agree, and the surface leaves free where it is" if free else ""
+
+
+def _mask_off_steps(life: Lifecycle, evidence: Evidence) -> str:
+    off = evidence.outline < OUTLINE and life.doubted_frames < _LONGEST_DOUBT
+    return "its mask does not end where its depth does any more" if off else ""
+
+
+def _another_size(life: Lifecycle, evidence: Evidence) -> str:
+    ratio, sigma = evidence.size or (1.0, 0.0)
+    return f"its depth shows it {ratio:.2f} times as large as before" if off_size(ratio, sigma) else ""
+
+
+def _same_image(life: Lifecycle, evidence: Evidence) -> str:
+    return "the camera gives the same image again and again" if evidence.still else ""
+
+
+def off_size(ratio: float, sigma: float = 0.0) -> bool:
+    """Whether something is measured so many times as large as before that it is not the same."""
+    return abs(ratio - 1) > _SIZE + _SIZE_SIGMAS * sigma
+
+
+#: Every reason to doubt a pose that no gate refuses: what camera and masks say contradicts itself.
+DOUBTS: dict[str, Callable[[Lifecycle, Evidence], str]] = {
+    "size": _another_size,
+    "outline": _mask_off_steps,
+    "still": _same_image,
+}
+
+#: Every reason to refuse a pose, in the order in which they are asked: state, evidence and bounds to words, or "".
+GATES: dict[str, Callable[[Lifecycle, Evidence, LifecycleConfig], str]] = {
+    "return_gate": _few_points_on_return,
+    "surface_gate": _no_points_and_off_surface,
+    "sliding_gate": _few_points_on_flat,
+}

@@ -1,0 +1,153 @@
+"""What an object has been through, as a value: what the gates, the search for it and its second map go by.
+
+:class:`Lifecycle` never changes: each frame makes the next one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.types import Status
+from p2p_lib.extended.motion import Motion
+from p2p_lib.method.object_model import Life
+
+if TYPE_CHECKING:
+    from p2p_lib.extended.gates import Judgement
+
+#: A return has to be confirmed for so many frames, and is marked as recovered meanwhile; for more without points.
+CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES = 5, 15
+#: A longer time between two frames is a pause, s, if it is so many times what it was before, too.
+_PAUSE_S, _PAUSE = 0.25, 5
+#: The motion so far is that of poses with more confidence.
+_CONFIDENT = 0.5
+#: Shape and colour tell a turn from all others by this lead, and leave no doubt by this one.
+TELLING, CLEAR = 0.25, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Lifecycle(Life):
+    """The state of one object between two frames.
+
+    Beside what the paper's has:
+
+    pace_s          time between the newest two frames that followed each other with poses; infinite before
+    T_previous      pose of the frame before it; None after a gap
+    T_left          newest pose before the absence; an unconfirmed return falls back to it
+    confirming      frames for which a return still has to be confirmed
+    T_world_obj     newest pose in the scene that many points agreed with, where the camera was known; None before
+    motion          how it moves, by the sure poses; None before the first
+    start_px        pixels of the newest mask, in a frame without a pose; None without a mask
+    doubted         since a gap nothing has told its turn from others that look alike
+    lost_frames     frames since the newest proven pose in which it was in view
+    doubted_frames  newest frames in a row whose pose was doubted by one of :data:`~p2p_lib.extended.gates.DOUBTS`
+    seen_m2         the most that a keyframe showed of it, across the line of sight
+    in_sight        it has had a mask in every frame since its newest pose, or since its motion still led to it
+    """
+
+    pace_s: float = float("inf")
+    T_previous: np.ndarray | None = None
+    T_left: np.ndarray | None = None
+    T_world_obj: np.ndarray | None = None
+    motion: Motion | None = None
+    start_px: int | None = None
+    doubted: bool = False
+    lost_frames: int = 0
+    doubted_frames: int = 0
+    in_sight: bool = False
+    seen_m2: float = 0.0
+
+    @property
+    def followed(self) -> bool:
+        """Whether two frames that followed each other ever had poses: else the map may be of something else."""
+        return self.pace_s < float("inf")
+
+    @property
+    def unconfirmed(self) -> bool:
+        """Whether a pose would be a return, or one of the frames that confirm a return."""
+        return not self.has_pose or self.confirming > 0
+
+    def at(self, time_s: float) -> Lifecycle:
+        """The state before a frame at this time: after a pause in the stream the object may be anywhere."""
+        paused = self.has_pose and time_s - self.seen_s > max(_PAUSE_S, _PAUSE * self.pace_s)
+        return replace(self, status=Status.LOST) if paused else self
+
+    def motion_priors(self) -> dict[str, np.ndarray]:
+        """Where the object is if it stays or moves on evenly: origin to T_cam_obj; empty after a gap."""
+        if not self.has_pose or self.T_cam_obj is None:
+            return {}
+        priors = {"last pose": self.T_cam_obj}
+        if self.T_previous is not None:
+            priors["constant velocity"] = self.T_cam_obj @ se3.inverse(self.T_previous) @ self.T_cam_obj
+        return priors
+
+    def scene_prior(self, T_world_cam: np.ndarray | None) -> dict[str, np.ndarray]:
+        """Where an absent object is if it has lain still: origin to T_cam_obj; empty where nobody knows."""
+        if self.has_pose or T_world_cam is None or self.T_world_obj is None:
+            return {}
+        return {"scene": se3.orthonormalised(se3.inverse(T_world_cam) @ self.T_world_obj)}
+
+    def in_frame(self, T_old_new: np.ndarray) -> Lifecycle:
+        """The same in another object frame; T_old_new (4, 4) maps it to the one so far."""
+        poses = {name: getattr(self, name) for name in ("T_cam_obj", "T_previous", "T_left", "T_world_obj")}
+        motion = self.motion and self.motion.in_frame(T_old_new)
+        return replace(self, motion=motion, **{n: None if T is None else T @ T_old_new for n, T in poses.items()})
+
+    def placed(self, T_world_cam: np.ndarray | None) -> Lifecycle:
+        """The state with the newest pose's place in the scene, once a return has been confirmed.
+
+        A pose that few points agree with, as one of a sliver at the image's border, places nothing again.
+        """
+        if T_world_cam is None or self.confirming or (self.status is Status.DEGRADED and self.T_world_obj is not None):
+            return self
+        return replace(self, T_world_obj=T_world_cam @ self.T_cam_obj)
+
+    def moved(self, confidence: float) -> Lifecycle:
+        """The state with its motion, which goes on with the newest pose where that is sure."""
+        if confidence <= _CONFIDENT:
+            return self
+        known = self.motion is not None and self.motion.time_s < self.seen_s
+        go_on = self.motion.followed_by if known else Motion
+        return replace(self, motion=go_on(self.T_cam_obj, self.seen_s))
+
+    def corrected(self, T_cam_obj: np.ndarray) -> Lifecycle:
+        """With the newest pose as the graph has it: what comes next starts from there."""
+        lies = self.T_world_obj
+        lies = None if lies is None else lies @ se3.inverse(self.T_cam_obj) @ T_cam_obj
+        return replace(self, T_cam_obj=T_cam_obj, T_world_obj=lies)
+
+    def with_verdict(
+        self, T_cam_obj: np.ndarray, time_s: float, verdict: Judgement, lead: float | None = None
+    ) -> Lifecycle:
+        """The state after a frame with an accepted pose, and the lead by which it was."""
+        clear = verdict.status is not Status.DEGRADED or (lead is not None and lead >= CLEAR)
+        longest = CONFIRM_FRAMES if clear else CONFIRM_SIGHTED_FRAMES
+        return replace(
+            self,
+            status=verdict.status,
+            T_cam_obj=T_cam_obj,
+            seen_s=time_s,
+            pace_s=time_s - self.seen_s if self.has_pose else self.pace_s,
+            lost_frames=0 if verdict.proven else self.lost_frames + 1,
+            start_px=None,
+            in_sight=True,
+            doubted_frames=self.doubted_frames + 1 if verdict.doubted else 0,
+            doubted=self.doubted if lead is None else lead < TELLING,
+            T_previous=self.T_cam_obj if self.has_pose else None,
+            T_left=self.T_left if self.has_pose else self.T_cam_obj,
+            confirming=min(max(self.confirming - verdict.proven, 0), longest) if self.has_pose else longest,
+        )
+
+    def without_pose(self, status: Status, mask_px: int | None = None, carried: bool = False) -> Lifecycle:
+        """The state after a frame without a pose, where its motion leads or not.
+
+        A return that was not confirmed is taken back.
+        """
+        taken_back = {"T_cam_obj": self.T_left, "confirming": 0} if self.confirming else {}
+        lost = status is Status.LOST
+        in_sight = lost and (self.in_sight or carried)
+        lost_frames = self.lost_frames + lost
+        return replace(self, status=status, lost_frames=lost_frames, start_px=mask_px, in_sight=in_sight, **taken_back)

@@ -1,0 +1,300 @@
+"""An object's answers by default: its motion proposes too, gates judge, contradictions keep frames out of the map.
+
+Each of :mod:`~p2p_lib.extended.default`'s mechanisms that :class:`OurPolicy` knows is ``on`` or left out by its name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from p2p_lib.core.types import DOUBTED, Status
+from p2p_lib.extended.agreement import scene_ratio, size_ratio
+from p2p_lib.extended.confidence import Belief, may_slide
+from p2p_lib.extended.gates import SIGHTED, Evidence, Judgement, judge, off_size
+from p2p_lib.extended.graph import explained
+from p2p_lib.extended.image_search import laid_on
+from p2p_lib.extended.lifecycle import TELLING, Lifecycle
+from p2p_lib.extended.motion import motion_weight
+from p2p_lib.extended.shape_search import ShapeSearch
+from p2p_lib.extended.sight import Sight, cut_off
+from p2p_lib.method import registration
+from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
+from p2p_lib.method.policy import Admission, Candidate, Policy, Verdict
+from p2p_lib.method.registration import Hypothesis
+
+#: A pose that nothing has told from others since a gap is compared again every so many frames.
+_COMPARE_EVERY = 5
+#: Where depth has steps at less of a mask's outline than this, it does not tell where the object ends.
+_CLEAR_OUTLINE = 0.3
+#: A pose of less confidence makes no keyframe: what it places agrees with it for ever after. One that the surface
+#: alone determines well has more.
+MAPPED = 0.1
+#: Why a pose is degraded that nothing contradicts.
+_UNCONSTRAINED = "rotation not constrained by shape or texture"
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal(Candidate):
+    """A hypothesis with what shape and colour say of it.
+
+    sighting  share of the surface that shows under its pose; None where nobody has looked
+    lead      share of that which is more than where it is turned otherwise; None where nobody has compared
+    """
+
+    sighting: float | None = None
+    lead: float | None = None
+
+    @property
+    def evidence(self) -> Evidence:
+        """What speaks for it."""
+        share = self.refined.inliers if self.refined.refined else None
+        return Evidence(self.hypothesis.support, share, self.sighting, self.lead)
+
+    def agreement(self, keypoints: np.ndarray) -> float:
+        """The keypoints seen, (N,) bool, that agree, less those that do not, as a share of all."""
+        return float(np.where(self.hypothesis.inliers[keypoints], 1, -1).mean()) if keypoints.any() else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class BelievedAdmission(Admission):
+    """What of a frame enters the model, and how far its pose is believed.
+
+    T_cam_obj    (4, 4) the pose, and life after it
+    belief       what the pose rests on; None: its confidence is not asked
+    most         the confidence at most
+    stray_sigma  (N, 2) noise in bearing and range by which no stray point enters the graph; None: all enter
+    """
+
+    T_cam_obj: np.ndarray = field(default_factory=lambda: np.eye(4))
+    life: Lifecycle = field(default_factory=Lifecycle)
+    belief: Belief | None = None
+    most: float = 1.0
+    stray_sigma: np.ndarray | None = None
+
+    def rows(self, obs: Sight, model: ObjectModel) -> np.ndarray:
+        """As in the paper, without the stray."""
+        rows = super().rows(obs, model)
+        if self.stray_sigma is None:
+            return rows
+        return rows & explained(model.map.p_obj, obs.p_cam, self.T_cam_obj, self.stray_sigma)
+
+    def rated(self, model: ObjectModel) -> tuple[np.ndarray, float]:
+        """What the map as it is now may be wrong by is included."""
+        return super().rated(model) if self.belief is None else self.belief.at(self.T_cam_obj, model, self.most)
+
+
+class OurPolicy(Policy):
+    """The paper's answers with the mechanisms that are ``on``."""
+
+    def __init__(self, *paper: object, on: Container[str]):
+        super().__init__(*paper, life=Lifecycle())
+        self.on = on
+        self.shape = ShapeSearch(self.observer, self.config, self.stopwatch, "shape_search" in on)
+        self.trusted: Sight | None = None  # the newest without a doubt; None once it was hidden since
+
+    # -- propose -------------------------------------------------------------------------------
+
+    def propose(self, obs: Sight, known: Known) -> list[Hypothesis]:
+        """Candidate poses from the keypoints seen; with motion, from the last poses too."""
+        cfg = self.config.registration
+        with self.stopwatch("registration"):
+            use, certain = self.correspondences(obs, known)
+            priors = self._motion_priors(obs, known)
+            if obs.sighting is not None:
+                priors = {"sighting": obs.sighting.T_cam_obj, **priors}
+            p_cam = np.where(use[:, None], obs.p_cam, np.nan)
+            found = self.register(known, p_cam, priors)
+            most = max((h.support for h in found), default=0)
+            if priors and cfg.method != "svd" and most < cfg.contradicted * use.sum():
+                # Most points are wrong, whichever: pending ones may tell, or those that agree with the surface.
+                p_cam = np.where(certain[:, None], obs.p_cam, np.nan)
+                found = self.register(known, p_cam, priors)
+                found += self._along_surface(obs, known, p_cam, priors)
+            return found or self._surface_only(known, priors)
+
+    def few_keypoints(self, known: Known) -> int:
+        """While an object is followed, fast turns leave few keypoints sooner than they leave few points."""
+        if "pending_points" in self.on and not known.life.unconfirmed:
+            return self.config.keypoint_map.keyframe_min_points
+        return super().few_keypoints(known)
+
+    def _motion_priors(self, obs: Sight, known: Known) -> dict[str, np.ndarray]:
+        """Where the object is by its motion: name to T_cam_obj."""
+        priors = known.life.motion_priors() if "motion_prior" in self.on else {}
+        return priors or self._carried_on(obs, known)
+
+    def carried(self, known: Known, time_s: float) -> bool:
+        """Whether its motion before a gap still says where the object is at this time."""
+        motion = known.life.motion
+        return "motion_over_gaps" in self.on and motion is not None and motion.holds(time_s)
+
+    def _carried_on(self, obs: Sight, known: Known) -> dict[str, np.ndarray]:
+        """Where an absent object is if it has gone on as it did, and where its depth is, turned like that."""
+        motion, time_s = known.life.motion, obs.frame.time_s
+        if not (self.carried(known, time_s) and len(obs.cloud) and self.shape.knows(known)):
+            return {}
+        T_cam_obj = motion.at(time_s)
+        (on_depth,) = laid_on(T_cam_obj[None], obs.cloud, self.shape.sample(known.model))
+        near = np.linalg.norm(on_depth[:3, 3] - T_cam_obj[:3, 3]) < motion.reach_m(time_s)
+        return {"motion": T_cam_obj} | ({"motion, on its depth": on_depth} if near else {})
+
+    def _along_surface(
+        self, obs: Sight, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray]
+    ) -> list[Hypothesis]:
+        """The hypothesis that grows from where the surface alone leads."""
+        start = self.refined(obs, known, list(priors.values())[-1])
+        if not start.refined:
+            return []
+        cfg, sigma_m = self.config.registration, known.model.noise_m(p_cam)
+        return registration.refit(start.T_cam_obj, "surface", known.map.p_obj, p_cam, cfg, sigma_m)
+
+    def _surface_only(self, known: Known, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
+        """Too few points to register: the surface may track from where the object should be."""
+        no_inliers, no_residual = np.zeros(len(known.map), bool), np.full(len(known.map), np.inf)
+        return [Hypothesis(T_cam_obj, no_inliers, no_residual, name) for name, T_cam_obj in priors.items()]
+
+    # -- choose --------------------------------------------------------------------------------
+
+    def choose(self, obs: Sight, known: Known, hypotheses: list[Hypothesis]) -> tuple[Proposal | None, str]:
+        """The best of some hypotheses, refined, and why. The paper selects one and refines that; ours refines all."""
+        candidates = [Proposal(hypothesis) for hypothesis in hypotheses]
+        if self.config.selection.rule == "support":
+            candidates = self._look_again(obs, known, [self.refine(obs, known, c) for c in candidates])
+        best, reason = self._best(obs, known, candidates)
+        if best is None:
+            return None, reason
+        return self._compared(obs, known, best if best.refined else self.refine(obs, known, best)), reason
+
+    def _best(self, obs: Sight, known: Known, candidates: list[Proposal]) -> tuple[Proposal | None, str]:
+        """The candidate to go on with, and why."""
+        few = max((c.hypothesis.support for c in candidates), default=0) < self.config.lifecycle.return_inliers
+        if few and any((c.sighting or 0.0) > 0 for c in candidates):
+            return max(candidates, key=lambda c: c.sighting or 0.0), "most of the surface shows"
+        weight = None
+        if "motion_weight" in self.on:
+            weight = motion_weight([c.T_cam_obj for c in candidates], list(known.life.motion_priors().values()))
+        return self.select(obs, known, candidates, weight)
+
+    def _look_again(self, obs: Sight, known: Known, candidates: list[Proposal]) -> list[Proposal]:
+        """Candidates for a return, with how much of the surface shows in the image under each."""
+        if not (known.life.unconfirmed and self.shape.knows(known)):
+            return candidates
+        found = self.shape.at(obs, known, [c.T_cam_obj for c in candidates])
+        return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
+
+    def _compared(self, obs: Sight, known: Known, best: Proposal) -> Proposal:
+        """The pose of a return with its lead over the best that is turned otherwise, or that one, where it shows more.
+
+        Asked again now and then until a lead tells. Where no other turn is known, points have to agree with this one.
+        """
+        life = known.life
+        due = life.unconfirmed or (life.doubted and not obs.frame.index % _COMPARE_EVERY)
+        if not (due and self.shape.knows(known) and "turns" in self.on):
+            return best
+        own, other = self.shape.otherwise(obs, known, best.T_cam_obj)
+        if own is None or other is None:
+            return replace(best, lead=0.0 if own is None else best.agreement(known.keypoints(obs)))
+        lead = (own.share - other.share) / max(own.share, other.share, 1e-6)
+        if lead > -TELLING or other.share < SIGHTED or cut_off(self.observer, obs):
+            return replace(best, lead=lead)
+        turned = self.refine(obs, known, Proposal(*self._surface_only(known, {"other turn": other.T_cam_obj})))
+        return replace(turned, sighting=other.share, lead=0.0)
+
+    # -- judge ---------------------------------------------------------------------------------
+
+    def start(self, known: Known, points: int) -> Verdict:
+        """The surface may carry an object from fewer points than registration takes."""
+        verdict = super().start(known, points)
+        if verdict.accepted or known.model.surface is None or "motion_prior" not in self.on:
+            return verdict
+        return Verdict(True, Status.DEGRADED, f"only {points} points")
+
+    def judge(self, obs: Sight, known: Known, best: Proposal) -> Judgement:
+        """Whether the pose stands, by what speaks for it and by whether camera and masks agree with themselves."""
+        size = self._size(obs, known, best) if "size" in self.on else None
+        outline = self.outline(obs) if "outline" in self.on else 1.0
+        carried = self.carried(known, obs.frame.time_s)
+        slides = "sliding_gate" in self.on and may_slide(best, self.config.refinement.min_eigenvalue)
+        evidence = replace(best.evidence, size=size, outline=outline, still=obs.still, carried=carried, slides=slides)
+        return judge(known.life, evidence, self.on, self.config.lifecycle)
+
+    def judge_other(self, obs: Sight, known: Known, best: Proposal) -> Judgement:
+        """The same in a second map, by what speaks for the pose alone."""
+        return judge(known.life, replace(best.evidence, still=obs.still), self.on, self.config.lifecycle)
+
+    def _before(self, obs: Sight) -> Sight | None:
+        """The newest frame in which nothing was doubted, where its mask and this one's can be compared."""
+        before = self.trusted
+        return None if obs.mask is None or before is None or before.mask is None else before
+
+    def _size(self, obs: Sight, known: Known, best: Proposal) -> tuple[float, float] | None:
+        """How large it is measured, where the scene beside it is measured otherwise than before, too; else None.
+
+        Points that slide over an object change its size alone.
+        """
+        before = self._before(obs)
+        if before is None or not off_size(scene_ratio(obs.frame, obs.mask, before.frame, before.mask)):
+            return None
+        keypoints = known.keypoints(obs)
+        agreeing = keypoints & best.hypothesis.inliers
+        sized = agreeing if 2 * agreeing.sum() > keypoints.sum() else keypoints
+        p_cam = obs.p_cam[sized]
+        return size_ratio(known.map.p_obj[sized], p_cam, self.observer.noise_m(p_cam))
+
+    def outline(self, obs: Sight) -> float:
+        """What of the mask's outline lies where depth has steps, as a share of what did before any doubt."""
+        before = self._before(obs)
+        then, now = None if before is None else before.outline_share, obs.outline_share
+        return 1.0 if then is None or now is None or then < _CLEAR_OUTLINE else now / then
+
+    # -- admit and request ---------------------------------------------------------------------
+
+    def admit(self, obs: Sight, known: Known, best: Proposal, verdict: Judgement) -> BelievedAdmission:
+        """Nothing is learnt from a pose that is doubted, and no keyframe made of one that is hardly believed."""
+        belief = Belief.of(obs, best, known, self, "texture" in self.on) if "confidence" in self.on else None
+        life = known.life.with_verdict(best.T_cam_obj, obs.frame.time_s, verdict, best.lead)
+        most = DOUBTED if verdict.doubted or life.doubted else 1.0
+        kept = {"life": life, "T_cam_obj": best.T_cam_obj, "belief": belief, "most": most}
+        kept |= {"learns": not verdict.doubted, "in_camera": "moving_points" in self.on}
+        if "stray_points" in self.on and not verdict.joins:  # two maps that become one lie as far off as poses tell
+            sigma_m = self.observer.noise_m(obs.p_cam)
+            bearing_rad = np.full_like(sigma_m, self.config.factor_graph.bearing_sigma_rad)
+            kept["stray_sigma"] = np.stack([bearing_rad, sigma_m], -1)
+        if belief is None:
+            return BelievedAdmission(verdict, best.hypothesis.inliers, self.covariance(obs, known, best), **kept)
+        # A turn that nothing tells bends no map.
+        covariance, confidence = belief.at(best.T_cam_obj, known.model, most, constrained=True)
+        kept["keyframe"] = "sure_keyframes" not in self.on or (
+            not life.confirming and belief.confidence_given_turn(covariance) >= MAPPED
+        )
+        if not verdict.doubted and not belief.constrained and verdict.status is Status.TRACKED:
+            verdict = replace(verdict, status=Status.DEGRADED, reason=_UNCONSTRAINED)
+        return BelievedAdmission(verdict, best.hypothesis.inliers, belief.of_frame, confidence, **kept)
+
+    def request(self, obs: Sight, known: Known, best: Proposal, admission: Admission) -> Requests:
+        """Tracks of keypoints that contradict the pose are rejected, where the pose is learnt from."""
+        if "rejection" not in self.on or not admission.learns:
+            return Requests()
+        return Requests(reject=known.map.ids[known.keypoints(obs) & ~best.hypothesis.inliers])
+
+    # -- what the object has been through ------------------------------------------------------
+
+    def begun(self, obs: Sight, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
+        """As in the paper, with its place in the scene; the frame is one to compare others with."""
+        self.trusted = obs
+        return super().begun(obs, T_cam_obj, verdict).placed(obs.frame.T_world_cam)
+
+    def followed(
+        self, obs: Sight, known: Known, best: Proposal, admission: BelievedAdmission, sure: float
+    ) -> Lifecycle:
+        """A frame that is learnt from tells its place in the scene and its motion, too."""
+        life = admission.life
+        return life.placed(obs.frame.T_world_cam).moved(sure) if admission.learns else life
+
+    def missed(self, obs: Sight, known: Known, verdict: Verdict) -> Lifecycle:
+        """After a frame in which the object was hidden nothing is compared with what was before."""
+        self.trusted = self.trusted if verdict.status is Status.LOST else None
+        return known.life.without_pose(verdict.status, obs.mask_px, self.carried(known, obs.frame.time_s))

@@ -1,0 +1,123 @@
+"""Around track and segment: an absent object is looked for where motion, scene, shape and colour say.
+
+The camera is located beside the 2D tracker; objects that are sought are looked for before the frame is segmented, and
+the tracker looks for their points there; what was observed says which tracks are on something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from p2p_lib.core.image import either
+from p2p_lib.core.interfaces import Hint, LazyHints
+from p2p_lib.core.types import Frame
+from p2p_lib.extended.image_search import Sighting
+from p2p_lib.extended.scene import Scene
+from p2p_lib.extended.sight import Sight
+from p2p_lib.extended.two_maps import TwoMaps
+from p2p_lib.method.frontend import Asked, Frontend, Masks
+from p2p_lib.method.object_model import Requests
+
+#: The camera is located every so many frames: while all objects have poses, while one is away.
+_LOCATE_EVERY, _LOCATE_EVERY_AWAY = 5, 2
+
+
+class Reacquisition(Frontend):
+    """The paper's front end with the mechanisms that are ``on``; ``scene`` locates the camera."""
+
+    objects: dict[str, TwoMaps]
+
+    def __init__(self, *paper: object, on: Container[str], scene: Scene | None):
+        super().__init__(*paper)
+        self.on, self.scene = on, scene
+        self._unlocated = _LOCATE_EVERY
+        self._sightings: Mapping[str, Sighting] = {}
+
+    def track(self, asked: Asked) -> Asked | None:
+        """The camera is located meanwhile."""
+        answers = len(self.waiting) >= self.tracker.latency_frames
+        locating = self._locate((self.waiting[0] if self.waiting else asked).frame) if answers else None
+        tracked = super().track(asked)
+        if locating is None or tracked is None:
+            return tracked
+        with self.stopwatch("scene"):
+            return replace(tracked, frame=replace(tracked.frame, T_world_cam=locating.result()))
+
+    def _locate(self, frame: Frame) -> Future[np.ndarray | None] | None:
+        """The camera's pose, sought beside the 2D tracker: often while an object is away, else now and then."""
+        self._unlocated += 1
+        away = any(obj.outlook.away for obj in self.objects.values())
+        every = _LOCATE_EVERY_AWAY if away else _LOCATE_EVERY
+        if self.scene is None or frame.T_world_cam is not None or self._unlocated < every:
+            return None
+        self._unlocated = 0
+        known = [mask for mask in self.masks.values() if mask is not None]
+        return self.beside.submit(self.scene.locate, frame, either(known) if known else None)
+
+    def segment(self, asked: Asked) -> None:
+        """Sought objects are looked for first."""
+        self._sightings = self._sighted(asked.frame, asked.masks)
+        super().segment(asked)
+
+    def _sighted(self, frame: Frame, masks: Masks) -> dict[str, Sighting]:
+        """Sought objects that show by shape and colour; the tracker looks for their points there."""
+        objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
+        sought = [name for name, obj in objects.items() if obj.outlook.sought]
+        seen = {name: objects[name].observe(frame, masks[name], self.tracks) for name in sought}
+        looked = {name: objects[name].outlook.sighted(obs) for name, obs in seen.items()}
+        found = {name: sighting for name, sighting in looked.items() if sighting is not None}
+        self._suggest({name: objects[name].outlook.points_px(seen[name], at.T_cam_obj) for name, at in found.items()})
+        return found
+
+    def hints(self, frame: Frame, sought: Sequence[str]) -> Mapping[str, Hint]:
+        """Where these objects should be; tracks of the absent that agree on no pose are rejected."""
+        hint = cache(lambda name: self._hint(self.objects[name], frame, self._sightings.get(name)))
+        if "rejection" in self.on:
+            self.apply({name: hint(name)[1] for name in sought if self.objects[name].outlook.sought})
+        return LazyHints(sought, lambda name: hint(name)[0])
+
+    def _hint(self, obj: TwoMaps, frame: Frame, sighting: Sighting | None) -> tuple[Hint, Requests]:
+        return obj.outlook.hint(obj.observe(frame, None, self.tracks, sighting))
+
+    def observe(self, asked: Asked) -> Mapping[str, Sight]:
+        """Every object's share of the frame, after its misplaced tracks are rejected and others are looked for."""
+        seen = {
+            name: self.objects[name].observe(
+                asked.frame, mask, self.tracks, self._sightings.get(name), asked.masks[name] is not None
+            )
+            for name, mask in self.masks.items()
+        }
+        if "rejection" in self.on:
+            self.apply(self._misplaced(seen, asked.masks))
+        return seen | self._redetect(seen) if "redetection" in self.on else seen
+
+    def _misplaced(self, seen: Mapping[str, Sight], given: Masks) -> dict[str, Requests]:
+        """Tracks of absent objects that are on something else.
+
+        Where the segmenter finds nothing of an object it went by these very tracks: only other objects are elsewhere.
+        """
+        nowhere = {name for name, obs in seen.items() if given[name] is None and obs.mask_px == 0}
+        elsewhere = ~either(self.masks.values()) if nowhere else None
+        within = {name: elsewhere if name in nowhere else obs.mask for name, obs in seen.items()}
+        return {name: self.objects[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
+
+    def _redetect(self, seen: Mapping[str, Sight]) -> dict[str, Sight]:
+        """Guided re-detection: the tracker looks for points where their objects expect them; what is seen then."""
+        looked = {name: self.objects[name].outlook.expected_px(obs) for name, obs in seen.items()}
+        expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}
+        self._suggest(expected)
+        return {name: self.objects[name].seen_anew(seen[name], self.tracks) for name in expected}
+
+    def _suggest(self, expected_px: Mapping[str, np.ndarray]) -> None:
+        """Have the tracker look for points where their objects expect them, unless it answers late."""
+        if self.tracker.latency_frames:
+            return
+        with self.stopwatch("tracking"):
+            for name, uv_px in expected_px.items():
+                found = self.tracker.suggest(self.objects[name].map.ids, uv_px)
+                self.tracks = self.tracks if found is None else found

@@ -1,0 +1,82 @@
+"""Where an object shows by shape and colour, when points do not say it: its last places, its motion, its known turns.
+
+What it is compared with is the surface, by :class:`p2p_lib.extended.image_search.ImageSearch` (not in the paper).
+"""
+
+from __future__ import annotations
+
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from p2p_lib.core.config import Config
+from p2p_lib.core.stopwatch import Stopwatch
+from p2p_lib.core.types import Frame
+from p2p_lib.extended.gates import SIGHTED
+from p2p_lib.extended.image_search import ImageSearch, Sighting, SurfaceSample
+from p2p_lib.extended.sight import Sight, cut_off
+from p2p_lib.method.object_model import Known, ObjectModel
+from p2p_lib.method.observation import Observer
+from p2p_lib.method.refinement import surface_distances
+
+#: A lost object is looked for in every so many frames, turned as in so many of its keyframes at most. Depth this near
+#: its surface is on it, m.
+_TURN_EVERY, _TURNS, _ON_M = 2, 40, 0.01
+
+
+class ShapeSearch:
+    """Looks for one object in the frames of one camera; where it is not ``on``, nothing is looked for."""
+
+    def __init__(self, observer: Observer, config: Config, stopwatch: Stopwatch, on: bool = True):
+        self.observer, self.config, self._stopwatch, self._on = observer, config, stopwatch, on
+        self._samples: WeakKeyDictionary[ObjectModel, tuple[int, SurfaceSample]] = WeakKeyDictionary()
+
+    def knows(self, known: Known) -> bool:
+        """Whether shape and colour have a say."""
+        return self._on and known.model.has_surface
+
+    def sample(self, model: ObjectModel) -> SurfaceSample:
+        """Points of the surface as it was first asked for since the newest keyframe."""
+        revision, sample = self._samples.get(model, (None, None))
+        if revision != model.revision:
+            sample = SurfaceSample.of(model.surface.mesh())
+            self._samples[model] = model.revision, sample
+        return sample
+
+    def at(self, obs: Sight, known: Known, poses: list[np.ndarray]) -> list[Sighting | None]:
+        """What of the surface shows under each of some poses; None where too little would be in the image."""
+        search = self._search(obs.frame)
+        return [search.at(T_cam_obj, self.sample(known.model)) for T_cam_obj in poses]
+
+    def sighted(self, obs: Sight, known: Known, carried: bool) -> Sighting | None:
+        """Where a sought object shows: near where scene or motion say, or where it was a frame ago; or in its mask."""
+        life, model, time_s = known.life, known.model, obs.frame.time_s
+        proposed = [*life.scene_prior(obs.frame.T_world_cam).values()]
+        if obs.mask is None and carried:  # in a mask it is laid on its depth besides
+            proposed.append(life.motion.at(time_s))
+        proposed += [life.T_cam_obj] if life.has_pose else []
+        with self._stopwatch("search"):
+            search = self._search(obs.frame)
+            found = [search.about(T_cam_obj, self.sample(model)) for T_cam_obj in proposed]
+            if obs.mask is not None and life.lost_frames % _TURN_EVERY == 1 and not cut_off(self.observer, obs):
+                found.append(self._turned(obs, known, search))
+            best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
+            return best if best is not None and best.share >= SIGHTED else None
+
+    def otherwise(self, obs: Sight, known: Known, T_cam_obj: np.ndarray) -> tuple[Sighting | None, ...]:
+        """What shows under a pose, and the best that is turned otherwise; None where it cannot be said."""
+        with self._stopwatch("search"):
+            search, sample = self._search(obs.frame), self.sample(known.model)
+            views = known.model.views.some(_TURNS)
+            return search.at(T_cam_obj, sample), search.otherwise(T_cam_obj, views, obs.cloud, sample)
+
+    def _turned(self, obs: Sight, known: Known, search: ImageSearch) -> Sighting | None:
+        """Where a lost object shows in its mask, turned as in one of its keyframes. Of a part of it any turn may be."""
+        found = search.turned(known.model.views.some(_TURNS), obs.cloud, self.sample(known.model))
+        if found is None:
+            return None
+        distance_m = surface_distances(known.model.surface, obs.cloud, found.T_cam_obj[None])[0]
+        return found if (distance_m < _ON_M).mean() >= self.config.lifecycle.surface_only_share else None
+
+    def _search(self, frame: Frame) -> ImageSearch:
+        return ImageSearch(frame, self.observer.camera, self.config.depth)

@@ -1,0 +1,187 @@
+"""What an object's step leaves open, and the paper's answers: propose, choose, judge, admit, request.
+
+:class:`~p2p_lib.method.object_tracker.ObjectTracker` asks these questions in its step, and believes the answers. The
+paper takes the hypothesis that lies nearest to the surface, believes every pose that it finds, and learns from every
+frame with a pose (Sec. "Object Registration", appendix "Sampling Criteria").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from p2p_lib.core.config import Config
+from p2p_lib.core.stopwatch import Stopwatch
+from p2p_lib.core.types import Status
+from p2p_lib.method import refinement, registration, selection
+from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
+from p2p_lib.method.observation import Observation, Observer
+from p2p_lib.method.refinement import Keypoints, Refinement
+from p2p_lib.method.registration import Hypothesis
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A hypothesis, and its pose refined on the surface once it is known."""
+
+    hypothesis: Hypothesis
+    refined: Refinement | None = None
+
+    @property
+    def T_cam_obj(self) -> np.ndarray:
+        """(4, 4) the best pose known of it."""
+        return (self.refined or self.hypothesis).T_cam_obj
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a pose stands, with the status that it gives the object and the reason in words."""
+
+    accepted: bool
+    status: Status
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Admission:
+    """What of a frame with a pose enters the model.
+
+    covariance  (6, 6) of the pose, right tangent of T_cam_obj
+    confidence  of the pose; the paper gives none: 1 in every pose that it reports
+    learns      whether the keypoint map takes the frame in
+    keyframe    whether it may become a keyframe
+    in_camera   whether a point must move with the object to become a keypoint
+    """
+
+    verdict: Verdict
+    agrees: np.ndarray
+    covariance: np.ndarray
+    confidence: float = 1.0
+    learns: bool = True
+    keyframe: bool = True
+    in_camera: bool = False
+
+    def rows(self, obs: Observation, model: ObjectModel) -> np.ndarray:
+        """(N,) bool: points whose observations enter the graph at a keyframe: those that agree, and the pending."""
+        return obs.seen & (self.agrees | ~model.map.promoted)
+
+    def rated(self, model: ObjectModel) -> tuple[np.ndarray, float]:
+        """Covariance (6, 6) and confidence that are reported of the pose: the map may be wrong, too, says the graph."""
+        return self.covariance + model.covariance, self.confidence
+
+
+@dataclass(eq=False)
+class Policy:
+    """The paper's answers for one object; ``known`` is what they are asked of."""
+
+    observer: Observer
+    config: Config
+    rng: np.random.Generator
+    stopwatch: Stopwatch
+    life: Life = field(default_factory=Life)  # of an object that has not been seen
+
+    # -- propose -------------------------------------------------------------------------------
+
+    def propose(self, obs: Observation, known: Known) -> list[Hypothesis]:
+        """Candidate poses by the keypoints seen."""
+        with self.stopwatch("registration"):
+            use, _ = self.correspondences(obs, known)
+            return self.register(known, np.where(use[:, None], obs.p_cam, np.nan))
+
+    def correspondences(self, obs: Observation, known: Known) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) bool each: the points to register, and all that are certain enough for it."""
+        certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)
+        use = certain & known.map.promoted
+        return (use if use.sum() >= self.few_keypoints(known) else certain), certain
+
+    def few_keypoints(self, known: Known) -> int:
+        """With fewer visible keypoints, pending ones help to register (the release's)."""
+        return 12
+
+    def register(
+        self, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray] | None = None
+    ) -> list[Hypothesis]:
+        """Hypotheses from the points measured at p_cam (N, 3), as far as they are finite."""
+        cfg, sigma_m = self.config.registration, known.model.noise_m(p_cam)
+        return registration.register(known.map.p_obj, p_cam, cfg, self.rng, sigma_m=sigma_m, priors=priors)
+
+    # -- choose --------------------------------------------------------------------------------
+
+    def choose(self, obs: Observation, known: Known, hypotheses: list[Hypothesis]) -> tuple[Candidate | None, str]:
+        """One of the hypotheses, refined on the surface, and why it is that one."""
+        best, reason = self.select(obs, known, [Candidate(hypothesis) for hypothesis in hypotheses])
+        return (None if best is None else self.refine(obs, known, best)), reason
+
+    def select(
+        self, obs: Observation, known: Known, candidates: list[Candidate], weight: np.ndarray | None = None
+    ) -> tuple[Candidate | None, str]:
+        """The candidate to go on with, and why; ``weight`` (H,) factors of their support."""
+        with self.stopwatch("selection"):
+            poses, distance_m = [c.T_cam_obj for c in candidates], None
+            if len(poses) > 1 and known.model.has_surface and len(obs.cloud):
+                distance_m = refinement.surface_distances(known.model.surface, obs.cloud, np.stack(poses))
+            hypotheses = [c.hypothesis for c in candidates]
+            row, reason = selection.select(hypotheses, distance_m, self.config.selection, weight)
+            return (None if row is None else candidates[row]), reason
+
+    def refine(self, obs: Observation, known: Known, candidate: Candidate) -> Candidate:
+        """The candidate with its refined pose."""
+        with self.stopwatch("refinement"):
+            refined = self.refined(obs, known, candidate.T_cam_obj, candidate.hypothesis.inliers)
+            return replace(candidate, refined=refined)
+
+    def refined(
+        self, obs: Observation, known: Known, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None
+    ) -> Refinement:
+        """The pose refined on the surface, with the keypoints that agree (N,) where the configuration says so."""
+        cfg, keypoints = self.config.refinement, None
+        if cfg.residuals == "none" or not known.model.has_surface or not len(obs.cloud):
+            return Refinement(T_cam_obj, reason="no surface")
+        if agrees is not None and cfg.residuals == "surface_and_keypoints":
+            p_cam = obs.p_cam[agrees]
+            keypoints = Keypoints(known.map.p_obj[agrees], p_cam, self.observer.noise_m(p_cam))
+        return refinement.refine(T_cam_obj, obs.cloud, known.model.surface, cfg, keypoints=keypoints)
+
+    # -- judge, admit, request -----------------------------------------------------------------
+
+    def start(self, known: Known, points: int) -> Verdict:
+        """Whether a map may begin with so many points."""
+        enough = points >= self.config.registration.min_inliers
+        return Verdict(enough, Status.TRACKED, "" if enough else f"only {points} points to start from")
+
+    def judge(self, obs: Observation, known: Known, best: Candidate) -> Verdict:
+        """Every pose stands; few points degrade it."""
+        support = best.hypothesis.support
+        if support < self.config.lifecycle.return_inliers:
+            return Verdict(True, Status.DEGRADED, f"only {support} points agree")
+        return Verdict(True, Status.RECOVERED if known.life.returning else Status.TRACKED)
+
+    def admit(self, obs: Observation, known: Known, best: Candidate, verdict: Verdict) -> Admission:
+        """Every frame with a pose is learnt from."""
+        return Admission(verdict, best.hypothesis.inliers, self.covariance(obs, known, best))
+
+    def covariance(self, obs: Observation, known: Known, best: Candidate) -> np.ndarray:
+        """(6, 6) of the pose relative to the map: by the refinement, else by the keypoints alone."""
+        if best.refined.covariance is not None:
+            return best.refined.covariance
+        noise_m = self.observer.noise_m(obs.p_cam)
+        return registration.covariance(best.hypothesis, known.map.p_obj, obs.p_cam, noise_m)
+
+    def request(self, obs: Observation, known: Known, best: Candidate, admission: Admission) -> Requests:
+        """No track is rejected."""
+        return Requests()
+
+    # -- what the object has been through ------------------------------------------------------
+
+    def begun(self, obs: Observation, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
+        """The life of a map after its first frame."""
+        return replace(self.life, status=verdict.status, T_cam_obj=T_cam_obj, seen_s=obs.frame.time_s)
+
+    def followed(self, obs: Observation, known: Known, best: Candidate, admission: Admission, sure: float) -> Life:
+        """The life after a frame with a pose, which is reported with the confidence ``sure``."""
+        return known.life.with_pose(best.T_cam_obj, obs.frame.time_s, admission.verdict.status)
+
+    def missed(self, obs: Observation, known: Known, verdict: Verdict) -> Life:
+        """The life after a frame without a pose."""
+        return replace(known.life, status=verdict.status)

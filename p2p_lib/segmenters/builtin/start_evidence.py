@@ -1,0 +1,162 @@
+"""What says of a pixel, in the frame that starts an object, that it belongs to the clicks; on a patch's grid.
+
+All of it is foreground log-odds (h, w) and adds up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.config import SegmentationConfig
+from p2p_lib.segmenters.builtin.colours import evidence, histogram
+from p2p_lib.segmenters.builtin.patch import (
+    Patch,
+    approximate_median,
+    components_touching,
+    connected_components,
+    dilated,
+    plane_heights,
+    support_plane,
+)
+
+#: Clicks on one object are this far apart at least, and a lone one stands for this extent: nobody can tell, m.
+_EXTENT_M, _LONE_M = 0.03, 0.1
+#: Log-odds between the clicks, right beside them, lost with each of their extents farther away, and at least.
+_BETWEEN, _BESIDE, _PER_EXTENT, _FAR = 2.0, 0.8, 2.0, -2.5
+#: What is lower than this many standard deviations and metres above its support is flat.
+_FLAT_SIGMAS, _FLAT_M = 2.0, 0.003
+#: A plane's fit adds this to the noise of depth, m.
+_PLANE_SIGMA_M = 0.001
+#: Log-odds of a pixel in the support plane and of one above it at most: things stand there that are not the object.
+_IN_PLANE, _ABOVE_PLANE = -2.0, 0.5
+#: Log-odds of what depth connects with the clicks, and of what it does not.
+_CONNECTED, _APART = 2.5, -1.5
+#: Less of a component than this on the patch's border is an accident.
+_AT_THE_BORDER = 0.02
+#: An unmeasured pixel has this share of its nearest measured one's log-odds.
+_UNMEASURED = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Clicked:
+    """Where the clicks on an object are, on a patch.
+
+    seeds     (h, w) bool, squares around them
+    hull      (h, w) bool, what lies between them
+    extents   (h, w) distance from the hull, in extents of the clicks
+    """
+
+    seeds: np.ndarray
+    hull: np.ndarray
+    extents: np.ndarray
+
+    @classmethod
+    def of(cls, patch: Patch, clicks_px: np.ndarray, z_m: float) -> Clicked:
+        """Of clicks (N, 2) in the image at a depth."""
+        seeds = patch.dots(clicks_px, 1)
+        at = (clicks_px - [patch.box.left, patch.box.top] + 0.5) / patch.cell_px - 0.5
+        hull = np.zeros(patch.shape, np.uint8)
+        cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(at).astype(np.int32)[:, None]), 1)
+        hull = (hull > 0) | seeds
+        least_m = _EXTENT_M if len(clicks_px) > 1 else _LONE_M
+        extent = max(float(np.ptp(at, 0).max()), least_m * patch.camera.fx / z_m / patch.cell_px)
+        away = cv2.distanceTransform((~hull).astype(np.uint8), cv2.DIST_L2, 5)
+        return cls(seeds, hull, away / extent)
+
+    def prior_beside(self, connected: np.ndarray) -> np.ndarray:
+        """(h, w) log-odds by the distance from the clicks, which tells nothing against what is ``connected`` (h, w)."""
+        beside = np.clip(_BESIDE - _PER_EXTENT * self.extents, np.where(connected > 0, 0, _FAR), None)
+        return np.where(self.hull, _BETWEEN, beside).astype(np.float32)
+
+    @property
+    def near(self) -> np.ndarray:
+        """(h, w) share in the object's colours before it is cut out."""
+        return np.exp(-4 * self.extents)
+
+    @property
+    def beyond(self) -> np.ndarray:
+        """(h, w) share in the background's colours before the object is cut out."""
+        return (self.extents > min(1.0, self.extents.max() / 2)).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Height:
+    """What the height above the support plane says.
+
+    plane     (4,) the plane around the clicks; None where there is none
+    flat      whether the clicks are in it, so that it tells nothing, or there is none
+    log_odds  (h, w): a height is that of the plane with its noise, or any up to twice that of the clicks
+    """
+
+    plane: np.ndarray | None
+    flat: bool
+    log_odds: np.ndarray
+
+    @classmethod
+    def of(cls, patch: Patch, clicked: Clicked) -> Height:
+        """By the plane that supports most of what surrounds the clicks."""
+        weight = np.exp(-((clicked.extents / 2) ** 2) / 2) + 0.05
+        plane = support_plane(patch, (patch.depth_m > 0) & (clicked.extents > 0.5), weight)
+        return cls(plane, True, np.zeros(patch.shape, np.float32)).on(patch, clicked)
+
+    def on(self, patch: Patch, clicked: Clicked) -> Height:
+        """By the same plane on another patch."""
+        nothing, at = np.zeros(patch.shape, np.float32), clicked.seeds & (patch.depth_m > 0)
+        if self.plane is None or not at.any():
+            return replace(self, flat=True, log_odds=nothing)
+        height, sigma_m = plane_heights(patch, self.plane), patch.sigma_m + _PLANE_SIGMA_M
+        clicks_m = approximate_median(height[at])
+        if clicks_m < _FLAT_SIGMAS * approximate_median(patch.sigma_m[at]) + _FLAT_M:
+            return replace(self, flat=clicks_m > -_FLAT_M, log_odds=nothing)
+        # The density of noise at 0, sqrt(2 pi) sigma to one, against an even one up to twice the height of the clicks.
+        surprise = np.log(np.maximum(2 * clicks_m / (2.5 * sigma_m), 1.05))
+        log_odds = np.maximum(height, 0) ** 2 / (2 * sigma_m**2) - surprise
+        log_odds = np.where(patch.depth_m > 0, np.clip(log_odds, _IN_PLANE, _ABOVE_PLANE), 0)
+        return replace(self, flat=False, log_odds=log_odds.astype(np.float32))
+
+
+def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndarray:
+    """No object reaches farther in depth than ``config.reach_m`` from its clicks."""
+    far = (patch.depth_m > 0) & (np.abs(patch.depth_m - z_m) > config.reach_m)
+    return np.where(far, -config.geometry_weight, 0).astype(np.float32)
+
+
+def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
+    """What depth connects with the clicks above their support is of the object, where it ends within the patch."""
+    log_odds = np.zeros(patch.shape, np.float32)
+    if height.flat:
+        return log_odds
+    component = components_touching(connected_components(patch.smooth & (height.log_odds >= 0)), clicked.seeds)
+    log_odds[(patch.depth_m > 0) & ~dilated(component, 1)] = _APART
+    if component[patch.border()].mean() <= _AT_THE_BORDER:
+        log_odds[component] = _CONNECTED
+    return log_odds
+
+
+def by_shares(patch: Patch, own: np.ndarray, other: np.ndarray, config: SegmentationConfig) -> np.ndarray:
+    """Each pixel's colour is likelier where the object is, or where it is not, by weights (h, w) of all pixels."""
+    shares = (histogram(patch.codes.ravel(), weights.ravel()) for weights in (own, other))
+    return config.colour_weight * evidence(*shares)[patch.codes]
+
+
+def filled(log_odds: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """With a share of the nearest measured pixel's log-odds where nothing is ``measured`` (h, w) bool."""
+    if measured.all() or not measured.any():
+        return log_odds
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~measured).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    value_of = np.zeros(nearest.max() + 1, np.float32)
+    value_of[nearest[measured]] = log_odds[measured]
+    return np.where(measured, log_odds, _UNMEASURED * value_of[nearest])
+
+
+def tolerant(log_odds: np.ndarray, radius: float) -> np.ndarray:
+    """Without what a shift by ``radius`` pixels would change: depth ends beside the outline that colour shows."""
+    if radius < 0.5:
+        return log_odds
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius) + 1,) * 2)
+    return np.minimum(cv2.dilate(log_odds, around), 0) + np.maximum(cv2.erode(log_odds, around), 0)

@@ -1,0 +1,162 @@
+"""Wide-baseline matching: how a rigid motion segment moved where short steps fail, by the corners of two frames.
+
+A fast turn, a fast camera or blur leaves nothing for Lucas-Kanade, whose steps are short, and little for templates.
+Corners described on the surface are still the same: those of the segment in the frame where it was seen last are
+matched with those of the newest frame, both ways, and the rigid motion that most pairs agree on in 3D is the segment's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from p2p_lib.core import robust, se3
+from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.image import in_mask
+from p2p_lib.trackers.builtin.features import mutual_match
+from p2p_lib.trackers.builtin.image import Image
+from p2p_lib.trackers.builtin.landmarks import Corners, corners
+
+#: Corners that are described on a segment, and where it may be in the next frame: what a search costs at most.
+CORNERS, _MOST = 400, 900
+#: A segment reaches so far beyond the hull of its points; it may move by these from frame to frame.
+_BESIDE_PX, _MOVES_PX, _MOVES_M = 6, 80, 0.08
+#: Corners nearer to the border of a region are of its outline, px.
+_BORDER_PX = 4
+#: A corner is on it that is nearer to one of its points than so many times their own distance, within these bounds.
+_SPACINGS, _NEAR_M = 2.0, (0.01, 0.03)
+#: Colours (CIELAB a, b) that differ by less than one or two of these are the same.
+_BIN = 6
+#: Samples of the search for the rigid motion, and pairs that have to agree on it.
+_SAMPLES, _AGREEING = 300, 8
+#: They agree within this and so many times the noise of depth, m; what is off by little more is of it, too.
+_AGREE_M, _AGREE_SIGMAS = 0.003, 2.0
+
+
+def inner(region: np.ndarray) -> np.ndarray:
+    """A region (H, W) without its border: an outline does not move with a round object that turns."""
+    return cv2.erode(region.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)) > 0
+
+
+@dataclass(eq=False)
+class Sight:
+    """A segment where it was last seen: the image, its visible points uv_px (N, 2), its pose T_cam_seg.
+
+    search  (H, W) bool: where the objects were in that frame; None where nobody knows
+    found   corners of the whole region that was searched in that frame; None where it was not
+    """
+
+    image: Image
+    uv_px: np.ndarray
+    T_cam_seg: np.ndarray
+    search: np.ndarray | None = None
+    found: Corners | None = field(default=None, repr=False)
+
+    @cached_property
+    def own(self) -> np.ndarray:
+        """(H, W) bool: the segment, inside the hull of its points."""
+        hull = np.zeros(self.image.gray.shape, np.uint8)
+        cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(self.uv_px).astype(np.int32)), 1)
+        own = cv2.dilate(hull, np.ones((2 * _BESIDE_PX + 1,) * 2, np.uint8)) > 0
+        return own if self.search is None else own & inner(self.search)
+
+    @cached_property
+    def corners(self) -> Corners:
+        """The corners on the segment: those near points of it in space, for a hand may be before it."""
+        found = self.found
+        if found is None:
+            found = corners(self.image, self.own, CORNERS)
+        else:
+            found = found.select(in_mask(found.uv_px, self.own))
+        z = self.image.depth_at(self.uv_px)
+        p_cam = self.image.camera.unproject(self.uv_px[z > 0], z[z > 0])
+        if len(p_cam) < 2:
+            return found.select(np.zeros(len(found.uv_px), bool))
+        tree = cKDTree(p_cam)
+        apart_m = np.clip(_SPACINGS * np.median(tree.query(p_cam, 2)[0][:, 1]), *_NEAR_M)
+        return found.select(tree.query(found.p_cam)[0] < apart_m)
+
+    def region(self, now: Image) -> np.ndarray:
+        """(H, W) bool: where the segment can be one frame later, by its place, its depth and its colours."""
+        h, w = now.gray.shape
+        left, top = np.clip(self.uv_px.min(0) - _MOVES_PX, 0, [w - 1, h - 1]).astype(int)
+        right, bottom = np.clip(self.uv_px.max(0) + _MOVES_PX + 1, 1, [w, h]).astype(int)
+        part = np.s_[top:bottom, left:right]
+        z = self.image.depth_at(self.uv_px)
+        z = z[z > 0]
+        region = np.zeros((h, w), bool)
+        if len(z):
+            depth_m = now.depth_m[part]
+            region[part] = (depth_m > z.min() - _MOVES_M) & (depth_m < z.max() + _MOVES_M) & self._coloured(now)[part]
+        return region
+
+    def _coloured(self, now: Image) -> np.ndarray:
+        """(H, W) bool: the pixels with about the colours of the segment."""
+        own = cv2.resize(self.own.astype(np.uint8), self.image.chroma.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
+        known = np.zeros((256 // _BIN,) * 2, np.uint8)
+        known[tuple((self.image.chroma[own] // _BIN).astype(int).T)] = 1
+        known = cv2.dilate(known, np.ones((3, 3), np.uint8))
+        a, b = (now.chroma // _BIN).astype(int).transpose(2, 0, 1)
+        near = cv2.dilate(known[a, b], np.ones((3, 3), np.uint8))
+        return cv2.resize(near, now.gray.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """The pose T_cam_seg (4, 4) that pairs agree on; of those p_seg (M, 3), uv_px (M, 2), z_m (M,).
+
+    found  the corners that were searched
+    """
+
+    T_cam_seg: np.ndarray
+    p_seg: np.ndarray
+    uv_px: np.ndarray
+    z_m: np.ndarray
+    found: Corners
+
+    def __len__(self) -> int:
+        return len(self.p_seg)
+
+
+def corners_of(sights: Sequence[Sight], now: Image, search: np.ndarray | None) -> tuple[Corners, list[np.ndarray]]:
+    """The corners of a later frame wherever segments can be, and the region (H, W) of each.
+
+    They are as dense as on the segments, as far as the bound allows. ``search`` (H, W) says where objects are.
+    """
+    regions = [then.region(now) for then in sights]
+    if search is not None:
+        inside = inner(search)
+        regions = [region & inside for region in regions]
+    anywhere = np.logical_or.reduce(regions)
+    segment_px = np.mean([np.count_nonzero(then.own) for then in sights])
+    limit = CORNERS * np.count_nonzero(anywhere) / max(segment_px, 1)
+    return corners(now, anywhere, int(np.clip(limit, CORNERS, _MOST))), regions
+
+
+def matched(then: Sight, found: Corners, cfg: TrackingConfig, rng: np.random.Generator) -> Matched | None:
+    """The segment's pose among the corners ``found`` in a later frame; None where too few of its own agree on one."""
+    own = then.corners
+    if min(len(own.uv_px), len(found.uv_px)) < _AGREEING:
+        return None
+    scales = (np.moveaxis(of.descriptors, 1, 0) for of in (own, found))
+    pairs = [mutual_match(a, b, cfg.match_ratio) for a, b in zip(*scales, strict=True)]
+    which, corner = np.unique(np.concatenate(pairs, 1), axis=1)
+    p_then, p_cam = own.p_cam[which], found.p_cam[corner]
+    # Tight: what stands still while a round object turns slowly is off by millimetres alone.
+    limit_m = np.maximum(_AGREE_M, _AGREE_SIGMAS * depth_noise_m(p_cam[:, 2]))
+    T = robust.ransac(p_then, p_cam, limit_m, 3, _SAMPLES, rng) if len(p_cam) >= _AGREEING else None
+    if T is None:
+        return None
+    everything = np.ones(len(p_cam), bool)
+    fit = robust.refit(T, p_then, p_cam, limit_m, np.ones(len(p_cam)), _AGREEING, everything)
+    if fit is None:
+        return None
+    agree = fit.residual_m <= np.maximum(cfg.segment_inlier_m, limit_m)
+    p_seg = se3.transform(se3.inverse(then.T_cam_seg), p_then[agree])
+    return Matched(fit.T_a_b @ then.T_cam_seg, p_seg, found.uv_px[corner[agree]], p_cam[agree, 2], found)

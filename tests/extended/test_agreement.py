@@ -1,0 +1,100 @@
+"""What says that camera and masks contradict themselves, on made-up values."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.core import se3
+from p2p_lib.core.types import Frame
+from p2p_lib.extended.agreement import outline_share, scene_ratio, size_ratio
+from p2p_lib.extended.frame_guard import StaleFrames
+
+RNG = np.random.default_rng(0)
+P_OBJ = RNG.uniform(-0.05, 0.05, (30, 3))
+T = se3.exp(np.array([0.4, -0.3, 0.8, 0.1, 0.05, 0.7]))
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.0, 1.2])
+def test_the_size_is_that_of_the_depth_wherever_the_object_is(scale):
+    p_cam = scale * se3.transform(T, P_OBJ) + RNG.normal(0, 5e-4, P_OBJ.shape)
+    p_cam[:6] += RNG.normal(0, 0.05, (6, 3))  # wrong points
+    ratio, sigma = size_ratio(P_OBJ, p_cam, np.full(30, 5e-4))
+    assert ratio == pytest.approx(scale, abs=0.02) and sigma < 0.01
+
+
+def test_depth_that_is_offset_shows_it_larger():
+    facing = P_OBJ * [1, 1, 0] + [0, 0, 0.7]
+    ratio, _ = size_ratio(P_OBJ * [1, 1, 0], facing * (1 + 0.15 / 0.7), np.zeros(30))
+    assert ratio == pytest.approx(1 + 0.15 / 0.7)
+
+
+def test_noise_spreads_the_size_by_as_much_as_it_says():
+    noisy = [size_ratio(P_OBJ, P_OBJ + RNG.normal(0, 2e-3, P_OBJ.shape), np.full(30, 2e-3)) for _ in range(200)]
+    ratio, sigma = np.transpose(noisy)
+    assert 0.5 * sigma[0] < ratio.std() < 2 * sigma[0]
+
+
+def test_few_points_or_points_in_one_place_have_no_size():
+    assert size_ratio(P_OBJ[:7], P_OBJ[:7], np.zeros(7)) is None
+    assert size_ratio(0.1 * P_OBJ, P_OBJ, np.zeros(30)) is None
+
+
+def scene(left: int, grey: int = 100, wall_m: float = 0.9) -> tuple[Frame, np.ndarray]:
+    """A square of 20 px at 0.5 m before a wall, and its mask."""
+    mask = np.zeros((40, 80), bool)
+    mask[10:30, left : left + 20] = True
+    depth_m = np.where(mask, 0.5, wall_m).astype(np.float32)
+    return Frame(0, 0.0, np.full((40, 80, 3), grey, np.uint8), depth_m), mask
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.2])
+def test_a_camera_that_measures_otherwise_does_so_beside_the_object_too(factor):
+    (before, mask_before), (frame, mask) = scene(20), scene(30)
+    other = replace(frame, depth_m=np.where(mask, 2.0, factor) * frame.depth_m)
+    assert scene_ratio(other, mask, before, mask_before) == pytest.approx(factor), "whatever the object does"
+    moving = replace(other, rgb=other.rgb + np.uint8(40))
+    assert scene_ratio(moving, mask, before, mask_before) == 1, "nothing looks the same"
+
+
+def test_a_mask_ends_where_depth_has_steps():
+    frame, mask = scene(30)
+    assert outline_share(frame, mask) == 1
+    wide, beside = cv2.dilate(mask.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0, np.roll(mask, 14, 1)
+    assert outline_share(frame, wide) == 0 and outline_share(frame, beside) < 0.4
+    half = np.where(np.arange(mask.shape[0])[:, None] < 20, np.roll(frame.depth_m, 8, 1), frame.depth_m)
+    assert 0.3 < outline_share(replace(frame, depth_m=half), mask) < 0.9
+
+
+def test_where_nothing_is_measured_an_outline_tells_nothing():
+    frame, mask = scene(30)
+    assert outline_share(replace(frame, depth_m=np.where(mask, frame.depth_m, 0)), mask) is None
+    assert outline_share(frame, np.zeros_like(mask)) is None
+
+
+def test_at_the_border_of_the_image_depth_has_no_step():
+    inside, mask = scene(30)
+    shown = [outline_share(*scene(left)) for left in (30, 60, 0)]
+    assert shown == [1, pytest.approx(0.75, abs=0.05), pytest.approx(0.75, abs=0.05)], "one side of a square is cut off"
+    assert outline_share(inside, np.ones_like(mask)) == 0, "it ends nowhere"
+
+
+def stood(frame: Frame, before: Frame) -> tuple[bool, bool]:
+    """What is said of a frame that comes a tenth of a second after another."""
+    return StaleFrames().with_frame(replace(before, time_s=0.0)).with_frame(replace(frame, time_s=0.1)).for_long(0.1)
+
+
+def test_half_an_image_stands_where_the_other_half_goes_on():
+    half, whole, nothing = (True, False), (False, True), (False, False)
+    (before, _), (moved, _), (later, _) = scene(20), scene(21), scene(20, grey=101)
+    assert stood(later, before) == stood(moved, before) == half, "depth stands, colour stands"
+    noisy = later.depth_m.copy()
+    noisy[3, 5] += 1e-4
+    assert stood(replace(later, depth_m=noisy), before) == nothing, "to the last bit"
+    assert stood(before, before) == whole
+    assert StaleFrames().with_frame(before).with_frame(before).for_long(0.05) == nothing, "a camera may be slow"
+    empty = np.zeros_like(later.depth_m)
+    assert stood(replace(later, depth_m=empty), replace(before, depth_m=empty)) == nothing
+    black = np.zeros_like(before.rgb)
+    assert stood(replace(moved, rgb=black), replace(before, rgb=black)) == nothing

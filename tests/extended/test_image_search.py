@@ -1,0 +1,138 @@
+"""A surface laid into the image: found where it is, in its colours, and nowhere else."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import preset
+from p2p_lib.core.types import Frame
+from p2p_lib.extended.gates import SIGHTED
+from p2p_lib.extended.image_search import ImageSearch, SurfaceSample
+from p2p_lib.method.observation import sample_cloud
+from tests.method import analytic_scene
+
+CAMERA = Camera(300.0, 300.0, 160.0, 120.0, 320, 240)
+RADIUS_M = 0.05
+BLUE, GREY = (90, 100, 150), (150, 150, 150)
+PLACE = se3.from_rt(np.eye(3), np.array([0.02, -0.01, 0.6]))
+WALL_M = 1.0
+
+
+def ball_in_front_of_a_wall(colour=BLUE, centre=PLACE[:3, 3], gain: float = 1.0) -> Frame:
+    """Exact image of a ball and a wall behind it."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    ray = CAMERA.unproject(np.stack([u, v], -1), np.ones(u.shape))
+    a, b, c = (ray**2).sum(-1), ray @ centre, centre @ centre - RADIUS_M**2
+    hit = b**2 - a * c >= 0
+    z = np.where(hit, (b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a, WALL_M)
+    rgb = np.where(hit[..., None], colour, GREY) * gain
+    return Frame(0, 0.0, rgb.clip(0, 255).astype(np.uint8), z.astype(np.float32))
+
+
+def sample_of_the_ball(colour=BLUE) -> SurfaceSample:
+    """Points spread evenly over the ball."""
+    k = np.arange(300) + 0.5
+    z, turn = 1 - 2 * k / 300, np.pi * (1 + 5**0.5) * k
+    n = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], -1)
+    lab = cv2.cvtColor(np.uint8([[colour]]), cv2.COLOR_RGB2LAB)[0].astype(np.float32)
+    return SurfaceSample(RADIUS_M * n, n, np.repeat(lab, 300, 0))
+
+
+def moved(*by_m: float) -> np.ndarray:
+    T = PLACE.copy()
+    T[:3, 3] += by_m
+    return T
+
+
+def search(frame: Frame) -> ImageSearch:
+    return ImageSearch(frame, CAMERA, preset().depth)
+
+
+@pytest.mark.parametrize("by_m", [(0, 0, 0), (0.05, 0, 0), (-0.03, 0.04, 0.04)])
+def test_it_is_found_near_where_it_is_expected(by_m):
+    found = search(ball_in_front_of_a_wall()).about(moved(*by_m), sample_of_the_ball())
+    assert found.share > 0.9
+    assert np.linalg.norm((found.T_cam_obj - PLACE)[:3, 3]) < 0.003
+    on_it = np.linalg.norm(found.uv_px - CAMERA.project(PLACE[:3, 3]), axis=1)
+    assert len(found.uv_px) > 100 and on_it.max() <= 1.05 * CAMERA.fx * RADIUS_M / 0.55
+
+
+def test_exposure_may_have_changed_colour_not():
+    sample = sample_of_the_ball()
+    assert search(ball_in_front_of_a_wall(gain=0.5)).at(PLACE, sample).share > 0.9
+    assert search(ball_in_front_of_a_wall((150, 100, 90))).at(PLACE, sample).share < 0.1
+
+
+def test_what_is_seen_through_is_not_there():
+    """Free space contradicts a pose, which counts against it."""
+    empty = ball_in_front_of_a_wall(centre=np.array([0.5, 0.0, 0.3]))
+    assert search(empty).at(PLACE, sample_of_the_ball()).share < -0.5
+    best = search(empty).about(PLACE, sample_of_the_ball())
+    assert best is None or best.share < SIGHTED
+
+
+def test_what_hides_it_says_little():
+    """Half behind a board it is found by the other half; behind all of it there is nothing to say."""
+    frame, sample = ball_in_front_of_a_wall(), sample_of_the_ball()
+    depth = frame.depth_m.copy()
+    depth[:, : round(CAMERA.project(PLACE[:3, 3])[0])] = 0.4
+    assert SIGHTED < search(replace(frame, depth_m=depth)).at(PLACE, sample).share < 0.9
+    assert search(replace(frame, depth_m=np.full_like(depth, 0.4))).at(PLACE, sample) is None
+
+
+def test_outside_the_image_nothing_is_known():
+    assert search(ball_in_front_of_a_wall()).about(moved(2.0, 0, 0), sample_of_the_ball()) is None
+
+
+def test_what_fits_anywhere_proves_nothing():
+    """A plain plate on a plain wall of its colour fits everywhere along it."""
+    flat = Frame(0, 0.0, np.full((240, 320, 3), BLUE, np.uint8), np.full((240, 320), 0.6, np.float32))
+    side = np.linspace(-RADIUS_M, RADIUS_M, 18)
+    p = np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3)
+    plate = replace(sample_of_the_ball(), p_obj=p[:300], n_obj=np.tile([0.0, 0, -1], (300, 1)))
+    assert search(flat).at(PLACE, plate).share > 0.9
+    assert search(flat).about(PLACE, plate) is None
+
+
+def sample_of(sdf) -> SurfaceSample:
+    """Points of a black shape: of a cloud about it, the nearest on its surface, where its gradient is the normal."""
+    p, h = np.random.default_rng(0).uniform(-0.07, 0.09, (3000, 3)), 1e-5
+    for _ in range(30):
+        gradient = np.stack([(sdf(p + h * e) - sdf(p - h * e)) / (2 * h) for e in np.eye(3)], -1)
+        p = p - sdf(p)[:, None] * gradient
+    on = np.abs(sdf(p)) < 1e-4
+    return SurfaceSample(p[on][:300], gradient[on][:300], np.tile(np.float32([0, 128, 128]), (300, 1)))
+
+
+def image_of(sdf, T_cam_obj) -> tuple[ImageSearch, np.ndarray]:
+    """A shape's exact image in front of a wall, and its depth points."""
+    depth_m, mask = analytic_scene.render(sdf, T_cam_obj)
+    frame = Frame(0, 0.0, np.zeros((*depth_m.shape, 3), np.uint8), np.where(mask, depth_m, np.float32(WALL_M)))
+    cloud = sample_cloud(frame.depth_m, mask, analytic_scene.CAMERA, 500)
+    return ImageSearch(frame, analytic_scene.CAMERA, preset().depth), cloud
+
+
+def test_a_view_known_before_is_found_wherever_it_is():
+    """Nothing is known but the turns."""
+    turns, shift = analytic_scene.around(8), se3.from_rt(np.eye(3), [0.03, -0.04, 0.05])
+    for k in (1, 4):
+        truth = shift @ turns[k] @ se3.exp(np.array([0.05, -0.08, np.radians(12), 0, 0, 0]))
+        seen, cloud = image_of(analytic_scene.LUMP, truth)
+        found = seen.turned(np.stack(turns), cloud, sample_of(analytic_scene.LUMP))
+        error = se3.inverse(truth) @ found.T_cam_obj
+        assert found.share > SIGHTED and np.degrees(se3.angle_rad(error)) < 8  # it started 13 off
+        assert np.linalg.norm(error[:3, 3]) < 0.006
+
+
+def test_another_turn_shows_as_much_where_a_shape_looks_alike():
+    truth, back = analytic_scene.around(8)[1], analytic_scene.around(8)[5]
+    for shape, alike in ((analytic_scene.box((0, 0, 0), (0.03, 0.02, 0.045)), True), (analytic_scene.LUMP, False)):
+        seen, cloud = image_of(shape, truth)
+        other = seen.otherwise(truth, np.stack([truth, back]), cloud, sample_of(shape))
+        assert (other.share > 0.9 * seen.at(truth, sample_of(shape)).share) == alike
+        assert np.degrees(se3.angle_rad(se3.inverse(truth) @ other.T_cam_obj)) > 150
+    assert seen.otherwise(truth, truth[None], cloud, sample_of(shape)) is None
