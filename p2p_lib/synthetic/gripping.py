@@ -35,8 +35,6 @@ OPEN = np.radians([[0, 5, 5], [4, 8, 5], [2, 8, 5], [4, 8, 5], [8, 10, 6]])
 _FURTHEST = np.radians([[75, 55, 70], *[[85, 100, 70]] * 4])
 #: How many balls fill a phalanx.
 _BALLS = 3
-#: A fingertip that is so near touches.
-TOUCH_M = 0.0025
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.synthetic.noise import PERFECT, Sensor, measured_colour, measured_depth
+from p2p_lib.synthetic.noise import PERFECT, Sensor, in_motion, measured_colour, measured_depth
 from p2p_lib.synthetic.render import Rendering
 
 CAMERA = Camera(615.0, 615.0, 319.5, 239.5, 640, 480)
@@ -130,3 +130,21 @@ def test_colour_noise_and_exposure(level):
 def test_impossible_sensors_are_refused(wrong):
     with pytest.raises(BadInput, match=next(iter(wrong))):
         Sensor(**wrong)
+
+
+def test_an_edge_that_passes_leaves_patches_and_a_slope_does_not():
+    v, u = np.mgrid[:120, :160].astype(float)
+    slopes = [0.5 + 0.004 * (v + k) for k in (-5, 0, 5)]  # 4 cm of depth pass every pixel, and no edge
+    sensor = only(edge_m=0.02, edge_loss=0.5, correlation_px=1.5)
+    measured = in_motion(slopes[1], slopes, sensor, np.random.default_rng(0))
+    np.testing.assert_array_equal(measured, slopes[1])
+    steps = [np.where(u < 80 + k, 0.6, 1.0) for k in (-8, 0, 8)]
+    measured = in_motion(steps[1], steps, sensor, np.random.default_rng(1))
+    passed = (u >= 72) & (u < 88)
+    np.testing.assert_array_equal(measured[~passed], steps[1][~passed])
+    seen = measured[passed]
+    assert 0.35 < (seen == 0).mean() < 0.65
+    near, far = (np.abs(seen - z) < 1e-9 for z in (0.6, 1.0))
+    mixed = (seen > 0.61) & (seen < 0.99)
+    assert near.mean() > 0.1 and far.mean() > 0.1 and 0.03 < mixed.mean() < 0.2
+    np.testing.assert_allclose(1 / seen[mixed], np.where(u < 80, 2 / 3, 1 / 3)[passed][mixed] * (1 / 0.6 - 1) + 1)
