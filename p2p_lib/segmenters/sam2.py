@@ -35,7 +35,7 @@ from p2p_lib.segmenters.sam2_image import Features, MaskCandidates, Sam2Image
 _KEYPOINTS, _MIDDLE = 3, 3
 #: Weight of the overlap with the mask that is expected beside the network's own score and the mask's stability.
 _OVERLAP = 0.5
-#: What looks less like the object than this, see :meth:`p2p_lib.segmenters.sam2_image.Features.look`, is not it.
+#: What looks less like the object than this, see ``Features.look`` of :mod:`p2p_lib.segmenters.sam2_image`, is not it.
 _ALIKE = 0.4
 #: Looks of an object that are remembered, besides the first.
 _LOOKS = 4

@@ -140,7 +140,7 @@ def load(threads: int = 0) -> Sam2Image:
 
     threads  that a session may use; 0: as many as there are cores
     """
-    onnxruntime = packages.load(PACKAGE, CHECKPOINT, PACKAGE)
+    onnxruntime = packages.load("onnxruntime", CHECKPOINT, PACKAGE)
     encoder, decoder = checkpoints.checked_files(CHECKPOINT)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = threads, 3

@@ -151,10 +151,7 @@ def _gaps(hand: Hand, thing: Mesh, T_thing_hand: np.ndarray, angles: np.ndarray,
 
 def distance_m(thing: Mesh, points: np.ndarray) -> np.ndarray:
     """How far points (N, 3) are from a surface (N,), inside or out."""
-    from p2p_lib.core.native import load_open3d
-
-    query = load_open3d().core.Tensor(np.ascontiguousarray(points, np.float32))
-    return thing.ray_scene.compute_distance(query).numpy()
+    return thing.distance(points)
 
 
 def _joined(limbs: list[Patch], image: np.ndarray, size: float) -> Mesh:

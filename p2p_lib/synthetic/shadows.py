@@ -9,7 +9,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.native import load_open3d
+from p2p_lib.core.raycasting import blocked
 from p2p_lib.synthetic.render import Light, Rendering
 from p2p_lib.synthetic.shapes import Mesh
 
@@ -56,6 +56,4 @@ def _blocked(mesh: Mesh, T_model_world: np.ndarray, points: np.ndarray, way: np.
     """Whether a mesh is in the way of points (N, 3) in a direction (3,)."""
     if not len(points):
         return np.zeros(0, bool)
-    rays = np.empty((len(points), 6), np.float32)
-    rays[:, :3], rays[:, 3:] = se3.transform(T_model_world, points), T_model_world[:3, :3] @ way
-    return mesh.ray_scene.test_occlusions(load_open3d().core.Tensor(rays), tnear=1e-3).numpy()
+    return blocked(mesh.ray_scene, se3.transform(T_model_world, points), T_model_world[:3, :3] @ way)

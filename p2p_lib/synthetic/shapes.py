@@ -12,7 +12,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.raycasting import ray_scene
+from p2p_lib.core.raycasting import SurfaceDistance, ray_scene
 from p2p_lib.synthetic import labels, texture
 
 #: Print resolution of the procedural labels; at 0.5 m and 615 px focal length the image has 1.2 px/mm.
@@ -77,6 +77,11 @@ class Mesh:
     def ray_scene(self) -> Any:
         """The mesh for :mod:`p2p_lib.core.raycasting`."""
         return ray_scene(self.vertices, self.faces)
+
+    @cached_property
+    def distance(self) -> SurfaceDistance:
+        """How far points are from the surface."""
+        return SurfaceDistance(self.vertices, self.faces)
 
     def sample(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draws n points (n, 3) and normals (n, 3) on the surface, even in area, in model coordinates."""

@@ -214,7 +214,7 @@ def test_a_scheduler_that_does_not_answer_is_named(plan, tmp_path, monkeypatch):
 
 def test_without_distributed_it_says_what_to_install(plan, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    told = r"--scheduler: the package distributed cannot be loaded .*\. Run: .*distributed"
+    told = r"--scheduler: the package distributed cannot be loaded .*\. Run: .*p2p_lib\[dask\]"
     with pytest.raises(MissingBackend, match=told):
         run_benchmark(plan, tmp_path, "quick", scheduler="tcp://127.0.0.1:9", progress=False)
 

@@ -6,7 +6,7 @@ import trimesh
 
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.native import load_open3d
-from p2p_lib.core.raycasting import cast, ray_scene
+from p2p_lib.core.raycasting import SurfaceDistance, blocked, cast, ray_scene
 
 
 def test_a_box_in_closed_form():
@@ -42,3 +42,16 @@ def test_open3d_sees_the_same():
     np.testing.assert_allclose(
         found["primitive_normals"][met & same], other["primitive_normals"][met & same], atol=1e-5
     )
+
+
+def test_what_is_in_the_way_and_how_far_a_surface_is():
+    """Of a box: by arithmetic."""
+    box, rng = trimesh.creation.box([0.2, 0.4, 0.6]), np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (2000, 3))
+    off = np.abs(points) - np.array([0.1, 0.2, 0.3])
+    outside = np.linalg.norm(np.maximum(off, 0), axis=1)
+    true_m = np.where((off < 0).all(1), -off.max(1), outside)
+    np.testing.assert_allclose(SurfaceDistance(box.vertices, box.faces)(points), true_m, atol=1e-6)
+    below = (np.abs(points[:, :2]) < [0.1, 0.2]).all(1) & (points[:, 2] < 0.299)
+    assert 50 < below.sum() < 1000
+    np.testing.assert_array_equal(blocked(ray_scene(box.vertices, box.faces), points, np.array([0, 0, 1.0])), below)
