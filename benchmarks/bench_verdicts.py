@@ -122,7 +122,8 @@ PAGE = """# What is said of a run without its truth
 Written by `python benchmarks/bench_verdicts.py`; do not edit. Runs of commit {commit}. *Worth*: good from {GOOD} on,
 bad below {BAD} (AUC in percent; in between a run is not counted), or bad by what was done wrong on purpose: clicks on
 a table, a wall or two objects, depth in another unit, a tracker of 2D motion alone, no long memory, no gates. One
-limit, that of jumps (8 to 12 px), was moved after a first look at the runs kept aside, where it had called two good ones bad.
+limit, that of jumps (8 to 12 px), was moved after a first look at the runs kept aside, where it had called two good
+ones bad.
 
 {counts}
 Nothing that a run keeps tells a scale of depth that is wrong by a factor (`bad_mustard_scale01`) nor a wrong focal
