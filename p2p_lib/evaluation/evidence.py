@@ -5,8 +5,9 @@ Nothing here judges; :mod:`p2p_lib.evaluation.suspicions` does.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +35,8 @@ _RIM_CELLS = 2
 _GAP_CELLS = 3
 
 
-class SurfaceFit(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class SurfaceFit:
     """How the surface lies in the images: (n,) shares each, NaN in frames that were not looked at.
 
     on_surface  of the surface in view, where depth was measured on it; through: behind it

@@ -23,6 +23,7 @@ from p2p_lib.extended.sight import Sight, cut_off
 from p2p_lib.method import registration
 from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
 from p2p_lib.method.policy import Admission, Candidate, Policy, Verdict
+from p2p_lib.method.refinement import Refinement as Refinement  # the type of an inherited field
 from p2p_lib.method.registration import Hypothesis
 
 #: A pose that nothing has told from others since a gap is compared again every so many frames.

@@ -9,6 +9,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.image import bounds
+from p2p_lib.core.types import Frame as Frame  # the type of an inherited field
 from p2p_lib.core.types import Tracks
 from p2p_lib.extended.agreement import outline_share
 from p2p_lib.extended.frame_guard import StillFrame
