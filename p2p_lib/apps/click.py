@@ -135,8 +135,8 @@ def clicked_masks(sequence: Sequence, prompts: Iterable[Prompt], config: Config 
     """Each object's first mask, as the built-in segmenter cuts it out of the frame that its first prompt is of."""
     config, found = config or preset(), {}
     for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
-        frame, rng = sequence.frame(i), np.random.default_rng(config.seed)
-        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation, rng)
+        frame = sequence.frame(i)
+        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation)
         labels = segmenter.segment(frame, [prompt for prompt in said if prompt.name not in found])
         found |= {name: (frame, labels == label) for label, name in enumerate(segmenter.names, 1)}
     return found

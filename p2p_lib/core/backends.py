@@ -29,7 +29,7 @@ DETECTORS = {
     "orb": "p2p_lib.detectors.classical:OrbDetector",
     "superpoint": "p2p_lib.detectors.superpoint:load",
 }
-#: Segmenters by the name that --masks takes, as module:callable(camera, config, rng).
+#: Segmenters by the name that --masks takes, as module:callable(camera, config).
 SEGMENTERS = {
     "builtin": "p2p_lib.segmenters.anchored:builtin",
     "sam2": "p2p_lib.segmenters.anchored:sam2",
@@ -58,13 +58,11 @@ def make_detector(detector: str | Detector, config: SamplingConfig, rng: np.rand
     return _find("detector", detector, DETECTORS)(config, rng) if isinstance(detector, str) else detector
 
 
-def make_segmenter(
-    segmenter: str | Segmenter, camera: Camera, config: SegmentationConfig, rng: np.random.Generator
-) -> Segmenter:
+def make_segmenter(segmenter: str | Segmenter, camera: Camera, config: SegmentationConfig) -> Segmenter:
     """The segmenter of this name, or the one given; :class:`BadInput` lists the known names."""
     if not isinstance(segmenter, str):
         return segmenter
-    return _find("segmenter", segmenter, SEGMENTERS)(camera, config, rng)
+    return _find("segmenter", segmenter, SEGMENTERS)(camera, config)
 
 
 def _find(kind: str, name: str, known: dict[str, str]) -> Any:

@@ -21,13 +21,16 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
 from p2p_lib.core.errors import BadInput, MissingData
+
+T = TypeVar("T")
 
 #: Bytes of any file; of JSON and tables; of a pickle; of TOML and its lines, the square of which its reader takes.
 LARGEST_FILE, LARGEST_TEXT, LARGEST_PICKLE = 1 << 28, 1 << 26, 1 << 22
@@ -118,6 +121,19 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     except UNREADABLE as error:
         raise BadInput(str(path), f"an unreadable archive ({error})", expected) from None
     raise BadInput(str(path), f"arrays of {size} bytes", f"at most {LARGEST_ARRAYS}")
+
+
+def load_by_object(path: Path, kind: type[T]) -> dict[str, T]:
+    """Object to its arrays, fields of the dataclass ``kind``, of a file that holds them as ``OBJECT/FIELD``.
+
+    Empty where there is no file; :class:`BadInput` where one is damaged or lacks a field.
+    """
+    arrays = load_arrays(path)
+    names = dict.fromkeys(key.rsplit("/", 1)[0] for key in arrays)
+    try:
+        return {n: kind(*(arrays[f"{n}/{f.name}"] for f in fields(kind))) for n in names}  # type: ignore[arg-type]
+    except (KeyError, TypeError) as error:
+        raise BadInput(str(path), f"an archive without {error}", "arrays as p2p run wrote them") from None
 
 
 def file_name(what: str, name: object) -> str:

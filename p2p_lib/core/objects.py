@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -16,7 +17,7 @@ from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 
 
-class Objects:
+class Objects(ABC):
     """What a user adds, corrects and removes; whoever tracks them says what it is to ``begin`` one.
 
     refused  of objects whose last prompt did not fit the frame that it was made on: why it was not used
@@ -29,18 +30,18 @@ class Objects:
         self._said: dict[str, Prompt] = {}  # in the frame to come
 
     @property
+    @abstractmethod
     def tracker(self) -> PointTracker:
         """The 2D tracker."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def segmenter(self) -> Segmenter:
         """What finds the objects in frames without their masks."""
-        raise NotImplementedError
 
+    @abstractmethod
     def begin(self, name: str) -> None:
         """A new object, without anything known of it."""
-        raise NotImplementedError
 
     def add_object(
         self,

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.files import load_arrays, replacing
+from p2p_lib.core.files import load_by_object, replacing
 
 FILE = "keypoints.npz"
 
@@ -72,10 +72,4 @@ class KeypointLog:
 
 def load_keypoints(folder: str | Path) -> dict[str, ObjectKeypoints]:
     """Object to its keypoints; empty for a run that was killed before it could write them."""
-    path = Path(folder) / FILE
-    arrays = load_arrays(path)
-    names = dict.fromkeys(key.rsplit("/", 1)[0] for key in arrays)
-    try:
-        return {n: ObjectKeypoints(*(arrays[f"{n}/{f.name}"] for f in fields(ObjectKeypoints))) for n in names}
-    except (KeyError, TypeError) as error:
-        raise BadInput(str(path), f"an archive without {error}", "arrays as p2p run wrote them") from None
+    return load_by_object(Path(folder) / FILE, ObjectKeypoints)

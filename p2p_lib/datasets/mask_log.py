@@ -7,7 +7,7 @@ images. Every :data:`CELL_PX`-th pixel of every such row is kept, as bits: about
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.files import load_arrays, replacing
+from p2p_lib.core.files import load_by_object, replacing
 from p2p_lib.core.types import Frame
 
 FILE = "masks.npz"
@@ -116,13 +116,7 @@ class MaskLog:
 
 def load_masks(folder: str | Path) -> dict[str, ObjectMasks]:
     """Object to its masks; empty for a run that was killed before it could write them, and for older ones."""
-    path = Path(folder) / FILE
-    arrays = load_arrays(path)
-    names = dict.fromkeys(key.rsplit("/", 1)[0] for key in arrays)
-    try:
-        return {n: ObjectMasks(*(arrays[f"{n}/{f.name}"] for f in fields(ObjectMasks))) for n in names}
-    except (KeyError, TypeError) as error:
-        raise BadInput(str(path), f"an archive without {error}", "arrays as p2p run wrote them") from None
+    return load_by_object(Path(folder) / FILE, ObjectMasks)
 
 
 def _measured(p_cam: np.ndarray) -> tuple[float, np.ndarray]:

@@ -57,7 +57,7 @@ class Outlook:
         should show, which the tracker checks by their appearance: so an object is back in the frame of its return.
         """
         known, unknown = self.known, obs.mask is None or self.known.model.empty
-        if unknown or self._hidden(obs):
+        if unknown or self.policy.hidden(obs):
             return None
         enough = known.keypoints(obs).sum() >= self.policy.config.keypoint_map.keyframe_min_points
         if known.life.has_pose and (enough or obs.frame.index % _LOOK_EVERY):
@@ -72,7 +72,7 @@ class Outlook:
 
     def sighted(self, obs: Sight) -> Sighting | None:
         """Where a sought object shows by shape and colour."""
-        if not (self.sought and self.policy.shape.knows(self.known)) or self._hidden(obs):
+        if not (self.sought and self.policy.shape.knows(self.known)) or self.policy.hidden(obs):
             return None
         return self.policy.shape.sighted(obs, self.known, self.policy.carried(self.known, obs.frame.time_s))
 
@@ -87,7 +87,7 @@ class Outlook:
         best = max(self.policy.propose(obs, known), key=lambda h: h.support, default=None)
         if self.sought:
             agrees = np.zeros(len(known.map), bool) if best is None else best.inliers
-            certain = obs.seen & (obs.tracks.uncertainty <= self.policy.config.registration.max_uncertainty)
+            _, certain = self.policy.correspondences(obs, known)
             requests = Requests(reject=known.map.ids[certain & ~agrees])
             enough = best is not None and best.support >= self.policy.config.lifecycle.return_inliers
             if obs.sighting is not None and not enough:
@@ -104,9 +104,6 @@ class Outlook:
 
     def _hint(self, frame: Frame, uv_px: np.ndarray, T_cam_obj: np.ndarray, sighted: bool) -> Hint:
         return replace(hint_at(frame, self.known, self.policy.observer, uv_px, T_cam_obj), sighted=sighted)
-
-    def _hidden(self, obs: Sight) -> bool:
-        return obs.mask_px is not None and obs.mask_px < self.policy.config.lifecycle.min_mask_px
 
     def _gone(self, frame: Frame) -> bool:
         """Whether nothing of an absent object would show in the image if it has lain still; False if nobody knows."""

@@ -176,7 +176,7 @@ class TwoMaps:
 
     def _step(self, obs: Sight) -> ObjectStep:
         own = self.own
-        if own.hidden(obs) or (own.model.empty and not self._still_growing(obs)):
+        if own.policy.hidden(obs) or (own.model.empty and not self._still_growing(obs)):
             return own.step(obs)
         if own.model.empty:
             return own.absent(obs, Verdict(False, Status.INITIALISING, _STILL_GROWING))

@@ -106,7 +106,7 @@ class ObjectTracker:
 
     def find(self, obs: Observation) -> tuple[Candidate | None, Verdict]:
         """Register, select and refine, judge: the pose, None where there is none, and whether it stands."""
-        if self.hidden(obs):
+        if self.policy.hidden(obs):
             return None, Verdict(False, Status.OCCLUDED, f"{obs.mask_px} mask pixels")
         best, reason = self.policy.choose(obs, self.known, self.policy.propose(obs, self.known))
         if best is None:
@@ -144,7 +144,7 @@ class ObjectTracker:
 
     def begin(self, obs: Observation) -> ObjectStep:
         """The first frame of a map: fix the object frame and start with the first points."""
-        if obs.mask_px is None or self.hidden(obs):
+        if obs.mask_px is None or self.policy.hidden(obs):
             return self.absent(obs, Verdict(False, Status.INITIALISING, "not seen yet"))
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < self.config.lifecycle.min_mask_px:
@@ -202,10 +202,6 @@ class ObjectTracker:
         T_cam_obj = self.model.adopt()
         if T_cam_obj is not None:
             self.life = self.life.corrected(T_cam_obj)
-
-    def hidden(self, obs: Observation) -> bool:
-        """Whether the mask says that nothing of the object is to be seen."""
-        return obs.mask_px is not None and obs.mask_px < self.config.lifecycle.min_mask_px
 
     def awaited(self, mask: np.ndarray | None) -> bool:
         """Whether the object had no pose until now and its mask says that it is back."""

@@ -71,11 +71,10 @@ class Point2Pose(Objects):
             fix = "p2p_lib.Point2Pose composes them."
             raise BadInput("config method.mechanisms", repr(self.config.method.mechanisms), "none", fix)
         self._parts = parts or Parts()
-        rng, seed = np.random.default_rng(self.config.seed), self.config.seed
+        rng = np.random.default_rng(self.config.seed)
         tracker = backends.make_tracker(tracker, self.config.tracking, rng)
         self.detector = backends.make_detector(detector, self.config.sampling, rng)
-        rng = np.random.default_rng([seed, 1])
-        segmenter = backends.make_segmenter(segmenter, camera, self.config.segmentation, rng)
+        segmenter = backends.make_segmenter(segmenter, camera, self.config.segmentation)
         self.frame: Frame | None = None
         self.stopwatch = Stopwatch()
         self._beside = ThreadPoolExecutor(2, "p2p")

@@ -89,6 +89,10 @@ class Policy:
             use, _ = self.correspondences(obs, known)
             return self.register(known, np.where(use[:, None], obs.p_cam, np.nan))
 
+    def hidden(self, obs: Observation) -> bool:
+        """Whether the mask says that nothing of the object is to be seen."""
+        return obs.mask_px is not None and obs.mask_px < self.config.lifecycle.min_mask_px
+
     def correspondences(self, obs: Observation, known: Known) -> tuple[np.ndarray, np.ndarray]:
         """(N,) bool each: the points to register, and all that are certain enough for it."""
         certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)

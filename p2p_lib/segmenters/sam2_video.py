@@ -36,7 +36,7 @@ _READ_ONCE = ("pred_masks", "high_res_masks")
 _SPATIAL = ("maskmem_features", "maskmem_pos_enc")
 
 
-def load(camera: Camera, config: SegmentationConfig, rng: np.random.Generator | None = None) -> Sam2VideoSegmenter:
+def load(camera: Camera, config: SegmentationConfig) -> Sam2VideoSegmenter:
     """The segmenter with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
     packages.load("torch", "sam2_video", "transformers")
     transformers = packages.load("transformers", "sam2_video", "transformers")

@@ -1002,6 +1002,16 @@ def test_a_hint_rejects_what_agrees_on_no_pose_only_while_it_is_away():
     assert set(requests.reject.tolist()) >= set(few.ids[visible_first(6)(few)].tolist()) & set(lifted.tolist()) != set()
 
 
+def test_the_papers_hint_needs_the_points_of_a_return_too():
+    """One object by itself, without what looks after absent ones."""
+    lump = settled(begun(), [2])
+    frame, own = lump.observed(turned(4)).frame, lump.tracker.own
+    lump.see(turned(3), mask=np.zeros((CAMERA.height, CAMERA.width), bool))
+    tracks = lump.tracks(turned(4))
+    few = replace(tracks, visible=tracks.visible & (np.cumsum(tracks.visible) <= 6))
+    assert [len(own.hint(lump.tracker.observe(frame, None, seen)).uv_px) > 0 for seen in (few, tracks)] == [False, True]
+
+
 def test_a_hint_leaves_doubtful_tracks_to_the_tracker():
     """An object that comes out from behind another: its points are found before they are certain."""
     lump = settled(begun(), [2])

@@ -134,7 +134,7 @@ def test_points_agree_with_an_earlier_frame_at_their_depth_and_in_their_colour()
 @pytest.mark.parametrize("part_moves", [True, False])
 def test_the_segmenter_takes_in_what_moves_along(part_moves):
     """Clicks lie on the plate alone; the pose of the plate is known. What stands still beside it stays outside."""
-    segmenter = BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0))
+    segmenter = BuiltinSegmenter(CAMERA, CONFIG)
     clicks = [Prompt("it", 0, np.array([[130.0, 125], [150, 130], [140, 140]]))]
     points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
     for k in range(26):
@@ -183,7 +183,7 @@ def scene_of_nothing(k: int) -> Frame:
 
 def test_there_is_room_for_parts_that_reach_farther_than_all_that_was_seen():
     """The part sticks out of the box that the plate alone asks for."""
-    segmenter, tall = BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0)), (125, 20, 30, 90)
+    segmenter, tall = BuiltinSegmenter(CAMERA, CONFIG), (125, 20, 30, 90)
     points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
     for k in range(36):
         moved_m = 0.003 * k
@@ -207,7 +207,7 @@ def test_a_look_alike_in_view_is_not_the_absent_object():
             rgb[:, :150], depth[:, :150] = 90, 0.5
         return Frame(k, k / 30, rgb, depth)
 
-    segmenter = BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0))
+    segmenter = BuiltinSegmenter(CAMERA, CONFIG)
     clicks = [
         Prompt(name, 0, np.add(at_px[:2], [[15.0, 15], [30, 30], [15, 35]]))
         for name, at_px in (("one", here), ("two", there))

@@ -42,7 +42,7 @@ def picture(k: int = 0, moved: int = 0, likeness: float = 0.0) -> Frame:
 
 
 def segmenter() -> BuiltinSegmenter:
-    return BuiltinSegmenter(CAMERA, preset().segmentation, np.random.default_rng(0))
+    return BuiltinSegmenter(CAMERA, preset().segmentation)
 
 
 def iou(one: np.ndarray, other: np.ndarray) -> float:

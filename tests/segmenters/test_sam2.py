@@ -140,6 +140,8 @@ def test_nothing_is_taken_where_nothing_fits():
     assert question.answer(offered(mask_of(GREEN_PX), score=[0.99]), FEATURES) is None
     assert question.answer(offered(mask_of(RED_PX), score=[0.1]), FEATURES) is None
     assert question.answer(offered(mask_of(RED_PX), score=[0.9]), FEATURES) is not None
+    beside = Question.of_prompt(Prompt("red", points_px=AT_RED), mask_of(RED_PX), np.array(AT_GREEN))
+    assert beside.answer(offered(mask_of(RED_PX) | mask_of(GREEN_PX), score=[0.99]), FEATURES) is None
 
 
 def test_of_like_candidates_the_followed_mask_decides():
@@ -175,9 +177,7 @@ def test_specks_and_pinholes_go_and_a_handle_stays():
 
 def segmenter(network, every=None, config=None):
     config = config or preset().segmentation
-    return BuiltinSegmenter(
-        CAMERA, config, np.random.default_rng(0), Sam2Refiner(lambda: network, CAMERA, config, every)
-    )
+    return BuiltinSegmenter(CAMERA, config, Sam2Refiner(lambda: network, CAMERA, config, every))
 
 
 def prompts():
@@ -221,7 +221,7 @@ def test_a_correction_beside_the_object_keeps_the_rest_of_it(network):
 def test_the_built_in_mask_stays_where_no_candidate_fits(network):
     network._decoder.scores = (0.1, 0.1, 0.1)
     labels = segmenter(network).segment(frame_of(), prompts())
-    alone = BuiltinSegmenter(CAMERA, preset().segmentation, np.random.default_rng(0)).segment(frame_of(), prompts())
+    alone = BuiltinSegmenter(CAMERA, preset().segmentation).segment(frame_of(), prompts())
     assert np.array_equal(labels, alone) and labels.any()
 
 
@@ -266,21 +266,20 @@ def test_beside_the_tracking_an_answer_arrives_later_where_the_object_is_then(ne
 
 def test_without_weights_the_built_in_segmenter_is_alone_and_sam2_says_what_to_fetch(monkeypatch, tmp_path):
     monkeypatch.setenv("P2P_DATA", str(tmp_path))
-    config, rng = preset().segmentation, np.random.default_rng(0)
-    assert make_segmenter("builtin", CAMERA, config, rng).name == "builtin"
+    config = preset().segmentation
+    assert make_segmenter("builtin", CAMERA, config).name == "builtin"
     for name, changed in (("sam2", {}), ("builtin", {"segmentation.first_masks": "sam2"})):
         with pytest.raises(MissingBackend, match=r"onnxruntime|p2p data fetch sam2"):
-            make_segmenter(name, CAMERA, preset().with_values(changed).segmentation, rng)
+            make_segmenter(name, CAMERA, preset().with_values(changed).segmentation)
 
 
 def test_where_the_weights_are_prompts_are_its_own_unless_told_otherwise(monkeypatch):
     monkeypatch.setattr(anchored, "_available", lambda: True)
-    rng = np.random.default_rng(0)
     config = {
         name: preset().with_values({"segmentation.first_masks": name}).segmentation for name in ("auto", "builtin")
     }
-    assert make_segmenter("builtin", CAMERA, config["auto"], rng).name == "builtin+sam2"
-    assert make_segmenter("builtin", CAMERA, config["builtin"], rng).name == "builtin"
+    assert make_segmenter("builtin", CAMERA, config["auto"]).name == "builtin+sam2"
+    assert make_segmenter("builtin", CAMERA, config["builtin"]).name == "builtin"
 
 
 @pytest.mark.parametrize("name", ["builtin", "sam2"])
@@ -289,7 +288,7 @@ def test_as_p2p_live_wants_it_it_works_beside_the_tracking(monkeypatch, network,
     monkeypatch.setattr(sam2_image, "load", lambda threads: network)
     sam2._network.cache_clear()
     config = preset().with_values({"segmentation.sam2_every": 0}).segmentation
-    of = make_segmenter(name, CAMERA, config, np.random.default_rng(0))
+    of = make_segmenter(name, CAMERA, config)
     assert iou(of.segment(frame_of(), prompts()) == 1, mask_of(RED_PX)) > 0.95
     of.segment(frame_of(1, 1))
     working = of._refiner._working
@@ -313,7 +312,7 @@ def test_real_weights_cut_out_a_mug_in_a_hand(shared_data):
     folder = shared_data / "real_hand" / "mug_in_hand"
     sequence = open_sequence(folder)
     config = preset().with_values({"segmentation.first_masks": "sam2"}).segmentation
-    of = make_segmenter("builtin", sequence.camera, config, np.random.default_rng(0))
+    of = make_segmenter("builtin", sequence.camera, config)
     labels = of.segment(sequence.frame(0), load_prompts(shared_data / "prompts" / "mug_in_hand.json"))
     truth = cv2.imread(str(sorted((folder / "reference_masks" / "mug").glob("*.png"))[0]), 0) > 0
     assert iou(labels == 1, truth) > 0.95

@@ -294,7 +294,7 @@ def test_clicks_without_depth_are_refused(model):
 def test_it_says_what_to_install_or_fetch(monkeypatch):
     monkeypatch.delenv("P2P_DATA", raising=False)
     with pytest.raises(MissingBackend) as error:
-        make_segmenter("sam2_video", CAMERA, preset().segmentation, np.random.default_rng(0))
+        make_segmenter("sam2_video", CAMERA, preset().segmentation)
     if importlib.util.find_spec("transformers") is None:
         assert "pip install" in str(error.value) and "transformers" in str(error.value)
     else:

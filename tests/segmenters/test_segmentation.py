@@ -66,7 +66,7 @@ def on(**at) -> list[Prompt]:
 
 
 def segmenter() -> BuiltinSegmenter:
-    return BuiltinSegmenter(CAMERA, CONFIG, np.random.default_rng(0))
+    return BuiltinSegmenter(CAMERA, CONFIG)
 
 
 def iou(one: np.ndarray, other: np.ndarray) -> float:
@@ -420,7 +420,7 @@ def test_clicks_without_depth_name_the_click():
 def test_embedded_sequence(seed):
     """The first pass of synthetic/crossing: new sides come into view, and one covers part of the other."""
     sequence = open_sequence("synthetic/crossing", seed=seed)
-    new = BuiltinSegmenter(sequence.camera, CONFIG, np.random.default_rng(0))
+    new = BuiltinSegmenter(sequence.camera, CONFIG)
     rng, first, clicks = np.random.default_rng(seed), sequence.frame(0), []
     for name, mask in sequence.masks(0).items():
         v, u = np.nonzero((cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0) & (first.depth_m > 0))

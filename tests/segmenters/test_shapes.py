@@ -37,7 +37,7 @@ for h, w in eval(sys.argv[1]):
 OBJECTS = """
 for left, top, w, h in eval(sys.argv[1]):
     print(left, top, w, h, flush=True)
-    segmenter = BuiltinSegmenter(camera, config, np.random.default_rng(0))
+    segmenter = BuiltinSegmenter(camera, config)
     box = np.s_[max(top, 0) : top + h, max(left, 0) : left + w]
     u, v = np.clip([left + w // 2, top + h // 2], 0, [319, 239])
     for k in range(4):

@@ -55,13 +55,7 @@ class BuiltinSegmenter:
     refiner  may replace what is claimed for an object in a frame, before it is labelled and learnt from
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        config: SegmentationConfig,
-        rng: np.random.Generator | None = None,
-        refiner: Refiner | None = None,
-    ):
+    def __init__(self, camera: Camera, config: SegmentationConfig, refiner: Refiner | None = None):
         self.name = "builtin" if refiner is None else refiner.name
         self.camera, self.config, self._refiner = camera, config, refiner
         self._targets: dict[str, Target] = {}

@@ -36,7 +36,6 @@ _EYE2, _EYE3 = np.eye(2), np.eye(3)
 _FOLLOWED = 0.5
 #: Covariance of a matched corner on its segment (m^2), and of where it is seen (px^2).
 _MATCHED_M2, _MATCHED_PX2 = 0.001**2 * _EYE3, 1.5**2 * _EYE2
-_NO_ROWS = np.zeros(0, np.int64)
 
 
 @dataclass(eq=False)
