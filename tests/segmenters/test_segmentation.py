@@ -556,13 +556,3 @@ def test_what_leaps_is_found_by_its_colours_near_to_where_it_was():
     for k, frame in enumerate(_leap((158, 96))):
         found = follow.segment(frame, () if k else on(card=(100, 80))) == 1
     assert iou(found, card((158, 96))) > 0.85
-
-
-def test_a_place_without_the_colours_is_not_the_object_though_it_is_sighted_there():
-    """A shape says that it is back where only the wall is: it is followed where it is."""
-    follow, frames = segmenter(), _leap((100, 80))
-    for k, frame in enumerate(frames[:4]):
-        follow.segment(frame, () if k else on(card=(100, 80)))
-    wall_px = np.stack(np.meshgrid(np.arange(20, 60, 6), np.arange(150, 200, 6)), -1).reshape(-1, 2).astype(float)
-    found = follow.segment(frames[4], hints={"card": Hint(wall_px, T_cam_obj=np.eye(4), sighted=True)}) == 1
-    assert iou(found, card((100, 80))) > 0.85

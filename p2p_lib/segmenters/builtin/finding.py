@@ -9,7 +9,7 @@ import numpy as np
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
-from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, max_plane_height_m, strange
+from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, max_plane_height_m
 from p2p_lib.segmenters.builtin.patch import (
     Patch,
     around,
@@ -54,9 +54,7 @@ def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
     background = (patch.border() | barred) & ~seeds
     x = keep_seeded_components(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
     own_colours = colour[x > 0.5]
-    if not len(own_colours) or strange(patch, x > 0.5, target.colours):
-        return None
-    return (patch.box, patch.up(x)) if hint.sighted or own_colours.mean() > 0 else None
+    return (patch.box, patch.up(x)) if len(own_colours) and (hint.sighted or own_colours.mean() > 0) else None
 
 
 def near_last(view: View, target: Target, hint: Hint) -> Hint:

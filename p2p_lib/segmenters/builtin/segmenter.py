@@ -154,10 +154,7 @@ class BuiltinSegmenter:
         if hint.gone:
             return target, None
         if predicted is None or hint.sighted:  # what has been followed is not where the object was found
-            claim = find(view, target, hint, taken)
-            if predicted is None or claim is not None:
-                return target, claim
-            target, hint = replace(target, confident=False), Hint()  # nor is it where it was sighted
+            return target, find(view, target, hint, taken)
         due = target.confident and target.past.due(view.frame)
         target = with_room(view, target, hint) if due else target
         claim = follow(view, target, hint, predicted)
