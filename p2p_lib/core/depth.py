@@ -52,6 +52,21 @@ def off_edges(depth_m: np.ndarray, edge_m: float) -> np.ndarray:
     return (low > 0) & (high - low <= edge_m)
 
 
+def of_one_surface(
+    depth_m: np.ndarray, mask: np.ndarray, border_px: int, edge_m: float, narrow: bool = True
+) -> np.ndarray:
+    """(H, W) bool: pixels of a mask whose depth does not mix two surfaces.
+
+    Off a border of the mask, with a whole 3x3 neighbourhood that holds no step larger than ``edge_m``.
+
+    narrow  whether parts that are too narrow for this keep the pixels that agree with what is around them in the mask
+    """
+    square = np.ones((2 * border_px + 1,) * 2, np.uint8)
+    inner = cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    found = inner & off_edges(depth_m, edge_m)
+    return found | (narrow_parts(mask, border_px) & agreeing(depth_m, mask, edge_m)) if narrow else found
+
+
 def narrow_parts(mask: np.ndarray, border_px: int) -> np.ndarray:
     """(H, W) bool: where the mask is so narrow that a border of so many pixels leaves nothing of it nearby."""
     inside = np.ascontiguousarray(mask).astype(np.uint8)

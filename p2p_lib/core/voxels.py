@@ -116,7 +116,7 @@ def _trilinear(value: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> np.
 
 
 @compiled
-def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, hi, near, behind, tau_m, inside_m, carve):
+def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, hi, near, behind, tau, inside_m, carve):
     height, width = depth_m.shape
     touched = 0
     for i in range(lo[0], hi[0]):
@@ -134,10 +134,10 @@ def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, h
                     continue
                 row, column = int(v), int(u)
                 d = depth_m[row, column] - z
-                if d < -tau_m or (carve and d < tau_m and not inside[row, column]):
+                if d < -tau or (carve and d < tau and not inside[row, column]):
                     continue
                 touched += 1
-                phi, at = min(d / tau_m, 1.0), (i - first[0], j - first[1], k - first[2])
+                phi, at = min(d / tau, 1.0), (i - first[0], j - first[1], k - first[2])
                 weight = near if d >= -inside_m else behind
                 total[at] += weight * phi
                 count[at] += weight
