@@ -261,13 +261,6 @@ class TsdfConfig(_Checked):
     truncation_voxels: float = _p(5.0, "The truncation tau is so many voxels.", "voxels", "release", low=1)
     max_voxels: int = _p(8_000_000, "A volume has at most so many voxels; parts beyond are left out.", low=1000)
     carve: bool = _p(True, "Depth behind the object, outside the mask, carves free space.")
-    behind_weight: float = _p(
-        0.25,
-        "What lies deeper behind the surface than noise explains counts this much: it is not seen, and may be the air"
-        " before the other side of something thin.",
-        low=0,
-        high=1,
-    )
 
 
 @dataclass(frozen=True)
@@ -397,7 +390,6 @@ _TEXT: dict[str, Any] = {
     "selection.rule": "surface",
     "depth.narrow": False,
     "tsdf.carve": False,
-    "tsdf.behind_weight": 1.0,
     "refinement.residuals": "surface",
     "factor_graph.max_keyframes": 0,
 }

@@ -40,21 +40,6 @@ class Image:
     hi: np.ndarray
 
 
-@dataclass(frozen=True)
-class Rule:
-    """What a voxel at a distance d before the measured surface takes in: min(1, d / tau), unless d < -tau.
-
-    tau_m          the truncation
-    inside_m       voxels up to here behind the surface count fully, those behind by ``behind_weight``
-    carve          whether depth beside the object says what is free before it
-    """
-
-    tau_m: float
-    inside_m: float
-    behind_weight: float
-    carve: bool
-
-
 class CpuGrid:
     """Voxels (nx, ny, nz), float32: ``total`` and ``weight`` of the mean ``value``, NaN where nothing was observed.
 
@@ -82,7 +67,7 @@ class CpuGrid:
         """A NumPy copy of one of the arrays."""
         return array.copy()
 
-    def fuse(self, image: Image, A, b, first: np.ndarray, weight: float, rule: Rule) -> int:
+    def fuse(self, image: Image, A, b, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
         """Take an image into the means, or out with a negative weight; returns how many voxels it touched.
 
         A, b   (3, 3), (3,): u z, v z and z of lattice point (i, j, k) are A (i, j, k) + b
@@ -90,8 +75,7 @@ class CpuGrid:
         """
         arrays = self.total, self.weight, self.value, self.colour
         seen = image.depth_m, image.inside, image.rgbw, A, b, image.lo, image.hi
-        weights = np.float32(weight), np.float32(weight * rule.behind_weight)
-        return _fuse(*arrays, first, *seen, *weights, rule.tau_m, rule.inside_m, rule.carve)
+        return _fuse(*arrays, first, *seen, np.float32(weight), tau_m, carve)
 
     def at(self, index: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         """(K, N) values between voxels, at indices (N, 3) moved by offsets (K, 3); NaN outside and beside NaN."""
@@ -116,7 +100,7 @@ def _trilinear(value: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> np.
 
 
 @compiled
-def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, hi, near, behind, tau, inside_m, carve):
+def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, hi, weight, tau_m, carve):
     height, width = depth_m.shape
     touched = 0
     for i in range(lo[0], hi[0]):
@@ -134,11 +118,10 @@ def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, h
                     continue
                 row, column = int(v), int(u)
                 d = depth_m[row, column] - z
-                if d < -tau or (carve and d < tau and not inside[row, column]):
+                if d < -tau_m or (carve and d < tau_m and not inside[row, column]):
                     continue
                 touched += 1
-                phi, at = min(d / tau, 1.0), (i - first[0], j - first[1], k - first[2])
-                weight = near if d >= -inside_m else behind
+                phi, at = min(d / tau_m, 1.0), (i - first[0], j - first[1], k - first[2])
                 total[at] += weight * phi
                 count[at] += weight
                 if count[at] == 0:  # all were taken out again: what the total still holds is rounding
@@ -172,17 +155,15 @@ class TorchGrid(CpuGrid):
         """A NumPy copy of one of the tensors."""
         return array.cpu().numpy().copy()
 
-    def fuse(self, image: Image, A, b, first: np.ndarray, weight: float, rule: Rule) -> int:
+    def fuse(self, image: Image, A, b, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
         """As on the CPU."""
         import torch
-
-        tau_m = rule.tau_m
 
         def flat(array: np.ndarray) -> torch.Tensor:
             return torch.from_numpy(np.ascontiguousarray(array)).to(self.device).flatten(-2)
 
         depth, rgbw = flat(image.depth_m).double(), flat(image.rgbw.astype(np.float32))
-        gate = flat(np.where(image.inside | (not rule.carve), -tau_m, tau_m))
+        gate = flat(np.where(image.inside | (not carve), -tau_m, tau_m))
         sheet = max(1, _AT_ONCE // max(int(np.prod(image.hi[1:] - image.lo[1:])), 1))
         touched = 0
         for x in range(image.lo[0], image.hi[0], sheet):
@@ -192,10 +173,9 @@ class TorchGrid(CpuGrid):
             d = depth[pixel] - z
             hit = (d >= gate[pixel]).nonzero().view(-1)
             phi = (d[hit] / tau_m).clamp_(max=1.0)
-            counts = torch.where(d[hit] >= -rule.inside_m, weight, weight * rule.behind_weight).float()
-            self._accumulate(at[hit], phi, counts)
-            near = (phi < 1).nonzero().view(-1)
-            self.colour.view(4, -1).index_add_(1, at[hit[near]], rgbw[:, pixel[hit[near]]] * counts[near])
+            self._accumulate(at[hit], phi, weight)
+            near = hit[(phi < 1).nonzero().view(-1)]
+            self.colour.view(4, -1).index_add_(1, at[near], rgbw[:, pixel[near]], alpha=weight)
             touched += len(hit)
         return touched
 
@@ -215,10 +195,10 @@ class TorchGrid(CpuGrid):
         at = ((i - int(first[0])) * ny + j - int(first[1])) * nz + k - int(first[2])
         return at.view(-1), pixel.view(-1), z.view(-1)
 
-    def _accumulate(self, at: torch.Tensor, phi: torch.Tensor, weight: torch.Tensor) -> None:
+    def _accumulate(self, at: torch.Tensor, phi: torch.Tensor, weight: float) -> None:
         total, count = self.total.view(-1), self.weight.view(-1)
-        new_total, new_count = total[at] + phi.float() * weight, count[at] + weight
-        if len(weight) and weight[0] < 0:
+        new_total, new_count = total[at].add_(phi.float(), alpha=weight), count[at].add_(weight)
+        if weight < 0:
             new_total.masked_fill_(new_count == 0, 0.0)
         total[at], count[at] = new_total, new_count
         # 0 / 0 is NaN, which is what an unobserved voxel holds.

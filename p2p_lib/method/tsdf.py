@@ -20,15 +20,13 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TsdfConfig
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.voxels import CpuGrid, Image, Rule, TorchGrid
+from p2p_lib.core.voxels import CpuGrid, Image, TorchGrid
 
 if TYPE_CHECKING:
     import trimesh
 
 #: The grid's sides are multiples of this many voxels, so that it grows seldom.
 BLOCK = 8
-#: So many voxels behind a measured surface are within it: the wall of what may be thin.
-_INSIDE_VOXELS = 2.5
 #: Room around new surface when the grid grows.
 _PADDING_M = 0.02
 #: Depth pixels looked at to decide where the object is.
@@ -87,7 +85,6 @@ class TsdfVolume:
     ):
         self.config = config
         self.voxel_m, self.tau_m = config.voxel_m, config.voxel_m * config.truncation_voxels
-        self._rule = Rule(self.tau_m, _INSIDE_VOXELS * self.voxel_m, config.behind_weight, config.carve)
         self.grows = 0 in shape
         self.anchor_m = np.zeros(3) if origin_m is None else np.asarray(origin_m, float)
         if np.prod(shape) > config.max_voxels:
@@ -343,7 +340,7 @@ class TsdfVolume:
         K = np.array([[cam.fx, 0, cam.cx - view.corner[0] + 1], [0, cam.fy, cam.cy - view.corner[1] + 1], [0, 0, 1.0]])
         A = K @ view.T_cam_obj[:3, :3] * self.voxel_m
         b = K @ se3.transform(view.T_cam_obj, self.anchor_m[None])[0]
-        touched = self._grid.fuse(view, A, b, self.lo, weight, self._rule)
+        touched = self._grid.fuse(view, A, b, self.lo, weight, self.tau_m, self.config.carve)
         self._total += weight * touched
         return touched
 
