@@ -19,6 +19,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
@@ -150,7 +151,7 @@ class BuiltinSegmenter:
     ) -> tuple[Target, Claim]:
         """Follow an object that was seen, or find one that was absent outside what is ``taken`` (H, W) bool."""
         agreed = hint.T_cam_obj is not None and len(hint.uv_px) >= view.config.find_points
-        target = replace(target, confident=agreed)
+        held, target = target.confident, replace(target, confident=agreed)
         if hint.gone:
             return target, None
         if predicted is None or hint.sighted:  # what has been followed is not where the object was found
@@ -158,6 +159,11 @@ class BuiltinSegmenter:
         due = target.confident and target.past.due(view.frame)
         target = with_room(view, target, hint) if due else target
         claim = follow(view, target, hint, predicted)
+        if agreed and not _holds(claim, hint.uv_px):
+            if held:  # what the flow has lost, its points have not
+                claim = find(view, target, hint, taken) or claim
+            else:
+                target = replace(target, confident=False)
         if claim is None:  # it has moved faster than the flow: it is not far from where it was
             return target, find(view, target, near_last(view, target, hint), taken)
         past = target.past.with_frame(view.frame, hint.T_cam_obj) if due else target.past
@@ -218,6 +224,14 @@ def _check(frame: Frame, said: Mapping[str, Prompt], camera: Camera) -> None:
     for prompt in (p for p in said.values() if p.mask is None):
         check_prompt(prompt, camera)
         check_depth(prompt, frame)
+
+
+def _holds(claim: Claim, uv_px: np.ndarray) -> bool:
+    """Whether most of an object's own points (N, 2) are on what is claimed for it."""
+    if claim is None:
+        return True
+    box, x = claim
+    return bool(2 * in_mask(uv_px - [box.left, box.top], x > 0.5).sum() > len(uv_px))
 
 
 def _mark(taken: np.ndarray, claim: Claim) -> None:

@@ -256,8 +256,9 @@ class MotionSegments:
         cfg = self.config
         for s, segment in enumerate(self.segments):
             rows = np.flatnonzero(p.visible & (p.segment == s))
-            # What is fast is blurred: nothing to be remembered by.
-            if not segment.posed or segment.matched or len(rows) < 2 * cfg.segment_min_points:
+            # What is fast is blurred: nothing to be remembered by where there is anything else.
+            blurred = segment.matched and len(segment.landmarks.p_seg)
+            if not segment.posed or blurred or len(rows) < 2 * cfg.segment_min_points:
                 continue
             T_seg_cam = se3.inverse(segment.fit.T_cam_seg)
             view = T_seg_cam[:3, 3] - segment.fit.centre
