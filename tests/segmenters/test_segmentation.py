@@ -16,6 +16,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.method.refinement import surface_distance
+from p2p_lib.segmenters.builtin import segmenter as segmenter_page
 from p2p_lib.segmenters.builtin.colours import colour_codes, evidence, histogram
 from p2p_lib.segmenters.builtin.patch import (
     Patch,
@@ -556,3 +557,14 @@ def test_what_leaps_is_found_by_its_colours_near_to_where_it_was():
     for k, frame in enumerate(_leap((158, 96))):
         found = follow.segment(frame, () if k else on(card=(100, 80))) == 1
     assert iou(found, card((158, 96))) > 0.85
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_mask_that_loses_the_points_which_were_on_it_is_found_anew_at_them(held, monkeypatch):
+    """Points that were not on it a frame ago may be on its double."""
+    monkeypatch.setattr(segmenter_page, "follow", lambda view, target, hint, predicted: predicted.claim)
+    follow, was, now = segmenter(), (60, 80), (170, 100)
+    for k, at in enumerate([was] * 4 + [now]):
+        hints = sure(card=at) if held or at == now else {}
+        found = follow.segment(picture(k, [(at, 1)]), () if k else on(card=was), hints) == 1
+    assert (iou(found, card(now)) > 0.85) == held

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.config import TrackingConfig
+from p2p_lib.core.types import Frame
 from p2p_lib.trackers.builtin.landmarks import Landmarks, corners
+from p2p_lib.trackers.builtin.tracker import BuiltinTracker
 from tests.trackers.made_up import CAMERA, DEPTH_M, SHAPE, grid, image, shifted, started, texture
 
 UV = grid((80, 180), (70, 170), 20)
@@ -32,6 +34,18 @@ def test_landmarks_are_added_for_new_sides_only():
     marks = Landmarks(views=np.array([[0, 0, -0.5]]))
     side = np.array([np.sin(np.radians(20)), 0, -np.cos(np.radians(20))])
     assert marks.taken_from(np.array([0, 0.01, -0.8]), 15) and not marks.taken_from(side, 15)
+
+
+def test_what_is_fast_from_the_start_is_remembered_by_its_first_view_alone():
+    tracker, now = BuiltinTracker(TrackingConfig()), image()
+    tracker.start(Frame(0, 0.0, np.repeat(now.gray[..., None], 3, 2), now.depth_m), now.camera)
+    tracker.add(UV)
+    (segment,) = tracker._segments.segments
+    count = len(segment.landmarks.p_seg)
+    assert count > 20
+    segment.matched, segment.landmarks.views = True, np.zeros((0, 3))
+    tracker._segments.add_landmarks(tracker._points, now)
+    assert len(segment.landmarks.p_seg) == count, "blurred, and there is a better view"
 
 
 def test_only_corners_on_the_segment_are_taken():

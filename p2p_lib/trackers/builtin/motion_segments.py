@@ -251,14 +251,14 @@ class MotionSegments:
         if len(np.unique(corner[agrees])) >= self.config.min_landmark_matches:
             segment.fit, segment.hidden_for = PoseFit(T, _PROPOSED_COV, segment.fit.centre), 1
 
-    def add_landmarks(self, p: Points, now: Image) -> None:
-        """Remember the corners on segments that show a new side."""
+    def add_landmarks(self, p: Points, now: Image, first: bool = False) -> None:
+        """Remember the corners on segments that show a new side; on those without any alone, if ``first``."""
         cfg = self.config
         for s, segment in enumerate(self.segments):
             rows = np.flatnonzero(p.visible & (p.segment == s))
             # What is fast is blurred: nothing to be remembered by where there is anything else.
-            blurred = segment.matched and len(segment.landmarks.p_seg)
-            if not segment.posed or blurred or len(rows) < 2 * cfg.segment_min_points:
+            skip = (segment.matched or first) and len(segment.landmarks.p_seg)
+            if not segment.posed or skip or len(rows) < 2 * cfg.segment_min_points:
                 continue
             T_seg_cam = se3.inverse(segment.fit.T_cam_seg)
             view = T_seg_cam[:3, 3] - segment.fit.centre

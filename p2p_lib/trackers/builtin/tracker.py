@@ -53,6 +53,7 @@ class BuiltinTracker:
         self._points = joined([self._points, Points.new(uv, self.config.templates)])
         recognition.store_templates(self._points, new, self._now, 0)
         self._segments.assign(self._points, new, self._now)
+        self._segments.add_landmarks(self._points, self._now, first=True)
         self._segments.remember(self._points, self._now, self._search)
         return ids
 
