@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, doubt
 from p2p_lib.core.mesh import save as save_mesh
@@ -46,8 +47,6 @@ from p2p_lib.extended.default import Point2Pose
 RUN_LOOKS = 30
 #: So many clicks an object are drawn from its first mask.
 CLICKS = 3
-#: Two frames that take longer did more than track.
-_LONG_START_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -390,6 +389,7 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None
 def _track(job: _Job, keeper: Keeper, progress: bool, say: Callable[[str], object]) -> None:
     """Every frame, and at the end the maps; Ctrl-C ends it early."""
     writer, method = keeper.writer, keeper.method
+    warm_up(say)
     with noted(keeper.doubts), progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
         try:
             for frame, estimates in _estimates(method, job):
@@ -448,11 +448,9 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     count = len(next(iter(run.objects.values())))
     hz, _ = rate(run.timings)
     lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
-    if (start_s := float(run.timings.get("total_ms", np.empty(0))[:2].sum()) / 1000) > _LONG_START_S:
-        lines[0] += f", after {start_s:.0f} s for the first two, in which loops are compiled (once on a machine)"
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
-        why = Counter(map(status_text, obj.status[lost], obj.reason[lost]))
+        why = Counter(status_text(*said).partition(" since ")[0] for said in zip(obj.status[lost], obj.reason[lost]))
         most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
         doubted = int(obj.doubted.sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""

@@ -98,6 +98,7 @@ def _live(a: argparse.Namespace) -> None:
     options.config()  # what does not fit is said before the camera starts
     _film_wanted(a.overlay)
     keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
+    keep["say"] = warn
     keep |= {} if a.backlog is None else {"backlog": a.backlog}
     if a.out is not None:
         look_into(a.out, keep["if_exists"])  # before anyone clicks
@@ -537,8 +538,21 @@ def _config(a: argparse.Namespace) -> None:
     print(f"In brackets, whose value it is: {whose}. Change one with --set KEY=VALUE.")
 
 
-@command("doctor", "check this installation and say how to mend it")
+@command(
+    "doctor",
+    "check this installation and say how to mend it",
+    arg(
+        "--warm-up",
+        action="store_true",
+        help="instead compile what is compiled once on a machine, and say how long it took",
+    ),
+)
 def _doctor(a: argparse.Namespace) -> int:
+    if a.warm_up:
+        from p2p_lib.core.compiled import warm_up
+
+        print(f"Inner loops are ready, after {warm_up(warn):.1f} s.")
+        return 0
     from p2p_lib.apps.doctor import run_doctor
     from p2p_lib.core.findings import Level, as_lines
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from p2p_lib.apps.click import Clicker, wait_for_clicks
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
+from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -64,6 +65,7 @@ def track_live(
     overlay: str | Path | None = None,
     if_exists: IfExists = "refuse",
     backlog: int = DEFAULT_BACKLOG,
+    say: Callable[[str], object] = lambda line: None,
 ) -> LiveCount:
     """Follow the objects of the prompts until the camera ends; every estimate goes to ``on_estimate`` at once.
 
@@ -75,6 +77,7 @@ def track_live(
     out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
     overlay  a film of it, .mp4, .gif or .webp, as the tracker sees it
     backlog  how many images may wait while one takes long, before the oldest is dropped; with 0 the newest one wins
+    say      told what it waits for before the first image
 
     Closes the camera at the end, whatever ends it. Raises :class:`BadInput` for clicks that do not fit.
     """
@@ -89,6 +92,7 @@ def track_live(
         raise BadInput("backlog", backlog, "how many images may wait, from 0")
     config = config.with_values({"segmentation.sam2_every": 0})  # no image waits for it
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
+    warm_up(say)
     if options.tracker.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
     with ExitStack() as kept:
@@ -122,7 +126,7 @@ def track_live(
 
 
 def _warm_up(method: Point2Pose) -> None:
-    """Load and compile on made-up images what the first of a camera would wait for, and later ones be dropped."""
+    """Load, and fill on made-up images, what the first of a camera would wait for, and later ones be dropped."""
     h, w = method.camera.height, method.camera.width
     print_ = np.kron(np.random.default_rng(0).integers(0, 255, (h // 8, w // 8, 3)), np.ones((8, 8, 1)))
     rgb, depth_m = np.full((h, w, 3), 90, np.uint8), np.full((h, w), 1.0, np.float32)

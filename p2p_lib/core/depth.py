@@ -68,11 +68,12 @@ def lift(frame: Frame, uv_px: np.ndarray, camera: Camera, config: DepthConfig) -
     slanted surface its depth at the pixel's fraction too. Depth outside ``config.min_m`` to ``config.max_m`` is
     invalid.
     """
+    uv_px = np.ascontiguousarray(uv_px, float)
     depth_m = _plane_depths(frame.depth_m, uv_px, config.min_m, config.max_m, config.edge_m)
     return camera.unproject(uv_px, depth_m)
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], f8, f8, f8")
 def _plane_depths(depth_m: np.ndarray, uv_px: np.ndarray, min_m: float, max_m: float, edge_m: float) -> np.ndarray:
     """(N,) depth at each pixel (N, 2), NaN where there is none to trust."""
     height, width = depth_m.shape
