@@ -18,9 +18,9 @@ import numpy as np
 
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import Config
-from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, doubt
+from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, advised, doubt
 from p2p_lib.core.mesh import save as save_mesh
-from p2p_lib.core.options import MaskSource, RunOptions
+from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate, status_text
@@ -30,6 +30,7 @@ from p2p_lib.datasets.cameras import Stream
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
 from p2p_lib.datasets.first_masks import FirstMasks
+from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.models import find_models, given_models
@@ -37,6 +38,7 @@ from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_fra
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.consistency import consistency
+from p2p_lib.evaluation.known_size import size_doubts
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
@@ -111,7 +113,8 @@ def run(
         _say_what_was_there(writer, say)
         if not writer.complete:
             prompts = [prompt for of_frame in job.prompts.values() for prompt in of_frame]
-            _track(job, Keeper(writer, method, options.save_masks, prompts), progress, say)
+            keeper = Keeper(writer, method, options.save_masks, prompts, sizes_m=lengths_m(options.sizes))
+            _track(job, keeper, options.skip_bad, progress, say)
     interrupted = writer.info["stopped_by"] is not None
     if not writer.begun and not writer.earlier:
         nothing = (f"0 of {len(job.frames)} frames",)
@@ -125,6 +128,7 @@ class Keeper:
 
     masks    whether to keep the masks as images
     prompts  what started the objects, to be drawn with their first masks
+    sizes_m  how long objects are known to be
     doubts   what was doubted meanwhile: a list that the caller fills (:func:`noted`)
     """
 
@@ -132,6 +136,7 @@ class Keeper:
     method: Point2Pose
     masks: bool = False
     prompts: Iterable[Prompt] = ()
+    sizes_m: Mapping[str, float] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
     keypoints: KeypointLog = field(default_factory=KeypointLog)
 
@@ -182,6 +187,8 @@ class Keeper:
         seen = (sequence, RUN_LOOKS) if sequence is not None else (Stream("", self.method.camera), 0)
         found = consistency(load_run(self.writer.path), *seen)
         told = {name: [suspicion.text for suspicion in of] for name, of in found.suspicions.items()}
+        for name, text in size_doubts(self.writer.path, self.sizes_m).items():
+            told[name] = [text, *told[name]]
         self.writer.info["look_at"] = told
 
 
@@ -293,7 +300,7 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     prompts = tuple(prompts or ())
     masks = options.mask_source()
     how = options.format, options.depth_scale, config.seed
-    sequence = sequences.open_sequence(sequence, *how, masks=masks.folder)
+    sequence = sequences.open_sequence(sequence, *how, masks=masks.folder, gaps=options.skip_bad)
     frames = _frame_range(len(sequence), options.start, options.stop)
     told = masks.name == "clicks" and bool(prompts)  # all that is known of the objects
     objects = _chosen([p.name for p in prompts] if told else sequence.objects, options.objects)
@@ -367,6 +374,9 @@ def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path,
         {name: path for name, path in known.items() if name in job.objects},
         if_exists,
     )
+    if unknown := lengths_m(options.sizes).keys() - set(job.objects):
+        raise BadInput("size", f"the name {min(unknown)!r}", f"one of the objects: {', '.join(job.objects)}")
+    writer.info["left_out"] = {}
     writer.info |= told(method, options, [prompt for of_frame in job.prompts.values() for prompt in of_frame])
     return writer
 
@@ -386,13 +396,13 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None
         say(f"{writer.path} held {writer.earlier}, which this one replaces.")
 
 
-def _track(job: _Job, keeper: Keeper, progress: bool, say: Callable[[str], object]) -> None:
+def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Callable[[str], object]) -> None:
     """Every frame, and at the end the maps; Ctrl-C ends it early."""
     writer, method = keeper.writer, keeper.method
     warm_up(say)
     with noted(keeper.doubts), progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
         try:
-            for frame, estimates in _estimates(method, job):
+            for frame, estimates in _estimates(method, job, writer.info["left_out"] if skip_bad else None):
                 if (started := keeper.add(frame, estimates)) and progress:
                     bar.clear()
                     say(f"First masks of {', '.join(started)} in frame {frame.index}: {keeper.first_masks.path}")
@@ -409,12 +419,23 @@ def _track(job: _Job, keeper: Keeper, progress: bool, say: Callable[[str], objec
         keeper.judge(job.sequence)
 
 
-def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
-    """Every frame with its estimates, which a late 2D tracker gives some frames later."""
+def _estimates(
+    method: Point2Pose, job: _Job, left_out: dict[str, str] | None
+) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
+    """Every frame with its estimates, which a late 2D tracker gives some frames later.
+
+    left_out  gets the frames that cannot be read, with the reason; None: they end the run
+    """
 
     def steps() -> Iterator[dict[str, PoseEstimate]]:
         for i in job.frames:
-            frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
+            try:
+                frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
+            except P2PError as unreadable:
+                if left_out is None or i in job.prompts:
+                    raise advised(unreadable, "A prompt is made on it." if i in job.prompts else SKIP_BAD) from None
+                left_out[str(i)] = str(unreadable)
+                continue
             for prompt in job.prompts.get(i, ()):
                 method.tell(prompt)
             estimates = method.step(frame, {name: masks[name] for name in method.objects if name in masks})
@@ -448,6 +469,8 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     count = len(next(iter(run.objects.values())))
     hz, _ = rate(run.timings)
     lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
+    if left_out := run.info.get("left_out"):
+        lines[0] += f"; {len(left_out)} left out, which cannot be read, the first: {next(iter(left_out.values()))}"
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
         why = Counter(status_text(*said).partition(" since ")[0] for said in zip(obj.status[lost], obj.reason[lost]))

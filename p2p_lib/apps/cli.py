@@ -16,7 +16,7 @@ from typing import Any
 
 from p2p_lib.apps.command_line import arg, command, main, open_page, run_options, warn
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
-from p2p_lib.core.options import RunOptions, names, pairs
+from p2p_lib.core.options import RunOptions, lengths_m, names, pairs
 
 #: Options that choose the method and its parameters.
 METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "detector")
@@ -125,7 +125,7 @@ def _live(a: argparse.Namespace) -> None:
     arg("run", type=Path, nargs="?", metavar="DIR", help="folder written by p2p run"),
     arg("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)"),
     arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
-    run_options("start", "stop", "models", format="layout of --sequence (default: recognised)"),
+    run_options("start", "stop", "models", "sizes", format="layout of --sequence (default: recognised)"),
     _JSON,
     arg("--rows", action="store_true", help="every number as a CSV row: all forms, Chamfer, returns"),
     arg("--align", choices=("first", "all"), default="first", help="object frame: by the first scored frame, or all"),
@@ -159,10 +159,15 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     from p2p_lib.datasets.models import given_models
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.evaluation.consistency import consistency
+    from p2p_lib.evaluation.known_size import size_doubts
     from p2p_lib.evaluation.protocol import evaluate
 
     run = load_run(a.run)
     score, not_scored = None, ""
+    if unknown := lengths_m(options.sizes).keys() - run.objects.keys():
+        raise BadInput("size", f"the name {min(unknown)!r}", f"one of the objects: {', '.join(run.objects)}")
+    for name, text in size_doubts(a.run, lengths_m(options.sizes)).items():
+        warn(f"p2p eval: {name}: {text}")
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
             score = evaluate(run, options.models, a.align, a.min_visible_px)
@@ -379,7 +384,7 @@ def _click(a: argparse.Namespace) -> None:
     "check",
     "look at data of your own: what is wrong with it and what to do",
     arg("sequence", metavar="FOLDER", help="rgb/ depth/ cam_K.txt masks/, or any sequence"),
-    run_options("format", "depth_scale", prompts="clicks, where there are no masks"),
+    run_options("format", "depth_scale", "sizes", prompts="clicks, where there are no masks"),
     _JSON,
 )
 def _check(a: argparse.Namespace) -> int:
@@ -388,7 +393,8 @@ def _check(a: argparse.Namespace) -> int:
     from p2p_lib.datasets.prompts import load_prompts
 
     prompts = load_prompts(a.prompts) if a.prompts else ()
-    findings = check_folder(a.sequence, prompts=prompts, format=a.format, depth_scale=a.depth_scale)
+    how = {"format": a.format, "depth_scale": a.depth_scale, "sizes_m": lengths_m(RunOptions.of_arguments(a).sizes)}
+    findings = check_folder(a.sequence, prompts=prompts, **how)
     fine = "Nothing is wrong with it as far as can be seen."
     print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings, fine))
     return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0

@@ -20,7 +20,7 @@ from p2p_lib.datasets.sequence import ObjectTruth
 def paired_images(folder: Path, colour: str = "rgb") -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     """The files of ``rgb/`` (or as the layout calls it) and ``depth/``, one of each a frame."""
     rgb = images.list_files(folder / colour, images.COLOUR, "colour images")
-    return rgb, images.check_paired(images.list_files(folder / "depth", images.DEPTH, "depth images"), rgb)
+    return rgb, images.paired_depth(images.list_files(folder / "depth", images.DEPTH, "depth images"), rgb)
 
 
 def camera_for(rgb: Path, K: np.ndarray, name: str) -> Camera:

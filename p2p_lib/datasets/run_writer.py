@@ -28,7 +28,7 @@ from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
 IfExists = Literal["refuse", "replace", "resume"]
 _ANEW = "--force, in Python if_exists='replace'"
 #: What of ``run.json`` may be otherwise when a run is resumed: how far it came, and what made it, which poses tell.
-_MAY_DIFFER = {"frames", "finished", "stopped_by", "versions", "commit", "modified"}
+_MAY_DIFFER = {"left_out", "frames", "finished", "stopped_by", "versions", "commit", "modified"}
 
 
 class RunWriter:

@@ -18,6 +18,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.types import Frame
+from p2p_lib.datasets.images import gaps_allowed
 
 #: Layouts, each by the name of its module: what a folder of it holds, in the order in which they are tried.
 FORMATS: dict[str, tuple[str, ...]] = {
@@ -104,6 +105,7 @@ def open_sequence(
     depth_scale: float | None = None,
     seed: int = 0,
     masks: str | Path | None = None,
+    gaps: bool = False,
 ) -> Sequence:
     """A sequence from a folder, the bundled ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
 
@@ -116,6 +118,7 @@ def open_sequence(
     depth_scale  metres per raw unit of the depth images (default: the layout's, mostly 0.001 for millimetres)
     seed         of the generator, for ``synthetic/NAME``
     masks        another folder of masks (a name inside the sequence, or a path); by default the dataset's own
+    gaps         depth images may be missing: their frames cannot be read, all others can
 
     Raises :class:`MissingData` where files are not there and :class:`BadInput` where they do not fit.
     """
@@ -134,14 +137,16 @@ def open_sequence(
         folder, format = _find(path_or_name, format)
         name = os.path.basename(os.path.abspath(folder))
     format = format or recognise(folder)
-    read = import_module(f"p2p_lib.datasets.{format}").load(folder, masks)
+    with gaps_allowed(gaps):
+        read = import_module(f"p2p_lib.datasets.{format}").load(folder, masks)
     return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale)
 
 
 def reopen(info: Mapping[str, Any]) -> Sequence:
     """The sequence that a run was made on, as its ``run.json`` says; raises as :func:`open_sequence`."""
-    depth_scale = (info.get("options") or {}).get("depth_scale")
-    return open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, info["seed"])
+    asked = info.get("options") or {}
+    depth_scale, gaps = asked.get("depth_scale"), bool(asked.get("skip_bad"))
+    return open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, info["seed"], gaps=gaps)
 
 
 def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:
