@@ -1,12 +1,13 @@
 """RGB-D sequences: the protocol that every layout fulfils, and :func:`open_sequence`, which opens any of them.
 
-A layout is one module with ``load(folder, masks)``, and one line in :data:`FORMATS`.
+A layout is one module with ``load(folder, masks)``, and one line in :data:`FORMATS`. One of somebody else is a function
+``load(folder, masks)``, named as ``package.module:load`` or offered as an entry point (:mod:`p2p_lib.core.plugins`).
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import data_dir
+from p2p_lib.core.plugins import find, offered
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.images import gaps_allowed
 
@@ -114,7 +116,7 @@ def open_sequence(
     Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one; any
     other folder by its path below ``$P2P_DATA``.
 
-    format       one of :data:`FORMATS`; by default the layout is recognised
+    format       one of :data:`FORMATS`, or somebody else's; by default the layout is recognised, ours before others
     depth_scale  metres per raw unit of the depth images (default: the layout's, mostly 0.001 for millimetres)
     seed         of the generator, for ``synthetic/NAME``
     masks        another folder of masks (a name inside the sequence, or a path); by default the dataset's own
@@ -127,8 +129,7 @@ def open_sequence(
     if depth_scale is not None and not 0 < depth_scale <= 1:
         fix = "Millimetres are 0.001, metres are 1."
         raise BadInput("depth_scale", depth_scale, "metres per raw unit, above 0 and at most 1", fix)
-    if format is not None and format not in FORMATS:
-        raise BadInput("format", repr(format), "one of " + ", ".join(FORMATS))
+    read_folder = None if format is None else _loader(format)
     name = str(path_or_name)
     if name.startswith(SYNTHETIC):
         render = import_module(_GENERATOR).scenario_dir
@@ -138,7 +139,7 @@ def open_sequence(
         name = os.path.basename(os.path.abspath(folder))
     format = format or recognise(folder)
     with gaps_allowed(gaps):
-        read = import_module(f"p2p_lib.datasets.{format}").load(folder, masks)
+        read = (read_folder or _loader(format))(folder, masks)
     return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale)
 
 
@@ -209,5 +210,17 @@ def recognise(folder: Path) -> str:
 
 
 def _layout(folder: Path) -> str | None:
-    found = (name for name, patterns in FORMATS.items() if any(next(folder.glob(p), None) for p in patterns))
-    return next(found, None)
+    """By patterns; those of others are tried before the last of ours, which takes almost everything."""
+
+    def tried() -> Iterator[tuple[str, tuple[str, ...]]]:
+        *ours, last = FORMATS.items()
+        yield from ours
+        yield from ((name, getattr(_loader(name), "patterns", ())) for name in offered("dataset"))
+        yield last
+
+    return next((name for name, patterns in tried() if any(next(folder.glob(p), None) for p in patterns)), None)
+
+
+def _loader(format: str) -> Callable[[Path, str | Path | None], Any]:
+    """The function that reads a layout."""
+    return find("dataset", format, {name: f"p2p_lib.datasets.{name}:load" for name in FORMATS})

@@ -109,7 +109,7 @@ class Point2Pose(pipeline.Point2Pose):
         self._newest: deque[Frame] = deque(maxlen=self.tracker.latency_frames + 1)
 
     def step(self, frame: Frame, masks: Mapping[str, np.ndarray | None] | None = None) -> dict[str, PoseEstimate]:
-        """One frame in, one estimate per object out: see :meth:`p2p_lib.method.pipeline.Point2Pose.step`.
+        """One frame in, one estimate per object out; arguments and answers as in :mod:`p2p_lib.method.pipeline`.
 
         Where the frame has a ``T_world_cam``, poses are given in the world as well: ``T_world_obj``.
         """
