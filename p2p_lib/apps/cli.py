@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -74,7 +75,7 @@ def _run(a: argparse.Namespace) -> int:
 @command(
     "live",
     "track objects before a camera; a line of JSON per object and frame, on a terminal with --out a readable one",
-    arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
+    arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING, folder:PATH or module:Class"),
     arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
     arg("--backlog", type=int, metavar="N", help="images that may wait while one takes long (default 4)"),
     run_options(
@@ -83,6 +84,8 @@ def _run(a: argparse.Namespace) -> int:
         masks="segmenter (default: builtin)",
         stop="end before the camera's J-th image (default: Ctrl-C)",
     ),
+    arg("--to", metavar="URL", help="send the lines to tcp://HOST:PORT or udp://HOST:PORT, not to standard output"),
+    arg("--listen", action="store_true", help="lines of JSON on standard input add, correct and remove objects"),
     arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
     _FORCE,
     _OVERLAY,
@@ -90,6 +93,7 @@ def _run(a: argparse.Namespace) -> int:
 )
 def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
+    from p2p_lib.apps.live_words import Outlet, Words
     from p2p_lib.datasets.cameras import open_camera
     from p2p_lib.datasets.prompts import load_prompts
     from p2p_lib.datasets.run_writer import look_into
@@ -105,10 +109,13 @@ def _live(a: argparse.Namespace) -> None:
     prompts = load_prompts(a.prompts) if a.prompts else ()
     camera = open_camera(a.camera, a.rate)
     try:
-        if not prompts:
+        if not prompts and not a.listen:
             prompts, first = click_first(camera, warn, not a.no_browser)
         line = text_line if a.out is not None and sys.stdout.isatty() else json_line
-        track_live(camera, prompts, lambda estimate: print(line(estimate), flush=True), options, first=first, **keep)
+        with Outlet(a.to, warn) if a.to else nullcontext() as outlet:
+            send = outlet.send if outlet else partial(print, flush=True)
+            keep["words"] = Words(sys.stdin, lambda error: warn(f"p2p live: {error}")) if a.listen else None
+            track_live(camera, prompts, lambda estimate: send(line(estimate)), options, first=first, **keep)
     except KeyboardInterrupt:
         pass  # how one stops a camera
     finally:

@@ -307,7 +307,7 @@ def _place(info: Mapping[str, Any]) -> str:
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:
-    return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason="not added yet")
+    return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason="not followed")
 
 
 def _from(folder: Path | None, path: Path) -> Path:
