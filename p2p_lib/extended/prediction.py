@@ -110,6 +110,7 @@ class Predictor:
         if not known.time_s <= time_s < np.inf:
             raise BadInput("predict time_s", time_s, f"a time from that of the newest sure pose on, {known.time_s:g} s")
         then = known.at(time_s)
-        T_cam_obj = se3.inverse(self._T_world_cam) @ then.T if known.in_world else then.T
+        T_world_cam = self._T_world_cam if known.in_world else None
+        T_cam_obj = then.T if T_world_cam is None else se3.inverse(T_world_cam) @ then.T
         rest = then.covariance[:6, :6], then.velocity, then.T if known.in_world else None
         return Prediction(name, time_s, T_cam_obj, *rest)
