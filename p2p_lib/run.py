@@ -5,6 +5,7 @@ Scores a 2D tracker by itself and any method's poses as well, and writes a run i
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -100,7 +101,8 @@ def run(
     :class:`P2PError` for anything that does not fit; Ctrl-C ends the run early and is reported in the result.
     """
     options = replace(options or RunOptions(), **changes)
-    job = _prepare(sequence, options)
+    with progress_bar("reading", shown=progress and sys.stderr.isatty(), leave=False, bar_format="{desc} ..."):
+        job = _prepare(sequence, options)
     _doubt_scale(job)
     tracker = options.tracker
     if tracker == OracleTracker.name:  # which has to know the sequence
@@ -399,8 +401,9 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None
 def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Callable[[str], object]) -> None:
     """Every frame, and at the end the maps; Ctrl-C ends it early."""
     writer, method = keeper.writer, keeper.method
-    warm_up(say)
+    warm_up(say if progress else lambda line: None)
     with noted(keeper.doubts), progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
+        bar.set_postfix_str("first masks")  # which SAM 2 takes seconds for
         try:
             for frame, estimates in _estimates(method, job, writer.info["left_out"] if skip_bad else None):
                 if (started := keeper.add(frame, estimates)) and progress:

@@ -25,7 +25,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
-from p2p_lib.datasets.image_sequence import paired_images
+from p2p_lib.datasets.image_sequence import WRITE_K, paired_images
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
@@ -52,6 +52,8 @@ RIM_SHARE = 0.5
 MEASURED_SHARE = 0.5
 #: What an object seldom is: so much of the image, so deep (of its distance). Good sequences: at most 0.07, 0.23.
 LARGE_SHARE, DEEP_SHARE = 0.12, 0.25
+#: Fewer points tell no pose.
+POSED = 3
 #: Fraction of depth at its largest value from which on it was cut off there.
 CLIPPED_SHARE = 0.1
 
@@ -72,7 +74,7 @@ _KNOWN = "--size NAME=CM (the object's longest side)"
 _PUT = {
     "rgb": "Put the colour images there, one for each depth image.",
     "depth": "Put the depth images there, registered to colour, one for each colour image, in 16-bit millimetres.",
-    "K": "Write fx 0 cx / 0 fy cy / 0 0 1 into it, in pixels at the size of the images.",
+    "K": WRITE_K,
 }
 
 
@@ -389,7 +391,7 @@ def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Findin
     text = f"places to track in frame {frame.index}: {count}"
     if count < needed:
         fix = "Its surface alone carries the pose; expect doubts. Come nearer, light it better, show a textured side."
-        level = Level.LOOK if count >= config.registration.min_inliers else Level.WRONG
+        level = Level.LOOK if count >= POSED else Level.WRONG
         return Finding(f"{name}: points", level, f"{text}; {needed} are needed to find it again", fix)
     return Finding(f"{name}: points", Level.OK, text)
 

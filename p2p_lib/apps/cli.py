@@ -355,12 +355,14 @@ def _film(a: argparse.Namespace) -> None:
     arg("--only", metavar="00,03", help="only these notebooks"),
     arg("--jobs", type=int, default=1, metavar="N", help="notebooks at a time"),
     arg("--parameter", action="append", metavar="NAME=VALUE", help="change a notebook parameter; repeatable"),
+    arg("--out", type=Path, metavar="DIR", help="folder of results (default out/PROFILE; with --parameter beside it)"),
 )
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.apps.clone import study
 
     parameters = pairs(a.parameter or (), "--parameter", "NAME=VALUE")
-    study("runner").run_notebooks(a.profile, only=names(a.only) or (), jobs=a.jobs, parameters=parameters)
+    how = {"only": names(a.only) or (), "jobs": a.jobs, "parameters": parameters, "out": a.out}
+    study("runner").run_notebooks(a.profile, **how)
 
 
 # --- data ----------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from p2p_lib.apps import cli
 from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
 from p2p_lib.apps.live_words import Outlet, Words
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -39,6 +40,12 @@ from tests.fixtures.sliding_board import H, K, W, write_sequence
 FRAMES = 20  # then the board jumps back
 SETTINGS = {"method.surface": "false", "method.graph": "false"}
 PROMPTS = (Prompt("board", 0, [[60, 50]]),)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ready():
+    """Nothing that is said comes of what is compiled, wherever these tests are run first."""
+    warm_up()
 
 
 @pytest.fixture(scope="module")
