@@ -13,7 +13,7 @@ NAN = float("nan")
     ("mask_m", "mesh_m", "said"),
     [
         (0.10, 0.10, ""),
-        (0.11, NAN, ""),
+        (0.12, NAN, ""),
         (0.05, 0.10, ""),  # a mask that never showed all of it
         (0.10, 0.06, ""),  # a surface of one side
         (NAN, NAN, ""),
@@ -29,9 +29,11 @@ def test_what_does_not_fit_is_said(mask_m, mesh_m, said):
     assert re.search(said, text) if said else not text
 
 
-def test_a_mesh_is_as_long_as_its_longest_side_however_it_lies(tmp_path):
+def test_a_mesh_is_as_long_as_its_longest_side_however_it_lies_and_whatever_sticks_out(tmp_path):
     turn = trimesh.transformations.random_rotation_matrix(np.array([0.3, 0.6, 0.2]))
-    trimesh.creation.box((0.2, 0.1, 0.05), turn).export(tmp_path / "box.ply")
+    box = trimesh.creation.box((0.2, 0.1, 0.05), turn)
+    shred = trimesh.creation.box((0.3, 0.002, 0.002), turn)
+    trimesh.util.concatenate([box, shred]).export(tmp_path / "box.ply")
     assert mesh_length_m(tmp_path / "box.ply") == pytest.approx(
         0.2, rel=0.02
     )  # the box fitted around it is not the smallest to the last percent
