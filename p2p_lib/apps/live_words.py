@@ -22,17 +22,25 @@ _GONE_S = 0.5
 
 
 class Words:
-    """Lines of JSON that add, correct and remove objects, taken in by a thread of its own as they come.
+    """Lines of JSON that add, correct and remove objects, as they come: by a thread that reads them, or :meth:`hear`.
 
     ``{"name": "mug", "points": [[320, 240]]}`` starts an object in the next frame, or corrects its mask; ``negative``
     and ``box`` as in a file of ``p2p click``, whose whole content is understood, too. ``{"remove": "mug"}`` ends it.
     What does not fit is said, and changes nothing.
     """
 
-    def __init__(self, lines: Iterable[str], say: Callable[[str], object]):
+    def __init__(self, lines: Iterable[str] | None, say: Callable[[str], object]):
         self._said: deque[tuple[str, Prompt | None]] = deque()
         self._say = say
-        threading.Thread(target=self._listen, args=(lines,), daemon=True).start()
+        if lines is not None:
+            threading.Thread(target=lambda: [self.hear(line) for line in lines], daemon=True).start()
+
+    def hear(self, line: str) -> None:
+        """Take in one line; what does not fit is said."""
+        try:
+            self._said.extend(_parsed(line) if line.strip() else ())
+        except BadInput as error:
+            self._say(str(error))
 
     def tell(self, method: Point2Pose, frame_index: int) -> list[Prompt]:
         """Tell a tracker what was said since, before its next frame; the prompts that it took."""
@@ -49,14 +57,6 @@ class Words:
             except BadInput as error:
                 self._say(str(error))
         return taken
-
-    def _listen(self, lines: Iterable[str]) -> None:
-        for line in lines:
-            if line.strip():
-                try:
-                    self._said.extend(_parsed(line))
-                except BadInput as error:
-                    self._say(str(error))
 
 
 def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
