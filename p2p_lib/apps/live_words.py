@@ -33,7 +33,7 @@ class Words:
         self._said: deque[tuple[str, Prompt | None]] = deque()
         self._say = say
         if lines is not None:
-            threading.Thread(target=lambda: [self.hear(line) for line in lines], daemon=True).start()
+            threading.Thread(target=lambda: deque(map(self.hear, lines), 0), daemon=True).start()
 
     def hear(self, line: str) -> None:
         """Take in one line; what does not fit is said."""
