@@ -107,6 +107,7 @@ class Point2Pose(pipeline.Point2Pose):
         super().__init__(*self._made_of, compose(camera, config))
         self._predictor = Predictor()
         self._newest: deque[Frame] = deque(maxlen=self.tracker.latency_frames + 1)
+        self._closed = False
 
     def step(self, frame: Frame, masks: Mapping[str, np.ndarray | None] | None = None) -> dict[str, PoseEstimate]:
         """One frame in, one estimate per object out; arguments and answers as in :mod:`p2p_lib.method.pipeline`.
@@ -114,6 +115,8 @@ class Point2Pose(pipeline.Point2Pose):
         Where the frame has a ``T_world_cam``, poses are given in the world as well: ``T_world_obj``.
         """
         with self.alone():
+            if self._closed:
+                raise BadInput("step", "a frame after close()", "an open tracker", "reset() opens it again, as new.")
             estimates = super().step(frame, masks)
             self._newest.append(frame)
             return {name: self._placed(estimate) for name, estimate in estimates.items()}
@@ -143,6 +146,11 @@ class Point2Pose(pipeline.Point2Pose):
         """Stop following an object; its points are dropped from the tracker."""
         super().remove_object(name)
         self._predictor.forget(name)
+
+    def close(self) -> None:
+        """End the threads, after what they are at; nothing can be tracked any more, until a :meth:`reset`."""
+        super().close()
+        self._closed = True
 
     def reset(self) -> None:
         """Forget all objects and the stream: as new, with the same camera, parameters and parts.

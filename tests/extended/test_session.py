@@ -31,6 +31,16 @@ def test_after_a_reset_a_tracker_is_as_new():
         assert_same(followed(method, film()[:FEW]), track(film()[:FEW]))
 
 
+def test_a_closed_tracker_says_so_and_can_be_reset():
+    with Point2Pose(CAMERA, quick()) as method:
+        method.add_object("left")
+    with pytest.raises(BadInput, match=r"a frame after close\(\).* reset\(\)"):
+        method.step(film()[0][0])
+    method.reset()
+    assert method.step(film()[0][0]) == {}
+    method.close()
+
+
 def test_a_reset_forgets_the_objects_of_a_segmenter_that_was_given():
     own = builtin(CAMERA, quick().segmentation)
     with Point2Pose(CAMERA, quick(), segmenter=own) as method:
