@@ -75,7 +75,7 @@ def warm_up(say: Callable[[str], object] = lambda line: None) -> float:
     say  told a line before anything is compiled; nothing where it is only loaded
     """
     start_s = monotonic()
-    beside = None
+    beside: subprocess.Popen | None = None
     try:
         for module in (name for name in (*LOOPS, *LOOPS_BESIDE) if name not in _warm):
             if module == LOOPS_BESIDE[0] and beside is not None:
@@ -105,12 +105,15 @@ def _ready(module: str) -> int:
     return missed
 
 
-def _compiling_beside() -> subprocess.Popen:
+def _compiling_beside() -> subprocess.Popen | None:
     """Another process that compiles :data:`LOOPS_BESIDE`, for numba compiles one function of a process at a time."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from p2p_lib.core import compiled as c\n"
     code += "for module in c.LOOPS_BESIDE: c._ready(module)"
     quiet = subprocess.DEVNULL
-    return subprocess.Popen([sys.executable, "-c", code], stdin=quiet, stdout=quiet, stderr=quiet)
+    try:
+        return subprocess.Popen([sys.executable, "-c", code], stdin=quiet, stdout=quiet, stderr=quiet)
+    except OSError:  # it may not start any: then all is compiled here
+        return None
 
 
 def _compile(module: str) -> None:
