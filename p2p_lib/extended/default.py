@@ -6,9 +6,7 @@ Taking a mechanism out is deleting its line here; leaving it out of one run is i
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Container, Mapping
-from dataclasses import replace
+from collections.abc import Container
 from functools import partial
 from typing import Any
 
@@ -19,11 +17,9 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.interfaces import PointTracker, Segmenter
-from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.extended.model import JoinableModel
 from p2p_lib.extended.policy import OurPolicy
-from p2p_lib.extended.prediction import Prediction, Predictor
 from p2p_lib.extended.reacquisition import Reacquisition
 from p2p_lib.extended.scene import Scene
 from p2p_lib.extended.two_maps import TwoMaps
@@ -105,58 +101,13 @@ class Point2Pose(pipeline.Point2Pose):
         config = as_config("default" if config is None else config)
         self._made_of: tuple[Any, ...] = camera, config, tracker, detector, segmenter
         super().__init__(*self._made_of, compose(camera, config))
-        self._predictor = Predictor()
-        self._newest: deque[Frame] = deque(maxlen=self.tracker.latency_frames + 1)
-        self._closed = False
-
-    def step(self, frame: Frame, masks: Mapping[str, np.ndarray | None] | None = None) -> dict[str, PoseEstimate]:
-        """One frame in, one estimate per object out; arguments and answers as in :mod:`p2p_lib.method.pipeline`.
-
-        Where the frame has a ``T_world_cam``, poses are given in the world as well: ``T_world_obj``.
-        """
-        with self.alone():
-            if self._closed:
-                raise BadInput("step", "a frame after close()", "an open tracker", "reset() opens it again, as new.")
-            estimates = super().step(frame, masks)
-            self._newest.append(frame)
-            return {name: self._placed(estimate) for name, estimate in estimates.items()}
-
-    def _placed(self, estimate: PoseEstimate) -> PoseEstimate:
-        """The estimate in the world that its frame was given in, if any; the scene that the tracker finds is none."""
-        T_world_cam = next((f.T_world_cam for f in reversed(self._newest) if f.time_s == estimate.time_s), None)
-        self._predictor.add(estimate, T_world_cam)
-        if estimate.T_cam_obj is None or T_world_cam is None:
-            return estimate
-        return replace(estimate, T_world_obj=T_world_cam @ estimate.T_cam_obj)
-
-    def predict(self, name: str, time_s: float) -> Prediction | None:
-        """Where an object is at a time to come, if it goes on as it does; its velocity, and how sure both are.
-
-        time_s  not before the newest pose of more confidence than 0.5. The covariance grows with the time since:
-                after a second it says little
-
-        None until there is such a pose. Raises :class:`BadInput` for an unknown name and an earlier time.
-        """
-        with self.alone():
-            if name not in self.objects:
-                raise BadInput("predict", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-            return self._predictor.predict(name, time_s)
-
-    def remove_object(self, name: str) -> None:
-        """Stop following an object; its points are dropped from the tracker."""
-        super().remove_object(name)
-        self._predictor.forget(name)
-
-    def close(self) -> None:
-        """End the threads, after what they are at; nothing can be tracked any more, until a :meth:`reset`."""
-        super().close()
-        self._closed = True
 
     def reset(self) -> None:
         """Forget all objects and the stream: as new, with the same camera, parameters and parts.
 
         What was given as an object, a 2D tracker or a segmenter, is kept and starts anew.
         """
+        self.closed = False
         with self.alone():
             for name in self.segmenter.names:
                 self.segmenter.remove(name)

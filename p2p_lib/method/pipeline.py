@@ -161,6 +161,7 @@ class Point2Pose(Objects):
 
     def close(self) -> None:
         """End the threads, after what they are at; nothing can be tracked any more."""
+        self.closed = True
         self._beside.shutdown()
 
     def __enter__(self) -> Self:

@@ -34,7 +34,7 @@ def test_after_a_reset_a_tracker_is_as_new():
 def test_a_closed_tracker_says_so_and_can_be_reset():
     with Point2Pose(CAMERA, quick()) as method:
         method.add_object("left")
-    with pytest.raises(BadInput, match=r"a frame after close\(\).* reset\(\)"):
+    with pytest.raises(BadInput, match=r"a call after close\(\).* reset\(\)"):
         method.step(film()[0][0])
     method.reset()
     assert method.step(film()[0][0]) == {}

@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import chi2
 
 from p2p_lib.core import se3
+from p2p_lib.core.prediction import _FORGOTTEN_S, _MOVES, _TURNS, Predictor
 from p2p_lib.core.types import PoseEstimate, Status
-from p2p_lib.extended.prediction import _FORGOTTEN_S, _MOVES, _TURNS, Predictor
 
 NOISE = np.diag(np.repeat([0.01, 0.002], 3) ** 2)
 
