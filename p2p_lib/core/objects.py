@@ -150,10 +150,10 @@ class Objects(ABC):
 
         What was said until now belongs to this frame: what does not fit it is ``refused``, and stops nobody.
         """
+        given, refused = given_masks(frame, masks, self._said, self.objects, self.camera)
         self._cameras.append((frame.time_s, frame.T_world_cam))
         while len(self._cameras) > self.tracker.latency_frames + 1:
             self._cameras.popleft()
-        given, refused = given_masks(frame, masks, self._said, self.objects, self.camera)
         said, self._said = {name: p for name, p in self._said.items() if name not in refused}, {}
         self.refused |= refused
         for name, error in refused.items():
