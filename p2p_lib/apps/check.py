@@ -383,7 +383,7 @@ def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Fin
 def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
     """Whether an object has anything to track: points that can be lifted, with a contrast of their own."""
     detector = make_detector(DEFAULT_DETECTOR, config.sampling, np.random.default_rng(config.seed))
-    found = detector.detect(frame, usable_region(frame, mask, config.depth.edge_m))
+    found = detector.detect(frame, usable_region(frame, mask, config.depth.edge_m, config.depth.narrow))
     taken = choose(found, np.zeros((0, 2)), config.sampling.max_visible, config.sampling)
     u, v = np.rint(found.uv_px[taken]).astype(int).T
     contrast = _contrast(frame.rgb, config.tracking.window_px)[v, u]

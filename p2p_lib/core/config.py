@@ -103,6 +103,9 @@ class DepthConfig(_Checked):
     min_m: float = _p(0.1, "Nearer depth is invalid.", "m", "release", low=0)
     max_m: float = _p(2.5, "Farther depth is invalid.", "m", low=0.1)
     edge_m: float = _p(0.01, "A larger depth step in the 3x3 neighbourhood is an edge.", "m", "release", low=0)
+    narrow: bool = _p(
+        True, "Parts of a mask too narrow for a border and whole neighbourhoods keep depth that agrees with theirs."
+    )
     noise_m: float = _p(0.001, "This is the standard deviation of depth at range 0.", "m", low=1e-6)
     noise_per_m2: float = _p(0.0025, "The standard deviation grows by this with the range squared.", "1/m", low=0)
 
@@ -385,6 +388,7 @@ _TEXT: dict[str, Any] = {
     "keypoint_map.cooldown": 0,
     "keypoint_map.max_points": 0,
     "selection.rule": "surface",
+    "depth.narrow": False,
     "tsdf.carve": False,
     "refinement.residuals": "surface",
     "factor_graph.max_keyframes": 0,

@@ -38,6 +38,7 @@ class Evidence:
     still          whether the same image has come again and again
     carried        whether its motion before the gap still says where it is
     slides         whether the pose may move along the surface without leaving it, as that of something flat
+    rests          whether an object that lay still is where the scene has it; None where nobody knows
     """
 
     support: int
@@ -49,6 +50,7 @@ class Evidence:
     still: bool = False
     carried: bool = False
     slides: bool = False
+    rests: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,15 @@ def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: Life
 
 def _few_points_on_flat(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
     """What is flat lies on a table as well as on itself: its own points have to say where."""
-    free = evidence.slides and evidence.support < _FIXED_BY and (evidence.sighting or 0.0) < SIGHTED
+    fixed = evidence.support >= _FIXED_BY or (evidence.sighting or 0.0) >= SIGHTED or evidence.rests
+    free = evidence.slides and not fixed
     return f"only {evidence.support} points agree, and the surface leaves free where it is" if free else ""
+
+
+def _few_points_elsewhere(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+    """What lay still does not move while nobody sees it, unless its own points say so."""
+    elsewhere = life.unconfirmed and evidence.support < config.return_inliers and evidence.rests is False
+    return f"only {evidence.support} points agree, and it lay still elsewhere" if elsewhere else ""
 
 
 def _mask_off_steps(life: Lifecycle, evidence: Evidence) -> str:
@@ -133,4 +142,5 @@ GATES: dict[str, Callable[[Lifecycle, Evidence, LifecycleConfig], str]] = {
     "return_gate": _few_points_on_return,
     "surface_gate": _no_points_and_off_surface,
     "sliding_gate": _few_points_on_flat,
+    "rest": _few_points_elsewhere,
 }

@@ -24,6 +24,9 @@ CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES = 5, 15
 _PAUSE_S, _PAUSE = 0.25, 5
 #: The motion so far is that of poses with more confidence.
 _CONFIDENT = 0.5
+#: Seen so often in the same place of the scene, an object lies still there. The same place is this near, m: what
+#: cameras that are located by the scene are off by.
+_RESTED, _NEAR_M = 3, 0.05
 #: Shape and colour tell a turn from all others by this lead, and leave no doubt by this one.
 TELLING, CLEAR = 0.25, 0.5
 
@@ -39,6 +42,7 @@ class Lifecycle(Life):
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
     T_world_obj     newest pose in the scene that many points agreed with, where the camera was known; None before
+    rested          how often in a row it was seen there again
     motion          how it moves, by the sure poses; None before the first
     start_px        pixels of the newest mask, in a frame without a pose; None without a mask
     doubted         since a gap nothing has told its turn from others that look alike
@@ -52,6 +56,7 @@ class Lifecycle(Life):
     T_previous: np.ndarray | None = None
     T_left: np.ndarray | None = None
     T_world_obj: np.ndarray | None = None
+    rested: int = 0
     motion: Motion | None = None
     start_px: int | None = None
     doubted: bool = False
@@ -85,8 +90,9 @@ class Lifecycle(Life):
         return priors
 
     def scene_prior(self, T_world_cam: np.ndarray | None) -> dict[str, np.ndarray]:
-        """Where an absent object is if it has lain still: origin to T_cam_obj; empty where nobody knows."""
-        if self.has_pose or T_world_cam is None or self.T_world_obj is None:
+        """Where a sought object is if it has lain still: origin to T_cam_obj; empty where nobody knows."""
+        known = T_world_cam is not None and self.T_world_obj is not None
+        if not known or (self.has_pose and not self.sought):
             return {}
         return {"scene": se3.orthonormalised(se3.inverse(T_world_cam) @ self.T_world_obj)}
 
@@ -103,7 +109,14 @@ class Lifecycle(Life):
         """
         if T_world_cam is None or self.confirming or (self.status is Status.DEGRADED and self.T_world_obj is not None):
             return self
-        return replace(self, T_world_obj=T_world_cam @ self.T_cam_obj)
+        T_world_obj = T_world_cam @ self.T_cam_obj
+        again = self.T_world_obj is not None and same_place(self.T_world_obj, T_world_obj)
+        return replace(self, T_world_obj=T_world_obj, rested=self.rested + 1 if again else 0)
+
+    @property
+    def lay_still(self) -> bool:
+        """Whether it was at rest in the scene as long as it was followed."""
+        return self.rested >= _RESTED
 
     def moved(self, confidence: float) -> Lifecycle:
         """The state with its motion, which goes on with the newest pose where that is sure."""
@@ -151,3 +164,8 @@ class Lifecycle(Life):
         in_sight = lost and (self.in_sight or carried)
         lost_frames = self.lost_frames + lost
         return replace(self, status=status, lost_frames=lost_frames, start_px=mask_px, in_sight=in_sight, **taken_back)
+
+
+def same_place(T: np.ndarray, other: np.ndarray) -> bool:
+    """Whether an object lies where it lay, turned or not: by two of its poses (4, 4) in one frame."""
+    return bool(np.linalg.norm(T[:3, 3] - other[:3, 3]) < _NEAR_M)

@@ -16,10 +16,10 @@ from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.gates import SIGHTED, Evidence, Judgement, judge, off_size
 from p2p_lib.extended.graph import explained
 from p2p_lib.extended.image_search import laid_on
-from p2p_lib.extended.lifecycle import TELLING, Lifecycle
+from p2p_lib.extended.lifecycle import TELLING, Lifecycle, same_place
 from p2p_lib.extended.motion import motion_weight
 from p2p_lib.extended.shape_search import ShapeSearch
-from p2p_lib.extended.sight import Sight, cut_off
+from p2p_lib.extended.sight import Sight, cut_off, empty
 from p2p_lib.method import registration
 from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
 from p2p_lib.method.policy import Admission, Candidate, Policy, Verdict
@@ -219,12 +219,22 @@ class OurPolicy(Policy):
         outline = self.outline(obs) if "outline" in self.on else 1.0
         carried = self.carried(known, obs.frame.time_s)
         slides = "sliding_gate" in self.on and may_slide(best, self.config.refinement.min_eigenvalue)
-        evidence = replace(best.evidence, size=size, outline=outline, still=obs.still, carried=carried, slides=slides)
+        rests = self._rests(obs, known, best) if "rest" in self.on else None
+        told = {"size": size, "outline": outline, "still": obs.still, "carried": carried, "slides": slides}
+        evidence = replace(best.evidence, rests=rests, **told)
         return judge(known.life, evidence, self.on, self.config.lifecycle)
 
     def judge_other(self, obs: Sight, known: Known, best: Proposal) -> Judgement:
         """The same in a second map, by what speaks for the pose alone."""
         return judge(known.life, replace(best.evidence, still=obs.still), self.on, self.config.lifecycle)
+
+    def _rests(self, obs: Sight, known: Known, best: Proposal) -> bool | None:
+        """Whether what lay still is where the scene has it; None where nobody knows, or its place is seen empty."""
+        place = known.life.scene_prior(obs.frame.T_world_cam).get("scene") if known.life.lay_still else None
+        if place is None:
+            return None
+        near = same_place(place, best.T_cam_obj)
+        return near or (None if empty(self.observer, obs.frame, place, known.map.p_obj) else False)
 
     def _before(self, obs: Sight) -> Sight | None:
         """The newest frame in which nothing was doubted, where its mask and this one's can be compared."""

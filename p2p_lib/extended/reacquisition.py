@@ -51,8 +51,8 @@ class Reacquisition(Frontend):
     def _locate(self, frame: Frame) -> Future[np.ndarray | None] | None:
         """The camera's pose, sought beside the 2D tracker: often while an object is away, else now and then."""
         self._unlocated += 1
-        away = any(obj.outlook.away for obj in self.objects.values())
-        every = _LOCATE_EVERY_AWAY if away else _LOCATE_EVERY
+        sought = any(obj.outlook.sought for obj in self.objects.values())
+        every = _LOCATE_EVERY_AWAY if sought else _LOCATE_EVERY
         if self.scene is None or frame.T_world_cam is not None or self._unlocated < every:
             return None
         self._unlocated = 0

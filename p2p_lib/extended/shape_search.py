@@ -33,7 +33,7 @@ class ShapeSearch:
 
     def knows(self, known: Known) -> bool:
         """Whether shape and colour have a say."""
-        return self._on and known.model.has_surface
+        return self._on and known.model.has_surface and len(self.sample(known.model)) > 0
 
     def sample(self, model: ObjectModel) -> SurfaceSample:
         """Points of the surface as it was first asked for since the newest keyframe."""

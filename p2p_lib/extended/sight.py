@@ -20,6 +20,8 @@ from p2p_lib.method.observation import Observation, Observer
 _BORDER_PX = 2
 #: A keypoint farther from the depth measured at its pixel is hidden, m.
 _HIDDEN_M = 0.015
+#: What is measured this far behind a point shows that nothing is there, m.
+_EMPTY_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,3 +86,12 @@ def expected_px(observer: Observer, obs: Observation, T_cam_obj: np.ndarray, p_o
     expected = np.full_like(uv_px, np.nan)
     expected[at] = uv_px[at]
     return expected
+
+
+def empty(observer: Observer, frame: Frame, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> bool:
+    """Whether points p_obj (N, 3) of an object are not where a pose has them: what is behind most of them is seen."""
+    p_cam = se3.transform(T_cam_obj, p_obj)
+    uv_px = observer.camera.project(p_cam)
+    at = np.flatnonzero((p_cam[:, 2] > 0) & observer.camera.inside(uv_px))
+    u, v = np.rint(uv_px[at]).astype(int).T
+    return bool(2 * (frame.depth_m[v, u] > p_cam[at, 2] + _EMPTY_M).sum() > len(p_obj))

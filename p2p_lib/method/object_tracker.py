@@ -169,7 +169,8 @@ class ObjectTracker:
         """New points where the objective wants them: uv_px (M, 2) and p_cam (M, 3)."""
         with self._stopwatch("sampling"):
             cfg = self.config.sampling
-            region = usable_region(obs.frame, obs.mask, self.config.depth.edge_m)
+            depth = self.config.depth
+            region = usable_region(obs.frame, obs.mask, depth.edge_m, depth.narrow)
             candidates = self.detector.detect(obs.frame, region)
             p_cam = self.observer.lift(obs.frame, candidates.uv_px)
             liftable = np.isfinite(p_cam[:, 0])

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import DepthConfig
-from p2p_lib.core.depth import depth_noise_m, in_range, lift, off_edges
+from p2p_lib.core.depth import depth_noise_m, in_range, lift, of_one_surface
 from p2p_lib.core.image import bounds, in_mask
 from p2p_lib.core.types import Frame, Tracks
 
@@ -60,7 +59,9 @@ class Observer:
     def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
         """The observation of an object whose points have these ``tracks``."""
         nothing = np.zeros((0, 3))
-        cloud = nothing if mask is None else sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points)
+        cloud = nothing
+        if mask is not None:
+            cloud = sample_cloud(frame.depth_m, mask, self.camera, self.cloud_points, self.config.narrow)
         return Observation(frame, mask, tracks, self.lifted(frame, mask, tracks), cloud)
 
     def lifted(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> np.ndarray:
@@ -88,21 +89,21 @@ class Observer:
         return self.camera.inside(self.camera.project(se3.transform(T_cam_obj, p_obj)), -0.5)
 
 
-def sample_cloud(depth_m: np.ndarray, mask: np.ndarray, camera: Camera, max_points: int) -> np.ndarray:
+def sample_cloud(
+    depth_m: np.ndarray, mask: np.ndarray, camera: Camera, max_points: int, narrow: bool = True
+) -> np.ndarray:
     """(N, 3) measured points of a masked depth image in the camera frame, N <= max_points.
 
-    Leaves out a border inside the mask, and pixels whose 3x3 neighbourhood holds an invalid depth or a step: both mix
-    two surfaces. Deterministic, spread over the whole mask. Empty where nothing is left.
+    Of the pixels :func:`~p2p_lib.core.depth.of_one_surface`. Deterministic, spread over the whole mask. Empty where
+    nothing is left.
     """
     cut = bounds(mask, 1)
     top, left = cut[0].start, cut[1].start
     if max_points < 1 or not mask[cut].any():
         return np.zeros((0, 3))
-    inside, depth = np.ascontiguousarray(mask[cut]).astype(np.uint8), np.ascontiguousarray(depth_m[cut], np.float32)
-    kernel = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
-    inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    depth = np.ascontiguousarray(depth_m[cut], np.float32)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-    usable = (inside > 0) & off_edges(depth, _CLOUD_EDGE_M)
+    usable = of_one_surface(depth, mask[cut], _BORDER_PX, _CLOUD_EDGE_M, narrow)
     # A lattice of pixels, then an even thinning of what is left over.
     stride = max(1, int(np.sqrt(np.count_nonzero(usable) / max_points)))
     v, u = stride * np.stack(np.nonzero(usable[::stride, ::stride]))

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from p2p_lib.core.config import SamplingConfig
-from p2p_lib.core.depth import off_edges
+from p2p_lib.core.depth import of_one_surface
 from p2p_lib.core.image import bounds
 from p2p_lib.core.interfaces import Candidates
 from p2p_lib.core.types import Frame
@@ -81,10 +80,9 @@ def distance_px(uv_px: np.ndarray, others_px: np.ndarray) -> np.ndarray:
     return cdist(uv_px, others_px).min(1)
 
 
-def usable_region(frame: Frame, mask: np.ndarray, edge_m: float) -> np.ndarray:
-    """(H, W) bool: where points can be lifted: in the mask, off its border, measured, off depth edges of ``edge_m``."""
-    cut, size, region = bounds(mask, 1), 2 * _EDGE_MARGIN_PX + 1, np.zeros(mask.shape, bool)
+def usable_region(frame: Frame, mask: np.ndarray, edge_m: float, narrow: bool = True) -> np.ndarray:
+    """(H, W) bool: where points can be lifted, by :func:`~p2p_lib.core.depth.of_one_surface`."""
+    cut, region = bounds(mask, 1), np.zeros(mask.shape, bool)
     if mask.any():
-        inner = cv2.erode(mask[cut].astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0)
-        region[cut] = (inner > 0) & off_edges(frame.depth_m[cut], edge_m)
+        region[cut] = of_one_surface(frame.depth_m[cut], mask[cut], _EDGE_MARGIN_PX, edge_m, narrow)
     return region

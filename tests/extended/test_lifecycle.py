@@ -174,6 +174,24 @@ def test_after_a_pause_in_the_stream_an_object_may_be_anywhere():
 # -- the scene -------------------------------------------------------------------------------------
 
 
+def test_a_return_without_points_goes_on_being_expected_where_it_lay():
+    """Else what was found on something else is followed there."""
+    found = lived(GOOD)[-1].placed(pose(3)).without_pose(Status.OCCLUDED).with_verdict(pose(9), 9, DEGRADED)
+    expected = np.linalg.inv(pose(5)) @ pose(3) @ pose(1)
+    np.testing.assert_allclose(found.scene_prior(pose(5))["scene"], expected, atol=1e-9)
+    assert found.with_verdict(pose(9), 10, TRACKED).scene_prior(pose(5)) == {}, "many points agree"
+
+
+def test_what_moves_in_the_scene_does_not_lie_still():
+    life, still = lived(GOOD)[-1], np.linalg.inv(lived(GOOD)[-1].T_cam_obj)
+    for lay in (False, False, False, True):
+        life = life.placed(still)
+        assert life.lay_still == lay
+    moved = still.copy()
+    moved[0, 3] += 0.06
+    assert not life.placed(moved).lay_still
+
+
 def test_what_lay_still_is_expected_where_it_lay():
     life = lived(GOOD)[-1].placed(pose(3))
     assert life.scene_prior(pose(5)) == {}, "while it is seen it needs no prior"

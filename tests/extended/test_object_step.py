@@ -22,6 +22,7 @@ from p2p_lib.extended.policy import OurPolicy, Proposal
 from p2p_lib.extended.sight import area_m2, expected_px
 from p2p_lib.method import refinement
 from p2p_lib.method.object_tracker import ObjectStep
+from p2p_lib.method.registration import Hypothesis
 from tests.method.analytic_scene import CAMERA, LUMP, look_from, render
 
 START = look_from((1.0, 0.2, 0.5))
@@ -423,6 +424,25 @@ def test_where_the_surface_leaves_free_where_it_is_points_have_to_agree(loosest,
     blind, seen = hide(lambda tracks: tracks.visible), None
     poses = [lump.see(turned(4), what).estimate.T_cam_obj for what in (blind, seen)]
     assert [T is not None for T in poses] == [loosest == 1, True]
+
+
+def test_what_lay_still_is_not_found_elsewhere_without_points():
+    lump, T_lay = begun(), begun().tracker.life.T_cam_obj
+    T_moved = se3.from_rt(np.eye(3), np.array([0.1, 0, 0])) @ T_lay
+    lay = replace(lump.tracker.life, T_world_obj=T_lay, rested=9).without_pose(Status.OCCLUDED)
+    obs = lump.observed(START)
+
+    def stands(T_cam_obj, life=lay, depth_m=obs.frame.depth_m):
+        seen = replace(obs, frame=replace(obs.frame, T_world_cam=np.eye(4), depth_m=depth_m))
+        none = np.zeros(len(lump.tracker.map), bool)
+        best = Proposal(
+            Hypothesis(T_cam_obj, none, np.full(len(none), np.inf), "sighting"), refinement.Refinement(T_cam_obj), 0.9
+        )
+        return lump.tracker.policy.judge(seen, replace(lump.tracker.known, life=life), best).accepted
+
+    assert stands(T_lay) and not stands(T_moved)
+    assert stands(T_moved, life=replace(lay, rested=0)), "it moved before"
+    assert stands(T_moved, depth_m=np.full_like(obs.frame.depth_m, 3.0)), "nothing is where it lay"
 
 
 def test_pending_points_are_not_rejected_and_enter_the_graph():

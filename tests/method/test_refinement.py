@@ -430,6 +430,20 @@ def test_sampled_points_are_measured_spread_inside_and_clear_of_edges():
     assert {116, 119} <= set(every_column) and not {117, 118} & set(every_column)
 
 
+@pytest.mark.parametrize("narrow", [True, False])
+def test_a_stick_of_three_pixels_has_points_that_are_its_own(narrow):
+    """Half of the depth beside its edges is missing, and some is that of the wall behind it."""
+    rng, (v, u) = np.random.default_rng(0), np.mgrid[: CAMERA.height, : CAMERA.width]
+    mask = (np.abs(v - 90 - (u - 120) // 3) <= 1) & (np.abs(u - 120) < 60)
+    depth = np.where(mask, 0.5 + 0.0005 * u, 1.5).astype(np.float32)
+    lost, wild = rng.random((2, *mask.shape))
+    depth[mask & (lost < 0.4)] = 0
+    depth[mask & (wild < 0.15)] = 1.5
+    p_cam = sample_cloud(depth, mask, CAMERA, 700, narrow)
+    assert len(p_cam) > 0.3 * np.count_nonzero(mask & (depth > 0)) if narrow else not len(p_cam)
+    assert not narrow or (p_cam[:, 2] < 0.7).mean() > 0.97
+
+
 def test_nothing_to_sample_gives_no_points():
     depth, mask = render(LUMP, VIEW)
     for d, m in ((depth * 0, mask), (np.full_like(depth, np.nan), mask), (depth, np.zeros_like(mask))):

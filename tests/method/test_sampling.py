@@ -323,3 +323,14 @@ def test_a_corner_is_found_where_it_is():
 def test_unknown_detectors_are_refused():
     with pytest.raises(BadInput, match=r"detector: got 'cornres', expected one of corners"):
         make_detector("cornres", DEFAULT)
+
+
+def test_a_narrow_part_has_a_region_of_its_own():
+    mask, depth = np.zeros((60, 80), bool), np.full((60, 80), 1.5, np.float32)
+    mask[20:40, 10:30], mask[29:32, 30:70] = True, True  # a blade and its handle
+    depth[mask] = 0.5
+    frame = Frame(0, 0.0, np.zeros((60, 80, 3), np.uint8), depth)
+    region = usable_region(frame, mask, 0.01)
+    assert region[29:32, 36:70].all() and region[22:38, 12:28].all()
+    assert not region[20:22].any() and not region[:, 10:12].any()  # the blade keeps its border
+    assert not usable_region(frame, mask, 0.01, narrow=False)[:, 30:].any()

@@ -81,7 +81,8 @@ def by_geometry(
         parts = parts_that_follow(patch, part, component, motions)
         component |= parts
         log_odds[parts] += config.geometry_weight
-    log_odds[measured & ~dilated(component, 1)] -= config.geometry_weight
+    # What is as low as the plane may touch it: that counts once, and colour may contradict it.
+    log_odds[measured & ~dilated(component, 1) & (free | ~patch.smooth)] -= config.geometry_weight
     if component[patch.border()].mean() > _AT_THE_BORDER:
         return log_odds, nothing  # it goes on beyond the patch: more than one object is connected
     log_odds[component] += config.geometry_weight
