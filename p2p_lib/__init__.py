@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what _WHERE says, for type checkers and editors
     from p2p_lib.core.camera import Camera
+    from p2p_lib.core.compiled import warm_up
     from p2p_lib.core.config import Config, preset
     from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
     from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
@@ -31,12 +32,13 @@ _NAMES = {
     "p2p_lib.extended.default": ["Point2Pose"],
     "p2p_lib.datasets.sequence": ["open_sequence"],
     "p2p_lib.core.camera": ["Camera"],
+    "p2p_lib.core.compiled": ["warm_up"],
     "p2p_lib.core.config": ["Config", "preset"],
     "p2p_lib.core.types": ["Frame", "PoseEstimate", "Status", "Tracks"],
     "p2p_lib.core.errors": ["BadInput", "MissingData", "MissingBackend", "P2PError"],
 }
 _WHERE = {name: module for module, names in _NAMES.items() for name in names}
-__all__ = ["Point2Pose", "open_sequence", "Camera", "Config", "preset"]  # noqa: RUF022 what one needs first comes first
+__all__ = ["Point2Pose", "open_sequence", "Camera", "Config", "preset", "warm_up"]  # noqa: RUF022 what one needs first comes first
 __all__ += ["Frame", "PoseEstimate", "Status", "Tracks"]
 __all__ += ["BadInput", "MissingBackend", "MissingData", "P2PError", "__version__"]
 

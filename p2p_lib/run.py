@@ -5,6 +5,7 @@ Scores a 2D tracker by itself and any method's poses as well, and writes a run i
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import Config
-from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, doubt
+from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, advised, doubt
 from p2p_lib.core.mesh import save as save_mesh
-from p2p_lib.core.options import MaskSource, RunOptions
+from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate, status_text
@@ -29,6 +31,7 @@ from p2p_lib.datasets.cameras import Stream
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
 from p2p_lib.datasets.first_masks import FirstMasks
+from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.models import find_models, given_models
@@ -36,6 +39,7 @@ from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_fra
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.consistency import consistency
+from p2p_lib.evaluation.known_size import size_doubts
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
@@ -46,8 +50,6 @@ from p2p_lib.extended.default import Point2Pose
 RUN_LOOKS = 30
 #: So many clicks an object are drawn from its first mask.
 CLICKS = 3
-#: Two frames that take longer did more than track.
-_LONG_START_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,8 @@ def run(
     :class:`P2PError` for anything that does not fit; Ctrl-C ends the run early and is reported in the result.
     """
     options = replace(options or RunOptions(), **changes)
-    job = _prepare(sequence, options)
+    with progress_bar("reading", shown=progress and sys.stderr.isatty(), leave=False, bar_format="{desc} ..."):
+        job = _prepare(sequence, options)
     _doubt_scale(job)
     tracker = options.tracker
     if tracker == OracleTracker.name:  # which has to know the sequence
@@ -112,7 +115,8 @@ def run(
         _say_what_was_there(writer, say)
         if not writer.complete:
             prompts = [prompt for of_frame in job.prompts.values() for prompt in of_frame]
-            _track(job, Keeper(writer, method, options.save_masks, prompts), progress, say)
+            keeper = Keeper(writer, method, options.save_masks, prompts, sizes_m=lengths_m(options.sizes))
+            _track(job, keeper, options.skip_bad, progress, say)
     interrupted = writer.info["stopped_by"] is not None
     if not writer.begun and not writer.earlier:
         nothing = (f"0 of {len(job.frames)} frames",)
@@ -126,6 +130,7 @@ class Keeper:
 
     masks    whether to keep the masks as images
     prompts  what started the objects, to be drawn with their first masks
+    sizes_m  how long objects are known to be
     doubts   what was doubted meanwhile: a list that the caller fills (:func:`noted`)
     """
 
@@ -133,6 +138,7 @@ class Keeper:
     method: Point2Pose
     masks: bool = False
     prompts: Iterable[Prompt] = ()
+    sizes_m: Mapping[str, float] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
     keypoints: KeypointLog = field(default_factory=KeypointLog)
 
@@ -183,6 +189,8 @@ class Keeper:
         seen = (sequence, RUN_LOOKS) if sequence is not None else (Stream("", self.method.camera), 0)
         found = consistency(load_run(self.writer.path), *seen)
         told = {name: [suspicion.text for suspicion in of] for name, of in found.suspicions.items()}
+        for name, text in size_doubts(self.writer.path, self.sizes_m).items():
+            told[name] = [text, *told[name]]
         self.writer.info["look_at"] = told
 
 
@@ -294,7 +302,7 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     prompts = tuple(prompts or ())
     masks = options.mask_source()
     how = options.format, options.depth_scale, config.seed
-    sequence = sequences.open_sequence(sequence, *how, masks=masks.folder)
+    sequence = sequences.open_sequence(sequence, *how, masks=masks.folder, gaps=options.skip_bad)
     frames = _frame_range(len(sequence), options.start, options.stop)
     told = masks.name == "clicks" and bool(prompts)  # all that is known of the objects
     objects = _chosen([p.name for p in prompts] if told else sequence.objects, options.objects)
@@ -368,6 +376,9 @@ def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path,
         {name: path for name, path in known.items() if name in job.objects},
         if_exists,
     )
+    if unknown := lengths_m(options.sizes).keys() - set(job.objects):
+        raise BadInput("size", f"the name {min(unknown)!r}", f"one of the objects: {', '.join(job.objects)}")
+    writer.info["left_out"] = {}
     writer.info |= told(method, options, [prompt for of_frame in job.prompts.values() for prompt in of_frame])
     return writer
 
@@ -387,12 +398,14 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None
         say(f"{writer.path} held {writer.earlier}, which this one replaces.")
 
 
-def _track(job: _Job, keeper: Keeper, progress: bool, say: Callable[[str], object]) -> None:
+def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Callable[[str], object]) -> None:
     """Every frame, and at the end the maps; Ctrl-C ends it early."""
     writer, method = keeper.writer, keeper.method
+    warm_up(say if progress else lambda line: None)
     with noted(keeper.doubts), progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
+        bar.set_postfix_str("first masks")  # which SAM 2 takes seconds for
         try:
-            for frame, estimates in _estimates(method, job):
+            for frame, estimates in _estimates(method, job, writer.info["left_out"] if skip_bad else None):
                 if (started := keeper.add(frame, estimates)) and progress:
                     bar.clear()
                     say(f"First masks of {', '.join(started)} in frame {frame.index}: {keeper.first_masks.path}")
@@ -409,12 +422,23 @@ def _track(job: _Job, keeper: Keeper, progress: bool, say: Callable[[str], objec
         keeper.judge(job.sequence)
 
 
-def _estimates(method: Point2Pose, job: _Job) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
-    """Every frame with its estimates, which a late 2D tracker gives some frames later."""
+def _estimates(
+    method: Point2Pose, job: _Job, left_out: dict[str, str] | None
+) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
+    """Every frame with its estimates, which a late 2D tracker gives some frames later.
+
+    left_out  gets the frames that cannot be read, with the reason; None: they end the run
+    """
 
     def steps() -> Iterator[dict[str, PoseEstimate]]:
         for i in job.frames:
-            frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
+            try:
+                frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
+            except P2PError as unreadable:
+                if left_out is None or i in job.prompts:
+                    raise advised(unreadable, "A prompt is made on it." if i in job.prompts else SKIP_BAD) from None
+                left_out[str(i)] = str(unreadable)
+                continue
             for prompt in job.prompts.get(i, ()):
                 method.tell(prompt)
             estimates = method.step(frame, {name: masks[name] for name in method.objects if name in masks})
@@ -448,11 +472,11 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     count = len(next(iter(run.objects.values())))
     hz, _ = rate(run.timings)
     lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
-    if (start_s := float(run.timings.get("total_ms", np.empty(0))[:2].sum()) / 1000) > _LONG_START_S:
-        lines[0] += f", after {start_s:.0f} s for the first two, in which loops are compiled (once on a machine)"
+    if left_out := run.info.get("left_out"):
+        lines[0] += f"; {len(left_out)} left out, which cannot be read, the first: {next(iter(left_out.values()))}"
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
-        why = Counter(map(status_text, obj.status[lost], obj.reason[lost]))
+        why = Counter(status_text(*said).partition(" since ")[0] for said in zip(obj.status[lost], obj.reason[lost]))
         most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
         doubted = int(obj.doubted.sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""

@@ -53,6 +53,7 @@ class NotebookResult:
     checks     what the last cell claims
     image_png  its first image in base64, or empty
     error      empty, or the cell and the message that ended the run
+    changed    the parameters that it was run with instead of its own, in words
     """
 
     name: str
@@ -62,6 +63,7 @@ class NotebookResult:
     checks: tuple[Claim, ...]
     image_png: str
     error: str
+    changed: str
 
 
 def list_notebooks(folder: Path | None = None, only: Sequence[str] = ()) -> list[Path]:
@@ -92,7 +94,8 @@ def run_notebooks(
     """Run the notebooks in order and write executed copies, pages, images, tables and a gallery.
 
     only        numbers or names of notebooks; all by default
-    out         folder of the results, default ``out/<profile>``; images of the full profile then go to ``figures/``.
+    out         folder of the results, default ``out/<profile>``, beside it with other parameters, named by them; images
+                of the full profile go to ``figures/`` by default.
                 Notebooks find their folders in ``$P2P_FIGURES``, ``$P2P_TABLES`` and ``$P2P_RUNS``
     jobs        how many run at a time
     parameters  of the notebooks, besides ``PROFILE``; a string is read as the kind of value the notebook has
@@ -112,8 +115,9 @@ def run_notebooks(
     paths = list_notebooks(folder, only)
     given = {**(parameters or {}), "PROFILE": profile}
     plans = [(path, _fitting_parameters(path, given)) for path in paths]
-    home = (out or CLONE / "out" / profile).resolve()
-    figures = CLONE / "figures" if profile == "full" and out is None else home / "figures"
+    own = [re.sub(r"[^\w.]+", "-", f"{name}={value}") for name, value in (parameters or {}).items()]
+    home = (out or CLONE / "out" / "_".join([profile, *own])).resolve()
+    figures = CLONE / "figures" if profile == "full" and out is None and not own else home / "figures"
     places = {"P2P_FIGURES": figures, "P2P_TABLES": home / "tables", "P2P_RUNS": home / "runs"}
     for place in (home / "notebooks", *places.values()):
         place.mkdir(parents=True, exist_ok=True)
@@ -185,7 +189,14 @@ def read_result(executed: Path) -> NotebookResult:
         checks=tuple(Claim(**row) for row in kept),
         image_png="".join(images[0].split()) if images else "",
         error=errors[0] if errors else "",
+        changed=_changed(notebook, notebook_parameters(executed)),
     )
+
+
+def _changed(notebook: NotebookNode, own: Mapping[str, Value]) -> str:
+    """The parameters that an executed notebook was given and that are not those that its source has."""
+    given = notebook.metadata.get("papermill", {}).get("parameters") or {}
+    return ", ".join(f"{name}={value}" for name, value in given.items() if name != "PROFILE" and own.get(name) != value)
 
 
 def write_gallery(home: Path, profile: str) -> Path:

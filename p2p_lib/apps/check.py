@@ -7,7 +7,7 @@ milliseconds, masks that hold the table too, objects without anything to track.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -25,9 +25,11 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
-from p2p_lib.datasets.image_sequence import paired_images
+from p2p_lib.datasets.image_sequence import WRITE_K, paired_images
 from p2p_lib.datasets.images import DEFAULT_HZ
+from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
+from p2p_lib.evaluation.known_size import size_doubt
 from p2p_lib.method.sampling import choose, usable_region
 
 #: Frames that are looked at, evenly spread.
@@ -50,14 +52,29 @@ RIM_SHARE = 0.5
 MEASURED_SHARE = 0.5
 #: What an object seldom is: so much of the image, so deep (of its distance). Good sequences: at most 0.07, 0.23.
 LARGE_SHARE, DEEP_SHARE = 0.12, 0.25
+#: Fewer points tell no pose.
+POSED = 3
 #: Fraction of depth at its largest value from which on it was cut off there.
 CLIPPED_SHARE = 0.1
 
+#: Metres per unit of depth images in the field, likeliest first, and whose they are.
+UNITS_M = {
+    0.001: "millimetres",
+    1.0: "metres",
+    1 / 5000: "TUM RGB-D",
+    1 / 4000: "1/4000 m, as of some LiDAR cameras",
+    0.0001: "tenths of millimetres, as of YCB-Video and short-range stereo",
+    1e-6: "micrometres",
+    0.01: "centimetres",
+}
+#: Where things stand that are tracked, m.
+_STANDS_M = (0.15, 5.0)
+_KNOWN = "--size NAME=CM (the object's longest side)"
 #: What to put where something of a folder is missing.
 _PUT = {
     "rgb": "Put the colour images there, one for each depth image.",
     "depth": "Put the depth images there, registered to colour, one for each colour image, in 16-bit millimetres.",
-    "K": "Write fx 0 cx / 0 fy cy / 0 0 1 into it, in pixels at the size of the images.",
+    "K": WRITE_K,
 }
 
 
@@ -68,11 +85,13 @@ def check_folder(
     format: str | None = None,
     depth_scale: float | None = None,
     config: Config | None = None,
+    sizes_m: Mapping[str, float] | None = None,
 ) -> list[Finding]:
     """What is right and wrong with a sequence, in the order in which it should be mended.
 
     prompts  clicks, for a sequence without masks: the built-in segmenter makes its first ones
     config   whose limits count (default: the preset ``default``)
+    sizes_m  how long objects are known to be: what was measured is compared with it
 
     Files that are missing or cannot be read are findings too, all that can be told without each other.
     """
@@ -98,7 +117,8 @@ def check_folder(
         except P2PError as error:
             return [_unreadable("clicks" if prompts else "masks", error)]
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
-    depth = _depth(frames)
+    scale = getattr(sequence, "depth_scale", 1.0)
+    depth = _depth(frames, scale)
     findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
     pairs = [(f, sequence.frame(f.index + 1)) for f in frames if f.index + 1 < len(sequence)]
     findings += [_times(sequence), _repeated(pairs), depth, _scale(pairs), _registered(frames)]
@@ -107,14 +127,16 @@ def check_folder(
     findings.append(_truth(sequence))
     if not firsts:
         return [*findings, _no_masks(sequence, any(masks), config)]
-    if beyond := _beyond(firsts, config):
+    if beyond := _beyond(firsts, config, scale):
         return [*findings, beyond]  # what follows would only be its consequences
     for name, (frame, mask) in firsts.items():
         if mask.sum() < config.lifecycle.min_mask_px:
             findings.append(_nothing_there(name, frame, mask, config))
             continue
+        if name in (sizes_m or {}):
+            findings.append(_size(name, sizes_m[name], frame, mask, sequence.camera))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
-        findings.append(_range(name, frame, mask, config))
+        findings.append(_range(name, frame, mask, config, scale))
         own = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
         findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in own]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
@@ -174,7 +196,17 @@ def _camera(camera: Camera) -> Finding:
     if (view_deg < VIEW_DEG[0]).any() or (view_deg > VIEW_DEG[1]).any():
         fix = "fx and fy are in pixels, at the size that the images have here."
         return Finding("camera", Level.WRONG, f"{text}: no RGB-D camera does", fix)
-    return Finding("camera", Level.OK, text)
+    return Finding(
+        "camera", Level.OK, f"{text}; images cannot tell whether fx and fy are right: a known size can, {_KNOWN}"
+    )
+
+
+def _size(name: str, known_m: float, frame: Frame, mask: np.ndarray, camera: Camera) -> Finding:
+    """Whether what a mask holds is as long as the object is known to be."""
+    text = size_doubt(known_m, measured_m := mask_length_m(frame, mask, camera))
+    if text:
+        return Finding(f"{name}: size", Level.LOOK, f"{text} (frame {frame.index})", "Mend K or --depth-scale first.")
+    return Finding(f"{name}: size", Level.OK, f"{100 * measured_m:.1f} cm long in frame {frame.index}, as it should be")
 
 
 def _times(sequence: Sequence) -> Finding:
@@ -225,7 +257,7 @@ def _repeated(pairs: list[tuple[Frame, Frame]]) -> Finding:
     return Finding("motion", Level.OK, "every image looked at differs from the next")
 
 
-def _depth(frames: list[Frame]) -> Finding:
+def _depth(frames: list[Frame], scale: float) -> Finding:
     """Whether depth is in metres once the scale is applied."""
     known = [frame.depth_m[frame.depth_m > 0] for frame in frames]
     share = float(np.mean([len(d) / f.depth_m.size for d, f in zip(known, frames)]))
@@ -240,9 +272,8 @@ def _depth(frames: list[Frame]) -> Finding:
             text = f"{text}; {100 * clipped:.0f} % of them are cut off at {every_m.max():.3g} m, the most that fits"
             fix = "No scale brings back what was cut off: export the depth again, as 16-bit millimetres."
             return Finding("depth", Level.WRONG, text, fix)
-        factor = _factor(median_m)
-        guess = f" A scale {factor:g} times the present one would make it {median_m * factor:.2g} m." if factor else ""
-        fix = f"Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1).{guess}"
+        fix = "Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1)."
+        fix += f" {guess}." if (guess := _units(median_m, scale)) else ""
         return Finding("depth", Level.WRONG, f"{text}: the unit is another", fix)
     if share < MEASURED_SHARE / 2:
         fix = "Keep the sensor's least distance, and out of the sun; glass, mirrors and black things have no depth."
@@ -250,9 +281,12 @@ def _depth(frames: list[Frame]) -> Finding:
     return Finding("depth", Level.OK, text)
 
 
-def _factor(median_m: float) -> float | None:
-    """The power of ten that brings a depth to where things stand before a camera; None where none does."""
-    return next((10.0**k for k in (-3, 3, -4, 4, -1, 1) if 0.15 <= median_m * 10.0**k <= 5), None)
+def _units(median_m: float, scale: float) -> str:
+    """The units of the field that bring a depth to where things stand before a camera, likeliest first, in words."""
+    fits = [(unit, what, median_m * unit / scale) for unit, what in UNITS_M.items() if not np.isclose(unit, scale)]
+    fits = [(unit, what, m) for unit, what, m in fits if _STANDS_M[0] <= m <= _STANDS_M[1]][:3]
+    said = [f"{unit:g} ({what}) would make it {m:.2g} m" for unit, what, m in fits]
+    return f"A unit of {', of '.join(said)}" if said else ""
 
 
 def _registered(frames: list[Frame]) -> Finding:
@@ -295,7 +329,7 @@ def _distance_m(frame: Frame, mask: np.ndarray) -> float:
     return float(np.median(measured)) if enough else float("nan")
 
 
-def _beyond(firsts: FirstMasks, config: Config) -> Finding | None:
+def _beyond(firsts: FirstMasks, config: Config, scale: float) -> Finding | None:
     """The one finding of objects that are all too far away, or all too near: most likely depth is in another unit."""
     limits, away_m = config.depth, {name: _distance_m(*first) for name, first in firsts.items()}
     distances = np.array(list(away_m.values()))
@@ -305,15 +339,14 @@ def _beyond(firsts: FirstMasks, config: Config) -> Finding | None:
     (first, (frame, mask)), *others = firsts.items()
     text = f"{away_m[first]:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
     text += f" ({', '.join(f'{name} {away_m[name]:.2f} m' for name, _ in others)})" if others else ""
-    factor = _factor(float(np.median(distances)))
-    guess = f": {factor:g} times the present one would make it {distances[0] * factor:.2f} m" if factor else ""
+    guess = f". {units}" if (units := _units(float(distances[0]), scale)) else ""
     wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
-    fix = f"If it was not, the depth scale is wrong (--depth-scale{guess}); if it was, --set depth.{wider}."
+    fix = f"If it was, --set depth.{wider}; if it was not, the depth scale is wrong (--depth-scale){guess}."
     text += f", but {limits.min_m:g} to {limits.max_m:g} m count"
     return Finding(f"{first}: depth", Level.WRONG, text, fix)
 
 
-def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding:
+def _range(name: str, frame: Frame, mask: np.ndarray, config: Config, scale: float) -> Finding:
     """Whether an object is where depth counts, and measured."""
     share = float((frame.depth_m[mask] > 0).mean())
     if share < MEASURED_SHARE:
@@ -321,7 +354,7 @@ def _range(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Finding
         text = f"only {100 * share:.0f} % of its pixels in frame {frame.index} have a depth"
         return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
     text = f"{_distance_m(frame, mask):.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
-    return _beyond({name: (frame, mask)}, config) or Finding(f"{name}: depth", Level.OK, text)
+    return _beyond({name: (frame, mask)}, config, scale) or Finding(f"{name}: depth", Level.OK, text)
 
 
 def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Finding:
@@ -358,7 +391,7 @@ def _points(name: str, frame: Frame, mask: np.ndarray, config: Config) -> Findin
     text = f"places to track in frame {frame.index}: {count}"
     if count < needed:
         fix = "Its surface alone carries the pose; expect doubts. Come nearer, light it better, show a textured side."
-        level = Level.LOOK if count >= config.registration.min_inliers else Level.WRONG
+        level = Level.LOOK if count >= POSED else Level.WRONG
         return Finding(f"{name}: points", level, f"{text}; {needed} are needed to find it again", fix)
     return Finding(f"{name}: points", Level.OK, text)
 

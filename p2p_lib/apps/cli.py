@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 from p2p_lib.apps.command_line import arg, command, main, open_page, run_options, warn
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
-from p2p_lib.core.options import RunOptions, names, pairs
+from p2p_lib.core.options import RunOptions, lengths_m, names, pairs
 
 #: Options that choose the method and its parameters.
 METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "detector")
@@ -74,7 +75,7 @@ def _run(a: argparse.Namespace) -> int:
 @command(
     "live",
     "track objects before a camera; a line of JSON per object and frame, on a terminal with --out a readable one",
-    arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING or folder:PATH"),
+    arg("--camera", required=True, metavar="CAM", help="realsense, realsense:RECORDING, folder:PATH or module:Class"),
     arg("--rate", type=float, metavar="HZ", help="frames per second of folder:PATH (default 30)"),
     arg("--backlog", type=int, metavar="N", help="images that may wait while one takes long (default 4)"),
     run_options(
@@ -83,6 +84,8 @@ def _run(a: argparse.Namespace) -> int:
         masks="segmenter (default: builtin)",
         stop="end before the camera's J-th image (default: Ctrl-C)",
     ),
+    arg("--to", metavar="URL", help="send the lines to tcp://HOST:PORT or udp://HOST:PORT, not to standard output"),
+    arg("--listen", action="store_true", help="lines of JSON on standard input add, correct and remove objects"),
     arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
     _FORCE,
     _OVERLAY,
@@ -90,6 +93,7 @@ def _run(a: argparse.Namespace) -> int:
 )
 def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
+    from p2p_lib.apps.live_words import Outlet, Words
     from p2p_lib.datasets.cameras import open_camera
     from p2p_lib.datasets.prompts import load_prompts
     from p2p_lib.datasets.run_writer import look_into
@@ -98,16 +102,20 @@ def _live(a: argparse.Namespace) -> None:
     options.config()  # what does not fit is said before the camera starts
     _film_wanted(a.overlay)
     keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
+    keep["say"] = warn
     keep |= {} if a.backlog is None else {"backlog": a.backlog}
     if a.out is not None:
         look_into(a.out, keep["if_exists"])  # before anyone clicks
     prompts = load_prompts(a.prompts) if a.prompts else ()
     camera = open_camera(a.camera, a.rate)
     try:
-        if not prompts:
+        if not prompts and not a.listen:
             prompts, first = click_first(camera, warn, not a.no_browser)
         line = text_line if a.out is not None and sys.stdout.isatty() else json_line
-        track_live(camera, prompts, lambda estimate: print(line(estimate), flush=True), options, first=first, **keep)
+        with Outlet(a.to, warn) if a.to else nullcontext() as outlet:
+            send = outlet.send if outlet else partial(print, flush=True)
+            keep["words"] = Words(sys.stdin, lambda error: warn(f"p2p live: {error}")) if a.listen else None
+            track_live(camera, prompts, lambda estimate: send(line(estimate)), options, first=first, **keep)
     except KeyboardInterrupt:
         pass  # how one stops a camera
     finally:
@@ -124,7 +132,7 @@ def _live(a: argparse.Namespace) -> None:
     arg("run", type=Path, nargs="?", metavar="DIR", help="folder written by p2p run"),
     arg("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)"),
     arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
-    run_options("start", "stop", "models", format="layout of --sequence (default: recognised)"),
+    run_options("start", "stop", "models", "sizes", format="layout of --sequence (default: recognised)"),
     _JSON,
     arg("--rows", action="store_true", help="every number as a CSV row: all forms, Chamfer, returns"),
     arg("--align", choices=("first", "all"), default="first", help="object frame: by the first scored frame, or all"),
@@ -158,10 +166,15 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     from p2p_lib.datasets.models import given_models
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.evaluation.consistency import consistency
+    from p2p_lib.evaluation.known_size import size_doubts
     from p2p_lib.evaluation.protocol import evaluate
 
     run = load_run(a.run)
     score, not_scored = None, ""
+    if unknown := lengths_m(options.sizes).keys() - run.objects.keys():
+        raise BadInput("size", f"the name {min(unknown)!r}", f"one of the objects: {', '.join(run.objects)}")
+    for name, text in size_doubts(a.run, lengths_m(options.sizes)).items():
+        warn(f"p2p eval: {name}: {text}")
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
             score = evaluate(run, options.models, a.align, a.min_visible_px)
@@ -342,12 +355,14 @@ def _film(a: argparse.Namespace) -> None:
     arg("--only", metavar="00,03", help="only these notebooks"),
     arg("--jobs", type=int, default=1, metavar="N", help="notebooks at a time"),
     arg("--parameter", action="append", metavar="NAME=VALUE", help="change a notebook parameter; repeatable"),
+    arg("--out", type=Path, metavar="DIR", help="folder of results (default out/PROFILE; with --parameter beside it)"),
 )
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.apps.clone import study
 
     parameters = pairs(a.parameter or (), "--parameter", "NAME=VALUE")
-    study("runner").run_notebooks(a.profile, only=names(a.only) or (), jobs=a.jobs, parameters=parameters)
+    how = {"only": names(a.only) or (), "jobs": a.jobs, "parameters": parameters, "out": a.out}
+    study("runner").run_notebooks(a.profile, **how)
 
 
 # --- data ----------------------------------------------------------------------------------------
@@ -378,7 +393,7 @@ def _click(a: argparse.Namespace) -> None:
     "check",
     "look at data of your own: what is wrong with it and what to do",
     arg("sequence", metavar="FOLDER", help="rgb/ depth/ cam_K.txt masks/, or any sequence"),
-    run_options("format", "depth_scale", prompts="clicks, where there are no masks"),
+    run_options("format", "depth_scale", "sizes", prompts="clicks, where there are no masks"),
     _JSON,
 )
 def _check(a: argparse.Namespace) -> int:
@@ -387,7 +402,8 @@ def _check(a: argparse.Namespace) -> int:
     from p2p_lib.datasets.prompts import load_prompts
 
     prompts = load_prompts(a.prompts) if a.prompts else ()
-    findings = check_folder(a.sequence, prompts=prompts, format=a.format, depth_scale=a.depth_scale)
+    how = {"format": a.format, "depth_scale": a.depth_scale, "sizes_m": lengths_m(RunOptions.of_arguments(a).sizes)}
+    findings = check_folder(a.sequence, prompts=prompts, **how)
     fine = "Nothing is wrong with it as far as can be seen."
     print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings, fine))
     return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
@@ -537,8 +553,21 @@ def _config(a: argparse.Namespace) -> None:
     print(f"In brackets, whose value it is: {whose}. Change one with --set KEY=VALUE.")
 
 
-@command("doctor", "check this installation and say how to mend it")
+@command(
+    "doctor",
+    "check this installation and say how to mend it",
+    arg(
+        "--warm-up",
+        action="store_true",
+        help="instead compile what is compiled once on a machine, and say how long it took",
+    ),
+)
 def _doctor(a: argparse.Namespace) -> int:
+    if a.warm_up:
+        from p2p_lib.core.compiled import warm_up
+
+        print(f"Inner loops are ready, after {warm_up(warn):.1f} s.")
+        return 0
     from p2p_lib.apps.doctor import run_doctor
     from p2p_lib.core.findings import Level, as_lines
 

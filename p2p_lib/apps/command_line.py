@@ -51,6 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for library in ("OMP", "OPENBLAS", "MKL"):
         # The matrices are small: more threads cost time, most of all where other programs run. Set it to override.
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    if "" not in sys.path:
+        sys.path.append("")  # --tracker mine:Tracker finds mine.py here
     arguments = parser().parse_args(argv)
     if arguments.log:
         logging.basicConfig(format="%(name)s %(levelname)s %(message)s")

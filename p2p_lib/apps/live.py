@@ -17,7 +17,9 @@ from time import monotonic
 import numpy as np
 
 from p2p_lib.apps.click import Clicker, wait_for_clicks
+from p2p_lib.apps.live_words import Words
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
+from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -47,6 +49,11 @@ class LiveCount:
         self.dropped += 0 if self._last is None else frame.index - self._last - 1
         self.frames, self._last = self.frames + 1, frame.index
 
+    def until(self, stop: int) -> None:
+        """That it was stopped before this frame: what lies between it and the last one tracked was dropped, too."""
+        if self._last is not None:
+            self.dropped, self._last = self.dropped + stop - self._last - 1, stop - 1
+
     def __str__(self) -> str:
         rate = f" ({self.frames / self.seconds:.1f} Hz)" if self.seconds else ""
         return f"{self.frames} frames in {self.seconds:.1f} s{rate}, {self.dropped} dropped"
@@ -64,6 +71,8 @@ def track_live(
     overlay: str | Path | None = None,
     if_exists: IfExists = "refuse",
     backlog: int = DEFAULT_BACKLOG,
+    say: Callable[[str], object] = lambda line: None,
+    words: Words | None = None,
 ) -> LiveCount:
     """Follow the objects of the prompts until the camera ends; every estimate goes to ``on_estimate`` at once.
 
@@ -75,12 +84,15 @@ def track_live(
     out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
     overlay  a film of it, .mp4, .gif or .webp, as the tracker sees it
     backlog  how many images may wait while one takes long, before the oldest is dropped; with 0 the newest one wins
+    say      told what it waits for before the first image
+    words    says of objects what comes in meanwhile; there need be no prompts then
 
     Closes the camera at the end, whatever ends it. Raises :class:`BadInput` for clicks that do not fit.
     """
     options, count = options or RunOptions(), count or LiveCount()
     prompts = sorted(prompts, key=lambda p: p.frame)
-    config, masks = options.config(), replace(options, prompts=prompts).mask_source()
+    asked = replace(options, prompts=prompts, masks=options.masks or (DEFAULT_SEGMENTER if words else None))
+    config, masks = options.config(), asked.mask_source()
     if masks.name != "clicks":
         raise BadInput("masks", repr(options.masks), f"the name of a segmenter: {', '.join(SEGMENTERS)}")
     if options.stop is not None and options.stop < 1:
@@ -89,14 +101,16 @@ def track_live(
         raise BadInput("backlog", backlog, "how many images may wait, from 0")
     config = config.with_values({"segmentation.sam2_every": 0})  # no image waits for it
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
+    warm_up(say)
     if options.tracker.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
+    said = list(prompts)
     with ExitStack() as kept:
         listeners = [lambda _, estimates: [on_estimate(estimate) for estimate in estimates.values()]]
         if overlay is not None:
             listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
         if out is not None:
-            listeners.append(kept.enter_context(_kept(out, camera, method, options, prompts, if_exists)))
+            listeners.append(kept.enter_context(_kept(out, camera, method, options, said, if_exists)))
 
         def tell(estimates: dict[str, PoseEstimate]) -> None:
             for listen in listeners if method.frame is not None else ():
@@ -108,11 +122,14 @@ def track_live(
         while frame is not None and (frame is first or options.stop is None or frame.index < options.stop):
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))
+            said += words.tell(method, frame.index) if words else []
             tell(method.step(frame))
             if frame is not first:  # which may be long ago
                 count.count(frame)
             count.seconds = monotonic() - start_s
             frame = newest.take()
+        if frame is not None and options.stop is not None:
+            count.until(options.stop)
         for estimates in method.finish():
             tell(estimates)
     if prompts:
@@ -122,7 +139,7 @@ def track_live(
 
 
 def _warm_up(method: Point2Pose) -> None:
-    """Load and compile on made-up images what the first of a camera would wait for, and later ones be dropped."""
+    """Load, and fill on made-up images, what the first of a camera would wait for, and later ones be dropped."""
     h, w = method.camera.height, method.camera.width
     print_ = np.kron(np.random.default_rng(0).integers(0, 255, (h // 8, w // 8, 3)), np.ones((8, 8, 1)))
     rgb, depth_m = np.full((h, w, 3), 90, np.uint8), np.full((h, w), 1.0, np.float32)
@@ -155,7 +172,7 @@ def _kept(
     camera: LiveCamera,
     method: Point2Pose,
     options: RunOptions,
-    prompts: Iterable[Prompt],
+    prompts: list[Prompt],
     if_exists: IfExists,
 ) -> Iterator[Listener]:
     """Keeps every frame in a run's folder; Ctrl-C is how one stops a camera, so that it ends the run well."""
@@ -175,7 +192,8 @@ def _kept(
         except KeyboardInterrupt as stop:
             stopped = stop
             writer.keep_whole_frames()
-        if writer.begun:
+        if writer.begun and writer.info["objects"]:
+            writer.info["prompts"] = [prompt.as_dict() for prompt in prompts]  # those that came meanwhile, too
             keeper.save_maps()
             keeper.judge()
     if stopped:
@@ -204,10 +222,10 @@ def text_line(estimate: PoseEstimate) -> str:
 
 
 def json_line(estimate: PoseEstimate) -> str:
-    """An estimate as a line of JSON: time_s, frame, object, status, confidence, T_cam_obj, map_id, covariance, reason.
+    """An estimate as a line of JSON, with time_s, frame, object, status, confidence, map_id and reason.
 
     ``T_cam_obj`` (4x4, metres) and ``covariance`` (6x6, [rotation rad, translation m] on the right) are null without
-    a pose.
+    a pose, ``T_world_obj`` as well where the camera does not say where it stands.
     """
     line = {
         "time_s": round(estimate.time_s, 6),
@@ -219,5 +237,6 @@ def json_line(estimate: PoseEstimate) -> str:
         "map_id": estimate.map_id,
         "covariance": estimate.covariance,
         "reason": estimate.reason,
+        "T_world_obj": estimate.T_world_obj,
     }
     return json.dumps(line, allow_nan=False, default=np.ndarray.tolist)

@@ -9,19 +9,24 @@ Needs ROS 2 (``rclpy``, ``cv_bridge``, ``message_filters``, ``tf2_ros``) on the 
 millimetres or 32FC1 metres) and ``camera_info`` (rectified images: distortion is ignored), and publishes
 ``poses/<object>`` (PoseWithCovarianceStamped in the camera's optical frame) and the transform from it to
 ``<object>``, while there is a pose and only then. ``prompts.json`` is what ``p2p click`` writes; its frame 0 is the
-first image that arrives.
+first image that arrives; ``prompts:=""`` starts without objects. Meanwhile they are added, corrected and removed by
+lines of JSON (``std_msgs/String``) on ``words``, ``{"name": "mug", "points": [[320, 240]]}`` or ``{"remove": "mug"}``
+(:class:`p2p_lib.apps.live_words.Words`).
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
+from p2p_lib.apps.live_words import Words
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import MissingBackend, P2PError
 from p2p_lib.core.types import Frame, PoseEstimate
 from p2p_lib.datasets.ros_messages import read_depth_m, read_rgb, seconds
@@ -76,9 +81,11 @@ class TrackingNode:
     prompts     what is said of objects, see :func:`p2p_lib.datasets.prompts.load_prompts`
     publish     takes an estimate with a pose and the header of its colour image
     config      parameters or the name of a preset, as :class:`p2p_lib.extended.default.Point2Pose` takes them
+    say         is told what does not fit of the ``words`` that come meanwhile
     """
 
-    def __init__(self, prompts: Any, publish: Any, config: Any = None):
+    def __init__(self, prompts: Any, publish: Any, config: Any = None, say: Callable[[str], object] = print):
+        self.words = Words(None, say)
         self.prompts, self.publish, self.config = sorted(prompts, key=lambda p: p.frame), publish, config
         self.tracker: Any = None
         self._headers: dict[int, Any] = {}  # of frames without an answer yet
@@ -92,6 +99,7 @@ class TrackingNode:
             self.tracker = Point2Pose(camera_of(info), self.config)
         while self.prompts and self.prompts[0].frame <= self._count:
             self.tracker.tell(self.prompts.pop(0))
+        self.words.tell(self.tracker, self._count)
         self._headers[self._count] = rgb.header
         estimates = self.tracker.step(frame_of(self._count, rgb, depth))
         self._count += 1
@@ -109,7 +117,7 @@ def main() -> None:
 
     try:
         rclpy, filters, tf2 = map(import_module, ("rclpy", "message_filters", "tf2_ros"))
-        sensors, geometry = map(import_module, ("sensor_msgs.msg", "geometry_msgs.msg"))
+        sensors, geometry, strings = map(import_module, ("sensor_msgs.msg", "geometry_msgs.msg", "std_msgs.msg"))
     except ModuleNotFoundError as error:
         fix = "Source its setup.bash, with an environment that sees the system's packages: environment.md."
         raise MissingBackend("ros2_node", f"{error.name} of ROS 2 is not to be found", fix) from None
@@ -126,7 +134,10 @@ def main() -> None:
         publishers[estimate.object].publish(fill_pose(kind(), estimate, header))
         transforms.sendTransform(fill_transform(geometry.TransformStamped(), estimate, header))
 
-    tracking = TrackingNode(load_prompts(path), publish, preset)
+    say = node.get_logger().warning
+    tracking = TrackingNode(load_prompts(path) if path else (), publish, preset, say)
+    node.create_subscription(strings.String, "words", lambda message: tracking.words.hear(message.data), 10)
+    warm_up(node.get_logger().info)
     kinds = {"rgb": sensors.Image, "depth": sensors.Image, "camera_info": sensors.CameraInfo}
     qos = import_module("rclpy.qos").qos_profile_sensor_data
     topics = [filters.Subscriber(node, kind, topic, qos_profile=qos) for topic, kind in kinds.items()]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SamplingConfig, SegmentationConfig, TrackingConfig
-from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
+from p2p_lib.core.plugins import find, knows, load
 
 #: 2D trackers by the name that --tracker takes, as module:callable(config, rng).
 TRACKERS = {
@@ -35,6 +34,12 @@ SEGMENTERS = {
     "sam2": "p2p_lib.segmenters.anchored:sam2",
     "sam2_video": "p2p_lib.segmenters.sam2_video:load",
 }
+#: What a class of somebody else has at least (:mod:`p2p_lib.core.interfaces`); ``name`` may be made by its __init__.
+PROMISES = {
+    "tracker": ("start", "add", "track", "drop", "reject", "suggest"),
+    "detector": ("detect",),
+    "segmenter": ("names", "segment", "remove"),
+}
 #: What runs when none is named.
 DEFAULT_TRACKER, DEFAULT_DETECTOR, DEFAULT_SEGMENTER = "builtin", "corners", "builtin"
 _SHORT_HORIZON = "p2p_lib.trackers.short_horizon:ShortHorizon"
@@ -47,10 +52,10 @@ def make_tracker(
 ) -> PointTracker:
     """The tracker of this name, or the one given, with the memory that the configuration grants it.
 
-    :class:`BadInput` lists the known names where this one is unknown.
+    A name may be ``package.module:Class``. :class:`BadInput` lists the known names where this one is unknown.
     """
     made = _find("tracker", tracker, TRACKERS)(config, rng) if isinstance(tracker, str) else tracker
-    return _load(_SHORT_HORIZON)(made, config.forget_after) if config.forget_after else made
+    return load(_SHORT_HORIZON)(made, config.forget_after) if config.forget_after else made
 
 
 def make_detector(detector: str | Detector, config: SamplingConfig, rng: np.random.Generator | None = None) -> Detector:
@@ -65,13 +70,10 @@ def make_segmenter(segmenter: str | Segmenter, camera: Camera, config: Segmentat
     return _find("segmenter", segmenter, SEGMENTERS)(camera, config)
 
 
+def is_segmenter(name: str) -> bool:
+    """Whether a name that may be a folder of masks as well stands for a segmenter."""
+    return knows("segmenter", ALIASES.get(name, name), SEGMENTERS)
+
+
 def _find(kind: str, name: str, known: dict[str, str]) -> Any:
-    name = ALIASES.get(name, name)
-    if name not in known:
-        raise BadInput(kind, repr(name), "one of " + ", ".join(known), did_you_mean(name, known))
-    return _load(known[name])
-
-
-def _load(where: str) -> Any:
-    module, _, attribute = where.partition(":")
-    return getattr(import_module(module), attribute)
+    return find(kind, ALIASES.get(name, name), known, PROMISES[kind])

@@ -35,6 +35,8 @@ class Camera:
             raise BadInput("camera", f"fx, fy, cx, cy = {values}", "finite numbers, focal lengths above 0 (pixels)")
         if self.width < 1 or self.height < 1:
             raise BadInput("camera", f"{self.width}x{self.height}", "an image size of at least 1x1 pixels")
+        for name, value in zip(("fx", "fy", "cx", "cy"), values):
+            object.__setattr__(self, name, float(value))
 
     @classmethod
     def from_K(cls, K: np.ndarray, width: int, height: int, name: str = "K") -> Camera:

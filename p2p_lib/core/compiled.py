@@ -1,40 +1,119 @@
 """Inner loops as machine code: what runs many times a frame over few points, where NumPy mostly calls itself.
 
 A function under :func:`compiled` takes and gives arrays and numbers alone, and calls no compiled function of another
-file: the cache of one file does not know when another changes.
+file: the cache of one file does not know when another changes. What it is called with is said beside it, so that
+:func:`warm_up` can have all of them ready before the first frame.
 """
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
+from importlib import import_module
+from time import monotonic
 from types import FrameType
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 F = TypeVar("F", bound=Callable)
 
+#: The modules that have compiled functions. The first tells whether they have been compiled before; two processes that
+#: compile take about as long for the others before and after the gap.
+LOOPS = (
+    "p2p_lib.trackers.builtin.features",
+    "p2p_lib.core.depth",
+    "p2p_lib.core.voxels",
+    "p2p_lib.extended.scene",
+    "p2p_lib.trackers.builtin.appearance",
+    "p2p_lib.extended.image_search",
+    "p2p_lib.core.robust",
+)
+LOOPS_BESIDE = ("p2p_lib.trackers.builtin.rigid_motion", "p2p_lib.method.refinement")
 _waiting: dict[str, list[Callable]] = {}
+_arguments: dict[tuple[str, str], tuple[str, ...]] = {}  # (module, function) to the types it is called with
+_warm: set[str] = set()
 _compiling = threading.Lock()
 
 
-def compiled(function: F) -> F:
-    """The function, compiled by numba when a function of its file is first called.
+def compiled(*arguments: str) -> Callable[[F], F]:
+    """Decorates a function that numba compiles when a function of its file is first called, or :func:`warm_up` is.
+
+    arguments  the types of its arguments in numba's words, ``"f8[:,::1], f8"``; several where it is called with
+               several, none where compiled functions of its file alone call it. Others still work, and are compiled
+               when they come
 
     The machine code is kept beside the file, or in the user's cache folder where that cannot be written. Sums keep
     their order (no ``fastmath``): results are the same in every run.
     """
-    _waiting.setdefault(function.__module__, []).append(function)
 
-    @wraps(function)
-    def first(*args):
-        _compile(function.__module__)
-        return getattr(sys.modules[function.__module__], function.__name__)(*args)
+    def declare(function: F) -> F:
+        _waiting.setdefault(function.__module__, []).append(function)
+        _arguments[function.__module__, function.__name__] = arguments
 
-    return cast(F, first)
+        @wraps(function)
+        def first(*args: Any) -> Any:
+            _compile(function.__module__)
+            return getattr(sys.modules[function.__module__], function.__name__)(*args)
+
+        return cast(F, first)
+
+    return declare
+
+
+def warm_up(say: Callable[[str], object] = lambda line: None) -> float:
+    """Compile everything that a run can meet, or load it where an earlier process did; returns the seconds it took.
+
+    Compiled code is kept for later processes (see :func:`compiled`): the first call on a machine takes 10 to 25 s, on
+    two cores at once, later ones a second. Without it a step compiles what it is the first to meet, as at an object's
+    first absence, and takes as long. Safe to call again, and in any thread.
+
+    say  told a line before anything is compiled; nothing where it is only loaded
+    """
+    start_s = monotonic()
+    beside: subprocess.Popen | None = None
+    try:
+        for module in (name for name in (*LOOPS, *LOOPS_BESIDE) if name not in _warm):
+            if module == LOOPS_BESIDE[0] and beside is not None:
+                beside.wait()  # what it has compiled is loaded; what it has not is compiled here
+            if _ready(module) and module == LOOPS[0]:
+                say("Compiling inner loops, once on this machine: 10 to 25 s.")
+                beside = _compiling_beside() if len(os.sched_getaffinity(0)) > 1 else None
+    finally:
+        if beside is not None:
+            beside.kill()
+            beside.wait()
+    return monotonic() - start_s
+
+
+def _ready(module: str) -> int:
+    """Have all functions of a module compiled; how many were not kept from before."""
+    import_module(module)
+    _compile(module)
+    missed = 0
+    _warm.add(module)
+    for (of, name), arguments in _arguments.items():
+        if of == module and arguments:
+            function = getattr(sys.modules[module], name)
+            for types in arguments:
+                function.compile(f"({types})")
+            missed += sum(function.stats.cache_misses.values())
+    return missed
+
+
+def _compiling_beside() -> subprocess.Popen | None:
+    """Another process that compiles :data:`LOOPS_BESIDE`, for numba compiles one function of a process at a time."""
+    code = f"import sys; sys.path[:] = {sys.path!r}; from p2p_lib.core import compiled as c\n"
+    code += "for module in c.LOOPS_BESIDE: c._ready(module)"
+    quiet = subprocess.DEVNULL
+    try:
+        return subprocess.Popen([sys.executable, "-c", code], stdin=quiet, stdout=quiet, stderr=quiet)
+    except OSError:  # it may not start any: then all is compiled here
+        return None
 
 
 def _compile(module: str) -> None:

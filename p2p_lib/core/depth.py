@@ -64,7 +64,10 @@ def of_one_surface(
     square = np.ones((2 * border_px + 1,) * 2, np.uint8)
     inner = cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
     found = inner & off_edges(depth_m, edge_m)
-    return found | (narrow_parts(mask, border_px) & agreeing(depth_m, mask, edge_m)) if narrow else found
+    if not narrow:
+        return found
+    agrees = agreeing(np.ascontiguousarray(depth_m, np.float32), np.ascontiguousarray(mask, bool), edge_m)
+    return found | (narrow_parts(mask, border_px) & agrees)
 
 
 def narrow_parts(mask: np.ndarray, border_px: int) -> np.ndarray:
@@ -75,7 +78,7 @@ def narrow_parts(mask: np.ndarray, border_px: int) -> np.ndarray:
     return (inside > 0) & (cv2.dilate(wide, near) == 0)  # the corner of something wide is not narrow
 
 
-@compiled
+@compiled("f4[:,::1], b1[:,::1], f8")
 def agreeing(depth_m: np.ndarray, mask: np.ndarray, edge_m: float) -> np.ndarray:
     """(H, W) bool: pixels of the mask that most of what it measures around them agrees with, two readings at least.
 
@@ -114,11 +117,12 @@ def lift(frame: Frame, uv_px: np.ndarray, camera: Camera, config: DepthConfig) -
     slanted surface its depth at the pixel's fraction too. Depth outside ``config.min_m`` to ``config.max_m`` is
     invalid.
     """
+    uv_px = np.ascontiguousarray(uv_px, float)
     depth_m = _plane_depths(frame.depth_m, uv_px, config.min_m, config.max_m, config.edge_m)
     return camera.unproject(uv_px, depth_m)
 
 
-@compiled
+@compiled("f4[:,::1], f8[:,::1], f8, f8, f8")
 def _plane_depths(depth_m: np.ndarray, uv_px: np.ndarray, min_m: float, max_m: float, edge_m: float) -> np.ndarray:
     """(N,) depth at each pixel (N, 2), NaN where there is none to trust."""
     height, width = depth_m.shape

@@ -52,6 +52,15 @@ class MissingBackend(P2PError, ImportError):
         super().__init__(_sentence(f"{name}: {missing}", fix), name=name)
 
 
+def advised(error: P2PError, fix: str) -> P2PError:
+    """The same error with more of what to do."""
+    if isinstance(error, BadInput):
+        return BadInput(error.name, error.got, error.expected, f"{error.fix} {fix}".strip())
+    if isinstance(error, MissingData):
+        return MissingData(error.name, error.expected, f"{error.fix} {fix}".strip())
+    return error
+
+
 class Doubt(UserWarning):
     """What can be meant, and most often is not: tracking goes on."""
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -13,13 +16,18 @@ from numpy.typing import ArrayLike
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.core.prediction import Prediction, Predictor
 from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
-from p2p_lib.core.types import Frame, PoseEstimate, Status
+from p2p_lib.core.types import NOT_FOUND, OUT_OF_VIEW, Frame, PoseEstimate, Status
 
 
 class Objects(ABC):
     """What a user adds, corrects and removes; whoever tracks them says what it is to ``begin`` one.
 
+    One thread at a time calls it, whichever that is: another one that comes meanwhile gets :class:`BadInput`, and
+    nothing has changed.
+
+    closed   whether it has been ended
     refused  of objects whose last prompt did not fit the frame that it was made on: why it was not used
     """
 
@@ -28,6 +36,25 @@ class Objects(ABC):
         self.objects: dict[str, Any] = {}
         self.refused: dict[str, BadInput] = {}
         self._said: dict[str, Prompt] = {}  # in the frame to come
+        self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
+        self._turn, self.closed = RLock(), False
+        self._predictor = Predictor()
+        self._cameras: deque[tuple[float, np.ndarray | None]] = deque()  # time and T_world_cam of frames, as given
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """While one thread is inside no other one can be; nobody can once it is closed."""
+        if self.closed:
+            raise BadInput("tracker", "a call after close()", "an open tracker", "Make a new one, or reset() this one.")
+        if not self._turn.acquire(blocking=False):
+            fix = "Put a lock around its calls, or give each thread a tracker of its own."
+            raise BadInput(
+                "tracker", "a call from a second thread during one from another", "one thread at a time", fix
+            )
+        try:
+            yield
+        finally:
+            self._turn.release()
 
     @property
     @abstractmethod
@@ -65,7 +92,8 @@ class Objects(ABC):
         if name in self.objects:
             raise BadInput("add_object", repr(name), "a name not in use", f"In use: {', '.join(self.objects)}.")
         if mask is clicks is negative is box is None:
-            self.begin(name)
+            with self.alone():
+                self.begin(name)
         else:
             self.tell(_prompt(name, mask=mask, clicks=clicks, negative=negative, box=box))
 
@@ -83,21 +111,37 @@ class Objects(ABC):
         if name not in known and not prompt.starts:
             what = "an empty mask" if prompt.mask is not None else "clicks beside it alone"
             raise BadInput(f"object {name!r}", what, "a click on it, a box or at least one pixel of its mask")
-        if name not in self.objects:
-            self.begin(name)
-        self._said[name] = prompt
-        self.refused.pop(name, None)
+        with self.alone():
+            if name not in self.objects:
+                self.begin(name)
+            self._said[name] = prompt
+            self.refused.pop(name, None)
 
     def remove_object(self, name: str) -> None:
         """Stop following an object; its points are dropped from the tracker."""
         if name not in self.objects:
             raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        if len(ids := self.objects.pop(name).ids):
-            self.tracker.drop(ids)
-        self._said.pop(name, None)
-        self.refused.pop(name, None)
-        if name in self.segmenter.names:
-            self.segmenter.remove(name)
+        with self.alone():
+            if len(ids := self.objects.pop(name).ids):
+                self.tracker.drop(ids)
+            for kept in (self._said, self.refused, self._without):
+                kept.pop(name, None)
+            self._predictor.forget(name)
+            if name in self.segmenter.names:
+                self.segmenter.remove(name)
+
+    def predict(self, name: str, time_s: float) -> Prediction | None:
+        """Where an object is at a time to come, if it goes on as it does; its velocity, and how sure both are.
+
+        time_s  not before the newest pose of more confidence than 0.5. The covariance grows with the time since:
+                after a second it says little
+
+        None until there is such a pose. Raises :class:`BadInput` for an unknown name and an earlier time.
+        """
+        with self.alone():
+            if name not in self.objects:
+                raise BadInput("predict", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+            return self._predictor.predict(name, time_s)
 
     def take_said(
         self, frame: Frame, masks: Mapping[str, np.ndarray | None]
@@ -107,6 +151,9 @@ class Objects(ABC):
         What was said until now belongs to this frame: what does not fit it is ``refused``, and stops nobody.
         """
         given, refused = given_masks(frame, masks, self._said, self.objects, self.camera)
+        self._cameras.append((frame.time_s, frame.T_world_cam))
+        while len(self._cameras) > self.tracker.latency_frames + 1:
+            self._cameras.popleft()
         said, self._said = {name: p for name, p in self._said.items() if name not in refused}, {}
         self.refused |= refused
         for name, error in refused.items():
@@ -114,11 +161,28 @@ class Objects(ABC):
                 doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is not used. {error.fix}")
         return given, said
 
-    def explained(self, estimate: PoseEstimate) -> PoseEstimate:
-        """An estimate that says, where its object has not started, what was wrong with its prompt."""
-        if estimate.status != Status.INITIALISING or estimate.object not in self.refused:
+    def explained(self, estimate: PoseEstimate, mask_given: bool) -> PoseEstimate:
+        """An estimate that says what is known: of an object that has not started, what was wrong with its prompt.
+
+        Where nobody gave a mask, an object without pixels may be hidden, or in view and not found; since when, is sure.
+        Where its frame was given with a ``T_world_cam``, its pose is in the world, too; the scene that a tracker finds
+        is no world of the user's.
+        """
+        name = estimate.object
+        T_world_cam = next((T for time_s, T in reversed(self._cameras) if time_s == estimate.time_s), None)
+        self._predictor.add(estimate, T_world_cam)
+        if estimate.T_cam_obj is not None and T_world_cam is not None:
+            estimate = replace(estimate, T_world_obj=T_world_cam @ estimate.T_cam_obj)
+        if estimate.status == Status.INITIALISING:
+            return replace(estimate, reason=str(self.refused[name])) if name in self.refused else estimate
+        if estimate.T_cam_obj is not None:
+            self._without.pop(name, None)
             return estimate
-        return replace(estimate, reason=str(self.refused[estimate.object]))
+        since = self._without.setdefault(name, estimate.frame_index)
+        if estimate.status != Status.OCCLUDED or mask_given:
+            return estimate
+        known = f"{OUT_OF_VIEW}: " * estimate.reason.startswith(OUT_OF_VIEW)
+        return replace(estimate, reason=f"{known}{NOT_FOUND} since frame {since}")
 
 
 def _prompt(name: str, **said: ArrayLike | None) -> Prompt:

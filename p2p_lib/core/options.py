@@ -20,6 +20,7 @@ from p2p_lib.core.backends import (
     DETECTORS,
     SEGMENTERS,
     TRACKERS,
+    is_segmenter,
 )
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput
@@ -58,18 +59,23 @@ _SET = _typed(
 )
 _SEED = _typed("of every random choice (default 0)", type=int, metavar="N")
 _DEVICE = _typed("where surfaces are kept and fused: cpu (default), cuda or cuda:N")
-_TRACKER = _typed(f"2D point tracker: {', '.join(TRACKERS)} (default {DEFAULT_TRACKER})", metavar="NAME")
-_DETECTOR = _typed(f"source of new points: {', '.join(DETECTORS)} (default {DEFAULT_DETECTOR})", metavar="NAME")
+_OWN = "or your own as package.module:Class"
+_TRACKER = _typed(f"2D point tracker: {', '.join(TRACKERS)} (default {DEFAULT_TRACKER}), {_OWN}", metavar="NAME")
+_DETECTOR = _typed(f"source of points: {', '.join(DETECTORS)} (default {DEFAULT_DETECTOR}), {_OWN}", metavar="NAME")
 #: Where masks come from, beside folders. A segmenter's name stands for clicks with that segmenter.
 MASK_SOURCES = ("dataset", "first", "clicks", *SEGMENTERS)
 _MASKS = _typed(
     "dataset (all its masks), first (each object's first), clicks (--prompts, or drawn from the first masks), "
-    f"{' or '.join(SEGMENTERS)} (clicks, with that segmenter), FOLDER (default: dataset; with --prompts clicks)",
+    f"{', '.join(SEGMENTERS)} or package.module:Class (clicks, with that segmenter), "
+    "FOLDER (default: dataset; with --prompts clicks)",
     metavar="SOURCE",
 )
 _PROMPTS = _typed("what starts objects and corrects masks (see p2p click)", type=Path, metavar="FILE")
 _SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")
-_FORMAT = _typed("layout: ho3d, bop, tum, open3d, ycbmultitrack, ycbineoat, folder (default: recognised)")
+_SKIP_BAD = _typed("leave frames out whose images are missing or cannot be read, and count them", action="store_true")
+_FORMAT = _typed(
+    "layout: ho3d, bop, tum, open3d, ycbmultitrack, ycbineoat, folder (default: recognised), or a package.module:load"
+)
 _DEPTH_SCALE = _typed("metres per raw depth unit (default 0.001)", type=float, metavar="M")
 _OBJECTS = _typed("track only these objects", read=names, metavar="A,B")
 _START = _typed("first frame", type=int, metavar="I")
@@ -81,6 +87,29 @@ _MODELS = _typed(
     action="extend",
     metavar="NAME=PATH",
 )
+
+
+_SIZES = _typed(
+    "how long objects are, cm: what was measured is compared with it",
+    flag="--size",
+    read=partial(pairs, option="--size", form="NAME=CM"),
+    nargs="+",
+    action="extend",
+    metavar="NAME=CM",
+)
+
+
+def lengths_m(given: Mapping[str, Any] | None) -> dict[str, float]:
+    """``{"mug": "9.5"}``, as ``--size mug=9.5`` gives centimetres, to metres; :class:`BadInput` for what is no size."""
+    found = {}
+    for name, cm in (given or {}).items():
+        try:
+            found[name] = float(cm) / 100
+        except (TypeError, ValueError):
+            found[name] = float("nan")
+        if not 0 < found[name] < 100:
+            raise BadInput(f"size of {name!r}", repr(cm), "its longest side in centimetres, as --size mug=9.5")
+    return found
 
 
 @dataclass(frozen=True)
@@ -115,12 +144,14 @@ class RunOptions:
     masks: str | None = field(default=None, metadata=_MASKS)
     prompts: str | Path | Iterable[Any] | None = field(default=None, metadata=_PROMPTS)
     save_masks: bool = field(default=False, metadata=_SAVE_MASKS)
+    skip_bad: bool = field(default=False, metadata=_SKIP_BAD)
     format: str | None = field(default=None, metadata=_FORMAT)
     depth_scale: float | None = field(default=None, metadata=_DEPTH_SCALE)
     objects: Sequence[str] | None = field(default=None, metadata=_OBJECTS)
     start: int = field(default=0, metadata=_START)
     stop: int | None = field(default=None, metadata=_STOP)
     models: Mapping[str, str | Path] | None = field(default=None, metadata=_MODELS)
+    sizes: Mapping[str, Any] | None = field(default=None, metadata=_SIZES)
 
     @classmethod
     def of_arguments(cls, arguments: argparse.Namespace) -> RunOptions:
@@ -138,7 +169,7 @@ class RunOptions:
         asked = ALIASES.get(asked, asked).removeprefix("dataset:")
         if not asked:
             raise BadInput("masks", repr(self.masks), "a folder, or one of " + ", ".join(MASK_SOURCES))
-        if asked in SEGMENTERS:
+        if is_segmenter(asked):
             return MaskSource("clicks", asked)
         return MaskSource(asked, DEFAULT_SEGMENTER, None if asked in MASK_SOURCES else asked)
 

@@ -42,12 +42,13 @@ def fit_rigid_inertia(
     p_b, p_a = np.asarray(p_b, float), np.asarray(p_a, float)
     w = np.ones(p_b.shape[:-1]) if weights is None else np.asarray(weights, float)
     several, (n, _) = p_b.shape[:-2], p_b.shape[-2:]
-    p_a, w = np.broadcast_to(p_a, p_b.shape), np.broadcast_to(w, p_b.shape[:-1])
-    T, inertia_m2 = _fits(p_b.reshape(-1, n, 3), p_a.reshape(-1, n, 3), w.reshape(-1, n))
+    p_a, w = np.broadcast_to(p_a, p_b.shape).copy(), np.broadcast_to(w, p_b.shape[:-1]).copy()
+    arrays = p_b.reshape(-1, n, 3), p_a.reshape(-1, n, 3), w.reshape(-1, n)
+    T, inertia_m2 = _fits(*map(np.ascontiguousarray, arrays))
     return T.reshape(*several, 4, 4), inertia_m2.reshape(several)
 
 
-@compiled
+@compiled("f8[:,:,::1], f8[:,:,::1], f8[:,::1]")
 def _fits(p_b: np.ndarray, p_a: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     T, inertia_m2, nothing = np.zeros((len(p_b), 4, 4)), np.zeros(len(p_b)), np.zeros((3, 3))
     for n in range(len(p_b)):
@@ -55,7 +56,7 @@ def _fits(p_b: np.ndarray, p_a: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, 
     return T, inertia_m2
 
 
-@compiled
+@compiled()
 def _fit(p_b: np.ndarray, p_a: np.ndarray, w: np.ndarray, prior: np.ndarray, T: np.ndarray) -> float:
     """Into T (4, 4) the motion of one set; returns the inertia. ``prior`` (3, 3) is added to the cross-covariance."""
     mean_b, mean_a, H, total = np.zeros(3), np.zeros(3), prior.copy(), 1e-300
@@ -97,11 +98,11 @@ def ransac(
     to have been missed.
     """
     drawn = rng.random((iterations, sample_size))
-    T, score = _ransac(np.asarray(p_b, float), np.asarray(p_a, float), np.asarray(limit_m, float), drawn)
+    T, score = _ransac(*(np.ascontiguousarray(a, float) for a in (p_b, p_a, limit_m, drawn)))
     return T if score > 0 else None
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,::1], f8[::1], f8[:,::1]")
 def _ransac(p_b: np.ndarray, p_a: np.ndarray, limit_m: np.ndarray, drawn: np.ndarray) -> tuple[np.ndarray, float]:
     """The best motion and its inliers, less a fraction of one for how loosely they fit; drawn (S, k) from 0 to 1."""
     count, size = len(p_b), drawn.shape[1]
@@ -127,7 +128,7 @@ def _ransac(p_b: np.ndarray, p_a: np.ndarray, limit_m: np.ndarray, drawn: np.nda
     return best, best_score
 
 
-@compiled
+@compiled()
 def _residual_m(T: np.ndarray, p_b: np.ndarray, p_a: np.ndarray) -> float:
     squared = 0.0
     for i in range(3):
@@ -135,7 +136,7 @@ def _residual_m(T: np.ndarray, p_b: np.ndarray, p_a: np.ndarray) -> float:
     return np.sqrt(squared)
 
 
-@compiled
+@compiled()
 def _lengths_agree(p_b: np.ndarray, p_a: np.ndarray, limit_m: np.ndarray, sample: np.ndarray) -> bool:
     """Whether a sample keeps the distances between successive points: no rigid motion fits it otherwise."""
     for i in range(len(sample)):
@@ -184,7 +185,7 @@ def refit(
     return RigidFit(T, inliers, residual, inertia_m2) if inliers.sum() >= min_inliers else None
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], i8, b1[::1], f8[:,::1]")
 def _refit(T_a_b, p_b, p_a, limit_m, weights, min_inliers, among, prior):
     T, residual, inertia_m2, w = T_a_b.copy(), np.empty(len(p_b)), 0.0, np.empty(len(p_b))
     inliers, fitted = np.zeros(len(p_b), np.bool_), np.zeros(len(p_b), np.bool_)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import Field, dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import cached_property
+from numbers import Real
 from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import cv2
@@ -59,7 +60,7 @@ class Frame:
             raise BadInput(f"frame {self.index} depth", got, want, "Register the depth to the colour camera first.")
         if not np.issubdtype(depth.dtype, np.floating):
             raise BadInput(f"frame {self.index} depth", depth.dtype, "metres as floats", "Apply the depth scale first.")
-        if not np.isfinite(self.time_s):
+        if not isinstance(self.time_s, Real) or not np.isfinite(self.time_s):
             raise BadInput(f"frame {self.index} time_s", self.time_s, "a finite time in seconds")
         if self.T_world_cam is not None:
             T_world_cam = se3.check(f"frame {self.index} T_world_cam", self.T_world_cam)
@@ -67,7 +68,7 @@ class Frame:
         object.__setattr__(self, "rgb", rgb.copy())
         # A sensor's NaN, infinity, negative and impossible readings all mean "no measurement", which is 0 here.
         with np.errstate(over="ignore"):
-            clean = depth.astype(np.float32)
+            clean = depth.astype(np.float32, order="C")
         clean[~((clean >= NEAREST_M) & (clean <= FARTHEST_M))] = 0
         object.__setattr__(self, "depth_m", clean)
 
@@ -165,17 +166,19 @@ class Status(StrEnum):
     RECOVERED = "recovered"  # the first frames after occluded or lost
 
 
-#: How the reason of an occlusion begins where the object has left the image.
-OUT_OF_VIEW = "out of view"
+#: How the reason of an occlusion begins where the object has left the image, and where nobody knows what hides it.
+OUT_OF_VIEW, NOT_FOUND = "out of view", "not found"
 
 
 def status_word(status: str, reason: str) -> str:
-    """A status as people are told it: nothing occludes an object that has left the image."""
-    return OUT_OF_VIEW if reason.startswith(OUT_OF_VIEW) else str(status)
+    """A status as people are told it: nothing occludes an object that has left the image, or is just not found."""
+    return next((known for known in (OUT_OF_VIEW, NOT_FOUND) if reason.startswith(known)), str(status))
 
 
 def status_text(status: str, reason: str) -> str:
     """The same with the reason behind it."""
+    if reason.startswith(NOT_FOUND):
+        return reason
     return f"{status_word(status, reason)}: {reason.removeprefix(f'{OUT_OF_VIEW}: ')}"
 
 
@@ -200,6 +203,7 @@ class PoseEstimate:
     joined          (id, T_obj_joined) of a map that became part of this one at this frame, else None: a point of its
                     object frame is T_obj_joined times it in this one
     last_T_cam_obj  the newest pose known, and last_seen_s its time: for those who want to guess
+    T_world_obj     (4, 4) the pose in the world, where there is a pose and the frame brought ``T_world_cam``; else None
     """
 
     object: str
@@ -217,6 +221,7 @@ class PoseEstimate:
     keyframe: bool = False
     map_id: int = 0
     joined: tuple[int, np.ndarray] | None = None
+    T_world_obj: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         name = f"estimate of {self.object!r} at frame {self.frame_index}"

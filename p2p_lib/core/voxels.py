@@ -82,7 +82,7 @@ class CpuGrid:
         return _trilinear(self.value, np.ascontiguousarray(index), offsets)
 
 
-@compiled
+@compiled("f4[:,:,::1], f8[:,::1], f8[:,::1]")
 def _trilinear(value: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     nx, ny, nz = value.shape
     out = np.full((len(offsets), len(index)), np.nan)
@@ -99,7 +99,10 @@ def _trilinear(value: np.ndarray, index: np.ndarray, offsets: np.ndarray) -> np.
     return out
 
 
-@compiled
+@compiled(
+    "f4[:,:,::1], f4[:,:,::1], f4[:,:,::1], f4[:,:,:,::1], i8[::1], f4[:,::1], b1[:,::1], u1[:,:,::1], f8[:,::1], "
+    "f8[::1], i8[::1], i8[::1], f4, f8, b1"
+)
 def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, hi, weight, tau_m, carve):
     height, width = depth_m.shape
     touched = 0

@@ -17,6 +17,7 @@ from typing import Protocol
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.plugins import find, is_place
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import ObjectTruth, Sequence, open_sequence
 
@@ -92,16 +93,21 @@ class FolderCamera:
 
 
 def open_camera(spec: str, rate_hz: float | None = None) -> LiveCamera:
-    """The camera that ``realsense``, ``realsense:RECORDING`` or ``folder:PATH`` names.
+    """The camera that ``realsense``, ``realsense:RECORDING``, ``folder:PATH`` or ``package.module:Class`` names.
+
+    The class is called without arguments and gives a :class:`LiveCamera`.
 
     rate_hz  of a folder alone (default 30). PATH is whatever ``p2p run`` takes for a sequence
     """
     kind, _, what = spec.partition(":")
     if kind == "folder" and what:
         return FolderCamera(open_sequence(what), DEFAULT_RATE_HZ if rate_hz is None else rate_hz)
+    if kind != "realsense" and is_place(spec) and rate_hz is None:
+        return find("camera", spec, {}, has=("read", "close"))()
     if kind != "realsense":
         fix = f"Did you mean folder:{spec}?" if Path(spec).is_dir() else ""
-        raise BadInput("camera", repr(spec), "realsense, realsense:RECORDING or folder:PATH", fix)
+        expected = "realsense, realsense:RECORDING, folder:PATH or your own as module:Class"
+        raise BadInput("camera", repr(spec), expected, fix)
     if rate_hz is not None:
         raise BadInput("rate", f"{rate_hz:g} with {spec}", "a rate for folder:PATH alone: other cameras have their own")
     from p2p_lib.datasets.realsense import RealSenseCamera

@@ -10,17 +10,20 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, MissingData, advised
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.masks import MaskFiles, find_masks
 from p2p_lib.datasets.sequence import ObjectTruth
 
+#: What to do without a camera matrix.
+WRITE_K = "Write fx 0 cx / 0 fy cy / 0 0 1 into it, in pixels at the size of the images."
+
 
 def paired_images(folder: Path, colour: str = "rgb") -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     """The files of ``rgb/`` (or as the layout calls it) and ``depth/``, one of each a frame."""
     rgb = images.list_files(folder / colour, images.COLOUR, "colour images")
-    return rgb, images.check_paired(images.list_files(folder / "depth", images.DEPTH, "depth images"), rgb)
+    return rgb, images.paired_depth(images.list_files(folder / "depth", images.DEPTH, "depth images"), rgb)
 
 
 def camera_for(rgb: Path, K: np.ndarray, name: str) -> Camera:
@@ -134,6 +137,13 @@ class ImageSequence:
 def image_files(folder: Path) -> ImageSequence:
     """The sequence in a folder with ``rgb/``, ``depth/``, ``cam_K.txt`` and times, paired and checked."""
     rgb, depth = paired_images(folder)
-    path = folder / "cam_K.txt"
-    camera = camera_for(rgb[0], images.read_numbers(path, "a 3x3 camera matrix in pixels"), str(path))
+    camera = camera_for(rgb[0], read_K(folder), str(folder / "cam_K.txt"))
     return ImageSequence(folder, rgb, depth, camera, images.frame_times(folder, rgb))
+
+
+def read_K(folder: Path) -> np.ndarray:
+    """(3, 3) the camera matrix in ``cam_K.txt``; :class:`MissingData` says what to write where there is none."""
+    try:
+        return images.read_numbers(folder / "cam_K.txt", "a 3x3 camera matrix in pixels")
+    except MissingData as error:
+        raise advised(error, WRITE_K) from None

@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import re
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from io import BytesIO
 from pathlib import Path
 
@@ -20,8 +23,31 @@ LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
 DEPTH = (*LOSSLESS, ".npy")
 DEPTH_SCALE = 0.001  # metres per raw unit: all layouts here store millimetres
 DEFAULT_HZ = 30.0
+#: What to do about a frame that cannot be read, where nobody can mend it.
+SKIP_BAD = "p2p run --skip-bad goes on without such frames."
 # YCBInEOAT's rotations are orthonormal to 0.3 % only: nearer than this they are made rigid, beyond refused.
 NOT_RIGID = 0.01
+
+
+_gaps = ContextVar("gaps", default=False)
+
+
+@contextmanager
+def gaps_allowed(allowed: bool = True) -> Iterator[None]:
+    """Depth images may be missing of a sequence that is opened inside: reading such a frame fails, opening does not."""
+    before = _gaps.set(allowed)
+    try:
+        yield
+    finally:
+        _gaps.reset(before)
+
+
+def paired_depth(files: tuple[Path, ...], rgb: tuple[Path, ...]) -> tuple[Path, ...]:
+    """The depth image of each colour image, by their names where some are missing and :func:`gaps_allowed` says so."""
+    by_name = {path.stem: path for path in files}
+    if _gaps.get() and len(files) < len(rgb) and by_name.keys() <= {path.stem for path in rgb}:
+        return tuple(by_name.get(path.stem, files[0].with_stem(path.stem)) for path in rgb)
+    return check_paired(files, rgb, SKIP_BAD if len(files) < len(rgb) else "")
 
 
 def full(folder: Path) -> Path:

@@ -96,9 +96,7 @@ class MaskLog:
         at = np.argwhere(cells)
         low, high = (at.min(0), at.max(0) + 1) if len(at) else (np.zeros(2, int), np.zeros(2, int))
         bits = np.packbits(cells[low[0] : high[0], low[1] : high[1]])
-        depth_m = frame.depth_m[CELLS][cells]
-        measured = depth_m > 0
-        p_cam = self._camera.unproject(CELL_PX * at[measured, ::-1], depth_m[measured])
+        p_cam = _points(frame, mask, self._camera)
         box = (*low.tolist(), *(high - low).tolist())
         self._rows[name].append(_Row(frame.index, int(np.count_nonzero(mask)), box, bits, *_measured(p_cam)))
 
@@ -117,6 +115,18 @@ class MaskLog:
 def load_masks(folder: str | Path) -> dict[str, ObjectMasks]:
     """Object to its masks; empty for a run that was killed before it could write them, and for older ones."""
     return load_by_object(Path(folder) / FILE, ObjectMasks)
+
+
+def mask_length_m(frame: Frame, mask: np.ndarray, camera: Camera) -> float:
+    """The length along its longest axis of what a mask (H, W) bool holds, by depth; NaN where nothing is measured."""
+    return _measured(_points(frame, mask, camera))[0]
+
+
+def _points(frame: Frame, mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """(N, 3) what was measured of a mask at the pixels :data:`CELLS`."""
+    at = np.argwhere(mask[CELLS])
+    depth_m = frame.depth_m[CELLS][mask[CELLS]]
+    return camera.unproject(CELL_PX * at[depth_m > 0, ::-1], depth_m[depth_m > 0])
 
 
 def _measured(p_cam: np.ndarray) -> tuple[float, np.ndarray]:

@@ -28,7 +28,7 @@ from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
 IfExists = Literal["refuse", "replace", "resume"]
 _ANEW = "--force, in Python if_exists='replace'"
 #: What of ``run.json`` may be otherwise when a run is resumed: how far it came, and what made it, which poses tell.
-_MAY_DIFFER = {"frames", "finished", "stopped_by", "versions", "commit", "modified"}
+_MAY_DIFFER = {"left_out", "frames", "finished", "stopped_by", "versions", "commit", "modified"}
 
 
 class RunWriter:
@@ -307,7 +307,7 @@ def _place(info: Mapping[str, Any]) -> str:
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:
-    return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason="not added yet")
+    return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason="not followed")
 
 
 def _from(folder: Path | None, path: Path) -> Path:

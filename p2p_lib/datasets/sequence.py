@@ -1,12 +1,13 @@
 """RGB-D sequences: the protocol that every layout fulfils, and :func:`open_sequence`, which opens any of them.
 
-A layout is one module with ``load(folder, masks)``, and one line in :data:`FORMATS`.
+A layout is one module with ``load(folder, masks)``, and one line in :data:`FORMATS`. One of somebody else is a function
+``load(folder, masks)``, named as ``package.module:load`` or offered as an entry point (:mod:`p2p_lib.core.plugins`).
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -17,7 +18,9 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import data_dir
+from p2p_lib.core.plugins import find, offered
 from p2p_lib.core.types import Frame
+from p2p_lib.datasets.images import gaps_allowed
 
 #: Layouts, each by the name of its module: what a folder of it holds, in the order in which they are tried.
 FORMATS: dict[str, tuple[str, ...]] = {
@@ -104,6 +107,7 @@ def open_sequence(
     depth_scale: float | None = None,
     seed: int = 0,
     masks: str | Path | None = None,
+    gaps: bool = False,
 ) -> Sequence:
     """A sequence from a folder, the bundled ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
 
@@ -112,10 +116,11 @@ def open_sequence(
     Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one; any
     other folder by its path below ``$P2P_DATA``.
 
-    format       one of :data:`FORMATS`; by default the layout is recognised
+    format       one of :data:`FORMATS`, or somebody else's; by default the layout is recognised, ours before others
     depth_scale  metres per raw unit of the depth images (default: the layout's, mostly 0.001 for millimetres)
     seed         of the generator, for ``synthetic/NAME``
     masks        another folder of masks (a name inside the sequence, or a path); by default the dataset's own
+    gaps         depth images may be missing: their frames cannot be read, all others can
 
     Raises :class:`MissingData` where files are not there and :class:`BadInput` where they do not fit.
     """
@@ -124,8 +129,7 @@ def open_sequence(
     if depth_scale is not None and not 0 < depth_scale <= 1:
         fix = "Millimetres are 0.001, metres are 1."
         raise BadInput("depth_scale", depth_scale, "metres per raw unit, above 0 and at most 1", fix)
-    if format is not None and format not in FORMATS:
-        raise BadInput("format", repr(format), "one of " + ", ".join(FORMATS))
+    read_folder = None if format is None else _loader(format)
     name = str(path_or_name)
     if name.startswith(SYNTHETIC):
         render = import_module(_GENERATOR).scenario_dir
@@ -134,14 +138,16 @@ def open_sequence(
         folder, format = _find(path_or_name, format)
         name = os.path.basename(os.path.abspath(folder))
     format = format or recognise(folder)
-    read = import_module(f"p2p_lib.datasets.{format}").load(folder, masks)
+    with gaps_allowed(gaps):
+        read = (read_folder or _loader(format))(folder, masks)
     return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale)
 
 
 def reopen(info: Mapping[str, Any]) -> Sequence:
     """The sequence that a run was made on, as its ``run.json`` says; raises as :func:`open_sequence`."""
-    depth_scale = (info.get("options") or {}).get("depth_scale")
-    return open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, info["seed"])
+    asked = info.get("options") or {}
+    depth_scale, gaps = asked.get("depth_scale"), bool(asked.get("skip_bad"))
+    return open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, info["seed"], gaps=gaps)
 
 
 def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:
@@ -204,5 +210,17 @@ def recognise(folder: Path) -> str:
 
 
 def _layout(folder: Path) -> str | None:
-    found = (name for name, patterns in FORMATS.items() if any(next(folder.glob(p), None) for p in patterns))
-    return next(found, None)
+    """By patterns; those of others are tried before the last of ours, which takes almost everything."""
+
+    def tried() -> Iterator[tuple[str, tuple[str, ...]]]:
+        *ours, last = FORMATS.items()
+        yield from ours
+        yield from ((name, getattr(_loader(name), "patterns", ())) for name in offered("dataset"))
+        yield last
+
+    return next((name for name, patterns in tried() if any(next(folder.glob(p), None) for p in patterns)), None)
+
+
+def _loader(format: str) -> Callable[[Path, str | Path | None], Any]:
+    """The function that reads a layout."""
+    return find("dataset", format, {name: f"p2p_lib.datasets.{name}:load" for name in FORMATS})

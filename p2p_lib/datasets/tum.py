@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import ImageSequence, camera_for
+from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, read_K
 
 DEPTH_SCALE = 1 / 5000
 APART_S = 0.02
@@ -65,6 +65,6 @@ def _K(folder: Path) -> tuple[np.ndarray, str]:
     path = folder / "cam_K.txt"
     known = re.search("|".join(KINECTS), images.full(folder).name)
     if path.is_file() or known is None:
-        return images.read_numbers(path, "a 3x3 camera matrix in pixels"), str(path)
+        return read_K(folder), str(path)
     fx, fy, cx, cy = KINECTS[known[0]]
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), f"the camera of {known[0]}"

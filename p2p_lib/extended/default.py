@@ -10,6 +10,8 @@ from collections.abc import Container
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, as_config
@@ -85,7 +87,8 @@ class Point2Pose(pipeline.Point2Pose):
     config  parameters, or the name of a preset (default: ``default``)
 
     What becomes of the objects is logged as ``p2p_lib``. :meth:`close` ends its threads, and so does the end of a
-    ``with`` block.
+    ``with`` block. One thread at a time calls it, whichever that is; another one that comes meanwhile gets
+    :class:`BadInput`.
     """
 
     def __init__(
@@ -97,7 +100,22 @@ class Point2Pose(pipeline.Point2Pose):
         segmenter: str | Segmenter = backends.DEFAULT_SEGMENTER,
     ):
         config = as_config("default" if config is None else config)
-        super().__init__(camera, config, tracker, detector, segmenter, compose(camera, config))
+        self._made_of: tuple[Any, ...] = camera, config, tracker, detector, segmenter
+        super().__init__(*self._made_of, compose(camera, config))
+
+    def reset(self) -> None:
+        """Forget all objects and the stream: as new, with the same camera, parameters and parts.
+
+        What was given as an object, a 2D tracker or a segmenter, is kept and starts anew.
+        """
+        self.closed = False
+        with self.alone():
+            for name in self.segmenter.names:
+                self.segmenter.remove(name)
+            self.close()
+            turn = self._turn
+            Point2Pose.__init__(self, *self._made_of)
+            self._turn = turn
 
 
 def compose(camera: Camera, config: Config) -> pipeline.Parts:
@@ -107,8 +125,6 @@ def compose(camera: Camera, config: Config) -> pipeline.Parts:
         return pipeline.Parts()
     scene = None
     if "scene" in on:
-        import numpy as np
-
         scene = Scene(camera, config.depth, np.random.default_rng([config.seed, 2]))
     front = partial(Reacquisition, on=on, scene=scene)
     return pipeline.Parts(FrameGuard("moments" in on), front, partial(object_tracker, on=on))

@@ -182,7 +182,7 @@ class ImageSearch:
         return _compare(*arrays, self._lens, self._noise, near_m, _FEWEST * len(sample) / _POINTS)
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,::1], f8[:,::1], f4[:,::1], UniTuple(f8, 4)")
 def _normal_equations(T, p_obj, n_obj, depth_m, lens):
     """A (6, 6), b (6,) of the motion about a centre (3,) that lays points into the planes of those at their pixels."""
     (height, width), (fx, fy, cx, cy) = depth_m.shape, lens
@@ -209,7 +209,9 @@ def _normal_equations(T, p_obj, n_obj, depth_m, lens):
     return A, right, centre
 
 
-@compiled
+@compiled(
+    "f8[:,:,::1], f8[:,::1], f8[:,::1], f4[:,::1], f4[:,::1], u1[:,:,::1], UniTuple(f8, 4), UniTuple(f8, 2), f8, f8"
+)
 def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, fewest):
     poses, points = len(T_cam_obj), len(p_obj)
     (height, width), (fx, fy, cx, cy) = depth_m.shape, lens

@@ -128,7 +128,7 @@ class Scene:
         return view.p[good], seen.p[at], at
 
 
-@compiled
+@compiled("u8[:,::1], u8[:,::1]")
 def two_nearest(descriptors, others):
     """Of binary descriptors (M, W) uint64: the nearest (M,) of others (N, W), and how many bits it and the next differ.
 

@@ -114,7 +114,7 @@ class Point2Pose(Objects):
         while there are none), ``self.masks`` keeps the masks that they were made with, the segmenter's included, and
         ``self.tracks`` everybody's 2D tracks.
         """
-        with self.stopwatch.frame(), uninterrupted():
+        with self.alone(), self.stopwatch.frame(), uninterrupted():
             tracked = self.front.track(self._asked(frame, masks or {}))
             self.frame = None if tracked is None else tracked.frame
             if tracked is None:
@@ -123,7 +123,8 @@ class Point2Pose(Objects):
             seen = self.front.observe(tracked)
             steps = {name: self.objects[name].step(obs) for name, obs in seen.items()}
             self.front.apply({name: step.requests for name, step in steps.items()})
-            estimates = {name: self.explained(steps[name].estimate) for name in self.objects if name in steps}
+            answers = {name: steps[name].estimate for name in self.objects if name in steps}
+            estimates = {n: self.explained(answer, tracked.masks[n] is not None) for n, answer in answers.items()}
         self._log(estimates)
         return estimates
 
@@ -160,6 +161,7 @@ class Point2Pose(Objects):
 
     def close(self) -> None:
         """End the threads, after what they are at; nothing can be tracked any more."""
+        self.closed = True
         self._beside.shutdown()
 
     def __enter__(self) -> Self:

@@ -283,7 +283,7 @@ class _Problem:
 _HUBER = 1.345
 
 
-@compiled
+@compiled("f8[::1], f8, f8")
 def _huber_loss(e: np.ndarray, threshold: float, most: float) -> float:
     """Twice Huber's loss of residuals (N,) at least 0 and, as they count, at most ``most``, summed."""
     total = 0.0
@@ -292,12 +292,12 @@ def _huber_loss(e: np.ndarray, threshold: float, most: float) -> float:
     return total
 
 
-@compiled
+@compiled()
 def _upper_median(x: np.ndarray) -> float:
     return np.partition(x, len(x) // 2)[len(x) // 2]
 
 
-@compiled
+@compiled("f8[:,::1], f8[::1], f8, f8[::1], f8[::1,:], b1[::1], f8, f8, f8, f8")
 def _linearised(p_obj, centre, radius, value, gradient, valid, floor_m, reach_m, huber_m, least_m):
     """Of points (N, 3) with these distances: rows (n,) used, their J (n, 6), H, g, the cut, the rms and the noise.
 
@@ -324,7 +324,7 @@ def _linearised(p_obj, centre, radius, value, gradient, valid, floor_m, reach_m,
     return used, J, H / count, g / count, cut, np.sqrt(squares / count), sigma
 
 
-@compiled
+@compiled()
 def surface_jacobian(q: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     """(N, 6) derivative of Phi at points q (N, 3) when the pose turns right by xi: q -> exp(-xi) q.
 
@@ -338,7 +338,7 @@ def surface_jacobian(q: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     return J
 
 
-@compiled
+@compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8")
 def _keypoint_system(
     T_obj_cam: np.ndarray, p_obj: np.ndarray, p_cam: np.ndarray, sigma_m: np.ndarray, centre: np.ndarray, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -19,9 +19,12 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
 from p2p_lib.datasets.alignment import background_share, misfit
+from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.prompts import load_prompts, prompts_in
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.synthetic.faults import Faulty
+
+CAMERA = open_sequence("synthetic/crossing").camera
 
 
 def another_K(sequence, K):
@@ -46,7 +49,12 @@ FAULTS = {
 }
 #: What must be found: the level, a part of what is said, and a part of the remedy.
 EXPECTED = {
-    "depth unit": ("depth", Level.WRONG, r"^\d{3} m in the middle", r"--depth-scale .* 0\.001 times the present"),
+    "depth unit": (
+        "depth",
+        Level.WRONG,
+        r"^\d{3} m in the middle",
+        r"--depth-scale .*\. A unit of 0\.001 \(millimetres\)",
+    ),
     "a moving scale": ("scale", Level.WRONG, r"all depth changes by \d+ % from frame \d to \d", "a depth camera"),
     "ten times as far": ("box: depth", Level.WRONG, r"6\.\d+ m away.*0\.1 to 2\.5 m count", "the depth scale is wrong"),
     "depth not registered": ("registration", Level.WRONG, r"0\.7\d times as large", "Register depth to colour"),
@@ -281,12 +289,26 @@ def scaled_depth(folder, factor):
 
 
 @pytest.mark.parametrize(
-    ("factor", "limit", "scale"), [(0.1, "depth.min_m=0.03", "10 times"), (10, "depth.max_m=1", "0.1 times")]
+    ("factor", "limit", "scale"),
+    [(0.1, "depth.min_m=0.03", "0.01 (centimetres)"), (5, "depth.max_m=7", "0.0002 (TUM RGB-D)")],
 )
 def test_objects_all_out_of_range_are_one_finding(good, tmp_path, factor, limit, scale):
     (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)))
     assert wrong.name == "box: depth" and "(can " in wrong.text
     assert limit in wrong.fix and scale in wrong.fix
+
+
+def test_a_known_size_tells_what_nothing_else_does(good):
+    """The focal length of a lens half as long makes everything twice as wide; all other findings stay as they were."""
+    assert "--size NAME=CM" in found(good, "camera").text
+    length_m = mask_length_m((frame := open_sequence(good).frame(0)), open_sequence(good).masks(0)["box"], CAMERA)
+    known = {"sizes_m": {"box": length_m}}
+    assert found(good, "box: size", **known).level is Level.OK
+    wide = another_K(open_sequence(good), CAMERA.K * [[0.5, 1, 1], [1, 0.5, 1], [1, 1, 1]])
+    finding = found(wide, "box: size", **known)
+    assert finding.level is Level.LOOK and re.search(r"(1\.[5-9]|2\.0)\d? times: focal length", finding.text)
+    assert alarms(check_folder(wide, **known)) == [finding]
+    assert frame.index == 0
 
 
 def test_depth_that_was_cut_off_must_be_exported_again(good, tmp_path):

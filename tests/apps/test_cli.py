@@ -303,6 +303,53 @@ def test_depth_whose_scale_moves_is_doubted_before_anything_is_tracked(sequence,
     assert re.match(r"p2p run: depth: all depth changes by [67] % from frame \d to \d\. .* See p2p check", first)
 
 
+def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(sequence, tmp_path, capsys):
+    (sequence / "depth/0002.png").unlink()
+    assert run(sequence, tmp_path / "run") == 2
+    assert "0002.png is missing. p2p run --skip-bad goes on" in capsys.readouterr().err
+    assert run(sequence, tmp_path / "run", "--skip-bad", "--save-masks") == 0
+    assert re.search(
+        r"7 of 8 frames.*; 1 left out, which cannot be read, the first: .*0002\.png", capsys.readouterr().out
+    )
+    kept = load_run(tmp_path / "run")
+    assert (
+        kept.objects["object"].frame_index.tolist() == [0, 1, 3, 4, 5, 6, 7] and kept.objects["object"].has_pose.all()
+    )
+    assert list(kept.info["left_out"]) == ["2"] and "0002.png" in kept.info["left_out"]["2"]
+    assert cli.main(["eval", str(tmp_path / "run")]) == 0
+    assert cli.main(["film", str(tmp_path / "run"), "--out", str(tmp_path / "film.webp")]) == 0
+    assert run(sequence, tmp_path / "run", "--skip-bad", "--save-masks", "--resume") == 0
+
+
+def test_a_torn_frame_is_left_out_too_but_not_one_that_a_prompt_is_made_on(sequence, tmp_path, capsys):
+    for k in (0, 3):
+        (sequence / f"depth/000{k}.png").write_bytes(b"torn")
+    (tmp_path / "prompts.json").write_text('{"objects": [{"name": "board", "frame": 1, "points": [[60, 50]]}]}')
+    clicks = ["--prompts", str(tmp_path / "prompts.json"), "--skip-bad"]
+    assert run(sequence, tmp_path / "run", *clicks) == 0
+    assert re.search("6 of 8 frames.*; 2 left out", capsys.readouterr().out)
+    (sequence / "depth/0001.png").write_bytes(b"torn")
+    assert run(sequence, tmp_path / "other", *clicks) == 2
+    assert "0001.png" in (err := capsys.readouterr().err) and "A prompt is made on it." in err
+
+
+def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, capsys):
+    """The board is 60 px wide half a metre away: 15 cm."""
+    run(sequence, tmp_path / "run", "--size", "object=15")
+    assert "known to be" not in capsys.readouterr().out
+    run(sequence, tmp_path / "other", "--size", "object=7")
+    assert re.search(
+        r"object: known to be 7\.0 cm long, measured 1\d\.\d cm in its masks, 2\.\d+ times", capsys.readouterr().out
+    )
+    assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=40"]) == 0
+    assert "or its length was never in view" in capsys.readouterr().err
+    for words in (["eval", str(tmp_path / "run")], ["run", str(sequence), "--out", str(tmp_path / "third")]):
+        assert cli.main([*words, "--size", "mug=9"]) == 2
+        assert "size: got the name 'mug', expected one of the objects: object" in capsys.readouterr().err
+    assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=long"]) == 2
+    assert "its longest side in centimetres" in capsys.readouterr().err
+
+
 def test_config_explains_every_parameter_and_how_the_presets_differ(capsys):
     from p2p_lib.core.config import diff, parameters, preset
 

@@ -4,6 +4,7 @@ import json
 import queue
 import re
 import shutil
+import socket
 import sys
 import threading
 import time
@@ -17,7 +18,9 @@ import pytest
 
 from p2p_lib.apps import cli
 from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
+from p2p_lib.apps.live_words import Outlet, Words
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -37,6 +40,12 @@ from tests.fixtures.sliding_board import H, K, W, write_sequence
 FRAMES = 20  # then the board jumps back
 SETTINGS = {"method.surface": "false", "method.graph": "false"}
 PROMPTS = (Prompt("board", 0, [[60, 50]]),)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ready():
+    """Nothing that is said comes of what is compiled, wherever these tests are run first."""
+    warm_up()
 
 
 @pytest.fixture(scope="module")
@@ -277,7 +286,18 @@ def test_live_prints_a_line_per_object_and_frame(folder, tmp_path, capsys):
     assert code == 0
     frames, dropped = map(int, re.fullmatch(r"(\d+) frames in .* s \(.* Hz\), (\d+) dropped\n", err).groups())
     assert len(lines) == frames and frames + dropped <= FRAMES
-    keys = {"time_s", "frame", "object", "status", "confidence", "T_cam_obj", "map_id", "covariance", "reason"}
+    keys = {
+        "time_s",
+        "frame",
+        "object",
+        "status",
+        "confidence",
+        "T_cam_obj",
+        "map_id",
+        "covariance",
+        "reason",
+        "T_world_obj",
+    }
     assert all(set(line) == keys and line["object"] == "board" for line in lines)
     last = lines[-1]
     assert last["time_s"] == pytest.approx(last["frame"] / 30, abs=1e-6) and last["status"] in WITH_POSE
@@ -316,6 +336,7 @@ def test_no_pose_is_null_and_the_line_is_strict_json():
         "map_id": 0,
         "covariance": None,
         "reason": "",
+        "T_world_obj": None,
     }
     assert "\n" not in line and "NaN" not in line
 
@@ -339,7 +360,10 @@ def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeyp
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--camera", "webcam"], "camera: got 'webcam', expected realsense, realsense:RECORDING or folder:PATH"),
+        (
+            ["--camera", "webcam"],
+            "camera: got 'webcam', expected realsense, realsense:RECORDING, folder:PATH or your own",
+        ),
         (["--camera", "{folder}"], "Did you mean folder:"),
         (["--camera", "folder:{folder}", "--prompts", "{prompts}", "--stop", "0"], "stop: got 0, expected"),
         (["--camera", "folder:"], "camera: got 'folder:'"),
@@ -347,6 +371,13 @@ def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeyp
         (["--camera", "folder:{folder}x"], "slidex: no such folder"),
         (["--camera", "realsense:{folder}/no.bag"], "no.bag: no such recording"),
         (["--camera", "folder:{folder}", "--overlay", "x.avi"], "film: got x.avi, expected a name that ends in .mp4"),
+        (
+            ["--camera", "folder:{folder}", "--listen", "--to", "http://localhost:1"],
+            "to: got 'http://localhost:1', expected",
+        ),
+        (["--camera", "folder:{folder}", "--listen", "--to", "tcp://localhost"], "expected tcp://HOST:PORT or udp://"),
+        (["--camera", "folder:{folder}", "--listen", "--to", "tcp://localhost:1"], "nobody listens there"),
+        (["--camera", "no_such_module:Camera"], "no_such_module cannot be imported"),
         (["--camera", "realsense", "--rate", "15"], "rate: got 15 with realsense"),
         (["--camera", "folder:{folder}", "--prompts", "{folder}/none.json"], "none.json: no such file"),
         (["--camera", "folder:{folder}", "--prompts", "{prompts}", "--masks", "sam9"], "sam9"),
@@ -384,3 +415,164 @@ def test_what_is_tracked_before_the_camera_starts_uses_all_that_its_frames_will(
     assert method.objects["made up"].life.has_pose and method.masks["made up"].any()
     used = {"tracking", "segmentation", "observation", "registration", "refinement", "selection", "map"}
     assert used <= set(method.stopwatch.last_ms)
+
+
+# --- while it runs -----------------------------------------------------------------------------
+
+
+class Lines:
+    """What somebody types, when they do."""
+
+    def __init__(self):
+        self.typed = queue.Queue()
+
+    def __iter__(self):
+        return iter(self.typed.get, None)
+
+
+def test_objects_are_added_corrected_and_removed_while_it_runs(scripted, folder, tmp_path):
+    sequence, lines, got, errors = open_sequence(folder), Lines(), [], []
+    words = Words(lines, errors.append)
+    #: Before which frame what is typed.
+    script = {
+        2: '{"name": "board", "points": [[64, 52]]}',
+        5: '{"objects": [{"name": "board", "points": [[70, 55]], "negative": [[5, 5]]}]}',
+        8: '{"remove": "board"}',
+        10: '{"name": "again", "box": [30, 20, 130, 110]}',
+    }
+
+    def type_for(k):
+        if k in script:
+            lines.typed.put(script[k])
+            while lines.typed.qsize():
+                time.sleep(0.001)
+            time.sleep(0.02)
+
+    class Told(Scripted):
+        def read(self):
+            k = self.next
+            self.next += 1
+            while k > 0 and self.done.get(timeout=20) != k - 1:
+                pass
+            type_for(k)
+            return sequence.frame(k) if k < 14 else None
+
+    camera = Told(sequence.camera)
+    camera.next, camera.done = 0, queue.Queue()
+    step = Point2Pose.step
+
+    def stepped(self, frame, masks=None):
+        estimates = step(self, frame, masks)
+        camera.done.put(frame.index)
+        return estimates
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Point2Pose, "step", stepped)
+        patch.setattr("p2p_lib.apps.live._warm_up", lambda method: None)
+        options = RunOptions(settings=SETTINGS)
+        track_live(camera, (), got.append, options, words=words, out=tmp_path / "run", backlog=20)
+    seen = {name: [e.frame_index for e in got if e.object == name] for name in ("board", "again")}
+    assert seen == {"board": list(range(2, 8)), "again": list(range(10, 14))} and not errors
+    assert all(e.T_cam_obj is not None for e in got)
+    info = load_run(tmp_path / "run").info
+    assert [(p["name"], p["frame"]) for p in info["prompts"]] == [("board", 2), ("board", 5), ("again", 10)]
+
+
+def test_words_that_do_not_fit_are_said_and_change_nothing():
+    lines, errors = Lines(), []
+    words = Words(lines, errors.append)
+    with Point2Pose(Camera.from_K(K, W, H)) as method:
+        for line in (
+            "hello",
+            '{"remove": "mug"}',
+            '{"name": "mug", "points": [[900, 10]]}',
+            '{"name": "mug"}',
+            "[]",
+            " ",
+        ):
+            lines.typed.put(line)
+        lines.typed.put(None)
+        while lines.typed.qsize() or len(errors) < 3:
+            time.sleep(0.001)
+        assert words.tell(method, 3) == [] and not method.objects
+    said = "\n".join(errors)
+    for part in (
+        "line: got hello",
+        "remove_object: got 'mug', expected one of no objects",
+        "clicks on 'mug'",
+        "prompts: got",
+    ):
+        assert part in said
+    assert len(errors) == 5
+
+
+@pytest.mark.parametrize("kind", ["tcp", "udp"])
+def test_lines_go_to_a_socket(kind, folder, tmp_path, capsys):
+    got = []
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM if kind == "tcp" else socket.SOCK_DGRAM) as server:
+        server.bind(("127.0.0.1", 0))
+        server.settimeout(30)
+        if kind == "tcp":
+            server.listen()
+
+        def read():
+            if kind == "tcp":
+                with server.accept()[0].makefile() as lines:
+                    got.extend(lines)
+            else:
+                while json.loads(line := server.recv(65536).decode())["frame"] < 5:
+                    got.append(line)
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        prompts = save_prompts(tmp_path / "p.json", PROMPTS)
+        words = ["live", "--camera", f"folder:{folder}", "--rate", "40", "--prompts", str(prompts), *WORDS]
+        assert cli.main([*words, "--to", f"{kind}://127.0.0.1:{server.getsockname()[1]}"]) == 0
+        reader.join()
+    assert capsys.readouterr().out == "" and {json.loads(line)["object"] for line in got} == {"board"}
+
+
+def test_a_reader_that_goes_away_ends_nothing(capsys):
+    said = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        with Outlet(f"tcp://127.0.0.1:{server.getsockname()[1]}", said.append) as outlet:
+            server.accept()[0].close()
+            for _ in range(20):
+                outlet.send("x" * 10_000)
+                time.sleep(0.01)
+    assert len(said) == 1 and "tracking goes on" in said[0]
+
+
+def test_a_camera_of_somebody_elses(folder, tmp_path, capsys, monkeypatch):
+    (tmp_path / "their_camera.py").write_text(
+        "import numpy as np\n"
+        "from p2p_lib import Camera, Frame\n"
+        "from p2p_lib.datasets.sequence import open_sequence\n"
+        "class Theirs:\n"
+        "    name = 'theirs'\n"
+        "    def __init__(self):\n"
+        f"        self.sequence, self.k = open_sequence({str(folder)!r}), -1\n"
+        "        self.camera = self.sequence.camera\n"
+        "    def read(self):\n"
+        "        self.k += 1\n"
+        "        f = self.sequence.frame(self.k)\n"
+        "        return Frame(self.k, f.time_s, f.rgb, f.depth_m, np.eye(4)) if self.k < 6 else None\n"
+        "    def close(self):\n"
+        "        pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    prompts = save_prompts(tmp_path / "p.json", PROMPTS)
+    assert cli.main(["live", "--camera", "their_camera:Theirs", "--prompts", str(prompts), *WORDS]) == 0
+    line = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert line["T_world_obj"] == line["T_cam_obj"] is not None
+    assert cli.main(["live", "--camera", "their_camera:Frame", "--prompts", str(prompts)]) == 2
+    assert "a class without read, close" in capsys.readouterr().err
+
+
+def test_frames_up_to_the_stop_are_all_counted(folder):
+    def slow(estimate):
+        time.sleep(0.08)
+
+    options = RunOptions(settings=SETTINGS, stop=12)
+    count = track_live(FolderCamera(open_sequence(folder), 100), PROMPTS, slow, options, backlog=0)
+    assert count.frames + count.dropped == 12 and count.dropped > 0

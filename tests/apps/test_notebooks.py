@@ -254,6 +254,7 @@ def test_what_a_notebook_claimed_is_read_back(run):
     assert (seed.value, seed.bar) == (3, "") and (scale.value, scale.bar) == (2.0, "at least 0.5")
     assert isinstance(scale.value, float) and profile.value == "quick"
     assert result.title == "A story" and result.image_png == PNG and result.error == ""
+    assert "SEED=3" in result.changed and "SEED=3" in (run[1] / "index.html").read_text()
     assert result.seconds > 0
 
 

@@ -111,6 +111,8 @@ calls = []
 class Node:
     def declare_parameter(self, name, default): return M(value={"prompts": sys.argv[1]}.get(name, default))
     def create_publisher(self, kind, topic, depth): return M(publish=lambda m: calls.append((topic, m)))
+    def create_subscription(self, kind, topic, hear, depth): Node.hear = hear
+    def get_logger(self): return M(info=lambda line: None, warning=lambda line: calls.append((line[:4], None)))
     def destroy_node(self): calls.append(("destroyed", None))
 class Sync:
     def __init__(self, topics, queue_size, slop): self.topics = topics
@@ -119,7 +121,8 @@ sys.path.insert(0, sys.argv[2])
 from tests.apps.test_ros2_node import blank, messages
 qos = module("rclpy.qos", qos_profile_sensor_data="sensors")
 module("rclpy", init=lambda: None, create_node=lambda name: Node(), shutdown=lambda: None, qos=qos,
-       spin=lambda node: [Sync.back(*messages(k)) for k in range(2)])
+       spin=lambda node: [(Sync.back(*messages(k)), Node.hear(M(data=line))) for k, line in enumerate(sys.argv[3:])])
+module("std_msgs"); module("std_msgs.msg", String=object)
 module("message_filters", Subscriber=lambda node, kind, topic, qos_profile: topic, ApproximateTimeSynchronizer=Sync)
 module("tf2_ros", TransformBroadcaster=lambda node: M(sendTransform=lambda m: calls.append(("tf", m))))
 module("sensor_msgs"); module("sensor_msgs.msg", Image=object, CameraInfo=object)
@@ -133,7 +136,9 @@ print(*(topic for topic, _ in calls))
 def test_the_node_spins_and_publishes(tmp_path):
     prompts = tmp_path / "prompts.json"
     prompts.write_text('{"objects": [{"name": "card", "frame": 0, "points": [[100, 119], [80, 110], [120, 130]]}]}')
-    words = [sys.executable, "-c", ROS, prompts, __file__.rpartition("/tests/")[0]]
+    lines = ["", '{"remove": "card"}', '{"name": "more", "points": [[110, 100]]}', "hello", '{"remove": "more"}', ""]
+    words = [sys.executable, "-c", ROS, prompts, __file__.rpartition("/tests/")[0], *lines]
     ran = subprocess.run(words, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr[-2000:]
-    assert ran.stdout.split() == ["poses/card", "tf", "poses/card", "tf", "destroyed"]
+    card, more = ["poses/card", "tf"], ["poses/more", "tf"]
+    assert ran.stdout.split() == [*card, *card, *more, "line", *more, "destroyed"]

@@ -8,18 +8,19 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from p2p_lib.core.compiled import uninterrupted
+from p2p_lib.core.compiled import LOOPS, LOOPS_BESIDE, uninterrupted
+from p2p_lib.core.paths import PROJECT
 
 FILE = '''
 import numpy as np
 from p2p_lib.core.compiled import compiled
 
-@compiled
+@compiled()
 def square(x):
     """Of x."""
     return x * x
 
-@compiled
+@compiled("f8[::1]")
 def norm(v):
     total = 0.0
     for x in v:
@@ -86,3 +87,65 @@ def test_a_signal_that_is_ignored_stays_ignored():
 def test_another_thread_hears_no_signals():
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(uninterrupted()(lambda: 3)).result() == 3
+
+
+WARM = """
+import sys
+from collections import Counter
+
+from numba.core import event
+
+import p2p_lib
+from p2p_lib.core import compiled
+from p2p_lib.run import run
+
+
+class Compilations(event.Listener):
+    def on_start(self, event):
+        seen.append(event.data["dispatcher"].__name__)
+
+    def on_end(self, event):
+        pass
+
+
+seen, calls, said = [], Counter(), []
+event.register("numba:compile", Compilations())
+p2p_lib.warm_up(said.append)
+in_warm_up, seen[:] = len(seen), []
+
+
+def counted(name, function):
+    def call(*args):
+        calls[name] += 1
+        return function(*args)
+    return call
+
+
+declared = [key for key, arguments in compiled._arguments.items() if arguments]
+for module, name in declared:
+    loops = vars(sys.modules[module])
+    loops[name] = counted(name, loops[name])
+for sequence, options in (("crossing", {"stop": 96}), ("other_side", {"start": 60, "stop": 130})):
+    run(f"synthetic/{sequence}", f"{sys.argv[1]}/{sequence}", masks="first", progress=False, **options)
+print(in_warm_up > 0, len(said), seen, [name for _, name in declared if not calls[name]])
+"""
+
+
+def test_once_warmed_up_nothing_is_compiled_in_any_frame(tmp_path):
+    """In a fresh process with an empty cache, with absences, returns, the scene's search and a second map."""
+    surroundings = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    words = [sys.executable, "-c", WARM, str(tmp_path)]
+    ran = subprocess.run(words, capture_output=True, text=True, env=surroundings)
+    assert not ran.returncode, ran.stderr
+    assert ran.stdout.strip() == "True 1 [] []"
+    again = "import p2p_lib; said = []; p2p_lib.warm_up(said.append); print(said)"
+    ran = subprocess.run([sys.executable, "-c", again], capture_output=True, text=True, env=surroundings)
+    assert ran.stdout.strip() == "[]", ran.stderr
+
+
+def test_every_file_with_compiled_functions_is_warmed_up():
+    files = (PROJECT / "p2p_lib").rglob("*.py")
+    have = {
+        str(p.relative_to(PROJECT).with_suffix("")).replace("/", ".") for p in files if "\n@compiled" in p.read_text()
+    }
+    assert have == {*LOOPS, *LOOPS_BESIDE}

@@ -25,12 +25,14 @@ TYPED = {
     "masks": (["--masks", "dataset:drawn"], "dataset:drawn"),
     "prompts": (["--prompts", "p.json"], "p.json"),
     "save_masks": (["--save-masks"], True),
+    "skip_bad": (["--skip-bad"], True),
     "format": (["--format", "bop"], "bop"),
     "depth_scale": (["--depth-scale", "0.0001"], 0.0001),
     "objects": (["--objects", "mug,can"], ["mug", "can"]),
     "start": (["--start", "3"], 3),
     "stop": (["--stop", "9"], 9),
     "models": (["--models", "mug=a.ply", "can=b.ply"], {"mug": "a.ply", "can": "b.ply"}),
+    "sizes": (["--size", "mug=9.5"], {"mug": "9.5"}),
 }
 
 

@@ -52,6 +52,8 @@ def test_readings_that_are_none_become_zero(reading, dtype):
         (RGB, np.full((4, 6), 500, np.uint16), 0.0, "frame 7 depth: got uint16, expected metres as floats"),
         (RGB, DEPTH, np.nan, "frame 7 time_s: got nan"),
         (RGB, DEPTH, np.inf, "frame 7 time_s: got inf"),
+        (RGB, DEPTH, None, "frame 7 time_s: got None, expected a finite time in seconds"),
+        (RGB, DEPTH, "0.1", "frame 7 time_s: got 0.1, expected a finite time"),
     ],
 )
 def test_frame_refuses(rgb, depth, time_s, words):

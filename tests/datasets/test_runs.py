@@ -87,7 +87,7 @@ def test_everything_comes_back(table, tmp_path):
         np.testing.assert_array_equal(obj.frame_index, np.arange(20))
         np.testing.assert_array_equal(obj.time_s, np.arange(20) / 30)
         np.testing.assert_array_equal(obj.status, [e.status if e else "initialising" for e in given])
-        np.testing.assert_array_equal(obj.reason, [e.reason if e else "not added yet" for e in given])
+        np.testing.assert_array_equal(obj.reason, [e.reason if e else "not followed" for e in given])
         np.testing.assert_array_equal(obj.has_pose, [bool(e and e.T_cam_obj is not None) for e in given])
         for i, e in enumerate(given):
             if e and e.T_cam_obj is not None:

@@ -148,7 +148,7 @@ def align(
     return Alignment(uv, A, ncc, cov, contrast / patches.contrast[rows])
 
 
-@compiled
+@compiled("f4[:,::1], f4[:,::1], f4[:,:,::1], i8[::1], f4[:,::1], f4[:,:,::1], i8")
 def _aligned(image, pixels, solver, rows, uv, A, iterations):
     """Moves uv (N, 2) and A (N, 2, 2) to where the patches at ``rows`` are; correlation and contrast (N,) there."""
     right, bottom, one = np.float32(image.shape[1] - 1), np.float32(image.shape[0] - 1), np.float32(1)

@@ -91,7 +91,7 @@ def _described(maps: list[np.ndarray], uv: np.ndarray, M: np.ndarray) -> np.ndar
     return np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-6))
 
 
-@compiled
+@compiled("f4[:,::1], f4[:,::1], f4[:,::1]")
 def _rectified(gx: np.ndarray, gy: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """(D, N, S) derivatives along directions (D, 2), 0 where negative: in one pass over each."""
     out = np.empty((len(directions), *gx.shape), gx.dtype)

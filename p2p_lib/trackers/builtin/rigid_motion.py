@@ -66,7 +66,7 @@ def fit_pose(
     return PoseFit(se3.from_rt(R, at - R @ centre), np.linalg.inv(H), centre, agrees)
 
 
-@compiled
+@compiled("f8[:,::1], f8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[::1], f8[::1], f8, f8, f8, f8")
 def _fit_pose(R, at, arm_seg, map_cov, uv_px, cov_px2, z_m, sigma_m, fx, fy, cx, cy):
     """Rotation, centre, H (6, 6), and the squared residuals of pixels and depths (N,) in variances."""
     count, start, turned = len(arm_seg), at.copy(), np.zeros(3)
@@ -110,7 +110,7 @@ def _fit_pose(R, at, arm_seg, map_cov, uv_px, cov_px2, z_m, sigma_m, fx, fy, cx,
     return R, at, H, chi2, chi2_z
 
 
-@compiled
+@compiled()
 def _rotation(w: np.ndarray) -> np.ndarray:
     """(3, 3) turn about w (3,) by its length, rad."""
     angle = np.sqrt((w * w).sum())

@@ -1,0 +1,131 @@
+"""What goes in and out of ``p2p live`` while it runs: words on its objects, and lines of estimates over a network."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import replace
+from urllib.parse import urlsplit
+
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, in_a_line
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.datasets.prompts import parse_prompts
+from p2p_lib.extended.default import Point2Pose
+
+_FORM = '{"name": "mug", "points": [[x, y], ...]} or {"remove": "mug"}'
+#: A reader that takes no line for so long is no longer there, s.
+_GONE_S = 0.5
+
+
+class Words:
+    """Lines of JSON that add, correct and remove objects, as they come: by a thread that reads them, or :meth:`hear`.
+
+    ``{"name": "mug", "points": [[320, 240]]}`` starts an object in the next frame, or corrects its mask; ``negative``
+    and ``box`` as in a file of ``p2p click``, whose whole content is understood, too. ``{"remove": "mug"}`` ends it.
+    What does not fit is said, and changes nothing.
+    """
+
+    def __init__(self, lines: Iterable[str] | None, say: Callable[[str], object]):
+        self._said: deque[tuple[str, Prompt | None]] = deque()
+        self._say = say
+        if lines is not None:
+            threading.Thread(target=lambda: deque(map(self.hear, lines), 0), daemon=True).start()
+
+    def hear(self, line: str) -> None:
+        """Take in one line; what does not fit is said."""
+        try:
+            self._said.extend(_parsed(line) if line.strip() else ())
+        except BadInput as error:
+            self._say(str(error))
+
+    def tell(self, method: Point2Pose, frame_index: int) -> list[Prompt]:
+        """Tell a tracker what was said since, before its next frame; the prompts that it took."""
+        taken = []
+        while self._said:
+            name, prompt = self._said.popleft()
+            try:
+                if prompt is None:
+                    method.remove_object(name)
+                else:
+                    prompt = replace(prompt, frame=frame_index)
+                    method.tell(prompt)
+                    taken.append(prompt)
+            except BadInput as error:
+                self._say(str(error))
+        return taken
+
+
+def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
+    """Object and prompt of each thing that a line says; no prompt: it is to be removed."""
+    try:
+        said = json.loads(line)
+    except ValueError as error:
+        raise BadInput("line", f"{line.strip()[:60]} ({in_a_line(error)})", _FORM) from None
+    if isinstance(said, dict) and said.keys() == {"remove"} and isinstance(said["remove"], str):
+        return [(said["remove"], None)]
+    prompts = parse_prompts(said if isinstance(said, dict) and "objects" in said else {"objects": [said]})
+    return [(prompt.name, prompt) for prompt in prompts]
+
+
+class Outlet:
+    """Sends lines to ``tcp://HOST:PORT`` or, one a datagram, to ``udp://HOST:PORT``; a context manager.
+
+    A reader that goes away, or takes no line for half a second, is given up, which is said once: tracking goes on.
+    """
+
+    def __init__(self, to: str, say: Callable[[str], object]):
+        self._to, self._say = to, say
+        self._socket: socket.socket | None = _connected(to)
+
+    def send(self, line: str) -> None:
+        """One more line."""
+        if self._socket is None:
+            return
+        try:
+            self._socket.sendall(f"{line}\n".encode())
+        except OSError as error:
+            if self._socket.type == socket.SOCK_DGRAM and not isinstance(error, TimeoutError):
+                return  # nobody listens yet, or any more: datagrams are for whoever is there
+            self._say(f"{self._to} takes no more lines ({in_a_line(error)}); tracking goes on.")
+            self.close()
+
+    def close(self) -> None:
+        """Send no more."""
+        if self._socket is not None:
+            with suppress(OSError):
+                self._socket.close()
+        self._socket = None
+
+    def __enter__(self) -> Outlet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _connected(to: str) -> socket.socket:
+    try:
+        at = urlsplit(to)
+        kind = {"tcp": socket.SOCK_STREAM, "udp": socket.SOCK_DGRAM}[at.scheme]
+        host, port = at.hostname, at.port
+        if not host or port is None:
+            raise ValueError
+    except (KeyError, ValueError):
+        raise BadInput("to", repr(to), "tcp://HOST:PORT or udp://HOST:PORT") from None
+    found: P2PError = MissingData(to, "no such host")
+    with suppress(socket.gaierror):
+        for family, _, _, _, address in socket.getaddrinfo(host, port, type=kind):
+            made = socket.socket(family, kind)
+            made.settimeout(_GONE_S)
+            try:
+                made.connect(address)
+            except OSError as error:
+                made.close()
+                found = MissingData(to, f"nobody listens there ({in_a_line(error)})", "Start the reader first.")
+            else:
+                return made
+    raise found

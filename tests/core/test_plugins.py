@@ -1,0 +1,129 @@
+"""Parts of other people: by their place or by the name that an installed package offers; what is wrong is one line."""
+
+import shutil
+import sys
+
+import pytest
+
+from p2p_lib.apps import cli
+from p2p_lib.core.backends import make_detector, make_segmenter, make_tracker
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import preset
+from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.options import RunOptions
+from p2p_lib.datasets.runs import load_run
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.trackers.lk import LkTracker
+from tests.apps.test_cli import POINTS_ALONE
+from tests.fixtures.sliding_board import write_sequence
+
+CODE = """
+from p2p_lib.datasets import folder as plain
+from p2p_lib.detectors.classical import UniformDetector
+from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
+from p2p_lib.trackers.lk import LkTracker
+
+class Mine(LkTracker):
+    name = "mine"
+
+class Dots(UniformDetector):
+    name = "dots"
+
+class Cutter(BuiltinSegmenter):
+    def __init__(self, *of):
+        super().__init__(*of)
+        self.name = "cutter"
+
+class Unfinished:
+    def start(self, frame, camera=None): ...
+
+def load(folder, masks):
+    return plain.load(folder, masks)
+
+load.patterns = ("gt_mask.marked/",)
+"""
+OFFERED = """
+[p2p_lib.trackers]
+somebodys = their_parts:Mine
+builtin = their_parts:Mine
+gone = their_lost_parts:Mine
+
+[p2p_lib.detectors]
+dots = their_parts:Dots
+
+[p2p_lib.segmenters]
+cutter = their_parts:Cutter
+
+[p2p_lib.datasets]
+marked = their_parts:load
+"""
+
+
+@pytest.fixture
+def theirs(tmp_path, monkeypatch):
+    """Somebody's package, as if it were installed."""
+    home = tmp_path / "site"
+    (home / "their_parts-1.0.dist-info").mkdir(parents=True)
+    (home / "their_parts.py").write_text(CODE)
+    (home / "their_parts-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: their-parts\nVersion: 1.0\n"
+    )
+    (home / "their_parts-1.0.dist-info" / "entry_points.txt").write_text(OFFERED)
+    monkeypatch.syspath_prepend(str(home))
+    yield home
+    sys.modules.pop("their_parts", None)
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    return write_sequence(tmp_path / "slide")
+
+
+@pytest.mark.parametrize("place", [True, False], ids=["by its place", "by its name"])
+def test_parts_of_others_run_as_ours_do(theirs, sequence, tmp_path, place):
+    tracker, detector, cutter = ("their_parts:Mine", "their_parts:Dots", "their_parts:Cutter")
+    named = [tracker, detector, cutter] if place else ["somebodys", "dots", "cutter"]
+    (tmp_path / "prompts.json").write_text('{"objects": [{"name": "object", "frame": 0, "points": [[60, 50]]}]}')
+    words = [f"--{option}={name}" for option, name in zip(("tracker", "detector", "masks"), named)]
+    words += ["--prompts", str(tmp_path / "prompts.json"), "--out", str(tmp_path / "run")]
+    assert cli.main(["run", str(sequence), *words, *POINTS_ALONE]) == 0
+    info = load_run(tmp_path / "run").info
+    assert (info["tracker"], info["detector"], info["segmenter"]) == ("mine", "dots", "cutter")
+
+
+def test_a_layout_of_others_is_recognised_or_named(theirs, sequence):
+    (sequence / "gt_mask").rename(sequence / "gt_mask.marked")
+    assert open_sequence(sequence).format == "ycbineoat", "ours come first"
+    shutil.rmtree(sequence / "annotated_poses")
+    assert open_sequence(sequence).format == "marked", "but for the one that takes everything"
+    for name in ("marked", "their_parts:load"):
+        assert open_sequence(sequence, format=name).format == name
+
+
+def test_our_names_stay_ours(theirs):
+    assert type(make_tracker("builtin", preset().tracking)).__module__.startswith("p2p_lib.")
+
+
+def test_what_cannot_be_had_is_said_in_one_line(theirs):
+    tracking, sampling = preset().tracking, preset().sampling
+    with pytest.raises(BadInput, match=r"expected one of builtin, .*somebodys, .*Did you mean somebodys"):
+        make_tracker("somebody", tracking)
+    for name in ("gone", "their_lost_parts:Mine"):
+        with pytest.raises(MissingBackend, match=rf"tracker {name}: their_lost_parts cannot be imported .* PYTHONPATH"):
+            make_tracker(name, tracking)
+    with pytest.raises(BadInput, match=r"something called Mime in their_parts. Did you mean their_parts:Mine\?"):
+        make_tracker("their_parts:Mime", tracking)
+    with pytest.raises(BadInput, match="Unfinished: got a class without add, track, drop, reject, suggest"):
+        make_tracker("their_parts:Unfinished", tracking)
+    with pytest.raises(BadInput, match="a class without detect"):
+        make_detector("their_parts:Mine", sampling)
+    with pytest.raises(BadInput, match="a class without names, segment, remove"):
+        make_segmenter("their_parts:Mine", Camera(100, 100, 10, 10, 20, 20), preset().segmentation)
+    with pytest.raises(BadInput, match=r"format: got 'marks', .* or your own as package.module:Class"):
+        open_sequence("nowhere", format="marks")
+
+
+def test_a_folder_of_masks_is_no_segmenter(theirs):
+    assert RunOptions(masks="drawn").mask_source().folder == "drawn"
+    assert RunOptions(masks="their_parts:Cutter").mask_source().segmenter == "their_parts:Cutter"
+    assert issubclass(type(make_tracker("somebodys", preset().tracking)), LkTracker)

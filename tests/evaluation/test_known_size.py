@@ -1,0 +1,40 @@
+"""Known sizes: what does not fit is said, what may not have been in view is not."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from p2p_lib.evaluation.known_size import mesh_length_m, size_doubt
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("mask_m", "mesh_m", "said"),
+    [
+        (0.10, 0.10, ""),
+        (0.12, NAN, ""),
+        (0.05, 0.10, ""),  # a mask that never showed all of it
+        (0.10, 0.06, ""),  # a surface of one side
+        (NAN, NAN, ""),
+        (0.05, 0.05, "0.50 times: .* its length was never in view"),
+        (0.19, 0.21, "2.00 times: .* masks hold more"),
+        (0.10, 0.15, "measured 10.0 cm in its masks and 15.0 cm of its surface, 1.50 times"),
+    ],
+)
+def test_what_does_not_fit_is_said(mask_m, mesh_m, said):
+    import re
+
+    text = size_doubt(0.10, mask_m, mesh_m)
+    assert re.search(said, text) if said else not text
+
+
+def test_a_mesh_is_as_long_as_its_longest_side_however_it_lies_and_whatever_sticks_out(tmp_path):
+    turn = trimesh.transformations.random_rotation_matrix(np.array([0.3, 0.6, 0.2]))
+    box = trimesh.creation.box((0.2, 0.1, 0.05), turn)
+    shred = trimesh.creation.box((0.3, 0.002, 0.002), turn)
+    trimesh.util.concatenate([box, shred]).export(tmp_path / "box.ply")
+    assert mesh_length_m(tmp_path / "box.ply") == pytest.approx(
+        0.2, rel=0.02
+    )  # the box fitted around it is not the smallest to the last percent
+    assert np.isnan(mesh_length_m(tmp_path / "none.ply"))

@@ -1,0 +1,151 @@
+"""What a program asks of a tracker beside poses: a new start, one thread at a time, the world, where things will be."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from p2p_lib.core import se3
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import NOT_FOUND, Status, status_text, status_word
+from p2p_lib.extended.default import Point2Pose
+from p2p_lib.segmenters.anchored import builtin
+from tests.method.test_pipeline import CAMERA, HIDDEN, assert_same, film, quick, track
+
+FEW = 8
+
+
+def followed(method: Point2Pose, frames) -> list:
+    for name in ("left", "right"):
+        method.add_object(name)
+    return [method.step(frame, masks) for frame, masks in frames]
+
+
+def test_after_a_reset_a_tracker_is_as_new():
+    with Point2Pose(CAMERA, quick()) as method:
+        method.add_object("other", mask=film()[3][1]["right"])
+        method.step(film()[3][0])
+        method.reset()
+        assert not method.objects and not method.segmenter.names and method.frame is None
+        assert_same(followed(method, film()[:FEW]), track(film()[:FEW]))
+
+
+def test_a_closed_tracker_says_so_and_can_be_reset():
+    with Point2Pose(CAMERA, quick()) as method:
+        method.add_object("left")
+    with pytest.raises(BadInput, match=r"a call after close\(\).* reset\(\)"):
+        method.step(film()[0][0])
+    method.reset()
+    assert method.step(film()[0][0]) == {}
+    method.close()
+
+
+def test_a_reset_forgets_the_objects_of_a_segmenter_that_was_given():
+    own = builtin(CAMERA, quick().segmentation)
+    with Point2Pose(CAMERA, quick(), segmenter=own) as method:
+        method.add_object("left", mask=film()[0][1]["left"])
+        method.step(film()[0][0])
+        assert own.names == ("left",)
+        method.reset()
+        assert method.segmenter is own and not own.names
+
+
+def test_a_second_thread_is_told_so_and_nothing_has_changed():
+    inside, go_on, answers = threading.Event(), threading.Event(), []
+
+    with Point2Pose(CAMERA, quick()) as method:
+        track_frame = method.front.track
+
+        def slow(asked):
+            inside.set()
+            assert go_on.wait(20)
+            return track_frame(asked)
+
+        method.add_object("left")
+        method.front.track = slow
+        (frame, masks), (second, _) = film()[:2]
+        first = threading.Thread(target=lambda: answers.append(method.step(frame, {"left": masks["left"]})))
+        first.start()
+        assert inside.wait(20)
+        calls = {
+            "step": lambda: method.step(second),
+            "add": lambda: method.add_object("right"),
+            "click": lambda: method.add_object("right", clicks=[[200, 150]]),
+            "correct": lambda: method.correct("left", clicks=[[200, 150]]),
+            "remove": lambda: method.remove_object("left"),
+            "reset": method.reset,
+            "predict": lambda: method.predict("left", 1.0),
+        }
+        for call in calls.values():
+            with pytest.raises(BadInput, match=r"a call from a second thread .* one thread at a time.* lock"):
+                call()
+        go_on.set()
+        first.join()
+        assert list(method.objects) == ["left"] and answers[0]["left"].status is Status.TRACKED
+        method.front.track = track_frame
+        method.step(second)  # a third thread, or this one, when nobody is inside
+
+
+def test_poses_are_in_the_world_where_the_camera_is_given():
+    """A robot's camera that goes by things: each T_world_obj is what the object's own motion makes of it."""
+    T_world_cam = [se3.exp(np.array([0, 0.02 * k, 0, 0.01 * k, 0, 0.3])) for k in range(FEW)]
+    placed = [(replace(frame, T_world_cam=T_world_cam[k]), masks) for k, (frame, masks) in enumerate(film()[:FEW])]
+    for estimates, T in zip(track(placed), T_world_cam):
+        for estimate in estimates.values():
+            np.testing.assert_allclose(estimate.T_world_obj, T @ estimate.T_cam_obj)
+    assert all(e.T_world_obj is None for of in track(film()[:2]) for e in of.values())
+
+
+def test_the_scene_that_the_tracker_finds_is_no_world_of_the_users():
+    config = quick().with_values({"method.mechanisms": "all"})
+    assert all(e.T_world_obj is None for of in track(film(board=True), config=config) for e in of.values())
+
+
+def test_prediction_and_velocity_go_by_the_world_where_it_is_given():
+    """Camera and object go the same way: nothing moves before the camera, everything moves in the world."""
+    step, stands = np.array([0, 0, 0, 0.003, 0, 0.0]), film()[0]
+    frames = [(replace(stands[0], index=k, time_s=k / 30, T_world_cam=se3.exp(k * step)), stands[1]) for k in range(25)]
+    with Point2Pose(CAMERA, quick().with_values({"method.mechanisms": "all but still"})) as method:
+        estimates = followed(method, frames)
+        said = method.predict("left", 24 / 30 + 0.1)
+    world_m_s = estimates[-1]["left"].T_world_obj[:3, :3] @ said.velocity[3:]
+    np.testing.assert_allclose(world_m_s, [0.09, 0, 0], atol=0.005)
+    moved = said.T_world_obj[:3, 3] - estimates[-1]["left"].T_world_obj[:3, 3]
+    np.testing.assert_allclose(moved, [0.009, 0, 0], atol=0.001)
+    np.testing.assert_allclose(se3.exp(24 * step) @ said.T_cam_obj, said.T_world_obj, atol=1e-9)
+
+
+def test_a_prediction_refuses_what_it_cannot_answer():
+    with Point2Pose(CAMERA, quick()) as method:
+        with pytest.raises(BadInput, match="predict: got 'mug', expected one of no objects"):
+            method.predict("mug", 1.0)
+        method.add_object("left")
+        assert method.predict("left", 1.0) is None
+        for frame, masks in film()[:3]:
+            method.step(frame, {"left": masks["left"]})
+        for time_s in (0.0, np.nan, np.inf):
+            with pytest.raises(BadInput, match="predict time_s"):
+                method.predict("left", time_s)
+        method.remove_object("left")
+        method.add_object("left")
+        assert method.predict("left", 1.0) is None
+
+
+def test_what_the_segmenter_does_not_find_is_said_to_be_not_found_and_since_when():
+    """With a mask that is empty it is hidden for sure; without any nobody knows."""
+    for given in (True, False):
+        with Point2Pose(CAMERA, quick()) as method:
+            method.add_object("left", mask=film(board=True)[0][1]["left"])
+            frames = enumerate(film(board=True))
+            said = [method.step(f, {"left": m["left"]} if given and k else None)["left"] for k, (f, m) in frames]
+        reasons = {said[k].reason for k in HIDDEN if said[k].status is Status.OCCLUDED}
+        first = min(k for k in HIDDEN if said[k].T_cam_obj is None)
+        assert reasons == {"0 mask pixels" if given else f"not found since frame {first}"}
+
+
+def test_people_are_told_what_is_known():
+    since = f"{NOT_FOUND} since frame 31"
+    assert (status_word("occluded", since), status_text("occluded", since)) == ("not found", since)
+    assert status_text("occluded", f"out of view: {since}") == f"out of view: {since}"
+    assert status_text("occluded", "0 mask pixels") == "occluded: 0 mask pixels"
