@@ -37,6 +37,7 @@ SEGMENTERS = {
 }
 #: What runs when none is named.
 DEFAULT_TRACKER, DEFAULT_DETECTOR, DEFAULT_SEGMENTER = "builtin", "corners", "builtin"
+_RECOGNISER = "p2p_lib.trackers.builtin.recogniser:Recogniser"
 _SHORT_HORIZON = "p2p_lib.trackers.short_horizon:ShortHorizon"
 #: Names of earlier versions.
 ALIASES = {"embedded": "builtin"}
@@ -63,6 +64,11 @@ def make_segmenter(segmenter: str | Segmenter, camera: Camera, config: Segmentat
     if not isinstance(segmenter, str):
         return segmenter
     return _find("segmenter", segmenter, SEGMENTERS)(camera, config)
+
+
+def make_recogniser(camera: Camera) -> Any:
+    """What describes objects' landmarks, and finds them again in images of this camera."""
+    return _load(_RECOGNISER)(camera)
 
 
 def _find(kind: str, name: str, known: dict[str, str]) -> Any:

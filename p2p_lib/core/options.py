@@ -68,6 +68,13 @@ _MASKS = _typed(
     metavar="SOURCE",
 )
 _PROMPTS = _typed("what starts objects and corrects masks (see p2p click)", type=Path, metavar="FILE")
+_MEMORY = _typed(
+    "look for an object that an earlier run learnt (its maps/OBJECT.npz); repeatable, no clicks needed",
+    read=lambda given: tuple(path for one in given for path in str(one).split(",")),
+    action="append",
+    metavar="FILE",
+)
+_FROZEN = _typed("what --memory brings stays as it is: its maps do not grow", action="store_true")
 _SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")
 _FORMAT = _typed("layout: ho3d, bop, tum, open3d, ycbmultitrack, ycbineoat, folder (default: recognised)")
 _DEPTH_SCALE = _typed("metres per raw depth unit (default 0.001)", type=float, metavar="M")
@@ -114,6 +121,8 @@ class RunOptions:
     detector: str = field(default=DEFAULT_DETECTOR, metadata=_DETECTOR)
     masks: str | None = field(default=None, metadata=_MASKS)
     prompts: str | Path | Iterable[Any] | None = field(default=None, metadata=_PROMPTS)
+    memory: Sequence[str | Path] | None = field(default=None, metadata=_MEMORY)
+    frozen: bool = field(default=False, metadata=_FROZEN)
     save_masks: bool = field(default=False, metadata=_SAVE_MASKS)
     format: str | None = field(default=None, metadata=_FORMAT)
     depth_scale: float | None = field(default=None, metadata=_DEPTH_SCALE)
@@ -134,7 +143,7 @@ class RunOptions:
 
     def mask_source(self) -> MaskSource:
         """Where masks come from."""
-        asked = self.masks or ("clicks" if self.prompts else "dataset")
+        asked = self.masks or ("clicks" if self.prompts or self.memory else "dataset")
         asked = ALIASES.get(asked, asked).removeprefix("dataset:")
         if not asked:
             raise BadInput("masks", repr(self.masks), "a folder, or one of " + ", ".join(MASK_SOURCES))

@@ -135,7 +135,7 @@ class RunWriter:
 
     def begin(self) -> None:
         """Write all so far in the place of an earlier run; what :meth:`add` does at the first frame that is new."""
-        for folder in ("poses", "meshes", "masks"):
+        for folder in ("poses", "meshes", "maps", "masks"):
             if (self.path / folder).is_symlink():
                 raise BadInput(str(self.path / folder), "a link", "a folder of the run's own", "Take it away.")
         if self.resumed is None:

@@ -15,10 +15,13 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.extended.model import JoinableModel
 from p2p_lib.extended.policy import OurPolicy
 from p2p_lib.extended.reacquisition import Reacquisition
+from p2p_lib.extended.remembered import Remembered
+from p2p_lib.extended.remembering import memory_of
 from p2p_lib.extended.scene import Scene
 from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method import pipeline
@@ -97,6 +100,37 @@ class Point2Pose(pipeline.Point2Pose):
     ):
         config = as_config("default" if config is None else config)
         super().__init__(camera, config, tracker, detector, segmenter, compose(camera, config))
+
+    def add_object(
+        self, name: str, *said: Any, memory: ObjectMemory | None = None, frozen: bool = False, **more: Any
+    ) -> None:
+        """As in :meth:`p2p_lib.core.objects.Objects.add_object`, or an object that is known from a memory.
+
+        memory  as :func:`p2p_lib.core.memory.load_memory` reads it: the object is looked for in every frame until it is
+                found, and its pose is in the frame of the map that it was learnt in. Nothing else is said of it
+        frozen  whether that map stays as it is
+
+        Raises :class:`BadInput` for a memory together with clicks or masks, and with preset ``paper``.
+        """
+        if memory is None:
+            super().add_object(name, *said, **more)
+            return
+        if said or more or name in self.objects:
+            got = "clicks or a mask, too" if said or more else f"{name!r}, which is in use"
+            raise BadInput("add_object with a memory", got, "a new name and the memory alone")
+        if not chosen(self.config):
+            raise BadInput("add_object with a memory", "mechanisms none", "preset default: the paper has no memory")
+        self.begin(name)
+        self.objects[name] = Remembered(self.objects[name].own, memory, frozen)
+
+    def memory(self, name: str, **made_of: Any) -> ObjectMemory:
+        """What is known of an object now, to be kept by :func:`p2p_lib.core.memory.save_memory`.
+
+        made_of  where it comes from, plain values. Raises :class:`BadInput` where it could not be found again by it
+        """
+        if name not in self.objects:
+            raise BadInput("memory", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+        return memory_of(name, self.objects[name].known, made_of)
 
 
 def compose(camera: Camera, config: Config) -> pipeline.Parts:

@@ -1,0 +1,152 @@
+"""An object that is known from a memory: one that was lost before the video began (not in the paper).
+
+Until it is found it is looked for in the whole image by its landmarks; where enough of them agree on a pose, and the
+surface shows there, the segmenter starts from what lies on the surface and the 2D tracker follows the landmarks. From
+there on it is an object like any other, in the frame of its old map. Landmarks of sides that come into view later
+become keypoints as they show.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import backends
+from p2p_lib.core.image import in_mask
+from p2p_lib.core.interfaces import PointTracker
+from p2p_lib.core.memory import ObjectMemory
+from p2p_lib.core.types import Frame, Status, Tracks, joined
+from p2p_lib.extended.gates import SIGHTED
+from p2p_lib.extended.image_search import ImageSearch, Sighting
+from p2p_lib.extended.sight import Sight
+from p2p_lib.extended.two_maps import TwoMaps
+from p2p_lib.method.object_model import Requests
+from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
+from p2p_lib.method.policy import Verdict
+from p2p_lib.method.refinement import surface_distance
+
+#: An object is recognised where so many landmarks agree on a pose.
+_FEWEST = 8
+#: Pixels are of a found object whose depth is this near to its surface, m.
+_ON_SURFACE_M = 0.012
+#: Landmarks are looked for on a followed object every so many frames while fewer than so many are seen on it.
+_EVERY, _ENOUGH = 5, 60
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where a remembered object is in an image: its ``mask`` (H, W) bool, what shows of it, and landmarks there.
+
+    keys  (M,) of the landmarks in the map, seen at uv_px (M, 2)
+    """
+
+    mask: np.ndarray
+    sighting: Sighting
+    keys: np.ndarray
+    uv_px: np.ndarray
+
+
+class Remembered(TwoMaps):
+    """One object that began with a memory; ``frozen``: its map does not grow."""
+
+    def __init__(self, own: ObjectTracker, memory: ObjectMemory, frozen: bool = False):
+        super().__init__(own)
+        self.policy.frozen = frozen
+        own.model.recall(memory)
+        self.life = replace(self.life, seen_m2=float(memory.seen_m2))
+        self._memory, self._frozen = memory, frozen
+        self._recogniser = backends.make_recogniser(self.observer.camera)
+        self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
+        self._since = 0  # frames since landmarks were looked for on it
+
+    @property
+    def recalls(self) -> bool:
+        """Whether it is to be looked for by its landmarks."""
+        return not self.life.has_pose
+
+    def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
+        """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool."""
+        memory = self._memory
+        seen = self._recogniser.find(frame, memory.p_obj, memory.descriptors, _FEWEST)
+        if seen is None:
+            return None
+        sighting = self._confirmed(frame, seen.T_cam_obj)
+        if sighting is None:
+            return None
+        where = mask if mask is not None else self._on_surface(frame, sighting.T_cam_obj, sighting.uv_px)
+        if taken is not None and mask is None:
+            if (where & taken).sum() > 0.5 * where.sum():
+                return None
+            where &= ~taken
+        of_it = in_mask(seen.uv_px, where)
+        if of_it.sum() < _FEWEST or where.sum() < self.config.lifecycle.min_mask_px:
+            return None
+        uv_px = seen.uv_px[of_it]
+        return Found(where, sighting, self._taken_in(seen.rows[of_it]), uv_px)
+
+    def _confirmed(self, frame: Frame, T_cam_obj: np.ndarray) -> Sighting | None:
+        """What of the surface shows about a pose, where that is enough."""
+        search = ImageSearch(frame, self.observer.camera, self.config.depth)
+        found = search.about(T_cam_obj, self.policy.shape.sample(self.model))
+        return found if found is not None and found.share >= SIGHTED else None
+
+    def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
+        """(H, W) bool: what lies on the surface under a pose, as far as it holds together with pixels (M, 2) on it."""
+        distance_m = surface_distance(self.model.surface, frame.depth_m, self.observer.camera, T_cam_obj)
+        near = (np.abs(distance_m) < _ON_SURFACE_M).astype(np.uint8)
+        near = cv2.morphologyEx(near, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        _, label = cv2.connectedComponents(near)
+        u, v = np.rint(uv_px).astype(int).T
+        held = np.unique(label[v, u])
+        return np.isin(label, held[held > 0])
+
+    def _taken_in(self, rows: np.ndarray) -> np.ndarray:
+        """Landmarks (M,) as keypoints of the map, anew where they were lost: their keys."""
+        memory = self._memory
+        keys = self.model.remember(memory.p_obj[rows].astype(float), memory.confidence[rows])
+        self._key[rows] = keys
+        return keys
+
+    # -- the step ------------------------------------------------------------------------------
+
+    def step(self, obs: Sight) -> ObjectStep:
+        """The object's pose at a frame; once it is followed, landmarks that have come into view are added."""
+        if self.life.T_cam_obj is None and obs.mask is None:
+            return self.own.absent(obs, Verdict(False, Status.INITIALISING, "remembered, and not found yet"))
+        followed = int(np.isin(self.map.keys, self._key)[obs.seen].sum())
+        step = super().step(obs)
+        self._since += 1
+        due = self._since >= _EVERY and step.estimate.T_cam_obj is not None and self.known.map_id == 0
+        if not due or followed >= _ENOUGH or step.estimate.status is Status.DEGRADED or obs.mask is None:
+            return step
+        self._since = 0
+        return replace(step, requests=self._with_more(step.requests, obs, step.estimate.T_cam_obj))
+
+    def _with_more(self, requests: Requests, obs: Sight, T_cam_obj: np.ndarray) -> Requests:
+        """Requests with landmarks that are seen under a pose, and are not followed yet."""
+        absent = np.flatnonzero(~np.isin(self._key, self.map.keys))
+        p_obj, descriptors = self._memory.p_obj[absent], self._memory.descriptors[absent]
+        seen = self._recogniser.at(obs.frame, obs.mask, T_cam_obj, p_obj, descriptors)
+        if not len(seen.rows):
+            return requests
+        keys = self._taken_in(absent[seen.rows])
+        add_px, keys = np.concatenate([requests.add_px, seen.uv_px]), np.concatenate([requests.keys, keys])
+        return replace(requests, add_px=add_px, keys=keys)
+
+    def _outgrown(self, obs: Sight) -> bool:
+        """A memory is never founded anew."""
+        return False
+
+    def _turned_over(self, obs: Sight) -> bool:
+        """No second map where the map does not grow, or before the object was ever found."""
+        return not self._frozen and self.life.T_cam_obj is not None and super()._turned_over(obs)
+
+
+def follow(obj: Remembered, found: Found, tracker: PointTracker, tracks: Tracks) -> Tracks:
+    """Have the tracker follow what was found; everybody's tracks in this frame, with these."""
+    ids = tracker.add(found.uv_px)
+    obj.map.assign(found.keys, ids)
+    count = len(ids)
+    return joined([tracks, Tracks(ids, found.uv_px, np.ones(count, bool), np.zeros(count))])
