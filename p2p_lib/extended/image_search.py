@@ -41,6 +41,10 @@ _STEP_M, _STEPS = 0.03, 2
 _COARSE, _TRIED = 3, 3
 #: Of turns, so many are aligned that are so far apart, rad, moved by this step about the depth points, m.
 _TRIED_TURNS, _APART_RAD, _NEAR_M = 6, np.radians(20), 0.015
+#: Pixels between the places of a search anywhere, and so many of them that have the right colours (bins of CIELAB).
+_LATTICE_PX, _PLACES, _BIN = 10, 250, 8
+#: Of many poses so many are ranked, and so many that differ are aligned.
+_RANKED, _TRIED_PLACES = 200, 8
 #: A place is no evidence where the surface, moved by its own size along itself, keeps this much of what it shows.
 _ANYWHERE = 0.7
 #: From this share on a pose is polished: by small motions (rad, m), all at first, then smaller ones about the best.
@@ -109,6 +113,34 @@ class ImageSearch:
         found = self._turns(turns, cloud, sample)
         other = [s for s in found if se3.angle_rad(se3.inverse(T_cam_obj) @ s.T_cam_obj) > _APART_RAD]
         return max(other, key=lambda s: s.share, default=None)
+
+    def places(self, free: np.ndarray, sample: SurfaceSample, rng: np.random.Generator) -> np.ndarray:
+        """(P, 3) some measured points of ``free`` pixels (H, W) bool that have one of the surface's colours."""
+        known = np.zeros((256 // _BIN,) * 2, np.uint8)
+        known[tuple((sample.lab[:, 1:] // _BIN).astype(int).T)] = 1
+        known = cv2.dilate(known, np.ones((3, 3), np.uint8))
+        top, left = rng.integers(0, _LATTICE_PX, 2)
+        every = np.s_[top::_LATTICE_PX, left::_LATTICE_PX]
+        a, b = np.moveaxis(self._lab[every][..., 1:] // _BIN, -1, 0).astype(int)
+        v, u = np.nonzero(free[every] & (self._depth_m[every] > 0) & (known[a, b] > 0))
+        some = rng.permutation(len(v))[:_PLACES]
+        v, u = v[some] * _LATTICE_PX + top, u[some] * _LATTICE_PX + left
+        return self._camera.unproject(np.stack([u, v], -1), self._depth_m[v, u].astype(float))
+
+    def among(self, poses: np.ndarray, sample: SurfaceSample) -> list[Sighting]:
+        """The best of many poses (H, 4, 4) that differ, aligned and polished."""
+        if len(sample) < _FEWEST or not len(poses):
+            return []
+        share, best = self._roughly(poses, sample), []
+        for k in np.argsort(-share)[:_RANKED]:
+            apart_m = np.linalg.norm(poses[best, :3, 3] - poses[k, :3, 3], axis=1)
+            turned = se3.angle_rad(se3.inverse(poses[best]) @ poses[k])
+            if np.isfinite(share[k]) and ((apart_m > _STEP_M) | (turned > _APART_RAD)).all():
+                best.append(k)
+            if len(best) == _TRIED_PLACES:
+                break
+        found = [self._best([sighting], sample) for sighting in self._all_aligned(poses[best], sample)]
+        return [sighting for sighting in found if sighting is not None]
 
     def _turns(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> list[Sighting]:
         """The best poses near some turns that differ, aligned."""
@@ -266,6 +298,16 @@ def laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.n
     for T in poses:
         facing = sample.n_obj @ T[:3, :3].T @ centre < 0
         T[:3, 3] = centre - T[:3, :3] @ sample.p_obj[facing if facing.any() else slice(None)].mean(0)
+    return poses
+
+
+def laid_at(turns: np.ndarray, p_cam: np.ndarray, sample: SurfaceSample) -> np.ndarray:
+    """(V * P, 4, 4) poses of turns (V, 4, 4), what faced the camera then about where points (P, 3) are."""
+    poses = np.repeat(turns, len(p_cam), 0)
+    for k, T in enumerate(turns):
+        facing = ((sample.n_obj @ T[:3, :3].T) * se3.transform(T, sample.p_obj)).sum(1) < 0
+        middle = sample.p_obj[facing if facing.any() else slice(None)].mean(0)
+        poses[k * len(p_cam) : (k + 1) * len(p_cam), :3, 3] = p_cam - T[:3, :3] @ middle
     return poses
 
 

@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 
 from p2p_lib.core import backends
-from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.core.types import Frame, Status, Tracks, joined
+from p2p_lib.extended.agreement import outline_share
 from p2p_lib.extended.gates import SIGHTED
-from p2p_lib.extended.image_search import ImageSearch, Sighting
+from p2p_lib.extended.image_search import ImageSearch, Sighting, laid_at
 from p2p_lib.extended.sight import Sight
 from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method.object_model import Requests
@@ -27,8 +27,13 @@ from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
 from p2p_lib.method.policy import Verdict
 from p2p_lib.method.refinement import surface_distance
 
-#: An object is recognised where so many landmarks agree on a pose.
-_FEWEST = 8
+#: Where so many landmarks agree on a pose, no other is tried.
+_AGREEING = 8
+#: So many landmarks that show under a pose prove it; fewer do where so much of the surface shows, and where the object
+#: ends there is a step in depth along so much of the outline.
+_PROVING, _FEWEST, _SHARE, _OUTLINE = 10, 4, 0.7, 0.4
+#: Else it is looked for as it was turned in so many of its keyframes.
+_TURNS = 12
 #: Pixels are of a found object whose depth is this near to its surface, m.
 _ON_SURFACE_M = 0.012
 #: Landmarks are looked for on a followed object every so many frames while fewer than so many are seen on it.
@@ -53,6 +58,7 @@ class Remembered(TwoMaps):
 
     def __init__(self, own: ObjectTracker, memory: ObjectMemory, frozen: bool = False):
         super().__init__(own)
+        self._rng = np.random.default_rng(0)
         self.policy.frozen = frozen
         own.model.recall(memory)
         self.life = replace(self.life, seen_m2=float(memory.seen_m2))
@@ -69,28 +75,41 @@ class Remembered(TwoMaps):
     def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool."""
         memory = self._memory
-        seen = self._recogniser.find(frame, memory.p_obj, memory.descriptors, _FEWEST)
-        if seen is None:
-            return None
-        sighting = self._confirmed(frame, seen.T_cam_obj)
-        if sighting is None:
-            return None
-        where = mask if mask is not None else self._on_surface(frame, sighting.T_cam_obj, sighting.uv_px)
-        if taken is not None and mask is None:
-            if (where & taken).sum() > 0.5 * where.sum():
-                return None
-            where &= ~taken
-        of_it = in_mask(seen.uv_px, where)
-        if of_it.sum() < _FEWEST or where.sum() < self.config.lifecycle.min_mask_px:
-            return None
-        uv_px = seen.uv_px[of_it]
-        return Found(where, sighting, self._taken_in(seen.rows[of_it]), uv_px)
-
-    def _confirmed(self, frame: Frame, T_cam_obj: np.ndarray) -> Sighting | None:
-        """What of the surface shows about a pose, where that is enough."""
         search = ImageSearch(frame, self.observer.camera, self.config.depth)
-        found = search.about(T_cam_obj, self.policy.shape.sample(self.model))
-        return found if found is not None and found.share >= SIGHTED else None
+        for sighting in self._sightings(frame, search, mask, taken):
+            where = mask if mask is not None else self._on_surface(frame, sighting.T_cam_obj, sighting.uv_px)
+            if taken is not None and mask is None:
+                if (where & taken).sum() > 0.5 * where.sum():
+                    continue
+                where = where & ~taken
+            if where.sum() < self.config.lifecycle.min_mask_px:
+                continue
+            seen = self._recogniser.at(frame, where, sighting.T_cam_obj, memory.p_obj, memory.descriptors)
+            if _certain(len(seen), sighting.share, outline_share(frame, where)):
+                return Found(where, sighting, self._taken_in(seen.rows), seen.uv_px)
+        return None
+
+    def _sightings(
+        self, frame: Frame, search: ImageSearch, mask: np.ndarray | None, taken: np.ndarray | None
+    ) -> list[Sighting]:
+        """Where it may be, the likeliest first: by landmarks that agree, else by what looks like it here and there."""
+        p_obj, sample = self._memory.p_obj, self.policy.shape.sample(self.model)
+        pairs = self._recogniser.pairs(frame, self._memory.descriptors)
+        agreeing = self._recogniser.agreeing(pairs, p_obj)
+        if len(agreeing) >= _AGREEING:
+            found = search.about(agreeing.T_cam_obj, sample)
+            if found is not None and found.share >= SIGHTED:
+                return [found]
+        turns = self.model.views.some(_TURNS)
+        free = np.ones(frame.shape, bool) if mask is None else mask
+        free = free if taken is None else free & ~taken
+        poses = [laid_at(turns, search.places(free, sample, self._rng), sample)]
+        for T in turns:
+            one = np.repeat(T[None], len(pairs), 0)
+            one[:, :3, 3] = pairs.p_cam - p_obj[pairs.rows] @ T[:3, :3].T
+            poses.append(one)
+        found = search.among(np.concatenate(poses), sample)
+        return sorted((s for s in found if s.share >= SIGHTED), key=lambda s: -s.share)
 
     def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
         """(H, W) bool: what lies on the surface under a pose, as far as it holds together with pixels (M, 2) on it."""
@@ -129,7 +148,7 @@ class Remembered(TwoMaps):
         absent = np.flatnonzero(~np.isin(self._key, self.map.keys))
         p_obj, descriptors = self._memory.p_obj[absent], self._memory.descriptors[absent]
         seen = self._recogniser.at(obs.frame, obs.mask, T_cam_obj, p_obj, descriptors)
-        if not len(seen.rows):
+        if not len(seen):
             return requests
         keys = self._taken_in(absent[seen.rows])
         add_px, keys = np.concatenate([requests.add_px, seen.uv_px]), np.concatenate([requests.keys, keys])
@@ -142,6 +161,15 @@ class Remembered(TwoMaps):
     def _turned_over(self, obs: Sight) -> bool:
         """No second map where the map does not grow, or before the object was ever found."""
         return not self._frozen and self.life.T_cam_obj is not None and super()._turned_over(obs)
+
+
+def _certain(landmarks: int, share: float, outline: float | None) -> bool:
+    """Whether this many landmarks, this share of the surface and of the outline are an object, and not its like.
+
+    What is bland and smooth lies on a wall as well as on itself: but nothing ends there.
+    """
+    whole = share >= _SHARE and outline is not None and outline >= _OUTLINE
+    return landmarks >= _PROVING or (landmarks >= _FEWEST and whole)
 
 
 def follow(obj: Remembered, found: Found, tracker: PointTracker, tracks: Tracks) -> Tracks:

@@ -32,11 +32,18 @@ _AGREE_M = 0.008
 
 @dataclass(frozen=True, eq=False)
 class Recognised:
-    """Pairs that agree on one pose: T_cam_obj (4, 4), rows (M,) of the landmarks, and where they are, uv_px (M, 2)."""
+    """Landmarks, rows (M,), that look like corners at uv_px (M, 2), p_cam (M, 3); those that agree on T_cam_obj (4, 4).
 
-    T_cam_obj: np.ndarray
+    T_cam_obj is None for pairs of which nobody knows whether they agree.
+    """
+
     rows: np.ndarray
     uv_px: np.ndarray
+    p_cam: np.ndarray
+    T_cam_obj: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.rows)
 
 
 class Recogniser:
@@ -59,15 +66,20 @@ class Recogniser:
         as_bytes = np.rint(np.clip(descriptors, 0, 1) * _SCALE).astype(np.uint8)
         return np.concatenate([own.p_cam, points.p_cam]), as_bytes, which
 
-    def find(self, frame: Frame, p_obj: np.ndarray, descriptors: np.ndarray, fewest: int) -> Recognised | None:
-        """The pose that most landmarks (N, 3) agree on, anywhere in an image; None where fewer than ``fewest`` do."""
-        some, found = self._rng.permutation(len(p_obj))[:_COMPARED], self._corners(frame)
+    def pairs(self, frame: Frame, descriptors: np.ndarray) -> Recognised:
+        """Some of the landmarks (N,) that look like corners anywhere in an image."""
+        some, found = self._rng.permutation(len(descriptors))[:_COMPARED], self._corners(frame)
         rows, corner = self._pairs(found, descriptors, some, _RATIO)
         kept = np.sort(self._rng.permutation(len(rows))[:_PAIRS])
         rows, corner = rows[kept], corner[kept]
-        T_cam_obj, agrees = consensus(p_obj[rows], found.p_cam[corner], _AGREE_M, corner)
-        recognised = _once(T_cam_obj, rows[agrees], corner[agrees], found)
-        return recognised if len(recognised.rows) >= fewest else None
+        return Recognised(rows, found.uv_px[corner].astype(float), found.p_cam[corner])
+
+    @staticmethod
+    def agreeing(pairs: Recognised, p_obj: np.ndarray) -> Recognised:
+        """Of pairs with landmarks (N, 3) those that most agree with on one pose, each landmark and corner once."""
+        _, corner = np.unique(pairs.uv_px, axis=0, return_inverse=True)
+        T_cam_obj, agrees = consensus(p_obj[pairs.rows], pairs.p_cam, _AGREE_M, corner.ravel())
+        return _once(pairs, agrees, T_cam_obj)
 
     def at(
         self, frame: Frame, mask: np.ndarray, T_cam_obj: np.ndarray, p_obj: np.ndarray, descriptors: np.ndarray
@@ -76,7 +88,7 @@ class Recogniser:
         found = corners(Image.of(frame, self.camera), inner(mask), _IN_MASK)
         rows, corner = self._pairs(found, descriptors, np.arange(len(p_obj)), _EXPECTED_RATIO)
         near = np.linalg.norm(se3.transform(T_cam_obj, p_obj[rows]) - found.p_cam[corner], axis=1) < _AGREE_M
-        return _once(T_cam_obj, rows[near], corner[near], found)
+        return _once(Recognised(rows, found.uv_px[corner].astype(float), found.p_cam[corner]), near, T_cam_obj)
 
     def _corners(self, frame: Frame) -> Corners:
         if self._newest is None or self._newest[0] is not frame:
@@ -97,9 +109,9 @@ class Recogniser:
         return some[which], corner
 
 
-def _once(T_cam_obj: np.ndarray, rows: np.ndarray, corner: np.ndarray, found: Corners) -> Recognised:
-    """Of landmarks that are the same corner the first alone, and each landmark once."""
-    _, first = np.unique(corner, return_index=True)
-    rows, corner = rows[first], corner[first]
-    _, first = np.unique(rows, return_index=True)
-    return Recognised(T_cam_obj, rows[first], found.uv_px[corner[first]].astype(float))
+def _once(pairs: Recognised, chosen: np.ndarray, T_cam_obj: np.ndarray) -> Recognised:
+    """The chosen (M,) of some pairs, each corner and each landmark once."""
+    at = np.flatnonzero(chosen)
+    at = at[np.unique(pairs.uv_px[at], axis=0, return_index=True)[1]]
+    at = at[np.unique(pairs.rows[at], return_index=True)[1]]
+    return Recognised(pairs.rows[at], pairs.uv_px[at], pairs.p_cam[at], T_cam_obj)
