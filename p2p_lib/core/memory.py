@@ -110,11 +110,7 @@ def _check_shapes(value: Any, shapes: Mapping[str, tuple[int, ...]], what: str) 
 
 def save_memory(path: str | Path, memory: ObjectMemory) -> None:
     """Write a memory as one ``.npz`` file of arrays and JSON, whole or not at all."""
-    about = {"kind": _KIND, "version": VERSION, "name": memory.name, "made_of": dict(memory.made_of)}
-    arrays = {f.name: getattr(memory, f.name) for f in _array_fields(ObjectMemory)}
-    arrays |= {f"surface/{f.name}": getattr(memory.surface, f.name) for f in fields(SurfaceMemory)}
-    with replacing(Path(path)) as file:
-        np.savez_compressed(file, about=np.frombuffer(json.dumps(about).encode(), np.uint8), **arrays)
+    save_memories(path, {memory.name: memory}, _KIND, {})
 
 
 def load_memory(path: str | Path) -> ObjectMemory:
@@ -123,25 +119,49 @@ def load_memory(path: str | Path) -> ObjectMemory:
     Raises :class:`MissingData` where there is none, :class:`BadInput` for a file that is damaged, cut short, empty, of
     another kind or of another version.
     """
+    _, memories = read_memories(path, _KIND, _EXPECTED)
+    if len(memories) != 1:
+        raise BadInput(str(path), f"{len(memories)} objects", _EXPECTED)
+    return next(iter(memories.values()))
+
+
+def save_memories(path: str | Path, memories: Mapping[str, ObjectMemory], kind: str, about: Mapping[str, Any]) -> None:
+    """Write memories with plain values ``about`` them all as one file of this ``kind``, whole or not at all."""
+    made_of = {name: dict(memory.made_of) for name, memory in memories.items()}
+    head = json.dumps({"kind": kind, "version": VERSION, "objects": made_of, "about": dict(about)})
+    arrays = {"about": np.frombuffer(head.encode(), np.uint8)}
+    for name, memory in memories.items():
+        arrays |= {f"{name}/{f.name}": getattr(memory, f.name) for f in _array_fields(ObjectMemory)}
+        arrays |= {f"{name}/surface/{f.name}": getattr(memory.surface, f.name) for f in fields(SurfaceMemory)}
+    with replacing(Path(path)) as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_memories(path: str | Path, kind: str, expected: str) -> tuple[dict[str, Any], dict[str, ObjectMemory]]:
+    """What :func:`save_memories` wrote: ``about``, and object to memory; raises as :func:`load_memory`."""
     path = Path(path)
     if not path.exists():
-        raise MissingData(str(path), f"no such file, expected {_EXPECTED}", "See maps/ of a run's folder.")
+        raise MissingData(str(path), f"no such file, expected {expected}")
     arrays = load_arrays(path)
-    about = arrays.pop("about", np.zeros(0, np.uint8))
-    about = parse_json(about.tobytes(), str(path), _EXPECTED) if about.dtype == np.uint8 and about.size else {}
-    if not isinstance(about, dict) or about.get("kind") != _KIND:
-        raise BadInput(str(path), "an archive of something else", _EXPECTED)
-    if about.get("version") != VERSION:
-        fix = "Make it again from its video with this version: p2p run."
-        raise BadInput(str(path), f"a memory of version {about.get('version')}", f"version {VERSION}", fix)
+    head = arrays.pop("about", np.zeros(0, np.uint8))
+    head = parse_json(head.tobytes(), str(path), expected) if head.dtype == np.uint8 and head.size else {}
+    if not isinstance(head, dict) or head.get("kind") != kind:
+        raise BadInput(str(path), "an archive of something else", expected)
+    if head.get("version") != VERSION:
+        fix = "Make it again with this version."
+        raise BadInput(str(path), f"version {head.get('version')}", f"{expected} of version {VERSION}", fix)
     try:
-        surface = SurfaceMemory(*(arrays[f"surface/{f.name}"] for f in fields(SurfaceMemory)))
-        own = {f.name: arrays[f.name] for f in _array_fields(ObjectMemory)}
-        return ObjectMemory(about["name"], **own, surface=surface, made_of=dict(about.get("made_of") or {}))
-    except KeyError as error:
-        raise BadInput(str(path), f"a memory without {error}", _EXPECTED) from None
+        return dict(head["about"]), {name: _memory(name, of, arrays) for name, of in head["objects"].items()}
+    except (KeyError, AttributeError, TypeError) as error:
+        raise BadInput(str(path), f"a file without {error}", expected) from None
     except BadInput as error:
         raise BadInput(f"{path}: {error.name}", error.got, error.expected, error.fix) from None
+
+
+def _memory(name: str, made_of: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> ObjectMemory:
+    surface = SurfaceMemory(*(arrays[f"{name}/surface/{f.name}"] for f in fields(SurfaceMemory)))
+    own = {f.name: arrays[f"{name}/{f.name}"] for f in _array_fields(ObjectMemory)}
+    return ObjectMemory(name, **own, surface=surface, made_of=dict(made_of))
 
 
 def load_memories(paths: Sequence[str | Path]) -> dict[str, ObjectMemory]:

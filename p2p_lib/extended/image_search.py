@@ -43,8 +43,8 @@ _COARSE, _TRIED = 3, 3
 _TRIED_TURNS, _APART_RAD, _NEAR_M = 6, np.radians(20), 0.015
 #: Pixels between the places of a search anywhere, and so many of them that have the right colours (bins of CIELAB).
 _LATTICE_PX, _PLACES, _BIN = 10, 250, 8
-#: Of many poses so many are ranked, and so many that differ are aligned.
-_RANKED, _TRIED_PLACES = 200, 8
+#: Of many poses so many are ranked, so many that differ are aligned, and so many of these polished.
+_RANKED, _TRIED_PLACES, _POLISHED = 200, 8, 4
 #: A place is no evidence where the surface, moved by its own size along itself, keeps this much of what it shows.
 _ANYWHERE = 0.7
 #: From this share on a pose is polished: by small motions (rad, m), all at first, then smaller ones about the best.
@@ -139,7 +139,8 @@ class ImageSearch:
                 best.append(k)
             if len(best) == _TRIED_PLACES:
                 break
-        found = [self._best([sighting], sample) for sighting in self._all_aligned(poses[best], sample)]
+        aligned = sorted(self._all_aligned(poses[best], sample), key=lambda s: -s.share)
+        found = [self._best([sighting], sample) for sighting in aligned[:_POLISHED]]
         return [sighting for sighting in found if sighting is not None]
 
     def _turns(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> list[Sighting]:

@@ -8,12 +8,14 @@ become keypoints as they show.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
 
-from p2p_lib.core import backends
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.core.types import Frame, Status, Tracks, joined
@@ -27,11 +29,11 @@ from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
 from p2p_lib.method.policy import Verdict
 from p2p_lib.method.refinement import surface_distance
 
-#: Where so many landmarks agree on a pose, no other is tried.
+#: Where so many landmarks agree on a pose by themselves, and the surface shows there, it is the object's.
 _AGREEING = 8
-#: So many landmarks that show under a pose prove it; fewer do where so much of the surface shows, and where the object
-#: ends there is a step in depth along so much of the outline.
-_PROVING, _FEWEST, _SHARE, _OUTLINE = 10, 4, 0.7, 0.4
+#: Else so many have to show under a pose, with so much of the surface, and along so much of its outline the depth has
+#: to have a step.
+_FEWEST, _SHARE, _OUTLINE = 4, 0.8, 0.45
 #: Else it is looked for as it was turned in so many of its keyframes.
 _TURNS = 12
 #: Pixels are of a found object whose depth is this near to its surface, m.
@@ -54,16 +56,19 @@ class Found:
 
 
 class Remembered(TwoMaps):
-    """One object that began with a memory; ``frozen``: its map does not grow."""
+    """One object that began with a memory; ``frozen``: its map does not grow.
 
-    def __init__(self, own: ObjectTracker, memory: ObjectMemory, frozen: bool = False):
+    recogniser  what finds landmarks in images (:func:`p2p_lib.core.backends.make_recogniser`); objects may share it
+    """
+
+    def __init__(self, own: ObjectTracker, memory: ObjectMemory, recogniser: Any, frozen: bool = False):
         super().__init__(own)
         self._rng = np.random.default_rng(0)
         self.policy.frozen = frozen
         own.model.recall(memory)
         self.life = replace(self.life, seen_m2=float(memory.seen_m2))
         self._memory, self._frozen = memory, frozen
-        self._recogniser = backends.make_recogniser(self.observer.camera)
+        self._recogniser = recogniser
         self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
         self._since = 0  # frames since landmarks were looked for on it
 
@@ -76,7 +81,7 @@ class Remembered(TwoMaps):
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool."""
         memory = self._memory
         search = ImageSearch(frame, self.observer.camera, self.config.depth)
-        for sighting in self._sightings(frame, search, mask, taken):
+        for sighting, recognised in self._sightings(frame, search, mask, taken):
             where = mask if mask is not None else self._on_surface(frame, sighting.T_cam_obj, sighting.uv_px)
             if taken is not None and mask is None:
                 if (where & taken).sum() > 0.5 * where.sum():
@@ -85,21 +90,21 @@ class Remembered(TwoMaps):
             if where.sum() < self.config.lifecycle.min_mask_px:
                 continue
             seen = self._recogniser.at(frame, where, sighting.T_cam_obj, memory.p_obj, memory.descriptors)
-            if _certain(len(seen), sighting.share, outline_share(frame, where)):
+            if recognised or _certain(len(seen), sighting.share, partial(outline_share, frame, where)):
                 return Found(where, sighting, self._taken_in(seen.rows), seen.uv_px)
         return None
 
     def _sightings(
         self, frame: Frame, search: ImageSearch, mask: np.ndarray | None, taken: np.ndarray | None
-    ) -> list[Sighting]:
-        """Where it may be, the likeliest first: by landmarks that agree, else by what looks like it here and there."""
+    ) -> list[tuple[Sighting, bool]]:
+        """Where it may be, the likeliest first, and whether landmarks that agree say so or its looks alone."""
         p_obj, sample = self._memory.p_obj, self.policy.shape.sample(self.model)
         pairs = self._recogniser.pairs(frame, self._memory.descriptors)
         agreeing = self._recogniser.agreeing(pairs, p_obj)
         if len(agreeing) >= _AGREEING:
             found = search.about(agreeing.T_cam_obj, sample)
             if found is not None and found.share >= SIGHTED:
-                return [found]
+                return [(found, True)]
         turns = self.model.views.some(_TURNS)
         free = np.ones(frame.shape, bool) if mask is None else mask
         free = free if taken is None else free & ~taken
@@ -109,7 +114,7 @@ class Remembered(TwoMaps):
             one[:, :3, 3] = pairs.p_cam - p_obj[pairs.rows] @ T[:3, :3].T
             poses.append(one)
         found = search.among(np.concatenate(poses), sample)
-        return sorted((s for s in found if s.share >= SIGHTED), key=lambda s: -s.share)
+        return [(sighting, False) for sighting in sorted(found, key=lambda s: -s.share) if sighting.share >= _SHARE]
 
     def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
         """(H, W) bool: what lies on the surface under a pose, as far as it holds together with pixels (M, 2) on it."""
@@ -163,13 +168,12 @@ class Remembered(TwoMaps):
         return not self._frozen and self.life.T_cam_obj is not None and super()._turned_over(obs)
 
 
-def _certain(landmarks: int, share: float, outline: float | None) -> bool:
+def _certain(landmarks: int, share: float, outline: Callable[[], float | None]) -> bool:
     """Whether this many landmarks, this share of the surface and of the outline are an object, and not its like.
 
     What is bland and smooth lies on a wall as well as on itself: but nothing ends there.
     """
-    whole = share >= _SHARE and outline is not None and outline >= _OUTLINE
-    return landmarks >= _PROVING or (landmarks >= _FEWEST and whole)
+    return landmarks >= _FEWEST and share >= _SHARE and (outline() or 0.0) >= _OUTLINE
 
 
 def follow(obj: Remembered, found: Found, tracker: PointTracker, tracks: Tracks) -> Tracks:
