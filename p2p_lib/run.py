@@ -42,7 +42,6 @@ from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.extended.default import Point2Pose
-from p2p_lib.extended.remembering import memory_of
 from p2p_lib.method.object_model import Known
 
 #: Frames whose images are looked at when a run is judged at its end; ``p2p eval`` looks at more.
@@ -190,7 +189,7 @@ class Keeper:
         made_of = {key: info[key] for key in ("sequence", "tracker", "start", "stop") if key in info}
         for name, known in kept.items():
             with suppress(BadInput):
-                memory = memory_of(name, known, made_of | {"map_id": known.map_id})
+                memory = self.method.memory(name, known, **made_of, map_id=known.map_id)
                 save_memory(self.writer.path / "maps" / f"{name}.npz", memory)
 
     def judge(self, sequence: sequences.Sequence | None = None) -> None:

@@ -27,6 +27,7 @@ from p2p_lib.extended.remembering import memory_of
 from p2p_lib.extended.scene import Scene
 from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method import pipeline
+from p2p_lib.method.object_model import Known
 from p2p_lib.method.object_tracker import ObjectTracker
 
 #: Name to what it does.
@@ -159,14 +160,17 @@ class Point2Pose(pipeline.Point2Pose):
             raise BadInput(str(path), f"a file without {error}", "a tracker as Point2Pose.save writes it") from None
         return loaded
 
-    def memory(self, name: str, **made_of: Any) -> ObjectMemory:
+    def memory(self, name: str, known: Known | None = None, **made_of: Any) -> ObjectMemory:
         """What is known of an object now, to be kept by :func:`p2p_lib.core.memory.save_memory`.
 
+        known    in another of its maps than the newest
         made_of  where it comes from, plain values. Raises :class:`BadInput` where it could not be found again by it
         """
         if name not in self.objects:
             raise BadInput("memory", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        return memory_of(name, self.objects[name].known, made_of)
+        obj = self.objects[name]
+        known = known or obj.known
+        return memory_of(name, known, made_of, obj.began_with(known.map_id) if isinstance(obj, Remembered) else None)
 
 
 def compose(camera: Camera, config: Config) -> pipeline.Parts:

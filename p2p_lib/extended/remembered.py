@@ -77,6 +77,10 @@ class Remembered(TwoMaps):
         """Whether it is to be looked for by its landmarks."""
         return not self.life.has_pose
 
+    def began_with(self, map_id: int) -> ObjectMemory | None:
+        """The memory, of the map that began with it."""
+        return self._memory if map_id == 0 else None
+
     def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool."""
         memory = self._memory

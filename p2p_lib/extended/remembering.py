@@ -28,12 +28,19 @@ _LANDMARKS, _SHOWS_M = 1500, 0.01
 _MOST_WEIGHT = 200.0
 
 
-def memory_of(name: str, known: Known, made_of: dict[str, Any]) -> ObjectMemory:
-    """What is known of an object; :class:`BadInput` where that is too little to find it again."""
+def memory_of(name: str, known: Known, made_of: dict[str, Any], before: ObjectMemory | None = None) -> ObjectMemory:
+    """What is known of an object; :class:`BadInput` where that is too little to find it again.
+
+    before  what its map began with; its landmarks are kept
+    """
     surface = known.model.surface
     if surface is None or surface.empty:
         raise BadInput(f"memory of {name!r}", "no surface", "an object with a reconstructed surface")
-    p_obj, descriptors, confidence, keypoint = _landmarks(known, surface)
+    columns = [_landmarks(known, surface)]
+    if before is not None:
+        columns.append((before.p_obj, before.descriptors, before.confidence, before.keypoint))
+    columns = [column for column in columns if len(column[0])] or columns[:1]
+    p_obj, descriptors, confidence, keypoint = (np.concatenate(of) for of in zip(*columns, strict=True))
     rng = np.random.default_rng(0)
     kept = np.sort(np.argsort(~keypoint + rng.random(len(p_obj)))[:_LANDMARKS])  # keypoints first
     landmarks = [column[kept] for column in (p_obj, descriptors, confidence, keypoint)]

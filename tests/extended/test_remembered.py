@@ -160,6 +160,18 @@ def test_landmarks_that_come_into_view_become_keypoints(again):
     assert (of_memory >= 0).sum() > again.keypoints
 
 
+def test_what_was_found_is_kept_with_what_it_began_with(learnt, again):
+    kept = again.method.memory("box")
+    before = {tuple(p) for p in learnt.memory.p_obj}
+    assert len(before & {tuple(p) for p in kept.p_obj}) > 0.8 * len(before)
+
+
+def test_a_tracker_without_features_follows_what_was_found(crossing, learnt):
+    method = Point2Pose(crossing.camera, tracker="lk")
+    method.add_object("box", memory=learnt.memory)
+    assert all(one["box"].T_cam_obj is not None for one in followed(crossing, method, LATER[:4]))
+
+
 def test_what_is_not_there_is_not_found(learnt):
     other = open_sequence("synthetic/mug")
     method = Point2Pose(other.camera)
