@@ -20,7 +20,6 @@ from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.agreement import outline_share
-from p2p_lib.extended.gates import SIGHTED
 from p2p_lib.extended.image_search import ImageSearch, Sighting, laid_at
 from p2p_lib.extended.sight import Sight
 from p2p_lib.extended.two_maps import TwoMaps
@@ -29,11 +28,12 @@ from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
 from p2p_lib.method.policy import Verdict
 from p2p_lib.method.refinement import surface_distance
 
-#: Where so many landmarks agree on a pose by themselves, and the surface shows there, it is the object's.
-_AGREEING = 8
-#: Else so many have to show under a pose, with so much of the surface, and along so much of its outline the depth has
-#: to have a step.
-_FEWEST, _SHARE, _OUTLINE = 4, 0.8, 0.45
+#: Where so many landmarks agree on a pose by themselves, and so much of the surface shows there, it is the object's. (A
+#: label that repeats on the other side of a tin has half of its colours right.)
+_AGREEING, _RECOGNISED = 8, 0.65
+#: Else so many have to show under a pose, and so many of those that a keyframe gave (of so many keyframes, as if each
+#: had its own); so much of the surface, too, and along so much of its outline the depth has to have a step.
+_FEWEST, _OF_A_VIEW, _VIEWS, _SHARE, _OUTLINE = 4, 0.1, 10, 0.8, 0.45
 #: Else it is looked for as it was turned in so many of its keyframes.
 _TURNS = 12
 #: Pixels are of a found object whose depth is this near to its surface, m.
@@ -70,6 +70,7 @@ class Remembered(TwoMaps):
         self._memory, self._frozen = memory, frozen
         self._recogniser = recogniser
         self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
+        self._fewest = max(_FEWEST, _OF_A_VIEW * len(memory.p_obj) / min(len(memory.T_cam_obj), _VIEWS))
         self._since = 0  # frames since landmarks were looked for on it
 
     @property
@@ -94,7 +95,7 @@ class Remembered(TwoMaps):
             if where.sum() < self.config.lifecycle.min_mask_px:
                 continue
             seen = self._recogniser.at(frame, where, sighting.T_cam_obj, memory.p_obj, memory.descriptors)
-            if recognised or _certain(len(seen), sighting.share, partial(outline_share, frame, where)):
+            if recognised or _certain(len(seen) / self._fewest, sighting.share, partial(outline_share, frame, where)):
                 return Found(where, sighting, self._taken_in(seen.rows), seen.uv_px)
         return None
 
@@ -107,7 +108,7 @@ class Remembered(TwoMaps):
         agreeing = self._recogniser.agreeing(pairs, p_obj)
         if len(agreeing) >= _AGREEING:
             found = search.about(agreeing.T_cam_obj, sample)
-            if found is not None and found.share >= SIGHTED:
+            if found is not None and found.share >= _RECOGNISED:
                 return [(found, True)]
         turns = self.model.views.some(_TURNS)
         free = np.ones(frame.shape, bool) if mask is None else mask
@@ -172,12 +173,12 @@ class Remembered(TwoMaps):
         return not self._frozen and self.life.T_cam_obj is not None and super()._turned_over(obs)
 
 
-def _certain(landmarks: int, share: float, outline: Callable[[], float | None]) -> bool:
-    """Whether this many landmarks, this share of the surface and of the outline are an object, and not its like.
+def _certain(landmarks: float, share: float, outline: Callable[[], float | None]) -> bool:
+    """Whether landmarks, as a multiple of the fewest, a share of the surface and of the outline are the object's.
 
     What is bland and smooth lies on a wall as well as on itself: but nothing ends there.
     """
-    return landmarks >= _FEWEST and share >= _SHARE and (outline() or 0.0) >= _OUTLINE
+    return landmarks >= 1 and share >= _SHARE and (outline() or 0.0) >= _OUTLINE
 
 
 def follow(obj: Remembered, found: Found, tracker: PointTracker, tracks: Tracks) -> Tracks:
