@@ -76,7 +76,8 @@ class Reacquisition(Frontend):
         name = sought[self._turn % len(sought)]
         others = [mask for other, mask in self.masks.items() if other != name and mask is not None]
         with self.stopwatch("search"):
-            found = self.objects[name].find(asked.frame, asked.masks[name], either(others) if others else None)
+            rivals = [self.objects[other] for other in sought if other != name]
+            found = self.objects[name].find(asked.frame, asked.masks[name], either(others) if others else None, rivals)
         if found is None:
             return asked
         self.tracks = follow(self.objects[name], found, self.tracker, self.tracks)

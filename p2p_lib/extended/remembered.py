@@ -8,7 +8,7 @@ become keypoints as they show.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.core.types import Frame, Status, Tracks, joined
@@ -31,6 +32,8 @@ from p2p_lib.method.refinement import surface_distance
 #: Where so many landmarks agree on a pose by themselves, and so much of the surface shows there, it is the object's. (A
 #: label that repeats on the other side of a tin has half of its colours right.)
 _AGREEING, _RECOGNISED = 8, 0.65
+#: So many things that look alike are told from each other by how much of the surface shows.
+_ALIKE = 3
 #: Else so many have to show under a pose, and so many of those that a keyframe gave (of so many keyframes, as if each
 #: had its own); so much of the surface, too, and along so much of its outline the depth has to have a step.
 _FEWEST, _OF_A_VIEW, _VIEWS, _SHARE, _OUTLINE = 4, 0.1, 10, 0.8, 0.45
@@ -82,11 +85,22 @@ class Remembered(TwoMaps):
         """The memory, of the map that began with it."""
         return self._memory if map_id == 0 else None
 
-    def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
-        """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool."""
-        memory = self._memory
+    def find(
+        self,
+        frame: Frame,
+        mask: np.ndarray | None,
+        taken: np.ndarray | None,
+        rivals: Sequence[Remembered] = (),
+    ) -> Found | None:
+        """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool.
+
+        rivals  others that are looked for: what is more like one of them is not this one
+        """
+        memory, best = self._memory, None
         search = ImageSearch(frame, self.observer.camera, self.config.depth)
         for sighting, recognised in self._sightings(frame, search, mask, taken):
+            if recognised and any(rival.beats(frame, search, self._middle(sighting), sighting) for rival in rivals):
+                continue
             where = mask if mask is not None else self._on_surface(frame, sighting.T_cam_obj, sighting.uv_px)
             if taken is not None and mask is None:
                 if (where & taken).sum() > 0.5 * where.sum():
@@ -95,21 +109,24 @@ class Remembered(TwoMaps):
             if where.sum() < self.config.lifecycle.min_mask_px:
                 continue
             seen = self._recogniser.at(frame, where, sighting.T_cam_obj, memory.p_obj, memory.descriptors)
+            worth = sighting.share if recognised else len(seen)
+            if best is not None and worth <= best[0]:
+                continue
             if recognised or _certain(len(seen) / self._fewest, sighting.share, partial(outline_share, frame, where)):
-                return Found(where, sighting, self._taken_in(seen.rows), seen.uv_px)
-        return None
+                best = worth, where, sighting, seen
+        if best is None:
+            return None
+        _, where, sighting, seen = best
+        return Found(where, sighting, self._taken_in(seen.rows), seen.uv_px)
 
     def _sightings(
         self, frame: Frame, search: ImageSearch, mask: np.ndarray | None, taken: np.ndarray | None
     ) -> list[tuple[Sighting, bool]]:
-        """Where it may be, the likeliest first, and whether landmarks that agree say so or its looks alone."""
+        """Where it may be, and whether landmarks that agree say so or its looks alone."""
         p_obj, sample = self._memory.p_obj, self.policy.shape.sample(self.model)
         pairs = self._recogniser.pairs(frame, self._memory.descriptors)
-        agreeing = self._recogniser.agreeing(pairs, p_obj)
-        if len(agreeing) >= _AGREEING:
-            found = search.about(agreeing.T_cam_obj, sample)
-            if found is not None and found.share >= _RECOGNISED:
-                return [(found, True)]
+        if recognised := self._recognised(search, pairs):
+            return [(sighting, True) for sighting in recognised]
         turns = self.model.views.some(_TURNS)
         free = np.ones(frame.shape, bool) if mask is None else mask
         free = free if taken is None else free & ~taken
@@ -119,7 +136,30 @@ class Remembered(TwoMaps):
             one[:, :3, 3] = pairs.p_cam - p_obj[pairs.rows] @ T[:3, :3].T
             poses.append(one)
         found = search.among(np.concatenate(poses), sample)
-        return [(sighting, False) for sighting in sorted(found, key=lambda s: -s.share) if sighting.share >= _SHARE]
+        return [(sighting, False) for sighting in found if sighting.share >= _SHARE]
+
+    def _recognised(self, search: ImageSearch, pairs: Any) -> list[Sighting]:
+        """Where landmarks agree on a pose and the surface shows: more than one place where others look alike."""
+        p_obj, sample, found = self._memory.p_obj, self.policy.shape.sample(self.model), []
+        for _ in range(_ALIKE):
+            agreeing = self._recogniser.agreeing(pairs, p_obj)
+            if len(agreeing) < _AGREEING:
+                break
+            found.append(search.about(agreeing.T_cam_obj, sample))
+            away_m = np.linalg.norm(pairs.p_cam - agreeing.p_cam.mean(0), axis=1)
+            pairs = pairs.select(away_m > np.ptp(sample.p_obj, 0).max())
+        return [sighting for sighting in found if sighting is not None and sighting.share >= _RECOGNISED]
+
+    def _middle(self, sighting: Sighting) -> np.ndarray:
+        """(3,) where the middle of the surface is."""
+        return se3.transform(sighting.T_cam_obj, self.policy.shape.sample(self.model).p_obj).mean(0)
+
+    def beats(self, frame: Frame, search: ImageSearch, middle: np.ndarray, other: Sighting) -> bool:
+        """Whether more of this object's surface shows about a place (3,) than of another object's."""
+        found = self._recognised(search, self._recogniser.pairs(frame, self._memory.descriptors))
+        reach_m = np.ptp(self.policy.shape.sample(self.model).p_obj, 0).max() / 2
+        here = [one for one in found if np.linalg.norm(self._middle(one) - middle) < reach_m]
+        return any(one.share > other.share for one in here)
 
     def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
         """(H, W) bool: what lies on the surface under a pose, as far as it holds together with pixels (M, 2) on it."""

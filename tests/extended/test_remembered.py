@@ -271,3 +271,20 @@ def test_a_tracker_survives_a_restart(crossing, learnt, tmp_path):
     with pytest.raises(BadInput, match=r"Point2Pose\.save"):
         save_memory(tmp_path / "box.npz", learnt.memory)
         Point2Pose.load(tmp_path / "box.npz")
+
+
+def test_look_alikes_are_not_taken_for_each_other():
+    alike = open_sequence("synthetic/look_alikes")
+    method = Point2Pose(alike.camera)
+    for name in alike.objects:
+        method.add_object(name)
+    for i in range(40):
+        told = method.step(alike.frame(i), alike.masks(i))
+    T_obj_model = {n: se3.inverse(told[n].T_cam_obj) @ alike.truth[n].T_cam_model[39] for n in alike.objects}
+    again = Point2Pose(alike.camera)
+    for name in alike.objects:
+        again.add_object(name, memory=method.memory(name))
+    told = followed(alike, again, range(55, 61))[-1]
+    for name in alike.objects:
+        off = se3.inverse(alike.truth[name].T_cam_model[60]) @ told[name].T_cam_obj @ T_obj_model[name]
+        assert np.linalg.norm(off[:3, 3]) < 0.01

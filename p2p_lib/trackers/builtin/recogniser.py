@@ -5,14 +5,14 @@ By the same corners and descriptors the tracker finds a lost segment: what is re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.robust import consensus
-from p2p_lib.core.types import Frame
+from p2p_lib.core.types import SHARED, Frame, Rows
 from p2p_lib.trackers.builtin import features
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Corners, corners, described
@@ -31,7 +31,7 @@ _AGREE_M = 0.008
 
 
 @dataclass(frozen=True, eq=False)
-class Recognised:
+class Recognised(Rows):
     """Landmarks, rows (M,), that look like corners at uv_px (M, 2), p_cam (M, 3); those that agree on T_cam_obj (4, 4).
 
     T_cam_obj is None for pairs of which nobody knows whether they agree.
@@ -40,10 +40,7 @@ class Recognised:
     rows: np.ndarray
     uv_px: np.ndarray
     p_cam: np.ndarray
-    T_cam_obj: np.ndarray | None = None
-
-    def __len__(self) -> int:
-        return len(self.rows)
+    T_cam_obj: np.ndarray | None = field(default=None, metadata=SHARED)
 
 
 class Recogniser:
