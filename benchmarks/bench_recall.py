@@ -61,9 +61,8 @@ def memories(folder: Path, names: Sequence[str]) -> list[Path]:
 
 
 def tracked(sequence: str | Path, out: Path, **options: object) -> Run:
-    """The run in a folder, made unless it is there."""
-    if not (out / "run.json").is_file():
-        run(sequence, out, if_exists="replace", progress=False, **options)
+    """The run in a folder, made unless it is there and finished."""
+    run(sequence, out, if_exists="resume", progress=False, **options)
     return load_run(out)
 
 
