@@ -112,7 +112,9 @@ class Remembered(TwoMaps):
             worth = sighting.share if recognised else len(seen)
             if best is not None and worth <= best[0]:
                 continue
-            if recognised or _certain(len(seen) / self._fewest, sighting.share, partial(outline_share, frame, where)):
+            if recognised or _certain(
+                len(seen) / self._fewest, sighting.share, partial(outline_share, frame, where, True)
+            ):
                 best = worth, where, sighting, seen
         if best is None:
             return None
