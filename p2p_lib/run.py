@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, advised, doubt
+from p2p_lib.core.memory import ObjectMemory, load_memories, save_memory
 from p2p_lib.core.mesh import save as save_mesh
 from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar
@@ -45,6 +46,7 @@ from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.extended.default import Point2Pose
+from p2p_lib.method.object_model import Known
 
 #: Frames whose images are looked at when a run is judged at its end; ``p2p eval`` looks at more.
 RUN_LOOKS = 30
@@ -108,7 +110,8 @@ def run(
     if tracker == OracleTracker.name:  # which has to know the sequence
         tracker = OracleTracker(TrueScene.of(job.sequence, options.models), job.config.oracle, job.config.seed)
     method = Point2Pose(job.sequence.camera, job.config, tracker, options.detector, job.masks.segmenter)
-    for name in job.objects if job.masks.every_mask else ():
+    recall(method, job.memories, options.frozen)
+    for name in [n for n in job.objects if n not in job.memories] if job.masks.every_mask else ():
         method.add_object(name)
     writer = _writer(job, options, method, out, if_exists)
     with writer:
@@ -122,6 +125,12 @@ def run(
         nothing = (f"0 of {len(job.frames)} frames",)
         return RunResult(writer.path, None, "no frame was finished", nothing, interrupted, tracked=False)
     return _result(job, writer.path, interrupted)
+
+
+def recall(method: Point2Pose, memories: Mapping[str, ObjectMemory], frozen: bool) -> None:
+    """Have objects looked for that are known from memories."""
+    for name, memory in memories.items():
+        method.add_object(name, memory=memory, frozen=frozen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,16 +177,26 @@ class Keeper:
         return self.first_masks.add(frame, method.masks)
 
     def save_maps(self) -> None:
-        """``meshes/<object>.ply``, each surface in its object's frame where there is one, and the two logs."""
+        """``meshes/<object>.ply`` and ``maps/<object>.npz`` of each surface in its object's frame, and the two logs."""
         objects = self.method.objects.items()
         kept = {name: obj.known_as(self.writer.kept_map(name)) for name, obj in objects}
         models = {name: known.model for name, known in kept.items() if known is not None}
         for name, model in models.items():
             if model.surface is not None and len((mesh := model.surface.mesh()).faces):
                 save_mesh(mesh, self.writer.path / "meshes" / f"{name}.ply")
+        self._save_memories({name: known for name, known in kept.items() if known is not None})
         maps = {name: (model.map.ids, model.map.p_obj, model.map.promoted) for name, model in models.items()}
         self.keypoints.save(self.writer.path, maps)
         self.mask_log.save(self.writer.path)
+
+    def _save_memories(self, kept: Mapping[str, Known]) -> None:
+        """Of the objects of which enough is known to find them again."""
+        info = self.writer.info
+        made_of = {key: info[key] for key in ("sequence", "tracker", "start", "stop") if key in info}
+        for name, known in kept.items():
+            with suppress(BadInput):
+                memory = self.method.memory(name, known, **made_of, map_id=known.map_id)
+                save_memory(self.writer.path / "maps" / f"{name}.npz", memory)
 
     def judge(self, sequence: sequences.Sequence | None = None) -> None:
         """Have ``run.json`` say what was doubted, and what to look at before the run is believed; when all is kept.
@@ -280,6 +299,7 @@ class _Job:
     source   the sequence, and the prompts, as they would be given to the command line
     masks    where they come from; those of a folder are the sequence's then
     prompts  what starts objects and corrects their masks, by frame
+    memories  objects that are known, and looked for
     """
 
     source: str
@@ -289,6 +309,7 @@ class _Job:
     objects: tuple[str, ...]
     masks: MaskSource
     prompts: Mapping[int, tuple[Prompt, ...]]
+    memories: Mapping[str, ObjectMemory]
 
 
 def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> _Job:
@@ -299,13 +320,17 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     if isinstance(prompts, str | Path):
         source += f" --prompts {prompts}"
         prompts = load_prompts(prompts)
-    prompts = tuple(prompts or ())
+    prompts, memories = tuple(prompts or ()), load_memories(options.memory or ())
     masks = options.mask_source()
     how = options.format, options.depth_scale, config.seed
     sequence = sequences.open_sequence(sequence, *how, masks=masks.folder, gaps=options.skip_bad)
     frames = _frame_range(len(sequence), options.start, options.stop)
-    told = masks.name == "clicks" and bool(prompts)  # all that is known of the objects
-    objects = _chosen([p.name for p in prompts] if told else sequence.objects, options.objects)
+    told = masks.name == "clicks" and bool(prompts or memories)  # all that is known of the objects
+    objects = [p.name for p in prompts] if told else sequence.objects
+    objects = _chosen(list(dict.fromkeys([*objects, *memories])), options.objects)
+    memories = {name: memory for name, memory in memories.items() if name in objects}
+    if both := [p.name for p in prompts if p.name in memories]:
+        raise BadInput(f"memory of {both[0]!r}", "a prompt of it, too", "one of them", "Leave the prompt out.")
     if not told and all(sequence.masks(i) is None for i in frames):
         fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
         fix = "Leave --masks out: the prompts start the objects." if prompts else fix
@@ -313,18 +338,19 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
         raise BadInput("masks", f"none in frames {frames[0]} to {frames[-1]} of {sequence.name}", expected, fix)
     if not told and not masks.every_mask:
         rng, clicks = np.random.default_rng([config.seed, 2]), CLICKS if masks.name == "clicks" else 0
-        drawn = first_prompts(sequence, frames, objects, config.lifecycle.min_mask_px, clicks, rng)
+        unknown = tuple(name for name in objects if name not in memories)
+        drawn = first_prompts(sequence, frames, unknown, config.lifecycle.min_mask_px, clicks, rng)
         if not drawn:
             got = f"no mask of {', '.join(objects)} that is large enough"
             raise BadInput("masks", got, f"one of {config.lifecycle.min_mask_px} pixels", "Click on the objects.")
         prompts += drawn
-    started = objects if masks.every_mask else ()
+    started = objects if masks.every_mask else tuple(memories)
     by_frame = prompts_by_frame([p for p in prompts if p.name in objects], frames, sequence.camera, started)
     for i, said in by_frame.items() if masks.every_mask else ():
         if both := [p.name for p in said if p.name in (sequence.masks(i) or {})]:
             fix = "Leave --masks out to start from the prompts, or take the mask of that frame away."
             raise BadInput(f"prompt of {both[0]!r}", f"a mask in frame {i} too", "one of them", fix)
-    return _Job(source, config, sequence, frames, objects, masks, by_frame)
+    return _Job(source, config, sequence, frames, objects, masks, by_frame, memories)
 
 
 def _doubt_scale(job: _Job) -> None:

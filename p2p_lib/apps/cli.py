@@ -80,7 +80,9 @@ def _run(a: argparse.Namespace) -> int:
     arg("--backlog", type=int, metavar="N", help="images that may wait while one takes long (default 4)"),
     run_options(
         *METHOD,
-        prompts="clicks; without, the first image is clicked on",
+        "memory",
+        "frozen",
+        prompts="clicks; without and without --memory, the first image is clicked on",
         masks="segmenter (default: builtin)",
         stop="end before the camera's J-th image (default: Ctrl-C)",
     ),
@@ -109,7 +111,7 @@ def _live(a: argparse.Namespace) -> None:
     prompts = load_prompts(a.prompts) if a.prompts else ()
     camera = open_camera(a.camera, a.rate)
     try:
-        if not prompts and not a.listen:
+        if not (prompts or options.memory or a.listen):
             prompts, first = click_first(camera, warn, not a.no_browser)
         line = text_line if a.out is not None and sys.stdout.isatty() else json_line
         with Outlet(a.to, warn) if a.to else nullcontext() as outlet:

@@ -21,6 +21,7 @@ from p2p_lib.apps.live_words import Words
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.memory import load_memories
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate, status_text
@@ -29,7 +30,7 @@ from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
-from p2p_lib.run import Keeper, noted, told
+from p2p_lib.run import Keeper, noted, recall, told
 
 #: Made-up images that are tracked before a camera starts.
 _WARM_FRAMES = 4
@@ -78,7 +79,8 @@ def track_live(
 
     prompts  clicks, boxes, masks; those of frame k start their object, or correct its mask, at the camera's k-th image,
              which is not dropped
-    options  the method and its parameters; ``masks`` names the segmenter, ``stop`` the image before which it ends
+    options  the method and its parameters; ``masks`` names the segmenter, ``stop`` the image before which it ends,
+             ``memory`` what is known of objects, which are looked for without prompts
     first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
     out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
@@ -102,6 +104,8 @@ def track_live(
     config = config.with_values({"segmentation.sam2_every": 0})  # no image waits for it
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
     warm_up(say)
+    memories = load_memories(options.memory or ())
+    recall(method, memories, options.frozen)
     if options.tracker.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
     said = list(prompts)
@@ -110,7 +114,7 @@ def track_live(
         if overlay is not None:
             listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
         if out is not None:
-            listeners.append(kept.enter_context(_kept(out, camera, method, options, said, if_exists)))
+            listeners.append(kept.enter_context(_kept(out, camera, method, options, said, memories, if_exists)))
 
         def tell(estimates: dict[str, PoseEstimate]) -> None:
             for listen in listeners if method.frame is not None else ():
@@ -173,11 +177,12 @@ def _kept(
     method: Point2Pose,
     options: RunOptions,
     prompts: list[Prompt],
+    memories: Iterable[str],
     if_exists: IfExists,
 ) -> Iterator[Listener]:
     """Keeps every frame in a run's folder; Ctrl-C is how one stops a camera, so that it ends the run well."""
     sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
-    objects = tuple(dict.fromkeys(prompt.name for prompt in prompts))
+    objects = tuple(dict.fromkeys([*(prompt.name for prompt in prompts), *memories]))
     writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, if_exists=if_exists)
     writer.info |= told(method, options, prompts)
     keeper, stopped = Keeper(writer, method, options.save_masks, prompts), None

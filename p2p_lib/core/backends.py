@@ -42,6 +42,7 @@ PROMISES = {
 }
 #: What runs when none is named.
 DEFAULT_TRACKER, DEFAULT_DETECTOR, DEFAULT_SEGMENTER = "builtin", "corners", "builtin"
+_RECOGNISER = "p2p_lib.trackers.builtin.recogniser:Recogniser"
 _SHORT_HORIZON = "p2p_lib.trackers.short_horizon:ShortHorizon"
 #: Names of earlier versions.
 ALIASES = {"embedded": "builtin"}
@@ -73,6 +74,11 @@ def make_segmenter(segmenter: str | Segmenter, camera: Camera, config: Segmentat
 def is_segmenter(name: str) -> bool:
     """Whether a name that may be a folder of masks as well stands for a segmenter."""
     return knows("segmenter", ALIASES.get(name, name), SEGMENTERS)
+
+
+def make_recogniser(camera: Camera) -> Any:
+    """What describes objects' landmarks, and finds them again in images of this camera."""
+    return load(_RECOGNISER)(camera)
 
 
 def _find(kind: str, name: str, known: dict[str, str]) -> Any:

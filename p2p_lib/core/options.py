@@ -71,6 +71,13 @@ _MASKS = _typed(
     metavar="SOURCE",
 )
 _PROMPTS = _typed("what starts objects and corrects masks (see p2p click)", type=Path, metavar="FILE")
+_MEMORY = _typed(
+    "look for an object that an earlier run learnt (its maps/OBJECT.npz); repeatable, no clicks needed",
+    read=lambda given: tuple(path for one in given for path in str(one).split(",")),
+    action="append",
+    metavar="FILE",
+)
+_FROZEN = _typed("what --memory brings stays as it is: its maps do not grow", action="store_true")
 _SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")
 _SKIP_BAD = _typed("leave frames out whose images are missing or cannot be read, and count them", action="store_true")
 _FORMAT = _typed(
@@ -143,6 +150,8 @@ class RunOptions:
     detector: str = field(default=DEFAULT_DETECTOR, metadata=_DETECTOR)
     masks: str | None = field(default=None, metadata=_MASKS)
     prompts: str | Path | Iterable[Any] | None = field(default=None, metadata=_PROMPTS)
+    memory: Sequence[str | Path] | None = field(default=None, metadata=_MEMORY)
+    frozen: bool = field(default=False, metadata=_FROZEN)
     save_masks: bool = field(default=False, metadata=_SAVE_MASKS)
     skip_bad: bool = field(default=False, metadata=_SKIP_BAD)
     format: str | None = field(default=None, metadata=_FORMAT)
@@ -165,7 +174,7 @@ class RunOptions:
 
     def mask_source(self) -> MaskSource:
         """Where masks come from."""
-        asked = self.masks or ("clicks" if self.prompts else "dataset")
+        asked = self.masks or ("clicks" if self.prompts or self.memory else "dataset")
         asked = ALIASES.get(asked, asked).removeprefix("dataset:")
         if not asked:
             raise BadInput("masks", repr(self.masks), "a folder, or one of " + ", ".join(MASK_SOURCES))

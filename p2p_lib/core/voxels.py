@@ -63,6 +63,18 @@ class CpuGrid:
             new[..., *box] = old
             setattr(self, name, new)
 
+    def put(self, index: np.ndarray, value: np.ndarray, weight: np.ndarray, rgbw: np.ndarray) -> None:
+        """Set voxels (M,), counted in C order, to values (M,), weights (M,) and sums of colours (M, 4)."""
+        arrays = (self.total, value * weight), (self.weight, weight), (self.value, value), (self.colour, rgbw.T)
+        for array, new in arrays:
+            host = self.host(array)
+            host.reshape(*host.shape[:-3], -1)[..., index] = new
+            array[...] = self.like(host)
+
+    def like(self, array: np.ndarray) -> Any:
+        """A NumPy array as one of the arrays."""
+        return array
+
     def host(self, array: Any) -> np.ndarray:
         """A NumPy copy of one of the arrays."""
         return array.copy()
@@ -153,6 +165,12 @@ class TorchGrid(CpuGrid):
         import torch
 
         return torch.full(size, value, device=self.device)
+
+    def like(self, array: np.ndarray) -> Any:
+        """A NumPy array as a tensor."""
+        import torch
+
+        return torch.from_numpy(array).to(self.device)
 
     def host(self, array: Any) -> np.ndarray:
         """A NumPy copy of one of the tensors."""

@@ -135,7 +135,7 @@ class RunWriter:
 
     def begin(self) -> None:
         """Write all so far in the place of an earlier run; what :meth:`add` does at the first frame that is new."""
-        for folder in ("poses", "meshes", "masks"):
+        for folder in ("poses", "meshes", "maps", "masks"):
             if (self.path / folder).is_symlink():
                 raise BadInput(str(self.path / folder), "a link", "a folder of the run's own", "Take it away.")
         if self.resumed is None:
@@ -320,7 +320,7 @@ def _clear(out: Path, info: Mapping[str, Any]) -> None:
     kept_masks = (info.get("options") or {}).get("save_masks")
     masks = [f"masks/{name}/{'[0-9]' * 6}.png" for name in info["objects"]] if kept_masks else []
     poses = [f"poses/{name}.txt" for name in info["objects"]]
-    meshes = [f"meshes/{name}.ply" for name in info["objects"]]
+    meshes = [path for name in info["objects"] for path in (f"meshes/{name}.ply", f"maps/{name}.npz")]
     # First the one without which there is no run: two are never mixed, whenever a kill comes.
     others = ("config.toml", "models.npz", "timings.csv", KEYPOINTS, MASK_LOG, FIRST_MASKS)
     for pattern in ("poses.npz", *poses, *meshes, *masks, *others):

@@ -53,10 +53,11 @@ def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.n
     return float(np.median(now_m[same] / then_m[same])) if same.mean() > _LOOKS_THE_SAME else 1.0
 
 
-def outline_share(frame: Frame, mask: np.ndarray) -> float | None:
+def outline_share(frame: Frame, mask: np.ndarray, own: bool = False) -> float | None:
     """Share of a mask's (H, W) outline where the measured depth has a step, as it has where an object ends.
 
     Of the mask's largest part; None where too little is measured on both sides. At the image's border there is none.
+    With ``own``, steps alone where the mask is the nearer side: elsewhere something else ends before it.
     """
     cut = bounds(mask, 1)
     found, _ = cv2.findContours(mask[cut].astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -68,5 +69,6 @@ def outline_share(frame: Frame, mask: np.ndarray) -> float | None:
     sides = uv_px + across, uv_px - across
     inside = in_image(sides[0], mask.shape) & in_image(sides[1], mask.shape)
     z = [frame.depth_m[nearest_px(at, mask.shape)[::-1]] for at in sides]
-    steps = (inside & (np.abs(z[0] - z[1]) > _DEPTH_STEP_M))[~inside | (z[0] > 0) & (z[1] > 0)]
+    beyond_m = np.where(mask[nearest_px(sides[0], mask.shape)[::-1]], z[1] - z[0], z[0] - z[1])
+    steps = (inside & ((beyond_m if own else np.abs(beyond_m)) > _DEPTH_STEP_M))[~inside | (z[0] > 0) & (z[1] > 0)]
     return float(steps.mean()) if len(steps) >= _OUTLINE else None

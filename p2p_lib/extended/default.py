@@ -7,23 +7,29 @@ Taking a mechanism out is deleting its line here; leaving it out of one run is i
 from __future__ import annotations
 
 from collections.abc import Container
+from dataclasses import asdict
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
 from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.config import Config, as_config
+from p2p_lib.core.config import Config, as_config, preset
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.core.memory import ObjectMemory, read_memories, save_memories
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.extended.model import JoinableModel
 from p2p_lib.extended.policy import OurPolicy
 from p2p_lib.extended.reacquisition import Reacquisition
+from p2p_lib.extended.remembered import Remembered
+from p2p_lib.extended.remembering import memory_of
 from p2p_lib.extended.scene import Scene
 from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method import pipeline
+from p2p_lib.method.object_model import Known
 from p2p_lib.method.object_tracker import ObjectTracker
 
 #: Name to what it does.
@@ -60,6 +66,7 @@ MECHANISMS = {
     "sure_keyframes": "A pose that is hardly believed, or a return to be confirmed, makes no keyframe.",
     "stray_points": "A point that is seen far from where the pose has it stays out of the graph.",
 }
+_SAVED = "p2p tracker"
 ALL, NONE, ALL_BUT = "all", "none", "all but "
 
 
@@ -116,6 +123,73 @@ class Point2Pose(pipeline.Point2Pose):
             turn = self._turn
             Point2Pose.__init__(self, *self._made_of)
             self._turn = turn
+
+    _recogniser: Any = None  # of all objects that are known from memories
+
+    def add_object(
+        self, name: str, *said: Any, memory: ObjectMemory | None = None, frozen: bool = False, **more: Any
+    ) -> None:
+        """As in :meth:`p2p_lib.core.objects.Objects.add_object`, or an object that is known from a memory.
+
+        memory  as :func:`p2p_lib.core.memory.load_memory` reads it: the object is looked for in every frame until it is
+                found, and its pose is in the frame of the map that it was learnt in. Nothing else is said of it
+        frozen  whether that map stays as it is
+
+        Raises :class:`BadInput` for a memory together with clicks or masks, and with preset ``paper``.
+        """
+        if memory is None:
+            super().add_object(name, *said, **more)
+            return
+        if said or more or name in self.objects:
+            got = "clicks or a mask, too" if said or more else f"{name!r}, which is in use"
+            raise BadInput("add_object with a memory", got, "a new name and the memory alone")
+        if not chosen(self.config):
+            raise BadInput("add_object with a memory", "mechanisms none", "preset default: the paper has no memory")
+        self.begin(name)
+        self._recogniser = self._recogniser or backends.make_recogniser(self.camera)
+        self.objects[name] = Remembered(self.objects[name].own, memory, self._recogniser, frozen)
+
+    def save(self, path: str | Path) -> None:
+        """Keep what is known of all objects, as plain data: :meth:`load` goes on with it, on another day if need be.
+
+        :class:`BadInput` for an object of which too little is known to find it again.
+        """
+        learnt = {name: self.memory(name) for name, obj in self.objects.items() if not obj.model.empty}
+        parts = {"tracker": self.tracker.name, "detector": self.detector.name, "segmenter": self.segmenter.name}
+        about = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": list(self.objects), **parts}
+        save_memories(path, learnt, _SAVED, about)
+
+    @classmethod
+    def load(cls, path: str | Path, camera: Camera | None = None, **parts: Any) -> Self:
+        """A tracker that knows what another one knew when it was saved; its objects are looked for, and found, anew.
+
+        camera  where it is another one now; ``parts`` are a tracker, detector or segmenter in place of those named
+        """
+        about, learnt = read_memories(path, _SAVED, "a tracker as Point2Pose.save writes it")
+        try:
+            said = {name: about[name] for name in ("tracker", "detector", "segmenter")} | parts
+            stages = {stage: keys for stage, keys in about["config"].items() if isinstance(keys, dict)}
+            settings = {f"{stage}.{key}": of for stage, keys in stages.items() for key, of in keys.items()}
+            config = preset(about["config"]["preset"], about["config"]["seed"])
+            config = config.with_values(settings | {"device": about["config"]["device"]})
+            loaded = cls(camera or Camera(**about["camera"]), config, **said)
+            for name in about["objects"]:
+                loaded.add_object(name, memory=learnt.get(name))
+        except (KeyError, TypeError, AttributeError) as error:
+            raise BadInput(str(path), f"a file without {error}", "a tracker as Point2Pose.save writes it") from None
+        return loaded
+
+    def memory(self, name: str, known: Known | None = None, **made_of: Any) -> ObjectMemory:
+        """What is known of an object now, to be kept by :func:`p2p_lib.core.memory.save_memory`.
+
+        known    in another of its maps than the newest
+        made_of  where it comes from, plain values. Raises :class:`BadInput` where it could not be found again by it
+        """
+        if name not in self.objects:
+            raise BadInput("memory", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+        obj = self.objects[name]
+        known = known or obj.known
+        return memory_of(name, known, made_of, obj.began_with(known.map_id) if isinstance(obj, Remembered) else None)
 
 
 def compose(camera: Camera, config: Config) -> pipeline.Parts:

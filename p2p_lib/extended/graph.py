@@ -21,6 +21,8 @@ _MOVED_SIGMA = 1.25
 #: No noise explains an observation that is off by more standard deviations, poses a little off included.
 _STRAY_SIGMAS = 8.0
 # Noise of the relative pose that ties a graph to the one it joins (rad, m): next to none beside what points say.
+# Noise of a landmark that a memory places, m.
+_REMEMBERED_M = 0.002
 _JOINED_SIGMAS = np.repeat([0.05, 0.01], 3)
 
 
@@ -37,6 +39,17 @@ class BoundedGraph(ObjectGraph):
         if result.ok:
             merge_keyframes(self._keyframes, self.config.max_keyframes)
         return result
+
+    def remember(self, point_ids: np.ndarray, p_obj: np.ndarray) -> None:
+        """Points (N, 3) of a memory, which the first keyframe stands for: seen from it as sure as a map is."""
+        first = self._keyframes[min(self._keyframes)]
+        p_cam = se3.transform(se3.inverse(first.T_obj_cam), p_obj)
+        sigma_rad = _REMEMBERED_M / np.linalg.norm(p_cam, axis=1)
+        sigma = np.stack([sigma_rad, np.full(len(p_obj), _REMEMBERED_M)], -1)
+        seen = first.ids, first.p_cam, first.sigma
+        more = (point_ids, p_cam, sigma)
+        first.replace_observations(*(np.concatenate(both) for both in zip(seen, more, strict=True)))
+        self._points |= dict(zip(point_ids.tolist(), p_obj, strict=True))
 
     def join(self, other: BoundedGraph, T_obj_other: np.ndarray, point_shift: int) -> None:
         """Take in another graph of the same object, whose frame maps to this one's by T_obj_other (4, 4).

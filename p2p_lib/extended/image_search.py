@@ -17,7 +17,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import DepthConfig
-from p2p_lib.core.image import in_image
+from p2p_lib.core.image import in_image, nearest_px
 from p2p_lib.core.types import Frame, Rows
 
 if TYPE_CHECKING:
@@ -41,6 +41,13 @@ _STEP_M, _STEPS = 0.03, 2
 _COARSE, _TRIED = 3, 3
 #: Of turns, so many are aligned that are so far apart, rad, moved by this step about the depth points, m.
 _TRIED_TURNS, _APART_RAD, _NEAR_M = 6, np.radians(20), 0.015
+#: Pixels between the places of a search anywhere, and so many of them that have the right colours (bins of CIELAB).
+_LATTICE_PX, _PLACES, _BIN = 8, 200, 8
+#: Directions in which it is looked beyond a place, by so many times half the surface's length; what is behind, m.
+_AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4), np.sin(np.pi * np.arange(8) / 4)], -1)
+_BEYOND, _BEHIND_M = 1.15, 0.03
+#: Of many poses so many are ranked, so many that differ are aligned, and so many of these polished.
+_RANKED, _TRIED_PLACES, _POLISHED = 200, 8, 4
 #: A place is no evidence where the surface, moved by its own size along itself, keeps this much of what it shows.
 _ANYWHERE = 0.7
 #: From this share on a pose is polished: by small motions (rad, m), all at first, then smaller ones about the best.
@@ -109,6 +116,48 @@ class ImageSearch:
         found = self._turns(turns, cloud, sample)
         other = [s for s in found if se3.angle_rad(se3.inverse(T_cam_obj) @ s.T_cam_obj) > _APART_RAD]
         return max(other, key=lambda s: s.share, default=None)
+
+    def places(self, free: np.ndarray, sample: SurfaceSample, rng: np.random.Generator) -> np.ndarray:
+        """(P, 3) some measured points of ``free`` pixels (H, W) bool where the surface may be.
+
+        They have one of its colours, and stand out from what is around them: nothing ends amid a wall.
+        """
+        known = np.zeros((256 // _BIN,) * 2, np.uint8)
+        known[tuple((sample.lab[:, 1:] // _BIN).astype(int).T)] = 1
+        known = cv2.dilate(known, np.ones((3, 3), np.uint8))
+        top, left = rng.integers(0, _LATTICE_PX, 2)
+        every = np.s_[top::_LATTICE_PX, left::_LATTICE_PX]
+        a, b = np.moveaxis(self._lab[every][..., 1:] // _BIN, -1, 0).astype(int)
+        v, u = np.nonzero(free[every] & (self._depth_m[every] > 0) & (known[a, b] > 0))
+        px = np.stack([u * _LATTICE_PX + left, v * _LATTICE_PX + top], -1)
+        px = px[self._stands_out(px, np.ptp(sample.p_obj, 0).max())]
+        px = px[rng.permutation(len(px))[:_PLACES]]
+        return self._camera.unproject(px, self._depth_m[px[:, 1], px[:, 0]].astype(float))
+
+    def _stands_out(self, px: np.ndarray, length_m: float) -> np.ndarray:
+        """(P,) bool: pixels (P, 2) around which, beyond something so long, most is measured farther away."""
+        z = self._depth_m[px[:, 1], px[:, 0]]
+        radius_px = _BEYOND * length_m / 2 * self._camera.fx / np.maximum(z, 1e-3)
+        around = px[:, None] + radius_px[:, None, None] * _AROUND
+        u, v = nearest_px(around, self._depth_m.shape)
+        behind = (self._depth_m[v, u] > z[:, None] + _BEHIND_M) & in_image(around, self._depth_m.shape)
+        return behind.sum(1) >= len(_AROUND) / 2
+
+    def among(self, poses: np.ndarray, sample: SurfaceSample) -> list[Sighting]:
+        """The best of many poses (H, 4, 4) that differ, aligned and polished."""
+        if len(sample) < _FEWEST or not len(poses):
+            return []
+        share, best = self._roughly(poses, sample), []
+        for k in np.argsort(-share)[:_RANKED]:
+            apart_m = np.linalg.norm(poses[best, :3, 3] - poses[k, :3, 3], axis=1)
+            turned = se3.angle_rad(se3.inverse(poses[best]) @ poses[k])
+            if np.isfinite(share[k]) and ((apart_m > _STEP_M) | (turned > _APART_RAD)).all():
+                best.append(k)
+            if len(best) == _TRIED_PLACES:
+                break
+        aligned = sorted(self._all_aligned(poses[best], sample), key=lambda s: -s.share)
+        found = [self._best([sighting], sample) for sighting in aligned[:_POLISHED]]
+        return [sighting for sighting in found if sighting is not None]
 
     def _turns(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> list[Sighting]:
         """The best poses near some turns that differ, aligned."""
@@ -268,6 +317,16 @@ def laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.n
     for T in poses:
         facing = sample.n_obj @ T[:3, :3].T @ centre < 0
         T[:3, 3] = centre - T[:3, :3] @ sample.p_obj[facing if facing.any() else slice(None)].mean(0)
+    return poses
+
+
+def laid_at(turns: np.ndarray, p_cam: np.ndarray, sample: SurfaceSample) -> np.ndarray:
+    """(V * P, 4, 4) poses of turns (V, 4, 4), what faced the camera then about where points (P, 3) are."""
+    poses = np.repeat(turns, len(p_cam), 0)
+    for k, T in enumerate(turns):
+        facing = ((sample.n_obj @ T[:3, :3].T) * se3.transform(T, sample.p_obj)).sum(1) < 0
+        middle = sample.p_obj[facing if facing.any() else slice(None)].mean(0)
+        poses[k * len(p_cam) : (k + 1) * len(p_cam), :3, 3] = p_cam - T[:3, :3] @ middle
     return poses
 
 

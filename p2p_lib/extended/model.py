@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.extended.graph import BoundedGraph
+from p2p_lib.extended.remembering import restored
 from p2p_lib.extended.views import AccumulatedViews
-from p2p_lib.method.object_model import ObjectModel, Requests
+from p2p_lib.method.object_model import NO_IDS, ObjectModel, Requests
 
 
 class JoinableModel(ObjectModel):
@@ -22,6 +25,34 @@ class JoinableModel(ObjectModel):
         """As in the paper."""
         self.revision += 1
         return super().insert_keyframe(*args)
+
+    def recall(self, memory: ObjectMemory) -> None:
+        """Begin with what a memory says, in its frame; its landmarks come in one by one (:meth:`remember`)."""
+        kept, config = memory.surface, self.config.tsdf
+        if self._surface is not None:
+            voxel_m = float(kept.voxel_m)
+            how = {"voxel_m": voxel_m, "truncation_voxels": float(kept.tau_m) / voxel_m}
+            self._surface = restored(kept, replace(config, **how), self.config.device)
+        if self._graph is not None:
+            self._graph.add_keyframe(memory.T_cam_obj[0], NO_IDS, np.zeros((0, 3)), p_obj_init=np.zeros((0, 3)))
+            self._graph.optimise()
+        for T_cam_obj in memory.T_cam_obj:
+            self.views.add(T_cam_obj)
+        self.covariance = memory.covariance.copy()
+        self.revision += 1
+
+    def remember(self, p_obj: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+        """Take in landmarks (N, 3) of the memory that are seen now, as keypoints; returns their keys (N,).
+
+        The graph has them from its first keyframe, which stands for the memory: so they stay where they were.
+        """
+        keys = self._next_key + np.arange(len(p_obj))
+        self._next_key += len(keys)
+        self.map.add(keys, p_obj, True)
+        self.map.confidence[-len(keys) :] = confidence
+        if self._graph is not None:
+            self._beside_after(self._graph.remember, keys, p_obj)
+        return keys
 
     def join(self, other: JoinableModel, T_obj_other: np.ndarray) -> None:
         """Take in what another model knows of the same object; T_obj_other (4, 4) maps its frame to this one's.

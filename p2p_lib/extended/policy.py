@@ -94,6 +94,7 @@ class OurPolicy(Policy):
         super().__init__(*paper, life=Lifecycle())
         self.on = on
         self.shape = ShapeSearch(self.observer, self.config, self.stopwatch, "shape_search" in on)
+        self.frozen = False  # whether the map does not grow
         self.trusted: Sight | None = None  # the newest without a doubt; None once it was hidden since
 
     # -- propose -------------------------------------------------------------------------------
@@ -274,11 +275,12 @@ class OurPolicy(Policy):
             sigma_m = self.observer.noise_m(obs.p_cam)
             bearing_rad = np.full_like(sigma_m, self.config.factor_graph.bearing_sigma_rad)
             kept["stray_sigma"] = np.stack([bearing_rad, sigma_m], -1)
+        kept["keyframe"] = not self.frozen
         if belief is None:
             return BelievedAdmission(verdict, best.hypothesis.inliers, self.covariance(obs, known, best), **kept)
         # A turn that nothing tells bends no map.
         covariance, confidence = belief.at(best.T_cam_obj, known.model, most, constrained=True)
-        kept["keyframe"] = "sure_keyframes" not in self.on or (
+        kept["keyframe"] &= "sure_keyframes" not in self.on or (
             not life.confirming and belief.confidence_given_turn(covariance) >= MAPPED
         )
         if not verdict.doubted and not belief.constrained and verdict.status is Status.TRACKED:

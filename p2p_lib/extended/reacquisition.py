@@ -17,6 +17,7 @@ from p2p_lib.core.image import either
 from p2p_lib.core.interfaces import Hint, LazyHints
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
+from p2p_lib.extended.remembered import Remembered, follow
 from p2p_lib.extended.scene import Scene
 from p2p_lib.extended.sight import Sight
 from p2p_lib.extended.two_maps import TwoMaps
@@ -37,6 +38,7 @@ class Reacquisition(Frontend):
         self.on, self.scene = on, scene
         self._unlocated = _LOCATE_EVERY
         self._sightings: Mapping[str, Sighting] = {}
+        self._turn = 0  # of the objects that are known from memories
 
     def track(self, asked: Asked) -> Asked | None:
         """The camera is located meanwhile."""
@@ -62,7 +64,25 @@ class Reacquisition(Frontend):
     def segment(self, asked: Asked) -> None:
         """Sought objects are looked for first."""
         self._sightings = self._sighted(asked.frame, asked.masks)
-        super().segment(asked)
+        super().segment(self._recalled(asked))
+
+    def _recalled(self, asked: Asked) -> Asked:
+        """With the mask of an object that is known from a memory, where it is found: one is looked for in a frame."""
+        sought = [n for n, obj in sorted(self.objects.items()) if isinstance(obj, Remembered) and obj.recalls]
+        sought = [name for name in sought if name in asked.masks and name not in asked.said]
+        if not sought:
+            return asked
+        self._turn += 1
+        name = sought[self._turn % len(sought)]
+        others = [mask for other, mask in self.masks.items() if other != name and mask is not None]
+        with self.stopwatch("search"):
+            rivals = [self.objects[other] for other in sought if other != name]
+            found = self.objects[name].find(asked.frame, asked.masks[name], either(others) if others else None, rivals)
+        if found is None:
+            return asked
+        self.tracks = follow(self.objects[name], found, self.tracker, self.tracks)
+        self._sightings = {**self._sightings, name: found.sighting}
+        return replace(asked, masks=asked.masks | {name: found.mask})
 
     def _sighted(self, frame: Frame, masks: Masks) -> dict[str, Sighting]:
         """Sought objects that show by shape and colour; the tracker looks for their points there."""

@@ -24,6 +24,8 @@ TYPED = {
     "detector": (["--detector", "orb"], "orb"),
     "masks": (["--masks", "dataset:drawn"], "dataset:drawn"),
     "prompts": (["--prompts", "p.json"], "p.json"),
+    "memory": (["--memory", "a.npz", "--memory", "b.npz"], ["a.npz", "b.npz"]),
+    "frozen": (["--frozen"], True),
     "save_masks": (["--save-masks"], True),
     "skip_bad": (["--skip-bad"], True),
     "format": (["--format", "bop"], "bop"),

@@ -11,7 +11,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.gates import SIGHTED
-from p2p_lib.extended.image_search import ImageSearch, SurfaceSample
+from p2p_lib.extended.image_search import ImageSearch, SurfaceSample, laid_at
 from p2p_lib.method.observation import sample_cloud
 from tests.method import analytic_scene
 
@@ -136,3 +136,11 @@ def test_another_turn_shows_as_much_where_a_shape_looks_alike():
         assert (other.share > 0.9 * seen.at(truth, sample_of(shape)).share) == alike
         assert np.degrees(se3.angle_rad(se3.inverse(truth) @ other.T_cam_obj)) > 150
     assert seen.otherwise(truth, truth[None], cloud, sample_of(shape)) is None
+
+
+def test_of_one_colour_with_the_wall_only_the_ball_is_tried():
+    looked, sample = search(ball_in_front_of_a_wall(GREY)), sample_of_the_ball(GREY)
+    places = looked.places(np.ones((CAMERA.height, CAMERA.width), bool), sample, np.random.default_rng(0))
+    assert len(places) > 10 and (places[:, 2] < 0.7).all()
+    found = looked.among(laid_at(PLACE[None], places, sample), sample)
+    assert found and all(np.linalg.norm(one.T_cam_obj[:3, 3] - PLACE[:3, 3]) < 0.005 for one in found)

@@ -33,12 +33,16 @@ class Corners(Rows):
 
 def corners(now: Image, region: np.ndarray | None, limit: int) -> Corners:
     """The strongest corners, at most ``limit``, inside ``region`` (H, W) if given."""
-    uv = features.detect(now.gray, region, limit)
-    planes = planes_at(now.depth_m, now.camera, uv, 2)
-    known = np.isfinite(planes.p_cam[:, 0])
-    uv, planes = uv[known], planes.select(known)
+    return described(now, features.detect(now.gray, region, limit))[1]
+
+
+def described(now: Image, uv_px: np.ndarray) -> tuple[np.ndarray, Corners]:
+    """Which of the pixels (N, 2) have depth around them, rows (M,), and these as corners."""
+    planes = planes_at(now.depth_m, now.camera, uv_px, 2)
+    known = np.flatnonzero(np.isfinite(planes.p_cam[:, 0]))
+    uv_px, planes = uv_px[known], planes.select(known)
     steps = [tangent_steps(planes, now.camera, step_m) for step_m in _STEPS_M]
-    return Corners(uv, planes.p_cam, features.describe(now.gray, uv, steps))
+    return known, Corners(uv_px, planes.p_cam, features.describe(now.gray, uv_px, steps))
 
 
 @dataclass(eq=False)

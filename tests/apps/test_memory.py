@@ -1,0 +1,50 @@
+"""``p2p run`` keeps what it learnt of each object, and ``--memory`` looks for it in another video."""
+
+import numpy as np
+import pytest
+
+from p2p_lib.apps.cli import main
+from p2p_lib.core.memory import load_memory
+from p2p_lib.datasets.runs import load_run
+
+CROSSING = ["run", "synthetic/crossing", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory):
+    """A run's folder, and its memories."""
+    out = tmp_path_factory.mktemp("learnt") / "run"
+    assert main([*CROSSING, "--stop", "40", "--out", str(out)]) == 0
+    return out
+
+
+def test_each_object_is_kept_and_all_are_found_without_masks(learnt, tmp_path):
+    box, can = (learnt / "maps" / f"{name}.npz" for name in ("box", "can"))
+    assert (
+        load_memory(box).made_of["sequence"] == "synthetic/crossing" and box.stat().st_size + can.stat().st_size < 4e6
+    )
+    again = [*CROSSING, "--start", "44", "--stop", "50", "--memory", str(box), "--memory", str(can), "--frozen"]
+    assert main([*again, "--out", str(tmp_path / "again")]) == 0
+    run, before = load_run(tmp_path / "again"), load_run(learnt)
+    for name, obj in run.objects.items():
+        assert obj.has_pose[1:].all() and not obj.keyframe.any()  # one is looked for in a frame
+        T_obj_model = np.linalg.inv(before.objects[name].T_cam_obj[0]) @ before.objects[name].T_cam_model[0]
+        off_m = (obj.T_cam_obj[1:] @ T_obj_model - obj.T_cam_model[1:])[:, :3, 3]
+        assert np.linalg.norm(off_m, axis=1).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--memory", "{box}", "--memory", "{box}"], "two of 'box'"),
+        (["--memory", "{half}"], "half.npz"),
+        (["--memory", "{none}"], "no such file"),
+        (["--memory", "{box}", "--objects", "cup"], "'cup'"),
+    ],
+)
+def test_what_does_not_fit_is_said_before_anything_is_written(learnt, tmp_path, capsys, words, said):
+    box, half = learnt / "maps/box.npz", tmp_path / "half.npz"
+    half.write_bytes(box.read_bytes()[:5000])
+    files = {"box": box, "half": half, "none": tmp_path / "none.npz"}
+    assert main([*CROSSING, *(word.format(**files) for word in words), "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -1,0 +1,290 @@
+"""An object that was learnt in one video is found in another, in the frame of its map; one that is not there is not."""
+
+import json
+from dataclasses import fields, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from p2p_lib import Point2Pose, open_sequence, preset
+from p2p_lib.core import memory as memories
+from p2p_lib.core import se3
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.memory import ObjectMemory, SurfaceMemory, load_memories, load_memory, save_memory
+from p2p_lib.core.types import Status
+from p2p_lib.extended.graph import BoundedGraph
+from p2p_lib.extended.image_search import ImageSearch
+from p2p_lib.extended.remembered import _certain
+from p2p_lib.trackers.builtin.recogniser import Recognised, Recogniser
+
+LEARNT, LATER = range(0, 45), range(72, 83)
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    return open_sequence("synthetic/crossing")
+
+
+@pytest.fixture(scope="module")
+def learnt(crossing):
+    """The carton of ``crossing``, learnt in its first frames: the memory, T_obj_model, and the surface's values."""
+    method = Point2Pose(crossing.camera)
+    method.add_object("box")
+    for i in LEARNT:
+        estimate = method.step(crossing.frame(i), {"box": crossing.masks(i)["box"]})["box"]
+    T_obj_model = se3.inverse(estimate.T_cam_obj) @ crossing.truth["box"].T_cam_model[LEARNT[-1]]
+    surface = method.objects["box"].model.surface
+    known = SimpleNamespace(method=method, T_obj_model=T_obj_model, values=surface.values(), mesh=surface.mesh())
+    return SimpleNamespace(memory=method.memory("box", sequence="crossing"), **vars(known))
+
+
+@pytest.fixture
+def kept(learnt, tmp_path):
+    save_memory(tmp_path / "maps/box.npz", learnt.memory)
+    return tmp_path / "maps/box.npz"
+
+
+def followed(crossing, method, frames, masks=None):
+    """The estimates of frames without any masks."""
+    return [method.step(crossing.frame(i), masks and masks(i)) for i in frames]
+
+
+# -- the file ----------------------------------------------------------------------------------------
+
+
+def test_a_memory_is_read_as_it_was_written_and_is_small(learnt, kept):
+    read = load_memory(kept)
+    for kind, one, other in (ObjectMemory, learnt.memory, read), (SurfaceMemory, learnt.memory.surface, read.surface):
+        for f in fields(kind):
+            if isinstance(getattr(one, f.name), np.ndarray):
+                np.testing.assert_array_equal(getattr(other, f.name), getattr(one, f.name))
+                assert getattr(other, f.name).dtype == getattr(one, f.name).dtype
+    assert read.name == "box" and read.made_of == {"sequence": "crossing"}
+    assert kept.stat().st_size < 2e6
+    with np.load(kept, allow_pickle=False) as file:
+        assert all(file[name].dtype.kind in "iufb" for name in file.files)
+
+
+def test_the_surface_is_back_as_it_was(crossing, learnt, kept):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=load_memory(kept))
+    surface = method.objects["box"].model.surface
+    np.testing.assert_allclose(surface.values(), learnt.values, atol=1e-3)
+    mesh = surface.mesh()
+    assert len(mesh.faces) == pytest.approx(len(learnt.mesh.faces), rel=0.02)
+    np.testing.assert_allclose(mesh.bounds, learnt.mesh.bounds, atol=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.98])
+def test_a_file_that_was_cut_short_is_refused(kept, share):
+    data = kept.read_bytes()
+    kept.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(BadInput, match=r"box\.npz"):
+        load_memory(kept)
+
+
+def test_other_files_are_refused_and_say_what_was_expected(learnt, kept, tmp_path, monkeypatch):
+    with pytest.raises(MissingData, match=r"maps/OBJECT\.npz"):
+        load_memory(tmp_path / "nothing.npz")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(BadInput, match="something else"):
+        load_memory(tmp_path / "other.npz")
+    with np.load(kept) as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "part.npz", **{k: v for k, v in arrays.items() if not k.endswith("descriptors")})
+    with pytest.raises(BadInput, match="without 'box/descriptors'"):
+        load_memory(tmp_path / "part.npz")
+    arrays["box/p_obj"] = arrays["box/p_obj"] * np.nan
+    np.savez(tmp_path / "nan.npz", **arrays)
+    with pytest.raises(BadInput, match="p_obj"):
+        load_memory(tmp_path / "nan.npz")
+    monkeypatch.setattr(memories, "VERSION", 99)
+    save_memory(tmp_path / "newer.npz", learnt.memory)
+    monkeypatch.undo()
+    with pytest.raises(BadInput, match="version 99"):
+        load_memory(tmp_path / "newer.npz")
+
+
+def test_two_of_one_name_and_an_empty_map_are_refused(learnt, kept):
+    with pytest.raises(BadInput, match="two of 'box'"):
+        load_memories([kept, kept])
+    nothing = {f.name: getattr(learnt.memory, f.name)[:0] for f in fields(ObjectMemory)[1:5]}
+    with pytest.raises(BadInput, match="0 landmarks"):
+        replace(learnt.memory, **nothing)
+
+
+def test_a_write_that_fails_leaves_the_old_file(learnt, kept, monkeypatch):
+    before = kept.read_bytes()
+    monkeypatch.setattr(np, "savez_compressed", lambda file, **arrays: file.write(b"half") and 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        save_memory(kept, learnt.memory)
+    assert kept.read_bytes() == before and [path.name for path in kept.parent.iterdir()] == ["box.npz"]
+
+
+def test_a_memory_goes_with_nothing_else_and_not_with_the_paper(crossing, learnt):
+    with pytest.raises(BadInput, match="clicks or a mask, too"):
+        Point2Pose(crossing.camera).add_object("box", clicks=[[3, 3]], memory=learnt.memory)
+    with pytest.raises(BadInput, match="preset default"):
+        Point2Pose(crossing.camera, preset("paper")).add_object("box", memory=learnt.memory)
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    with pytest.raises(BadInput, match="in use"):
+        method.add_object("box", memory=learnt.memory)
+
+
+# -- found again -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def again(crossing, learnt):
+    """The carton found without masks: the tracker, its keypoints after the first frame, and all estimates."""
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    first = followed(crossing, method, LATER[:1])
+    keypoints = len(method.objects["box"].map)
+    return SimpleNamespace(method=method, keypoints=keypoints, told=first + followed(crossing, method, LATER[1:]))
+
+
+def test_it_is_found_at_once_in_the_frame_of_its_map(crossing, learnt, again):
+    for i, told in zip(LATER, again.told, strict=True):
+        assert told["box"].T_cam_obj is not None and told["box"].map_id == 0
+        off = se3.inverse(crossing.truth["box"].T_cam_model[i]) @ told["box"].T_cam_obj @ learnt.T_obj_model
+        assert np.linalg.norm(off[:3, 3]) < 0.006 and np.degrees(se3.angle_rad(off)) < 3
+    assert again.told[0]["box"].status is Status.RECOVERED
+    mask, true = again.method.masks["box"], crossing.masks(LATER[-1])["box"]
+    assert (mask & true).sum() > 0.8 * (mask | true).sum()
+
+
+def test_landmarks_that_come_into_view_become_keypoints(again):
+    of_memory = again.method.objects["box"]._key
+    assert again.keypoints >= 8
+    assert (of_memory >= 0).sum() > again.keypoints
+
+
+def test_what_was_found_is_kept_with_what_it_began_with(learnt, again):
+    kept = again.method.memory("box")
+    before = {tuple(p) for p in learnt.memory.p_obj}
+    assert len(before & {tuple(p) for p in kept.p_obj}) > 0.8 * len(before)
+
+
+def test_a_tracker_without_features_follows_what_was_found(crossing, learnt):
+    method = Point2Pose(crossing.camera, tracker="lk")
+    method.add_object("box", memory=learnt.memory)
+    assert all(one["box"].T_cam_obj is not None for one in followed(crossing, method, LATER[:4]))
+
+
+def sightings(crossing, memory, frame, pairs=None):
+    """Where the carton may be in a frame, by some ``pairs`` of all that look alike."""
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=memory)
+    obj = method.objects["box"]
+    if pairs is not None:
+        of = obj._recogniser.pairs(frame, memory.descriptors)
+        chosen = Recognised(of.rows[pairs], of.uv_px[pairs], of.p_cam[pairs])
+        obj._recogniser = SimpleNamespace(pairs=lambda *_: chosen, agreeing=Recogniser.agreeing)
+    return obj._sightings(frame, ImageSearch(frame, crossing.camera, method.config.depth), None, None)
+
+
+def right(crossing, learnt, sighting, i):
+    """Whether a sighting is within 3 cm and 15 degrees of the truth."""
+    off = se3.inverse(crossing.truth["box"].T_cam_model[i]) @ sighting.T_cam_obj @ learnt.T_obj_model
+    return np.linalg.norm(off[:3, 3]) < 0.03 and np.degrees(se3.angle_rad(off)) < 15
+
+
+def test_landmarks_alone_find_what_does_not_look_whole(crossing, learnt):
+    i = LATER[0]
+    frame = crossing.frame(i)
+    (found, recognised), *others = sightings(crossing, learnt.memory, frame)
+    assert recognised and not others and right(crossing, learnt, found, i)
+
+
+def test_looks_find_what_few_landmarks_show(crossing, learnt):
+    i = 50
+    found = sightings(crossing, learnt.memory, crossing.frame(i), pairs=slice(0, 5))
+    assert found and not any(recognised for _, recognised in found)
+    assert any(right(crossing, learnt, sighting, i) for sighting, _ in found)
+
+
+def test_landmarks_lie_on_the_surface(learnt):
+    corners = learnt.memory.p_obj[~learnt.memory.keypoint]
+    distance_m, known = learnt.method.objects["box"].model.surface.query(corners)
+    assert known.mean() > 0.9 and np.median(np.abs(distance_m[known])) < 1e-4
+
+
+def test_what_is_not_there_is_not_found(learnt):
+    other = open_sequence("synthetic/mug")
+    method = Point2Pose(other.camera)
+    method.add_object("box", memory=learnt.memory)
+    for i in range(0, 60, 6):
+        estimate = method.step(other.frame(i))["box"]
+        assert estimate.status is Status.INITIALISING and estimate.T_cam_obj is None
+        assert estimate.reason == "remembered, and not found yet"
+
+
+def test_a_frozen_map_does_not_grow(crossing, learnt):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory, frozen=True)
+    told = followed(crossing, method, range(45, 75))
+    model = method.objects["box"].model
+    assert all(one["box"].T_cam_obj is not None and not one["box"].keyframe for one in told)
+    assert len(model.views) == len(learnt.memory.T_cam_obj)
+    np.testing.assert_allclose(model.surface.values(), learnt.values, atol=1e-3)
+
+
+def test_few_landmarks_prove_nothing_on_what_does_not_end_where_depth_does():
+    assert _certain(1, 0.9, lambda: 0.6)
+    assert not _certain(5, 0.9, lambda: 0.1) and not _certain(5, 0.9, lambda: None)
+    assert not _certain(0.9, 0.9, lambda: 0.9) and not _certain(5, 0.6, lambda: 0.9)
+
+
+def test_the_graph_keeps_landmarks_where_the_memory_has_them():
+    rng = np.random.default_rng(0)
+    p_obj = rng.uniform(-0.05, 0.05, (30, 3))
+    T_cam_obj = se3.from_rt(np.eye(3), np.array([0.0, 0.0, 0.5]))
+    graph = BoundedGraph(preset().factor_graph)
+    nothing = np.zeros(0, int), np.zeros((0, 3))
+    graph.add_keyframe(T_cam_obj, *nothing, p_obj_init=nothing[1])
+    graph.optimise()
+    graph.remember(np.arange(30), p_obj)
+    off = T_cam_obj @ se3.exp(np.array([0.02, -0.01, 0.02, 0.004, -0.004, 0.004]))
+    graph.add_keyframe(off, np.arange(30), se3.transform(T_cam_obj, p_obj), p_obj_init=p_obj)
+    result = graph.optimise()
+    assert result.ok
+    np.testing.assert_allclose(result.p_obj, p_obj, atol=5e-4)
+    np.testing.assert_allclose(result.T_cam_obj[-1], T_cam_obj, atol=6e-3)
+
+
+# -- a restart ---------------------------------------------------------------------------------------
+
+
+def test_a_tracker_survives_a_restart(crossing, learnt, tmp_path):
+    learnt.method.save(tmp_path / "tracker.npz")
+    with np.load(tmp_path / "tracker.npz", allow_pickle=False) as file:
+        assert json.loads(file["about"].tobytes())["about"]["objects"] == ["box"]
+    loaded = Point2Pose.load(tmp_path / "tracker.npz")
+    assert loaded.config == learnt.method.config and loaded.camera == crossing.camera
+    (told,) = followed(crossing, loaded, [LEARNT[-1] + 1])
+    (goes_on,) = followed(crossing, learnt.method, [LEARNT[-1] + 1])
+    off = se3.inverse(goes_on["box"].T_cam_obj) @ told["box"].T_cam_obj
+    assert np.linalg.norm(off[:3, 3]) < 0.004 and np.degrees(se3.angle_rad(off)) < 2
+    with pytest.raises(BadInput, match=r"Point2Pose\.save"):
+        save_memory(tmp_path / "box.npz", learnt.memory)
+        Point2Pose.load(tmp_path / "box.npz")
+
+
+def test_look_alikes_are_not_taken_for_each_other():
+    alike = open_sequence("synthetic/look_alikes")
+    method = Point2Pose(alike.camera)
+    for name in alike.objects:
+        method.add_object(name)
+    for i in range(40):
+        told = method.step(alike.frame(i), alike.masks(i))
+    T_obj_model = {n: se3.inverse(told[n].T_cam_obj) @ alike.truth[n].T_cam_model[39] for n in alike.objects}
+    again = Point2Pose(alike.camera)
+    for name in alike.objects:
+        again.add_object(name, memory=method.memory(name))
+    told = followed(alike, again, range(55, 61))[-1]
+    for name in alike.objects:
+        off = se3.inverse(alike.truth[name].T_cam_model[60]) @ told[name].T_cam_obj @ T_obj_model[name]
+        assert np.linalg.norm(off[:3, 3]) < 0.01
