@@ -283,6 +283,19 @@ def _figures(a: argparse.Namespace) -> None:
         print(saved.path)
 
 
+@command(
+    "refine",
+    "go over a finished run with the whole video; its better poses and surfaces go to DIR/offline",
+    _RUN,
+    _QUIET,
+)
+def _refine(a: argparse.Namespace) -> None:
+    from p2p_lib.offline.refine import FOLDER, refine_run
+
+    print("\n".join(refine_run(a.run, not a.quiet)))
+    print(f"Results in {a.run / FOLDER}. Next: p2p eval {a.run / FOLDER}")
+
+
 # --- looking and handing on ----------------------------------------------------------------------
 
 

@@ -55,7 +55,7 @@ def outline(silhouette: Silhouette, depth_m: np.ndarray) -> Outline:
 
 
 def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, mask: np.ndarray | None):
-    """How well a label fits what was seen: IoU of what shows with the mask, and how far off nine of ten depths are, mm."""
+    """How well a label fits: IoU of what shows with the mask, and how far nine of ten depths are off at most, mm."""
     iou = np.nan if mask is None else np.count_nonzero(shown & mask) / max(np.count_nonzero(shown | mask), 1)
     image, own = silhouette.inside(depth_m)
     both = shown[image] & (depth_m[image] > 0)

@@ -76,9 +76,10 @@ def write_models(
     """
     if faces < 100:
         raise BadInput("faces", faces, "at least 100")
-    load_open3d()
+    open3d = load_open3d()
     made, told = Finished.of(folder), []
-    with new_folder(out) as there, progress_bar("models", len(made.tracked), "object", progress) as bar:
+    quiet = open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error)
+    with quiet, new_folder(out) as there, progress_bar("models", len(made.tracked), "object", progress) as bar:
         for name in made.tracked:
             told.append(_write_model(made, name, there / name, faces, min_confidence))
             bar.update()

@@ -39,7 +39,7 @@ def test_labels_are_the_poses_and_the_masks_are_the_true_ones(made, scene):
 
 
 def test_models_are_metric_whatever_the_file_says(made, scene):
-    for k, (name, path) in enumerate(sorted(find_models(made.sequence, MESHES).items()), 1):
+    for k, (_, path) in enumerate(sorted(find_models(made.sequence, MESHES).items()), 1):
         found = load_points(find_models(scene)[f"obj_{k:06d}"])
         np.testing.assert_allclose(found, se3.transform(T_OBJ_MODEL, load_points(path)), atol=1e-6)
 
