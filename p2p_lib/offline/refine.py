@@ -48,8 +48,8 @@ _STEP_M = 0.02
 #: A point is taken as a keypoint of a pose within this, m; a distance beyond the first counts as that.
 _NEAR_M, _FAR_M = 0.02, 0.01
 #: Where no mask tells of the object: so much of its surface may be seen through, and colours may be so many times as
-#: far off as usual, which this many frames tell.
-_BEHIND, _OTHER_COLOURS, _CALIBRATED = 0.15, 1.6, 12
+#: far off as usual, and correlate so many times as well at least. This many frames tell what is usual.
+_BEHIND, _OTHER_COLOURS, _LESS_ALIKE, _CALIBRATED = 0.15, 1.4, 0.6, 12
 #: Of a squared Mahalanobis distance with six degrees of freedom: three standard deviations (99.73 %).
 _CHI2_6 = 20.06
 
@@ -308,7 +308,7 @@ class _Refinement:
                 on = T[k - step] @ se3.inverse(before) @ T[k - step]  # goes on as it moved, else stays
                 if shown[k]:
                     found = self.best_of(k, [T[k - step], on], volume, points, seen)
-                elif (found := sight.found(k, [on, T[k - step]])) is None:
+                elif (found := sight.found(k, [on, T[k - step]], k - step, T[k - step])) is None:
                     continue
                 if found[2] < cost[k]:
                     T[k], covariance[k], cost[k] = found
@@ -339,6 +339,7 @@ class Sight:
 
     def __init__(self, work: _Refinement, volume: TsdfVolume, T: np.ndarray, sure: np.ndarray):
         self._work, self._volume = work, volume
+        self._light: dict[int, tuple[float, float]] = {}
         mesh = volume.mesh()
         self._colours, self._faces = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float), np.asarray(mesh.faces)
         self._render = Renderer(mesh.vertices, mesh.faces, work.camera) if len(mesh.faces) else None
@@ -349,9 +350,16 @@ class Sight:
     def _frame(self, k: int) -> Frame:
         return self._work.made.sequence.frame(int(self._work.made.frames[k]))
 
-    def found(self, k: int, candidates: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, float] | None:
-        """The pose of the k-th frame, its covariance and cost; None where the surface is not seen from any of these."""
+    def found(self, k: int, candidates: list[np.ndarray], beside: int, T_beside: np.ndarray):
+        """The pose of the k-th frame, its covariance and cost; None where the surface is not seen from any of these.
+
+        beside  a frame next to it with its pose, in the same light
+        """
         frame, best = self._frame(k), None
+        if beside not in self._light:  # what was found so passes on what it was found by: errors do not add up
+            known = self._seen(self._frame(beside), T_beside) if self._render else None
+            self._light[beside] = (max(self._usual, known[2]), known[3]) if known else (self._usual, 1.0)
+        self._light[k] = usual, alike = self._light[beside]
         for T in candidates if self._render else ():
             covariance = None
             for _ in range(3):
@@ -360,7 +368,7 @@ class Sight:
                 refined = refine(T, seen[0], self._volume, self._work.config.refinement)
                 T, covariance = refined.T_cam_obj, refined.covariance
             seen = None if covariance is None else self._seen(frame, T)
-            if seen is None or seen[1] > _BEHIND or seen[2] > _OTHER_COLOURS * self._usual:
+            if seen is None or seen[1] > _BEHIND or seen[2] > _OTHER_COLOURS * usual or seen[3] < _LESS_ALIKE * alike:
                 continue
             distance_m, valid = self._volume.query(se3.transform(se3.inverse(T), seen[0]))
             cost = float(np.where(valid, np.minimum(np.abs(distance_m), _FAR_M), _FAR_M).mean() / _FAR_M)
@@ -368,8 +376,8 @@ class Sight:
                 best = T, covariance, cost
         return best
 
-    def _seen(self, frame: Frame, T: np.ndarray, wide: bool = False) -> tuple[np.ndarray, float, float] | None:
-        """Points (N, 3) measured on the surface at a pose, the share measured behind it, how far off its colours are."""
+    def _seen(self, frame: Frame, T: np.ndarray, wide: bool = False) -> tuple[np.ndarray, float, float, float] | None:
+        """Points (N, 3) measured on the surface, the share measured behind it, how far colours are off and correlate."""
         silhouette = self._render(se3.orthonormalised(T))
         image, own = silhouette.inside(frame.depth_m)
         depth_m, z, hit = frame.depth_m[image], silhouette.depth_m[own], silhouette.hit[own]
@@ -387,7 +395,9 @@ class Sight:
         some = np.linspace(0, len(v) - 1, min(len(v), self._work.config.refinement.max_points)).astype(int)
         uv = np.stack([u[some] + image[1].start, v[some] + image[0].start], -1)
         cloud = self._work.camera.unproject(uv, depth_m[v[some], u[some]])
-        return cloud, float(behind.sum() / (on.sum() + behind.sum())), wrong
+        spread = colour - colour.mean(0), true - true.mean(0)
+        alike = (spread[0] * spread[1]).sum() / max(np.sqrt((spread[0] ** 2).sum() * (spread[1] ** 2).sum()), 1e-9)
+        return cloud, float(behind.sum() / (on.sum() + behind.sum())), wrong, float(alike)
 
 
 # --- files ---------------------------------------------------------------------------------------
