@@ -43,7 +43,15 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
 @command(
     "run",
     "track the objects of a sequence and write poses, timings, scores",
-    _SEQUENCE,
+    arg("sequence", nargs="?", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA"),
+    arg(
+        "--batch",
+        type=Path,
+        metavar="FOLDER",
+        help="instead of SEQ: every recording in it, each into DIR/NAME; resumes",
+    ),
+    arg("--jobs", type=int, metavar="N", help="recordings of --batch at a time (default: one a core)"),
+    arg("--scheduler", metavar="tcp://HOST:PORT", help="for --batch: a Dask cluster that sees DIR"),
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
     _FORCE,
     arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
@@ -54,6 +62,15 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
 def _run(a: argparse.Namespace) -> int:
     from p2p_lib.run import run
 
+    if (a.sequence is None) == (a.batch is None):
+        a.parser.error("needs either SEQ or --batch FOLDER")
+    if a.batch is not None:
+        from p2p_lib.benchmark.batch import TABLE, run_batch
+        from p2p_lib.core.tables import as_text
+
+        table = run_batch(a.batch, a.out, RunOptions.of_arguments(a), a.jobs, a.scheduler, not a.quiet)
+        print(f"{as_text(table)}\nResults in {a.out}, the table in {a.out / TABLE}")
+        return 0 if table["object"].notna().any() else P2PError.exit_code
     film = _film_wanted(a.overlay)
     options = replace(RunOptions.of_arguments(a), save_masks=a.save_masks or film is not None)
     how = {"if_exists": a.if_exists or "refuse", "progress": not a.quiet, "say": warn}

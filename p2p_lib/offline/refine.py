@@ -377,7 +377,7 @@ class Sight:
         return best
 
     def _seen(self, frame: Frame, T: np.ndarray, wide: bool = False) -> tuple[np.ndarray, float, float, float] | None:
-        """Points (N, 3) measured on the surface, the share measured behind it, how far colours are off and correlate."""
+        """Points (N, 3) measured on the surface, the share measured behind, how far colours are off and correlate."""
         silhouette = self._render(se3.orthonormalised(T))
         image, own = silhouette.inside(frame.depth_m)
         depth_m, z, hit = frame.depth_m[image], silhouette.depth_m[own], silhouette.hit[own]
