@@ -42,7 +42,7 @@ def off(T, T_true):
 
 
 def test_adjustment_is_as_good_as_its_covariance_says(scene):
-    T, p, seen, rng = scene
+    T, _, seen, rng = scene
     start = T @ se3.exp(rng.normal(size=(20, 6)) * ([0.05] * 3 + [0.005] * 3))
     best = adjust(start, placed(start, seen, 40), seen)
     error = off(best.T_cam_obj, T)
@@ -64,7 +64,6 @@ def test_tracks_that_slid_away_count_for_nothing(scene):
 
 def view(T_cam_obj, stands_still):
     """A plate with a knob beside its middle, and features: the knob's, and more that do not move with the plate."""
-    u, v = np.meshgrid(np.arange(320), np.arange(240))
     rays = CAMERA.rays.reshape(-1, 3).astype(float)
     T = se3.inverse(T_cam_obj)
     depth = -T[2, 3] / (rays @ T[2, :3])  # of the plane z = 0 of the object
