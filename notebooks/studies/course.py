@@ -109,7 +109,7 @@ LESSONS = (
     Lesson(
         "11_label_your_own",
         "Label your own",
-        "nowhere: what follows from it",
+        'section "3D Reconstruction", and what follows from it',
         "from a video and a click to a textured model and a labelled dataset, and how to tell that a label is good",
     ),
 )

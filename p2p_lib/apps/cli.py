@@ -324,7 +324,7 @@ def _refine(a: argparse.Namespace) -> None:
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
     arg("--frame", choices=("object", "model"), help="the tracker's (bop without truth needs it) or the model's"),
     arg("--min-confidence", type=float, metavar="C", help="leave less confident poses out (default 0, of labels 0.5)"),
-    arg("--faces", type=int, default=20_000, metavar="N", help="of a textured model, at most (default 20000)"),
+    arg("--faces", type=int, default=5000, metavar="N", help="of a textured model, at most (default 5000)"),
     _QUIET,
 )
 def _export(a: argparse.Namespace) -> None:

@@ -16,7 +16,7 @@ def write_product(
     format: str,
     out: str | Path,
     min_confidence: float | None = None,
-    faces: int = 20_000,
+    faces: int = 5000,
     progress: bool = False,
 ) -> str:
     """Write the run in a folder in one of :data:`~p2p_lib.offline.PRODUCTS` into a new one; what it holds, in words.
