@@ -33,11 +33,7 @@ _SEEN_THROUGH_M, _SEEN_THROUGH_VIEWS = 0.012, 2
 #: Faces of a collision mesh, at most.
 _HULL_FACES = 256
 #: The edge of a texture, px, and the room around its charts.
-TEXTURE_PX, _GUTTER_PX = 1024, 4
-#: The stretch that the atlas may have (Open3D's default: more charts, less stretch below).
-_STRETCH = 0.17
-#: So many faces are laid out at once: the time grows with their square.
-_FACES_AT_ONCE = 4000
+TEXTURE_PX, _GUTTER_PX = 2048, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,8 +243,8 @@ def with_texture(shape: Shape, views: list[texture.View], camera: Any, size: int
     mesh = open3d.t.geometry.TriangleMesh(
         open3d.core.Tensor(shape.vertices.astype(np.float32)), open3d.core.Tensor(shape.faces.astype(np.int64))
     )
-    parts = 1 + len(shape.faces) // _FACES_AT_ONCE
-    mesh.compute_uvatlas(size, _GUTTER_PX, _STRETCH, parallel_partitions=parts, nthreads=1)
+    uv = atlas(len(shape.faces), size)
+    mesh.triangle.texture_uvs = open3d.core.Tensor(uv.astype(np.float32))
     normals = np.array(shape.mesh.vertex_normals)
     mesh.vertex.normals = open3d.core.Tensor(normals.astype(np.float32))
     mesh.vertex.own = open3d.core.Tensor(shape.colours.astype(np.float32))
@@ -262,8 +258,21 @@ def with_texture(shape: Shape, views: list[texture.View], camera: Any, size: int
     even = texture.evened(views, camera, point[at][few].astype(float), unit[few])
     image = np.zeros((size, size, 3), np.uint8)
     image[at] = texture.baked(even, camera, point[at].astype(float), unit, own[at])
-    uv = mesh.triangle.texture_uvs.numpy().astype(float)
     return Textured(shape, uv, spread(image, at))
+
+
+def atlas(faces: int, size: int) -> np.ndarray:
+    """(F, 3, 2) places of faces in a texture: each its own triangle, two in a square.
+
+    Open3D's atlas (UVAtlas) has larger charts; on reconstructed surfaces it takes minutes, and some end the process.
+    """
+    squares = int(np.ceil(np.sqrt(np.ceil(faces / 2))))
+    low, high = _GUTTER_PX * squares / size, 1 - 2.5 * _GUTTER_PX * squares / size
+    half = np.array([[low, low], [high, low], [low, high]])
+    k = np.arange(faces)
+    inside = np.where((k % 2 == 0)[:, None, None], half, 1 - half)
+    corner = np.stack([k // 2 % squares, k // 2 // squares], 1)
+    return (corner[:, None] + inside) / squares
 
 
 def spread(image: np.ndarray, at: np.ndarray) -> np.ndarray:
