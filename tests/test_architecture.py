@@ -22,6 +22,7 @@ LAYERS = [
     {"synthetic"},
     {"trackers", "detectors", "segmenters"},
     {"evaluation"},
+    {"offline"},
     {"run"},
     {"benchmark"},
     {"figures"},

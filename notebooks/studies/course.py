@@ -106,6 +106,12 @@ LESSONS = (
         'figure "Overview of the framework", from the clicks to the mesh',
         "from a folder of your own to poses and a mesh: what to provide, what goes wrong, how to tell that it works",
     ),
+    Lesson(
+        "11_label_your_own",
+        "Label your own",
+        'section "3D Reconstruction", and what follows from it',
+        "from a video and a click to a textured model and a labelled dataset, and how to tell that a label is good",
+    ),
 )
 
 

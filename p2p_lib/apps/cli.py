@@ -18,13 +18,17 @@ from typing import Any
 from p2p_lib.apps.command_line import arg, command, main, open_page, run_options, warn
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.options import RunOptions, lengths_m, names, pairs
+from p2p_lib.offline import PRODUCTS
 
 #: Options that choose the method and its parameters.
 METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "detector")
 _SEQUENCE = arg("sequence", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA")
 _RUN = arg("run", type=Path, metavar="DIR", help="folder written by p2p run")
 _DATASET = arg("dataset", metavar="NAME")
-_FILES = "bop: p2p_SEQ-test.csv; tum: OBJECT.txt; poses: annotated_poses/OBJECT/FRAME.txt, 4x4 (all in DIR)"
+_FILES = (
+    "poses as bop: p2p_SEQ-test.csv; tum: OBJECT.txt; poses: annotated_poses/OBJECT/FRAME.txt, 4x4 (all in DIR);"
+    " bop-dataset: labelled images, masks and models; foundationpose: images, first mask, mesh; model: textured meshes"
+)
 _POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
 _JSON = arg("--json", action="store_true", help="JSON instead of a table")
 _QUIET = arg("--quiet", action="store_true", help="no progress bar")
@@ -40,7 +44,15 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
 @command(
     "run",
     "track the objects of a sequence and write poses, timings, scores",
-    _SEQUENCE,
+    arg("sequence", nargs="?", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA"),
+    arg(
+        "--batch",
+        type=Path,
+        metavar="FOLDER",
+        help="instead of SEQ: every recording in it, each into DIR/NAME; resumes",
+    ),
+    arg("--jobs", type=int, metavar="N", help="recordings of --batch at a time (default: one a core)"),
+    arg("--scheduler", metavar="tcp://HOST:PORT", help="for --batch: a Dask cluster that sees DIR"),
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
     _FORCE,
     arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
@@ -51,6 +63,15 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
 def _run(a: argparse.Namespace) -> int:
     from p2p_lib.run import run
 
+    if (a.sequence is None) == (a.batch is None):
+        a.parser.error("needs either SEQ or --batch FOLDER")
+    if a.batch is not None:
+        from p2p_lib.benchmark.batch import TABLE, run_batch
+        from p2p_lib.core.tables import as_text
+
+        table = run_batch(a.batch, a.out, RunOptions.of_arguments(a), a.jobs, a.scheduler, not a.quiet)
+        print(f"{as_text(table)}\nResults in {a.out}, the table in {a.out / TABLE}")
+        return 0 if table["object"].notna().any() else P2PError.exit_code
     film = _film_wanted(a.overlay)
     options = replace(RunOptions.of_arguments(a), save_masks=a.save_masks or film is not None)
     how = {"if_exists": a.if_exists or "refuse", "progress": not a.quiet, "say": warn}
@@ -294,22 +315,42 @@ def _figures(a: argparse.Namespace) -> None:
         print(saved.path)
 
 
+@command(
+    "refine",
+    "go over a finished run with the whole video; its better poses and surfaces go to DIR/offline",
+    _RUN,
+    _QUIET,
+)
+def _refine(a: argparse.Namespace) -> None:
+    from p2p_lib.offline.refine import FOLDER, refine_run
+
+    print("\n".join(refine_run(a.run, not a.quiet)))
+    print(f"Results in {a.run / FOLDER}. Next: p2p eval {a.run / FOLDER}")
+
+
 # --- looking and handing on ----------------------------------------------------------------------
 
 
 @command(
     "export",
-    "write a run's poses as BOP, TUM or a dataset keeps them",
+    "write a run's poses as BOP, TUM or a dataset keeps them, a labelled dataset, or textured models",
     _RUN,
-    arg("--format", required=True, choices=("bop", "tum", "poses"), help=_FILES),
+    arg("--format", required=True, choices=("bop", "tum", "poses", *PRODUCTS), help=_FILES),
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
     arg("--frame", choices=("object", "model"), help="the tracker's (bop without truth needs it) or the model's"),
-    arg("--min-confidence", type=float, default=0.0, metavar="C", help="leave less confident poses out (default 0)"),
+    arg("--min-confidence", type=float, metavar="C", help="leave less confident poses out (default 0, of labels 0.5)"),
+    arg("--faces", type=int, default=5000, metavar="N", help="of a textured model, at most (default 5000)"),
+    _QUIET,
 )
 def _export(a: argparse.Namespace) -> None:
+    if a.format in PRODUCTS:
+        from p2p_lib.offline.products import write_product
+
+        print(write_product(a.run, a.format, a.out, a.min_confidence, a.faces, not a.quiet))
+        return
     from p2p_lib.run import export_run
 
-    written = export_run(a.run, a.format, a.out, a.frame, a.min_confidence)
+    written = export_run(a.run, a.format, a.out, a.frame, a.min_confidence or 0.0)
     files = (f"{path}/*.txt ({len(list(path.iterdir()))})" if path.is_dir() else str(path) for path in written)
     print(f"Written: {', '.join(files)}")
 

@@ -10,13 +10,14 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing.connection import wait
 from multiprocessing.context import BaseContext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,16 +95,20 @@ def _tracks(job: Job) -> Outcome:
     return Outcome(key=job.key, status="done", ran=ran, tracks=scores, times=times)
 
 
-def execute(jobs: Sequence[Job], out: Path, at_a_time: int, scheduler: str | None) -> Iterator[tuple[Job, Outcome]]:
-    """The outcomes of jobs as they come; closing it ends what is still running.
+def execute(
+    jobs: Sequence[Any], out: Path, at_a_time: int, scheduler: str | None, work: Callable[..., Outcome] = perform
+) -> Iterator[tuple[Any, Outcome]]:
+    """The outcomes of jobs as they come, of each what ``work`` makes of it; closing it ends what is still running.
 
     scheduler  address of a Dask scheduler, whose workers see ``out`` under the same path; None: this machine. By
                ``tcp`` whoever reaches its port or a worker's runs what he likes there: a private network, or ``tls``
     """
-    return _on_this_machine(jobs, out, at_a_time) if scheduler is None else _on_cluster(jobs, out, scheduler)
+    if scheduler is None:
+        return _on_this_machine(jobs, out, at_a_time, work)
+    return _on_cluster(jobs, out, scheduler, work)
 
 
-def _on_this_machine(jobs: Iterable[Job], out: Path, at_a_time: int) -> Iterator[tuple[Job, Outcome]]:
+def _on_this_machine(jobs: Iterable[Any], out: Path, at_a_time: int, work: Callable[..., Outcome]):
     """A process for each run, so many at a time. One that dies, of a lack of memory say, takes no other with it."""
     for library in ("OMP", "OPENBLAS", "MKL"):  # runs share the cores: more threads would wait for each other
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
@@ -115,7 +120,7 @@ def _on_this_machine(jobs: Iterable[Job], out: Path, at_a_time: int) -> Iterator
     not_ours = set(multiprocessing.active_children())
     pool = ThreadPoolExecutor(at_a_time)
     try:
-        waiting = {pool.submit(_in_a_process, context, job, out): job for job in jobs}
+        waiting = {pool.submit(_in_a_process, context, job, out, work): job for job in jobs}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
     finally:
@@ -125,10 +130,10 @@ def _on_this_machine(jobs: Iterable[Job], out: Path, at_a_time: int) -> Iterator
         pool.shutdown(wait=True)
 
 
-def _in_a_process(context: BaseContext, job: Job, out: Path) -> Outcome:
+def _in_a_process(context: BaseContext, job: Any, out: Path, work: Callable[..., Outcome]) -> Outcome:
     try:
         with ProcessPoolExecutor(1, context, _end_with_parent) as process:
-            return process.submit(perform, job, out, library_version()).result()
+            return process.submit(work, job, out, library_version()).result()
     except BrokenProcessPool:
         return Outcome(key=job.key, status="failed", reason="its process was ended from outside: out of memory?")
 
@@ -140,7 +145,7 @@ def _end_with_parent() -> None:
     threading.Thread(target=lambda: wait([gone]) and os._exit(1), daemon=True).start()
 
 
-def _on_cluster(jobs: Sequence[Job], out: Path, scheduler: str) -> Iterator[tuple[Job, Outcome]]:
+def _on_cluster(jobs: Sequence[Any], out: Path, scheduler: str, work: Callable[..., Outcome]):
     """Dask distributes the runs; a worker that dies fails its run alone."""
     distributed = packages.load("distributed", "--scheduler", "distributed")
     try:
@@ -149,7 +154,7 @@ def _on_cluster(jobs: Sequence[Job], out: Path, scheduler: str) -> Iterator[tupl
         got = f"{scheduler} ({type(error).__name__})"
         raise BadInput("scheduler", got, "a Dask scheduler that answers", "Start one with: dask scheduler") from None
     with client:
-        futures = [client.submit(perform, job, out, library_version(), pure=False) for job in jobs]
+        futures = [client.submit(work, job, out, library_version(), pure=False) for job in jobs]
         by_key = {future.key: job for future, job in zip(futures, jobs, strict=True)}
         for future in distributed.as_completed(futures):
             job, error = by_key[future.key], future.exception()

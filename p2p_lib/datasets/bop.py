@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -135,8 +135,30 @@ def _model_places(folder: Path, obj: str) -> tuple[Path, ...]:
     return (folder / "models" / obj, *(root / models / f"{kind}.ply" for models in ("models_eval", "models")))
 
 
-def write_scene(folder: str | Path, sequence: Sequence) -> dict[str, int]:
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """An object in an image, whether something hides it or not, as BOP counts it.
+
+    mask (H, W) bool; px its pixels and box its x, y, width, height, both with what lies beyond the image's borders;
+    valid_px  pixels of it at which depth was measured
+    """
+
+    mask: np.ndarray
+    px: int
+    box: tuple[int, int, int, int]
+    valid_px: int
+
+
+def write_scene(
+    folder: str | Path,
+    sequence: Sequence,
+    frames: Iterable[int] | None = None,
+    outlines: Callable[[int], Mapping[str, Outline]] | None = None,
+) -> dict[str, int]:
     """Write a sequence as the BOP scene ``folder``, which is ``<dataset>/<split>/<scene>``; depth in millimetres.
+
+    frames    those to write, by default all; outlines tells of a frame the objects as if nothing hid them, for
+              ``mask/`` and their visible shares
 
     An object is listed in the images in which it has truth. Returns the objects' numbers: 1, 2, ... in their order.
     """
@@ -145,8 +167,9 @@ def write_scene(folder: str | Path, sequence: Sequence) -> dict[str, int]:
     camera = {"cam_K": sequence.camera.K.ravel().tolist(), "depth_scale": 1.0}
     scenes: dict[str, dict[int, object]] = {"scene_camera": {}, "scene_gt": {}, "scene_gt_info": {}}
     (folder / "mask_visib").mkdir(parents=True, exist_ok=True)
-    for i in range(len(sequence)):
+    for i in range(len(sequence)) if frames is None else frames:
         frame, masks = sequence.frame(i), sequence.masks(i) or {}
+        whole = outlines(i) if outlines else {}
         depth_mm = np.rint(frame.depth_m.astype(float) * 1000)
         if depth_mm.max(initial=0) > 65535:
             raise BadInput(f"frame {i} depth", f"{frame.depth_m.max():.2f} m", "at most 65.53 m")
@@ -157,22 +180,28 @@ def write_scene(folder: str | Path, sequence: Sequence) -> dict[str, int]:
         visible = [masks.get(name, np.zeros(frame.shape, bool)) for name in truth]
         for index, mask in enumerate(visible):
             images.save_png(folder / "mask_visib" / f"{i:06d}_{index:06d}.png", mask)
+        for index, outline in enumerate(whole[name] for name in truth if name in whole):
+            images.save_png(folder / "mask" / f"{i:06d}_{index:06d}.png", outline.mask)
         scenes["scene_camera"][i] = camera
         scenes["scene_gt"][i] = [
             {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (T[:3, 3] / MM).tolist(), "obj_id": obj_ids[name]}
             for name, T in truth.items()
         ]
-        scenes["scene_gt_info"][i] = [_visibility(mask) for mask in visible]
+        scenes["scene_gt_info"][i] = [_visibility(mask, whole.get(name)) for name, mask in zip(truth, visible)]
     for name, scene in scenes.items():
         rows = ",\n".join(f'  "{i}": {json.dumps(entry)}' for i, entry in scene.items())
         (folder / f"{name}.json").write_text("{\n" + rows + "\n}\n")
     return obj_ids
 
 
-def _visibility(mask: np.ndarray) -> dict[str, object]:
+def _visibility(mask: np.ndarray, whole: Outline | None) -> dict[str, object]:
     """Visible pixels, and x, y, width, height around them: -1 where there are none, as BOP writes it."""
     box = cv2.boundingRect(mask.astype(np.uint8)) if mask.any() else [-1] * 4
-    return {"bbox_visib": box, "px_count_visib": int(mask.sum())}
+    visible: dict[str, object] = {"bbox_visib": box, "px_count_visib": int(mask.sum())}
+    if whole is None:
+        return visible
+    counts = {"px_count_all": whole.px, "px_count_valid": whole.valid_px, "visib_fract": mask.sum() / max(whole.px, 1)}
+    return {"bbox_obj": whole.box} | visible | counts
 
 
 def write_models(folder: str | Path, models: Mapping[int, str | Path]) -> None:

@@ -200,7 +200,8 @@ class Run:
 
     def masks(self, sequence: Sequence, frame: int) -> dict[str, np.ndarray]:
         """Object to (H, W) bool at a frame of the sequence: the masks that were kept, else those of its that served."""
-        kept = {name: self.path / "masks" / name / f"{frame:06d}.png" for name in self.objects}
+        where = self.path / self.info.get("masks_in", "") / "masks"
+        kept = {name: where / name / f"{frame:06d}.png" for name in self.objects}
         if any(path.is_file() for path in kept.values()):
             shape = sequence.camera.height, sequence.camera.width
             return {name: read_labels(path, shape) > 0 for name, path in kept.items() if path.is_file()}

@@ -37,5 +37,5 @@ def test_every_stage_belongs_to_one_notebook():
 
 
 def test_a_notebook_that_is_not_there_is_refused():
-    with pytest.raises(BadInput, match="notebook: got '11', expected one of 00, 01"):
-        lesson("11")
+    with pytest.raises(BadInput, match="notebook: got '12', expected one of 00, 01"):
+        lesson("12")

@@ -1,0 +1,9 @@
+"""What is made of a finished run, ours: poses that know the whole video, labelled datasets, models to take away.
+
+``finished.py`` opens a run with its images, masks and surfaces, and says which poses are trusted; look there first.
+``adjustment.py`` and ``refine.py`` are ``p2p refine``; ``dataset.py``, ``model.py`` and ``texture.py`` are
+``p2p export``.
+"""
+
+#: What ``p2p export`` makes of a run besides files of poses.
+PRODUCTS = ("bop-dataset", "foundationpose", "model")

@@ -1,0 +1,141 @@
+"""Poses and points that agree best with what a whole video shows: a bundle adjustment of points measured in 3D.
+
+Minimises, over poses T_k in SE(3) and points p_j of the object, ``sum rho(e^T W e)`` with ``e = T_k p_j - z_kj``: z is
+where point j was measured in the camera of frame k, W the information of that measurement, which knows pixels better
+than depth. Gauss-Newton with the points eliminated (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000); rho
+is Geman and McClure's, so that a track that slid away counts for nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from p2p_lib.core import se3
+
+#: Residuals count a quarter at so many standard deviations; at first at as many times more, less by this each step.
+_HALF, _WIDE, _NARROWER = 3.0, 8.0, 0.6
+#: A smaller mean step, in metres and radians, ends the iterations.
+_TOLERANCE = 2e-6
+#: Three standard deviations of a point each way, and the median of chi squared with three degrees of freedom.
+_CHI2_MEDIAN_3 = 2.366
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """M sightings: of which pose (M,) and which point (M,), p_cam (M, 3), and the information (M, 3, 3) of each."""
+
+    pose: np.ndarray
+    point: np.ndarray
+    p_cam: np.ndarray
+    information: np.ndarray
+
+    def select(self, rows: np.ndarray) -> Sightings:
+        """Those at these rows or under this mask."""
+        return Sightings(self.pose[rows], self.point[rows], self.p_cam[rows], self.information[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """The best poses T (K, 4, 4) and points (N, 3), the poses' covariance (K, 6, 6), and each sighting's weight (M,).
+
+    covariance is of the right tangent of each pose, where the object frame is that of all poses together.
+    """
+
+    T_cam_obj: np.ndarray
+    p_obj: np.ndarray
+    covariance: np.ndarray
+    weight: np.ndarray
+
+
+def information(p_cam: np.ndarray, lateral_m: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+    """(M, 3, 3) of points (M, 3) known to these standard deviations (M,) across their ray and along it."""
+    ray = p_cam / np.linalg.norm(p_cam, axis=1, keepdims=True)
+    along = ray[:, :, None] * ray[:, None]
+    return (np.eye(3) - along) / lateral_m[:, None, None] ** 2 + along / depth_m[:, None, None] ** 2
+
+
+def placed(T_cam_obj: np.ndarray, seen: Sightings, count: int) -> np.ndarray:
+    """(count, 3) points where the poses have them, the median of each one's sightings; NaN where there are none."""
+    p_obj = se3.transform(se3.inverse(T_cam_obj[seen.pose]), seen.p_cam[:, None])[:, 0]
+    order = np.argsort(seen.point, kind="stable")
+    starts = np.searchsorted(seen.point[order], np.arange(count + 1))
+    points = np.full((count, 3), np.nan)
+    for j in np.flatnonzero(np.diff(starts)):  # over points of an object, not over sightings
+        points[j] = np.median(p_obj[order[starts[j] : starts[j + 1]]], axis=0)
+    return points
+
+
+def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings, iterations: int = 15) -> Adjusted:
+    """Poses (K, 4, 4) and points (N, 3) from these; every pose and point has a sighting at least."""
+    T, p = np.array(T_cam_obj, float), np.array(p_obj, float)
+    K, N = len(T), len(p)
+    same = np.tile(np.eye(6), (K, 1)) / np.sqrt(K)  # all poses by one change of the object frame: nothing tells
+    for step_number in range(iterations):
+        V, e, A, weight = _linear(T, p, seen, max(_WIDE * _NARROWER**step_number, 1.0))
+        AV = np.einsum("mia,mij->maj", A, V)
+        g = np.einsum("mij,mj->mi", V, e)
+        H = _summed(seen.pose, AV @ A, K)
+        b = _summed(seen.pose, np.einsum("mia,mi->ma", A, g), K)
+        C = _summed(seen.point, V, N) + 1e-3 * np.eye(3)
+        c = _summed(seen.point, g, N)
+        E = np.zeros((K, 6, N, 3))
+        np.add.at(E, (seen.pose, slice(None), seen.point), AV)
+        E = E.reshape(6 * K, 3 * N)
+        C_inverse = np.linalg.inv(C)
+        F = np.einsum("anj,njk->ank", E.reshape(6 * K, N, 3), C_inverse).reshape(6 * K, 3 * N)
+        S = -F @ E.T
+        for k in range(K):  # the blocks on the diagonal
+            S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += H[k]
+        S += np.trace(S) / len(S) * same @ same.T
+        S[np.diag_indices_from(S)] *= 1 + 1e-6
+        step = -np.linalg.solve(S, b.ravel() - F @ c.ravel())
+        shift = -np.einsum("njk,nk->nj", C_inverse, c + (E.T @ step).reshape(N, 3))
+        T = T @ se3.exp(np.clip(step.reshape(K, 6), -0.1, 0.1))
+        p = p + shift
+        if step_number > 6 and np.abs(step).mean() < _TOLERANCE:
+            break
+    covariance = np.linalg.inv(S)
+    blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(K)])
+    return Adjusted(se3.orthonormalised(T), p, blocks * _spread(T, p, seen), weight)
+
+
+def locate(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings, iterations: int = 15) -> Adjusted:
+    """Each pose (K, 4, 4) by itself on points (N, 3) that stay; a pose with few sightings hardly moves."""
+    T, K = np.array(T_cam_obj, float), len(T_cam_obj)
+    weak = np.diag(np.repeat([0.5, 0.1], 3) ** -2.0)
+    for step_number in range(iterations):
+        V, e, A, weight = _linear(T, p_obj, seen, max(_WIDE * _NARROWER ** (2 * step_number), 1.0))
+        H = _summed(seen.pose, np.einsum("mia,mij,mjb->mab", A, V, A), K) + weak
+        b = _summed(seen.pose, np.einsum("mia,mij,mj->ma", A, V, e), K)
+        step = -np.linalg.solve(H, b[..., None])[..., 0]
+        T = T @ se3.exp(np.clip(step, -0.1, 0.1))
+        if step_number > 4 and np.abs(step).mean() < _TOLERANCE:
+            break
+    return Adjusted(se3.orthonormalised(T), p_obj, np.linalg.inv(H) * _spread(T, p_obj, seen), weight)
+
+
+def _linear(T: np.ndarray, p: np.ndarray, seen: Sightings, wide: float = 1.0):
+    """In the object's axes: weighted information (M, 3, 3), residual (M, 3), its derivative (M, 3, 6), weight (M,)."""
+    R, points = T[seen.pose, :3, :3], p[seen.point]
+    e = points - np.einsum("mji,mj->mi", R, seen.p_cam - T[seen.pose, :3, 3])
+    V = np.einsum("mji,mjk,mkl->mil", R, seen.information, R)
+    squared = np.einsum("mi,mij,mj->m", e, V, e)
+    weight = 1 / (1 + squared / (wide * _HALF) ** 2) ** 2
+    A = np.concatenate([-se3.hat(points), np.broadcast_to(np.eye(3), (len(e), 3, 3))], axis=2)
+    return weight[:, None, None] * V, e, A, weight
+
+
+def _summed(row: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Sums of values (M, ...) by row (M,), (count, ...)."""
+    total = np.zeros((count, *values.shape[1:]))
+    np.add.at(total, row, values)
+    return total
+
+
+def _spread(T: np.ndarray, p: np.ndarray, seen: Sightings) -> float:
+    """By how much the squared residuals are larger than their information says, at least 1."""
+    V, e, _, weight = _linear(T, p, seen)
+    squared = np.einsum("mi,mij,mj->m", e, V / weight[:, None, None], e)
+    return max(float(np.median(squared)) / _CHI2_MEDIAN_3, 1.0) if len(squared) else 1.0

@@ -1,0 +1,204 @@
+"""A run as a dataset for others: a BOP scene with labels (``bop-dataset``), and the folders of FoundationPose.
+
+Labels are the run's trusted poses of the run's own surfaces. As in the BOP toolkit a surface is visible where nothing
+that was measured lies more than 15 mm before it; where nothing was measured it counts as visible.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import replace_text
+from p2p_lib.core.mesh import save
+from p2p_lib.core.progress import progress_bar
+from p2p_lib.core.types import DOUBTED, Frame
+from p2p_lib.datasets import images
+from p2p_lib.datasets.bop import Outline, write_models, write_scene
+from p2p_lib.datasets.sequence import ObjectTruth
+from p2p_lib.offline.finished import RULE, Finished, Renderer, Silhouette, new_folder
+
+#: What is measured no more than this before a surface does not hide it (the BOP toolkit's).
+VISIBLE_M = 0.015
+#: What ``labels.csv`` says of each label, from which one tells whether it is good.
+COLUMNS = ("image", "object", "obj_id", "confidence", "visib_fract", "mask_iou", "depth_off_mm")
+SCENE = "train/000001"
+
+
+def visible(silhouette: Silhouette, depth_m: np.ndarray) -> np.ndarray:
+    """(H, W) bool: the pixels of an image in which a surface shows, by the depth (H, W) measured."""
+    mask = np.zeros(depth_m.shape, bool)
+    image, own = silhouette.inside(depth_m)
+    measured = depth_m[image]
+    mask[image] = silhouette.hit[own] & ((measured == 0) | (silhouette.depth_m[own] - measured <= VISIBLE_M))
+    return mask
+
+
+def outline(silhouette: Silhouette, depth_m: np.ndarray) -> Outline:
+    """A surface in an image as if nothing hid it."""
+    mask = np.zeros(depth_m.shape, bool)
+    image, own = silhouette.inside(depth_m)
+    mask[image] = silhouette.hit[own]
+    x, y, w, h = cv2.boundingRect(silhouette.hit.astype(np.uint8))
+    box = silhouette.corner[0] + x, silhouette.corner[1] + y, w, h
+    return Outline(mask, int(silhouette.hit.sum()), box, int(np.count_nonzero(mask & (depth_m > 0))))
+
+
+def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, mask: np.ndarray | None):
+    """How well a label fits: IoU of what shows with the mask, and how far nine of ten depths are off at most, mm."""
+    iou = np.nan if mask is None else np.count_nonzero(shown & mask) / max(np.count_nonzero(shown | mask), 1)
+    image, own = silhouette.inside(depth_m)
+    both = shown[image] & (depth_m[image] > 0)
+    off_m = np.abs(silhouette.depth_m[own] - depth_m[image])[both]
+    return float(iou), float(1000 * np.quantile(off_m, 0.9)) if len(off_m) else np.nan
+
+
+@dataclass(eq=False)
+class _Labels:
+    """The run as a sequence whose truth are its trusted poses; says of each label how well it fits."""
+
+    made: Finished
+    min_confidence: float
+    rows: list[tuple] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.objects, self.camera = self.made.tracked, self.made.sequence.camera
+        surfaces = {name: self.made.surface(name) for name in self.objects}
+        self._render = {name: Renderer(mesh.vertices, mesh.faces, self.camera) for name, mesh in surfaces.items()}
+        self._seen: tuple[int, Frame, dict[str, Silhouette]] | None = None
+
+    camera: Camera = field(init=False)
+    objects: tuple[str, ...] = field(init=False)
+
+    @cached_property
+    def truth(self) -> dict[str, ObjectTruth]:
+        """Poses that are trusted."""
+        told = {}
+        for name, trusted in self.made.trusted(self.min_confidence).items():
+            poses, obj = np.full((len(self.made.sequence), 4, 4), np.nan), self.made.run.objects[name]
+            poses[obj.frame_index[trusted]] = obj.T_cam_obj[trusted]
+            told[name] = ObjectTruth(poses, np.isfinite(poses).all((1, 2)))
+        return told
+
+    @property
+    def frames(self) -> np.ndarray:
+        """Those with a label."""
+        return np.flatnonzero(np.logical_or.reduce([of.labelled for of in self.truth.values()]))
+
+    def __len__(self) -> int:
+        return len(self.made.sequence)
+
+    def frame(self, i: int) -> Frame:
+        """The image, with everything rendered into it."""
+        if self._seen is None or self._seen[0] != i:
+            poses = {name: of.T_cam_model[i] for name, of in self.truth.items() if of.labelled[i]}
+            frame = self.made.sequence.frame(i)
+            self._seen = i, frame, {name: self._render[name](T) for name, T in poses.items()}
+        return self._seen[1]
+
+    def masks(self, i: int) -> dict[str, np.ndarray]:
+        """What shows of each object."""
+        frame = self.frame(i)
+        return {name: visible(silhouette, frame.depth_m) for name, silhouette in self._seen[2].items()}
+
+    def outlines(self, i: int) -> dict[str, Outline]:
+        """The objects as if nothing hid them; notes how well the labels fit."""
+        frame, shown, given = self.frame(i), self.masks(i), self.made.masks(i)
+        whole = {name: outline(silhouette, frame.depth_m) for name, silhouette in self._seen[2].items()}
+        for name, silhouette in self._seen[2].items():
+            fits = agreement(silhouette, shown[name], frame.depth_m, given.get(name))
+            obj = self.made.run.objects[name]
+            sure = obj.confidence[np.searchsorted(obj.frame_index, i)]
+            share = np.count_nonzero(shown[name]) / max(whole[name].px, 1)
+            self.rows.append((i, name, self.objects.index(name) + 1, sure, share, *fits))
+        return whole
+
+
+def write_bop(folder: str | Path, out: str | Path, min_confidence: float = DOUBTED, progress: bool = False) -> str:
+    """Write the run in ``folder`` as the BOP dataset ``out`` (see the module); what it holds, in words.
+
+    Its scene is ``train/000001``, its images keep the run's frame numbers, its models are the run's surfaces.
+    ``labels.csv`` says of each label how well it fits, ``labels.json`` by what rule frames were left out and which
+    number is which object. Raises :class:`BadInput` where no frame has a label.
+    """
+    labels = _Labels(made := Finished.of(folder), min_confidence)
+    if not len(labels.frames):
+        fix = "Lower --min-confidence, or look at what was wrong: p2p eval RUN."
+        raise BadInput(str(folder), "no frame to label", RULE.format(min_confidence), fix)
+    with new_folder(out) as there:
+        with progress_bar("dataset", shown=progress, iterable=labels.frames.tolist()) as kept:
+            obj_ids = write_scene(there / SCENE, labels, kept, labels.outlines)  # type: ignore[arg-type]
+        write_models(there / "models", {obj_ids[n]: made.run.path / "meshes" / f"{n}.ply" for n in labels.objects})
+        camera = labels.camera
+        told = {key: getattr(camera, key) for key in ("cx", "cy", "fx", "fy", "width", "height")}
+        replace_text(there / "camera.json", json.dumps(told | {"depth_scale": 1.0}, indent=1) + "\n")
+        replace_text(there / "labels.csv", _csv(labels.rows))
+        about = _about(made, min_confidence) | {"objects": obj_ids}
+        about |= {"frames": len(made.frames), "labelled": len(labels.frames)}
+        replace_text(there / "labels.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+    return f"{len(labels.rows)} labels in {len(labels.frames)} of {len(made.frames)} images"
+
+
+def _about(made: Finished, min_confidence: float) -> dict[str, object]:
+    keys = ("sequence", "tracker", "preset", "seed", "commit", "offline")
+    of_run = {key: made.run.info[key] for key in keys if made.run.info.get(key) is not None}
+    return {
+        "rule": RULE.format(min_confidence),
+        "min_confidence": min_confidence,
+        "visible_m": VISIBLE_M,
+        "run": of_run,
+    }
+
+
+def _csv(rows: list[tuple]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows((*row[:3], *(f"{x:.4f}" for x in row[3:])) for row in rows)
+    return text.getvalue()
+
+
+def write_foundationpose(
+    folder: str | Path, out: str | Path, min_confidence: float = DOUBTED, meshes: Mapping[str, Path] | None = None
+) -> str:
+    """Write a folder for each object as FoundationPose's demo reads it; what was written, in words.
+
+    ``rgb/`` and ``depth/`` (millimetres) from its first trusted frame on, ``masks/`` of that frame, ``cam_K.txt`` and
+    ``mesh/``: the files of ``meshes`` (object to a folder of them), else its surface with colours as PLY.
+    """
+    made, told = Finished.of(folder), []
+    trusted = made.trusted(min_confidence)
+    seen = {name: made.frames[of] for name, of in trusted.items() if of.any()}
+    first = {
+        n: next((int(i) for i in at if made.masks(int(i)).get(n, np.zeros(1)).any()), None) for n, at in seen.items()
+    }
+    if not (first := {name: i for name, i in first.items() if i is not None}):
+        raise BadInput(str(folder), "no trusted frame with a mask", "one of an object", "Run it with --save-masks.")
+    with new_folder(out) as there:
+        for name, start in first.items():
+            at, numbers = there / name, [int(i) for i in made.frames if i >= start]
+            for i in numbers:
+                frame = made.sequence.frame(i)
+                images.save_png(at / "rgb" / f"{i:06d}.png", frame.rgb)
+                depth_mm = np.clip(np.rint(frame.depth_m.astype(float) * 1000), 0, 65535).astype(np.uint16)
+                images.save_png(at / "depth" / f"{i:06d}.png", depth_mm)
+            images.save_png(at / "masks" / f"{start:06d}.png", made.masks(start)[name])
+            np.savetxt(at / "cam_K.txt", made.sequence.camera.K, fmt="%.9g")
+            if meshes and name in meshes:
+                (at / "mesh").mkdir()
+                for file in sorted(meshes[name].iterdir()):
+                    (at / "mesh" / file.name).write_bytes(file.read_bytes())
+            else:
+                save(made.surface(name), at / "mesh" / f"{name}.ply")
+            told.append(f"{name}: {len(numbers)} images from frame {start} on")
+    return "; ".join(told)

@@ -1,0 +1,176 @@
+"""A finished run with all that it can be used for: its images, masks and surfaces, and which poses are trusted."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.raycasting import cast, ray_scene
+from p2p_lib.core.types import DOUBTED
+from p2p_lib.datasets.mask_log import CELL_PX, load_masks
+from p2p_lib.datasets.models import read_mesh
+from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.datasets.sequence import Sequence, reopen
+
+#: The one rule of what is labelled; ``{0}`` is the least confidence.
+RULE = (
+    "An image is labelled where every object of the run either has a pose of confidence above {0:g} or is not seen:"
+    " no pixel of it in the masks that the run used."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """A run with its sequence; raises :class:`MissingData` and :class:`BadInput` where something of it is gone.
+
+    run       as :func:`~p2p_lib.datasets.runs.load_run` reads it: poses of one map an object
+    sequence  on which it was made
+    """
+
+    run: Run
+    sequence: Sequence
+
+    @classmethod
+    def of(cls, folder: str | Path) -> Finished:
+        """The run in a folder; it has poses, and all its images are still there."""
+        run = load_run(folder)
+        if not any(obj.has_pose.any() for obj in run.objects.values()):
+            fix = "p2p check says what may be wrong with its data."
+            raise BadInput(str(folder), "a run without a single pose", "poses of an object at least", fix)
+        sequence = reopen(run.info)
+        if (last := max(int(obj.frame_index[-1]) for obj in run.objects.values())) >= len(sequence):
+            got = f"{len(sequence)} images, and poses up to frame {last}"
+            raise BadInput(sequence.name, got, "the images that the run was made on", "Have some been taken away?")
+        return cls(run, sequence)
+
+    @property
+    def tracked(self) -> tuple[str, ...]:
+        """The objects that have a pose in some frame."""
+        return tuple(name for name, obj in self.run.objects.items() if obj.has_pose.any())
+
+    @property
+    def frames(self) -> np.ndarray:
+        """(n,) frame numbers of the sequence that the run is over."""
+        return next(iter(self.run.objects.values())).frame_index
+
+    @cached_property
+    def _coarse(self) -> Mapping[str, Any]:
+        return load_masks(self.run.path / self.run.info.get("masks_in", ""))
+
+    @cached_property
+    def exact_masks(self) -> bool:
+        """Whether the masks that served are there pixel by pixel (``--save-masks``, or the dataset's own)."""
+        return bool(self.run.masks(self.sequence, int(self.frames[0])))
+
+    def masks(self, frame: int) -> dict[str, np.ndarray]:
+        """Object to (H, W) bool that served at a frame; coarse ones, every fourth pixel, where no others were kept."""
+        if self.exact_masks:
+            return self.run.masks(self.sequence, frame)
+        shape = self.sequence.camera.height, self.sequence.camera.width
+        rows = {name: (log, log.row(frame)) for name, log in self._coarse.items() if name in self.run.objects}
+        cells = {name: log.cells(row, shape) for name, (log, row) in rows.items() if row is not None}
+        return {n: c.repeat(CELL_PX, 0).repeat(CELL_PX, 1)[: shape[0], : shape[1]] for n, c in cells.items()}
+
+    def surface(self, name: str) -> Any:
+        """The reconstructed surface of an object, a ``trimesh.Trimesh`` in its frame, metres, with colours."""
+        path = self.run.path / "meshes" / f"{name}.ply"
+        if not path.is_file():
+            fix = "Was the run stopped before its end? Run it anew."
+            raise MissingData(str(path), f"no surface of {name!r} in the run", fix)
+        return read_mesh(path)
+
+    def trusted(self, min_confidence: float = DOUBTED) -> dict[str, np.ndarray]:
+        """Object to (n,) bool: its poses that are labels, in the frames of :data:`RULE`."""
+        objects = {name: self.run.objects[name] for name in self.tracked}
+        sure = {name: obj.has_pose & (obj.confidence > min_confidence) for name, obj in objects.items()}
+        unseen = {name: np.ones(len(obj), bool) for name, obj in objects.items()}
+        for k, frame in enumerate(self.frames):
+            if all(of[k] for of in sure.values()):
+                continue
+            for name, mask in self.masks(int(frame)).items():
+                if name in unseen:
+                    unseen[name][k] = not mask.any()
+        kept = np.logical_and.reduce([sure[name] | (unseen[name] & ~objects[name].has_pose) for name in objects])
+        return {name: of & kept for name, of in sure.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """A surface as a camera sees it: a cut of an image that may reach beyond its borders.
+
+    corner   column and row of its first pixel; depth_m (h, w) along the optical axis, infinite where it is not met
+    face     (h, w) which face, -1 where none; normal (h, w, 3) unit, in the object frame
+    """
+
+    corner: tuple[int, int]
+    depth_m: np.ndarray
+    face: np.ndarray
+    normal: np.ndarray
+
+    @property
+    def hit(self) -> np.ndarray:
+        """(h, w) bool."""
+        return np.isfinite(self.depth_m)
+
+    def inside(self, image: np.ndarray) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """Rows and columns of an image (H, W, ...) that the cut covers, and the same of the cut."""
+        (left, top), (h, w) = self.corner, self.depth_m.shape
+        rows = slice(min(max(top, 0), image.shape[0]), max(min(top + h, image.shape[0]), 0))
+        columns = slice(min(max(left, 0), image.shape[1]), max(min(left + w, image.shape[1]), 0))
+        own = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+        return (rows, columns), own
+
+
+class Renderer:
+    """Casts rays of a camera against one surface (V, 3), (F, 3) in its object frame."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, camera: Camera):
+        self._vertices, self._scene, self._camera = np.asarray(vertices, float), ray_scene(vertices, faces), camera
+
+    def __call__(self, T_cam_obj: np.ndarray) -> Silhouette:
+        """The surface at a pose, up to one image's size beyond each border."""
+        camera = self._camera
+        uv_px = camera.project(se3.transform(T_cam_obj, self._vertices))
+        size = np.array([camera.width, camera.height])
+        low, high = np.zeros(2, int), np.zeros(2, int)
+        if np.isfinite(uv_px).all():
+            low = np.clip(np.floor(uv_px.min(0)), -size, 2 * size).astype(int)
+            high = np.clip(np.ceil(uv_px.max(0)) + 1, -size, 2 * size).astype(int)
+        u, v = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+        rays = camera.unproject(np.stack([u, v], -1), np.ones(u.shape)).reshape(-1, 3)
+        T_obj_cam = se3.inverse(T_cam_obj)
+        if not len(rays):
+            return Silhouette((0, 0), np.zeros(u.shape), np.zeros(u.shape, int), np.zeros((*u.shape, 3)))
+        met = cast(self._scene, T_obj_cam[:3, 3], rays @ T_obj_cam[:3, :3].T)
+        depth_m, face = met["t_hit"].reshape(u.shape), met["primitive_ids"].reshape(u.shape)
+        return Silhouette((int(low[0]), int(low[1])), depth_m, face, met["primitive_normals"].reshape(*u.shape, 3))
+
+
+@contextmanager
+def new_folder(out: str | Path) -> Iterator[Path]:
+    """A folder to write into that takes the name ``out`` when all is written; nothing of it stays where that fails.
+
+    Raises :class:`BadInput` where ``out`` holds something already.
+    """
+    out = Path(out)
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise BadInput(str(out), "what is there already", "a new or empty folder", "Name another one.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    partial.mkdir()
+    try:
+        yield partial
+        os.replace(partial, out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

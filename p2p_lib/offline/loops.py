@@ -1,0 +1,201 @@
+"""Views of one object met again at other times: features matched between keyframes, and poses along the best matches.
+
+A causal tracker that took a wrong turn goes on from there; here any two keyframes may be tied, by tracks that both see
+or by SIFT features of one surface, and poses follow the maximum spanning tree of what ties them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import DepthConfig
+from p2p_lib.core.depth import depth_noise_m, lift, off_edges
+from p2p_lib.core.types import Frame
+
+#: A match needs to be so much nearer than the next best, and a tie so many matches that move as one.
+_RATIO, MIN_MATCHES = 0.8, 9
+#: RANSAC: samples of three pairs, and how far pairs may be off: standard deviations of depth, and at least this.
+_SAMPLES, _SIGMAS, _LEAST_M = 200, 3.0, 0.004
+#: Smaller views are enlarged twice before features are looked for.
+_SMALL_PX, _ROOM_PX, _MOST, _CLOUD = 220, 4, 400, 1000
+#: Features are looked for so far inside the mask, and not at a step in depth.
+_BORDER_PX, _STEP_M = 2, 0.02
+
+
+#: A point that would float this far before what was measured, m and standard deviations, contradicts a pose.
+_FLOATS_M, _FLOATS_SIGMAS = 0.006, 3.0
+#: A tie with so large a share of contradicting points counts for a third.
+_CONTRADICTED = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """SIFT features of an object in a frame: p_cam (N, 3) measured, descriptors (N, 128).
+
+    cloud (M, 3) are points of its surface, depth_m (H, W) and mask (H, W) bool the frame's.
+    """
+
+    p_cam: np.ndarray
+    descriptors: np.ndarray
+    cloud: np.ndarray
+    depth_m: np.ndarray
+    mask: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Tie:
+    """Two keyframes a and b in which matched points (rows of each, (M,)) move as one: T_a_b (4, 4).
+
+    strength  how many agree, less where depth and masks contradict it: what shines stands still while a thing turns
+    """
+
+    a: int
+    b: int
+    T_a_b: np.ndarray
+    rows_a: np.ndarray
+    rows_b: np.ndarray
+    strength: float
+
+
+def features(frame: Frame, mask: np.ndarray, camera: Camera, config: DepthConfig) -> Features:
+    """What can be recognised of an object, with depth."""
+    v, u = np.nonzero(mask & off_edges(frame.depth_m, _STEP_M))
+    some = np.linspace(0, len(v) - 1, min(len(v), _CLOUD)).astype(int)
+    cloud = camera.unproject(np.stack([u[some], v[some]], -1), frame.depth_m[v[some], u[some]])
+    seen = cloud, frame.depth_m, mask
+    nothing = Features(np.zeros((0, 3)), np.zeros((0, 128), np.float32), *seen)
+    if not mask.any():
+        return nothing
+    x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
+    left, top = max(x - _ROOM_PX, 0), max(y - _ROOM_PX, 0)
+    cut = np.s_[top : y + h + _ROOM_PX, left : x + w + _ROOM_PX]
+    # What shows at a mask's border, or through a handle, stands still while the object moves: it would be recognised.
+    own = cv2.erode(mask.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2)) * off_edges(frame.depth_m, _STEP_M)
+    grey, inside = cv2.cvtColor(frame.rgb[cut], cv2.COLOR_RGB2GRAY), own[cut].astype(np.uint8)
+    scale = 2.0 if max(w, h) < _SMALL_PX else 1.0
+    if scale > 1:
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        inside = cv2.resize(inside, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    found, descriptors = cv2.SIFT_create(_MOST, contrastThreshold=0.02).detectAndCompute(grey, inside)
+    if descriptors is None:
+        return nothing
+    uv_px = (np.array([point.pt for point in found]) + 0.5) / scale - 0.5 + (left, top)
+    p_cam = lift(frame, uv_px, camera, config)
+    lifted = np.isfinite(p_cam[:, 0])
+    return Features(p_cam[lifted], descriptors[lifted], *seen)
+
+
+def matched(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of a and of b that are each other's nearest, and clearly so."""
+    if min(len(a.p_cam), len(b.p_cam)) < 2:
+        return np.zeros(0, int), np.zeros(0, int)
+    likeness = a.descriptors @ b.descriptors.T / 512**2  # SIFT's have length 512
+    best = likeness.argmax(1)
+    rows = np.arange(len(best))
+    first = likeness[rows, best]
+    rest = likeness.copy()
+    rest[rows, best] = -1
+    off, next_off = (np.sqrt(np.maximum(2 - 2 * x, 1e-9)) for x in (first, rest.max(1)))
+    good = (off < _RATIO * next_off) & (likeness.argmax(0)[best] == rows)
+    return rows[good], best[good]
+
+
+def rigid(p_a: np.ndarray, p_b: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """T_a_b (4, 4) of most pairs of points (N, 3), by RANSAC and least squares, and which (N,) bool agree with it."""
+    none = np.eye(4), np.zeros(len(p_a), bool)
+    if len(p_a) < 3:
+        return none
+    noise = np.hypot(depth_noise_m(p_a[:, 2]), depth_noise_m(p_b[:, 2]))
+    within = np.maximum(_SIGMAS * noise, _LEAST_M)
+    sample = np.argsort(rng.random((_SAMPLES, len(p_a))), axis=1)[:, :3]
+    T = _kabsch(p_a[sample], p_b[sample])
+    off = np.linalg.norm(se3.transform(T, np.broadcast_to(p_b, (len(T), *p_b.shape))) - p_a, axis=-1)
+    best = np.minimum(off / within, 1).sum(1).argmin()
+    agree = off[best] < within
+    for _ in range(3):
+        if agree.sum() < 3:
+            return none
+        T_best = _kabsch(p_a[agree][None], p_b[agree][None])[0]
+        agree = np.linalg.norm(se3.transform(T_best, p_b) - p_a, axis=-1) < within
+    return T_best, agree
+
+
+def _kabsch(p_a: np.ndarray, p_b: np.ndarray) -> np.ndarray:
+    """T_a_b (S, 4, 4), least squares over points (S, n, 3)."""
+    a, b = p_a.mean(1), p_b.mean(1)
+    U, _, Vt = np.linalg.svd(np.swapaxes(p_a - a[:, None], 1, 2) @ (p_b - b[:, None]))
+    flip = np.ones((len(U), 3))
+    flip[:, 2] = np.linalg.det(U @ Vt)
+    R = (U * flip[:, None]) @ Vt
+    return se3.from_rt(R, a - np.einsum("sij,sj->si", R, b))
+
+
+def contradicted(T_a_b: np.ndarray, a: Features, b: Features, camera: Camera) -> float:
+    """The larger share of one view's points that the other contradicts: before its depth, or beside its mask."""
+    return max(_contradicted(T_a_b, a, b.cloud, camera), _contradicted(se3.inverse(T_a_b), b, a.cloud, camera))
+
+
+def _contradicted(T_a_b: np.ndarray, a: Features, cloud_b: np.ndarray, camera: Camera) -> float:
+    p_a = se3.transform(T_a_b, cloud_b)
+    uv_px = camera.project(p_a)
+    inside = camera.inside(uv_px)
+    if not inside.any():
+        return 1.0
+    u, v = np.where(inside, uv_px.T, 0).round().astype(int)
+    measured, z = a.depth_m[v, u], p_a[:, 2]
+    off = np.maximum(_FLOATS_M, _FLOATS_SIGMAS * depth_noise_m(z))
+    floats = inside & (measured > 0) & (z < measured - off)
+    return float(floats.sum() / inside.sum())
+
+
+def rated(T_a_b: np.ndarray, matches: int, a: Features, b: Features, camera: Camera) -> float:
+    """The strength of a tie of so many matches."""
+    return float(matches * np.exp(-contradicted(T_a_b, a, b, camera) / _CONTRADICTED))
+
+
+def ties(views: list[Features], camera: Camera, rng: np.random.Generator) -> list[Tie]:
+    """Every pair of keyframes that matched features tie."""
+    found = []
+    for a in range(len(views)):
+        for b in range(a + 1, len(views)):
+            rows_a, rows_b = matched(views[a], views[b])
+            if len(rows_a) < MIN_MATCHES:
+                continue
+            T_a_b, agree = rigid(views[a].p_cam[rows_a], views[b].p_cam[rows_b], rng)
+            if agree.sum() >= MIN_MATCHES:
+                strength = rated(T_a_b, int(agree.sum()), views[a], views[b], camera)
+                found.append(Tie(a, b, T_a_b, rows_a[agree], rows_b[agree], strength))
+    return found
+
+
+def along_ties(T_cam_obj: np.ndarray, pairs: list[tuple[int, int, np.ndarray, float]]) -> np.ndarray:
+    """Poses (K, 4, 4), NaN where none, along the maximum spanning tree of pairs (a, b, T_a_b, strength).
+
+    The keyframe that is tied most keeps its pose. What no tie reaches from there keeps its own.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+    K, T = len(T_cam_obj), np.array(T_cam_obj, float)
+    best: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
+    for a, b, T_a_b, strength in pairs:
+        if strength > best.get((a, b), (0.0, T_a_b))[0]:
+            best[a, b] = strength, T_a_b
+    if not best:
+        return T
+    rows, columns = np.array(list(best)).T
+    strengths = np.array([strength for strength, _ in best.values()])
+    tree = minimum_spanning_tree(coo_array((1 / strengths, (rows, columns)), (K, K)).tocsr())
+    total = np.bincount(rows, strengths, K) + np.bincount(columns, strengths, K)
+    total[~np.isfinite(T[:, 0, 0])] = -1
+    order, before = breadth_first_order(tree, int(total.argmax()), directed=False)
+    for k in order[1:]:
+        at = before[k]
+        T_k_at = best[k, at][1] if (k, at) in best else se3.inverse(best[at, k][1])
+        T[k] = T_k_at @ T[at]
+    return se3.orthonormalised(T) if np.isfinite(T).all() else T

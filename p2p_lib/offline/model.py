@@ -1,0 +1,365 @@
+"""Models to take away: a run's surfaces cleaned, closed where they may be, simplified and textured.
+
+Of each object a folder: ``textured_simple.obj`` with ``.mtl`` and ``.png``, ``textured_simple.glb``,
+``collision.obj`` (convex) and ``model.json``, which says what they are. All in metres, in the object frame of the
+run's poses. Faces that nobody saw are in the OBJ's group ``guessed``.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import replace_text, replacing
+from p2p_lib.core.native import load_open3d
+from p2p_lib.core.progress import progress_bar
+from p2p_lib.core.types import DOUBTED
+from p2p_lib.datasets.images import save_png
+from p2p_lib.offline import texture
+from p2p_lib.offline.finished import Finished, Renderer, new_folder
+
+NAME = "textured_simple"
+#: Components with less of the largest one's area are left out.
+_MIN_COMPONENT = 0.05
+#: Where a camera measured this much behind a patch there is no surface, m; so many views have to say so.
+_SEEN_THROUGH_M, _SEEN_THROUGH_VIEWS = 0.012, 2
+#: Faces of a collision mesh, at most.
+_HULL_FACES = 256
+#: The edge of a texture, px, and the room around its charts.
+TEXTURE_PX, _GUTTER_PX = 2048, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A surface: vertices (V, 3) metres, faces (F, 3), colours (V, 3) 0 to 255, guessed (F,) bool: nobody saw it."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colours: np.ndarray
+    guessed: np.ndarray
+
+    @property
+    def mesh(self) -> Any:
+        """As ``trimesh.Trimesh``, without colours."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Textured:
+    """A shape with uv (F, 3, 2) of each face's corners, from the lower left, and an image (S, S, 3) uint8."""
+
+    shape: Shape
+    uv: np.ndarray
+    image: np.ndarray
+
+
+def write_models(
+    folder: str | Path, out: str | Path, faces: int = 5000, min_confidence: float = DOUBTED, progress: bool = False
+) -> str:
+    """Write a model of each object of the run in ``folder`` below the new folder ``out``; what they are, in words.
+
+    faces           of a model, at most
+    min_confidence  views of poses with no more are not looked at
+
+    Needs Open3D; raises :class:`MissingBackend` without, :class:`BadInput` where ``faces`` is no number of faces.
+    """
+    if faces < 100:
+        raise BadInput("faces", faces, "at least 100")
+    open3d = load_open3d()
+    made, told = Finished.of(folder), []
+    quiet = open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error)
+    with quiet, new_folder(out) as there, progress_bar("models", len(made.tracked), "object", progress) as bar:
+        for name in made.tracked:
+            told.append(_write_model(made, name, there / name, faces, min_confidence))
+            bar.update()
+    return "; ".join(told)
+
+
+def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidence: float) -> str:
+    obj, surface = made.run.objects[name], made.surface(name)
+    rows = np.flatnonzero(obj.has_pose & (obj.confidence > min_confidence))
+    if not len(rows):
+        raise BadInput(str(made.run.path), f"no pose of {name!r} above confidence {min_confidence:g}", "one at least")
+    kept, held_out = rows[np.arange(len(rows)) % texture.HELD_OUT_EVERY != 5], rows[5 :: texture.HELD_OUT_EVERY]
+    camera = made.sequence.camera
+    render = Renderer(surface.vertices, surface.faces, camera)
+    views = texture.chosen_rows(made, name, kept, render)
+    seen = [(T, made.sequence.frame(view.frame).depth_m) for view in views[::3] for T in [view.T_cam_obj]]
+    shape = simplified(closed(cleaned(surface), camera, seen), faces)
+    textured = with_texture(shape, views, camera)
+    out.mkdir(parents=True)
+    write_obj(textured, out)
+    write_glb(textured, out / f"{NAME}.glb")
+    hull = collision(shape)
+    with replacing(out / "collision.obj") as file:
+        file.write(hull.export(file_type="obj", include_normals=False).encode())
+    few = held_out[np.unique(np.linspace(0, len(held_out) - 1, min(len(held_out), 12)).astype(int))]
+    off = errors(made, name, few, textured, surface)
+    about = _about(made, name, textured, len(views), off) | {"collision_faces": len(hull.faces)}
+    replace_text(out / "model.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+    guessed = f", {100 * about['guessed_share']:.0f} % of its area guessed" if shape.guessed.any() else ""
+    return f"{name}: {len(shape.faces)} faces, texture of {len(views)} views{guessed}"
+
+
+def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[str, float]) -> dict[str, Any]:
+    mesh, shape = textured.shape.mesh, textured.shape
+    frame = "the object frame of the run's poses: p_cam = T_cam_obj p_obj, OpenCV's camera axes"
+    told = {
+        "object": name,
+        "units": "m",
+        "frame": frame,
+        "faces": len(shape.faces),
+        "watertight": bool(mesh.is_watertight),
+    }
+    told |= {"guessed_share": float(mesh.area_faces[shape.guessed].sum() / mesh.area), "views": views}
+    told |= {"size_m": np.ptp(shape.vertices, axis=0).round(5).tolist(), "colour_error_of_255": off}
+    keys = ("sequence", "tracker", "preset", "seed", "commit", "offline")
+    return told | {"run": {key: made.run.info[key] for key in keys if made.run.info.get(key) is not None}}
+
+
+# --- shape ---------------------------------------------------------------------------------------
+
+
+def cleaned(surface: Any) -> Shape:
+    """A surface without its small components, faces of no area and edges of more than two faces; smoothed a little."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=True)
+    colours = np.asarray(surface.visual.vertex_colors)[:, :3]
+    from scipy.spatial import cKDTree
+
+    mesh.update_faces(mesh.nondegenerate_faces())
+    open3d = load_open3d()
+    legacy = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces)
+    )
+    legacy.remove_non_manifold_edges()
+    component, _, area = legacy.cluster_connected_triangles()
+    component, area = np.asarray(component), np.asarray(area)
+    legacy.remove_triangles_by_mask(area[component] < _MIN_COMPONENT * area.max())
+    legacy.remove_unreferenced_vertices()
+    # Twice a step out and in: voxels' steps go, and the shape keeps its size.
+    legacy = legacy.filter_smooth_taubin(number_of_iterations=5)
+    vertices, faces = np.asarray(legacy.vertices), np.asarray(legacy.triangles)
+    nearest = cKDTree(surface.vertices).query(vertices)[1]
+    return Shape(vertices, faces, colours[nearest].astype(float), np.zeros(len(faces), bool))
+
+
+def closed(shape: Shape, camera: Any, views: list[tuple[np.ndarray, np.ndarray]]) -> Shape:
+    """The same with its holes filled where no view (T_cam_obj, depth_m) looked through the patch."""
+    open3d = load_open3d()
+    tensor = open3d.t.geometry.TriangleMesh(
+        open3d.core.Tensor(shape.vertices.astype(np.float32)), open3d.core.Tensor(shape.faces.astype(np.int64))
+    )
+    filled = tensor.fill_holes(10.0)
+    vertices, faces = filled.vertex.positions.numpy().astype(float), filled.triangle.indices.numpy()
+    if len(vertices) != len(shape.vertices) or not np.allclose(vertices, shape.vertices, atol=1e-6):
+        return shape
+    known = {tuple(row) for row in np.sort(shape.faces, 1).tolist()}
+    new = faces[[tuple(row) not in known for row in np.sort(faces, 1).tolist()]]
+    patches = [patch for patch in _patches(new) if not _seen_through(vertices[new[patch]], camera, views)]
+    added = new[np.concatenate(patches)] if patches else new[:0]
+    guessed = np.arange(len(shape.faces) + len(added)) >= len(shape.faces)
+    return Shape(shape.vertices, np.concatenate([shape.faces, added]), shape.colours, guessed)
+
+
+def _patches(faces: np.ndarray) -> list[np.ndarray]:
+    """Rows of faces (F, 3) that hang together by edges, patch by patch."""
+    import trimesh
+
+    if not len(faces):
+        return []
+    labels = trimesh.graph.connected_component_labels(trimesh.graph.face_adjacency(faces), len(faces))
+    return [np.flatnonzero(labels == k) for k in range(labels.max() + 1)]
+
+
+def _seen_through(triangles: np.ndarray, camera: Any, views: list[tuple[np.ndarray, np.ndarray]]) -> bool:
+    """Whether views measured depth well behind a patch (F, 3, 3) at a third of its points in the image, or more."""
+    points = np.concatenate([triangles.mean(1), (triangles + triangles.mean(1, keepdims=True)).reshape(-1, 3) / 2])
+    through = 0
+    for T_cam_obj, depth_m in views:
+        p_cam = se3.transform(T_cam_obj, points)
+        uv_px = camera.project(p_cam)
+        inside = camera.inside(uv_px)
+        u, v = np.where(inside, uv_px.T, 0).round().astype(int)
+        behind = inside & (depth_m[v, u] > p_cam[:, 2] + _SEEN_THROUGH_M)
+        through += behind.sum() > max(len(points) / 3, 1)
+    return through >= _SEEN_THROUGH_VIEWS
+
+
+def simplified(shape: Shape, faces: int) -> Shape:
+    """The same with at most so many faces, by quadric error; what was guessed stays marked."""
+    from scipy.spatial import cKDTree
+
+    open3d = load_open3d()
+    # Marching cubes' faces are so regular and so many slivers that the atlas takes minutes: half of them say the same.
+    faces = min(faces, max(len(shape.faces) // 2, 100))
+    if len(shape.faces) <= faces:
+        return shape
+    legacy = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(shape.vertices), open3d.utility.Vector3iVector(shape.faces)
+    )
+    legacy = legacy.simplify_quadric_decimation(faces)
+    legacy.remove_degenerate_triangles()
+    legacy.remove_non_manifold_edges()
+    legacy.remove_unreferenced_vertices()
+    vertices, made = np.asarray(legacy.vertices), np.asarray(legacy.triangles)
+    colours = shape.colours[cKDTree(shape.vertices).query(vertices)[1]]
+    nearest = cKDTree(shape.vertices[shape.faces].mean(1)).query(vertices[made].mean(1))[1]
+    return Shape(vertices, made, colours, shape.guessed[nearest])
+
+
+def collision(shape: Shape) -> Any:
+    """A convex mesh around a shape, a ``trimesh.Trimesh`` of few faces."""
+    hull = shape.mesh.convex_hull
+    if len(hull.faces) <= _HULL_FACES:
+        return hull
+    import trimesh
+    from scipy.spatial import ConvexHull
+
+    # Of the hull's corners those that are farthest along directions all around.
+    k = np.arange(_HULL_FACES // 2) + 0.5
+    z, turn = 1 - 2 * k / len(k), np.pi * (1 + 5**0.5) * k
+    ways = np.stack([np.cos(turn) * np.sqrt(1 - z**2), np.sin(turn) * np.sqrt(1 - z**2), z], 1)
+    corners = hull.vertices[np.unique((hull.vertices @ ways.T).argmax(0))]
+    return trimesh.convex.convex_hull(corners[ConvexHull(corners).vertices])
+
+
+# --- texture -------------------------------------------------------------------------------------
+
+
+def with_texture(shape: Shape, views: list[texture.View], camera: Any, size: int = TEXTURE_PX) -> Textured:
+    """A shape with an atlas, and what views show of it."""
+    open3d = load_open3d()
+    mesh = open3d.t.geometry.TriangleMesh(
+        open3d.core.Tensor(shape.vertices.astype(np.float32)), open3d.core.Tensor(shape.faces.astype(np.int64))
+    )
+    uv = atlas(len(shape.faces), size)
+    mesh.triangle.texture_uvs = open3d.core.Tensor(uv.astype(np.float32))
+    normals = np.array(shape.mesh.vertex_normals)
+    mesh.vertex.normals = open3d.core.Tensor(normals.astype(np.float32))
+    mesh.vertex.own = open3d.core.Tensor(shape.colours.astype(np.float32))
+    mesh.vertex.here = open3d.core.Tensor(np.ones((len(normals), 1), np.float32))
+    # What is outside of all charts is 0.
+    maps = mesh.bake_vertex_attr_textures(size, {"positions", "normals", "own", "here"}, 0.0, 0.0, False)
+    point, normal, own, here = (maps[key].numpy() for key in ("positions", "normals", "own", "here"))
+    at = here[..., 0] > 0.5
+    unit = normal[at] / np.maximum(np.linalg.norm(normal[at], axis=1, keepdims=True), 1e-9)
+    few = np.unique(np.linspace(0, len(unit) - 1, 4000).astype(int))
+    even = texture.evened(views, camera, point[at][few].astype(float), unit[few])
+    image = np.zeros((size, size, 3), np.uint8)
+    image[at] = texture.baked(even, camera, point[at].astype(float), unit, own[at])
+    return Textured(shape, uv, spread(image, at))
+
+
+def atlas(faces: int, size: int) -> np.ndarray:
+    """(F, 3, 2) places of faces in a texture: each its own triangle, two in a square.
+
+    Open3D's atlas (UVAtlas) has larger charts; on reconstructed surfaces it takes minutes, and some end the process.
+    """
+    squares = int(np.ceil(np.sqrt(np.ceil(faces / 2))))
+    low, high = _GUTTER_PX * squares / size, 1 - 2.5 * _GUTTER_PX * squares / size
+    half = np.array([[low, low], [high, low], [low, high]])
+    k = np.arange(faces)
+    inside = np.where((k % 2 == 0)[:, None, None], half, 1 - half)
+    corner = np.stack([k // 2 % squares, k // 2 // squares], 1)
+    return (corner[:, None] + inside) / squares
+
+
+def spread(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """An image (H, W, 3) with the nearest texel's colour where there is none: charts do not fade at their borders."""
+    if at.all() or not at.any():
+        return image
+    _, label = cv2.distanceTransformWithLabels((~at).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    colour_of = np.zeros((label.max() + 1, 3), np.uint8)
+    colour_of[label[at]] = image[at]
+    return colour_of[label]
+
+
+def rendered(textured: Textured, T_cam_obj: np.ndarray, camera: Any) -> tuple[np.ndarray, np.ndarray]:
+    """A model as a camera sees it: (H, W, 3) uint8 and where it shows (H, W) bool."""
+    shape, size = textured.shape, textured.image.shape[0]
+    weights, at, face = _corners(shape.vertices, shape.faces, T_cam_obj, camera)
+    uv = np.einsum("nk,nkd->nd", weights, textured.uv[face])
+    x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
+    image = np.zeros((*at.shape, 3), np.uint8)
+    image[at] = texture.lookup(textured.image, np.stack([x, y], 1))
+    return image, at
+
+
+def _corners(vertices: np.ndarray, faces: np.ndarray, T_cam_obj: np.ndarray, camera: Any):
+    """Where a mesh shows (H, W) bool, and at each such pixel barycentric weights (N, 3) in a face (N,)."""
+    import trimesh
+
+    silhouette = Renderer(vertices, faces, camera)(T_cam_obj)
+    depth_m, which = np.full((camera.height, camera.width), np.inf), np.full((camera.height, camera.width), -1)
+    image, own = silhouette.inside(depth_m)
+    depth_m[image], which[image] = silhouette.depth_m[own], silhouette.face[own]
+    at = which >= 0
+    points = se3.transform(se3.inverse(T_cam_obj), (camera.rays[at].T * depth_m[at]).T)
+    return trimesh.triangles.points_to_barycentric(vertices[faces[which[at]]], points), at, which[at]
+
+
+def errors(made: Finished, name: str, rows: np.ndarray, textured: Textured, surface: Any) -> dict[str, float]:
+    """Mean colour error in frames ``rows`` that the texture is not of: the model's, and of vertex colours instead."""
+    camera, colours = made.sequence.camera, np.asarray(surface.visual.vertex_colors)[:, :3].astype(float)
+    render, off = Renderer(surface.vertices, surface.faces, camera), []
+    for row in rows:
+        view = texture.view_of(made, name, int(row), render)
+        mine, mine_at = rendered(textured, view.T_cam_obj, camera)
+        weights, at, face = _corners(surface.vertices, np.asarray(surface.faces), view.T_cam_obj, camera)
+        theirs = np.zeros_like(mine)
+        theirs[at] = np.einsum("nk,nkd->nd", weights, colours[surface.faces[face]]).round()
+        both = mine_at & at
+        off.append((texture.colour_error(view, mine, both), texture.colour_error(view, theirs, both)))
+    found = np.nanmean(np.array(off), axis=0) if np.isfinite(off).any() else (np.nan, np.nan)
+    return {"texture": round(float(found[0]), 3), "vertex_colours": round(float(found[1]), 3), "frames": len(rows)}
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+
+def write_obj(textured: Textured, folder: Path) -> None:
+    """``textured_simple.obj`` with ``.mtl`` and ``.png``; corners of a face have their own place in the texture."""
+    shape = textured.shape
+    uv, which = np.unique(textured.uv.reshape(-1, 2).round(7), axis=0, return_inverse=True)
+    corner = np.stack([shape.faces + 1, which.reshape(-1, 3) + 1], -1)
+    lines = [f"# metres\nmtllib {NAME}.mtl\nusemtl {NAME}"]
+    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in shape.vertices.tolist()]
+    lines += [f"vt {u:.7f} {v:.7f}" for u, v in uv.tolist()]
+    for group, of in (("seen", ~shape.guessed), ("guessed", shape.guessed)):
+        rows = corner[of].reshape(-1, 6).tolist()
+        lines += [f"g {group}"] * bool(rows) + ["f {}/{} {}/{} {}/{}".format(*row) for row in rows]
+    replace_text(folder / f"{NAME}.obj", "\n".join(lines) + "\n")
+    replace_text(folder / f"{NAME}.mtl", f"newmtl {NAME}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {NAME}.png\n")
+    save_png(folder / f"{NAME}.png", textured.image)
+
+
+def write_glb(textured: Textured, path: Path) -> None:
+    """One file with mesh and texture (glTF: metres)."""
+    import trimesh
+    from PIL import Image
+
+    shape = textured.shape
+    corners, which = np.unique(
+        np.concatenate([shape.faces.reshape(-1, 1), textured.uv.reshape(-1, 2).round(7)], 1),
+        axis=0,
+        return_inverse=True,
+    )
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(textured.image), metallicFactor=0.0, roughnessFactor=1.0
+    )
+    visual = trimesh.visual.TextureVisuals(uv=corners[:, 1:], material=material)
+    vertices = shape.vertices[corners[:, 0].astype(int)]
+    mesh = trimesh.Trimesh(vertices, which.reshape(-1, 3), visual=visual, process=False)
+    with replacing(path) as file:
+        file.write(mesh.export(file_type="glb"))

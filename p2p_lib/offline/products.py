@@ -1,0 +1,43 @@
+"""What ``p2p export`` makes of a run besides files of poses, by the name of its form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.types import DOUBTED
+from p2p_lib.offline import PRODUCTS
+from p2p_lib.offline.dataset import write_bop, write_foundationpose
+
+
+def write_product(
+    run: str | Path,
+    format: str,
+    out: str | Path,
+    min_confidence: float | None = None,
+    faces: int = 5000,
+    progress: bool = False,
+) -> str:
+    """Write the run in a folder in one of :data:`~p2p_lib.offline.PRODUCTS` into a new one; what it holds, in words.
+
+    min_confidence  poses of no more are not used (default: those that are doubted)
+    faces           of a textured model, at most
+
+    Raises :class:`BadInput` and :class:`MissingData` where that cannot be; nothing is left of ``out`` then.
+    """
+    least = DOUBTED if min_confidence is None else min_confidence
+    if format not in PRODUCTS:
+        raise BadInput("format", repr(format), "one of " + ", ".join(PRODUCTS))
+    if not 0 <= least < 1:
+        raise BadInput("min_confidence", f"{least:g}", "at least 0 and below 1")
+    if format == "bop-dataset":
+        return f"{write_bop(run, out, least, progress)}. Written: {out}"
+    from p2p_lib.offline.model import write_models
+
+    if format == "model":
+        return f"{write_models(run, out, faces, least, progress)}. Written: {out}"
+    with TemporaryDirectory() as folder:
+        write_models(run, models := Path(folder) / "models", faces, least, progress)
+        meshes = {path.name: path for path in models.iterdir() if path.is_dir()}
+        return f"{write_foundationpose(run, out, least, meshes)}. Written: {out}"

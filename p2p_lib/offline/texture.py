@@ -1,0 +1,139 @@
+"""The texture of a model: baked from the sharpest views all around, each texel from those that face it most.
+
+The exposure of the views is evened out first: a gain per view and channel, by what several of them show. What no view
+shows keeps the surface's own colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.offline.finished import Finished, Renderer
+
+#: Views that a texture is baked from, at most.
+VIEWS = 48
+#: Of the frames with a trusted pose every so many-th is kept out of the texture, to be compared with.
+HELD_OUT_EVERY = 10
+#: A surface counts as the one that a pixel shows where it is no farther behind what was rendered, and off what was
+#: measured, than this, m.
+_BEHIND_M, _MEASURED_M = 0.004, 0.015
+#: Texels seen more obliquely than this cosine are not taken from a view.
+_FACING = 0.25
+#: How much better views outweigh others: near 1 blurs by poses' errors, large numbers show seams.
+_SHARP = 6.0
+#: Pixels at a mask's border that may be of something else.
+_BORDER_PX = 3
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An image that shows an object: rgb (H, W, 3) float32, shows (H, W) bool where it can be believed, and how sharp.
+
+    depth_m (H, W) of the surface as rendered, infinite where it is not met.
+    """
+
+    frame: int
+    T_cam_obj: np.ndarray
+    rgb: np.ndarray
+    shows: np.ndarray
+    depth_m: np.ndarray
+    sharpness: float
+
+
+def view_of(made: Finished, name: str, row: int, render: Renderer) -> View:
+    """The object in the ``row``-th frame of a run."""
+    i, T = int(made.frames[row]), made.run.objects[name].T_cam_obj[row]
+    frame, mask = made.sequence.frame(i), made.masks(i).get(name)
+    silhouette, depth_m = render(T), np.full(frame.shape, np.inf, np.float32)
+    image, own = silhouette.inside(depth_m)
+    depth_m[image] = silhouette.depth_m[own]
+    near = (frame.depth_m == 0) | (np.abs(frame.depth_m - depth_m) < _MEASURED_M)
+    shows = np.isfinite(depth_m) & near if mask is None else np.isfinite(depth_m) & near & mask
+    shows = cv2.erode(shows.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2)) > 0
+    edges = cv2.Laplacian(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), cv2.CV_32F)
+    sharp = float(edges[shows].std()) if shows.sum() > 100 else 0.0
+    return View(i, T, frame.rgb.astype(np.float32), shows, depth_m, sharp)
+
+
+def chosen_rows(made: Finished, name: str, rows: np.ndarray, render: Renderer, count: int = VIEWS) -> list[View]:
+    """Of the frames ``rows`` the sharpest from each of ``count`` directions that lie far apart."""
+    T_obj_cam = se3.inverse(made.run.objects[name].T_cam_obj[rows])
+    way = T_obj_cam[:, :3, 3] / np.linalg.norm(T_obj_cam[:, :3, 3], axis=1, keepdims=True)
+    seeds, far = [0], np.linalg.norm(way - way[0], axis=1)
+    while len(seeds) < min(count, len(rows)) and far.max() > 1e-3:
+        seeds.append(int(far.argmax()))
+        far = np.minimum(far, np.linalg.norm(way - way[seeds[-1]], axis=1))
+    nearest = np.linalg.norm(way[:, None] - way[seeds][None], axis=-1).argmin(1)
+    best: list[View] = []
+    for k in range(len(seeds)):
+        members = np.flatnonzero(nearest == k)
+        some = members[np.unique(np.linspace(0, len(members) - 1, min(len(members), 4)).astype(int))]
+        views = (view_of(made, name, int(rows[member]), render) for member in some)
+        sharpest = max(views, key=lambda view: view.sharpness)
+        best += [sharpest] if sharpest.sharpness > 0 else []
+    return best
+
+
+def sampled(view: View, camera: Camera, p_obj: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (N, 3) of surface points (N, 3) with normals (N, 3) in a view, and how well it shows each, 0: not."""
+    p_cam = se3.transform(view.T_cam_obj, p_obj)
+    z, towards = p_cam[:, 2], -p_cam / np.linalg.norm(p_cam, axis=1, keepdims=True)
+    cosine = np.einsum("ij,ij->i", normal @ view.T_cam_obj[:3, :3].T, towards)
+    uv = np.nan_to_num(camera.project(p_cam), nan=-9.0).astype(np.float32)
+    inside = camera.inside(uv)
+    u, v = np.where(inside, uv.T, 0).round().astype(int)
+    seen = inside & view.shows[v, u] & (z < view.depth_m[v, u] + _BEHIND_M) & (cosine > _FACING)
+    return lookup(view.rgb, uv), np.where(seen, cosine * view.sharpness * camera.fx / np.maximum(z, 1e-3), 0.0)
+
+
+def lookup(image: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
+    """(N, 3) of an image (H, W, 3) between its pixels at (N, 2), in parts: OpenCV's images have few columns."""
+    parts = np.array_split(uv_px.astype(np.float32), -(-len(uv_px) // 30_000) or 1)
+    return np.concatenate([cv2.remap(image, p[None, :, 0], p[None, :, 1], cv2.INTER_LINEAR)[0] for p in parts])
+
+
+def evened(views: list[View], camera: Camera, p_obj: np.ndarray, normal: np.ndarray) -> list[View]:
+    """The views with gains that make what several of them show of surface points (N, 3) the same, on average 1."""
+    seen = [sampled(view, camera, p_obj, normal) for view in views]
+    value = np.stack([np.log(np.clip(colour, 8, 250)) for colour, _ in seen])
+    usable = np.stack([weight for _, weight in seen]) > 0
+    usable &= ((value > np.log(12)) & (value < np.log(245))).all(-1)
+    value = np.where(usable[..., None], value, np.nan)
+    gain = np.zeros((len(views), 3))
+    shared = usable.sum(0) > 1
+    for _ in range(10 if shared.any() else 0):
+        mean = np.nanmean(value[:, shared] - gain[:, None], axis=0)
+        enough = usable[:, shared].sum(1) > 20
+        off = np.zeros_like(gain)
+        off[enough] = np.nanmedian(value[enough][:, shared] - mean, axis=1)
+        gain = off - off[enough].mean(0) if enough.any() else gain
+    return [replace(view, rgb=np.clip(view.rgb / np.exp(g), 0, 255).astype(np.float32)) for view, g in zip(views, gain)]
+
+
+def baked(views: Iterable[View], camera: Camera, p_obj: np.ndarray, normal: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """(N, 3) uint8 of surface points (N, 3): from the views that show each best, else its ``own`` colour (N, 3)."""
+    total, weight = np.zeros((len(p_obj), 3)), np.zeros(len(p_obj))
+    for view in views:
+        colour, shown = sampled(view, camera, p_obj, normal)
+        # Weights of a power relative to a usual one, so that nothing overflows.
+        w = (shown / 1e4) ** _SHARP
+        total, weight = total + w[:, None] * colour, weight + w
+    found = weight > 0
+    colour = np.where(found[:, None], total / np.where(found, weight, 1)[:, None], own)
+    return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
+
+
+def colour_error(view: View, rendered: np.ndarray, shown: np.ndarray) -> float:
+    """Mean absolute difference, of 255, of a rendered image (H, W, 3) where it is ``shown`` (H, W), at one exposure."""
+    use = view.shows & shown
+    if use.sum() < 50:
+        return float("nan")
+    mine, true = rendered[use].astype(float), view.rgb[use].astype(float)
+    gain = np.median(true, axis=0) / np.maximum(np.median(mine, axis=0), 1)
+    return float(np.abs(np.clip(mine * gain, 0, 255) - true).mean())

@@ -1,0 +1,46 @@
+"""Many recordings at once: one table, a row that says why where one cannot be run, and nothing run twice."""
+
+import shutil
+
+import pandas as pd
+import pytest
+
+from p2p_lib.apps import cli
+from p2p_lib.benchmark.batch import recordings, run_batch
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.options import RunOptions
+from tests.fixtures.sliding_board import write_sequence
+
+OPTIONS = RunOptions(settings={"method.surface": False, "method.graph": False})
+
+
+@pytest.fixture
+def shelf(tmp_path):
+    folder = tmp_path / "shelf"
+    write_sequence(folder / "one")
+    shutil.copytree(folder / "one", folder / "two")
+    shutil.copytree(folder / "one", folder / "broken")
+    next((folder / "broken/depth").iterdir()).unlink()
+    (folder / "notes").mkdir()
+    return folder
+
+
+def test_every_recording_has_a_row_and_is_run_once(shelf, tmp_path):
+    table = run_batch(shelf, tmp_path / "out", OPTIONS, jobs=1)
+    assert table["recording"].tolist() == ["broken", "one", "two"]
+    assert table["pose [%]"].tolist()[1:] == [100, 100]
+    assert "files, expected" in table["note"][0] and pd.isna(table["object"][0])
+    pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "out/batch.csv"), table, check_dtype=False)
+    written = (tmp_path / "out/one/poses.npz").stat().st_mtime_ns
+    run_batch(shelf, tmp_path / "out", OPTIONS, jobs=1)
+    assert (tmp_path / "out/one/poses.npz").stat().st_mtime_ns == written
+
+
+def test_what_is_no_shelf_is_a_sentence(shelf, tmp_path, capsys):
+    with pytest.raises(BadInput, match="no recording in it"):
+        recordings(shelf / "notes", OPTIONS)
+    with pytest.raises(BadInput, match="a folder among the recordings"):
+        run_batch(shelf, shelf / "out", OPTIONS)
+    with pytest.raises(SystemExit):
+        cli.main(["run", "--out", str(tmp_path / "x")])
+    assert "needs either SEQ or --batch FOLDER" in capsys.readouterr().err

@@ -1,0 +1,130 @@
+"""Datasets made of a run: read back by the loaders, and compared with the truth that the run was made of."""
+
+import csv
+import json
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.apps import cli
+from p2p_lib.core import se3
+from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.datasets.models import MESHES, find_models, load_points
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.offline.products import write_product
+from tests.fixtures.made_run import T_OBJ_MODEL
+
+
+@pytest.fixture
+def scene(finished, tmp_path):
+    write_product(finished, "bop-dataset", tmp_path / "set")
+    return open_sequence(tmp_path / "set/train/000001")
+
+
+def test_labels_are_the_poses_and_the_masks_are_the_true_ones(made, scene):
+    numbers = [int(name) for name in scene.frame_names]
+    for k, name in enumerate(made.sequence.objects, 1):
+        truth, labels = made.sequence.truth[name].T_cam_model[numbers], scene.truth[f"obj_{k:06d}"].T_cam_model
+        right = [i not in made.wrong or name != "box" for i in numbers] & np.isfinite(labels).all((1, 2))
+        np.testing.assert_allclose(labels[right] @ T_OBJ_MODEL, truth[right], atol=1e-6)
+        shared = total = 0
+        for at in np.flatnonzero(right):
+            mine, own = scene.masks(int(at))[f"obj_{k:06d}"], made.sequence.masks(numbers[at])[name]
+            shared, total = shared + np.count_nonzero(mine & own), total + np.count_nonzero(mine | own)
+        assert right.sum() > 20 and shared / total > 0.97
+    np.testing.assert_array_equal(scene.frame(3).rgb, made.sequence.frame(numbers[3]).rgb)
+
+
+def test_models_are_metric_whatever_the_file_says(made, scene):
+    for k, (_, path) in enumerate(sorted(find_models(made.sequence, MESHES).items()), 1):
+        found = load_points(find_models(scene)[f"obj_{k:06d}"])
+        np.testing.assert_allclose(found, se3.transform(T_OBJ_MODEL, load_points(path)), atol=1e-6)
+
+
+def test_frames_with_an_object_in_plain_view_without_a_trusted_pose_are_left_out(made, scene):
+    left_out = set(range(len(made.sequence))) - {int(name) for name in scene.frame_names}
+    for i in range(len(made.sequence)):
+        few = [name for name, px in made.sequence.visible_px(i).items() if 0 < px < 300]  # hidden for the run
+        assert (i in left_out) == (i == 8 or bool(few)), i
+
+
+def test_masks_and_counts_are_those_of_bop(scene):
+    folder = scene.path
+    infos = json.loads((folder / "scene_gt_info.json").read_text())
+    fractions = []
+    for i, info in infos.items():
+        for k, counts in enumerate(info):
+            whole, shown = (
+                cv2.imread(str(folder / kind / f"{int(i):06d}_{k:06d}.png"), -1) > 0 for kind in ("mask", "mask_visib")
+            )
+            assert not (shown & ~whole).any() and counts["px_count_visib"] == shown.sum()
+            assert counts["px_count_all"] >= whole.sum() >= counts["px_count_valid"]
+            assert counts["visib_fract"] == pytest.approx(shown.sum() / counts["px_count_all"])
+            fractions.append(counts["visib_fract"])
+    assert min(fractions) < 0.5 and np.median(fractions) > 0.9  # the two cross
+
+
+def test_what_says_that_a_label_is_good_tells_the_wrong_ones(made, scene):
+    with (scene.path.parents[1] / "labels.csv").open() as file:
+        rows = {int(row["image"]): row for row in csv.DictReader(file) if row["object"] == "box"}
+    clear = {i: row for i, row in rows.items() if float(row["visib_fract"]) > 0.9 and i not in made.wrong}
+    iou, off_mm = (np.array([float(row[key]) for row in clear.values()]) for key in ("mask_iou", "depth_off_mm"))
+    assert max(float(rows[i]["mask_iou"]) for i in (6, 7)) < iou.min() - 0.05  # 2 cm aside
+    assert float(rows[5]["depth_off_mm"]) > off_mm.max() + 1  # turned by 5 degrees
+
+
+def test_nothing_is_half_written(finished, tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/mine").write_text("")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    with pytest.raises(BadInput, match="what is there already"):
+        write_product(finished, "bop-dataset", tmp_path / "full")
+    arrays = dict(np.load(finished / "poses.npz"))
+    doubted = {key: value / 2 for key, value in arrays.items() if key.endswith("/confidence")}
+    np.savez(finished / "poses.npz", **arrays | doubted)
+    with pytest.raises(BadInput, match="no frame to label"):
+        write_product(finished, "bop-dataset", tmp_path / "set")
+    write_product(finished, "bop-dataset", tmp_path / "set", min_confidence=0.4)
+    shutil.rmtree(tmp_path / "set")
+    np.savez(finished / "poses.npz", **arrays)
+    (finished / "meshes/box.ply").unlink()
+    with pytest.raises(MissingData, match="no surface of 'box' in the run"):
+        write_product(finished, "bop-dataset", tmp_path / "set")
+    with pytest.raises(BadInput, match="format: got 'gltf', expected one of bop-dataset"):
+        write_product(finished, "gltf", tmp_path / "set")
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_images_that_are_gone_and_runs_without_poses_are_a_sentence_each(finished, made, tmp_path, capsys):
+    info = json.loads((finished / "run.json").read_text())
+    copy = shutil.copytree(made.sequence.path, tmp_path / "copy")
+    (finished / "run.json").write_text(json.dumps(info | {"path": str(copy)}))
+    sorted((copy / "rgb").iterdir())[20].unlink()
+    assert cli.main(["export", str(finished), "--format", "bop-dataset", "--out", str(tmp_path / "set")]) == 2
+    assert re.search(r"rgb.*: got 39 files|got 40 files", capsys.readouterr().err)
+    shutil.rmtree(copy)
+    assert cli.main(["export", str(finished), "--format", "bop-dataset", "--out", str(tmp_path / "set")]) == 2
+    assert "no such folder" in capsys.readouterr().err and not (tmp_path / "set").exists()
+    arrays = dict(np.load(finished / "poses.npz"))
+    arrays |= {key: np.full_like(value, np.nan) for key, value in arrays.items() if key.endswith("/T_cam_obj")}
+    np.savez(finished / "poses.npz", **arrays)
+    assert cli.main(["export", str(finished), "--format", "bop-dataset", "--out", str(tmp_path / "set")]) == 2
+    assert "a run without a single pose" in capsys.readouterr().err
+
+
+def test_foundationpose_folders(finished, made, tmp_path):
+    write_product(finished, "foundationpose", tmp_path / "fp", faces=500)
+    for name in made.sequence.objects:
+        folder = tmp_path / "fp" / name
+        (mask,) = (folder / "masks").iterdir()
+        rgb = sorted((folder / "rgb").iterdir())
+        assert mask.name == rgb[0].name == sorted((folder / "depth").iterdir())[0].name
+        own = made.sequence.masks(int(mask.stem))[name]
+        np.testing.assert_array_equal(cv2.imread(str(mask), -1) > 0, own)
+        depth = cv2.imread(str(folder / "depth" / mask.name), -1) / 1000
+        np.testing.assert_allclose(depth, made.sequence.frame(int(mask.stem)).depth_m, atol=0.0005)
+        np.testing.assert_allclose(np.loadtxt(folder / "cam_K.txt"), made.sequence.camera.K)
+        assert {"textured_simple.obj", "textured_simple.png"} <= {path.name for path in (folder / "mesh").iterdir()}

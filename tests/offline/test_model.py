@@ -1,0 +1,112 @@
+"""Models to take away: what they look like, opened by other libraries, and how near they are to the truth."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.native import load_open3d
+from p2p_lib.core.raycasting import SurfaceDistance
+from p2p_lib.datasets.models import MESHES, find_models, load_mesh
+from p2p_lib.offline import model, texture
+from p2p_lib.offline.products import write_product
+from tests.fixtures.made_run import T_OBJ_MODEL
+
+
+@pytest.fixture(scope="module")
+def models(made, tmp_path_factory):
+    import shutil
+
+    from p2p_lib.core.mesh import save
+
+    folder = tmp_path_factory.mktemp("models")
+    run = shutil.copytree(made.run.path, folder / "run")
+    for name, path in find_models(made.sequence, MESHES).items():
+        vertices, faces = load_mesh(path)
+        surface = trimesh.Trimesh(se3.transform(T_OBJ_MODEL, vertices), faces, process=False).subdivide_to_size(0.006)
+        surface.visual.vertex_colors = np.full((len(surface.vertices), 3), 128, np.uint8)
+        save(surface, run / "meshes" / f"{name}.ply")
+    write_product(run, "model", folder / "out", faces=3000)
+    return folder / "out"
+
+
+def test_other_libraries_open_them_in_metres(made, models):
+    open3d = load_open3d()
+    for name, path in find_models(made.sequence, MESHES).items():
+        true = se3.transform(T_OBJ_MODEL, load_mesh(path)[0])
+        for kind in ("obj", "glb"):
+            file = models / name / f"textured_simple.{kind}"
+            mesh = trimesh.load(file, force="mesh")
+            assert len(mesh.faces) <= 3000 and mesh.visual.uv.shape == (len(mesh.vertices), 2)
+            np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), np.ptp(true, axis=0), atol=0.004)
+        read = open3d.io.read_triangle_mesh(str(models / name / "textured_simple.obj"), True)
+        assert read.has_triangle_uvs() and np.asarray(read.textures[0]).shape == (2048, 2048, 3)
+        hull = trimesh.load(models / name / "collision.obj")
+        assert hull.is_watertight and hull.is_convex and len(hull.faces) <= 256
+        assert json.loads((models / name / "model.json").read_text())["units"] == "m"
+
+
+def test_the_texture_is_what_the_camera_saw(models):
+    for folder in models.iterdir():
+        off = json.loads((folder / "model.json").read_text())["colour_error_of_255"]
+        assert off["texture"] < 0.6 * off["vertex_colours"]  # which are grey here
+        assert cv2.imread(str(folder / "textured_simple.png")).std() > 10
+
+
+def test_obj_and_glb_show_the_same(models):
+    meshes = [trimesh.load(models / "box" / f"textured_simple.{kind}", force="mesh") for kind in ("obj", "glb")]
+    colours = []
+    for mesh in meshes:
+        image = getattr(mesh.visual.material, "image", None) or mesh.visual.material.baseColorTexture
+        middle = mesh.visual.uv[mesh.faces].mean(1)
+        order = np.lexsort(mesh.triangles_center.round(4).T)
+        colours.append(trimesh.visual.color.uv_to_color(middle, image)[order, :3].astype(float))
+    assert np.abs(colours[0] - colours[1]).mean() < 2
+
+
+def box(open_above=True):
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide_to_size(0.02)
+    keep = ~((mesh.triangles_center[:, 2] > 0.049) & open_above)
+    mesh.update_faces(keep)
+    mesh.remove_unreferenced_vertices()
+    n = len(mesh.faces)
+    return model.Shape(
+        np.array(mesh.vertices), np.array(mesh.faces), np.zeros((len(mesh.vertices), 3)), np.zeros(n, bool)
+    )
+
+
+def test_holes_are_closed_and_marked_unless_a_camera_looked_through():
+    camera = Camera(300, 300, 79.5, 59.5, 160, 120)
+    above = se3.from_rt(np.diag([1.0, -1, -1]), np.array([0, 0, 0.3]))  # looks down on the opening, 25 cm away
+    into = [(above, np.full((120, 160), 0.35, np.float32))] * 3  # and sees the bottom
+    onto = [(above, np.full((120, 160), 0.25, np.float32))] * 3
+    shut = model.closed(box(), camera, onto)
+    assert shut.mesh.is_watertight and shut.guessed.any() and not shut.guessed[: len(box().faces)].any()
+    assert (shut.vertices[shut.faces[shut.guessed]][..., 2] > 0.049).all()
+    still_open = model.closed(box(), camera, into)
+    assert not still_open.mesh.is_watertight and not still_open.guessed.any()
+
+
+def test_fewer_faces_keep_the_shape_and_what_is_guessed():
+    shape = model.closed(box(), Camera(300, 300, 79.5, 59.5, 160, 120), [])
+    few = model.simplified(shape, 100)
+    assert len(few.faces) <= 100 and few.guessed.any()
+    assert (few.vertices[few.faces[few.guessed]].mean(1)[:, 2] > 0.04).all()
+    assert SurfaceDistance(few.vertices, few.faces)(shape.vertices).max() < 0.002
+
+
+def test_exposure_is_evened_out():
+    camera = Camera(300, 300, 79.5, 59.5, 160, 120)
+    rng = np.random.default_rng(0)
+    print_ = cv2.resize(rng.uniform(60, 180, (12, 16, 3)).astype(np.float32), (160, 120))
+    T = se3.from_rt(np.eye(3), np.array([0, 0, 0.5]))
+    depth_m, shows = np.full((120, 160), 0.5, np.float32), np.ones((120, 160), bool)
+    views = [texture.View(k, T, print_ * gain, shows, depth_m, 10.0) for k, gain in enumerate((0.8, 1.0, 1.25))]
+    p = np.stack([*rng.uniform(-0.08, 0.08, (2, 500)), np.zeros(500)], 1)
+    even = texture.evened(views, camera, p, np.tile([0, 0, -1.0], (500, 1)))
+    for view in even:
+        assert np.abs(view.rgb[10:-10, 10:-10] / even[1].rgb[10:-10, 10:-10] - 1).max() < 0.02

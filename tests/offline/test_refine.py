@@ -1,0 +1,183 @@
+"""The offline pass: bundle adjustment against simulated truth, ties that depth contradicts, and a whole run mended."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from p2p_lib.apps import cli
+from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.datasets.keypoint_log import KeypointLog
+from p2p_lib.datasets.models import MESHES, find_models, load_mesh
+from p2p_lib.datasets.runs import load_run
+from p2p_lib.offline import loops
+from p2p_lib.offline import refine as offline
+from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
+from tests.fixtures.made_run import T_OBJ_MODEL
+
+CAMERA = Camera(500, 500, 159.5, 119.5, 320, 240)
+
+
+@pytest.fixture
+def scene():
+    """20 poses of an object half a metre away, 40 points of it, each seen in every frame; 2 mm of noise."""
+    rng = np.random.default_rng(3)
+    T = se3.from_rt(np.eye(3), np.array([0, 0, 0.5])) @ se3.exp(rng.normal(size=(20, 6)) * ([0.4] * 3 + [0.02] * 3))
+    p = rng.normal(scale=0.05, size=(40, 3))
+    pose, point = (x.ravel() for x in np.meshgrid(np.arange(20), np.arange(40), indexing="ij"))
+    p_cam = se3.transform(T[pose], p[point][:, None])[:, 0] + rng.normal(scale=0.002, size=(800, 3))
+    noise_m = np.full(800, 0.002)
+    return T, p, Sightings(pose, point, p_cam, information(p_cam, noise_m, noise_m)), rng
+
+
+def off(T, T_true):
+    """Errors (n, 6) with the object frame that fits best."""
+    each = se3.inverse(T) @ T_true
+    mean = each[0]
+    for _ in range(20):
+        mean = mean @ se3.exp(se3.log(se3.inverse(mean) @ each).mean(0))
+    return se3.log(se3.inverse(mean) @ each)
+
+
+def test_adjustment_is_as_good_as_its_covariance_says(scene):
+    T, _, seen, rng = scene
+    start = T @ se3.exp(rng.normal(size=(20, 6)) * ([0.05] * 3 + [0.005] * 3))
+    best = adjust(start, placed(start, seen, 40), seen)
+    error = off(best.T_cam_obj, T)
+    assert np.abs(error[:, 3:]).mean() < 0.0004  # 2 mm by the root of 40 points
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(best.covariance), error)
+    assert 4 < nees.mean() < 9  # six degrees of freedom
+
+
+def test_tracks_that_slid_away_count_for_nothing(scene):
+    T, p, seen, rng = scene
+    wrong = rng.random(800) < 0.3
+    seen.p_cam[wrong] += [0.03, 0, 0.02]
+    best = adjust(T, placed(T, seen, 40), seen)
+    assert np.abs(off(best.T_cam_obj, T)[:, 3:]).mean() < 0.001
+    assert best.weight[wrong].max() < 0.2 < np.median(best.weight[~wrong])
+    alone = locate(T @ se3.exp(np.full(6, 0.01)), p, seen)
+    assert np.abs(se3.log(se3.inverse(alone.T_cam_obj) @ T)[:, 3:]).mean() < 0.002
+
+
+def view(T_cam_obj, stands_still):
+    """A plate with a knob beside its middle, and features: the knob's, and more that do not move with the plate."""
+    rays = CAMERA.rays.reshape(-1, 3).astype(float)
+    T = se3.inverse(T_cam_obj)
+    depth = -T[2, 3] / (rays @ T[2, :3])  # of the plane z = 0 of the object
+    p = se3.transform(T, rays * depth[:, None])
+    inside = (np.linalg.norm(p[:, :2], axis=1) < 0.06).reshape(240, 320)
+    knob = (np.linalg.norm(p[:, :2] - [0.03, 0], axis=1) < 0.02).reshape(240, 320)
+    depth_m = np.where(inside, depth.reshape(240, 320) - 0.03 * knob, 1.0).astype(np.float32)
+    rows = np.flatnonzero(inside)[::7]
+    cloud = rays[rows] * depth_m.ravel()[rows, None]
+    moving = se3.transform(T_cam_obj, np.random.default_rng(0).normal(scale=0.02, size=(12, 3)))
+    rng = np.random.default_rng(1)
+    descriptors = rng.random((12 + len(stands_still), 128))
+    descriptors *= 512 / np.linalg.norm(descriptors, axis=1, keepdims=True)
+    return loops.Features(np.concatenate([moving, stands_still]), descriptors, cloud, depth_m, inside)
+
+
+def test_what_shines_and_stands_still_ties_nothing():
+    T = se3.from_rt(np.eye(3), np.array([0, 0, 0.5]))
+    turned = T @ se3.exp(np.array([0, 0, np.radians(40), 0, 0, 0]))
+    shine = T[:3, 3] + np.random.default_rng(2).normal(scale=0.02, size=(25, 3))
+    views = [view(T, shine), view(turned, shine)]
+    (tie,) = loops.ties(views, CAMERA, np.random.default_rng(0))
+    assert np.degrees(se3.angle_rad(tie.T_a_b)) < 1  # most matches stand still
+    assert tie.strength < 5 < loops.rated(T @ se3.inverse(turned), 12, *views, CAMERA)
+
+
+def test_poses_follow_the_strongest_ties():
+    T = se3.exp(np.random.default_rng(5).normal(size=(5, 6)))
+    slipped = T.copy()
+    slipped[3:] = slipped[3:] @ se3.exp(np.array([0, 0.5, 0, 0, 0, 0]))
+    pairs = [(k, k + 1, slipped[k] @ se3.inverse(slipped[k + 1]), 2.0 if k == 2 else 30.0) for k in range(4)]
+    pairs.append((0, 4, T[0] @ se3.inverse(T[4]), 12.0))
+    found = loops.along_ties(slipped, pairs)
+    for k in range(1, 5):
+        np.testing.assert_allclose(found[0] @ se3.inverse(found[k]), T[0] @ se3.inverse(T[k]), atol=1e-9)
+
+
+@pytest.fixture
+def tracked(made, finished):
+    """The finished run with tracks: points of each model wherever the depth shows them, good to a third of a pixel."""
+    rng, log, maps = np.random.default_rng(0), KeypointLog(), {}
+    for number, (name, path) in enumerate(sorted(find_models(made.sequence, MESHES).items())):
+        vertices = load_mesh(path)[0]
+        points = vertices[rng.choice(len(vertices), 120)]
+        ids = np.arange(120) + 1000 * number
+        for i in range(len(made.sequence)):
+            p_cam = se3.transform(made.sequence.truth[name].T_cam_model[i], points)
+            uv_px, frame = made.sequence.camera.project(p_cam), made.sequence.frame(i)
+            u, v = np.clip(uv_px, 0, (639, 479)).round().astype(int).T
+            seen = made.sequence.camera.inside(uv_px) & (np.abs(frame.depth_m[v, u] - p_cam[:, 2]) < 0.005)
+            log.add(i, name, ids[seen], uv_px[seen] + rng.normal(scale=0.3, size=(seen.sum(), 2)))
+        maps[name] = ids, se3.transform(T_OBJ_MODEL, points), np.ones(120, bool)
+    log.save(finished, maps)
+    return finished
+
+
+def errors(made, folder, name):
+    obj = load_run(folder).objects[name]
+    T = made.sequence.truth[name].T_cam_model[obj.frame_index]
+    deg, mm = se3.error_deg_mm(obj.T_cam_obj @ T_OBJ_MODEL, T)
+    return deg, mm
+
+
+def test_wrong_poses_are_mended_and_the_lost_one_is_found(made, tracked):
+    before = {path: path.read_bytes() for path in tracked.rglob("*") if path.is_file()}
+    told = offline.refine_run(tracked)
+    assert "(1 more, 0 fewer than causally)" in told[0]
+    assert {path: path.read_bytes() for path in before} == before
+    deg, mm = errors(made, tracked / "offline", "box")
+    assert np.nanmax(deg[[5, 6, 7, 8]]) < 1.5 and np.nanmax(mm[[5, 6, 7, 8]]) < 4
+    assert np.nanmedian(deg) < 0.8 and np.nanmedian(mm) < 2
+    info = json.loads((tracked / "offline/run.json").read_text())
+    assert info["offline"] is True and "offline" not in json.loads((tracked / "run.json").read_text())
+    assert (tracked / "offline/meshes/box.ply").is_file()
+
+
+def test_an_interrupted_pass_goes_on(tracked, monkeypatch):
+    did, part = [], offline._part
+
+    def stopped(work, parts):
+        if work.name == "can" and not did.count("can"):
+            did.append("can")
+            raise KeyboardInterrupt
+        did.append(work.name)
+        part(work, parts)
+
+    monkeypatch.setattr(offline, "_part", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        offline.refine_run(tracked)
+    assert not (tracked / "offline").exists()
+    offline.refine_run(tracked)
+    assert did == ["box", "can", "can"] and (tracked / "offline/run.json").is_file()
+    assert not (tracked / offline._PARTS).exists()
+
+
+def test_disagreement_is_measured_by_the_causal_covariance(made):
+    obj = made.run.objects["can"]
+    covariance = np.tile(np.diag([1e-4] * 3 + [1e-6] * 3), (len(obj), 1, 1))
+    from dataclasses import replace
+
+    causal = replace(obj, covariance=covariance)
+    moved = replace(obj, T_cam_obj=obj.T_cam_obj @ se3.exp(np.array([0, 0, 0, 0.005, 0, 0])))
+    squared = offline.disagreement(causal, moved)
+    np.testing.assert_allclose(squared[obj.has_pose], 25, rtol=1e-6)  # 5 mm of 1 mm
+    assert np.isnan(squared[~obj.has_pose]).all()
+    assert offline.in_ranges([3, 4, 5, 9]) == ": frames 3 to 5, 9"
+
+
+def test_what_cannot_be_refined_is_a_sentence(tracked, capsys):
+    (tracked / "keypoints.npz").unlink()
+    assert cli.main(["refine", str(tracked), "--quiet"]) == 2
+    assert "no tracks were kept" in capsys.readouterr().err
+    assert not (tracked / "offline").exists() and not (tracked / offline._PARTS).exists()
+    shutil.copy(tracked / "run.json", tracked / "before.json")
+    (tracked / "run.json").write_text(json.dumps(json.loads((tracked / "before.json").read_text()) | {"offline": True}))
+    assert cli.main(["refine", str(tracked), "--quiet"]) == 2
+    assert "an offline result already" in capsys.readouterr().err
