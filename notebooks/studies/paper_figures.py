@@ -33,7 +33,8 @@ from studies.final_figures import rate_figure, scene_of
 from studies.pipeline_diagram import pipeline_diagram
 
 PLAN = "paper_figures"
-_OURS, _MESHES, _RIVAL = "Ours", "Ours, YCB meshes", "Ours, SH(10)"
+_OURS, _MESHES = "Ours", "Ours, YCB meshes"
+_POINTS, _FORGETS = "Ours, points alone", "Ours, points alone, SH(10)"
 _AIRPLANE, _HIDDEN = "synthetic/ycb_airplane_can", "synthetic/occlusion"
 _OTHER = "stand-in: rendered, not the paper's sequence"
 
@@ -74,11 +75,15 @@ def airplane_and_can(runs: Benchmark) -> np.ndarray:
 
 
 def return_beside(runs: Benchmark, poses: Path | None = None) -> np.ndarray:
-    """A complete occlusion and the return, ours above imported poses, or above the method without long memory."""
-    ours = scene_of(runs, _OURS, _HIDDEN)
+    """A complete occlusion and the return, ours above imported poses; or by points alone, with long memory and without.
+
+    Our search by shape and scene would find the object without any memory of its points.
+    """
     if poses is None:
-        scenes = {"ours": ours, "no long memory (stand-in)": scene_of(runs, _RIVAL, _HIDDEN)}
+        shown = {"ours, by points alone": _POINTS, "the same, no long memory (stand-in)": _FORGETS}
+        scenes = {label: scene_of(runs, method, _HIDDEN) for label, method in shown.items()}
     else:
+        ours = scene_of(runs, _OURS, _HIDDEN)
         rival = imported(poses, ours.sequence)
         scenes = {"ours": ours, poses.stem: Scene(ours.sequence, rival, evaluate(rival))}
     return _marked(beside(scenes, 4, axes=True), _OTHER)

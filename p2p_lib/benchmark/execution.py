@@ -67,7 +67,8 @@ def _poses(job: Job, out: Path) -> Outcome:
             raise KeyboardInterrupt
         done = load_run(unfinished)
         judge = fault_done if job.sequence.fault else chamfer if job.chamfer else None
-        outcome = scored(done, job.models, judge and partial(judge, done, sequence, job.models), job.key)
+        judge = judge and partial(judge, done, sequence, job.models)
+        outcome = scored(done, job.models, judge, job.key, job.min_mask_px)
         times = _times(done, cpu_s) | {"width_px": sequence.camera.width}
         outcome = outcome.model_copy(update={"times": times, "ran": outcome.ran | {"library": library_version()}})
         shutil.rmtree(run_path(out, job.key), ignore_errors=True)

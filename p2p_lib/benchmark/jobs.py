@@ -29,6 +29,7 @@ from p2p_lib.datasets import checkpoints, manifests
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.resized import Resized
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.synthetic.faults import Faulty
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -43,6 +44,7 @@ class Job:
 
     measure  "poses": the whole method; "tracks": its 2D tracker alone
     chamfer  whether the reconstruction is scored
+    min_mask_px  of an object's mask in frames that are scored
     key      16 digits, "" where it cannot run; then ``reason`` says why
     """
 
@@ -51,6 +53,7 @@ class Job:
     seed: int
     measure: Literal["poses", "tracks"]
     chamfer: bool
+    min_mask_px: int = MIN_VISIBLE_PX
     key: str = ""
     reason: str = ""
 
@@ -98,7 +101,7 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
                 for measure in measures:
                     for seed in scope.seeds:
                         reason = missing or lacking[method.name]
-                        job = Job(method, sequence, seed, measure, plan.chamfer, reason=reason)
+                        job = Job(method, sequence, seed, measure, plan.chamfer, plan.min_mask_px, reason=reason)
                         jobs.append(job if reason else _keyed(job, known))
     return jobs
 
@@ -145,6 +148,7 @@ def _keyed(job: Job, known: dict[tuple, str]) -> Job:
             "fault": planned.fault and [planned.fault.model_dump(), planned.during],
             "clicks": planned.clicks if uses_clicks(method) else {},
             "chamfer": job.chamfer,
+            "min_mask_px": job.min_mask_px,
         }
     except P2PError as error:
         if isinstance(error, BadInput) and planned.name.startswith(SYNTHETIC):

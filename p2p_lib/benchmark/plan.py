@@ -17,6 +17,7 @@ from p2p_lib.core.files import file_name, read_toml
 from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.schema import Strict, first_fault
 from p2p_lib.datasets.sequence import SYNTHETIC
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 
 PROFILES = ("quick", "full")
 #: Where the plans of this package lie.
@@ -143,6 +144,7 @@ class Plan(Strict):
     kind     how its table is arranged (see :mod:`p2p_lib.figures.final_tables`)
     chamfer  whether reconstructions are scored as well
     tracks   whether the 2D trackers are scored by themselves as well
+    min_mask_px  frames in which less of an object's mask is to be seen are not scored: often the first of a return
     """
 
     name: Annotated[str, AfterValidator(lambda name: file_name("name", name))]
@@ -151,6 +153,7 @@ class Plan(Strict):
     kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs", "pairs", "faults"] = "methods"
     chamfer: bool = False
     tracks: bool = False
+    min_mask_px: Count = MIN_VISIBLE_PX
     method: Annotated[list[Method], Field(min_length=1)]
     quick: Scope
     full: Scope

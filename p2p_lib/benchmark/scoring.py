@@ -20,7 +20,7 @@ from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation import reconstruction
 from p2p_lib.evaluation.faults import fault_score, mesh_off_share
-from p2p_lib.evaluation.protocol import ObjectScore, evaluate
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ObjectScore, evaluate
 
 if TYPE_CHECKING:
     import trimesh
@@ -34,13 +34,13 @@ Models = Mapping[str, str | Path]
 Judge = Callable[[str, ObjectScore], dict[str, Any]]
 
 
-def scored(done: Run, models: Models, judge: Judge | None, key: str = "") -> Outcome:
+def scored(done: Run, models: Models, judge: Judge | None, key: str = "", min_mask_px: int = MIN_VISIBLE_PX) -> Outcome:
     """A run's errors by both alignments, its returns, and what ``judge`` says of each object besides.
 
     models  object to model file, over those that the run was made with
     judge   :func:`chamfer` or :func:`fault_done` of the run
     """
-    first, over_all = (evaluate(done, models, align) for align in ("first", "all"))
+    first, over_all = (evaluate(done, models, align, min_mask_px) for align in ("first", "all"))
     objects = {}
     for name, score in first.objects.items():
         objects[name] = ObjectOutcome(

@@ -104,7 +104,8 @@ class Numbers:
         """What is to be said of every number of ours, and of those that the paper reports."""
         seeds = ", ".join(map(str, self.seeds))
         spread = f"mean ± standard deviation over seeds {seeds}" if len(self.seeds) > 1 else f"seed {seeds} alone"
-        return [f"{_HOW}; {spread}", self.what_ran(), *([_REPORTED] if self.plan.paper else [])]
+        scored = f"frames with less than {self.plan.min_mask_px} pixels of an object's mask are not scored"
+        return [f"{_HOW}; {scored}; {spread}", self.what_ran(), *([_REPORTED] if self.plan.paper else [])]
 
     def what_ran(self) -> str:
         """Trackers, detectors, masks, sequences, commit."""

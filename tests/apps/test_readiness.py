@@ -15,7 +15,9 @@ def nothing(monkeypatch):
 def test_a_plan_says_which_rows_can_run(nothing):
     title, ours, papers = readiness("long_range").splitlines()
     assert title.split()[0] == "long_range"
-    assert ours.startswith("  Ours; Ours, SH(10): 4 of 5 sequences; else: ycbmultitrack_real:")
+    assert ours.startswith(
+        "  Ours, points alone; Ours, points alone, SH(10); Ours; Ours, SH(10): 4 of 5 sequences; else:"
+    )
     assert papers.startswith(
         "  paper_full; paper_sh10: 0 of 5 sequences; else: no weights of sam2_video, superpoint, tapir. Run:"
     )

@@ -84,6 +84,14 @@ def test_mean_and_pool_are_those_of_the_runs(whole):
     assert number(rows, **pooled) == pytest.approx(metrics.auc_voc(np.concatenate(errors)))
 
 
+def test_frames_in_which_too_little_is_to_be_seen_are_left_out(plan, tmp_path):
+    path = tmp_path / "slides.toml"
+    path.write_text("min_mask_px = 1_000_000\n" + plan.read_text())
+    found = run_benchmark(path, tmp_path / "out", profile="quick", progress=False, jobs=1)
+    assert all("1000000 visible pixels" in outcome.reason for _, outcome in found.results)
+    assert "less than 1000000 pixels" in paper_table(found).files()[".md"]
+
+
 def test_the_summary_spreads_over_seeds(whole):
     values = [number(table(whole), **EXACT, method="Ours", seed=s, sequence="mean over sequences") for s in (0, 1)]
     (row,) = (
@@ -122,6 +130,7 @@ def test_a_key_is_of_everything_that_decides_a_result(slides, plan, tmp_path, mo
     assert keys(**{"A board that slides": "Another title", '"Ours"': '"Mine"'}) == same, "names decide nothing"
     assert len(set(same)) == 2
     assert keys(**{"seeds = [0]": "seeds = [4]"})[0] != same[0]
+    assert keys(**{'title = "A': 'min_mask_px = 0\ntitle = "A'})[0] != same[0]
     assert keys(**{'column = "AP10" }': "stop = 4 }"})[0] != same[0]
     assert keys(**{'"method.graph" = false': '"method.graph" = true'})[0] != same[0]
     copy = Path(shutil.copytree(slides[0], tmp_path / "copy"))

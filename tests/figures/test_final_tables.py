@@ -43,7 +43,7 @@ def benchmark(tmp_path, results: dict, seeds=(0,), **plan) -> Benchmark:
         method = next(m for m in made.method if m.name == name)
         planned = made.full.sequence[0].model_validate(sequence_of(sequence))
         jobs += [
-            (Job(method, planned, seed, "poses", made.chamfer, "k"), one)
+            (Job(method, planned, seed, "poses", made.chamfer, key="k"), one)
             for seed, one in zip(seeds, outcomes, strict=True)
         ]
     return Benchmark(made, "full", tmp_path, tuple(jobs))
@@ -110,7 +110,7 @@ def test_a_re_creation_is_never_compared_with_the_papers_numbers(tmp_path):
     for planned in plan.full.sequence:
         objects = {n: ObjectOutcome(lost=0, first=scored, all=scored, returns=[]) for n in planned.columns}
         jobs.append(
-            (Job(method, planned, 0, "poses", False, "k"), outcome(99.9).model_copy(update={"objects": objects}))
+            (Job(method, planned, 0, "poses", False, key="k"), outcome(99.9).model_copy(update={"objects": objects}))
         )
     table = paper_table(Benchmark(plan, "full", tmp_path, tuple(jobs)))
     at = [k for k, head in enumerate(table.heads) if head == method.name]
