@@ -46,8 +46,9 @@ _TURNS = 12
 _ON_SURFACE_M = 0.012
 #: Landmarks are looked for on a followed object every so many frames while fewer than so many are seen on it.
 _EVERY, _ENOUGH = 5, 60
-#: It is found again where it lies within half its length of where it was, and is turned by less, rad, in so many looks.
-_ALIKE_RAD, _LOOKS = np.radians(25), 8
+#: It is found again, in so many looks, where it is turned by less, rad, and lies within half its length and what it may
+#: have moved in the camera frame meanwhile, m/s.
+_LOOKS, _ALIKE_RAD, _FASTEST_M_S = 8, np.radians(25), 1.0
 #: A claim that so few points agree with is looked for anew, and is withdrawn after so many looks in vain.
 _BARE, _PATIENCE = 4, 5
 
@@ -87,7 +88,7 @@ class Remembered(TwoMaps):
         self.other, self.policy.frozen = None, True
         self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
         self._since = 0  # frames since landmarks were looked for on it
-        self._finds: list[np.ndarray | None] = []  # T_cam_obj of the newest looks, until two agree
+        self._finds: list[tuple[float, np.ndarray | None]] = []  # the newest looks, until two agree: time_s, T_cam_obj
         self._claimed, self._borne_out = False, 0  # whether it is said to be there; frames whose points agreed
         self._bare, self._in_vain = True, 0  # whether few points agree; looks in a row that did not find it
 
@@ -99,7 +100,7 @@ class Remembered(TwoMaps):
     @property
     def awaits(self) -> bool:
         """Whether it has been found once, and is to be looked for again right away."""
-        return any(T is not None for T in self._finds)
+        return any(T is not None for _, T in self._finds)
 
     @property
     def _sure(self) -> bool:
@@ -135,20 +136,21 @@ class Remembered(TwoMaps):
         """
         found = self._look(frame, mask, taken, rivals)
         T = None if found is None else found.sighting.T_cam_obj
-        before = [self.life.T_cam_obj] if self.life.has_pose else self._finds
-        again = found is not None and (mask is not None or any(self._alike(T, other) for other in before))
-        self._finds = [] if again or self.life.has_pose else [*self._finds, T][-_LOOKS:]
+        before = [(self.life.seen_s, self.life.T_cam_obj)] if self.life.has_pose else self._finds
+        alike = (self._alike(T, other, frame.time_s - time_s) for time_s, other in before)
+        again = found is not None and (mask is not None or any(alike))
+        self._finds = [] if again or self.life.has_pose else [*self._finds, (frame.time_s, T)][-_LOOKS:]
         self._in_vain = 0 if again else self._in_vain + 1
         self._claimed |= again
         return found if again else None
 
-    def _alike(self, T_cam_obj: np.ndarray, other: np.ndarray | None) -> bool:
-        """Whether two poses (4, 4) from images soon after each other may be of one object."""
+    def _alike(self, T_cam_obj: np.ndarray, other: np.ndarray | None, after_s: float) -> bool:
+        """Whether two poses (4, 4), one so long after the other, may be of one object."""
         if other is None or se3.angle_rad(se3.inverse(other) @ T_cam_obj) > _ALIKE_RAD:
             return False
         p_obj = self.policy.shape.sample(self.model).p_obj
         moved_m = se3.transform(T_cam_obj, p_obj).mean(0) - se3.transform(other, p_obj).mean(0)
-        return bool(np.linalg.norm(moved_m) < np.ptp(p_obj, 0).max() / 2)
+        return bool(np.linalg.norm(moved_m) < np.ptp(p_obj, 0).max() / 2 + _FASTEST_M_S * after_s)
 
     def _look(
         self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None, rivals: Sequence[Remembered]
