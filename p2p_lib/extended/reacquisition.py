@@ -77,8 +77,7 @@ class Reacquisition(Frontend):
         name = turn[self._turn % len(turn)]
         others = [mask for other, mask in self.masks.items() if other != name and mask is not None]
         with self.stopwatch("search"):
-            rivals = [self.objects[other] for other in sought if other != name]
-            found = self.objects[name].find(asked.frame, asked.masks[name], either(others) if others else None, rivals)
+            found = self.objects[name].find(asked.frame, asked.masks[name], either(others) if others else None)
         if self.objects[name].forsaken:
             self.apply({name: self.objects[name].withdraw()})
             if name in self.segmenter.names:

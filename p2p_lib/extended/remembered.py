@@ -10,7 +10,7 @@ frame of its old map. Landmarks of sides that come into view later become keypoi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -85,7 +85,7 @@ class Remembered(TwoMaps):
         own, memory = self.own, self._memory
         own.known = Known(own.new_model(), replace(self.policy.life, seen_m2=float(memory.seen_m2)))
         own.model.recall(memory)
-        self.other, self.policy.frozen = None, True
+        self.other, self.policy.frozen, self.policy.trusted = None, True, None
         self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
         self._since = 0  # frames since landmarks were looked for on it
         self._finds: list[tuple[float, np.ndarray | None]] = []  # the newest looks, until two agree: time_s, T_cam_obj
@@ -121,20 +121,12 @@ class Remembered(TwoMaps):
         """The memory, of the map that began with it."""
         return self._memory if map_id == 0 else None
 
-    def find(
-        self,
-        frame: Frame,
-        mask: np.ndarray | None,
-        taken: np.ndarray | None,
-        rivals: Sequence[Remembered] = (),
-    ) -> Found | None:
+    def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool.
 
         It is found where one of the last looks found it, too, or where its pose has it; at once in a mask.
-
-        rivals  others that are looked for: what is more like one of them is not this one
         """
-        found = self._look(frame, mask, taken, rivals)
+        found = self._look(frame, mask, taken)
         T = None if found is None else found.sighting.T_cam_obj
         before = [(self.life.seen_s, self.life.T_cam_obj)] if self.life.has_pose else self._finds
         alike = (self._alike(T, other, frame.time_s - time_s) for time_s, other in before)
@@ -152,15 +144,11 @@ class Remembered(TwoMaps):
         moved_m = se3.transform(T_cam_obj, p_obj).mean(0) - se3.transform(other, p_obj).mean(0)
         return bool(np.linalg.norm(moved_m) < np.ptp(p_obj, 0).max() / 2 + _FASTEST_M_S * after_s)
 
-    def _look(
-        self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None, rivals: Sequence[Remembered]
-    ) -> Found | None:
+    def _look(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
         """Where it may be in one frame."""
         memory, best = self._memory, None
         search = ImageSearch(frame, self.observer.camera, self.config.depth)
         for sighting, recognised in self._sightings(frame, search, mask, taken):
-            if recognised and any(rival.beats(frame, search, self._middle(sighting), sighting) for rival in rivals):
-                continue
             where = mask if mask is not None else self._on_surface(frame, sighting.T_cam_obj, sighting.uv_px)
             if taken is not None and mask is None:
                 if (where & taken).sum() > 0.5 * where.sum():
@@ -211,17 +199,6 @@ class Remembered(TwoMaps):
             away_m = np.linalg.norm(pairs.p_cam - agreeing.p_cam.mean(0), axis=1)
             pairs = pairs.select(away_m > np.ptp(sample.p_obj, 0).max())
         return [sighting for sighting in found if sighting is not None and sighting.share >= _RECOGNISED]
-
-    def _middle(self, sighting: Sighting) -> np.ndarray:
-        """(3,) where the middle of the surface is."""
-        return se3.transform(sighting.T_cam_obj, self.policy.shape.sample(self.model).p_obj).mean(0)
-
-    def beats(self, frame: Frame, search: ImageSearch, middle: np.ndarray, other: Sighting) -> bool:
-        """Whether more of this object's surface shows about a place (3,) than of another object's."""
-        found = self._recognised(search, self._recogniser.pairs(frame, self._memory.descriptors))
-        reach_m = np.ptp(self.policy.shape.sample(self.model).p_obj, 0).max() / 2
-        here = [one for one in found if np.linalg.norm(self._middle(one) - middle) < reach_m]
-        return any(one.share > other.share for one in here)
 
     def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
         """(H, W) bool: what lies on the surface under a pose, as far as it holds together with pixels (M, 2) on it."""
