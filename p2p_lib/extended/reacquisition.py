@@ -73,11 +73,15 @@ class Reacquisition(Frontend):
         if not sought:
             return asked
         self._turn += 1
-        name = sought[self._turn % len(sought)]
+        turn = [name for name in sought if self.objects[name].awaits] or sought
+        name = turn[self._turn % len(turn)]
         others = [mask for other, mask in self.masks.items() if other != name and mask is not None]
         with self.stopwatch("search"):
-            rivals = [self.objects[other] for other in sought if other != name]
-            found = self.objects[name].find(asked.frame, asked.masks[name], either(others) if others else None, rivals)
+            found = self.objects[name].find(asked.frame, asked.masks[name], either(others) if others else None)
+        if self.objects[name].forsaken:
+            self.apply({name: self.objects[name].withdraw()})
+            if name in self.segmenter.names:
+                self.segmenter.remove(name)
         if found is None:
             return asked
         self.tracks = follow(self.objects[name], found, self.tracker, self.tracks)

@@ -1,14 +1,16 @@
 """An object that is known from a memory: one that was lost before the video began (not in the paper).
 
 Until it is found it is looked for in the whole image by its landmarks; where enough of them agree on a pose, and the
-surface shows there, the segmenter starts from what lies on the surface and the 2D tracker follows the landmarks. From
-there on it is an object like any other, in the frame of its old map. Landmarks of sides that come into view later
-become keypoints as they show.
+surface shows there, it may be there. It is claimed to be once it has been found again, by another image alone, at the
+same place: what only resembles it in one image is not found twice. Then the segmenter starts from what lies on the
+surface and the 2D tracker follows the landmarks; a claim whose points are lost is renewed by its landmarks, or
+withdrawn, and nothing is learnt before points have borne it out. From there on it is an object like any other, in the
+frame of its old map. Landmarks of sides that come into view later become keypoints as they show.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -22,9 +24,10 @@ from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.agreement import outline_share
 from p2p_lib.extended.image_search import ImageSearch, Sighting, laid_at
+from p2p_lib.extended.lifecycle import CONFIRM_FRAMES
 from p2p_lib.extended.sight import Sight
 from p2p_lib.extended.two_maps import TwoMaps
-from p2p_lib.method.object_model import Requests
+from p2p_lib.method.object_model import Known, Requests
 from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
 from p2p_lib.method.policy import Verdict
 from p2p_lib.method.refinement import surface_distance
@@ -43,18 +46,23 @@ _TURNS = 12
 _ON_SURFACE_M = 0.012
 #: Landmarks are looked for on a followed object every so many frames while fewer than so many are seen on it.
 _EVERY, _ENOUGH = 5, 60
+#: It is found again, in so many looks, where it is turned by less, rad, and lies within half its length and what it may
+#: have moved in the camera frame meanwhile, m/s.
+_LOOKS, _ALIKE_RAD, _FASTEST_M_S = 8, np.radians(25), 1.0
+#: A claim that so few points agree with is looked for anew, and is withdrawn after so many looks in vain.
+_BARE, _PATIENCE = 4, 5
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
     """Where a remembered object is in an image: its ``mask`` (H, W) bool, what shows of it, and landmarks there.
 
-    keys  (M,) of the landmarks in the map, seen at uv_px (M, 2)
+    rows  (M,) of the landmarks in the memory, seen at uv_px (M, 2)
     """
 
     mask: np.ndarray
     sighting: Sighting
-    keys: np.ndarray
+    rows: np.ndarray
     uv_px: np.ndarray
 
 
@@ -67,40 +75,80 @@ class Remembered(TwoMaps):
     def __init__(self, own: ObjectTracker, memory: ObjectMemory, recogniser: Any, frozen: bool = False):
         super().__init__(own)
         self._rng = np.random.default_rng(0)
-        self.policy.frozen = frozen
-        own.model.recall(memory)
-        self.life = replace(self.life, seen_m2=float(memory.seen_m2))
         self._memory, self._frozen = memory, frozen
         self._recogniser = recogniser
-        self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
         self._fewest = max(_FEWEST, _OF_A_VIEW * len(memory.p_obj) / min(len(memory.T_cam_obj), _VIEWS))
+        self._begin()
+
+    def _begin(self) -> None:
+        """What is known is the memory alone."""
+        own, memory = self.own, self._memory
+        own.known = Known(own.new_model(), replace(self.policy.life, seen_m2=float(memory.seen_m2)))
+        own.model.recall(memory)
+        self.other, self.policy.frozen, self.policy.trusted = None, True, None
+        self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
         self._since = 0  # frames since landmarks were looked for on it
+        self._finds: list[tuple[float, np.ndarray | None]] = []  # the newest looks, until two agree: time_s, T_cam_obj
+        self._claimed, self._borne_out = False, 0  # whether it is said to be there; frames whose points agreed
+        self._bare, self._in_vain = True, 0  # whether few points agree; looks in a row that did not find it
 
     @property
     def recalls(self) -> bool:
         """Whether it is to be looked for by its landmarks."""
-        return not self.life.has_pose
+        return not self.life.has_pose or (self._bare and not self._sure)
+
+    @property
+    def awaits(self) -> bool:
+        """Whether it has been found once, and is to be looked for again right away."""
+        return any(T is not None for _, T in self._finds)
+
+    @property
+    def _sure(self) -> bool:
+        return self._borne_out >= CONFIRM_FRAMES
+
+    @property
+    def forsaken(self) -> bool:
+        """Whether it was claimed to be there, and neither points nor landmarks bear that out."""
+        return self._claimed and not self._sure and self._in_vain >= _PATIENCE
+
+    def withdraw(self) -> Requests:
+        """Take the claim back, with what has come of it."""
+        ids = self.ids
+        self._begin()
+        return Requests(drop=ids[ids >= 0])
 
     def began_with(self, map_id: int) -> ObjectMemory | None:
         """The memory, of the map that began with it."""
         return self._memory if map_id == 0 else None
 
-    def find(
-        self,
-        frame: Frame,
-        mask: np.ndarray | None,
-        taken: np.ndarray | None,
-        rivals: Sequence[Remembered] = (),
-    ) -> Found | None:
+    def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool.
 
-        rivals  others that are looked for: what is more like one of them is not this one
+        It is found where one of the last looks found it, too, or where its pose has it; at once in a mask.
         """
+        found = self._look(frame, mask, taken)
+        T = None if found is None else found.sighting.T_cam_obj
+        before = [(self.life.seen_s, self.life.T_cam_obj)] if self.life.has_pose else self._finds
+        alike = (self._alike(T, other, frame.time_s - time_s) for time_s, other in before)
+        again = found is not None and (mask is not None or any(alike))
+        self._finds = [] if again or self.life.has_pose else [*self._finds, (frame.time_s, T)][-_LOOKS:]
+        self._in_vain = 0 if again else self._in_vain + 1
+        self._claimed |= again
+        return found if again else None
+
+    def _alike(self, T_cam_obj: np.ndarray, other: np.ndarray | None, after_s: float) -> bool:
+        """Whether two poses (4, 4), one so long after the other, may be of one object."""
+        if other is None or se3.angle_rad(se3.inverse(other) @ T_cam_obj) > _ALIKE_RAD:
+            return False
+        p_obj = self.policy.shape.sample(self.model).p_obj
+        moved_m = se3.transform(T_cam_obj, p_obj).mean(0) - se3.transform(other, p_obj).mean(0)
+        return bool(np.linalg.norm(moved_m) < np.ptp(p_obj, 0).max() / 2 + _FASTEST_M_S * after_s)
+
+    def _look(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
+        """Where it may be in one frame."""
         memory, best = self._memory, None
         search = ImageSearch(frame, self.observer.camera, self.config.depth)
         for sighting, recognised in self._sightings(frame, search, mask, taken):
-            if recognised and any(rival.beats(frame, search, self._middle(sighting), sighting) for rival in rivals):
-                continue
             where = mask if mask is not None else self._on_surface(frame, sighting.T_cam_obj, sighting.uv_px)
             if taken is not None and mask is None:
                 if (where & taken).sum() > 0.5 * where.sum():
@@ -119,7 +167,7 @@ class Remembered(TwoMaps):
         if best is None:
             return None
         _, where, sighting, seen = best
-        return Found(where, sighting, self._taken_in(seen.rows), seen.uv_px)
+        return Found(where, sighting, seen.rows, seen.uv_px)
 
     def _sightings(
         self, frame: Frame, search: ImageSearch, mask: np.ndarray | None, taken: np.ndarray | None
@@ -152,17 +200,6 @@ class Remembered(TwoMaps):
             pairs = pairs.select(away_m > np.ptp(sample.p_obj, 0).max())
         return [sighting for sighting in found if sighting is not None and sighting.share >= _RECOGNISED]
 
-    def _middle(self, sighting: Sighting) -> np.ndarray:
-        """(3,) where the middle of the surface is."""
-        return se3.transform(sighting.T_cam_obj, self.policy.shape.sample(self.model).p_obj).mean(0)
-
-    def beats(self, frame: Frame, search: ImageSearch, middle: np.ndarray, other: Sighting) -> bool:
-        """Whether more of this object's surface shows about a place (3,) than of another object's."""
-        found = self._recognised(search, self._recogniser.pairs(frame, self._memory.descriptors))
-        reach_m = np.ptp(self.policy.shape.sample(self.model).p_obj, 0).max() / 2
-        here = [one for one in found if np.linalg.norm(self._middle(one) - middle) < reach_m]
-        return any(one.share > other.share for one in here)
-
     def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
         """(H, W) bool: what lies on the surface under a pose, as far as it holds together with pixels (M, 2) on it."""
         distance_m = surface_distance(self.model.surface, frame.depth_m, self.observer.camera, T_cam_obj)
@@ -173,7 +210,7 @@ class Remembered(TwoMaps):
         held = np.unique(label[v, u])
         return np.isin(label, held[held > 0])
 
-    def _taken_in(self, rows: np.ndarray) -> np.ndarray:
+    def taken_in(self, rows: np.ndarray) -> np.ndarray:
         """Landmarks (M,) as keypoints of the map, anew where they were lost: their keys."""
         memory = self._memory
         keys = self.model.remember(memory.p_obj[rows].astype(float), memory.confidence[rows])
@@ -184,10 +221,15 @@ class Remembered(TwoMaps):
 
     def step(self, obs: Sight) -> ObjectStep:
         """The object's pose at a frame; once it is followed, landmarks that have come into view are added."""
-        if self.life.T_cam_obj is None and obs.mask is None:
+        given = obs.mask is not None and obs.given
+        if not given and not (self._claimed and (obs.mask is not None or self.life.T_cam_obj is not None)):
             return self.own.absent(obs, Verdict(False, Status.INITIALISING, "remembered, and not found yet"))
         followed = int(np.isin(self.map.keys, self._key)[obs.seen].sum())
         step = super().step(obs)
+        if step.estimate.T_cam_obj is not None:
+            self._claimed, self._bare = True, step.estimate.inliers < _BARE
+            self._borne_out += step.estimate.inliers >= self.config.lifecycle.return_inliers
+            self.policy.frozen = self._frozen or not self._sure
         self._since += 1
         due = self._since >= _EVERY and step.estimate.T_cam_obj is not None and self.known.map_id == 0
         if not due or followed >= _ENOUGH or step.estimate.status is Status.DEGRADED or obs.mask is None:
@@ -202,7 +244,7 @@ class Remembered(TwoMaps):
         seen = self._recogniser.at(obs.frame, obs.mask, T_cam_obj, p_obj, descriptors)
         if not len(seen):
             return requests
-        keys = self._taken_in(absent[seen.rows])
+        keys = self.taken_in(absent[seen.rows])
         add_px, keys = np.concatenate([requests.add_px, seen.uv_px]), np.concatenate([requests.keys, keys])
         return replace(requests, add_px=add_px, keys=keys)
 
@@ -212,7 +254,7 @@ class Remembered(TwoMaps):
 
     def _turned_over(self, obs: Sight) -> bool:
         """No second map where the map does not grow, or before the object was ever found."""
-        return not self._frozen and self.life.T_cam_obj is not None and super()._turned_over(obs)
+        return not self.policy.frozen and self.life.T_cam_obj is not None and super()._turned_over(obs)
 
 
 def _certain(landmarks: float, share: float, outline: Callable[[], float | None]) -> bool:
@@ -225,7 +267,7 @@ def _certain(landmarks: float, share: float, outline: Callable[[], float | None]
 
 def follow(obj: Remembered, found: Found, tracker: PointTracker, tracks: Tracks) -> Tracks:
     """Have the tracker follow what was found; everybody's tracks in this frame, with these."""
-    ids = tracker.add(found.uv_px)
-    obj.map.assign(found.keys, ids)
+    keys, ids = obj.taken_in(found.rows), tracker.add(found.uv_px)
+    obj.map.assign(keys, ids)
     count = len(ids)
     return joined([tracks, Tracks(ids, found.uv_px, np.ones(count, bool), np.zeros(count))])

@@ -27,9 +27,9 @@ def test_each_object_is_kept_and_all_are_found_without_masks(learnt, tmp_path):
     assert main([*again, "--out", str(tmp_path / "again")]) == 0
     run, before = load_run(tmp_path / "again"), load_run(learnt)
     for name, obj in run.objects.items():
-        assert obj.has_pose[1:].all() and not obj.keyframe.any()  # one is looked for in a frame
+        assert obj.has_pose[3:].all() and not obj.keyframe.any()  # one is looked for in a frame, and twice
         T_obj_model = np.linalg.inv(before.objects[name].T_cam_obj[0]) @ before.objects[name].T_cam_model[0]
-        off_m = (obj.T_cam_obj[1:] @ T_obj_model - obj.T_cam_model[1:])[:, :3, 3]
+        off_m = (obj.T_cam_obj[3:] @ T_obj_model - obj.T_cam_model[3:])[:, :3, 3]
         assert np.linalg.norm(off_m, axis=1).max() < 0.01
 
 
