@@ -129,7 +129,7 @@ class Point2Pose(pipeline.Point2Pose):
     def add_object(
         self, name: str, *said: Any, memory: ObjectMemory | None = None, frozen: bool = False, **more: Any
     ) -> None:
-        """As in :meth:`p2p_lib.core.objects.Objects.add_object`, or an object that is known from a memory.
+        """As in :class:`p2p_lib.core.objects.Objects`, or an object that is known from a memory.
 
         memory  as :func:`p2p_lib.core.memory.load_memory` reads it: the object is looked for in every frame until it is
                 found, and its pose is in the frame of the map that it was learnt in. Nothing else is said of it

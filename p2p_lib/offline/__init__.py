@@ -1,7 +1,7 @@
 """What is made of a finished run, ours: poses that know the whole video, labelled datasets, models to take away.
 
-``finished.py`` opens a run with its images, masks and surfaces, and says which poses are trusted; look there first.
-``adjustment.py`` and ``refine.py`` are ``p2p refine``; ``dataset.py``, ``model.py`` and ``texture.py`` are
+:mod:`p2p_lib.offline.finished` opens a run with its images, masks and surfaces, and says which poses are trusted; look
+there first. ``adjustment.py``, ``loops.py`` and :mod:`p2p_lib.offline.refine` are ``p2p refine``; ``dataset.py``, ``model.py`` and ``texture.py`` are
 ``p2p export``.
 """
 

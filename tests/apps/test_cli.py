@@ -585,7 +585,7 @@ def test_a_damaged_run_is_named(case, done, tmp_path, capsys):
     [
         ([], "COMMAND"),
         (["fly"], "'fly'"),
-        (["run"], "SEQ"),
+        (["run", "--out", "y"], "SEQ"),
         (["run", "x"], "--out"),
         (["run", "x", "--out", "y", "--seed", "one"], "'one'"),
         (["run", "x", "--out", "y", "--start", "1.5"], "'1.5'"),
