@@ -29,14 +29,14 @@ from p2p_lib.core.mesh import save
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, Frame, Status
 from p2p_lib.datasets.keypoint_log import load_keypoints
-from p2p_lib.datasets.runs import COLUMNS, NO_COVARIANCE, NO_POSE, ObjectRun, tum_line
+from p2p_lib.datasets.runs import COLUMNS, NO_COVARIANCE, NO_POSE, OFFLINE, ObjectRun, tum_line
 from p2p_lib.method.refinement import Keypoints, refine
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.offline import loops
 from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished, Renderer
 
-FOLDER, _PARTS = "offline", ".offline.partial"
+FOLDER, _PARTS = OFFLINE, ".offline.partial"
 #: Keyframes that are compared with each other; poses adjusted together; views fused while refining and at the end.
 KEYFRAMES, TOGETHER, FUSED, FUSED_LAST = 60, 200, 80, 150
 #: A tie stronger than this counts (see :class:`~p2p_lib.offline.loops.Tie`).
