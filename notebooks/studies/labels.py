@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from p2p_lib.offline.model import NAME, Shape, Textured, rendered
 
 def read_model(folder: Path) -> Textured:
     """A model as ``p2p export --format model`` wrote it, read back by trimesh."""
-    mesh = trimesh.load(folder / f"{NAME}.glb", force="mesh")
+    mesh: Any = trimesh.load(folder / f"{NAME}.glb", force="mesh")
     image = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     shape = Shape(vertices, faces, np.zeros_like(vertices), np.zeros(len(faces), bool))
