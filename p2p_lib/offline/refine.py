@@ -218,7 +218,7 @@ class _Refinement:
 
     def adjusted(self, T: np.ndarray, seen: Sightings) -> tuple[np.ndarray, np.ndarray, Sightings]:
         """Poses, points (N, 3) and what is seen of them."""
-        posed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
+        found, posed = seen, np.flatnonzero(np.isfinite(T[:, 0, 0]))
         others = np.setdiff1d(posed, self.evidence.key)
         some = (
             others[
@@ -239,7 +239,7 @@ class _Refinement:
             together = together[np.isin(together, seen.pose)]
         if len(together) < 2:
             return T, np.zeros((0, 3)), seen.select(np.zeros(len(seen.pose), bool))
-        _, point = np.unique(seen.point, return_inverse=True)
+        known, point = np.unique(seen.point, return_inverse=True)
         seen = replace(seen, point=point)
         mine = np.isin(seen.pose, together)
         first = replace(seen.select(mine), pose=np.searchsorted(together, seen.pose[mine]))
@@ -251,7 +251,9 @@ class _Refinement:
         )
         T[rest] = locate(T[rest], best.p_obj, alone).T_cam_obj
         T[together] = best.T_cam_obj
-        return T, best.p_obj, seen
+        # Frames without a pose see these points too: they tell what their neighbours' poses are worth there.
+        found = found.select(np.isin(found.point, known))
+        return T, best.p_obj, replace(found, point=np.searchsorted(known, found.point))
 
     # -- on the surface --------------------------------------------------------------------------
 
@@ -293,7 +295,8 @@ class _Refinement:
         distance_m, valid = volume.query(se3.transform(T_obj_cam, cloud))
         off = np.where(valid, np.minimum(np.abs(distance_m), _FAR_M), _FAR_M) / _FAR_M
         apart = np.linalg.norm(se3.transform(T_obj_cam, p_cam) - p_obj, axis=1) / (5 * sigma_m)
-        return float(off.mean() if len(off) else 1.0) + (float(np.minimum(apart, 1).mean()) if len(apart) else 0.5)
+        parts = [float(part.mean()) for part in (off, np.minimum(apart, 1)) if len(part)]
+        return 2 * sum(parts) / len(parts) if parts else 2.0
 
     def result(self) -> tuple[Refined, TsdfVolume]:
         """Everything in turn."""
