@@ -154,7 +154,7 @@ def test_poses_that_fill_the_masks_better_stay(made, tracked, monkeypatch):
     causal, refined = (load_run(folder).objects["can"] for folder in (tracked, tracked / "offline"))
     np.testing.assert_array_equal(refined.T_cam_obj[causal.has_pose], causal.T_cam_obj[causal.has_pose])
     _, mm = errors(made, tracked / "offline", "box")
-    assert np.nanmedian(mm) < 0.1 and mm[6] > 1  # its causal pose is 2 cm beside
+    assert np.nanmedian(mm) < 0.1 and mm[6] < 18  # of 20 that the causal pose is off in that frame alone
 
 
 def test_an_interrupted_pass_goes_on(tracked, monkeypatch):
