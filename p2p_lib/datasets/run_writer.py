@@ -22,7 +22,7 @@ from p2p_lib.datasets.keypoint_log import FILE as KEYPOINTS
 from p2p_lib.datasets.mask_log import FILE as MASK_LOG
 from p2p_lib.datasets.models import load_points
 from p2p_lib.datasets.provenance import provenance
-from p2p_lib.datasets.runs import COLUMNS, NO_POSE, ObjectRun, Run, load_run, read_info, tum_line
+from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, Run, load_run, read_info, tum_line
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
 
 IfExists = Literal["refuse", "replace", "resume"]
@@ -327,6 +327,13 @@ def _clear(out: Path, info: Mapping[str, Any]) -> None:
         for path in out.glob(pattern):
             if not path.parent.is_symlink():
                 path.unlink()
+    refined = out / OFFLINE  # of poses that are gone: it would pass for one of the new run
+    if (refined / "run.json").is_file() and not refined.is_symlink() and (of := read_info(refined)).get("offline"):
+        _clear(refined, of)
+        (refined / "run.json").unlink()
+        for folder in (refined / "poses", refined / "meshes", refined):
+            with suppress(OSError):  # something else is in it
+                folder.rmdir()
 
 
 def _save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

@@ -40,6 +40,8 @@ from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import Sequence
 
 NO_MASKS = -1  # visible_px of sequences that come without masks
+#: Where in a run's folder ``p2p refine`` puts what it makes of it.
+OFFLINE = "offline"
 NO_POSE = np.full((4, 4), np.nan)
 NO_COVARIANCE = np.full((6, 6), np.nan)
 

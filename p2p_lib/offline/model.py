@@ -32,8 +32,8 @@ _MIN_COMPONENT = 0.05
 _SEEN_THROUGH_M, _SEEN_THROUGH_VIEWS = 0.012, 2
 #: Faces of a collision mesh, at most.
 _HULL_FACES = 256
-#: The edge of a texture, px, and the room around its charts.
-TEXTURE_PX, _GUTTER_PX = 2048, 2
+#: The edge of a texture, px, at least and at most, and the room around its charts.
+TEXTURE_PX, _GUTTER_PX = (512, 2048), 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,8 +237,9 @@ def collision(shape: Shape) -> Any:
 # --- texture -------------------------------------------------------------------------------------
 
 
-def with_texture(shape: Shape, views: list[texture.View], camera: Any, size: int = TEXTURE_PX) -> Textured:
+def with_texture(shape: Shape, views: list[texture.View], camera: Any) -> Textured:
     """A shape with an atlas, and what views show of it."""
+    size = texture_px(shape, views, camera)
     open3d = load_open3d()
     mesh = open3d.t.geometry.TriangleMesh(
         open3d.core.Tensor(shape.vertices.astype(np.float32)), open3d.core.Tensor(shape.faces.astype(np.int64))
@@ -255,10 +256,23 @@ def with_texture(shape: Shape, views: list[texture.View], camera: Any, size: int
     at = here[..., 0] > 0.5
     unit = normal[at] / np.maximum(np.linalg.norm(normal[at], axis=1, keepdims=True), 1e-9)
     few = np.unique(np.linspace(0, len(unit) - 1, 4000).astype(int))
-    even = texture.evened(views, camera, point[at][few].astype(float), unit[few])
+    even = texture.evened(views, camera, point[at][few], unit[few])
     image = np.zeros((size, size, 3), np.uint8)
-    image[at] = texture.baked(even, camera, point[at].astype(float), unit, own[at])
+    image[at] = texture.baked(even, camera, point[at], unit, own[at])
     return Textured(shape, uv, spread(image, at))
+
+
+def texture_px(shape: Shape, views: list[texture.View], camera: Any) -> int:
+    """The edge of a texture whose texels are as fine as the pixels of the nearest views, for nine of ten faces."""
+    nearest_m = np.quantile([view.depth_m.min() for view in views], 0.1) if views else 1.0
+    edge_px = np.quantile(shape.mesh.edges_unique_length, 0.9) * camera.fx / nearest_m
+    wanted = (edge_px + 3.5 * _GUTTER_PX) * _squares(len(shape.faces))
+    return int(np.clip(2 ** np.ceil(np.log2(wanted)), *TEXTURE_PX))
+
+
+def _squares(faces: int) -> int:
+    """Along each edge of a texture, of two faces each."""
+    return int(np.ceil(np.sqrt(np.ceil(faces / 2))))
 
 
 def atlas(faces: int, size: int) -> np.ndarray:
@@ -266,7 +280,7 @@ def atlas(faces: int, size: int) -> np.ndarray:
 
     Open3D's atlas (UVAtlas) has larger charts; on reconstructed surfaces it takes minutes, and some end the process.
     """
-    squares = int(np.ceil(np.sqrt(np.ceil(faces / 2))))
+    squares = _squares(faces)
     low, high = _GUTTER_PX * squares / size, 1 - 2.5 * _GUTTER_PX * squares / size
     half = np.array([[low, low], [high, low], [low, high]])
     k = np.arange(faces)

@@ -4,7 +4,8 @@ For each object: keyframes from the whole video, those without a pose included, 
 show the same (``loops.py``); poses follow the strongest ties, then a bundle adjustment of all that was tracked
 (``adjustment.py``). On the surface that these poses fuse each frame is refined, from where it was tracked, where it was
 adjusted, and, from the end backwards and then forwards, from its neighbours; the best stands. A frame that had no pose
-gets one where it fits as well as the others do. The surface is fused anew at half the voxel.
+gets one where it fits as well as the others do. Where the surface fills the masks better at the causal poses, they
+stay. The surface is fused anew at half the voxel.
 
 Written to ``RUN/offline``, a run's folder of its own that says ``"offline": true``: causal results stay as they are.
 """
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config, from_toml
@@ -29,14 +31,15 @@ from p2p_lib.core.mesh import save
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, Frame, Status
 from p2p_lib.datasets.keypoint_log import load_keypoints
-from p2p_lib.datasets.runs import COLUMNS, NO_COVARIANCE, NO_POSE, ObjectRun, tum_line
+from p2p_lib.datasets.runs import COLUMNS, NO_COVARIANCE, NO_POSE, OFFLINE, ObjectRun, tum_line
 from p2p_lib.method.refinement import Keypoints, refine
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.offline import loops
 from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
+from p2p_lib.offline.dataset import agreement, visible
 from p2p_lib.offline.finished import Finished, Renderer
 
-FOLDER, _PARTS = "offline", ".offline.partial"
+FOLDER, _PARTS = OFFLINE, ".offline.partial"
 #: Keyframes that are compared with each other; poses adjusted together; views fused while refining and at the end.
 KEYFRAMES, TOGETHER, FUSED, FUSED_LAST = 60, 200, 80, 150
 #: A tie stronger than this counts (see :class:`~p2p_lib.offline.loops.Tie`).
@@ -50,6 +53,10 @@ _NEAR_M, _FAR_M = 0.02, 0.01
 #: Where no mask tells of the object: so much of its surface may be seen through, and colours may be so many times as
 #: far off as usual, and correlate so many times as well at least. This many frames tell what is usual.
 _BEHIND, _OTHER_COLOURS, _LESS_ALIKE, _CALIBRATED = 0.15, 1.4, 0.6, 12
+#: Old and new poses are judged in every so many-th frame, by the mean over so many of them.
+_JUDGED_EVERY, _JUDGED = 3, 7
+#: A causal pose that costs so many times what a good one may was wrong in that frame alone, and does not stay.
+_GROSS = 2.0
 #: Of a squared Mahalanobis distance with six degrees of freedom: three standard deviations (99.73 %).
 _CHI2_6 = 20.06
 
@@ -211,7 +218,7 @@ class _Refinement:
 
     def adjusted(self, T: np.ndarray, seen: Sightings) -> tuple[np.ndarray, np.ndarray, Sightings]:
         """Poses, points (N, 3) and what is seen of them."""
-        posed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
+        found, posed = seen, np.flatnonzero(np.isfinite(T[:, 0, 0]))
         others = np.setdiff1d(posed, self.evidence.key)
         some = (
             others[
@@ -232,7 +239,7 @@ class _Refinement:
             together = together[np.isin(together, seen.pose)]
         if len(together) < 2:
             return T, np.zeros((0, 3)), seen.select(np.zeros(len(seen.pose), bool))
-        _, point = np.unique(seen.point, return_inverse=True)
+        known, point = np.unique(seen.point, return_inverse=True)
         seen = replace(seen, point=point)
         mine = np.isin(seen.pose, together)
         first = replace(seen.select(mine), pose=np.searchsorted(together, seen.pose[mine]))
@@ -244,7 +251,9 @@ class _Refinement:
         )
         T[rest] = locate(T[rest], best.p_obj, alone).T_cam_obj
         T[together] = best.T_cam_obj
-        return T, best.p_obj, seen
+        # Frames without a pose see these points too: they tell what their neighbours' poses are worth there.
+        found = found.select(np.isin(found.point, known))
+        return T, best.p_obj, replace(found, point=np.searchsorted(known, found.point))
 
     # -- on the surface --------------------------------------------------------------------------
 
@@ -261,9 +270,8 @@ class _Refinement:
 
     def best_of(self, k: int, candidates: list[np.ndarray], volume: TsdfVolume, points: np.ndarray, seen: Sightings):
         """The pose of the k-th frame that fits surface and points best, its covariance and its cost."""
-        lo, hi = np.searchsorted(seen.pose, [k, k + 1])
-        p_obj, p_cam, cloud = points[seen.point[lo:hi]], seen.p_cam[lo:hi], self.evidence.clouds[k].astype(float)
-        sigma_m = np.hypot(depth_noise_m(p_cam[:, 2], self.config.depth), p_cam[:, 2] / self.camera.fx)
+        p_obj, p_cam, sigma_m = self._points_in(k, points, seen)
+        cloud = self.evidence.clouds[k].astype(float)
         best = NO_POSE, NO_COVARIANCE, np.inf
         for T in candidates:
             near = np.linalg.norm(se3.transform(se3.inverse(T), p_cam) - p_obj, axis=1) < _NEAR_M
@@ -274,13 +282,21 @@ class _Refinement:
                 best = found.T_cam_obj, NO_COVARIANCE if found.covariance is None else found.covariance, cost
         return best
 
+    def _points_in(self, k: int, points: np.ndarray, seen: Sightings):
+        """What is seen in the k-th frame: points of the object (M, 3), where (M, 3), and how well known (M,)."""
+        lo, hi = np.searchsorted(seen.pose, [k, k + 1])
+        p_cam = seen.p_cam[lo:hi]
+        sigma_m = np.hypot(depth_noise_m(p_cam[:, 2], self.config.depth), p_cam[:, 2] / self.camera.fx)
+        return points[seen.point[lo:hi]], p_cam, sigma_m
+
     def _cost(self, T, cloud, volume, p_obj, p_cam, sigma_m) -> float:
         """How far off, 0 to 2: the cloud from the surface, and the points from where they are seen."""
         T_obj_cam = se3.inverse(T)
         distance_m, valid = volume.query(se3.transform(T_obj_cam, cloud))
         off = np.where(valid, np.minimum(np.abs(distance_m), _FAR_M), _FAR_M) / _FAR_M
         apart = np.linalg.norm(se3.transform(T_obj_cam, p_cam) - p_obj, axis=1) / (5 * sigma_m)
-        return float(off.mean() if len(off) else 1.0) + (float(np.minimum(apart, 1).mean()) if len(apart) else 0.5)
+        parts = [float(part.mean()) for part in (off, np.minimum(apart, 1)) if len(part)]
+        return 2 * sum(parts) / len(parts) if parts else 2.0
 
     def result(self) -> tuple[Refined, TsdfVolume]:
         """Everything in turn."""
@@ -316,22 +332,45 @@ class _Refinement:
         T[lost], covariance[lost] = NO_POSE, NO_COVARIANCE
         has, fit = np.isfinite(T[:, 0, 0]), cost <= limit
         confidence = np.where(fit, np.maximum(self.obj.confidence, 1 - 0.5 * cost / limit), self.obj.confidence)
-        T, covariance = self.in_causal_frame(T, covariance)
+        T_new_old = self.causal_frame(T)
+        causal = self.obj.T_cam_obj @ se3.inverse(T_new_old)
+        stays = self.stays(T, causal, sight)
+        for k in np.flatnonzero(stays):
+            cloud = self.evidence.clouds[k].astype(float)
+            stays[k] = self._cost(causal[k], cloud, volume, *self._points_in(k, points, seen)) <= _GROSS * limit
+        A = se3.adjoint(se3.inverse(T_new_old))
+        T, covariance = T @ T_new_old, A @ covariance @ A.T
+        T[stays], covariance[stays] = self.obj.T_cam_obj[stays], self.obj.covariance[stays]
+        confidence = np.where(stays, self.obj.confidence, confidence)
         last = self.fused(T, np.flatnonzero(has & fit & shown), FUSED_LAST, self.config.tsdf.voxel_m / 2)
         self.bar.update(len(T))
         return Refined(T, covariance, np.where(has, np.minimum(confidence, 1), 0.0)), last
 
-    def in_causal_frame(self, T: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses in the object frame that most of the causal ones are in."""
+    def stays(self, T: np.ndarray, causal: np.ndarray, sight: Sight) -> np.ndarray:
+        """(n,) bool: where the surface at the causal pose (n, 4, 4) fills the mask better than at the new one T.
+
+        The new poses fit the surface, which was fused with them; the masks are not of their making. Of one frame a mask
+        says little: the mean over its neighbours decides.
+        """
+        has = np.isfinite(T[:, 0, 0]) & np.isfinite(causal[:, 0, 0])
+        rows = np.flatnonzero(has & (np.array(self.evidence.mask_px) >= _MIN_PX))[::_JUDGED_EVERY]
+        if not len(rows) or not sight:
+            return np.zeros(len(T), bool)
+        better = [sight.overlap(k, causal[k]) - sight.overlap(k, T[k]) for k in rows.tolist()]
+        mean = uniform_filter1d(np.array(better), min(_JUDGED, len(rows)), mode="nearest")
+        nearest = np.abs(np.arange(len(T))[:, None] - rows).argmin(1)
+        return has & (mean[nearest] > 0)
+
+    def causal_frame(self, T: np.ndarray) -> np.ndarray:
+        """T_new_old (4, 4) to the object frame that most of the causal poses are in."""
         both = np.isfinite(T[:, 0, 0]) & self.obj.has_pose & (self.obj.confidence > DOUBTED)
         if not both.any():
-            return T, covariance
+            return np.eye(4)
         each = se3.inverse(T[both]) @ self.obj.T_cam_obj[both]
         T_new_old = each[len(each) // 2]
         for _ in range(20):
             T_new_old = T_new_old @ se3.exp(np.median(se3.log(se3.inverse(T_new_old) @ each), axis=0))
-        A = se3.adjoint(se3.inverse(T_new_old))
-        return T @ T_new_old, A @ covariance @ A.T
+        return T_new_old
 
 
 class Sight:
@@ -346,6 +385,9 @@ class Sight:
         some = sure[np.unique(np.linspace(0, len(sure) - 1, min(len(sure), _CALIBRATED)).astype(int))]
         usual = [seen[2] for k in some if self._render and (seen := self._seen(self._frame(k), T[k]))]
         self._usual = float(np.median(usual)) if usual else 0.0
+
+    def __bool__(self) -> bool:
+        return self._render is not None
 
     def _frame(self, k: int) -> Frame:
         return self._work.made.sequence.frame(int(self._work.made.frames[k]))
@@ -375,6 +417,12 @@ class Sight:
             if best is None or cost < best[2]:
                 best = T, covariance, cost
         return best
+
+    def overlap(self, k: int, T: np.ndarray) -> float:
+        """IoU of what shows of the surface at a pose with the mask of the k-th frame."""
+        frame, silhouette = self._frame(k), self._render(se3.orthonormalised(T))
+        mask = self._work.made.masks(frame.index)[self._work.name]
+        return agreement(silhouette, visible(silhouette, frame.depth_m), frame.depth_m, mask)[0]
 
     def _seen(self, frame: Frame, T: np.ndarray, wide: bool = False) -> tuple[np.ndarray, float, float, float] | None:
         """Points (N, 3) measured on the surface, the share measured behind, how far colours are off and correlate."""

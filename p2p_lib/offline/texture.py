@@ -80,16 +80,22 @@ def chosen_rows(made: Finished, name: str, rows: np.ndarray, render: Renderer, c
     return best
 
 
-def sampled(view: View, camera: Camera, p_obj: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (N, 3) of surface points (N, 3) with normals (N, 3) in a view, and how well it shows each, 0: not."""
-    p_cam = se3.transform(view.T_cam_obj, p_obj)
-    z, towards = p_cam[:, 2], -p_cam / np.linalg.norm(p_cam, axis=1, keepdims=True)
-    cosine = np.einsum("ij,ij->i", normal @ view.T_cam_obj[:3, :3].T, towards)
+def sampled(view: View, camera: Camera, p_obj: np.ndarray, normal: np.ndarray):
+    """Which of surface points (N, 3) with normals (N, 3) show in a view (M,), their colours (M, 3), and how well (M,).
+
+    What faces away is left out first, then what the image does not show: of all points few are looked up.
+    """
+    T = view.T_cam_obj.astype(np.float32)
+    away = p_obj - se3.inverse(view.T_cam_obj)[:3, 3].astype(np.float32)
+    towards = -np.einsum("ij,ij->i", normal, away)
+    rows = np.flatnonzero(towards > _FACING * np.sqrt(np.einsum("ij,ij->i", away, away)))
+    p_cam = p_obj[rows] @ T[:3, :3].T + T[:3, 3]
     uv = np.nan_to_num(camera.project(p_cam), nan=-9.0).astype(np.float32)
-    inside = camera.inside(uv)
-    u, v = np.where(inside, uv.T, 0).round().astype(int)
-    seen = inside & view.shows[v, u] & (z < view.depth_m[v, u] + _BEHIND_M) & (cosine > _FACING)
-    return lookup(view.rgb, uv), np.where(seen, cosine * view.sharpness * camera.fx / np.maximum(z, 1e-3), 0.0)
+    u, v = np.where(inside := camera.inside(uv), uv.T, 0).round().astype(int)
+    seen = inside & view.shows[v, u] & (p_cam[:, 2] < view.depth_m[v, u] + _BEHIND_M)
+    rows, z, uv = rows[seen], p_cam[seen, 2], uv[seen]
+    cosine = towards[rows] / np.linalg.norm(away[rows], axis=1)
+    return rows, lookup(view.rgb, uv), cosine * view.sharpness * camera.fx / np.maximum(z, 1e-3)
 
 
 def lookup(image: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
@@ -100,11 +106,12 @@ def lookup(image: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
 
 def evened(views: list[View], camera: Camera, p_obj: np.ndarray, normal: np.ndarray) -> list[View]:
     """The views with gains that make what several of them show of surface points (N, 3) the same, on average 1."""
-    seen = [sampled(view, camera, p_obj, normal) for view in views]
-    value = np.stack([np.log(np.clip(colour, 8, 250)) for colour, _ in seen])
-    usable = np.stack([weight for _, weight in seen]) > 0
-    usable &= ((value > np.log(12)) & (value < np.log(245))).all(-1)
-    value = np.where(usable[..., None], value, np.nan)
+    value = np.full((len(views), len(p_obj), 3), np.nan)
+    for of, view in zip(value, views):
+        rows, colour, _ = sampled(view, camera, p_obj, normal)
+        usable = ((colour > 12) & (colour < 245)).all(1)
+        of[rows[usable]] = np.log(colour[usable])
+    usable = np.isfinite(value[..., 0])
     gain = np.zeros((len(views), 3))
     shared = usable.sum(0) > 1
     for _ in range(10 if shared.any() else 0):
@@ -118,12 +125,13 @@ def evened(views: list[View], camera: Camera, p_obj: np.ndarray, normal: np.ndar
 
 def baked(views: Iterable[View], camera: Camera, p_obj: np.ndarray, normal: np.ndarray, own: np.ndarray) -> np.ndarray:
     """(N, 3) uint8 of surface points (N, 3): from the views that show each best, else its ``own`` colour (N, 3)."""
-    total, weight = np.zeros((len(p_obj), 3)), np.zeros(len(p_obj))
+    total, weight = np.zeros((len(p_obj), 3), np.float32), np.zeros(len(p_obj), np.float32)
     for view in views:
-        colour, shown = sampled(view, camera, p_obj, normal)
+        rows, colour, shown = sampled(view, camera, p_obj, normal)
         # Weights of a power relative to a usual one, so that nothing overflows.
-        w = (shown / 1e4) ** _SHARP
-        total, weight = total + w[:, None] * colour, weight + w
+        w = (shown / 1e4).astype(np.float32) ** _SHARP
+        total[rows] += w[:, None] * colour
+        weight[rows] += w
     found = weight > 0
     colour = np.where(found[:, None], total / np.where(found, weight, 1)[:, None], own)
     return np.clip(np.rint(colour), 0, 255).astype(np.uint8)

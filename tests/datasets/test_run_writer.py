@@ -108,6 +108,22 @@ def test_only_what_the_earlier_run_wrote_is_replaced(folder, tmp_path):
     assert all((out / name).read_text() == "mine" for name in mine)
 
 
+def test_what_was_refined_from_the_earlier_run_goes_with_it(folder, tmp_path):
+    out = write(tmp_path / "run", folder)
+    for name in ("offline", "mine"):
+        shutil.copytree(out, tmp_path / name)
+    info = json.loads((out / "run.json").read_text())
+    (tmp_path / "offline/run.json").write_text(json.dumps(info | {"offline": True}))
+    (tmp_path / "offline").rename(out / "offline")
+    (out / "offline/notes.md").write_text("mine")
+    write(out, folder, if_exists="replace")
+    assert set(contents(out / "offline")) == {"notes.md"}
+    shutil.rmtree(out / "offline")
+    (tmp_path / "mine").rename(out / "offline")  # not refined from it, whatever its name
+    write(out, folder, if_exists="replace")
+    assert "poses.npz" in contents(out / "offline")
+
+
 def test_a_link_leads_nowhere(folder, tmp_path):
     """In a run that came from somewhere else its folders may be links to one's own files."""
     mine, out = tmp_path / "mine", write(tmp_path / "run", folder)
