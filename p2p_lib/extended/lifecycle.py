@@ -26,7 +26,7 @@ _PAUSE_S, _PAUSE = 0.25, 5
 _CONFIDENT = 0.5
 #: Seen so often in the same place of the scene, an object lies still there. The same place is this near, m: what
 #: cameras that are located by the scene are off by.
-_RESTED, _NEAR_M = 3, 0.05
+_RESTED, _NEAR_M = 3, 0.08
 #: Shape and colour tell a turn from all others by this lead, and leave no doubt by this one.
 TELLING, CLEAR = 0.25, 0.5
 

@@ -188,7 +188,7 @@ def test_what_moves_in_the_scene_does_not_lie_still():
         life = life.placed(still)
         assert life.lay_still == lay
     moved = still.copy()
-    moved[0, 3] += 0.06
+    moved[0, 3] += 0.09
     assert not life.placed(moved).lay_still
 
 
