@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,7 +21,6 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import replace_text
-from p2p_lib.core.mesh import save
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, Frame
 from p2p_lib.datasets import images
@@ -37,18 +37,13 @@ SCENE = "train/000001"
 
 def visible(silhouette: Silhouette, depth_m: np.ndarray) -> np.ndarray:
     """(H, W) bool: the pixels of an image in which a surface shows, by the depth (H, W) measured."""
-    mask = np.zeros(depth_m.shape, bool)
-    image, own = silhouette.inside(depth_m)
-    measured = depth_m[image]
-    mask[image] = silhouette.hit[own] & ((measured == 0) | (silhouette.depth_m[own] - measured <= VISIBLE_M))
-    return mask
+    surface_m = silhouette.depth_in(depth_m)
+    return np.isfinite(surface_m) & ((depth_m == 0) | (surface_m - depth_m <= VISIBLE_M))
 
 
 def outline(silhouette: Silhouette, depth_m: np.ndarray) -> Outline:
     """A surface in an image as if nothing hid it."""
-    mask = np.zeros(depth_m.shape, bool)
-    image, own = silhouette.inside(depth_m)
-    mask[image] = silhouette.hit[own]
+    mask = np.isfinite(silhouette.depth_in(depth_m))
     x, y, w, h = cv2.boundingRect(silhouette.hit.astype(np.uint8))
     box = silhouette.corner[0] + x, silhouette.corner[1] + y, w, h
     return Outline(mask, int(silhouette.hit.sum()), box, int(np.count_nonzero(mask & (depth_m > 0))))
@@ -57,9 +52,8 @@ def outline(silhouette: Silhouette, depth_m: np.ndarray) -> Outline:
 def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, mask: np.ndarray | None):
     """How well a label fits: IoU of what shows with the mask, and how far nine of ten depths are off at most, mm."""
     iou = np.nan if mask is None else np.count_nonzero(shown & mask) / max(np.count_nonzero(shown | mask), 1)
-    image, own = silhouette.inside(depth_m)
-    both = shown[image] & (depth_m[image] > 0)
-    off_m = np.abs(silhouette.depth_m[own] - depth_m[image])[both]
+    both = shown & (depth_m > 0)
+    off_m = np.abs(silhouette.depth_in(depth_m)[both] - depth_m[both])
     return float(iou), float(1000 * np.quantile(off_m, 0.9)) if len(off_m) else np.nan
 
 
@@ -143,21 +137,11 @@ def write_bop(folder: str | Path, out: str | Path, min_confidence: float = DOUBT
         told = {key: getattr(camera, key) for key in ("cx", "cy", "fx", "fy", "width", "height")}
         replace_text(there / "camera.json", json.dumps(told | {"depth_scale": 1.0}, indent=1) + "\n")
         replace_text(there / "labels.csv", _csv(labels.rows))
-        about = _about(made, min_confidence) | {"objects": obj_ids}
+        about = {"rule": RULE.format(min_confidence), "min_confidence": min_confidence, "visible_m": VISIBLE_M}
+        about |= {"run": made.about, "objects": obj_ids}
         about |= {"frames": len(made.frames), "labelled": len(labels.frames)}
         replace_text(there / "labels.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
     return f"{len(labels.rows)} labels in {len(labels.frames)} of {len(made.frames)} images"
-
-
-def _about(made: Finished, min_confidence: float) -> dict[str, object]:
-    keys = ("sequence", "tracker", "preset", "seed", "commit", "offline")
-    of_run = {key: made.run.info[key] for key in keys if made.run.info.get(key) is not None}
-    return {
-        "rule": RULE.format(min_confidence),
-        "min_confidence": min_confidence,
-        "visible_m": VISIBLE_M,
-        "run": of_run,
-    }
 
 
 def _csv(rows: list[tuple]) -> str:
@@ -169,36 +153,31 @@ def _csv(rows: list[tuple]) -> str:
 
 
 def write_foundationpose(
-    folder: str | Path, out: str | Path, min_confidence: float = DOUBTED, meshes: Mapping[str, Path] | None = None
+    folder: str | Path, out: str | Path, meshes: Mapping[str, Path], min_confidence: float = DOUBTED
 ) -> str:
     """Write a folder for each object as FoundationPose's demo reads it; what was written, in words.
 
     ``rgb/`` and ``depth/`` (millimetres) from its first trusted frame on, ``masks/`` of that frame, ``cam_K.txt`` and
-    ``mesh/``: the files of ``meshes`` (object to a folder of them), else its surface with colours as PLY.
+    ``mesh/``: the files of ``meshes`` (object to a folder of them).
     """
     made, told = Finished.of(folder), []
-    trusted = made.trusted(min_confidence)
-    seen = {name: made.frames[of] for name, of in trusted.items() if of.any()}
-    first = {
-        n: next((int(i) for i in at if made.masks(int(i)).get(n, np.zeros(1)).any()), None) for n, at in seen.items()
-    }
-    if not (first := {name: i for name, i in first.items() if i is not None}):
+    first = {}
+    for name, trusted in made.trusted(min_confidence).items():
+        masks = ((int(i), made.masks(int(i)).get(name)) for i in made.frames[trusted])
+        if shown := next(((i, mask) for i, mask in masks if mask is not None and mask.any()), None):
+            first[name] = shown
+    if not first:
         raise BadInput(str(folder), "no trusted frame with a mask", "one of an object", "Run it with --save-masks.")
     with new_folder(out) as there:
-        for name, start in first.items():
+        for name, (start, mask) in first.items():
             at, numbers = there / name, [int(i) for i in made.frames if i >= start]
             for i in numbers:
                 frame = made.sequence.frame(i)
                 images.save_png(at / "rgb" / f"{i:06d}.png", frame.rgb)
                 depth_mm = np.clip(np.rint(frame.depth_m.astype(float) * 1000), 0, 65535).astype(np.uint16)
                 images.save_png(at / "depth" / f"{i:06d}.png", depth_mm)
-            images.save_png(at / "masks" / f"{start:06d}.png", made.masks(start)[name])
+            images.save_png(at / "masks" / f"{start:06d}.png", mask)
             np.savetxt(at / "cam_K.txt", made.sequence.camera.K, fmt="%.9g")
-            if meshes and name in meshes:
-                (at / "mesh").mkdir()
-                for file in sorted(meshes[name].iterdir()):
-                    (at / "mesh" / file.name).write_bytes(file.read_bytes())
-            else:
-                save(made.surface(name), at / "mesh" / f"{name}.ply")
+            shutil.copytree(meshes[name], at / "mesh")
             told.append(f"{name}: {len(numbers)} images from frame {start} on")
     return "; ".join(told)

@@ -60,6 +60,12 @@ class Finished:
         return tuple(name for name, obj in self.run.objects.items() if obj.has_pose.any())
 
     @property
+    def about(self) -> dict[str, Any]:
+        """By what the run was made, for what is made of it."""
+        keys = ("sequence", "tracker", "preset", "seed", "commit", "offline")
+        return {key: self.run.info[key] for key in keys if self.run.info.get(key) is not None}
+
+    @property
     def frames(self) -> np.ndarray:
         """(n,) frame numbers of the sequence that the run is over."""
         return next(iter(self.run.objects.values())).frame_index
@@ -105,18 +111,22 @@ class Finished:
         return {name: of & kept for name, of in sure.items()}
 
 
+def evenly(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of rows (n, ...), spread evenly over them; the first and the last are among them."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), max(most, 0))).astype(int)]
+
+
 @dataclass(frozen=True, eq=False)
 class Silhouette:
     """A surface as a camera sees it: a cut of an image that may reach beyond its borders.
 
     corner   column and row of its first pixel; depth_m (h, w) along the optical axis, infinite where it is not met
-    face     (h, w) which face, -1 where none; normal (h, w, 3) unit, in the object frame
+    face     (h, w) which face, -1 where none
     """
 
     corner: tuple[int, int]
     depth_m: np.ndarray
     face: np.ndarray
-    normal: np.ndarray
 
     @property
     def hit(self) -> np.ndarray:
@@ -131,17 +141,25 @@ class Silhouette:
         own = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
         return (rows, columns), own
 
+    def depth_in(self, image: np.ndarray) -> np.ndarray:
+        """(H, W) float32 metres in an image (H, W, ...), infinite where the surface is not met."""
+        depth_m = np.full(image.shape[:2], np.inf, np.float32)
+        at, own = self.inside(image)
+        depth_m[at] = self.depth_m[own]
+        return depth_m
+
 
 class Renderer:
     """Casts rays of a camera against one surface (V, 3), (F, 3) in its object frame."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, camera: Camera):
-        self._vertices, self._scene, self._camera = np.asarray(vertices, float), ray_scene(vertices, faces), camera
+        self.vertices, self.faces, self.camera = np.asarray(vertices, float), np.asarray(faces), camera
+        self._scene = ray_scene(vertices, faces)
 
     def __call__(self, T_cam_obj: np.ndarray) -> Silhouette:
         """The surface at a pose, up to one image's size beyond each border."""
-        camera = self._camera
-        uv_px = camera.project(se3.transform(T_cam_obj, self._vertices))
+        camera = self.camera
+        uv_px = camera.project(se3.transform(T_cam_obj, self.vertices))
         size = np.array([camera.width, camera.height])
         low, high = np.zeros(2, int), np.zeros(2, int)
         if np.isfinite(uv_px).all():
@@ -151,10 +169,10 @@ class Renderer:
         rays = camera.unproject(np.stack([u, v], -1), np.ones(u.shape)).reshape(-1, 3)
         T_obj_cam = se3.inverse(T_cam_obj)
         if not len(rays):
-            return Silhouette((0, 0), np.zeros(u.shape), np.zeros(u.shape, int), np.zeros((*u.shape, 3)))
+            return Silhouette((0, 0), np.zeros(u.shape), np.zeros(u.shape, int))
         met = cast(self._scene, T_obj_cam[:3, 3], rays @ T_obj_cam[:3, :3].T)
         depth_m, face = met["t_hit"].reshape(u.shape), met["primitive_ids"].reshape(u.shape)
-        return Silhouette((int(low[0]), int(low[1])), depth_m, face, met["primitive_normals"].reshape(*u.shape, 3))
+        return Silhouette((int(low[0]), int(low[1])), depth_m, face)
 
 
 @contextmanager

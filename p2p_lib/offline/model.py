@@ -18,12 +18,13 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import replace_text, replacing
+from p2p_lib.core.image import nearest_px
 from p2p_lib.core.native import load_open3d
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED
 from p2p_lib.datasets.images import save_png
 from p2p_lib.offline import texture
-from p2p_lib.offline.finished import Finished, Renderer, new_folder
+from p2p_lib.offline.finished import Finished, Renderer, evenly, new_folder
 
 NAME = "textured_simple"
 #: Components with less of the largest one's area are left out.
@@ -102,8 +103,7 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     hull = collision(shape)
     with replacing(out / "collision.obj") as file:
         file.write(hull.export(file_type="obj", include_normals=False).encode())
-    few = held_out[np.unique(np.linspace(0, len(held_out) - 1, min(len(held_out), 12)).astype(int))]
-    off = errors(made, name, few, textured, surface)
+    off = errors(made, name, evenly(held_out, 12), textured, render, surface)
     about = _about(made, name, textured, len(views), off) | {"collision_faces": len(hull.faces)}
     replace_text(out / "model.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
     guessed = f", {100 * about['guessed_share']:.0f} % of its area guessed" if shape.guessed.any() else ""
@@ -122,8 +122,7 @@ def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[
     }
     told |= {"guessed_share": float(mesh.area_faces[shape.guessed].sum() / mesh.area), "views": views}
     told |= {"size_m": np.ptp(shape.vertices, axis=0).round(5).tolist(), "colour_error_of_255": off}
-    keys = ("sequence", "tracker", "preset", "seed", "commit", "offline")
-    return told | {"run": {key: made.run.info[key] for key in keys if made.run.info.get(key) is not None}}
+    return told | {"run": made.about}
 
 
 # --- shape ---------------------------------------------------------------------------------------
@@ -132,16 +131,11 @@ def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[
 def cleaned(surface: Any) -> Shape:
     """A surface without its small components, faces of no area and edges of more than two faces; smoothed a little."""
     import trimesh
-
-    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=True)
-    colours = np.asarray(surface.visual.vertex_colors)[:, :3]
     from scipy.spatial import cKDTree
 
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=True)
     mesh.update_faces(mesh.nondegenerate_faces())
-    open3d = load_open3d()
-    legacy = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces)
-    )
+    legacy = _legacy(mesh.vertices, mesh.faces)
     legacy.remove_non_manifold_edges()
     component, _, area = legacy.cluster_connected_triangles()
     component, area = np.asarray(component), np.asarray(area)
@@ -150,16 +144,26 @@ def cleaned(surface: Any) -> Shape:
     # Twice a step out and in: voxels' steps go, and the shape keeps its size.
     legacy = legacy.filter_smooth_taubin(number_of_iterations=5)
     vertices, faces = np.asarray(legacy.vertices), np.asarray(legacy.triangles)
-    nearest = cKDTree(surface.vertices).query(vertices)[1]
-    return Shape(vertices, faces, colours[nearest].astype(float), np.zeros(len(faces), bool))
+    colours = np.asarray(surface.visual.vertex_colors)[cKDTree(surface.vertices).query(vertices)[1], :3]
+    return Shape(vertices, faces, colours.astype(float), np.zeros(len(faces), bool))
+
+
+def _legacy(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """As ``open3d.geometry.TriangleMesh``."""
+    open3d = load_open3d()
+    return open3d.geometry.TriangleMesh(open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(faces))
+
+
+def _tensor(shape: Shape) -> Any:
+    """As ``open3d.t.geometry.TriangleMesh``."""
+    open3d = load_open3d()
+    vertices, faces = shape.vertices.astype(np.float32), shape.faces.astype(np.int64)
+    return open3d.t.geometry.TriangleMesh(open3d.core.Tensor(vertices), open3d.core.Tensor(faces))
 
 
 def closed(shape: Shape, camera: Any, views: list[tuple[np.ndarray, np.ndarray]]) -> Shape:
     """The same with its holes filled where no view (T_cam_obj, depth_m) looked through the patch."""
-    open3d = load_open3d()
-    tensor = open3d.t.geometry.TriangleMesh(
-        open3d.core.Tensor(shape.vertices.astype(np.float32)), open3d.core.Tensor(shape.faces.astype(np.int64))
-    )
+    tensor = _tensor(shape)  # whose memory holds what is filled
     filled = tensor.fill_holes(10.0)
     vertices, faces = filled.vertex.positions.numpy().astype(float), filled.triangle.indices.numpy()
     if len(vertices) != len(shape.vertices) or not np.allclose(vertices, shape.vertices, atol=1e-6):
@@ -190,7 +194,7 @@ def _seen_through(triangles: np.ndarray, camera: Any, views: list[tuple[np.ndarr
         p_cam = se3.transform(T_cam_obj, points)
         uv_px = camera.project(p_cam)
         inside = camera.inside(uv_px)
-        u, v = np.where(inside, uv_px.T, 0).round().astype(int)
+        u, v = nearest_px(uv_px, depth_m.shape)
         behind = inside & (depth_m[v, u] > p_cam[:, 2] + _SEEN_THROUGH_M)
         through += behind.sum() > max(len(points) / 3, 1)
     return through >= _SEEN_THROUGH_VIEWS
@@ -200,15 +204,11 @@ def simplified(shape: Shape, faces: int) -> Shape:
     """The same with at most so many faces, by quadric error; what was guessed stays marked."""
     from scipy.spatial import cKDTree
 
-    open3d = load_open3d()
     # Marching cubes' faces are so regular and so many slivers that the atlas takes minutes: half of them say the same.
     faces = min(faces, max(len(shape.faces) // 2, 100))
     if len(shape.faces) <= faces:
         return shape
-    legacy = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(shape.vertices), open3d.utility.Vector3iVector(shape.faces)
-    )
-    legacy = legacy.simplify_quadric_decimation(faces)
+    legacy = _legacy(shape.vertices, shape.faces).simplify_quadric_decimation(faces)
     legacy.remove_degenerate_triangles()
     legacy.remove_non_manifold_edges()
     legacy.remove_unreferenced_vertices()
@@ -240,23 +240,19 @@ def collision(shape: Shape) -> Any:
 def with_texture(shape: Shape, views: list[texture.View], camera: Any) -> Textured:
     """A shape with an atlas, and what views show of it."""
     size = texture_px(shape, views, camera)
-    open3d = load_open3d()
-    mesh = open3d.t.geometry.TriangleMesh(
-        open3d.core.Tensor(shape.vertices.astype(np.float32)), open3d.core.Tensor(shape.faces.astype(np.int64))
-    )
+    mesh, to = _tensor(shape), load_open3d().core.Tensor
     uv = atlas(len(shape.faces), size)
-    mesh.triangle.texture_uvs = open3d.core.Tensor(uv.astype(np.float32))
+    mesh.triangle.texture_uvs = to(uv.astype(np.float32))
     normals = np.array(shape.mesh.vertex_normals)
-    mesh.vertex.normals = open3d.core.Tensor(normals.astype(np.float32))
-    mesh.vertex.own = open3d.core.Tensor(shape.colours.astype(np.float32))
-    mesh.vertex.here = open3d.core.Tensor(np.ones((len(normals), 1), np.float32))
+    mesh.vertex.normals = to(normals.astype(np.float32))
+    mesh.vertex.own = to(shape.colours.astype(np.float32))
+    mesh.vertex.here = to(np.ones((len(normals), 1), np.float32))
     # What is outside of all charts is 0.
     maps = mesh.bake_vertex_attr_textures(size, {"positions", "normals", "own", "here"}, 0.0, 0.0, False)
     point, normal, own, here = (maps[key].numpy() for key in ("positions", "normals", "own", "here"))
     at = here[..., 0] > 0.5
     unit = normal[at] / np.maximum(np.linalg.norm(normal[at], axis=1, keepdims=True), 1e-9)
-    few = np.unique(np.linspace(0, len(unit) - 1, 4000).astype(int))
-    even = texture.evened(views, camera, point[at][few], unit[few])
+    even = texture.evened(views, camera, evenly(point[at], 4000), evenly(unit, 4000))
     image = np.zeros((size, size, 3), np.uint8)
     image[at] = texture.baked(even, camera, point[at], unit, own[at])
     return Textured(shape, uv, spread(image, at))
@@ -302,7 +298,7 @@ def spread(image: np.ndarray, at: np.ndarray) -> np.ndarray:
 def rendered(textured: Textured, T_cam_obj: np.ndarray, camera: Any) -> tuple[np.ndarray, np.ndarray]:
     """A model as a camera sees it: (H, W, 3) uint8 and where it shows (H, W) bool."""
     shape, size = textured.shape, textured.image.shape[0]
-    weights, at, face = _corners(shape.vertices, shape.faces, T_cam_obj, camera)
+    weights, at, face = _corners(Renderer(shape.vertices, shape.faces, camera), T_cam_obj)
     uv = np.einsum("nk,nkd->nd", weights, textured.uv[face])
     x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
     image = np.zeros((*at.shape, 3), np.uint8)
@@ -310,29 +306,32 @@ def rendered(textured: Textured, T_cam_obj: np.ndarray, camera: Any) -> tuple[np
     return image, at
 
 
-def _corners(vertices: np.ndarray, faces: np.ndarray, T_cam_obj: np.ndarray, camera: Any):
-    """Where a mesh shows (H, W) bool, and at each such pixel barycentric weights (N, 3) in a face (N,)."""
+def _corners(render: Renderer, T_cam_obj: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Barycentric weights (N, 3) at each pixel where a mesh shows, (H, W) bool, and in which face (N,)."""
     import trimesh
 
-    silhouette = Renderer(vertices, faces, camera)(T_cam_obj)
-    depth_m, which = np.full((camera.height, camera.width), np.inf), np.full((camera.height, camera.width), -1)
-    image, own = silhouette.inside(depth_m)
-    depth_m[image], which[image] = silhouette.depth_m[own], silhouette.face[own]
-    at = which >= 0
-    points = se3.transform(se3.inverse(T_cam_obj), (camera.rays[at].T * depth_m[at]).T)
-    return trimesh.triangles.points_to_barycentric(vertices[faces[which[at]]], points), at, which[at]
+    silhouette, rays = render(T_cam_obj), render.camera.rays
+    image, own = silhouette.inside(rays)
+    at = np.isfinite(depth_m := silhouette.depth_in(rays))
+    face = silhouette.face[own][at[image]]
+    points = se3.transform(se3.inverse(T_cam_obj), (rays[at].T * depth_m[at]).T)
+    return trimesh.triangles.points_to_barycentric(render.vertices[render.faces[face]], points), at, face
 
 
-def errors(made: Finished, name: str, rows: np.ndarray, textured: Textured, surface: Any) -> dict[str, float]:
-    """Mean colour error in frames ``rows`` that the texture is not of: the model's, and of vertex colours instead."""
-    camera, colours = made.sequence.camera, np.asarray(surface.visual.vertex_colors)[:, :3].astype(float)
-    render, off = Renderer(surface.vertices, surface.faces, camera), []
+def errors(
+    made: Finished, name: str, rows: np.ndarray, textured: Textured, render: Renderer, surface: Any
+) -> dict[str, float]:
+    """Mean colour error in frames ``rows`` that the texture is not of: the model's, and of vertex colours instead.
+
+    render  of the run's ``surface``
+    """
+    colours, off = np.asarray(surface.visual.vertex_colors)[:, :3].astype(float), []
     for row in rows:
         view = texture.view_of(made, name, int(row), render)
-        mine, mine_at = rendered(textured, view.T_cam_obj, camera)
-        weights, at, face = _corners(surface.vertices, np.asarray(surface.faces), view.T_cam_obj, camera)
+        mine, mine_at = rendered(textured, view.T_cam_obj, render.camera)
+        weights, at, face = _corners(render, view.T_cam_obj)
         theirs = np.zeros_like(mine)
-        theirs[at] = np.einsum("nk,nkd->nd", weights, colours[surface.faces[face]]).round()
+        theirs[at] = np.einsum("nk,nkd->nd", weights, colours[render.faces[face]]).round()
         both = mine_at & at
         off.append((texture.colour_error(view, mine, both), texture.colour_error(view, theirs, both)))
     found = np.nanmean(np.array(off), axis=0) if np.isfinite(off).any() else (np.nan, np.nan)

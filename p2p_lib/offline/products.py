@@ -40,4 +40,4 @@ def write_product(
     with TemporaryDirectory() as folder:
         write_models(run, models := Path(folder) / "models", faces, least, progress)
         meshes = {path.name: path for path in models.iterdir() if path.is_dir()}
-        return f"{write_foundationpose(run, out, least, meshes)}. Written: {out}"
+        return f"{write_foundationpose(run, out, meshes, least)}. Written: {out}"

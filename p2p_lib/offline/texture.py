@@ -14,7 +14,8 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.offline.finished import Finished, Renderer
+from p2p_lib.core.image import nearest_px
+from p2p_lib.offline.finished import Finished, Renderer, evenly
 
 #: Views that a texture is baked from, at most.
 VIEWS = 48
@@ -50,9 +51,7 @@ def view_of(made: Finished, name: str, row: int, render: Renderer) -> View:
     """The object in the ``row``-th frame of a run."""
     i, T = int(made.frames[row]), made.run.objects[name].T_cam_obj[row]
     frame, mask = made.sequence.frame(i), made.masks(i).get(name)
-    silhouette, depth_m = render(T), np.full(frame.shape, np.inf, np.float32)
-    image, own = silhouette.inside(depth_m)
-    depth_m[image] = silhouette.depth_m[own]
+    depth_m = render(T).depth_in(frame.rgb)
     near = (frame.depth_m == 0) | (np.abs(frame.depth_m - depth_m) < _MEASURED_M)
     shows = np.isfinite(depth_m) & near if mask is None else np.isfinite(depth_m) & near & mask
     shows = cv2.erode(shows.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2)) > 0
@@ -73,8 +72,7 @@ def chosen_rows(made: Finished, name: str, rows: np.ndarray, render: Renderer, c
     best: list[View] = []
     for k in range(len(seeds)):
         members = np.flatnonzero(nearest == k)
-        some = members[np.unique(np.linspace(0, len(members) - 1, min(len(members), 4)).astype(int))]
-        views = (view_of(made, name, int(rows[member]), render) for member in some)
+        views = (view_of(made, name, int(rows[member]), render) for member in evenly(members, 4))
         sharpest = max(views, key=lambda view: view.sharpness)
         best += [sharpest] if sharpest.sharpness > 0 else []
     return best
@@ -91,8 +89,8 @@ def sampled(view: View, camera: Camera, p_obj: np.ndarray, normal: np.ndarray):
     rows = np.flatnonzero(towards > _FACING * np.sqrt(np.einsum("ij,ij->i", away, away)))
     p_cam = p_obj[rows] @ T[:3, :3].T + T[:3, 3]
     uv = np.nan_to_num(camera.project(p_cam), nan=-9.0).astype(np.float32)
-    u, v = np.where(inside := camera.inside(uv), uv.T, 0).round().astype(int)
-    seen = inside & view.shows[v, u] & (p_cam[:, 2] < view.depth_m[v, u] + _BEHIND_M)
+    u, v = nearest_px(uv, view.shows.shape)
+    seen = camera.inside(uv) & view.shows[v, u] & (p_cam[:, 2] < view.depth_m[v, u] + _BEHIND_M)
     rows, z, uv = rows[seen], p_cam[seen, 2], uv[seen]
     cosine = towards[rows] / np.linalg.norm(away[rows], axis=1)
     return rows, lookup(view.rgb, uv), cosine * view.sharpness * camera.fx / np.maximum(z, 1e-3)
