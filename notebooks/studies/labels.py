@@ -67,11 +67,7 @@ def label_errors_mm(scene: Sequence, source: Sequence, frames: list[int], names:
         T = scene.truth[bop].T_cam_model
         true = source.truth[name].T_cam_model[[frames[int(number)] for number in scene.frame_names]]
         both = np.flatnonzero(np.isfinite(T[:, 0, 0]) & np.isfinite(true[:, 0, 0]))
-        T_label_true = se3.inverse(T[both]) @ true[both]
-        mean = T_label_true[len(both) // 2]
-        for _ in range(10):
-            mean = mean @ se3.exp(np.median(se3.log(se3.inverse(mean) @ T_label_true), axis=0))
-        off = se3.error_deg_mm(T[both] @ mean, true[both])
+        off = se3.error_deg_mm(T[both] @ se3.median(se3.inverse(T[both]) @ true[both]), true[both])
         rows += [
             {"object": name, "image": int(scene.frame_names[k]), "off_deg": d, "off_mm": m}
             for k, d, m in zip(both, *off)

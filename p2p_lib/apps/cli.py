@@ -322,10 +322,11 @@ def _figures(a: argparse.Namespace) -> None:
     _QUIET,
 )
 def _refine(a: argparse.Namespace) -> None:
-    from p2p_lib.offline.refine import FOLDER, refine_run
+    from p2p_lib.datasets.runs import OFFLINE
+    from p2p_lib.offline.refine import refine_run
 
     print("\n".join(refine_run(a.run, not a.quiet)))
-    print(f"Results in {a.run / FOLDER}. Next: p2p eval {a.run / FOLDER}")
+    print(f"Results in {a.run / OFFLINE}. Next: p2p eval {a.run / OFFLINE}")
 
 
 # --- looking and handing on ----------------------------------------------------------------------

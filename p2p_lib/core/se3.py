@@ -129,6 +129,14 @@ def interpolate(T_a_b: np.ndarray, T_a_c: np.ndarray, s: float | np.ndarray) -> 
     return T_a_b @ exp(np.asarray(s)[..., None] * step)
 
 
+def median(T: np.ndarray) -> np.ndarray:
+    """The (4, 4) in the middle of (n, 4, 4), of which a few may be wild: the medians of the tangents there are 0."""
+    middle = T[len(T) // 2]
+    for _ in range(20):
+        middle = middle @ exp(np.median(log(inverse(middle) @ T), axis=0))
+    return middle
+
+
 def orthonormalised(T: np.ndarray) -> np.ndarray:
     """The rigid transformation nearest to T (rotation by SVD, proper)."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])

@@ -16,10 +16,8 @@ from p2p_lib.core import se3
 
 #: Residuals count a quarter at so many standard deviations; at first at as many times more, less by this each step.
 _HALF, _WIDE, _NARROWER = 3.0, 8.0, 0.6
-#: A smaller mean step, in metres and radians, ends the iterations.
-_TOLERANCE = 2e-6
-#: Three standard deviations of a point each way, and the median of chi squared with three degrees of freedom.
-_CHI2_MEDIAN_3 = 2.366
+#: Steps at most; a smaller mean step, in metres and radians, ends them.
+_ITERATIONS, _TOLERANCE = 15, 2e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,19 +32,6 @@ class Sightings:
     def select(self, rows: np.ndarray) -> Sightings:
         """Those at these rows or under this mask."""
         return Sightings(self.pose[rows], self.point[rows], self.p_cam[rows], self.information[rows])
-
-
-@dataclass(frozen=True, eq=False)
-class Adjusted:
-    """The best poses T (K, 4, 4) and points (N, 3), the poses' covariance (K, 6, 6), and each sighting's weight (M,).
-
-    covariance is of the right tangent of each pose, where the object frame is that of all poses together.
-    """
-
-    T_cam_obj: np.ndarray
-    p_obj: np.ndarray
-    covariance: np.ndarray
-    weight: np.ndarray
 
 
 def information(p_cam: np.ndarray, lateral_m: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
@@ -67,13 +52,13 @@ def placed(T_cam_obj: np.ndarray, seen: Sightings, count: int) -> np.ndarray:
     return points
 
 
-def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings, iterations: int = 15) -> Adjusted:
+def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> tuple[np.ndarray, np.ndarray]:
     """Poses (K, 4, 4) and points (N, 3) from these; every pose and point has a sighting at least."""
     T, p = np.array(T_cam_obj, float), np.array(p_obj, float)
     K, N = len(T), len(p)
     same = np.tile(np.eye(6), (K, 1)) / np.sqrt(K)  # all poses by one change of the object frame: nothing tells
-    for step_number in range(iterations):
-        V, e, A, weight = _linear(T, p, seen, max(_WIDE * _NARROWER**step_number, 1.0))
+    for step_number in range(_ITERATIONS):
+        V, e, A = _linear(T, p, seen, max(_WIDE * _NARROWER**step_number, 1.0))
         AV = np.einsum("mia,mij->maj", A, V)
         g = np.einsum("mij,mj->mi", V, e)
         H = _summed(seen.pose, AV @ A, K)
@@ -96,35 +81,33 @@ def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings, iterations
         p = p + shift
         if step_number > 6 and np.abs(step).mean() < _TOLERANCE:
             break
-    covariance = np.linalg.inv(S)
-    blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(K)])
-    return Adjusted(se3.orthonormalised(T), p, blocks * _spread(T, p, seen), weight)
+    return se3.orthonormalised(T), p
 
 
-def locate(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings, iterations: int = 15) -> Adjusted:
+def locate(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> np.ndarray:
     """Each pose (K, 4, 4) by itself on points (N, 3) that stay; a pose with few sightings hardly moves."""
     T, K = np.array(T_cam_obj, float), len(T_cam_obj)
     weak = np.diag(np.repeat([0.5, 0.1], 3) ** -2.0)
-    for step_number in range(iterations):
-        V, e, A, weight = _linear(T, p_obj, seen, max(_WIDE * _NARROWER ** (2 * step_number), 1.0))
+    for step_number in range(_ITERATIONS):
+        V, e, A = _linear(T, p_obj, seen, max(_WIDE * _NARROWER ** (2 * step_number), 1.0))
         H = _summed(seen.pose, np.einsum("mia,mij,mjb->mab", A, V, A), K) + weak
         b = _summed(seen.pose, np.einsum("mia,mij,mj->ma", A, V, e), K)
         step = -np.linalg.solve(H, b[..., None])[..., 0]
         T = T @ se3.exp(np.clip(step, -0.1, 0.1))
         if step_number > 4 and np.abs(step).mean() < _TOLERANCE:
             break
-    return Adjusted(se3.orthonormalised(T), p_obj, np.linalg.inv(H) * _spread(T, p_obj, seen), weight)
+    return se3.orthonormalised(T)
 
 
-def _linear(T: np.ndarray, p: np.ndarray, seen: Sightings, wide: float = 1.0):
-    """In the object's axes: weighted information (M, 3, 3), residual (M, 3), its derivative (M, 3, 6), weight (M,)."""
+def _linear(T: np.ndarray, p: np.ndarray, seen: Sightings, wide: float):
+    """In the object's axes: weighted information (M, 3, 3), residual (M, 3), its derivative (M, 3, 6)."""
     R, points = T[seen.pose, :3, :3], p[seen.point]
     e = points - np.einsum("mji,mj->mi", R, seen.p_cam - T[seen.pose, :3, 3])
     V = np.einsum("mji,mjk,mkl->mil", R, seen.information, R)
     squared = np.einsum("mi,mij,mj->m", e, V, e)
     weight = 1 / (1 + squared / (wide * _HALF) ** 2) ** 2
     A = np.concatenate([-se3.hat(points), np.broadcast_to(np.eye(3), (len(e), 3, 3))], axis=2)
-    return weight[:, None, None] * V, e, A, weight
+    return weight[:, None, None] * V, e, A
 
 
 def _summed(row: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
@@ -132,10 +115,3 @@ def _summed(row: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     total = np.zeros((count, *values.shape[1:]))
     np.add.at(total, row, values)
     return total
-
-
-def _spread(T: np.ndarray, p: np.ndarray, seen: Sightings) -> float:
-    """By how much the squared residuals are larger than their information says, at least 1."""
-    V, e, _, weight = _linear(T, p, seen)
-    squared = np.einsum("mi,mij,mj->m", e, V / weight[:, None, None], e)
-    return max(float(np.median(squared)) / _CHI2_MEDIAN_3, 1.0) if len(squared) else 1.0

@@ -15,7 +15,10 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import depth_noise_m, lift, off_edges
+from p2p_lib.core.image import bounds, nearest_px
+from p2p_lib.core.robust import fit_rigid, residual_m
 from p2p_lib.core.types import Frame
+from p2p_lib.offline.finished import evenly
 
 #: A match needs to be so much nearer than the next best, and a tie so many matches that move as one.
 _RATIO, MIN_MATCHES = 0.8, 9
@@ -25,8 +28,6 @@ _SAMPLES, _SIGMAS, _LEAST_M = 200, 3.0, 0.004
 _SMALL_PX, _ROOM_PX, _MOST, _CLOUD = 220, 4, 400, 1000
 #: Features are looked for so far inside the mask, and not at a step in depth.
 _BORDER_PX, _STEP_M = 2, 0.02
-
-
 #: A point that would float this far before what was measured, m and standard deviations, contradicts a pose.
 _FLOATS_M, _FLOATS_SIGMAS = 0.006, 3.0
 #: A tie with so large a share of contradicting points counts for a third.
@@ -37,21 +38,20 @@ _CONTRADICTED = 0.03
 class Features:
     """SIFT features of an object in a frame: p_cam (N, 3) measured, descriptors (N, 128).
 
-    cloud (M, 3) are points of its surface, depth_m (H, W) and mask (H, W) bool the frame's.
+    cloud (M, 3) are points of its surface, depth_m (H, W) is the frame's.
     """
 
     p_cam: np.ndarray
     descriptors: np.ndarray
     cloud: np.ndarray
     depth_m: np.ndarray
-    mask: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Tie:
     """Two keyframes a and b in which matched points (rows of each, (M,)) move as one: T_a_b (4, 4).
 
-    strength  how many agree, less where depth and masks contradict it: what shines stands still while a thing turns
+    strength  how many agree, less where depth contradicts it: what shines stands still while a thing turns
     """
 
     a: int
@@ -64,27 +64,25 @@ class Tie:
 
 def features(frame: Frame, mask: np.ndarray, camera: Camera, config: DepthConfig) -> Features:
     """What can be recognised of an object, with depth."""
-    v, u = np.nonzero(mask & off_edges(frame.depth_m, _STEP_M))
-    some = np.linspace(0, len(v) - 1, min(len(v), _CLOUD)).astype(int)
-    cloud = camera.unproject(np.stack([u[some], v[some]], -1), frame.depth_m[v[some], u[some]])
-    seen = cloud, frame.depth_m, mask
+    smooth = off_edges(frame.depth_m, _STEP_M)
+    vu = evenly(np.argwhere(mask & smooth), _CLOUD)
+    cloud = camera.unproject(vu[:, ::-1], frame.depth_m[tuple(vu.T)])
+    seen = cloud, frame.depth_m
     nothing = Features(np.zeros((0, 3)), np.zeros((0, 128), np.float32), *seen)
     if not mask.any():
         return nothing
-    x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
-    left, top = max(x - _ROOM_PX, 0), max(y - _ROOM_PX, 0)
-    cut = np.s_[top : y + h + _ROOM_PX, left : x + w + _ROOM_PX]
+    tight, cut = bounds(mask), bounds(mask, _ROOM_PX)
     # What shows at a mask's border, or through a handle, stands still while the object moves: it would be recognised.
-    own = cv2.erode(mask.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2)) * off_edges(frame.depth_m, _STEP_M)
+    own = cv2.erode(mask.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2)) * smooth
     grey, inside = cv2.cvtColor(frame.rgb[cut], cv2.COLOR_RGB2GRAY), own[cut].astype(np.uint8)
-    scale = 2.0 if max(w, h) < _SMALL_PX else 1.0
+    scale = 2.0 if max(span.stop - span.start for span in tight) < _SMALL_PX else 1.0
     if scale > 1:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         inside = cv2.resize(inside, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
     found, descriptors = cv2.SIFT_create(_MOST, contrastThreshold=0.02).detectAndCompute(grey, inside)
     if descriptors is None:
         return nothing
-    uv_px = (np.array([point.pt for point in found]) + 0.5) / scale - 0.5 + (left, top)
+    uv_px = (np.array([point.pt for point in found]) + 0.5) / scale - 0.5 + (cut[1].start, cut[0].start)
     p_cam = lift(frame, uv_px, camera, config)
     lifted = np.isfinite(p_cam[:, 0])
     return Features(p_cam[lifted], descriptors[lifted], *seen)
@@ -110,52 +108,47 @@ def rigid(p_a: np.ndarray, p_b: np.ndarray, rng: np.random.Generator) -> tuple[n
     none = np.eye(4), np.zeros(len(p_a), bool)
     if len(p_a) < 3:
         return none
-    noise = np.hypot(depth_noise_m(p_a[:, 2]), depth_noise_m(p_b[:, 2]))
-    within = np.maximum(_SIGMAS * noise, _LEAST_M)
+    within = _within_m(p_a, p_b)
     sample = np.argsort(rng.random((_SAMPLES, len(p_a))), axis=1)[:, :3]
-    T = _kabsch(p_a[sample], p_b[sample])
-    off = np.linalg.norm(se3.transform(T, np.broadcast_to(p_b, (len(T), *p_b.shape))) - p_a, axis=-1)
+    off = residual_m(fit_rigid(p_b[sample], p_a[sample]), p_b, p_a)
     best = np.minimum(off / within, 1).sum(1).argmin()
     agree = off[best] < within
     for _ in range(3):
         if agree.sum() < 3:
             return none
-        T_best = _kabsch(p_a[agree][None], p_b[agree][None])[0]
-        agree = np.linalg.norm(se3.transform(T_best, p_b) - p_a, axis=-1) < within
+        T_best = fit_rigid(p_b[agree], p_a[agree])
+        agree = agreeing(T_best, p_a, p_b)
     return T_best, agree
 
 
-def _kabsch(p_a: np.ndarray, p_b: np.ndarray) -> np.ndarray:
-    """T_a_b (S, 4, 4), least squares over points (S, n, 3)."""
-    a, b = p_a.mean(1), p_b.mean(1)
-    U, _, Vt = np.linalg.svd(np.swapaxes(p_a - a[:, None], 1, 2) @ (p_b - b[:, None]))
-    flip = np.ones((len(U), 3))
-    flip[:, 2] = np.linalg.det(U @ Vt)
-    R = (U * flip[:, None]) @ Vt
-    return se3.from_rt(R, a - np.einsum("sij,sj->si", R, b))
+def agreeing(T_a_b: np.ndarray, p_a: np.ndarray, p_b: np.ndarray) -> np.ndarray:
+    """(N,) bool: pairs of points (N, 3) that are one at T_a_b, as far as they are measured."""
+    return residual_m(T_a_b, p_b, p_a) < _within_m(p_a, p_b)
 
 
-def contradicted(T_a_b: np.ndarray, a: Features, b: Features, camera: Camera) -> float:
-    """The larger share of one view's points that the other contradicts: before its depth, or beside its mask."""
-    return max(_contradicted(T_a_b, a, b.cloud, camera), _contradicted(se3.inverse(T_a_b), b, a.cloud, camera))
+def _within_m(p_a: np.ndarray, p_b: np.ndarray) -> np.ndarray:
+    noise = np.hypot(depth_noise_m(p_a[:, 2]), depth_noise_m(p_b[:, 2]))
+    return np.maximum(_SIGMAS * noise, _LEAST_M)
+
+
+def rated(T_a_b: np.ndarray, matches: int, a: Features, b: Features, camera: Camera) -> float:
+    """The strength of a tie of so many matches: less by the larger share of one view's points that the other denies."""
+    share = max(_contradicted(T_a_b, a, b.cloud, camera), _contradicted(se3.inverse(T_a_b), b, a.cloud, camera))
+    return float(matches * np.exp(-share / _CONTRADICTED))
 
 
 def _contradicted(T_a_b: np.ndarray, a: Features, cloud_b: np.ndarray, camera: Camera) -> float:
+    """The share of the points (N, 3) of one view, where they fall into the other, that would float before its depth."""
     p_a = se3.transform(T_a_b, cloud_b)
     uv_px = camera.project(p_a)
     inside = camera.inside(uv_px)
     if not inside.any():
         return 1.0
-    u, v = np.where(inside, uv_px.T, 0).round().astype(int)
+    u, v = nearest_px(uv_px, a.depth_m.shape)
     measured, z = a.depth_m[v, u], p_a[:, 2]
     off = np.maximum(_FLOATS_M, _FLOATS_SIGMAS * depth_noise_m(z))
     floats = inside & (measured > 0) & (z < measured - off)
     return float(floats.sum() / inside.sum())
-
-
-def rated(T_a_b: np.ndarray, matches: int, a: Features, b: Features, camera: Camera) -> float:
-    """The strength of a tie of so many matches."""
-    return float(matches * np.exp(-contradicted(T_a_b, a, b, camera) / _CONTRADICTED))
 
 
 def ties(views: list[Features], camera: Camera, rng: np.random.Generator) -> list[Tie]:

@@ -285,3 +285,10 @@ def test_check_refuses_in_one_line_that_names_the_thing(T, words):
         se3.check("pose of frame 7", T)
     assert str(caught.value).startswith("pose of frame 7: got ")
     assert "\n" not in str(caught.value)
+
+
+def test_the_median_is_in_the_middle_whatever_a_few_do():
+    T, rng = se3.exp(tangents(())), np.random.default_rng(3)
+    near = T @ se3.exp(rng.normal(scale=0.01, size=(40, 6)))
+    near[:6] = se3.exp(rng.normal(size=(6, 6)))
+    assert np.abs(se3.log(se3.inverse(T) @ se3.median(near))).max() < 0.01

@@ -1,0 +1,125 @@
+"""Is an object's surface where a pose has it? By the frame's mask, by depth and colours where there is none."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from p2p_lib.core import se3
+from p2p_lib.core.config import Config
+from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.types import Frame
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
+from p2p_lib.method.refinement import refine
+from p2p_lib.method.tsdf import TsdfVolume
+from p2p_lib.offline.dataset import agreement, visible
+from p2p_lib.offline.finished import Finished, Renderer, evenly
+
+#: A distance from the surface beyond this counts as this, m.
+_FAR_M = 0.01
+#: What is measured this near the rendered surface is taken for it while it is sought; once found, this or three sigmas.
+_SEEK_M, _ON_M = 0.02, 0.006
+#: Where no mask tells of the object: so much of its surface may be seen through, and colours may be so many times as
+#: far off as usual, and correlate so many times as well at least. This many frames tell what is usual.
+_BEHIND, _OTHER_COLOURS, _LESS_ALIKE, _CALIBRATED = 0.15, 1.4, 0.6, 12
+#: How much brighter or darker than on the surface a colour may be, by the light.
+_GAINS = 0.7, 1.4
+
+
+class Found(NamedTuple):
+    """A pose (4, 4) of a frame, its covariance (6, 6), and what it costs."""
+
+    T_cam_obj: np.ndarray
+    covariance: np.ndarray
+    cost: float
+
+
+class _Look(NamedTuple):
+    """Points (N, 3) measured on the surface, the share measured behind, how far colours are off and correlate."""
+
+    cloud: np.ndarray
+    behind: float
+    off: float
+    alike: float
+
+
+def off_surface(volume: TsdfVolume, T_cam_obj: np.ndarray, cloud: np.ndarray) -> np.ndarray:
+    """(N,) how far points (N, 3) are off a surface at a pose: 1 is far, or where nobody knows of a surface."""
+    distance_m, valid = volume.query(se3.transform(se3.inverse(T_cam_obj), cloud.astype(float)))
+    return np.where(valid, np.minimum(np.abs(distance_m), _FAR_M), _FAR_M) / _FAR_M
+
+
+class Sight:
+    """Looks at one object's surface, which has faces, in the frames of a run.
+
+    sure  rows of frames in which it is where T (n, 4, 4) says: they tell how its colours usually look
+    """
+
+    def __init__(self, made: Finished, name: str, config: Config, volume: TsdfVolume, T: np.ndarray, sure: np.ndarray):
+        self._made, self._name, self._config, self._volume = made, name, config, volume
+        mesh = volume.mesh()
+        colours = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float)
+        self._colours = colours[mesh.faces].mean(1)
+        self._render = Renderer(mesh.vertices, mesh.faces, made.sequence.camera)
+        looks = (self._look(self._frame(k), T[k]) for k in evenly(sure, _CALIBRATED))
+        usual = [look.off for look in looks if look]
+        self._usual = float(np.median(usual)) if usual else 0.0
+        self._light: dict[int, tuple[float, float]] = {}
+
+    def _frame(self, k: int) -> Frame:
+        return self._made.sequence.frame(int(self._made.frames[k]))
+
+    def found(self, k: int, candidates: list[np.ndarray], beside: int, T_beside: np.ndarray) -> Found | None:
+        """The best pose of the k-th frame; None where the surface is not seen from any of these.
+
+        beside  a frame next to it with its pose, in the same light
+        """
+        frame, best = self._frame(k), None
+        if beside not in self._light:  # what was found so passes on what it was found by: errors do not add up
+            known = self._look(self._frame(beside), T_beside)
+            self._light[beside] = (max(self._usual, known.off), known.alike) if known else (self._usual, 1.0)
+        self._light[k] = usual, alike = self._light[beside]
+        for T in candidates:
+            covariance = None
+            for _ in range(3):
+                if (look := self._look(frame, T, wide=True)) is None:
+                    break
+                refined = refine(T, look.cloud, self._volume, self._config.refinement)
+                T, covariance = refined.T_cam_obj, refined.covariance
+            look = None if covariance is None else self._look(frame, T)
+            if look is None or look.behind > _BEHIND:
+                continue
+            if look.off > _OTHER_COLOURS * usual or look.alike < _LESS_ALIKE * alike:
+                continue
+            cost = float(off_surface(self._volume, T, look.cloud).mean())
+            if best is None or cost < best.cost:
+                best = Found(T, covariance, cost)
+        return best
+
+    def overlap(self, k: int, T: np.ndarray) -> float:
+        """IoU of what shows of the surface at a pose with the mask of the k-th frame."""
+        frame, silhouette = self._frame(k), self._render(se3.orthonormalised(T))
+        mask = self._made.masks(frame.index)[self._name]
+        return agreement(silhouette, visible(silhouette, frame.depth_m), frame.depth_m, mask)[0]
+
+    def _look(self, frame: Frame, T: np.ndarray, wide: bool = False) -> _Look | None:
+        """What a frame shows where a pose has the surface; None where that is too little."""
+        silhouette = self._render(se3.orthonormalised(T))
+        image, own = silhouette.inside(frame.depth_m)
+        depth_m, z, hit = frame.depth_m[image], silhouette.depth_m[own], silhouette.hit[own]
+        use = hit & (depth_m > 0)
+        off = np.where(use, depth_m - np.where(hit, z, 0), 0)
+        within = _SEEK_M if wide else np.maximum(_ON_M, 3 * depth_noise_m(depth_m, self._config.depth))
+        on, behind = use & (np.abs(off) < within), use & (off > within)
+        if on.sum() < MIN_VISIBLE_PX:
+            return None
+        colour, true = self._colours[silhouette.face[own][on]], frame.rgb[image][on].astype(float)
+        gain = np.median(true, axis=0) / np.maximum(np.median(colour, axis=0), 1)
+        wrong = float(np.abs(np.clip(colour * np.clip(gain, *_GAINS), 0, 255) - true).mean())
+        vu = evenly(np.argwhere(on), self._config.refinement.max_points)
+        uv_px = vu[:, ::-1] + (image[1].start, image[0].start)
+        cloud = self._made.sequence.camera.unproject(uv_px, depth_m[tuple(vu.T)])
+        a, b = colour - colour.mean(0), true - true.mean(0)
+        alike = (a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-9)
+        return _Look(cloud, float(behind.sum() / (on.sum() + behind.sum())), wrong, float(alike))
