@@ -7,12 +7,9 @@ not run again; what was cut short goes on.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from p2p_lib.benchmark.execution import execute
 from p2p_lib.benchmark.outcome import Outcome
@@ -82,10 +79,9 @@ def run_batch(
     if out.resolve().is_relative_to(Path(folder).resolve()):
         raise BadInput(str(out), "a folder among the recordings", "another one for the results")
     out.mkdir(parents=True, exist_ok=True)
-    outcomes: Iterator[tuple[Any, Outcome]] = execute(todo, out, jobs or os.cpu_count() or 1, scheduler, perform)
     done: dict[str, Outcome] = {}
     with progress_bar("batch", len(todo), "recording", progress) as bar:
-        for job, outcome in outcomes:
+        for job, outcome in execute(todo, out, jobs or os.cpu_count() or 1, scheduler, tracked):
             done[job.key] = outcome
             bar.update()
     table = DataFrame([row for one in todo for row in _rows(one, out / one.key, done[one.key])])
@@ -94,14 +90,9 @@ def run_batch(
     return table
 
 
-def perform(job: Recording, out: Path, library: str) -> Outcome:
-    """Run one recording; what goes wrong in it is in the outcome."""
-    try:
-        result = run(job.folder, out / job.key, job.options, if_exists="resume", progress=False)
-    except P2PError as error:
-        return Outcome(key=job.key, status="failed", reason=str(error))
-    except Exception as error:  # noqa: BLE001 one failing run must not end the others
-        return Outcome(key=job.key, status="failed", reason=f"{type(error).__name__}: {' '.join(str(error).split())}")
+def tracked(job: Recording, out: Path) -> Outcome:
+    """Run one recording; the outcome's reason is what the run advises."""
+    result = run(job.folder, out / job.key, job.options, if_exists="resume", progress=False)
     return Outcome(key=job.key, status="done", reason=result.advice)
 
 
@@ -116,12 +107,10 @@ def _rows(job: Recording, out: Path, outcome: Outcome) -> list[dict[str, Any]]:
     look_at = done.info.get("look_at") or {}
     rows = []
     for name, obj in done.objects.items():
-        shares = {
-            "pose [%]": 100 * obj.has_pose.mean(),
-            "doubted [%]": 100 * obj.doubted.sum() / max(obj.has_pose.sum(), 1),
-        }
+        doubted = obj.doubted.sum() / max(obj.has_pose.sum(), 1)
+        shares = {"pose [%]": obj.has_pose.mean(), "doubted [%]": doubted}
         row: dict[str, Any] = {"recording": job.key, "object": name, "frames": len(obj)}
-        row |= {key: round(float(np.float64(value)), 1) for key, value in shares.items()}
+        row |= {key: round(100 * float(share), 1) for key, share in shares.items()}
         row |= {key: value for key, value in scores.get(name, {}).items() if key in ("ADD-S AUC [%]", "ADD AUC [%]")}
         rows.append(row | {"note": "; ".join(look_at.get(name, ())) or outcome.reason or "good"})
     return rows

@@ -25,7 +25,7 @@ from p2p_lib.benchmark.jobs import Job, library_version, open_planned
 from p2p_lib.benchmark.outcome import Outcome, run_path
 from p2p_lib.benchmark.scoring import chamfer, fault_done, scored
 from p2p_lib.core import packages
-from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.files import replace_text
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.protocol import rate
@@ -34,12 +34,14 @@ from p2p_lib.run import evaluate_tracker, run
 # Loaded once, in the process from which those of the runs are forked.
 _PRELOADED = ["p2p_lib.benchmark.execution", "p2p_lib.method.factor_graph", "torch", "scipy.spatial", "scipy.optimize"]
 _PRELOADED += ["trimesh", "skimage.measure"]
+#: What is done of a job, which has a key, in a folder of results.
+Work = Callable[[Any, Path], Outcome]
 # How long a scheduler may take to answer.
 _CONNECT_S = 20
 
 
-def perform(job: Job, out: Path, library: str) -> Outcome:
-    """Run a job and score it. Nothing that goes wrong in it is raised: the outcome says so, and the others go on.
+def perform(work: Work, job: Any, out: Path, library: str) -> Outcome:
+    """Do a job. Nothing that goes wrong in it is raised: the outcome says so, and the others go on.
 
     library  of whoever gave the job: results of another source would not be what its key says
     """
@@ -47,13 +49,18 @@ def perform(job: Job, out: Path, library: str) -> Outcome:
         if library != library_version():
             fix = "Install the same version of p2p-lib, numpy, scipy, opencv and gtsam on every worker."
             raise BadInput("benchmark worker", f"source {library_version()}", library, fix)
-        return _poses(job, out) if job.measure == "poses" else _tracks(job)
+        return work(job, out)
     except (MissingData, MissingBackend) as error:
         return Outcome(key=job.key, status="not run", reason=str(error))
     except Exception as error:  # noqa: BLE001 one failing run must not end the others
         replace_text(out / "failures" / f"{job.key}.txt", traceback.format_exc())
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return Outcome(key=job.key, status="failed", reason=reason[:500])
+        kind = "" if isinstance(error, P2PError) else f"{type(error).__name__}: "
+        return Outcome(key=job.key, status="failed", reason=f"{kind}{' '.join(str(error).split())}"[:500])
+
+
+def measured(job: Job, out: Path) -> Outcome:
+    """Run a job of a benchmark, and score it."""
+    return _poses(job, out) if job.measure == "poses" else _tracks(job)
 
 
 def _poses(job: Job, out: Path) -> Outcome:
@@ -97,7 +104,7 @@ def _tracks(job: Job) -> Outcome:
 
 
 def execute(
-    jobs: Sequence[Any], out: Path, at_a_time: int, scheduler: str | None, work: Callable[..., Outcome] = perform
+    jobs: Sequence[Any], out: Path, at_a_time: int, scheduler: str | None, work: Work = measured
 ) -> Iterator[tuple[Any, Outcome]]:
     """The outcomes of jobs as they come, of each what ``work`` makes of it; closing it ends what is still running.
 
@@ -109,7 +116,7 @@ def execute(
     return _on_cluster(jobs, out, scheduler, work)
 
 
-def _on_this_machine(jobs: Iterable[Any], out: Path, at_a_time: int, work: Callable[..., Outcome]):
+def _on_this_machine(jobs: Iterable[Any], out: Path, at_a_time: int, work: Work):
     """A process for each run, so many at a time. One that dies, of a lack of memory say, takes no other with it."""
     for library in ("OMP", "OPENBLAS", "MKL"):  # runs share the cores: more threads would wait for each other
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
@@ -131,10 +138,10 @@ def _on_this_machine(jobs: Iterable[Any], out: Path, at_a_time: int, work: Calla
         pool.shutdown(wait=True)
 
 
-def _in_a_process(context: BaseContext, job: Any, out: Path, work: Callable[..., Outcome]) -> Outcome:
+def _in_a_process(context: BaseContext, job: Any, out: Path, work: Work) -> Outcome:
     try:
         with ProcessPoolExecutor(1, context, _end_with_parent) as process:
-            return process.submit(work, job, out, library_version()).result()
+            return process.submit(perform, work, job, out, library_version()).result()
     except BrokenProcessPool:
         return Outcome(key=job.key, status="failed", reason="its process was ended from outside: out of memory?")
 
@@ -146,7 +153,7 @@ def _end_with_parent() -> None:
     threading.Thread(target=lambda: wait([gone]) and os._exit(1), daemon=True).start()
 
 
-def _on_cluster(jobs: Sequence[Any], out: Path, scheduler: str, work: Callable[..., Outcome]):
+def _on_cluster(jobs: Sequence[Any], out: Path, scheduler: str, work: Work):
     """Dask distributes the runs; a worker that dies fails its run alone."""
     distributed = packages.load("distributed", "--scheduler", "distributed")
     try:
@@ -155,7 +162,7 @@ def _on_cluster(jobs: Sequence[Any], out: Path, scheduler: str, work: Callable[.
         got = f"{scheduler} ({type(error).__name__})"
         raise BadInput("scheduler", got, "a Dask scheduler that answers", "Start one with: dask scheduler") from None
     with client:
-        futures = [client.submit(work, job, out, library_version(), pure=False) for job in jobs]
+        futures = [client.submit(perform, work, job, out, library_version(), pure=False) for job in jobs]
         by_key = {future.key: job for future, job in zip(futures, jobs, strict=True)}
         for future in distributed.as_completed(futures):
             job, error = by_key[future.key], future.exception()

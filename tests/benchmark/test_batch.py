@@ -6,7 +6,8 @@ import pandas as pd
 import pytest
 
 from p2p_lib.apps import cli
-from p2p_lib.benchmark.batch import recordings, run_batch
+from p2p_lib.benchmark.batch import recordings, run_batch, tracked
+from p2p_lib.benchmark.execution import perform
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.options import RunOptions
 from tests.fixtures.sliding_board import write_sequence
@@ -44,3 +45,16 @@ def test_what_is_no_shelf_is_a_sentence(shelf, tmp_path, capsys):
     with pytest.raises(SystemExit):
         cli.main(["run", "--out", str(tmp_path / "x")])
     assert "needs either SEQ or --batch FOLDER" in capsys.readouterr().err
+
+
+def test_prompts_of_its_own_are_a_recordings_options(shelf):
+    (shelf / "two/prompts.json").write_text("{}")
+    found = {one.key: one.options for one in recordings(shelf, OPTIONS)}
+    assert found["one"] == OPTIONS and found["two"].prompts == shelf / "two/prompts.json"
+
+
+def test_a_worker_of_another_source_runs_nothing(shelf, tmp_path):
+    (job, *_) = recordings(shelf, OPTIONS)
+    outcome = perform(tracked, job, tmp_path / "out", "another library")
+    assert outcome.status == "failed" and "expected another library" in outcome.reason
+    assert not (tmp_path / "out" / job.key).exists()
