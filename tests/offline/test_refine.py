@@ -2,21 +2,27 @@
 
 import json
 import shutil
+from dataclasses import replace
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
 from p2p_lib.apps import cli
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import from_toml, preset
+from p2p_lib.core.types import Frame
 from p2p_lib.datasets.keypoint_log import KeypointLog
-from p2p_lib.datasets.models import MESHES, find_models, load_mesh
+from p2p_lib.datasets.models import MESHES, find_models, load_mesh, read_mesh
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.offline import evidence, loops
 from p2p_lib.offline import refine as offline
 from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
-from p2p_lib.offline.sight import Found
-from p2p_lib.offline.surface import SurfacePoses
+from p2p_lib.offline.finished import Finished
+from p2p_lib.offline.sight import Found, Sight
+from p2p_lib.offline.surface import SurfacePoses, fused
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 CAMERA = Camera(500, 500, 159.5, 119.5, 320, 240)
@@ -135,12 +141,13 @@ def test_wrong_poses_are_mended_and_the_lost_one_is_found(made, tracked, monkeyp
     told = offline.refine_run(tracked)
     assert "(1 more, 0 fewer than causally)" in told[0]
     assert {path: path.read_bytes() for path in before} == before
+    mesh = read_mesh(tracked / "offline/meshes/box.ply")
+    assert np.median(mesh.edges_unique_length) < 0.6 * from_toml(tracked / "config.toml").tsdf.voxel_m
     deg, mm = errors(made, tracked / "offline", "box")
     assert np.nanmax(deg[[5, 6, 7, 8]]) < 1.5 and np.nanmax(mm[[5, 6, 7, 8]]) < 4
     assert np.nanmedian(deg) < 0.8 and np.nanmedian(mm) < 2
     info = json.loads((tracked / "offline/run.json").read_text())
     assert info["offline"] is True and "offline" not in json.loads((tracked / "run.json").read_text())
-    assert (tracked / "offline/meshes/box.ply").is_file()
 
 
 def test_poses_that_fill_the_masks_better_stay(made, tracked, monkeypatch):
@@ -180,8 +187,6 @@ def test_an_interrupted_pass_goes_on(tracked, monkeypatch):
 def test_disagreement_is_measured_by_the_causal_covariance(made):
     obj = made.run.objects["can"]
     covariance = np.tile(np.diag([1e-4] * 3 + [1e-6] * 3), (len(obj), 1, 1))
-    from dataclasses import replace
-
     causal = replace(obj, covariance=covariance)
     moved = replace(obj, T_cam_obj=obj.T_cam_obj @ se3.exp(np.array([0, 0, 0, 0.005, 0, 0])))
     squared = offline.disagreement(causal, moved)
@@ -199,3 +204,53 @@ def test_what_cannot_be_refined_is_a_sentence(tracked, capsys):
     (tracked / "run.json").write_text(json.dumps(json.loads((tracked / "before.json").read_text()) | {"offline": True}))
     assert cli.main(["refine", str(tracked), "--quiet"]) == 2
     assert "an offline result already" in capsys.readouterr().err
+
+
+def test_frames_keep_the_causal_object_frame_and_what_does_not_fit_has_no_pose(made):
+    obj, moved = made.run.objects["box"], se3.exp(np.array([0.3, -0.2, 0.1, 0.02, 0.01, -0.03]))
+    has, n = obj.has_pose, len(obj)
+    T = np.where(has[:, None, None], obj.T_cam_obj, np.eye(4)) @ moved
+    cost = np.where(has, 0.2, 0.9)
+    poses = SimpleNamespace(T=T, covariance=np.tile(np.eye(6), (n, 1, 1)), cost=cost, limit=0.5)
+    columns, fits = offline._columns(obj, poses, evidence.Evidence(mask_px=[0] * n), None)
+    np.testing.assert_allclose(columns["T_cam_obj"][has], obj.T_cam_obj[has], atol=1e-9)
+    assert np.isnan(columns["T_cam_obj"][~has]).all() and (columns["confidence"][~has] == 0).all()
+    assert (fits == has).all()
+    columns["T_cam_obj"][3], columns["T_cam_obj"][~has] = np.nan, np.eye(4)
+    refined = offline._merged(obj, columns)
+    assert refined.status[3] == "lost" and set(refined.status[~has]) == {"recovered"}
+    assert (refined.status[4:8] == obj.status[4:8]).all()
+
+
+@pytest.mark.parametrize("what", ["as it is", "behind", "colours", "pattern"])
+def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what):
+    of, T, config = Finished(made.run, made.sequence), made.run.objects["can"].T_cam_obj, preset()
+    rows = np.arange(0, 12)
+    sight = Sight(of, "can", config, fused(of, "can", T, rows, config, 0.004), T, rows)
+    frame, k = made.sequence.frame(6), 6
+    mask = made.sequence.masks(6)["can"]
+    depth_m, rgb = frame.depth_m.copy(), frame.rgb.astype(float)
+    middle = rgb[mask].mean(0)
+    if what == "behind":  # through half of it one sees what stands behind
+        v, u = np.nonzero(mask)
+        depth_m[v[u > np.median(u)], u[u > np.median(u)]] += 0.05
+    if what == "colours":  # as it was, but three times as strong
+        rgb = middle + 3 * (rgb - middle)
+    if what == "pattern":  # the same colours elsewhere
+        v, u = np.nonzero(mask)
+        rgb[v, u] = rgb[v, u][np.random.default_rng(0).permutation(len(v))]
+    seen = replace(frame, depth_m=depth_m, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
+    sight._frame = lambda row: seen if row == k else made.sequence.frame(row)
+    found = sight.found(k, [T[k] @ se3.exp(np.array([0, 0, 0, 0.002, 0.001, 0]))], k - 1, T[k - 1])
+    assert (found is not None) == (what == "as it is")
+    assert found is None or np.linalg.norm((found.T_cam_obj - T[k])[:3, 3]) < 0.003
+
+
+def test_features_keep_away_from_the_border_of_the_mask():
+    """What shows there, or through a handle, may be of something else, which does not move with the object."""
+    rgb = cv2.resize(np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8), (320, 240))
+    mask = np.zeros((240, 320), bool)
+    mask[100:150, 140:200] = True
+    found = loops.features(Frame(0, 0.0, rgb, np.full((240, 320), 0.5, np.float32)), mask, CAMERA, preset().depth)
+    u, v = CAMERA.project(found.p_cam).T
+    assert len(u) > 40 and ((u > 141) & (u < 198) & (v > 101) & (v < 148)).all()
