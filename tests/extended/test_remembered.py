@@ -314,6 +314,15 @@ def test_a_tracker_survives_a_restart(crossing, learnt, tmp_path):
         Point2Pose.load(tmp_path / "box.npz")
 
 
+def test_after_a_reset_it_is_looked_for_as_at_first(crossing, learnt):
+    method, told = Point2Pose(crossing.camera), []
+    for _ in range(2):
+        method.add_object("box", memory=learnt.memory)
+        told.append(followed(crossing, method, LATER[:3])[-1]["box"])
+        method.reset()
+    np.testing.assert_array_equal(told[1].T_cam_obj, told[0].T_cam_obj)
+
+
 def test_look_alikes_are_not_taken_for_each_other():
     alike = open_sequence("synthetic/look_alikes")
     method = Point2Pose(alike.camera)
