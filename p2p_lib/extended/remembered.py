@@ -98,11 +98,6 @@ class Remembered(TwoMaps):
         return not self.life.has_pose or (self._bare and not self._sure)
 
     @property
-    def awaits(self) -> bool:
-        """Whether it has been found once, and is to be looked for again right away."""
-        return any(T is not None for _, T in self._finds)
-
-    @property
     def _sure(self) -> bool:
         return self._borne_out >= CONFIRM_FRAMES
 

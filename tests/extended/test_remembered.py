@@ -223,11 +223,9 @@ def test_what_is_not_there_is_not_found(learnt):
         assert estimate.reason == "remembered, and not found yet"
 
 
-def test_what_is_found_in_one_image_and_elsewhere_in_the_next_is_not_claimed(crossing, learnt, monkeypatch):
-    method = Point2Pose(crossing.camera)
-    method.add_object("box", memory=learnt.memory)
-    obj, aside = method.objects["box"], iter(0.4 * np.arange(20))
-    look = obj._look
+def lead_astray(obj, monkeypatch):
+    """Have every look find the object in yet another place; returns how far aside, m, the next ones will be."""
+    look, aside = obj._look, iter(0.4 * np.arange(20))
 
     def astray(*asked):
         if (found := look(*asked)) is None:
@@ -236,9 +234,44 @@ def test_what_is_found_in_one_image_and_elsewhere_in_the_next_is_not_claimed(cro
         return replace(found, sighting=replace(found.sighting, T_cam_obj=off @ found.sighting.T_cam_obj))
 
     monkeypatch.setattr(obj, "_look", astray)
+    return aside
+
+
+def unseen(tracks):
+    """Tracks of which none is visible."""
+    return replace(tracks, visible=np.zeros(len(tracks), bool))
+
+
+def test_what_is_found_in_one_image_and_elsewhere_in_the_next_is_not_claimed(crossing, learnt, monkeypatch):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    obj = method.objects["box"]
+    aside = lead_astray(obj, monkeypatch)
     told = followed(crossing, method, LATER[:6])
     assert all(one["box"].status is Status.INITIALISING and one["box"].T_cam_obj is None for one in told)
     assert next(aside) >= 1.2 and not len(obj.map)
+
+
+def test_one_that_is_seen_here_and_there_does_not_keep_another_waiting(crossing, learnt, monkeypatch):
+    method = Point2Pose(crossing.camera)
+    for name in ("box", "elsewhere"):  # which is looked for first
+        method.add_object(name, memory=replace(learnt.memory, name=name))
+    lead_astray(method.objects["elsewhere"], monkeypatch)
+    told = followed(crossing, method, range(45, 49))[-1]
+    assert told["box"].T_cam_obj is not None and told["elsewhere"].T_cam_obj is None
+
+
+def test_a_claim_that_the_surface_alone_bears_out_is_withdrawn_too(crossing, learnt, monkeypatch):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    assert followed(crossing, method, range(45, 48))[-1]["box"].T_cam_obj is not None
+    obj, track = method.objects["box"], method.tracker.track
+    monkeypatch.setattr(method.tracker, "track", lambda *asked: unseen(track(*asked)))
+    monkeypatch.setattr(method.tracker, "suggest", lambda *asked: None)
+    monkeypatch.setattr(obj, "_look", lambda *asked: None)
+    told = [one["box"] for one in followed(crossing, method, range(48, 54))]
+    assert all(one.T_cam_obj is not None and not one.inliers for one in told[:5])
+    assert told[5].status is Status.INITIALISING and not len(obj.map)
 
 
 def test_a_claim_that_nothing_bears_out_is_withdrawn(crossing, learnt):
