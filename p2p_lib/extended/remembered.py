@@ -248,8 +248,8 @@ class Remembered(TwoMaps):
         return False
 
     def _turned_over(self, obs: Sight) -> bool:
-        """No second map where the map does not grow, or before the object was ever found."""
-        return not self.policy.frozen and self.life.T_cam_obj is not None and super()._turned_over(obs)
+        """No second map where the map does not grow."""
+        return not self.policy.frozen and super()._turned_over(obs)
 
 
 def _certain(landmarks: float, share: float, outline: Callable[[], float | None]) -> bool:

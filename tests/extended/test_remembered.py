@@ -261,6 +261,14 @@ def test_one_that_is_seen_here_and_there_does_not_keep_another_waiting(crossing,
     assert told["box"].T_cam_obj is not None and told["elsewhere"].T_cam_obj is None
 
 
+def test_nothing_is_taken_for_two_objects(crossing, learnt):
+    method = Point2Pose(crossing.camera)
+    for name in ("one", "other"):
+        method.add_object(name, memory=replace(learnt.memory, name=name))
+    told = followed(crossing, method, range(45, 53))[-1]
+    assert sum(one.T_cam_obj is not None for one in told.values()) == 1
+
+
 def test_a_claim_that_the_surface_alone_bears_out_is_withdrawn_too(crossing, learnt, monkeypatch):
     method = Point2Pose(crossing.camera)
     method.add_object("box", memory=learnt.memory)
@@ -303,6 +311,14 @@ def test_a_frozen_map_does_not_grow(crossing, learnt):
     assert all(one["box"].T_cam_obj is not None and not one["box"].keyframe for one in told[2:])
     assert len(model.views) == len(learnt.memory.T_cam_obj)
     np.testing.assert_allclose(model.surface.values(), learnt.values, atol=1e-3)
+
+
+def test_a_mask_of_something_else_founds_no_other_map(learnt):
+    other = open_sequence("synthetic/mug")
+    method = Point2Pose(other.camera)
+    method.add_object("box", memory=learnt.memory)
+    told = [method.step(other.frame(i), {"box": other.masks(i)["mug"]})["box"] for i in range(15)]
+    assert all(one.status is Status.LOST and one.map_id == 0 for one in told)
 
 
 def test_few_landmarks_prove_nothing_on_what_does_not_end_where_depth_does():
