@@ -156,7 +156,8 @@ class Point2Pose(pipeline.Point2Pose):
         """
         learnt = {name: self.memory(name) for name, obj in self.objects.items() if not obj.model.empty}
         parts = {"tracker": self.tracker.name, "detector": self.detector.name, "segmenter": self.segmenter.name}
-        about = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": list(self.objects), **parts}
+        frozen = {name: isinstance(obj, Remembered) and obj.frozen for name, obj in self.objects.items()}
+        about = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": frozen, **parts}
         save_memories(path, learnt, _SAVED, about)
 
     @classmethod
@@ -169,8 +170,8 @@ class Point2Pose(pipeline.Point2Pose):
         try:
             said = {name: about[name] for name in ("tracker", "detector", "segmenter")} | parts
             loaded = cls(camera or Camera(**about["camera"]), from_dict(about["config"], str(path)), **said)
-            for name in about["objects"]:
-                loaded.add_object(name, memory=learnt.get(name))
+            for name, frozen in about["objects"].items():
+                loaded.add_object(name, memory=learnt.get(name), frozen=frozen)
         except (KeyError, TypeError, AttributeError) as error:
             raise BadInput(str(path), f"a file without {error}", _SAVED_BY) from None
         return loaded

@@ -350,7 +350,7 @@ def test_the_graph_keeps_landmarks_where_the_memory_has_them():
 def test_a_tracker_survives_a_restart(crossing, learnt, tmp_path):
     learnt.method.save(tmp_path / "tracker.npz")
     with np.load(tmp_path / "tracker.npz", allow_pickle=False) as file:
-        assert json.loads(file["about"].tobytes())["about"]["objects"] == ["box"]
+        assert json.loads(file["about"].tobytes())["about"]["objects"] == {"box": False}
     loaded = Point2Pose.load(tmp_path / "tracker.npz")
     assert loaded.config == learnt.method.config and loaded.camera == crossing.camera
     again = range(LEARNT[-1] + 1, LEARNT[-1] + 5)
@@ -361,6 +361,15 @@ def test_a_tracker_survives_a_restart(crossing, learnt, tmp_path):
     with pytest.raises(BadInput, match=r"Point2Pose\.save"):
         save_memory(tmp_path / "box.npz", learnt.memory)
         Point2Pose.load(tmp_path / "box.npz")
+
+
+def test_what_is_frozen_is_so_after_a_restart_and_what_is_not_found_yet_is_looked_for(crossing, learnt, tmp_path):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory, frozen=True)
+    method.save(tmp_path / "tracker.npz")
+    loaded = Point2Pose.load(tmp_path / "tracker.npz")
+    told = followed(crossing, loaded, range(45, 52))
+    assert told[-1]["box"].T_cam_obj is not None and loaded.objects["box"].policy.frozen
 
 
 def test_after_a_reset_it_is_looked_for_as_at_first(crossing, learnt):
