@@ -48,7 +48,7 @@ def held(ours: Point2Pose, peer: Peer) -> dict[str, float]:
         "keypoints": len(obj.map),
         "keyframes": len(obj.model.graph.keys),
         "views": len(obj.model.views),
-        "images": len(obj.model.surface.keys),
+        "images": len(obj.model.surface.views),
         "voxels (million)": rounded(np.prod(obj.model.surface.shape) / 1e6),
         "peer, keypoints": len(known.p_obj),
         "peer, map (MB)": round((known.p_obj.nbytes + known.descriptors.nbytes) / 2**20, 1),

@@ -105,6 +105,7 @@ def run(
     options = replace(options or RunOptions(), **changes)
     with progress_bar("reading", shown=progress and sys.stderr.isatty(), leave=False, bar_format="{desc} ..."):
         job = _prepare(sequence, options)
+    sizes_m = lengths_m(options.sizes, job.objects)
     _doubt_scale(job)
     tracker = options.tracker
     if tracker == OracleTracker.name:  # which has to know the sequence
@@ -118,7 +119,7 @@ def run(
         _say_what_was_there(writer, say)
         if not writer.complete:
             prompts = [prompt for of_frame in job.prompts.values() for prompt in of_frame]
-            keeper = Keeper(writer, method, options.save_masks, prompts, sizes_m=lengths_m(options.sizes))
+            keeper = Keeper(writer, method, options.save_masks, prompts, sizes_m)
             _track(job, keeper, options.skip_bad, progress, say)
     interrupted = writer.info["stopped_by"] is not None
     if not writer.begun and not writer.earlier:
@@ -402,8 +403,6 @@ def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path,
         {name: path for name, path in known.items() if name in job.objects},
         if_exists,
     )
-    if unknown := lengths_m(options.sizes).keys() - set(job.objects):
-        raise BadInput("size", f"the name {min(unknown)!r}", f"one of the objects: {', '.join(job.objects)}")
     writer.info["left_out"] = {}
     writer.info |= told(method, options, [prompt for of_frame in job.prompts.values() for prompt in of_frame])
     return writer

@@ -32,7 +32,7 @@ def stream():
             "tracked": len(method.tracker._points),
             "mapped": len(box.map),
             "views": len(box.model.views),
-            "pictures": len(box.model.surface.keys),
+            "pictures": len(box.model.surface.views),
             "graph": len(box.model.graph.keys),
             "voxels": int(np.prod(box.model.surface.shape)),
             "tracked pose": estimate.status in WITH_POSE,

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError
 from p2p_lib.core.findings import Finding, Level
+from p2p_lib.core.options import lengths_m
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
@@ -85,13 +87,13 @@ def check_folder(
     format: str | None = None,
     depth_scale: float | None = None,
     config: Config | None = None,
-    sizes_m: Mapping[str, float] | None = None,
+    sizes: Mapping[str, Any] | None = None,
 ) -> list[Finding]:
     """What is right and wrong with a sequence, in the order in which it should be mended.
 
     prompts  clicks, for a sequence without masks: the built-in segmenter makes its first ones
     config   whose limits count (default: the preset ``default``)
-    sizes_m  how long objects are known to be: what was measured is compared with it
+    sizes    how long objects are known to be, cm: what was measured is compared with it
 
     Files that are missing or cannot be read are findings too, all that can be told without each other.
     """
@@ -116,6 +118,7 @@ def check_folder(
             firsts = clicked_masks(sequence, prompts, config) if prompts else _first_masks(sequence, config)
         except P2PError as error:
             return [_unreadable("clicks" if prompts else "masks", error)]
+    sizes_m = lengths_m(sizes, dict.fromkeys([*sequence.objects, *firsts]))
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     scale = getattr(sequence, "depth_scale", 1.0)
     depth = _depth(frames, scale)
@@ -133,7 +136,7 @@ def check_folder(
         if mask.sum() < config.lifecycle.min_mask_px:
             findings.append(_nothing_there(name, frame, mask, config))
             continue
-        if name in (sizes_m or {}):
+        if name in sizes_m:
             findings.append(_size(name, sizes_m[name], frame, mask, sequence.camera))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         findings.append(_range(name, frame, mask, config, scale))

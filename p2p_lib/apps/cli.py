@@ -194,9 +194,7 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
 
     run = load_run(a.run)
     score, not_scored = None, ""
-    if unknown := lengths_m(options.sizes).keys() - run.objects.keys():
-        raise BadInput("size", f"the name {min(unknown)!r}", f"one of the objects: {', '.join(run.objects)}")
-    for name, text in size_doubts(a.run, lengths_m(options.sizes)).items():
+    for name, text in size_doubts(a.run, lengths_m(options.sizes, run.objects)).items():
         warn(f"p2p eval: {name}: {text}")
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
@@ -446,7 +444,7 @@ def _check(a: argparse.Namespace) -> int:
     from p2p_lib.datasets.prompts import load_prompts
 
     prompts = load_prompts(a.prompts) if a.prompts else ()
-    how = {"format": a.format, "depth_scale": a.depth_scale, "sizes_m": lengths_m(RunOptions.of_arguments(a).sizes)}
+    how = {"format": a.format, "depth_scale": a.depth_scale, "sizes": RunOptions.of_arguments(a).sizes}
     findings = check_folder(a.sequence, prompts=prompts, **how)
     fine = "Nothing is wrong with it as far as can be seen."
     print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings, fine))

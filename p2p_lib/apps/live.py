@@ -102,9 +102,9 @@ def track_live(
     if backlog < 0:
         raise BadInput("backlog", backlog, "how many images may wait, from 0")
     config = config.with_values({"segmentation.sam2_every": 0})  # no image waits for it
+    memories = load_memories(options.memory or ())
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
     warm_up(say)
-    memories = load_memories(options.memory or ())
     recall(method, memories, options.frozen)
     if options.tracker.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -446,13 +447,19 @@ def from_toml(path: str | Path, base: Config | None = None) -> Config:
     """Read ``[stage] key = value`` from a TOML file over ``base``, else over the file's own ``preset``."""
     path = Path(path)
     table = read_toml(path, "TOML, [stage] tables of key = value", "Give --config an existing TOML file.")
-    named = table.pop("preset", "default")
+    return from_dict(table, str(path), base)
+
+
+def from_dict(table: Mapping[str, Any], source: str, base: Config | None = None) -> Config:
+    """Nested plain values, as :meth:`Config.as_dict` gives them, over ``base``, else over their own ``preset``."""
+    named = table.get("preset", "default")
     base = base or preset(named)
     values: dict[str, Any] = {}
     for key, value in table.items():
         is_table = isinstance(value, dict) and (value or key in _STAGES)
         values |= {f"{key}.{k}": v for k, v in value.items()} if is_table else {key: value}
-    return base.with_values(values, source=str(path))
+    values.pop("preset", None)
+    return base.with_values(values, source=source)
 
 
 def _unknown(what: str, key: str, known: Any) -> BadInput:

@@ -19,7 +19,7 @@ import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from io import BytesIO
@@ -134,6 +134,15 @@ def load_by_object(path: Path, kind: type[T]) -> dict[str, T]:
         return {n: kind(*(arrays[f"{n}/{f.name}"] for f in fields(kind))) for n in names}  # type: ignore[arg-type]
     except (KeyError, TypeError) as error:
         raise BadInput(str(path), f"an archive without {error}", "arrays as p2p run wrote them") from None
+
+
+def check_arrays(what: str, value: Any, shapes: Mapping[str, tuple[int, ...]], finite: bool = False) -> None:
+    """Raise :class:`BadInput` for a field of ``value`` that is no numbers of its shape, or none that are finite."""
+    for key, shape in shapes.items():
+        got = getattr(value, key)
+        if got.shape != shape or got.dtype.kind not in "iufb" or (finite and not np.isfinite(got).all()):
+            expected = f"{'finite ' * finite}numbers {shape}"
+            raise BadInput(f"{what}: {key}", f"{got.dtype} {got.shape}", expected)
 
 
 def file_name(what: str, name: object) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.files import file_name, load_arrays, parse_json, replacing
+from p2p_lib.core.files import check_arrays, file_name, load_arrays, parse_json, replacing
 
 #: Of the files that this library writes, and reads.
 VERSION = 1
@@ -50,7 +50,8 @@ class SurfaceMemory:
     def __post_init__(self) -> None:
         m = len(self.index)
         single = {"voxel_m": (), "tau_m": (), "origin_m": (3,), "lo": (3,), "shape": (3,)}
-        _check_shapes(self, single | {"value": (m,), "weight": (m,), "rgb": (m, 3), "rgb_weight": (m,)}, "surface")
+        of_each = {"value": (m,), "weight": (m,), "rgb": (m, 3), "rgb_weight": (m,)}
+        check_arrays("memory surface", self, single | of_each, finite=True)
         voxels = np.prod(self.shape.astype(float))
         if not (0 < float(self.voxel_m) < 1 and float(self.tau_m) > 0 and (self.shape > 1).all() and voxels < 1 << 31):
             raise BadInput("memory surface", f"{self.shape} voxels of {self.voxel_m} m", "a grid of voxels")
@@ -96,16 +97,9 @@ class ObjectMemory:
             raise BadInput("memory descriptors", f"{self.descriptors.shape}", "(N, scales, SIZE) uint8")
         shapes = {"p_obj": (n, 3), "descriptors": (n, *self.descriptors.shape[1:]), "confidence": (n,)}
         shapes |= {"keypoint": (n,), "T_cam_obj": (v, 4, 4), "covariance": (6, 6), "seen_m2": ()}
-        _check_shapes(self, shapes, f"of {self.name!r}")
+        check_arrays(f"memory of {self.name!r}", self, shapes, finite=True)
         for T in self.T_cam_obj:
             se3.check("memory T_cam_obj", T, _POSE_TOLERANCE)
-
-
-def _check_shapes(value: Any, shapes: Mapping[str, tuple[int, ...]], what: str) -> None:
-    for key, shape in shapes.items():
-        got = getattr(value, key)
-        if got.shape != shape or got.dtype.kind not in "iufb" or not np.isfinite(got).all():
-            raise BadInput(f"memory {what}: {key}", f"{got.dtype} {got.shape}", f"finite numbers {shape}")
 
 
 def save_memory(path: str | Path, memory: ObjectMemory) -> None:

@@ -73,7 +73,6 @@ _MASKS = _typed(
 _PROMPTS = _typed("what starts objects and corrects masks (see p2p click)", type=Path, metavar="FILE")
 _MEMORY = _typed(
     "look for an object that an earlier run learnt (its maps/OBJECT.npz); repeatable, no clicks needed",
-    read=lambda given: tuple(path for one in given for path in str(one).split(",")),
     action="append",
     metavar="FILE",
 )
@@ -94,8 +93,6 @@ _MODELS = _typed(
     action="extend",
     metavar="NAME=PATH",
 )
-
-
 _SIZES = _typed(
     "how long objects are, cm: what was measured is compared with it",
     flag="--size",
@@ -106,9 +103,14 @@ _SIZES = _typed(
 )
 
 
-def lengths_m(given: Mapping[str, Any] | None) -> dict[str, float]:
-    """``{"mug": "9.5"}``, as ``--size mug=9.5`` gives centimetres, to metres; :class:`BadInput` for what is no size."""
-    found = {}
+def lengths_m(given: Mapping[str, Any] | None, objects: Iterable[str]) -> dict[str, float]:
+    """``{"mug": "9.5"}``, as ``--size mug=9.5`` gives centimetres, to metres.
+
+    :class:`BadInput` for what is no size, or of none of the ``objects``.
+    """
+    found: dict[str, float] = {}
+    if unknown := sorted((given or {}).keys() - set(objects)):
+        raise BadInput("size", f"the name {unknown[0]!r}", f"one of the objects: {', '.join(objects)}")
     for name, cm in (given or {}).items():
         try:
             found[name] = float(cm) / 100
@@ -228,9 +230,14 @@ def _word(option: Field, value: Any) -> str:
     flag = _flag(option)
     if value == option.default or value == []:
         return f"no {flag}"
+    if value is True:
+        return flag
+    said = [",".join(value) if isinstance(value, list) else str(value)]
     if isinstance(value, Mapping):
-        return " ".join(f"{flag} {quote(f'{name}={of}')}" for name, of in value.items())
-    return flag if value is True else f"{flag} {quote(','.join(value) if isinstance(value, list) else str(value))}"
+        said = [f"{name}={of}" for name, of in value.items()]
+    elif option.metadata["how"].get("action") == "append":
+        said = value
+    return " ".join(f"{flag} {quote(one)}" for one in said)
 
 
 def add_options(parser: argparse.ArgumentParser, *wanted: str, **helps: str) -> None:

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from p2p_lib.core.errors import BadInput
-from p2p_lib.core.files import load_by_object, replacing
+from p2p_lib.core.files import check_arrays, load_by_object, replacing
 
 FILE = "keypoints.npz"
 
@@ -37,9 +36,7 @@ class ObjectKeypoints:
     def __post_init__(self) -> None:
         n, m = len(self.ids), len(self.frame_index)
         of_map = {"ids": (n,), "p_obj": (n, 3), "promoted": (n,)}
-        for key, shape in (of_map | {"frame_index": (m,), "track_id": (m,), "uv_px": (m, 2)}).items():
-            if (got := getattr(self, key)).shape != shape or got.dtype.kind not in "iufb":
-                raise BadInput(f"keypoints: {key}", f"shape {got.shape} {got.dtype}", f"numbers {shape}")
+        check_arrays("keypoints", self, of_map | {"frame_index": (m,), "track_id": (m,), "uv_px": (m, 2)})
 
     def at(self, frame: int) -> slice:
         """The rows of observations of one frame."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.files import load_by_object, replacing
+from p2p_lib.core.files import check_arrays, load_by_object, replacing
 from p2p_lib.core.types import Frame
 
 FILE = "masks.npz"
@@ -49,9 +49,7 @@ class ObjectMasks:
     def __post_init__(self) -> None:
         n = len(self.frame_index)
         shapes = {"frame_index": (n,), "px": (n,), "box": (n, 4), "size_m": (n,), "centre_m": (n, 3)}
-        for key, shape in shapes.items():
-            if (got := getattr(self, key)).shape != shape or got.dtype.kind not in "iuf":
-                raise BadInput(f"masks: {key}", f"shape {got.shape} {got.dtype}", f"numbers {shape}")
+        check_arrays("masks", self, shapes)
         if self.bits.dtype != np.uint8 or self.bits.shape != (self._ends[-1],):
             raise BadInput("masks: bits", f"shape {self.bits.shape} {self.bits.dtype}", f"{self._ends[-1]} bytes")
 

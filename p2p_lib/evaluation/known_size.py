@@ -36,10 +36,9 @@ def size_doubt(known_m: float, mask_m: float, mesh_m: float = float("nan")) -> s
         return ""
     found = " and ".join(f"{100 * m:.1f} cm {what}" for what, m in measured.items())
     factor = float(np.median(list(off.values())))
-    why = "focal length or depth scale is wrong by this factor, or masks hold more than the object"
-    if factor < 1:
-        why = "focal length or depth scale is wrong by this factor, or its length was never in view"
-    return f"known to be {100 * known_m:.1f} cm long, measured {found}, {factor:.2f} times: {why}"
+    text = f"known to be {100 * known_m:.1f} cm long, measured {found}, {factor:.2f} times"
+    besides = "its length was never in view" if factor < 1 else "masks hold more than the object"
+    return f"{text}: focal length or depth scale is wrong by this factor, or {besides}"
 
 
 def size_doubts(folder: str | Path, known_m: Mapping[str, float]) -> dict[str, str]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.config import Config, as_config, preset
+from p2p_lib.core.config import Config, as_config, from_dict
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.memory import ObjectMemory, read_memories, save_memories
@@ -66,7 +66,8 @@ MECHANISMS = {
     "sure_keyframes": "A pose that is hardly believed, or a return to be confirmed, makes no keyframe.",
     "stray_points": "A point that is seen far from where the pose has it stays out of the graph.",
 }
-_SAVED = "p2p tracker"
+#: A file of :meth:`Point2Pose.save`: its kind, and what that is to people.
+_SAVED, _SAVED_BY = "p2p tracker", "a tracker as Point2Pose.save writes it"
 ALL, NONE, ALL_BUT = "all", "none", "all but "
 
 
@@ -108,6 +109,7 @@ class Point2Pose(pipeline.Point2Pose):
     ):
         config = as_config("default" if config is None else config)
         self._made_of: tuple[Any, ...] = camera, config, tracker, detector, segmenter
+        self._recogniser: Any = None  # of all objects that are known from memories
         super().__init__(*self._made_of, compose(camera, config))
 
     def reset(self) -> None:
@@ -123,8 +125,6 @@ class Point2Pose(pipeline.Point2Pose):
             turn = self._turn
             Point2Pose.__init__(self, *self._made_of)
             self._turn = turn
-
-    _recogniser: Any = None  # of all objects that are known from memories
 
     def add_object(
         self, name: str, *said: Any, memory: ObjectMemory | None = None, frozen: bool = False, **more: Any
@@ -156,7 +156,8 @@ class Point2Pose(pipeline.Point2Pose):
         """
         learnt = {name: self.memory(name) for name, obj in self.objects.items() if not obj.model.empty}
         parts = {"tracker": self.tracker.name, "detector": self.detector.name, "segmenter": self.segmenter.name}
-        about = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": list(self.objects), **parts}
+        frozen = {name: isinstance(obj, Remembered) and obj.frozen for name, obj in self.objects.items()}
+        about = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": frozen, **parts}
         save_memories(path, learnt, _SAVED, about)
 
     @classmethod
@@ -165,18 +166,14 @@ class Point2Pose(pipeline.Point2Pose):
 
         camera  where it is another one now; ``parts`` are a tracker, detector or segmenter in place of those named
         """
-        about, learnt = read_memories(path, _SAVED, "a tracker as Point2Pose.save writes it")
+        about, learnt = read_memories(path, _SAVED, _SAVED_BY)
         try:
             said = {name: about[name] for name in ("tracker", "detector", "segmenter")} | parts
-            stages = {stage: keys for stage, keys in about["config"].items() if isinstance(keys, dict)}
-            settings = {f"{stage}.{key}": of for stage, keys in stages.items() for key, of in keys.items()}
-            config = preset(about["config"]["preset"], about["config"]["seed"])
-            config = config.with_values(settings | {"device": about["config"]["device"]})
-            loaded = cls(camera or Camera(**about["camera"]), config, **said)
-            for name in about["objects"]:
-                loaded.add_object(name, memory=learnt.get(name))
+            loaded = cls(camera or Camera(**about["camera"]), from_dict(about["config"], str(path)), **said)
+            for name, frozen in about["objects"].items():
+                loaded.add_object(name, memory=learnt.get(name), frozen=frozen)
         except (KeyError, TypeError, AttributeError) as error:
-            raise BadInput(str(path), f"a file without {error}", "a tracker as Point2Pose.save writes it") from None
+            raise BadInput(str(path), f"a file without {error}", _SAVED_BY) from None
         return loaded
 
     def memory(self, name: str, known: Known | None = None, **made_of: Any) -> ObjectMemory:

@@ -20,9 +20,9 @@ from p2p_lib.method.factor_graph import GraphResult, Keyframe, Link, ObjectGraph
 _MOVED_SIGMA = 1.25
 #: No noise explains an observation that is off by more standard deviations, poses a little off included.
 _STRAY_SIGMAS = 8.0
-# Noise of the relative pose that ties a graph to the one it joins (rad, m): next to none beside what points say.
 # Noise of a landmark that a memory places, m.
 _REMEMBERED_M = 0.002
+# Noise of the relative pose that ties a graph to the one it joins (rad, m): next to none beside what points say.
 _JOINED_SIGMAS = np.repeat([0.05, 0.01], 3)
 
 

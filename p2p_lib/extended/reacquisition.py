@@ -73,8 +73,7 @@ class Reacquisition(Frontend):
         if not sought:
             return asked
         self._turn += 1
-        turn = [name for name in sought if self.objects[name].awaits] or sought
-        name = turn[self._turn % len(turn)]
+        name = sought[self._turn % len(sought)]
         others = [mask for other, mask in self.masks.items() if other != name and mask is not None]
         with self.stopwatch("search"):
             found = self.objects[name].find(asked.frame, asked.masks[name], either(others) if others else None)

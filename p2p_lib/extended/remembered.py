@@ -75,7 +75,7 @@ class Remembered(TwoMaps):
     def __init__(self, own: ObjectTracker, memory: ObjectMemory, recogniser: Any, frozen: bool = False):
         super().__init__(own)
         self._rng = np.random.default_rng(0)
-        self._memory, self._frozen = memory, frozen
+        self._memory, self.frozen = memory, frozen
         self._recogniser = recogniser
         self._fewest = max(_FEWEST, _OF_A_VIEW * len(memory.p_obj) / min(len(memory.T_cam_obj), _VIEWS))
         self._begin()
@@ -96,11 +96,6 @@ class Remembered(TwoMaps):
     def recalls(self) -> bool:
         """Whether it is to be looked for by its landmarks."""
         return not self.life.has_pose or (self._bare and not self._sure)
-
-    @property
-    def awaits(self) -> bool:
-        """Whether it has been found once, and is to be looked for again right away."""
-        return any(T is not None for _, T in self._finds)
 
     @property
     def _sure(self) -> bool:
@@ -229,7 +224,7 @@ class Remembered(TwoMaps):
         if step.estimate.T_cam_obj is not None:
             self._claimed, self._bare = True, step.estimate.inliers < _BARE
             self._borne_out += step.estimate.inliers >= self.config.lifecycle.return_inliers
-            self.policy.frozen = self._frozen or not self._sure
+            self.policy.frozen = self.frozen or not self._sure
         self._since += 1
         due = self._since >= _EVERY and step.estimate.T_cam_obj is not None and self.known.map_id == 0
         if not due or followed >= _ENOUGH or step.estimate.status is Status.DEGRADED or obs.mask is None:
@@ -253,8 +248,8 @@ class Remembered(TwoMaps):
         return False
 
     def _turned_over(self, obs: Sight) -> bool:
-        """No second map where the map does not grow, or before the object was ever found."""
-        return not self.policy.frozen and self.life.T_cam_obj is not None and super()._turned_over(obs)
+        """No second map where the map does not grow."""
+        return not self.policy.frozen and super()._turned_over(obs)
 
 
 def _certain(landmarks: float, share: float, outline: Callable[[], float | None]) -> bool:

@@ -54,7 +54,7 @@ def _landmarks(known: Known, surface: TsdfVolume) -> tuple[np.ndarray, ...]:
     own, sure = points.p_obj[points.promoted], points.confidence[points.promoted]
     middling = float(np.median(sure)) if len(sure) else 0.0
     found: list[tuple[np.ndarray, ...]] = []
-    for view in surface._views.values():
+    for view in surface.views.values():
         (height, width), (left, top), lens = view.inside.shape, view.corner, view.camera
         camera = Camera(lens.fx, lens.fy, lens.cx - left + 1, lens.cy - top + 1, width, height)
         depth_m = np.where(view.inside, view.depth_m, np.float32(0))
@@ -110,6 +110,5 @@ def restored(kept: SurfaceMemory, config: TsdfConfig, device: str) -> TsdfVolume
     rgb_weight = kept.rgb_weight.astype(np.float32)[:, None]
     weight = kept.weight.astype(np.float32)
     rgbw = np.hstack([kept.rgb * rgb_weight, rgb_weight])
-    volume._grid.put(kept.index, kept.value.astype(np.float32), weight, rgbw)
-    volume.lo, volume.grows, volume._total = kept.lo.copy(), True, float(weight.sum())
+    volume.put(kept.lo, kept.index, kept.value.astype(np.float32), weight, rgbw)
     return volume

@@ -42,7 +42,7 @@ _CARVE_MARGIN_PX = 1
 
 
 @dataclass(frozen=True, eq=False)
-class _View(Image):
+class View(Image):
     """One masked RGB-D observation with a border of a pixel; its box is fixed, so that taking out mirrors putting in.
 
     corner    column and row of the cut's first inner pixel
@@ -89,7 +89,7 @@ class TsdfVolume:
         self.anchor_m = np.zeros(3) if origin_m is None else np.asarray(origin_m, float)
         if np.prod(shape) > config.max_voxels:
             raise BadInput("tsdf shape", "x".join(map(str, shape)), f"at most {config.max_voxels} voxels")
-        self._views: dict[int, _View] = {}
+        self.views: dict[int, View] = {}  # observations of keyframes, oldest first, that are kept for re-integration
         self._total = 0  # of all weights
         self.lo = np.zeros(3, int)
         self._grid = CpuGrid(shape) if device == "cpu" else TorchGrid(shape, device)
@@ -115,11 +115,6 @@ class TsdfVolume:
         """(8, 3) corners of the grid in the object frame."""
         corners = np.array(np.meshgrid(*zip(self.lo, self.lo + self.shape, strict=True), indexing="ij"))
         return self.anchor_m + self.voxel_m * corners.reshape(3, -1).T
-
-    @property
-    def keys(self) -> tuple[int, ...]:
-        """The keyframes whose observations are kept for re-integration, oldest first."""
-        return tuple(self._views)
 
     def values(self) -> np.ndarray:
         """(nx, ny, nz) float32: V(v) = the mean of min(1, d / tau), normalised to [-1, 1]; NaN where unobserved."""
@@ -167,12 +162,17 @@ class TsdfVolume:
             return 0
         if key is not None:
             self.remove(key)
-            self._views[key] = view
+            self.views[key] = view
         return self._fuse(view, 1.0)
+
+    def put(self, lo: np.ndarray, index: np.ndarray, value: np.ndarray, weight: np.ndarray, rgbw: np.ndarray) -> None:
+        """Set voxels as :meth:`CpuGrid.put` does, of a grid that begins at lattice index ``lo`` (3,) and grows on."""
+        self._grid.put(index, value, weight, rgbw)
+        self.lo, self.grows, self._total = lo.copy(), True, float(weight.sum())
 
     def remove(self, key: int) -> bool:
         """Take a kept keyframe's observation out of the volume; False if there is none."""
-        view = self._views.pop(key, None)
+        view = self.views.pop(key, None)
         if view is not None:
             self._fuse(view, -1.0)
         return view is not None
@@ -180,7 +180,7 @@ class TsdfVolume:
     def keep_only(self, keys: Iterable[int]) -> None:
         """Let go of the kept observations of all other keyframes: they stay fused, and cannot be moved any more."""
         kept = set(map(int, keys))
-        self._views = {key: view for key, view in self._views.items() if key in kept}
+        self.views = {key: view for key, view in self.views.items() if key in kept}
 
     def move(self, poses: Mapping[int, np.ndarray], limit: int | None = None) -> list[int]:
         """Re-integrate the kept observations of keyframes that the graph has moved (T_cam_obj by key).
@@ -189,12 +189,12 @@ class TsdfVolume:
         ``limit`` of them (None: all); the rest stay where they are for a later
         call. Poses that are not finite are passed over. Returns the keys moved.
         """
-        known = [key for key in poses if key in self._views]
+        known = [key for key in poses if key in self.views]
         if not known:
             return []
         T_new = np.stack([np.asarray(poses[key], float) for key in known])
-        T_old = np.stack([self._views[key].T_cam_obj for key in known])
-        centre = np.stack([self._views[key].centre_cam for key in known])[:, None]
+        T_old = np.stack([self.views[key].T_cam_obj for key in known])
+        centre = np.stack([self.views[key].centre_cam for key in known])[:, None]
         shift = se3.transform(se3.inverse(T_new), centre) - se3.transform(se3.inverse(T_old), centre)
         excess = np.maximum(
             np.linalg.norm(shift[:, 0], axis=-1) / (0.5 * self.voxel_m),
@@ -202,7 +202,7 @@ class TsdfVolume:
         )
         order = [i for i in np.argsort(-excess, kind="stable") if excess[i] > 1 and np.isfinite(T_new[i]).all()]
         for i in order[:limit]:
-            view = self._views[known[i]]
+            view = self.views[known[i]]
             self._fuse(view, -1.0)
             self._put(known[i], view, T_new[i])
         return [known[i] for i in order[:limit]]
@@ -212,18 +212,18 @@ class TsdfVolume:
 
         What it has let go of is not in there.
         """
-        for key, view in other._views.items():
+        for key, view in other.views.items():
             self._put(key + shift, view, view.T_cam_obj @ se3.inverse(T_obj_other))
 
-    def _put(self, key: int, view: _View, T_cam_obj: np.ndarray) -> None:
+    def _put(self, key: int, view: View, T_cam_obj: np.ndarray) -> None:
         """Fuse and keep a view at a pose."""
         moved = replace(view, T_cam_obj=T_cam_obj)
         self._grow(moved)
         lo, hi = self._frustum_box(moved)
-        self._views[key] = moved = replace(moved, lo=lo, hi=hi)
+        self.views[key] = moved = replace(moved, lo=lo, hi=hi)
         self._fuse(moved, 1.0)
 
-    def _view(self, depth_m, rgb, mask, camera: Camera, T_cam_obj) -> _View | None:
+    def _view(self, depth_m, rgb, mask, camera: Camera, T_cam_obj) -> View | None:
         depth_m, mask = np.asarray(depth_m), np.asarray(mask, bool)
         want = (camera.height, camera.width)
         if depth_m.shape != want or mask.shape != want or np.shape(rgb) != (*want, 3):
@@ -242,7 +242,7 @@ class TsdfVolume:
         lo, hi = self._frustum_box(view)
         return replace(view, lo=lo, hi=hi)
 
-    def _cut(self, left, top, right, bottom, depth_m, rgb, mask, camera, T_cam_obj) -> _View:
+    def _cut(self, left, top, right, bottom, depth_m, rgb, mask, camera, T_cam_obj) -> View:
         """The view of these columns and rows of an image."""
         cut = np.s_[top:bottom, left:right]
         depth, mask = np.asarray(depth_m[cut], np.float32), mask[cut]
@@ -252,9 +252,9 @@ class TsdfVolume:
         depth = np.pad(np.where(used, depth, -np.inf), 1, constant_values=-np.inf)
         rgbw = np.ones((4, *inside.shape), np.uint8)
         rgbw[:3, 1:-1, 1:-1] = np.moveaxis(np.asarray(rgb)[cut], -1, 0)
-        return _View(depth, inside, rgbw, self.lo, self.lo, (left, top), camera, T_cam_obj)
+        return View(depth, inside, rgbw, self.lo, self.lo, (left, top), camera, T_cam_obj)
 
-    def _window(self, view: _View) -> tuple[int, int, int, int]:
+    def _window(self, view: View) -> tuple[int, int, int, int]:
         """Columns and rows [left, top, right, bottom) that the grid projects to, all where it reaches the camera."""
         p_cam = se3.transform(view.T_cam_obj, self.corners_m())
         width, height = view.camera.width, view.camera.height
@@ -265,7 +265,7 @@ class TsdfVolume:
         right, bottom = np.clip(np.ceil(uv.max(0)) + 1, (left + 1, top + 1), (width, height)).astype(int)
         return int(left), int(top), int(right), int(bottom)
 
-    def _region(self, view: _View) -> np.ndarray:
+    def _region(self, view: View) -> np.ndarray:
         """(2, 3) robust bounds of the masked cloud in the object frame, unpadded.
 
         The largest run of depths without a gap, and of it all but the outermost half percent on each
@@ -282,7 +282,7 @@ class TsdfVolume:
         p_obj = se3.transform(se3.inverse(view.T_cam_obj), view.camera.unproject(uv_px, z[own]))
         return np.percentile(p_obj, [0.5, 99.5], axis=0)
 
-    def _grow(self, view: _View) -> None:
+    def _grow(self, view: View) -> None:
         """Make room for the view's cloud."""
         if not self.grows:
             return
@@ -315,7 +315,7 @@ class TsdfVolume:
                 high = share
         return lo, hi
 
-    def _frustum_box(self, view: _View) -> tuple[np.ndarray, np.ndarray]:
+    def _frustum_box(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Lattice box [lo, hi) of the grid's voxels that may lie behind the view's pixels, before depth + tau."""
         lo, hi = self.lo, self.lo + self.shape
         corners = np.array(np.meshgrid(*zip(lo, hi - 1, strict=True), indexing="ij")).reshape(3, -1).T
@@ -332,7 +332,7 @@ class TsdfVolume:
         box_lo = np.clip(np.floor(index.min(0)).astype(int), lo, hi)
         return box_lo, np.clip(np.ceil(index.max(0)).astype(int) + 1, box_lo, hi)
 
-    def _fuse(self, view: _View, weight: float) -> int:
+    def _fuse(self, view: View, weight: float) -> int:
         """Fuse a view, or take it out with weight -1; returns how many voxels it touched."""
         if (view.hi <= view.lo).any():
             return 0

@@ -302,7 +302,7 @@ def test_a_known_size_tells_what_nothing_else_does(good):
     """The focal length of a lens half as long makes everything twice as wide; all other findings stay as they were."""
     assert "--size NAME=CM" in found(good, "camera").text
     length_m = mask_length_m((frame := open_sequence(good).frame(0)), open_sequence(good).masks(0)["box"], CAMERA)
-    known = {"sizes_m": {"box": length_m}}
+    known = {"sizes": {"box": 100 * length_m}}
     assert found(good, "box: size", **known).level is Level.OK
     wide = another_K(open_sequence(good), CAMERA.K * [[0.5, 1, 1], [1, 0.5, 1], [1, 1, 1]])
     finding = found(wide, "box: size", **known)

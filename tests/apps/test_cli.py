@@ -343,7 +343,8 @@ def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, c
     )
     assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=40"]) == 0
     assert "or its length was never in view" in capsys.readouterr().err
-    for words in (["eval", str(tmp_path / "run")], ["run", str(sequence), "--out", str(tmp_path / "third")]):
+    third = ["run", str(sequence), "--out", str(tmp_path / "third")]
+    for words in (["eval", str(tmp_path / "run")], third, ["check", str(sequence)]):
         assert cli.main([*words, "--size", "mug=9"]) == 2
         assert "size: got the name 'mug', expected one of the objects: object" in capsys.readouterr().err
     assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=long"]) == 2

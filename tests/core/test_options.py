@@ -24,7 +24,7 @@ TYPED = {
     "detector": (["--detector", "orb"], "orb"),
     "masks": (["--masks", "dataset:drawn"], "dataset:drawn"),
     "prompts": (["--prompts", "p.json"], "p.json"),
-    "memory": (["--memory", "a.npz", "--memory", "b.npz"], ["a.npz", "b.npz"]),
+    "memory": (["--memory", "a, b.npz", "--memory", "c.npz"], ["a, b.npz", "c.npz"]),
     "frozen": (["--frozen"], True),
     "save_masks": (["--save-masks"], True),
     "skip_bad": (["--skip-bad"], True),

@@ -67,6 +67,12 @@ def test_a_mask_ends_where_depth_has_steps():
     assert 0.3 < outline_share(replace(frame, depth_m=half), mask) < 0.9
 
 
+def test_what_ends_before_something_nearer_has_no_outline_of_its_own():
+    (frame, mask), (pit, _) = scene(30), scene(30, wall_m=0.3)
+    assert outline_share(frame, mask, own=True) == 1
+    assert outline_share(pit, mask) == 1 and outline_share(pit, mask, own=True) == 0
+
+
 def test_where_nothing_is_measured_an_outline_tells_nothing():
     frame, mask = scene(30)
     assert outline_share(replace(frame, depth_m=np.where(mask, frame.depth_m, 0)), mask) is None

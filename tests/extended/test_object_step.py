@@ -616,7 +616,7 @@ def test_keypoints_that_keep_contradicting_are_dropped_and_hidden_ones_are_not()
 def test_images_of_merged_keyframes_are_let_go():
     lump = settled(begun(factor_graph__max_keyframes=2), [11, 22, 33, 44])
     model = lump.tracker.model
-    assert len(model.views) == 5 and len(model.surface.keys) <= 3
+    assert len(model.views) == 5 and len(model.surface.views) <= 3
 
 
 def test_no_more_points_than_are_missing_are_added():

@@ -223,11 +223,9 @@ def test_what_is_not_there_is_not_found(learnt):
         assert estimate.reason == "remembered, and not found yet"
 
 
-def test_what_is_found_in_one_image_and_elsewhere_in_the_next_is_not_claimed(crossing, learnt, monkeypatch):
-    method = Point2Pose(crossing.camera)
-    method.add_object("box", memory=learnt.memory)
-    obj, aside = method.objects["box"], iter(0.4 * np.arange(20))
-    look = obj._look
+def lead_astray(obj, monkeypatch):
+    """Have every look find the object in yet another place; returns how far aside, m, the next ones will be."""
+    look, aside = obj._look, iter(0.4 * np.arange(20))
 
     def astray(*asked):
         if (found := look(*asked)) is None:
@@ -236,9 +234,52 @@ def test_what_is_found_in_one_image_and_elsewhere_in_the_next_is_not_claimed(cro
         return replace(found, sighting=replace(found.sighting, T_cam_obj=off @ found.sighting.T_cam_obj))
 
     monkeypatch.setattr(obj, "_look", astray)
+    return aside
+
+
+def unseen(tracks):
+    """Tracks of which none is visible."""
+    return replace(tracks, visible=np.zeros(len(tracks), bool))
+
+
+def test_what_is_found_in_one_image_and_elsewhere_in_the_next_is_not_claimed(crossing, learnt, monkeypatch):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    obj = method.objects["box"]
+    aside = lead_astray(obj, monkeypatch)
     told = followed(crossing, method, LATER[:6])
     assert all(one["box"].status is Status.INITIALISING and one["box"].T_cam_obj is None for one in told)
     assert next(aside) >= 1.2 and not len(obj.map)
+
+
+def test_one_that_is_seen_here_and_there_does_not_keep_another_waiting(crossing, learnt, monkeypatch):
+    method = Point2Pose(crossing.camera)
+    for name in ("box", "elsewhere"):  # which is looked for first
+        method.add_object(name, memory=replace(learnt.memory, name=name))
+    lead_astray(method.objects["elsewhere"], monkeypatch)
+    told = followed(crossing, method, range(45, 49))[-1]
+    assert told["box"].T_cam_obj is not None and told["elsewhere"].T_cam_obj is None
+
+
+def test_nothing_is_taken_for_two_objects(crossing, learnt):
+    method = Point2Pose(crossing.camera)
+    for name in ("one", "other"):
+        method.add_object(name, memory=replace(learnt.memory, name=name))
+    told = followed(crossing, method, range(45, 53))[-1]
+    assert sum(one.T_cam_obj is not None for one in told.values()) == 1
+
+
+def test_a_claim_that_the_surface_alone_bears_out_is_withdrawn_too(crossing, learnt, monkeypatch):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    assert followed(crossing, method, range(45, 48))[-1]["box"].T_cam_obj is not None
+    obj, track = method.objects["box"], method.tracker.track
+    monkeypatch.setattr(method.tracker, "track", lambda *asked: unseen(track(*asked)))
+    monkeypatch.setattr(method.tracker, "suggest", lambda *asked: None)
+    monkeypatch.setattr(obj, "_look", lambda *asked: None)
+    told = [one["box"] for one in followed(crossing, method, range(48, 54))]
+    assert all(one.T_cam_obj is not None and not one.inliers for one in told[:5])
+    assert told[5].status is Status.INITIALISING and not len(obj.map)
 
 
 def test_a_claim_that_nothing_bears_out_is_withdrawn(crossing, learnt):
@@ -272,6 +313,14 @@ def test_a_frozen_map_does_not_grow(crossing, learnt):
     np.testing.assert_allclose(model.surface.values(), learnt.values, atol=1e-3)
 
 
+def test_a_mask_of_something_else_founds_no_other_map(learnt):
+    other = open_sequence("synthetic/mug")
+    method = Point2Pose(other.camera)
+    method.add_object("box", memory=learnt.memory)
+    told = [method.step(other.frame(i), {"box": other.masks(i)["mug"]})["box"] for i in range(15)]
+    assert all(one.status is Status.LOST and one.map_id == 0 for one in told)
+
+
 def test_few_landmarks_prove_nothing_on_what_does_not_end_where_depth_does():
     assert _certain(1, 0.9, lambda: 0.6)
     assert not _certain(5, 0.9, lambda: 0.1) and not _certain(5, 0.9, lambda: None)
@@ -301,7 +350,7 @@ def test_the_graph_keeps_landmarks_where_the_memory_has_them():
 def test_a_tracker_survives_a_restart(crossing, learnt, tmp_path):
     learnt.method.save(tmp_path / "tracker.npz")
     with np.load(tmp_path / "tracker.npz", allow_pickle=False) as file:
-        assert json.loads(file["about"].tobytes())["about"]["objects"] == ["box"]
+        assert json.loads(file["about"].tobytes())["about"]["objects"] == {"box": False}
     loaded = Point2Pose.load(tmp_path / "tracker.npz")
     assert loaded.config == learnt.method.config and loaded.camera == crossing.camera
     again = range(LEARNT[-1] + 1, LEARNT[-1] + 5)
@@ -312,6 +361,24 @@ def test_a_tracker_survives_a_restart(crossing, learnt, tmp_path):
     with pytest.raises(BadInput, match=r"Point2Pose\.save"):
         save_memory(tmp_path / "box.npz", learnt.memory)
         Point2Pose.load(tmp_path / "box.npz")
+
+
+def test_what_is_frozen_is_so_after_a_restart_and_what_is_not_found_yet_is_looked_for(crossing, learnt, tmp_path):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory, frozen=True)
+    method.save(tmp_path / "tracker.npz")
+    loaded = Point2Pose.load(tmp_path / "tracker.npz")
+    told = followed(crossing, loaded, range(45, 52))
+    assert told[-1]["box"].T_cam_obj is not None and loaded.objects["box"].policy.frozen
+
+
+def test_after_a_reset_it_is_looked_for_as_at_first(crossing, learnt):
+    method, told = Point2Pose(crossing.camera), []
+    for _ in range(2):
+        method.add_object("box", memory=learnt.memory)
+        told.append(followed(crossing, method, LATER[:3])[-1]["box"])
+        method.reset()
+    np.testing.assert_array_equal(told[1].T_cam_obj, told[0].T_cam_obj)
 
 
 def test_look_alikes_are_not_taken_for_each_other():

@@ -45,6 +45,12 @@ def described(now: Image, uv_px: np.ndarray) -> tuple[np.ndarray, Corners]:
     return known, Corners(uv_px, planes.p_cam, features.describe(now.gray, uv_px, steps))
 
 
+def alike(descriptors: np.ndarray, found: Corners, ratio: float) -> np.ndarray:
+    """(2, M) which of descriptors (N, scales, SIZE) look like which corners, by one scale or the other."""
+    scales = zip(np.moveaxis(descriptors, 1, 0), np.moveaxis(found.descriptors, 1, 0), strict=True)
+    return np.concatenate([features.match(own, of, found.uv_px, ratio) for own, of in scales], 1)
+
+
 @dataclass(eq=False)
 class Landmarks:
     """Landmarks of one segment.
@@ -87,9 +93,7 @@ class Landmarks:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs of some of the landmarks with corners: p_seg (M, 3), p_cam (M, 3), and which corner (M,)."""
         some = rng.permutation(len(self.p_seg))[:_SEARCHED]
-        wanted, offered = (np.moveaxis(of, 1, 0) for of in (self.descriptors[some], found.descriptors))
-        pairs = [features.match(w, o, found.uv_px, ratio) for w, o in zip(wanted, offered, strict=True)]
-        which, corner = np.concatenate(pairs, 1)
+        which, corner = alike(self.descriptors[some], found, ratio)
         return self.p_seg[some[which]], found.p_cam[corner], corner
 
 

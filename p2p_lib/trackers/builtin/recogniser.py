@@ -13,9 +13,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.robust import consensus
 from p2p_lib.core.types import SHARED, Frame, Rows
-from p2p_lib.trackers.builtin import features
 from p2p_lib.trackers.builtin.image import Image
-from p2p_lib.trackers.builtin.landmarks import Corners, corners, described
+from p2p_lib.trackers.builtin.landmarks import Corners, alike, corners, described
 from p2p_lib.trackers.builtin.wide_baseline import inner
 
 #: Corners that are described in a whole image, and in the mask of one object.
@@ -96,13 +95,10 @@ class Recogniser:
     def _pairs(
         found: Corners, descriptors: np.ndarray, some: np.ndarray, ratio: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Rows among ``some`` landmarks, and the corners that look like them, by either scale."""
+        """Rows among ``some`` landmarks, and the corners that look like them."""
         if not len(found) or not len(some):
             return np.zeros((2, 0), int)
-        wanted = descriptors[some].astype(np.float32) / _SCALE
-        scales = zip(np.moveaxis(wanted, 1, 0), np.moveaxis(found.descriptors, 1, 0), strict=True)
-        pairs = [features.match(w, o, found.uv_px, ratio) for w, o in scales]
-        which, corner = np.unique(np.concatenate(pairs, 1), axis=1)
+        which, corner = np.unique(alike(descriptors[some].astype(np.float32) / _SCALE, found, ratio), axis=1)
         return some[which], corner
 
 
