@@ -51,9 +51,7 @@ def sheet(scene: Sequence, models: dict[str, Textured], frames: Iterable[int]) -
         poses = {name: scene.truth[name].T_cam_model[i] for name in models}
         poses = {name: T for name, T in poses.items() if np.isfinite(T).all()}
         tile = over_image(scene.frame(i).rgb, models, poses, scene.camera)
-        tiles.append(
-            overlay.draw_caption(tile, f"image {scene.frame_names[i]}: left half photographed, right rendered")
-        )
+        tiles.append(overlay.draw_caption(tile, f"image {scene.frame_names[i]}: left half as recorded, right rendered"))
     return overlay.montage(tiles, columns=2)
 
 
