@@ -61,35 +61,27 @@ def of_one_surface(
 
     narrow  whether parts that are too narrow for this keep the pixels that agree with what is around them in the mask
     """
-    square = np.ones((2 * border_px + 1,) * 2, np.uint8)
-    inner = cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    found = inner & off_edges(depth_m, edge_m)
-    if not narrow:
-        return found
-    agrees = agreeing(np.ascontiguousarray(depth_m, np.float32), np.ascontiguousarray(mask, bool), edge_m)
-    return found | (narrow_parts(mask, border_px) & agrees)
-
-
-def narrow_parts(mask: np.ndarray, border_px: int) -> np.ndarray:
-    """(H, W) bool: where the mask is so narrow that a border of so many pixels leaves nothing of it nearby."""
-    inside = np.ascontiguousarray(mask).astype(np.uint8)
     border, near = (np.ones((2 * reach_px + 1,) * 2, np.uint8) for reach_px in (border_px, 2 * border_px))
-    wide = cv2.erode(inside, border, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return (inside > 0) & (cv2.dilate(wide, near) == 0)  # the corner of something wide is not narrow
+    inner = cv2.erode(mask.astype(np.uint8), border, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    found = (inner > 0) & off_edges(depth_m, edge_m)
+    thin = mask & (cv2.dilate(inner, near) == 0)  # the corner of something wide is not narrow
+    if narrow and thin.any():
+        found |= _agreeing(np.ascontiguousarray(depth_m, np.float32), np.ascontiguousarray(mask, bool), thin, edge_m)
+    return found
 
 
-@compiled("f4[:,::1], b1[:,::1], f8")
-def agreeing(depth_m: np.ndarray, mask: np.ndarray, edge_m: float) -> np.ndarray:
-    """(H, W) bool: pixels of the mask that most of what it measures around them agrees with, two readings at least.
+@compiled("f4[:,::1], b1[:,::1], b1[:,::1], f8")
+def _agreeing(depth_m: np.ndarray, mask: np.ndarray, part: np.ndarray, edge_m: float) -> np.ndarray:
+    """(H, W) bool: pixels of a part of a mask that most of what the mask measures around them agrees with.
 
-    Around is the 5x5 neighbourhood; readings agree that differ by ``edge_m`` at most. On something a few pixels wide
-    no neighbourhood is whole.
+    Around is the 5x5 neighbourhood, of which it measures two pixels at least; readings agree that differ by
+    ``edge_m`` at most. On something a few pixels wide no neighbourhood is whole.
     """
     height, width = depth_m.shape
     out = np.zeros((height, width), np.bool_)
     for v in range(height):
         for u in range(width):
-            if not (mask[v, u] and depth_m[v, u] > 0):
+            if not (part[v, u] and depth_m[v, u] > 0):
                 continue
             measured, near = 0, 0
             for j in range(max(v - 2, 0), min(v + 3, height)):

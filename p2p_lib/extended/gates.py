@@ -100,7 +100,7 @@ def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: Life
 
 def _few_points_on_flat(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
     """What is flat lies on a table as well as on itself: its own points have to say where."""
-    fixed = evidence.support >= _FIXED_BY or (evidence.sighting or 0.0) >= SIGHTED or evidence.rests
+    fixed = evidence.support >= _FIXED_BY or (evidence.sighting or 0.0) >= SIGHTED
     free = evidence.slides and not fixed
     return f"only {evidence.support} points agree, and the surface leaves free where it is" if free else ""
 

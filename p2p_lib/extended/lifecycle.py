@@ -115,7 +115,7 @@ class Lifecycle(Life):
 
     @property
     def lay_still(self) -> bool:
-        """Whether it was at rest in the scene as long as it was followed."""
+        """Whether it was at rest in the scene when it was seen last."""
         return self.rested >= _RESTED
 
     def moved(self, confidence: float) -> Lifecycle:

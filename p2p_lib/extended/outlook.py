@@ -36,11 +36,6 @@ class Outlook:
         """Whether an object that has been seen is absent, or back by shape and colour alone."""
         return not self.known.model.empty and self.known.life.sought
 
-    @property
-    def away(self) -> bool:
-        """Whether an object that has been seen has no pose now."""
-        return not self.known.model.empty and not self.known.life.has_pose
-
     def misplaced(self, obs: Sight, within: np.ndarray | None) -> Requests:
         """Tracks that an absent object has elsewhere, on a look-alike perhaps: to be looked for anew.
 

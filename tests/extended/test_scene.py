@@ -123,6 +123,21 @@ def test_what_lies_still_is_back_when_the_camera_is(with_scene):
         assert last.T_cam_obj is None
 
 
+def test_the_camera_is_located_often_until_points_confirm_a_return(monkeypatch):
+    located, locate = [], Scene.locate
+    monkeypatch.setattr(
+        Scene, "locate", lambda self, frame, *more: located.append(frame.index) or locate(self, frame, *more)
+    )
+    method, back = Point2Pose(CAMERA), []
+    for k, x_m in enumerate([*np.arange(0, 0.6, 0.03), *np.arange(0.57, -0.01, -0.03)]):
+        frame, mask = ball_before_the_wall(x_m, k)
+        if not k:
+            method.add_object("ball", mask=mask)
+        estimate = method.step(frame)["ball"]
+        back += [k] if k > 20 and estimate.T_cam_obj is not None else []
+    assert len(back) > 5 and np.diff([k for k in located if k in back]).max() == 2
+
+
 def test_the_two_nearest_descriptors():
     rng = np.random.default_rng(1)
     ours, others = (rng.integers(0, 256, (n, 32), np.uint8) for n in (40, 70))
