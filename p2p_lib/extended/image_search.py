@@ -37,6 +37,8 @@ _SIGMAS = 2.0
 _HIDDEN, _SHOWN = 0.5, 0.3
 #: Steps of the search about a proposed pose, m, and their number to each side.
 _STEP_M, _STEPS = 0.03, 2
+#: Of two poses that show as much the one nearer to the proposal is taken: what it shows weighs so much more, per m.
+_STAY_PER_M = 2.0
 #: The search compares every so many points, and so many of its best poses are aligned.
 _COARSE, _TRIED = 3, 3
 #: Of turns, so many are aligned that are so far apart, rad, moved by this step about the depth points, m.
@@ -102,8 +104,8 @@ class ImageSearch:
         if len(uv_px) < _FEWEST or not in_image(uv_px, self._depth_m.shape).any():
             return None
         poses = _shifted(T_cam_obj, _STEP_M, _STEPS)
-        share = self._roughly(poses, sample)
-        return self._best(self._all_aligned(poses[np.argsort(-share)[:_TRIED]], sample), sample)
+        share = self._roughly(poses, sample) - _strayed(poses, T_cam_obj, sample)
+        return self._best(self._all_aligned(poses[np.argsort(-share)[:_TRIED]], sample), sample, T_cam_obj)
 
     def turned(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> Sighting | None:
         """The best pose of the object that these depth points (M, 3) are of, near the turns of T_cam_obj (V, 4, 4)."""
@@ -182,12 +184,14 @@ class ImageSearch:
         """(H,) shares by some of the points, -inf where unknown."""
         return self._compare(poses, sample.select(np.arange(0, len(sample), _COARSE)), _ROUGH_M)[0]
 
-    def _best(self, found: list[Sighting], sample: SurfaceSample) -> Sighting | None:
-        """The best of some, polished; None where it is none."""
-        best = max(found, key=lambda s: s.share, default=None)
+    def _best(
+        self, found: list[Sighting], sample: SurfaceSample, proposed: np.ndarray | None = None
+    ) -> Sighting | None:
+        """The best of some, polished, near what was ``proposed`` (4, 4) if anything was; None where it is none."""
+        best = max(found, key=lambda s: s.share - _strayed(s.T_cam_obj, proposed, sample), default=None)
         if best is None or best.share < _PROMISING or not self._distinct(best, sample):
             return None
-        return self.at(self._polished(best, sample), sample)
+        return self.at(self._polished(best, sample, proposed), sample)
 
     def _distinct(self, found: Sighting, sample: SurfaceSample) -> bool:
         """Whether the surface fits worse beside the place: what a table shows as well anywhere proves nothing."""
@@ -198,14 +202,14 @@ class ImageSearch:
         share, _, _ = self._compare(poses, sample, _FINE_M)
         return (share > _ANYWHERE * found.share).sum() < 2
 
-    def _polished(self, found: Sighting, sample: SurfaceSample) -> np.ndarray:
+    def _polished(self, found: Sighting, sample: SurfaceSample, proposed: np.ndarray | None) -> np.ndarray:
         """The pose nearby that shows most: colours tell where the shape does not, as on a flat cover."""
         T_cam_obj, centre = found.T_cam_obj, sample.p_obj.mean(0)
         about, back = se3.from_rt(np.eye(3), centre), se3.from_rt(np.eye(3), -centre)
         for scale in _POLISH_SCALES:
             poses = T_cam_obj @ about @ se3.exp(scale * _NEARBY) @ back
             share, _, _ = self._compare(poses, sample, _FINE_M)
-            T_cam_obj = poses[share.argmax()]
+            T_cam_obj = poses[(share - _strayed(poses, proposed, sample)).argmax()]
         return se3.orthonormalised(T_cam_obj)
 
     def at(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
@@ -309,6 +313,18 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
         if shown >= fewest and shown >= _SHOWN * facing:
             share[h] = (agree - behind) / max(shown + _HIDDEN * hidden, 1.0)
     return share, found, uv_px
+
+
+def _strayed(T_cam_obj: np.ndarray, proposed: np.ndarray | None, sample: SurfaceSample) -> np.ndarray:
+    """(...,) what counts against poses (..., 4, 4) for being away from the one proposed; 0 where none was.
+
+    What is alike all along, as a keyboard, shows as much a few centimetres farther on.
+    """
+    if proposed is None:
+        return np.zeros(T_cam_obj.shape[:-2])
+    centre = sample.p_obj.mean(0, keepdims=True)
+    away = se3.transform(T_cam_obj, centre) - se3.transform(proposed, centre)
+    return _STAY_PER_M * np.linalg.norm(away, axis=-1)[..., 0]
 
 
 def laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.ndarray:

@@ -568,3 +568,16 @@ def test_a_mask_that_loses_the_points_which_were_on_it_is_found_anew_at_them(hel
         hints = sure(card=at) if held or at == now else {}
         found = follow.segment(picture(k, [(at, 1)]), () if k else on(card=was), hints) == 1
     assert (iou(found, card(now)) > 0.85) == held
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_an_exposure_that_changes_its_colours_does_not_take_a_mask_from_its_points(told):
+    """Overexposed, a red card on a green wall is as white as what surrounds it."""
+    follow, at = segmenter(), (100, 80)
+    for k in range(5):
+        frame = picture(k, [(at, 2)])
+        frame.rgb[:], frame.rgb[card(at)] = (60, 120, 60), (200, 60, 50)
+        if k == 4:
+            frame.rgb[:], frame.rgb[card(at)] = (200, 60, 50), (60, 120, 60)
+        found = follow.segment(frame, () if k else on(card=at), sure(card=at) if told else {}) == 1
+    assert (iou(found, card(at)) > 0.8) == told

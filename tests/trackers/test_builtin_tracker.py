@@ -210,6 +210,25 @@ def test_suggested_places_are_verified():
     assert np.median(error_px(tracks, HIDDEN.stop)[tracks.visible]) < 0.5
 
 
+def test_a_third_of_the_points_is_no_proof_of_a_suggestion():
+    """Something like it shows a part of its points where a caller expects it."""
+    frames, t = film(), HIDDEN.stop
+    tracker = BuiltinTracker(TrackingConfig(redetect_every=1000))
+    tracker.start(frames[0])
+    ids = tracker.add(truth(0))
+    tracker.track(frames[1])
+    other = np.zeros(CARD, np.uint8)
+    other[:, : round(0.6 * CARD[1])] = 1
+    there = cv2.warpAffine(other, motion(t), SHAPE[::-1]) > 0
+    rgb = np.where(there[..., None], cv2.warpAffine(printed(7, CARD), motion(t), SHAPE[::-1]), frames[t].rgb)
+    like = replace(frames[t], rgb=rgb)
+    for _ in range(2):
+        tracker.track(like)
+    for _ in range(2):
+        tracker.suggest(ids, truth(t) + 0.8)
+        assert tracker.track(like).visible.mean() < 0.1
+
+
 def test_what_of_it_is_2d_alone_sees_no_depth_and_still_finds_points_again():
     """At corners of the card, as the sampler takes them: each is found by its own appearance."""
     frames, back = film(), HIDDEN.stop + 8

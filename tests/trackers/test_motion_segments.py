@@ -52,8 +52,28 @@ def test_a_segment_needs_a_fair_share_of_the_points_that_were_searched_for(found
     (segment,) = segments.segments
     segment.hidden_for = hidden_for
     p.verified[found:] = False
-    segments.fit_found(p, image(), np.arange(24))
+    segments.fit_found(p, image(), np.arange(24), motion_segments.MIN_FOUND)
     assert segment.posed == posed and p.verified.sum() == (found if posed else 0)
+
+
+@pytest.mark.parametrize(("found", "posed"), [(6, False), (9, False), (10, True)])
+def test_where_a_caller_expects_a_segment_it_needs_more_of_its_points(found, posed):
+    p, segments = started(RIGHT, image())
+    segments.segments[0].hidden_for = 1
+    p.verified[found:] = False
+    segments.fit_found(p, image(), np.arange(24), motion_segments.MIN_SUGGESTED)
+    assert segments.segments[0].posed == posed
+
+
+def test_a_segment_that_is_not_where_it_was_expected_is_searched_for_where_it_was():
+    p, segments = started(RIGHT, image())
+    (segment,) = segments.segments
+    segment.hidden_for, p.verified[:] = 7, False
+    was = segment.fit
+    before = segments.suggest(p, np.arange(len(RIGHT)), RIGHT - [90.0, 0], image())
+    assert segment.fit is not was and segment.hidden_for == 1
+    segments.restore(before)
+    assert segments.segments[0].fit is was and segments.segments[0].hidden_for == 7
 
 
 def test_points_that_leave_together_stay_verified_and_then_are_a_segment():

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, strange, warped
 from p2p_lib.segmenters.builtin.motion import scene_stays
@@ -68,7 +69,7 @@ def predict(view: View, target: Target) -> Prediction:
 def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Claim:
     """Cut the object out around its predicted mask.
 
-    None where it has left: what shows there has the colours of its surroundings, or lies behind it.
+    None where it has left: what shows there lies behind it, or has the colours of its surroundings and not its points.
     """
     cfg, patch, prior, jumped = view.config, predicted.patch, predicted.prior, predicted.jumped
     core = (prior > 0.8) & ~(jumped | predicted.shown)
@@ -86,8 +87,20 @@ def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Cla
     x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
     beside = dilated((x > 0.5) & (patch.depth_m > 0), 1)
     x = np.where((patch.depth_m > 0) | (prior > 0.5) | beside, x, 0)
-    elsewhere = strange(patch, x > 0.5, target.colours) or (predicted.left and not (x > 0.5).any())
-    return None if elsewhere else (patch.box, patch.up(x))
+    claim = patch.box, patch.up(x)
+    if predicted.left and not (x > 0.5).any():
+        return None
+    # Exposure changes colours; what its points agree on is it.
+    told = target.confident and holds(claim, hint.uv_px)
+    return claim if told or not strange(patch, x > 0.5, target.colours) else None
+
+
+def holds(claim: Claim, uv_px: np.ndarray) -> bool:
+    """Whether most of an object's own points (N, 2) are on what is claimed for it."""
+    if claim is None:
+        return True
+    box, x = claim
+    return bool(2 * in_mask(uv_px - [box.left, box.top], x > 0.5).sum() > len(uv_px))
 
 
 def with_room(view: View, target: Target, hint: Hint) -> Target:

@@ -19,12 +19,11 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
-from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.finding import find, near_last
-from p2p_lib.segmenters.builtin.following import Prediction, follow, predict, with_room
+from p2p_lib.segmenters.builtin.following import Prediction, follow, holds, predict, with_room
 from p2p_lib.segmenters.builtin.patch import Box
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter, doubt_start
 from p2p_lib.segmenters.builtin.target import Target, seen_in
@@ -159,7 +158,7 @@ class BuiltinSegmenter:
         due = target.confident and target.past.due(view.frame)
         target = with_room(view, target, hint) if due else target
         claim = follow(view, target, hint, predicted)
-        if agreed and not _holds(claim, hint.uv_px):
+        if agreed and not holds(claim, hint.uv_px):
             if held:  # what the flow has lost, its points have not
                 claim = find(view, target, hint, taken) or claim
             else:
@@ -224,14 +223,6 @@ def _check(frame: Frame, said: Mapping[str, Prompt], camera: Camera) -> None:
     for prompt in (p for p in said.values() if p.mask is None):
         check_prompt(prompt, camera)
         check_depth(prompt, frame)
-
-
-def _holds(claim: Claim, uv_px: np.ndarray) -> bool:
-    """Whether most of an object's own points (N, 2) are on what is claimed for it."""
-    if claim is None:
-        return True
-    box, x = claim
-    return bool(2 * in_mask(uv_px - [box.left, box.top], x > 0.5).sum() > len(uv_px))
 
 
 def _mark(taken: np.ndarray, claim: Claim) -> None:

@@ -23,8 +23,9 @@ from p2p_lib.trackers.builtin.wide_baseline import Matched, Sight, corners_of, m
 
 #: Covariance of a pose that matches have proposed: rad, m.
 _PROPOSED_COV = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
-#: Fraction of a segment's points that should show which must be found: fewer are chance, on something like it.
-_MIN_FOUND = 0.25
+#: Fraction of a segment's points that should show which must be found: fewer are chance, on something like it. Where
+#: a caller expects them no corner has been recognised: on rows of keys every third point is found a key beside its own.
+MIN_FOUND, MIN_SUGGESTED = 0.25, 0.4
 #: Effective information: errors of so many successive frames count as one observation of a position.
 _REPEATS = 4.0
 #: Error of a position (px) beside what alignment states: when a point is placed, when it is observed again.
@@ -136,20 +137,20 @@ class MotionSegments:
             if segment.matched is None:  # else they were left behind
                 self._split(p, at[~fit.agrees], now)
 
-    def fit_found(self, p: Points, now: Image, sought: np.ndarray) -> None:
-        """Fit poses of lost segments to the points that were found among those sought, rows (M,), where predicted.
+    def fit_found(self, p: Points, now: Image, sought: np.ndarray, fewest: float) -> None:
+        """Fit poses of lost segments to the points found among those sought, rows (M,), a share of these at least.
 
         A segment with a pose keeps it, unless hardly any of its points are found there.
         """
         for s, segment in enumerate(self.segments):
             at = np.flatnonzero(p.verified & (p.segment == s))
             own = sought[p.segment[sought] == s]
-            fewest = _MIN_FOUND * (len(at) + np.count_nonzero(~p.verified[own]))
+            shown = len(at) + np.count_nonzero(~p.verified[own])
             if segment.posed and segment.matched is None:
-                if len(at) < fewest:
+                if len(at) < MIN_FOUND * shown:
                     segment.hidden_for, p.verified[at] = 1, False
                 continue
-            fit = self._fitted(segment, p, at, now, fewest)
+            fit = self._fitted(segment, p, at, now, fewest * shown)
             if fit is not None:
                 segment.before = segment.before if segment.posed else fit.T_cam_seg
                 segment.fit, segment.hidden_for = fit, 0
@@ -236,14 +237,22 @@ class MotionSegments:
             if len(here.uv_px) >= cfg.min_landmark_matches:
                 self._propose(segment, *segment.landmarks.match(here, cfg.match_ratio, self._rng))
 
-    def suggest(self, p: Points, rows: np.ndarray, uv_px: np.ndarray, now: Image) -> None:
-        """Propose poses for lost segments by where the caller expects points of them, uv_px (M, 2)."""
-        z = now.depth_at(uv_px)
+    def suggest(self, p: Points, rows: np.ndarray, uv_px: np.ndarray, now: Image) -> list[MotionSegment]:
+        """Propose poses for lost segments by where the caller expects points of them, uv_px (M, 2).
+
+        Returns copies of all segments as they were, for :meth:`restore`.
+        """
+        z, before = now.depth_at(uv_px), [replace(segment) for segment in self.segments]
         for s, segment in enumerate(self.segments):
             own = (p.segment[rows] == s) & (z > 0)
             if not segment.posed:
                 p_cam = now.camera.unproject(uv_px[own], z[own])
                 self._propose(segment, p.p_seg[rows[own]], p_cam, np.arange(len(p_cam)))
+        return before
+
+    def restore(self, before: list[MotionSegment]) -> None:
+        """Segments that were not found where they were expected are as they were: nothing is searched for there."""
+        self.segments = [now if now.posed else then for now, then in zip(self.segments, before, strict=True)]
 
     def _propose(self, segment: MotionSegment, p_seg: np.ndarray, p_cam: np.ndarray, corner: np.ndarray) -> None:
         """Have a lost segment's points searched for at the pose that most pairs p_seg, p_cam (M, 3) agree on."""

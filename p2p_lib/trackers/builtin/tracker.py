@@ -9,7 +9,7 @@ from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.trackers.builtin import recognition
 from p2p_lib.trackers.builtin.image import Image
-from p2p_lib.trackers.builtin.motion_segments import MotionSegments
+from p2p_lib.trackers.builtin.motion_segments import MIN_FOUND, MIN_SUGGESTED, MotionSegments
 from p2p_lib.trackers.builtin.rigid_motion import Prediction
 from p2p_lib.trackers.builtin.tracked_points import Points
 from p2p_lib.trackers.ids import PointIds
@@ -83,8 +83,9 @@ class BuiltinTracker:
         usable = np.isin(ids, self._ids.live) & np.isfinite(uv_px).all(1)
         rows = np.searchsorted(self._ids.live, np.asarray(ids)[usable])
         known = self._segments.posed(p)
-        self._segments.suggest(p, rows, uv_px[usable], self._now)
-        self._find_predicted(None)
+        lost = self._segments.suggest(p, rows, uv_px[usable], self._now)
+        self._find_predicted(None, MIN_SUGGESTED)
+        self._segments.restore(lost)
         if (self._segments.posed(p) & ~known).any():
             self._reconcile(None)
             p.hidden_for[p.visible] = 0
@@ -125,8 +126,8 @@ class BuiltinTracker:
         own = (z == 0) | (np.abs(z - predicted.z_m) <= self.config.depth_jump_m)
         return own & (predicted.cosine > _MIN_COSINE) & self._now.inside(predicted.uv_px, search)
 
-    def _find_predicted(self, search: np.ndarray | None) -> None:
-        """Search for the points that were not followed where their segments predict them."""
+    def _find_predicted(self, search: np.ndarray | None, fewest: float = MIN_FOUND) -> None:
+        """Search for the points that were not followed where their segments predict them, a share of them at least."""
         p, cfg = self._points, self.config
         textured = p.contrast >= cfg.textureless_contrast
         rows = np.flatnonzero(~p.verified & textured & self._segments.posed(p, cfg.linger_frames))
@@ -138,7 +139,7 @@ class BuiltinTracker:
             rows = rows[pick]
             recognition.find(p, rows, *where, self._now, cfg)
         # What was badly predicted for long says nothing of whether its segment is there.
-        self._segments.fit_found(p, self._now, rows[p.chained[rows] <= cfg.linger_frames])
+        self._segments.fit_found(p, self._now, rows[p.chained[rows] <= cfg.linger_frames], fewest)
 
     def _reconcile(self, search: np.ndarray | None) -> None:
         """Compare points with their segments' predictions: what faces away or is hidden is invisible.
