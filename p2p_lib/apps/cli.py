@@ -56,6 +56,13 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
     _FORCE,
     arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
+    arg(
+        "--from",
+        dest="redo_from",
+        type=int,
+        metavar="N",
+        help="with --resume: go on from frame N, say with new prompts",
+    ),
     run_options(),
     _OVERLAY,
     _QUIET,
@@ -65,6 +72,8 @@ def _run(a: argparse.Namespace) -> int:
 
     if (a.sequence is None) == (a.batch is None):
         a.parser.error("needs either SEQ or --batch FOLDER")
+    if a.redo_from is not None and (a.batch is not None or a.if_exists != "resume"):
+        a.parser.error("--from goes with --resume, and with SEQ")
     if a.batch is not None:
         from p2p_lib.benchmark.batch import TABLE, run_batch
         from p2p_lib.core.tables import as_text
@@ -74,7 +83,7 @@ def _run(a: argparse.Namespace) -> int:
         return 0 if table["object"].notna().any() else P2PError.exit_code
     film = _film_wanted(a.overlay)
     options = replace(RunOptions.of_arguments(a), save_masks=a.save_masks or film is not None)
-    how = {"if_exists": a.if_exists or "refuse", "progress": not a.quiet, "say": warn}
+    how = {"if_exists": a.if_exists or "refuse", "redo_from": a.redo_from, "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
     print("\n".join(result.summary))
     if result.look_at:
