@@ -421,23 +421,34 @@ def _notebooks(a: argparse.Namespace) -> None:
 
 @command(
     "click",
-    "collect clicks on objects in the browser, for p2p run --prompts",
+    "collect clicks on objects, and masks painted with a brush, in the browser, for p2p run --prompts",
     _SEQUENCE,
     arg("--out", type=Path, required=True, metavar="FILE", help="the prompts; what it holds is shown first"),
     arg("--frame", type=int, default=0, metavar="I", help="frame to begin with (default 0)"),
+    arg("--run", type=Path, metavar="DIR", help="show the masks that a run kept (--save-masks), to be mended"),
     arg("--port", type=int, default=0, metavar="N", help="of the page (default: a free one)"),
     _NO_BROWSER,
     run_options("format", "depth_scale", seed="of a synthetic sequence (default 0)"),
 )
 def _click(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.click import Clicker, check_writable, wait_for_clicks
+    from p2p_lib.apps.click import Clicker, check_writable, first_change, wait_for_clicks
+    from p2p_lib.datasets.runs import load_run
     from p2p_lib.datasets.sequence import open_sequence
 
     check_writable(a.out)
     sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed or 0)
-    page = Clicker(sequence, a.out, a.frame, a.port)
+    shown = load_run(a.run) if a.run is not None else None
+    page = Clicker(sequence, a.out, a.frame, a.port, shown)
+    before = page.prompts
     prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)
-    print(f"{len(prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --save-masks --out DIR")
+    again, changed = f"p2p run {a.sequence} --prompts {a.out} --save-masks --out", first_change(before, prompts)
+    if shown is None or changed is None:
+        print(f"{len(prompts)} prompts in {a.out}. Next: {again} DIR")
+    else:
+        asked = replace(RunOptions(**(shown.info.get("options") or {})), prompts=None)
+        words = " ".join([again, str(a.run), *(w for w in asked.words() if w != "--save-masks")])
+        how = f"--resume --from {changed}" if changed > shown.info["start"] else "--force"
+        print(f"{len(prompts)} prompts in {a.out}, the first new one in frame {changed}. Next: {words} {how}")
 
 
 @command(
