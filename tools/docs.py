@@ -12,7 +12,8 @@ import warnings
 from html import unescape
 from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
+from pkgutil import iter_modules, walk_packages
+from typing import get_type_hints
 from urllib.parse import unquote
 
 import numpy as np
@@ -170,6 +171,10 @@ def write(out):
     """Render all; whatever cannot be imported or resolved is an error, not a gap."""
     for name in p2p_lib.__all__:  # pdoc sees what is there, not what is loaded when asked for
         setattr(p2p_lib, name, getattr(p2p_lib, name))
+    for module in walk_packages(p2p_lib.__path__, "p2p_lib."):
+        for kind in vars(import_module(module.name)).values() if module.name != "p2p_lib.__main__" else ():
+            if isinstance(kind, type) and hasattr(kind, "_fields"):  # pdoc cannot read what a NamedTuple is made of
+                kind.__new__.__annotations__ = get_type_hints(kind)
     # As the browser does it where there is no node; compiled it is ten times as large.
     pdoc.render.precompile_index = lambda documents, _: json.dumps(documents)
     # Sources are beside the documents, and would be most of the pages.
