@@ -108,7 +108,7 @@ class Clicker(AbstractContextManager):
         frame = content.get("frame") if isinstance(content, dict) else None
         if not isinstance(frame, int) or not 0 <= frame < len(self.sequence):
             raise BadInput("frame", repr(frame), f"a number from 0 to {len(self.sequence) - 1}")
-        prompts = parse_prompts(content) if content["objects"] else ()
+        prompts = parse_prompts(content) if isinstance(content, dict) and content["objects"] else ()
         found = self.run.masks(self.sequence, frame) if self.run else {}
         with self._segmenting, warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", Doubt)
@@ -129,7 +129,7 @@ class Clicker(AbstractContextManager):
                 check_depth(prompt, self.sequence.frame(i))
         save_prompts(self.path, prompts)
         self.prompts = prompts
-        if content.get("finish"):
+        if isinstance(content, dict) and content.get("finish"):
             self._finished.set()
 
 
@@ -148,7 +148,8 @@ def first_change(before: Iterable[Prompt], after: Iterable[Prompt]) -> int | Non
 
 def clicked_masks(sequence: Sequence, prompts: Iterable[Prompt], config: Config | None = None) -> FirstMasks:
     """Each object's first mask, as the built-in segmenter cuts it out of the frame that its first prompt is of."""
-    config, found = config or preset(), {}
+    config = config or preset()
+    found: FirstMasks = {}
     for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
         frame = sequence.frame(i)
         segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation)
