@@ -8,7 +8,7 @@ export MKL_NUM_THREADS := $(THREADS)
 # ROS and others put packages of another Python there.
 unexport PYTHONPATH PYTHONHOME
 
-.PHONY: help setup reproduce test test-backends docs mutants seeds bench lab figures lock
+.PHONY: help setup reproduce test release test-backends docs mutants seeds bench lab figures lock
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 22
 
@@ -32,6 +32,9 @@ test: setup ## linter and types, then all tests, every notebook included, and th
 
 docs: setup ## the API reference from the docstrings, pages that work offline, into out/docs
 	@.venv/bin/python tools/docs.py
+
+release: setup ## wheel and sdist into out/release, installed and tried; publishing up to the upload
+	@.venv/bin/python tools/release.py
 
 test-backends: setup ## the adapters of third-party networks against the official classes, in .venv-backends (no weights)
 	@.venv/bin/python tools/test_backends.py

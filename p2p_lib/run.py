@@ -82,6 +82,7 @@ def run(
     options: RunOptions | None = None,
     *,
     if_exists: IfExists = "refuse",
+    redo_from: int | None = None,
     progress: bool = True,
     say: Callable[[str], object] = lambda line: None,
     **changes: Any,
@@ -99,8 +100,10 @@ def run(
     ``sequence`` may be an open one. ``if_exists`` says what becomes of an earlier run in ``out``: ``refuse`` with
     :class:`BadInput`, ``replace`` it, or ``resume`` it where it was cut short. Resuming tracks its frames once more,
     since what it knew went with it: that takes as long as it took, each pose is compared with the one on disk, and what
-    is there stays as it is until the first new frame. Of all this ``say`` is told before anything is tracked. Raises
-    :class:`P2PError` for anything that does not fit; Ctrl-C ends the run early and is reported in the result.
+    is there stays as it is until the first new frame. With ``redo_from`` that is this frame: of a run that is there,
+    finished or not, the frames before it are kept, and prompts of later ones may have changed. Of all this ``say`` is
+    told before anything is tracked. Raises :class:`P2PError` for anything that does not fit; Ctrl-C ends the run early
+    and is reported in the result.
     """
     options = replace(options or RunOptions(), **changes)
     with progress_bar("reading", shown=progress and sys.stderr.isatty(), leave=False, bar_format="{desc} ..."):
@@ -114,7 +117,7 @@ def run(
     recall(method, job.memories, options.frozen)
     for name in [n for n in job.objects if n not in job.memories] if job.masks.every_mask else ():
         method.add_object(name)
-    writer = _writer(job, options, method, out, if_exists)
+    writer = _writer(job, options, method, out, if_exists if redo_from is None else "resume", redo_from)
     with writer:
         _say_what_was_there(writer, say)
         if not writer.complete:
@@ -383,7 +386,9 @@ def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> tuple[str, ..
     return chosen
 
 
-def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path, if_exists: IfExists) -> RunWriter:
+def _writer(
+    job: _Job, options: RunOptions, method: Point2Pose, out: str | Path, if_exists: IfExists, redo_from: int | None
+) -> RunWriter:
     """The writer of the run, told all that ``run.json`` says of it."""
     at, masks = job.sequence.path, job.masks.folder
     read = {"the sequence": [at] if at else [], "the masks": [Path(at or "", masks), Path(masks)] if masks else []}
@@ -402,6 +407,7 @@ def _writer(job: _Job, options: RunOptions, method: Point2Pose, out: str | Path,
         job.frames.stop,
         {name: path for name, path in known.items() if name in job.objects},
         if_exists,
+        redo_from,
     )
     writer.info["left_out"] = {}
     writer.info |= told(method, options, [prompt for of_frame in job.prompts.values() for prompt in of_frame])
@@ -418,7 +424,8 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None
     if writer.complete:
         say(f"{writer.path} holds {writer.earlier}, which is finished.")
     elif writer.resumed:
-        say(f"{writer.path} holds {writer.earlier}; its frames are tracked again and compared, then it goes on.")
+        kept = "its frames" if writer.redo_from is None else f"its frames before {writer.redo_from}"
+        say(f"{writer.path} holds {writer.earlier}; {kept} are tracked again and compared, then it goes on.")
     elif writer.earlier:
         say(f"{writer.path} held {writer.earlier}, which this one replaces.")
 

@@ -225,6 +225,27 @@ def test_ci_calls_make_test():
     assert script.read_text().splitlines()[-1] == "exec make test"
 
 
+def test_a_release_is_what_its_tag_says(tmp_path):
+    spec = importlib.util.spec_from_file_location("release", PROJECT / "tools" / "release.py")
+    release = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(release)
+    version = PYPROJECT["project"]["version"]
+    assert list(release.problems(PROJECT, "")) == []
+    for name in ("pyproject.toml", "CHANGELOG.md", *release.VERSIONS):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(PROJECT / name, tmp_path / name)
+    log = tmp_path / "CHANGELOG.md"
+    log.write_text(re.sub(rf"## {version} \(.*\)", f"## {version} (2026-01-31)", log.read_text()))
+    assert list(release.problems(tmp_path, f"v{version}")) == []
+    assert list(release.problems(tmp_path, "v9.9.9")) == [f"tag v9.9.9: expected v{version}"]
+    log.write_text(log.read_text().replace("(2026-01-31)", "(unreleased)"))
+    (tmp_path / "CITATION.cff").write_text("version: 9.9.9\n")
+    assert [line.split(":")[0] for line in release.problems(tmp_path, f"v{version}")] == [
+        "CITATION.cff",
+        "CHANGELOG.md",
+    ]
+
+
 def test_citation_names_the_papers_authors_and_this_version():
     yaml = pytest.importorskip("yaml")
     citation = yaml.safe_load((PROJECT / "CITATION.cff").read_text())

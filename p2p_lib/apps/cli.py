@@ -56,6 +56,13 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
     _FORCE,
     arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
+    arg(
+        "--from",
+        dest="redo_from",
+        type=int,
+        metavar="N",
+        help="with --resume: go on from frame N, say with new prompts",
+    ),
     run_options(),
     _OVERLAY,
     _QUIET,
@@ -65,6 +72,8 @@ def _run(a: argparse.Namespace) -> int:
 
     if (a.sequence is None) == (a.batch is None):
         a.parser.error("needs either SEQ or --batch FOLDER")
+    if a.redo_from is not None and (a.batch is not None or a.if_exists != "resume"):
+        a.parser.error("--from goes with --resume, and with SEQ")
     if a.batch is not None:
         from p2p_lib.benchmark.batch import TABLE, run_batch
         from p2p_lib.core.tables import as_text
@@ -74,7 +83,7 @@ def _run(a: argparse.Namespace) -> int:
         return 0 if table["object"].notna().any() else P2PError.exit_code
     film = _film_wanted(a.overlay)
     options = replace(RunOptions.of_arguments(a), save_masks=a.save_masks or film is not None)
-    how = {"if_exists": a.if_exists or "refuse", "progress": not a.quiet, "say": warn}
+    how = {"if_exists": a.if_exists or "refuse", "redo_from": a.redo_from, "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
     print("\n".join(result.summary))
     if result.look_at:
@@ -412,23 +421,34 @@ def _notebooks(a: argparse.Namespace) -> None:
 
 @command(
     "click",
-    "collect clicks on objects in the browser, for p2p run --prompts",
+    "collect clicks on objects, and masks painted with a brush, in the browser, for p2p run --prompts",
     _SEQUENCE,
     arg("--out", type=Path, required=True, metavar="FILE", help="the prompts; what it holds is shown first"),
     arg("--frame", type=int, default=0, metavar="I", help="frame to begin with (default 0)"),
+    arg("--run", type=Path, metavar="DIR", help="show the masks that a run kept (--save-masks), to be mended"),
     arg("--port", type=int, default=0, metavar="N", help="of the page (default: a free one)"),
     _NO_BROWSER,
     run_options("format", "depth_scale", seed="of a synthetic sequence (default 0)"),
 )
 def _click(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.click import Clicker, check_writable, wait_for_clicks
+    from p2p_lib.apps.click import Clicker, check_writable, first_change, wait_for_clicks
+    from p2p_lib.datasets.runs import load_run
     from p2p_lib.datasets.sequence import open_sequence
 
     check_writable(a.out)
     sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed or 0)
-    page = Clicker(sequence, a.out, a.frame, a.port)
+    shown = load_run(a.run) if a.run is not None else None
+    page = Clicker(sequence, a.out, a.frame, a.port, shown)
+    before = page.prompts
     prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)
-    print(f"{len(prompts)} objects in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --save-masks --out DIR")
+    again, changed = f"p2p run {a.sequence} --prompts {a.out} --save-masks --out", first_change(before, prompts)
+    if shown is None or changed is None:
+        print(f"{len(prompts)} prompts in {a.out}. Next: {again} DIR")
+    else:
+        asked = replace(RunOptions(**(shown.info.get("options") or {})), prompts=None)
+        words = " ".join([again, str(a.run), *(w for w in asked.words() if w != "--save-masks")])
+        how = f"--resume --from {changed}" if changed > shown.info["start"] else "--force"
+        print(f"{len(prompts)} prompts in {a.out}, the first new one in frame {changed}. Next: {words} {how}")
 
 
 @command(

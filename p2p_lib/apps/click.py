@@ -30,14 +30,15 @@ from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.files import parse_json
 from p2p_lib.core.prompts import Prompt, check_depth
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.prompts import load_prompts, parse_prompts, prompts_by_frame, save_prompts
+from p2p_lib.datasets.prompts import load_prompts, parse_prompts, prompts_by_frame, run_lengths, save_prompts
+from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence
 
 #: Object to a frame and its mask (H, W) bool there.
 FirstMasks = dict[str, tuple[Frame, np.ndarray]]
 HOST = "127.0.0.1"
 PAGE = Path(__file__).with_name("click.html")
-_LARGEST_BODY = 1 << 20
+_LARGEST_BODY = 1 << 24
 _HERE = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
 _JSON, _HTML, _PNG = "application/json", "text/html; charset=utf-8", "image/png"
 
@@ -47,12 +48,13 @@ class Clicker(AbstractContextManager):
 
     url   where the page is; a word in it keeps others out
     path  the file that saving writes; the prompts it holds already are shown to begin with
+    run   whose masks are shown where nothing is said, to be mended
     """
 
-    def __init__(self, sequence: Sequence, path: str | Path, frame: int = 0, port: int = 0):
+    def __init__(self, sequence: Sequence, path: str | Path, frame: int = 0, port: int = 0, run: Run | None = None):
         if not 0 <= frame < len(sequence):
             raise BadInput("frame", frame, f"a number from 0 to {len(sequence) - 1}")
-        self.sequence, self.path, self.first = sequence, Path(path), frame
+        self.sequence, self.path, self.first, self.run = sequence, Path(path), frame, run
         self.prompts: tuple[Prompt, ...] = load_prompts(path) if self.path.is_file() else ()
         self.image_png = lru_cache(maxsize=8)(self._image_png)
         self._finished, self._segmenting = Event(), Lock()
@@ -90,9 +92,9 @@ class Clicker(AbstractContextManager):
             "first": self.first,
             "width": self.sequence.camera.width,
             "height": self.sequence.camera.height,
-            "names": list(self.sequence.objects),
-            "file": str(self.path),
-            "objects": [prompt.as_dict() for prompt in self.prompts if prompt.mask is None],
+            "names": list(self.run.objects if self.run else self.sequence.objects),
+            "run": self.run is not None,
+            "objects": [_plain(prompt) for prompt in self.prompts],
         }
 
     def _image_png(self, i: int) -> bytes:
@@ -101,17 +103,19 @@ class Clicker(AbstractContextManager):
     def masks(self, content: object) -> dict[str, Any]:
         """What the prompts of a frame, as the page sends them, make of it, and what is doubtful about them.
 
-        ``masks`` are outlines [[x, y], ...] of each object that its prompts can start.
+        ``masks`` are run lengths of each object that its prompts can start, or of which the run kept a mask.
         """
-        prompts = [prompt for prompt in parse_prompts(content) if prompt.starts]
-        found = {}
+        frame = content.get("frame") if isinstance(content, dict) else None
+        if not isinstance(frame, int) or not 0 <= frame < len(self.sequence):
+            raise BadInput("frame", repr(frame), f"a number from 0 to {len(self.sequence) - 1}")
+        prompts = parse_prompts(content) if isinstance(content, dict) and content["objects"] else ()
+        found = self.run.masks(self.sequence, frame) if self.run else {}
         with self._segmenting, warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", Doubt)
-            for name, (_, mask) in clicked_masks(self.sequence, prompts).items():
-                outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
-                found[name] = [outline[:, 0].tolist() for outline in outlines]
+            made = clicked_masks(self.sequence, [prompt for prompt in prompts if prompt.starts])
+        found |= {name: mask for name, (_, mask) in made.items()}
         said = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
-        return {"masks": found, "doubts": said}
+        return {"masks": {name: run_lengths(mask)["counts"] for name, mask in found.items()}, "doubts": said}
 
     def save(self, content: object) -> None:
         """Check prompts as the page sends them, and write the file; :class:`BadInput` says what does not fit.
@@ -119,21 +123,33 @@ class Clicker(AbstractContextManager):
         ``finish`` beside the objects ends the waiting for the page, which otherwise goes on.
         """
         prompts = parse_prompts(content)
-        said = {(prompt.name, prompt.frame) for prompt in prompts}
-        prompts += tuple(p for p in self.prompts if p.mask is not None and (p.name, p.frame) not in said)
         by_frame = prompts_by_frame(prompts, range(len(self.sequence)), self.sequence.camera)
         for i, said in by_frame.items():
             for prompt in said:
                 check_depth(prompt, self.sequence.frame(i))
         save_prompts(self.path, prompts)
         self.prompts = prompts
-        if content.get("finish"):
+        if isinstance(content, dict) and content.get("finish"):
             self._finished.set()
+
+
+def _plain(prompt: Prompt) -> dict[str, Any]:
+    """As the page takes it: with the mask itself."""
+    plain = prompt.as_dict()
+    plain.pop("mask_px", None)
+    return plain if prompt.mask is None else plain | {"mask": run_lengths(prompt.mask)}
+
+
+def first_change(before: Iterable[Prompt], after: Iterable[Prompt]) -> int | None:
+    """The first frame of which other things are said; None where nothing has changed."""
+    one, other = ({json.dumps(_plain(prompt)): prompt.frame for prompt in prompts} for prompts in (before, after))
+    return min((dict([*one.items(), *other.items()])[key] for key in one.keys() ^ other.keys()), default=None)
 
 
 def clicked_masks(sequence: Sequence, prompts: Iterable[Prompt], config: Config | None = None) -> FirstMasks:
     """Each object's first mask, as the built-in segmenter cuts it out of the frame that its first prompt is of."""
-    config, found = config or preset(), {}
+    config = config or preset()
+    found: FirstMasks = {}
     for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
         frame = sequence.frame(i)
         segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation)

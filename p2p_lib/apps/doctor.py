@@ -48,7 +48,7 @@ def packages_of(extra: str = "") -> list[str]:
     """The distributions that this package requires, or that one of its extras adds, as its own metadata says."""
     found = set()
     for need in metadata.requires("p2p-lib") or []:
-        name, marker = re.match(r"[A-Za-z0-9._-]+", need)[0], re.search(r"""extra == ['"]([\w-]+)""", need)
+        name, marker = re.split(r"[^A-Za-z0-9._-]", need)[0], re.search(r"""extra == ['"]([\w-]+)""", need)
         if (marker[1] if marker else "") == extra and name != "p2p-lib":
             found.add(name)
     return sorted(found)

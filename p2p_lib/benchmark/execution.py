@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from p2p_lib.benchmark.jobs import Job, library_version, open_planned
 from p2p_lib.benchmark.outcome import Outcome, run_path
@@ -149,6 +150,7 @@ def _in_a_process(context: BaseContext, job: Any, out: Path, work: Work) -> Outc
 def _end_with_parent() -> None:
     """The process of a run ends with its parent, which alone hears Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system, which is left when the process is killed
     gone = multiprocessing.parent_process().sentinel
     threading.Thread(target=lambda: wait([gone]) and os._exit(1), daemon=True).start()
 

@@ -1,8 +1,9 @@
 """Prompts on disk: what somebody says of objects, in pixels of frames, as ``p2p click`` writes it.
 
 ``{"objects": [{"name": "mug", "frame": 0, "points": [[x, y], ...]}]}``. An entry has ``points`` (clicks on the object),
-``negative`` (clicks that are not on it), ``box`` (left, top, right, bottom) or ``mask`` (an image beside the file, 0 =
-not the object). An object's first entry starts it, those of later frames correct its mask.
+``negative`` (clicks that are not on it), ``box`` (left, top, right, bottom) or ``mask``: an image beside the file, 0 =
+not the object, or COCO's run lengths ``{"size": [height, width], "counts": [...]}``. An object's first entry starts it,
+those of later frames correct its mask.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from p2p_lib.datasets.sequence import Sequence
 
 _FORM = '{"objects": [{"name": "mug", "frame": 0, "points": [[x, y], ...]}]}'
 _MOST = 2000
+_MOST_PX = 100_000_000  # of a mask
 _KEYS = {"name", "frame", "points", "negative", "box", "mask"}
 #: Clicks that are drawn from a mask lie within this share of its inscribed circle.
 _WELL_INSIDE = 0.6
@@ -51,7 +53,7 @@ def load_prompts(path: str | Path) -> tuple[Prompt, ...]:
 def parse_prompts(content: object, folder: Path | None = None) -> tuple[Prompt, ...]:
     """The prompts in the plain values of a JSON file; :class:`BadInput` where they do not fit.
 
-    folder  where the images of masks lie; None allows no masks
+    folder  where the images of masks lie; None allows none, but run lengths
     """
     objects = content.get("objects") if isinstance(content, dict) else None
     if not isinstance(objects, list) or not objects:
@@ -71,7 +73,9 @@ def _prompt(given: Any, folder: Path | None) -> Prompt:
     if not isinstance(given, dict) or not {"name"} < given.keys() <= _KEYS:
         raise BadInput("prompts", f"the object {str(given)[:60]}", _FORM)
     mask = None
-    if given.get("mask") is not None:
+    if isinstance(given.get("mask"), dict):
+        mask = _of_runs(f"mask of {given['name']!r}", given["mask"])
+    elif given.get("mask") is not None:
         if folder is None or not isinstance(given["mask"], str):
             raise BadInput(f"mask of {given['name']!r}", repr(given["mask"])[:60], "an image beside the prompts")
         mask = read_image(folder / given["mask"], cv2.IMREAD_GRAYSCALE, "a mask image") > 0
@@ -79,6 +83,30 @@ def _prompt(given: Any, folder: Path | None) -> Prompt:
     fields = {"points_px": given.get("points"), "negative_px": given.get("negative"), "box_px": given.get("box")}
     fields = {key: value for key, value in fields.items() if value is not None}
     return Prompt(given["name"], given.get("frame", 0), **fields, mask=mask)
+
+
+def run_lengths(mask: np.ndarray) -> dict[str, list[int]]:
+    """A mask (H, W) as COCO's uncompressed run lengths: column by column, how many pixels are not it, are, are not, ...
+
+    >>> run_lengths(np.array([[True, True], [True, False]]))
+    {'size': [2, 2], 'counts': [0, 3, 1]}
+    """
+    flat = mask.ravel(order="F")
+    changes = np.flatnonzero(np.diff(flat, prepend=False))
+    return {"size": list(mask.shape), "counts": np.diff([0, *changes, flat.size]).tolist()}
+
+
+def _of_runs(what: str, given: Any) -> np.ndarray:
+    """The mask of run lengths."""
+    try:
+        height, width = map(int, given["size"])
+        counts = np.array(given["counts"], int)
+        if not 0 < height * width <= _MOST_PX or counts.ndim != 1 or counts.min() < 0 or counts.sum() != height * width:
+            raise ValueError
+    except (KeyError, TypeError, ValueError, OverflowError):
+        expected = '{"size": [height, width], "counts": [...]} that add up to its pixels'
+        raise BadInput(what, str(given)[:60], expected) from None
+    return np.repeat(np.arange(len(counts)) % 2 == 1, counts).reshape(width, height).T
 
 
 def prompts_by_frame(

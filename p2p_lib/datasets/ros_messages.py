@@ -33,7 +33,7 @@ def read_rgb(name: str, message: Any) -> np.ndarray:
     if message.encoding not in TO_RGB:
         fix = "Name the topic of the colour image, not of a raw one."
         raise BadInput(name, f"colour as {message.encoding}", "rgb8 or bgr8 (or rgba8, bgra8)", fix)
-    image, code = _pixels(name, message, 4 if "a" in message.encoding else 3, "u1"), TO_RGB[message.encoding]
+    image, code = pixels(name, message, 4 if "a" in message.encoding else 3, "u1"), TO_RGB[message.encoding]
     return image if code is None else cv2.cvtColor(image, code)
 
 
@@ -48,12 +48,12 @@ def read_depth_m(name: str, message: Any) -> np.ndarray:
     if message.encoding not in DEPTH_M:
         fix = "Name the topic of a depth image."
         raise BadInput(name, f"depth as {message.encoding}", f"one of {', '.join(DEPTH_M)}", fix)
-    raw = _pixels(name, message, 1, "f4" if message.encoding == "32FC1" else "u2")[..., 0]
+    raw = pixels(name, message, 1, "f4" if message.encoding == "32FC1" else "u2")[..., 0]
     return raw.astype(np.float32) * np.float32(DEPTH_M[message.encoding])
 
 
-def _pixels(name: str, image: Any, channels: int, dtype: str) -> np.ndarray:
-    """(H, W, channels) of a ``sensor_msgs/Image``."""
+def pixels(name: str, image: Any, channels: int, dtype: str) -> np.ndarray:
+    """(H, W, channels) of a ``sensor_msgs/Image``; :class:`BadInput` where it has too few bytes."""
     kind = np.dtype(dtype).newbyteorder(">" if image.is_bigendian else "<")
     width = image.width * channels * kind.itemsize
     if image.step < width or len(image.data) < image.height * image.step:

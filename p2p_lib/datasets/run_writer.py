@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -44,6 +44,8 @@ class RunWriter:
     if_exists  what becomes of a run that the folder holds already: ``refuse`` with :class:`BadInput`, ``replace`` it,
                or ``resume`` it: its frames are compared as they are added again, and nothing is written before they
                are all there. What was not written by a run is never touched
+    redo_from  of a run that is resumed only the frames before this one are kept; what was said of objects may be other
+               words from there on
     earlier    what run was in the folder before, in words; empty where there was none
     resumed    the run in the folder, where it goes on
     complete   whether a run that is resumed had finished, so that nothing is left to do
@@ -62,7 +64,9 @@ class RunWriter:
         stop: int | None = None,
         models: Mapping[str, Path] | None = None,
         if_exists: IfExists = "refuse",
+        redo_from: int | None = None,
     ):
+        self.redo_from = redo_from
         self.path, self._sequence, self._config, self._if_exists = Path(out), sequence, config, if_exists
         _ = sequence.truth  # what is wrong with it is said before anything is written
         names = sequence.objects if objects is None else objects
@@ -142,6 +146,10 @@ class RunWriter:
             if (earlier := read_info(self.path)) is not None:
                 _clear(self.path, earlier)
             self._write_info()  # by which the folder is known to be a run's: before anything else
+        elif self.redo_from is not None:
+            gone = [f"poses/{name}.txt" for name in self.resumed.objects.keys() - self._estimates.keys()]
+            _unlink(self.path, [*gone, *_maps(self.resumed.objects)])
+            _clear_refined(self.path)
         replace_text(self.path / "config.toml", self._config.to_toml())
         if self._points:
             _save_arrays(self.path / "models.npz", self._points)
@@ -198,7 +206,11 @@ class RunWriter:
             self.earlier = _in_words(info) if info else ""
             if info and self._if_exists == "resume":
                 self.resumed, self.complete = load_run(self.path, every_map=True), info["finished"]
+                if self.redo_from is not None:
+                    self.resumed, self.complete = self.resumed.until(self.redo_from), False
                 self._check_same(info)
+            elif self.redo_from is not None:
+                raise BadInput(str(self.path), "no run", f"one to go on with from frame {self.redo_from}")
             self._held = self._held.pop_all()
         return self
 
@@ -219,8 +231,14 @@ class RunWriter:
         """That what is to be resumed was asked for in the same words."""
         mine, fix = json.loads(json.dumps(self.info)), f"Ask for the same, or run it anew: {_ANEW}."
         parameters = read_text(self.path / "config.toml", "the parameters of the run") == self._config.to_toml()
-        # Objects may have come later.
-        theirs = {key: earlier.get(key) if key != "objects" else earlier[key][: len(mine[key])] for key in mine}
+        theirs = {key: earlier.get(key) for key in mine}
+        theirs["objects"] = theirs["objects"][: len(mine["objects"])]  # others may have come later
+        if (start := self.redo_from) is not None:
+            for info in (mine, theirs):
+                info["prompts"] = [said for said in info.get("prompts") or [] if said["frame"] < start]
+                info["options"] = {**(info.get("options") or {}), "prompts": None}
+            theirs["objects"] = mine["objects"]  # their poses tell
+            fix = "Say --from FRAME of the first change."
         differ = [key for key in mine if theirs[key] != mine[key] and key not in _MAY_DIFFER]
         if not differ and parameters:
             return
@@ -320,13 +338,26 @@ def _clear(out: Path, info: Mapping[str, Any]) -> None:
     kept_masks = (info.get("options") or {}).get("save_masks")
     masks = [f"masks/{name}/{'[0-9]' * 6}.png" for name in info["objects"]] if kept_masks else []
     poses = [f"poses/{name}.txt" for name in info["objects"]]
-    meshes = [path for name in info["objects"] for path in (f"meshes/{name}.ply", f"maps/{name}.npz")]
     # First the one without which there is no run: two are never mixed, whenever a kill comes.
     others = ("config.toml", "models.npz", "timings.csv", KEYPOINTS, MASK_LOG, FIRST_MASKS)
-    for pattern in ("poses.npz", *poses, *meshes, *masks, *others):
+    _unlink(out, ("poses.npz", *poses, *_maps(info["objects"]), *masks, *others))
+    _clear_refined(out)
+
+
+def _maps(objects: Iterable[str]) -> list[str]:
+    """What a run writes of its objects' surfaces at its end."""
+    return [path for name in objects for path in (f"meshes/{name}.ply", f"maps/{name}.npz")]
+
+
+def _unlink(out: Path, patterns: Iterable[str]) -> None:
+    for pattern in patterns:
         for path in out.glob(pattern):
             if not path.parent.is_symlink():
                 path.unlink()
+
+
+def _clear_refined(out: Path) -> None:
+    """Take away what was refined of a run."""
     refined = out / OFFLINE  # of poses that are gone: it would pass for one of the new run
     if (refined / "run.json").is_file() and not refined.is_symlink() and (of := read_info(refined)).get("offline"):
         _clear(refined, of)

@@ -200,6 +200,18 @@ class Run:
         poses = ", ".join(f"{name} {obj.has_pose.sum()} of {len(obj)}" for name, obj in self.objects.items())
         return f"{type(self).__name__}({str(self.path)!r}, frames with a pose: {poses})"
 
+    def until(self, frame: int) -> Run:
+        """The run as it was before a frame; :class:`BadInput` for one that has none before it, or was not reached."""
+        at = next(iter(self.objects.values())).frame_index
+        if not at[0] < frame <= at[-1]:
+            fix = "Frames before it are kept."
+            raise BadInput(f"{self.path}: from", f"frame {frame}", f"one from {at[0] + 1} to {at[-1]}", fix)
+        kept = at < frame
+        objects = {
+            name: ObjectRun(*(getattr(obj, column)[kept] for column in COLUMNS)) for name, obj in self.objects.items()
+        }
+        return replace(self, objects=objects, timings={key: rows[: kept.sum()] for key, rows in self.timings.items()})
+
     def masks(self, sequence: Sequence, frame: int) -> dict[str, np.ndarray]:
         """Object to (H, W) bool at a frame of the sequence: the masks that were kept, else those of its that served."""
         where = self.path / self.info.get("masks_in", "") / "masks"

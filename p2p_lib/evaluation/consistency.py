@@ -168,6 +168,6 @@ def _is_about(doubt: str, name: str) -> bool:
 def _reprojection_px(obj: ObjectRun, points: ObjectKeypoints, camera: Camera) -> float:
     """The median over all observations, in frames with a pose, of keypoints that the map still has; NaN without any."""
     posed = zip(obj.frame_index[obj.has_pose].tolist(), obj.T_cam_obj[obj.has_pose], strict=True)
-    off_px = [reprojected(points, frame, camera, T_cam_obj)[1] for frame, T_cam_obj in posed]
-    off_px = np.concatenate([np.zeros(0), *off_px])
+    each_px = (reprojected(points, frame, camera, T_cam_obj)[1] for frame, T_cam_obj in posed)
+    off_px = np.concatenate([np.zeros(0), *each_px])
     return float(np.median(off_px)) if len(off_px) else float("nan")

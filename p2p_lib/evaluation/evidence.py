@@ -98,7 +98,8 @@ def gathered(
         of_points = _of_keypoints(obj, keypoints, masks, sequence.camera)
     elsewhere = every.has_pose & ~obj.has_pose
     said = obj.frame_index, obj.has_pose, elsewhere, obj.confidence
-    return Evidence(*said, px, size_m, *of_points, fit.overlap, fit.through, told, apart)
+    seen, inside, off_px, jump_px = of_points
+    return Evidence(*said, px, size_m, seen, inside, off_px, jump_px, fit.overlap, fit.through, told, apart)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:

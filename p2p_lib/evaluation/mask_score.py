@@ -89,8 +89,9 @@ def evaluate_masks(run: Run, min_visible_px: int = MIN_VISIBLE_PX) -> MaskEvalua
     shape = sequence.camera.height, sequence.camera.width
     rows = []
     for i in sorted({int(path.stem) for path in kept}):
-        truth = sequence.masks(i)
-        for name in known if truth is not None else ():
+        if (truth := sequence.masks(i)) is None:
+            continue
+        for name in known:
             found = read_labels(run.path / "masks" / name / f"{i:06d}.png", shape) > 0
             rows.append((name, i, *agreement(found, truth.get(name, np.zeros(shape, bool)), min_visible_px)))
     if not rows:

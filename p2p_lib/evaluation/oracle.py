@@ -51,8 +51,8 @@ class OracleTracker(PointTracker):
         self._ids.check_started()
         self._frame, cfg = frame, self.config
         sight = self._scene.see(frame, self._points)
-        span, part = divmod(frame.index, cfg.lasting_frames)
-        part /= cfg.lasting_frames
+        span, since = divmod(frame.index, cfg.lasting_frames)
+        part = since / cfg.lasting_frames
         visible = sight.visible & (self._drawn(_DROPOUT, span, "random") >= cfg.dropout)
         uv = sight.uv_px + cfg.noise_px * self._drawn(_NOISE, frame.index, "standard_normal", 2)
         ends = (self._drawn(_SLIDE, span + k, "standard_normal", 2) for k in (0, 1))

@@ -48,10 +48,10 @@ def chamfer_cm(mesh: trimesh.Trimesh, T_model_obj: np.ndarray, reference: np.nda
     from scipy.spatial import cKDTree
 
     truth = thinned(reference)
-    mesh = _cleaned(mesh, T_model_obj, truth)
-    if mesh is None:
+    cleaned = _cleaned(mesh, T_model_obj, truth)
+    if cleaned is None:
         return {}
-    samples, _ = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
+    samples, _ = trimesh.sample.sample_surface(cleaned, SAMPLES, seed=0)
     as_aligned = (cKDTree(reference).query(samples)[0].mean() + cKDTree(samples).query(reference)[0].mean()) / 2
     samples = se3.transform(_icp(thinned(samples), truth), samples)
     tree = cKDTree(truth)

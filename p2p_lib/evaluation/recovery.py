@@ -38,7 +38,7 @@ def recovery_events(frame_index: np.ndarray, adds_m: np.ndarray) -> tuple[Recove
     returns = np.flatnonzero(np.diff(frame_index) > MIN_HIDDEN_FRAMES) + 1
     events = []
     for first, end in pairwise([*returns, len(frame_index)]):
-        found = np.flatnonzero(good[first:end]) if good[:first].any() else ()
+        found = np.flatnonzero(good[first:end]) if good[:first].any() else np.zeros(0, int)
         returned = int(frame_index[first])
         delay = int(frame_index[first + found[0]]) - returned if len(found) else None
         events.append(RecoveryEvent(int(frame_index[first - 1]) + 1, returned, delay))

@@ -95,6 +95,10 @@ class OurPolicy(Policy):
         self.on = on
         self.shape = ShapeSearch(self.observer, self.config, self.stopwatch, "shape_search" in on)
         self.frozen = False  # whether the map does not grow
+        self._lies: tuple[np.ndarray | None, np.ndarray | None] = (
+            None,
+            None,
+        )  # the last pose, and where what had it lies since, as seen last
         self.trusted: Sight | None = None  # the newest without a doubt; None once it was hidden since
 
     # -- propose -------------------------------------------------------------------------------
@@ -306,6 +310,14 @@ class OurPolicy(Policy):
         """A frame that is learnt from tells its place in the scene and its motion, too."""
         life = admission.life
         return life.placed(obs.frame.T_world_cam).moved(sure) if admission.learns else life
+
+    def expected(self, obs: Sight, known: Known) -> np.ndarray | None:
+        """Where it was left lying in the static scene, as the camera saw that last; else as in the paper."""
+        last = super().expected(obs, known)
+        if known.life.lay_still and (prior := known.life.scene_prior(obs.frame.T_world_cam)):
+            self._lies = last, prior["scene"]
+        since, lies = self._lies
+        return lies if since is last and since is not None else last
 
     def missed(self, obs: Sight, known: Known, verdict: Verdict) -> Lifecycle:
         """After a frame in which the object was hidden nothing is compared with what was before."""

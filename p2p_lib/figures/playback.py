@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from pandas import Series
+from scipy.spatial import cKDTree
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import P2PError
@@ -24,8 +25,9 @@ from p2p_lib.figures import style
 if TYPE_CHECKING:
     import trimesh
 
-#: Farther points are walls, which nobody needs to see.
-CLOUD_MAX_M = 2.5
+#: Farther points are walls, which nobody needs to see; those so near to a surface that is drawn would cover it.
+CLOUD_MAX_M, COVERING_M = 2.5, 0.015
+_SAMPLES = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,14 +116,31 @@ class Playback:
         """The image of row i, where it can still be had."""
         return None if self.sequence is None else self.sequence.frame(int(self.frame_index[i]))
 
-    def cloud(self, frame: Frame, points: int) -> tuple[np.ndarray, np.ndarray]:
-        """About so many of a frame's points (M, 3) in camera coordinates, on a grid, and their colours (M, 3) uint8."""
+    def cloud(self, i: int, frame: Frame, points: int) -> tuple[np.ndarray, np.ndarray]:
+        """About so many points (M, 3) of the frame of row i in camera coordinates, on a grid, and their colours (M, 3).
+
+        Those on a surface that stands there are left out.
+        """
         h, w = frame.shape
         step = max(1, round(np.sqrt(h * w / points)))
         v, u = (a.ravel() for a in np.mgrid[step // 2 : h : step, step // 2 : w : step])
         near = (frame.depth_m[v, u] > 0) & (frame.depth_m[v, u] < CLOUD_MAX_M)
         u, v = u[near], v[near]
-        return self.sequence.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u]), frame.rgb[v, u]
+        p_cam = self.sequence.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
+        for name, tree in self._surfaces.items():
+            obj = self.objects[name]
+            if obj.has_pose[i] and self.of_kept_map(name)[i]:
+                p_obj = se3.transform(se3.inverse(obj.T_cam_obj[i]), p_cam)
+                bare = tree.query(p_obj, distance_upper_bound=COVERING_M)[0] >= COVERING_M
+                p_cam, u, v = p_cam[bare], u[bare], v[bare]
+        return p_cam, frame.rgb[v, u]
+
+    @cached_property
+    def _surfaces(self) -> dict[str, cKDTree]:
+        """Points all over each surface."""
+        from trimesh.sample import sample_surface
+
+        return {name: cKDTree(sample_surface(mesh, _SAMPLES, seed=0)[0]) for name, mesh in self.meshes.items()}
 
     def masks(self, i: int) -> dict[str, np.ndarray]:
         """The masks (H, W) bool of row i, as the run gives them; none without a sequence."""

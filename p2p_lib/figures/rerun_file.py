@@ -102,7 +102,7 @@ def _log_images(rr: Any, stream: Any, playback: Playback, i: int) -> None:
             labels[masks[name]] = k
     if masks:
         stream.log([*_IMAGE, "masks"], rr.SegmentationImage(labels, opacity=0.4))
-    p_cam, colours = playback.cloud(frame, POINTS)
+    p_cam, colours = playback.cloud(i, frame, POINTS)
     stream.log("points", rr.Points3D(p_cam, colors=colours, radii=_POINT_M))
 
 

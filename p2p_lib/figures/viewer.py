@@ -159,7 +159,7 @@ class _Scene:
             self._show_object(name, nodes, i, before)
         frame = self._playback.frame(i)
         if frame is not None:
-            p_cam, colours = self._playback.cloud(frame, self._points)
+            p_cam, colours = self._playback.cloud(i, frame, self._points)
             self._scene.add_point_cloud("/points", p_cam, colours, point_size=_CLOUD_POINT_M)
             size = (IMAGE_PX, round(IMAGE_PX * frame.shape[0] / frame.shape[1]))
             self._camera.image = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)

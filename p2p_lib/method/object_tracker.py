@@ -138,7 +138,7 @@ class ObjectTracker:
     def absent(self, obs: Observation, verdict: Verdict) -> ObjectStep:
         """A frame without a pose."""
         self.life = self.policy.missed(obs, self.known, verdict)
-        if verdict.status is Status.OCCLUDED and self._out_of_view():
+        if verdict.status is Status.OCCLUDED and self._out_of_view(obs):
             verdict = replace(verdict, reason=f"{OUT_OF_VIEW}: {verdict.reason}")
         return ObjectStep(self._estimate(obs, verdict))
 
@@ -219,12 +219,11 @@ class ObjectTracker:
             return Hint()
         return hint_at(obs.frame, self.known, self.observer, obs.tracks.uv_px[best.inliers], best.T_cam_obj)
 
-    def _out_of_view(self) -> bool:
-        """Whether most keypoints of an absent object lay outside the image at its last pose."""
-        if self.life.T_cam_obj is None:
-            return False
-        inside = self.observer.in_image(self.life.T_cam_obj, self.map.p_obj)
-        return bool(len(inside)) and inside.mean() < 0.5
+    def _out_of_view(self, obs: Observation) -> bool:
+        """Whether most keypoints of an absent object lie outside the image where it is expected."""
+        T_cam_obj = self.policy.expected(obs, self.known)
+        inside = () if T_cam_obj is None else self.observer.in_image(T_cam_obj, self.map.p_obj)
+        return len(inside) > 0 and np.mean(inside) < 0.5
 
 
 def hint_at(frame: Frame, known: Known, observer: Observer, uv_px: np.ndarray, T_cam_obj: np.ndarray) -> Hint:

@@ -189,3 +189,7 @@ class Policy:
     def missed(self, obs: Observation, known: Known, verdict: Verdict) -> Life:
         """The life after a frame without a pose."""
         return replace(known.life, status=verdict.status)
+
+    def expected(self, obs: Observation, known: Known) -> np.ndarray | None:
+        """T_cam_obj of an absent object: its last pose, None where it had none."""
+        return known.life.T_cam_obj

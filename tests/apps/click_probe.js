@@ -1,6 +1,6 @@
 // Runs the script of the click page without a browser: node click_probe.js PAGE, on standard input
 // {"session": what the server says, "steps": [["frame", i] | ["press", x, y, shift, x to, y to] | ["zoom", x, y] |
-// ["row" | "clear" | "remove", k] | ["rename", k, name] | ["undo" | "save" | "finish"]]}.
+// ["tool", paint or erase, radius] | ["stroke", [x, y], ...] | ["row" | "clear" | "remove", k] | ["rename", k, name] | ["undo" | "save" | "finish"]]}.
 // Prints what Save sends, and what was asked for masks. Only what the page asks of a browser is here.
 const fs = require("fs");
 const given = JSON.parse(fs.readFileSync(0, "utf8"));
@@ -29,7 +29,8 @@ global.fetch = async (where, what) => {
   const content = JSON.parse(what.body);
   if (where === "masks") {
     asked.push(content.objects);
-    const square = [[[1, 1], [9, 1], [9, 9]]];
+    const { width, height } = given.session;
+    const square = [height + 1, 8, (width - 1) * height - 9]; // in its second column
     const masks = Object.fromEntries(content.objects.map(({ name }) => [name, square]));
     return { ok: true, json: async () => ({ masks, doubts: ["is it a table?"] }) };
   }
@@ -45,6 +46,15 @@ const steps = {
   press: (x, y, shift = false, x1 = x, y1 = y) => {
     elements.canvas.onpointerdown(at(x, y, shift));
     elements.canvas.onpointerup(at(x1, y1, shift));
+  },
+  tool: (kind, radius) => {
+    for (const id of ["on", "beside", "paint", "erase"]) document.getElementById(id).checked = id === kind;
+    document.getElementById("brush").value = radius;
+  },
+  stroke: (from, ...more) => {
+    elements.canvas.onpointerdown(at(...from));
+    for (const to of more) elements.canvas.onpointermove(at(...to));
+    elements.canvas.onpointerup(at(...(more.at(-1) ?? from)));
   },
   row: (k) => elements.objects.children[k].onclick(),
   zoom: (x, y) => elements.canvas.onwheel({ ...at(x, y), deltaY: -1 }),
@@ -64,5 +74,5 @@ const steps = {
   await elements.finish.onclick();
   const rows = elements.objects.children.map((row) => row.children[1].textContent);
   console.log(JSON.stringify({ sent, rows, message: elements.message.textContent,
-    doubts: elements.doubts.textContent, asked, tinted: drawn.some(([what, how]) => what === "fill" && how === "evenodd") }));
+    doubts: elements.doubts.textContent, asked, tinted: drawn.filter(([what]) => what === "rect").map(([, ...box]) => box) }));
 })();

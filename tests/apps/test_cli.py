@@ -20,7 +20,10 @@ import p2p_lib
 from p2p_lib.apps import cli
 from p2p_lib.core.errors import MissingData, P2PError
 from p2p_lib.core.options import RunOptions
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.datasets.prompts import save_prompts
 from p2p_lib.datasets.runs import load_run
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.run import summary
 from tests.fixtures.sliding_board import DEPTH_M, H, K, W, write_sequence
@@ -251,6 +254,38 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert "config.toml: got other parameters" in one_line(capsys)
     before["config.toml"] += b"\n"
     assert contents(out) == before
+
+
+def test_a_run_goes_on_from_a_frame_with_other_prompts(sequence, tmp_path, capsys):
+    """As a run that had them from the start; what is said of earlier frames has to stay."""
+
+    def prompts(*more: Prompt) -> list[str]:
+        first = Prompt("object", 0, mask=mask)
+        return ["--prompts", str(save_prompts(tmp_path / "p.json", [first, *more]))]
+
+    mask = open_sequence(sequence).masks(0)["object"]
+    hidden = Prompt("object", 5, mask=np.zeros_like(mask))
+    out, anew = tmp_path / "out", tmp_path / "anew"
+    assert run(sequence, out, *prompts(), "--save-masks") == 0
+    before = contents(out)
+    more = [*prompts(hidden), "--save-masks"]
+    for words, said in (
+        (["--resume"], "out: prompts: got"),
+        (["--resume", "--from", "6"], "Say --from FRAME of the first change"),
+        (["--resume", "--from", "0"], f"from: got frame 0, expected one from 1 to {FRAMES - 1}"),
+    ):
+        capsys.readouterr()
+        assert run(sequence, out, *more, *words) == 2 and said in one_line(capsys)
+    assert contents(out) == before
+    assert run(sequence, out, *more, "--resume", "--from", "5") == run(sequence, anew, *more) == 0
+    assert "its frames before 5 are tracked again" in capsys.readouterr().err
+    mine, theirs = load_run(out), load_run(anew)
+    for column in ("status", "T_cam_obj", "reason"):
+        np.testing.assert_array_equal(*(getattr(r.objects["object"], column) for r in (mine, theirs)))
+    assert mine.objects["object"].status[5] == "occluded" and mine.info["prompts"] == theirs.info["prompts"]
+    images = sorted((anew / "masks/object").iterdir())
+    assert all(path.read_bytes() == (out / "masks/object" / path.name).read_bytes() for path in images)
+    assert run(sequence, tmp_path / "none", *more, "--resume", "--from", "5") == 2 and "no run" in one_line(capsys)
 
 
 def test_without_truth_there_is_no_score_and_no_fuss(sequence, tmp_path, capsys):

@@ -14,11 +14,13 @@ import cv2
 import numpy as np
 import pytest
 
-from p2p_lib.apps.click import PAGE, Clicker
+from p2p_lib.apps.click import PAGE, Clicker, first_change
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.datasets.prompts import load_prompts, save_prompts
+from p2p_lib.datasets.prompts import load_prompts, parse_prompts, run_lengths, save_prompts
+from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.run import run
 
 H, W = 60, 80
 
@@ -109,6 +111,11 @@ REFUSED = {
     "same name": ({"objects": [one(), one()]}, "'cup' in frame 0 twice"),
     "late frame": ({"objects": [one(frame=3)]}, "prompt of 'cup': got frame 3, expected a frame from 0 to 2"),
     "no points": ({"objects": [one(points=())]}, "at least one [x, y]"),
+    "runs of another size": (
+        {"objects": [{"name": "cup", "mask": {"size": [1, 3], "counts": [1, 2]}}]},
+        "mask of 'cup': got 3x1, expected 80x60",
+    ),
+    "runs that do not add up": ({"objects": [{"name": "cup", "mask": {"size": [2, 3], "counts": [1, 2]}}]}, "add up"),
     "a number": ({"objects": [one() | {"points": 5}]}, "at least one [x, y]"),
     "nothing": ({"objects": []}, "prompts: got"),
     "a list": ([1, 2], "prompts: got"),
@@ -224,21 +231,24 @@ def test_the_page_makes_prompts_of_clicks_boxes_and_later_frames(sequence, out):
             ["press", 30, 40],  # taken back
             ["frame", 2],
             ["press", 62, 51, True],
-            ["row", 1],  # the sequence's own object
+            ["row", 2],  # the sequence's own object
             ["press", 70, 10, False, 30, 44],  # a box, from its upper right corner
         )
         assert seen["sent"]["objects"] == [
             {"name": "cup", "frame": 0, "points": [[40, 30], [50, 20]], "negative": [[60, 50]]},
             {"name": "cup", "frame": 2, "negative": [[62, 51]]},
+            {"name": "lid", "frame": 1, "mask": run_lengths(np.eye(H, W, dtype=bool))},
             {"name": "object", "frame": 2, "box": [30, 10, 70, 44]},
         ]
         assert seen["sent"]["finish"] is True
-        assert seen["rows"] == ["cup: frame 0, 2", "object: frame 2"] and seen["message"].startswith("Saved")
+        assert seen["rows"] == ["cup: frame 0, 2", "lid: frame 1", "object: frame 2"] and seen["message"].startswith(
+            "Saved"
+        )
         assert post(clicker.url, seen["sent"])[0] == 200
-        assert [(p.name, p.frame) for p in clicker.prompts] == [("cup", 0), ("cup", 2), ("object", 2), ("lid", 1)]
+        assert [(p.name, p.frame) for p in clicker.prompts] == [("cup", 0), ("cup", 2), ("lid", 1), ("object", 2)]
         again = visit(clicker.session(), ["remove", 0])
     assert again["sent"]["objects"] == seen["sent"]["objects"][2:]
-    np.testing.assert_array_equal(load_prompts(out)[-1].mask, np.eye(H, W, dtype=bool))  # masks stay as they were
+    np.testing.assert_array_equal(load_prompts(out)[2].mask, np.eye(H, W, dtype=bool))  # masks stay as they were
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
@@ -268,7 +278,67 @@ def test_the_page_asks_for_the_masks_of_the_frame_that_is_shown(sequence, out):
         seen = visit(clicker.session(), ["press", 50, 20], ["frame", 1], ["press", 30, 30])
     assert seen["asked"][0] == [{"name": "object", "frame": 0, "points": [[50, 20]]}]
     assert seen["asked"][-1] == [{"name": "object", "frame": 1, "points": [[30, 30]]}]
-    assert seen["tinted"] and seen["doubts"] == "is it a table?"
+    assert seen["tinted"][-1] == [1, 1, 1, 8] and seen["doubts"] == "is it a table?"
+
+
+def disc(x: int, y: int, radius: int) -> np.ndarray:
+    v, u = np.mgrid[:H, :W]
+    return (u - x) ** 2 + (v - y) ** 2 <= radius**2
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
+def test_a_brush_mends_a_mask(sequence, out):
+    """It starts from the mask that is shown; what it leaves is a mask, which a click replaces and undo brings back."""
+    with Clicker(sequence, out) as clicker:
+        session = clicker.session()
+        first = [["press", 50, 20], ["tool", "paint", 5], ["stroke", [20, 30], [20, 30]]]
+        square = np.zeros((H, W), bool)
+        square[1:9, 1] = True  # which the click made, as the probe says
+        cases = {
+            "painted": ([], square | disc(20, 30, 5)),
+            "erased": ([["tool", "erase", 3], ["stroke", [20, 30]]], (square | disc(20, 30, 5)) & ~disc(20, 30, 3)),
+            "beyond the rim": ([["stroke", [79, 59]]], square | disc(20, 30, 5) | disc(79, 59, 5)),
+            "undone": ([["stroke", [60, 30], [70, 30]], ["undo"]], square | disc(20, 30, 5)),
+            "clicked and undone": ([["tool", "on"], ["press", 60, 40], ["undo"]], square | disc(20, 30, 5)),
+        }
+        for case, (more, mask) in cases.items():
+            sent = visit(session, *first, *more)["sent"]
+            (prompt,) = parse_prompts(sent)
+            differs = (prompt.mask ^ mask).sum()
+            assert differs <= 8 and prompt.mask[1:9, 1].all() and not len(prompt.points_px), (case, differs)
+        assert visit(session, *first, ["tool", "on"], ["press", 60, 40])["sent"]["objects"] == [
+            one("object", 0, [[60, 40]])
+        ]
+        way = visit(session, *first[1:2], ["stroke", [20, 30], [40, 30]])["sent"]
+        np.testing.assert_array_equal(parse_prompts(way)[0].mask[30, 15:46], [False] + [True] * 29 + [False])
+        assert post(clicker.url, sent)[0] == 200
+        np.testing.assert_array_equal(load_prompts(out)[0].mask, prompt.mask)
+        assert clicker.session()["objects"] == sent["objects"]
+
+
+def test_the_masks_of_a_run_are_shown_to_be_mended(sequence, out, tmp_path):
+    board = np.zeros((H, W), bool)
+    board[20:40, 30:60] = True
+    made = [Prompt("board", 0, mask=board)]
+    settings = {"method.surface": "false", "method.graph": "false"}
+    run(sequence, tmp_path / "run", prompts=made, save_masks=True, settings=settings, progress=False)
+    with Clicker(sequence, out, run=load_run(tmp_path / "run")) as clicker:
+        assert clicker.session()["names"] == ["board"] and clicker.session()["run"]
+        status, found = post(clicker.url, {"objects": [], "frame": 0}, to="masks")
+        assert status == 200 and found["masks"] == {"board": run_lengths(board)["counts"]}
+        assert post(clicker.url, {"objects": [], "frame": 3}, to="masks")[0] == 400
+    command = ["click", str(sequence.path), "--out", str(out), "--run", str(tmp_path / "run"), "--no-browser"]
+    process = subprocess.Popen([sys.executable, "-m", "p2p_lib.apps.cli", *command], stdout=subprocess.PIPE, text=True)
+    try:
+        url = re.search(r"http://\S+", process.stdout.readline())[0]
+        content = {"objects": [one("board"), {"name": "board", "frame": 2, "mask": run_lengths(board)}], "finish": True}
+        assert post(url, content)[0] == 200
+        said, _ = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert "the first new one in frame 0. Next: p2p run" in said and said.endswith("--force\n")
+    assert first_change(load_prompts(out), load_prompts(out)) is None
+    assert first_change(load_prompts(out)[:1], load_prompts(out)) == 2
 
 
 def test_the_server_says_what_mask_the_clicks_make(sequence, out):
@@ -279,18 +349,18 @@ def test_the_server_says_what_mask_the_clicks_make(sequence, out):
         cv2.imwrite(str(sequence.path / "depth" / f"{k}.png"), depth)
         cv2.imwrite(str(sequence.path / "rgb" / f"{k}.png"), rgb)
     with Clicker(sequence, out) as clicker:
-        status, found = post(clicker.url, {"objects": [one(points=[(45, 30)])]}, to="masks")
-        mask = np.zeros((H, W), np.uint8)
-        cv2.fillPoly(mask, [np.array(outline) for outline in found["masks"]["cup"]], 1)
+        status, found = post(clicker.url, {"objects": [one(points=[(45, 30)])], "frame": 0}, to="masks")
+        runs = {"size": [H, W], "counts": found["masks"]["cup"]}
+        mask = parse_prompts({"objects": [{"name": "cup", "mask": runs}]})[0].mask
         board = np.zeros((H, W), bool)
         board[20:40, 30:60] = True
-        assert status == 200 and (mask.astype(bool) & board).sum() / (mask.astype(bool) | board).sum() > 0.85
+        assert status == 200 and (mask & board).sum() / (mask | board).sum() > 0.85
         assert found["doubts"] == []
-        wall = post(clicker.url, {"objects": [one(points=[(10, 10)])]}, to="masks")[1]
+        wall = post(clicker.url, {"objects": [one(points=[(10, 10)])], "frame": 0}, to="masks")[1]
         assert wall["doubts"][0].startswith("clicks on 'cup' in frame 0: ")
         beside = {"name": "cup", "frame": 1, "negative": [[5, 5]]}
-        assert post(clicker.url, {"objects": [beside]}, to="masks") == (200, {"masks": {}, "doubts": []})
-        status, found = post(clicker.url, {"objects": [one(points=[(W, 5)])]}, to="masks")
+        assert post(clicker.url, {"objects": [beside], "frame": 1}, to="masks") == (200, {"masks": {}, "doubts": []})
+        status, found = post(clicker.url, {"objects": [one(points=[(W, 5)])], "frame": 0}, to="masks")
         assert status == 400 and "expected pixels within" in found["error"] and not out.exists()
 
 

@@ -21,6 +21,7 @@ from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import jobs_of
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome, load_outcome, save_outcome
 from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import evaluate
@@ -196,6 +197,42 @@ def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp
     assert "its process was ended" in reason
     assert run_benchmark(plan, tmp_path, "quick", progress=False).counts()["failed"] == 1, "not without being told"
     assert run_benchmark(plan, tmp_path, "quick", progress=False, retry=True).counts()["done"] == 2
+
+
+def hold(job, out: Path) -> None:
+    """A run that has opened a progress bar and does not end."""
+    progress_bar("held", 1, shown=False)
+    (out / "held").touch()
+    time.sleep(60)
+
+
+INTERRUPTED = """
+import os, signal, sys, threading, time
+from pathlib import Path
+from types import SimpleNamespace
+from p2p_lib.benchmark.execution import execute
+from tests.benchmark.test_benchmark import hold
+
+def interrupt():
+    while not (out / "held").exists():
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGINT)
+
+out = Path(sys.argv[1])
+outcomes = execute([SimpleNamespace(key="a")], out, 1, None, hold)
+threading.Thread(target=interrupt).start()
+try:
+    next(outcomes)
+except KeyboardInterrupt:
+    outcomes.close()
+"""
+
+
+def test_a_run_that_is_killed_leaves_no_semaphore(tmp_path):
+    root = Path(__file__).resolve().parents[2]
+    command = [sys.executable, "-c", INTERRUPTED, str(tmp_path)]
+    ran = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=120)
+    assert (ran.returncode, ran.stderr) == (0, "") and (tmp_path / "held").exists()
 
 
 # --- on a cluster --------------------------------------------------------------------------------

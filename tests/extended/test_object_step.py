@@ -344,6 +344,22 @@ def test_an_object_that_left_the_image_is_said_to_be_out_of_view():
     assert estimate.status is Status.OCCLUDED and estimate.reason == "out of view: 0 mask pixels"
 
 
+def test_what_lay_still_is_out_of_view_where_the_camera_turned_away():
+    """Known in frames in which the camera is located; in those between as it was in the last of them."""
+    lump, nothing = settled(begun(**NO_SURFACE), [2]), np.zeros((CAMERA.height, CAMERA.width), bool)
+    life = lump.tracker.life
+    lay = replace(life, T_world_obj=life.T_cam_obj, rested=9)
+    away = se3.exp(np.array([0, 1.0, 0, 0, 0, 0]))
+
+    def said(lay, T_world_cam: np.ndarray | None) -> str:
+        lump.tracker.life = lay.without_pose(Status.OCCLUDED) if lay.has_pose else lay
+        obs = lump.observed(turned(3), mask=nothing)
+        return lump.tracker.step(replace(obs, frame=replace(obs.frame, T_world_cam=T_world_cam))).estimate.reason
+
+    assert said(replace(lay, rested=0), away) == said(lay, np.eye(4)) == "0 mask pixels", "a hand may have it"
+    assert said(lay, away) == said(lump.tracker.life, None) == "out of view: 0 mask pixels"
+
+
 # --- what is believed, kept and asked for ------------------------------------------------------
 
 

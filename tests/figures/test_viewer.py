@@ -112,6 +112,22 @@ def test_points_and_objects_are_of_the_same_frames(folder, made):
     assert messages["durationSeconds"] == pytest.approx(obj.time_s[-1] - obj.time_s[0] + 1 / 30)
 
 
+def test_points_do_not_cover_a_surface(folder, made):
+    """Those on the box are left out where it stands; in frame 8 it has no pose, and they are all there."""
+    shown, bare = Playback.of(folder, made.sequence), Playback.of(made.run.path, made.sequence)
+    half_m, frame = shown.meshes["box"].extents / 2, shown.frame(20)
+
+    def away_m(playback: Playback) -> np.ndarray:
+        T_cam_obj = shown.objects["box"].T_cam_obj[20]
+        beyond_m = np.abs(se3.transform(se3.inverse(T_cam_obj), playback.cloud(20, frame, 3000)[0])) - half_m
+        outside = (beyond_m > 0).any(1)
+        return np.where(outside, np.linalg.norm(np.maximum(beyond_m, 0), axis=1), -beyond_m.max(1))
+
+    assert away_m(bare).min() < 0.002 and away_m(shown).min() > 0.01
+    assert (away_m(bare) > 0.015).sum() == len(away_m(shown))
+    assert len(shown.cloud(8, shown.frame(8), 3000)[0]) == len(bare.cloud(8, bare.frame(8), 3000)[0])
+
+
 def test_the_page_needs_nothing_from_outside(page):
     assert len(page) < 3e6
     for kind in ("script", "link", "img", "iframe"):
