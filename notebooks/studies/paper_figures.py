@@ -192,7 +192,8 @@ Written by `p2p figures`. *Made on* says whether what is here is of the paper's 
 or of a stand-in, which carries the word in the picture. Tables of data that was not there hold the paper's
 numbers and, for ours, dashes with the reason: what was measured on such data before is in the project's
 [README](../README.md). `make figures` makes all of it from what is on disk; `p2p benchmark --list` says what
-can run here.
+can run here. *Earlier code*: what decides the numbers has changed since; `p2p benchmark --stale` lists these with
+the minutes they take, and makes them anew with `--out DIR`.
 
 """
 
@@ -220,7 +221,8 @@ def _made(file: Path, on: str, day_of: Callable[[str], str]) -> tuple[str, str, 
         return "-", "-", "not run for this table: its data was not there"
     commit = asked.get("commit") or said.get("commit") or ""
     part = f", {asked['runs']} runs" if "runs" in asked else ""
-    return str(asked.get("seeds", "0")), f"{commit[:7]} {day_of(commit)}".strip() or "-", on + part
+    made = f"{commit[:7]} {day_of(commit)}".strip() or "-"
+    return str(asked.get("seeds", "0")), made + ", *earlier code*" * said.get("earlier", False), on + part
 
 
 def _day(commit: str) -> str:

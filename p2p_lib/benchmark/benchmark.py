@@ -75,6 +75,13 @@ class Benchmark:
         statuses = [outcome.status for _, outcome in self.results]
         return {status: statuses.count(status) for status in ("done", "failed", "not run")}
 
+    @property
+    def cpu_min(self) -> float:
+        """Minutes of processor time that its finished runs took."""
+        done = [outcome for _, outcome in self.results if outcome.status == "done"]
+        ms = [o.ran.get("frames", 0) * sum(t for name, t in o.times.items() if "processor time" in name) for o in done]
+        return sum(ms) / 6e4
+
     def run(self, method: str, sequence: str = "") -> Run:
         """The poses of a method's first finished run (on a sequence)."""
         return load_run(run_path(self.out, self._finished(method, sequence)[0].key))

@@ -27,14 +27,12 @@ from p2p_lib.core.paths import data_dir
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets import checkpoints, manifests
 from p2p_lib.datasets.models import find_models
+from p2p_lib.datasets.provenance import code_digest
 from p2p_lib.datasets.resized import Resized
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.synthetic.faults import Faulty
 
-_PACKAGE = Path(__file__).resolve().parents[1]
-# What only shows results cannot change them.
-_WITHOUT = {"figures", "apps"}
 _NUMERICS = ("numpy", "scipy", "opencv-python-headless", "gtsam")
 
 
@@ -126,10 +124,8 @@ def open_planned(job: Job) -> Sequence:
 
 @cache
 def library_version() -> str:
-    """A hash of this package's source (without what only shows results) and of the versions of its numerics."""
-    sources = [path for path in sorted(_PACKAGE.rglob("*.py")) if path.relative_to(_PACKAGE).parts[0] not in _WITHOUT]
-    lines = [f"{path.relative_to(_PACKAGE).as_posix()} {_sha(path.read_bytes())}" for path in sources]
-    return _sha("\n".join([*lines, *(f"{name} {version(name)}" for name in _NUMERICS)]).encode())[:12]
+    """A hash of the sources that decide a result (:func:`code_digest`) and of the versions of their numerics."""
+    return _sha("\n".join([code_digest(), *(f"{name} {version(name)}" for name in _NUMERICS)]).encode())[:12]
 
 
 def _keyed(job: Job, known: dict[tuple, str]) -> Job:
