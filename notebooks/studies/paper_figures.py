@@ -180,6 +180,8 @@ _ROWS = (
            _BUNDLED),
     _table("-", "README's first tables", "readme", "-", "-", f"{_AND_MUSTARD}, 7-Scenes, TUM RGB-D"),
     _table("-", "2D point trackers, and what of the built-in one is 2D alone", "trackers", "01", "-", _AND_MUSTARD),
+    _table("-", "whose method: the paper's text and ours, by 2D tracker", "presets", "09", "-",
+           f"{_AND_MUSTARD}, 7-Scenes"),
     _table("-", "faults of camera, depth, masks and time", "faults", "10", "-", _AND_MUSTARD),
 )  # fmt: skip
 #: The paper's figures, tables and statements: where each is found (``file``, below ``figures/``), what that is made

@@ -254,11 +254,7 @@ def _part(job: Job, frames: int | None, dataset: str) -> str:
 
 def by_method(numbers: Numbers) -> Table:
     """A row per method, with the spread over sequences: the paper's ablations, and the comparison of trackers."""
-    ran = {job.method.name: job.method.detector for job, _ in numbers.benchmark.results}
-    lines = []
-    for method in numbers.methods:
-        chosen = "" if isinstance(method.detector, str) else f" ({ran[method.name]})"
-        lines.append([Cell(method.name + chosen), *_areas(numbers, method)])
+    lines = [[Cell(method.name), *_areas(numbers, method)] for method in numbers.methods]
     heads, groups = ["Method"], [("", 1), ("Ours", 4)]
     heads += [head for area in _AREA_HEADS for head in (area, "std over sequences")]
     bold = [1, 3] if numbers.judges else []
@@ -336,6 +332,42 @@ def by_run(numbers: Numbers) -> Table:
     how = "Exact area under the curve, frames without a pose count as 0"
     how += "; the rate is this machine's, under its load" * numbers.judges
     return Table(numbers.plan.title, heads, lines, groups, words=2, notes=[over, how, numbers.what_ran()])
+
+
+def by_grid(numbers: Numbers) -> Table:
+    """A row per sequence, a column per method: both areas and the frames lost, means over objects and seeds."""
+    done: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
+    for job, outcome in numbers.benchmark.results:
+        done[shown_name(job), job.method.name] += [outcome] if outcome.objects else []
+    scenes, methods = list(dict.fromkeys(s for s, _ in done)), [method.name for method in numbers.methods]
+    found = {at: np.mean([_areas_and_lost(o) for o in outcomes], 0) for at, outcomes in done.items() if outcomes}
+    whole = [scene for scene in scenes if all((scene, method) in found for method in methods)]
+    lines = []
+    for scene in scenes:
+        cells = [found.get((scene, method)) for method in methods]
+        shown = [numbers.missing(method, scene) if c is None else _three(c) for c, method in zip(cells, methods)]
+        lines.append([Cell(scene.removeprefix(SYNTHETIC)), *shown])
+    if whole:
+        means = [np.mean([found[scene, method] for scene in whole], 0) for method in methods]
+        lines.append([Cell(f"mean of {len(whole)}"), *map(_three, means)])
+    presets = [method.name.partition(", ")[0] for method in numbers.methods]
+    groups = [("", 1), *((preset, presets.count(preset)) for preset in dict.fromkeys(presets))]
+    heads = ["Sequence", *(name.partition(", ")[2] for name in methods)]
+    notes = ["ADD-S / ADD area under the curve (%), in brackets frames lost of all objects; the mean is over sequences"]
+    notes[0] += " on which every method ran"
+    rules = [len(scenes)] if whole else []
+    return Table(numbers.plan.title, heads, lines, groups, rules=rules, notes=[*notes, *numbers.notes()])
+
+
+def _areas_and_lost(outcome: Outcome) -> list[float]:
+    """Of one run: ADD-S and ADD areas, means over objects, and how many frames had no pose."""
+    errors = [obj.errors_m("first") for obj in outcome.objects.values()]
+    areas = [float(np.mean([metrics.auc_exact(e[key]) for e in errors])) for key in ("adds_m", "add_m")]
+    return [*areas, sum(obj.lost for obj in outcome.objects.values())]
+
+
+def _three(values: np.ndarray) -> Cell:
+    return Cell("{:.1f} / {:.1f} ({:.0f})".format(*values))
 
 
 def by_pair(numbers: Numbers) -> Table:
@@ -420,6 +452,7 @@ KINDS: dict[str, Callable[[Numbers], Table]] = {
     "returns": by_return,
     "rates": by_rate,
     "runs": by_run,
+    "grid": by_grid,
     "pairs": by_pair,
     "faults": by_fault,
 }

@@ -138,6 +138,21 @@ def test_pairs_are_differences_run_against_run(tmp_path):
     assert not any(cell.bold for cell in without[5:]), "three runs of a scene prove nothing"
 
 
+def test_a_grid_has_a_row_per_sequence_and_the_mean_of_those_that_all_methods_ran(tmp_path):
+    runs = {
+        ("paper, built-in", "bleach0"): [outcome(90), outcome(80)],
+        ("paper, built-in", "mustard0"): [outcome(70)] * 2,
+    }
+    runs[("default, built-in", "bleach0")] = [outcome(99)] * 2
+    table = paper_table(benchmark(tmp_path, runs, seeds=(0, 1), kind="grid"))
+    assert list(table.heads) == ["Sequence", "built-in", "built-in"]
+    assert list(table.groups) == [("", 1), ("paper", 1), ("default", 1)]
+    first, second, mean = [[cell.text for cell in row] for row in table.rows]
+    assert first == ["ycbineoat/bleach0", "85.0 / 85.0 (0)", "99.0 / 99.0 (0)"]
+    assert second == ["ycbineoat/mustard0", "70.0 / 70.0 (0)", "-"]
+    assert mean == ["mean of 1", *first[1:]]
+
+
 def test_where_only_the_quick_form_ran_the_shipped_table_is_shown(tmp_path, monkeypatch):
     monkeypatch.setenv("P2P_TABLES", str(tmp_path / "out"))
     monkeypatch.setattr(final_figures, "SHIPPED", tmp_path)
