@@ -178,6 +178,7 @@ _ROWS = (
     ("", "the same as a plot", "runtime.png", "p2p figures", "09", "-", _BUNDLED),
     _table("Section 4.5, long range", "5 of 5 returns against 0 of 5", "long_range", "07, 09", "ycbmultitrack_real",
            _BUNDLED),
+    _table("", "the same, scored from the first visible pixel on", "long_range_every_pixel", "-", "-", _BUNDLED),
     _table("-", "README's first tables", "readme", "-", "-", f"{_AND_MUSTARD}, 7-Scenes, TUM RGB-D"),
     _table("-", "2D point trackers, and what of the built-in one is 2D alone", "trackers", "01", "-", _AND_MUSTARD),
     _table("-", "whose method: the paper's text and ours, by 2D tracker", "presets", "09", "-",

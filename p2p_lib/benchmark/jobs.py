@@ -19,6 +19,7 @@ import numpy as np
 
 from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, uses_clicks
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
+from p2p_lib.core.files import read_toml
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.prompts import Prompt
@@ -30,6 +31,9 @@ from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.synthetic.faults import Faulty
 
+#: Beside the sequences of ``DATASET/*``, written by whoever knows: ``[SEQUENCE]``, then a line ``OBJECT = "COLUMN"``
+#: each, with the column of the paper's table that it fills ("one object 1 sugar"). Others have columns of their own.
+COLUMNS = "columns.toml"
 _NUMERICS = ("numpy", "scipy", "opencv-python-headless", "gtsam")
 
 
@@ -165,8 +169,11 @@ def _present(planned: PlannedSequence) -> Iterator[tuple[PlannedSequence, str]]:
     names = [path.name for path in sorted(root.glob("*")) if (path / "rgb").is_dir()]
     if not names:
         yield planned, f"{dataset}: no sequence in {of.folder} below $P2P_DATA"
+    own = root / COLUMNS
+    columns = read_toml(own, "sequences as tables: object = column of the paper's table") if own.is_file() else {}
     for name in names:
-        yield planned.model_copy(update={"name": f"{dataset}/{name}"}), ""
+        filled = columns.get(name, {})
+        yield planned.model_copy(update={"name": f"{dataset}/{name}", "columns": filled}), ""
 
 
 def _lacking(method: Method) -> str:

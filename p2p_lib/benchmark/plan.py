@@ -146,6 +146,8 @@ class Plan(Strict):
     name     of its file
     paper    LaTeX label of the paper's table that it re-creates, "" for none
     kind     how its table is arranged (see :mod:`p2p_lib.figures.final_tables`)
+    note     a sentence below its table, without its full stop
+    gpu_jobs so many runs at a time of methods that need a GPU
     chamfer  whether reconstructions are scored as well
     tracks   whether the 2D trackers are scored by themselves as well
     min_mask_px  frames in which less of an object's mask is to be seen are not scored: often the first of a return
@@ -155,6 +157,8 @@ class Plan(Strict):
     title: Text
     paper: str = ""
     kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs", "grid", "pairs", "faults"] = "methods"
+    note: str = ""
+    gpu_jobs: Annotated[int, Field(ge=1)] = 1
     chamfer: bool = False
     tracks: bool = False
     min_mask_px: Count = MIN_VISIBLE_PX

@@ -105,7 +105,12 @@ class Numbers:
         seeds = ", ".join(map(str, self.seeds))
         spread = f"mean ± standard deviation over seeds {seeds}" if len(self.seeds) > 1 else f"seed {seeds} alone"
         scored = f"frames with less than {self.plan.min_mask_px} pixels of an object's mask are not scored"
-        return [f"{_HOW}; {scored}; {spread}", self.what_ran(), *([_REPORTED] if self.plan.paper else [])]
+        reported = [_REPORTED] if self.plan.paper else []
+        return [f"{_HOW}; {scored}; {spread}", *self.of_the_plan(), self.what_ran(), *reported]
+
+    def of_the_plan(self) -> list[str]:
+        """What the plan itself has to say below its table."""
+        return [self.plan.note] if self.plan.note else []
 
     def what_ran(self) -> str:
         """Trackers, detectors, masks, sequences, commit."""
@@ -177,10 +182,10 @@ def _metrics(numbers: Numbers, paper: Reported) -> list[str]:
     return [metric for metric in METRICS if metric in printed and (metric in _AREAS or numbers.plan.chamfer)]
 
 
-def _places(numbers: Numbers) -> dict[str, tuple[Job, str]]:
-    """Column to the first job and object that fill it; a job that did not run fills those that its plan gives it."""
+def _places(numbers: Numbers, method: str = "") -> dict[str, tuple[Job, str]]:
+    """Column to the first job (of a method) and object that fill it; one that did not run fills those of its plan."""
     places: dict[str, tuple[Job, str]] = {}
-    for job, outcome in numbers.benchmark.results:
+    for job, outcome in (at for at in numbers.benchmark.results if method in ("", at[0].method.name)):
         names = list(outcome.objects) or list(job.sequence.columns) or job.sequence.objects or [""]
         for name in names:
             own = shown_name(job) + (f" {name}" if len(names) > 1 else "")
@@ -223,7 +228,7 @@ def _reported_line(paper: Reported, row: object) -> _Line:
 def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method: Method) -> _Line:
     columns, cells, whole, same = _columns(paper), defaultdict(numbers.not_planned), set(), set()
     frames = {shown_name(j): o.ran.get("frames") for j, o in numbers.benchmark.results if j.method.name == method.name}
-    for column, (job, name) in _places(numbers).items():
+    for column, (job, name) in _places(numbers, method.name).items():
         cells[column] = numbers.cell(method.name, METRICS[metric][0], shown_name(job), name, form)
         if column in columns:
             part = _part(job, frames.get(shown_name(job)), paper.dataset)
@@ -234,7 +239,10 @@ def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method:
             cells[column] = replace(cells[column], note=cells[column].note or said)
     cells["Mean"] = numbers.cell(method.name, METRICS[metric][0], MEAN, "", form)
     if len(whole) < len(columns):
-        cells["Mean"] = Cell(note=f"{len(whole)} of the table's {len(columns)} columns were run in whole")
+        values = [float(cells[column].text.partition(" ")[0]) for column in whole if cells[column].text != FAIL]
+        count = f"{len(whole)} of the table's {len(columns)} columns"
+        some = f"of {count}, which were run in whole" if whole else f"{count} were run in whole"
+        cells["Mean"] = replace(number(float(np.mean(values)) if values else None), note=some)
     name = method.name if metric in _AREAS else f"{method.name}, {form}'s form"
     comparable = {*same, "Mean"} if len(same) == len(columns) else same
     return _Line("CAD-free", name, cells, comparable)
@@ -314,7 +322,7 @@ def by_rate(numbers: Numbers) -> Table:
 
 
 def by_run(numbers: Numbers) -> Table:
-    """A row per method and sequence, means over objects: both alignments, range over seeds, frames lost, rate."""
+    """A row per method and sequence, means over objects: both alignments, frames lost, returns, rate."""
     done: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for job, outcome in numbers.benchmark.results:
         done[job.method.name, shown_name(job)] += [outcome] if outcome.objects else []
@@ -322,16 +330,29 @@ def by_run(numbers: Numbers) -> Table:
     hz = times[times.metric == "rate"].groupby(["method", "sequence"]).value.mean()
     lines = []
     for at, outcomes in done.items():
-        cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 5
+        cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 6
         rate = [number(hz[at], digits=1) if at in hz else numbers.missing(*at)] * numbers.judges
         lines.append([Cell(at[0]), Cell(at[1]), *cells, *rate])
-    heads = ["Method", "Sequence", *_AREA_HEADS, *_AREA_HEADS, "frames lost", *["rate (Hz)"] * numbers.judges]
-    groups = [("", 2), ("aligned at the first frame", 2), ("one constant over all", 2), ("", 1 + numbers.judges)]
+    heads = [
+        "Method",
+        "Sequence",
+        *_AREA_HEADS,
+        *_AREA_HEADS,
+        "frames lost",
+        "returns",
+        *["rate (Hz)"] * numbers.judges,
+    ]
+    groups = [("", 2), ("aligned at the first frame", 2), ("one constant over all", 2), ("", 2 + numbers.judges)]
     over = f"Mean over objects and seeds {', '.join(map(str, numbers.seeds))}"
     over += ", in brackets the lowest and the highest" * (len(numbers.seeds) > 1)
-    how = "Exact area under the curve, frames without a pose count as 0"
+    how = (
+        "Exact area under the curve, frames without a pose count as 0; returns after complete occlusion or out of view"
+    )
+    how += ", of all seeds: how many were found again, and after how many scored frames"
     how += "; the rate is this machine's, under its load" * numbers.judges
-    return Table(numbers.plan.title, heads, lines, groups, words=2, notes=[over, how, numbers.what_ran()])
+    return Table(
+        numbers.plan.title, heads, lines, groups, words=2, notes=[over, how, *numbers.of_the_plan(), numbers.what_ran()]
+    )
 
 
 def by_grid(numbers: Numbers) -> Table:
@@ -488,7 +509,7 @@ def _returns(numbers: Numbers, method: Method) -> Cell:
 
 
 def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
-    """The areas under the curve and the frames lost of one method on one sequence with several seeds."""
+    """The areas under the curve, frames lost and returns of one method on one sequence with several seeds."""
     cells = []
     for align in ("first", "all"):
         for key in ("adds_m", "add_m"):
@@ -497,4 +518,12 @@ def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
             cells.append(Cell(f"{np.mean(areas):.1f}{spread}"))
     lost = [sum(obj.lost for obj in o.objects.values()) for o in outcomes]
     frames = sum(len(obj.first["add_m"]) for obj in outcomes[0].objects.values())
-    return [*cells, Cell(f"{min(lost)}{f' to {max(lost)}' * (max(lost) > min(lost))} of {frames}")]
+    cells.append(Cell(f"{_range(lost)} of {frames}"))
+    after = [frames for o in outcomes for obj in o.objects.values() for frames in obj.returns]
+    found = [frames for frames in after if frames is not None]
+    again = f"{len(found)} of {len(after)}" + f" after {_range(found)} frames" * bool(found)
+    return [*cells, Cell(again if after else "none")]
+
+
+def _range(values: list[int]) -> str:
+    return f"{min(values)}{f' to {max(values)}' * (max(values) > min(values))}"

@@ -129,6 +129,23 @@ def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):
     assert ours and all("no files, expected colour" in reason for reason in ours), "and what is wrong with it"
 
 
+def test_whose_folders_are_which_rows_a_file_beside_them_says(tmp_path, monkeypatch):
+    """Both of YCBMultiTrack: what it names fills the paper's rows, the rest has rows of its own."""
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    for kind, column in (("real", "one object 2 mustard"), ("synthetic", "one object 1 sugar")):
+        root = tmp_path / "YCBMultiTrack" / kind
+        for name in ("a", "b"):
+            (root / name / "rgb").mkdir(parents=True)
+        (root / "columns.toml").write_text(f'[b]\nthing = "{column}"\n')
+        plan = read_plan(f"ycbmultitrack_{kind}")
+        jobs = [job for job in jobs_of(plan, "full") if job.sequence.name.startswith(f"ycbmultitrack_{kind}")]
+        assert {job.sequence.name.rpartition("/")[2]: job.sequence.column_of("thing") for job in jobs} == {
+            "a": "",
+            "b": column,
+        }
+        assert not {job.method.name for job in jobs} & {"Ours, exact depth", "Ours, sensor noise"}
+
+
 SMALL = 'title = "t"\n[[method]]\nname = "Ours"\n[quick]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
 SMALL += '[full]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
 
