@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 _CELL_PX = 8
 # Around the mask: what a keypoint depends on, 45 px in the network and some more for its suppressed neighbours.
 _MARGIN_PX = 64
-# A keypoint is the most probable within this distance, has at least this probability, and is so far from the border.
-_APART_PX, _LEAST, _BORDER_PX = 4, 0.005, 4
+# A keypoint is the most probable within this distance, and so far from the border. None is too improbable: a small
+# object has few, and the sampler weighs their scores.
+_APART_PX, _BORDER_PX = 4, 4
 #: Layers in order: name, channels in and out, width of the kernel. A pooling follows 1b, 2b and 3b, a ReLU all but Pb.
 _LAYERS = (
     ("1a", 1, 64, 3), ("1b", 64, 64, 3), ("2a", 64, 64, 3), ("2b", 64, 64, 3), ("3a", 64, 128, 3),
@@ -85,7 +86,7 @@ class SuperPointDetector:
         with torch.inference_mode():
             score = probabilities(self._net, gray)
             best = torch.nn.functional.max_pool2d(score[None], 2 * _APART_PX + 1, 1, _APART_PX)[0]
-            found = torch.nonzero((score == best) & (score >= _LEAST)).cpu().numpy()
+            found = torch.nonzero((score == best) & (score > 0)).cpu().numpy()
             score = score.cpu().numpy()
         uv_px = found[:, ::-1] + [x0, y0]
         size = np.array(mask.shape[::-1])

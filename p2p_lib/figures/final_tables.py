@@ -117,7 +117,11 @@ class Numbers:
         done = [(job, o) for job, o in self.benchmark.results if o.status == "done" and job.measure == "poses"]
         if not done:
             return "Nothing was run"
-        ran = {key: [str(o.ran.get(key)) for _, o in done] for key in ("tracker", "detector", "masks")}
+        ran = {
+            key: [str(o.ran.get(key)) for _, o in done]
+            for key in ("tracker", "detector", "masks", "segmenter")
+            if done[0][1].ran.get(key)
+        }
         ran["sequences"] = [shown_name(job).partition(" with ")[0] for job, _ in done]
         ran["commit"] = [str(o.ran.get("commit") or "unknown")[:7] for _, o in done]
         return "Ran: " + "; ".join(f"{key} {', '.join(dict.fromkeys(values))}" for key, values in ran.items())

@@ -95,7 +95,7 @@ def test_the_official_class_with_these_weights_has_the_same_keypoints_and_scores
         module = superpoint.packages.load("transformers", "superpoint", "transformers")
     except MissingBackend as error:
         pytest.skip(str(error))
-    model = module.SuperPointForKeypointDetection(module.SuperPointConfig()).eval()
+    model = module.SuperPointForKeypointDetection(module.SuperPointConfig(keypoint_threshold=0.0)).eval()
     net = weights()
     parts = {f"conv{k}{ab}": f"encoder.conv_blocks.{k - 1}.conv_{ab}" for k in range(1, 5) for ab in "ab"}
     parts |= {f"convP{ab}": f"keypoint_decoder.conv_score_{ab}" for ab in "ab"}
