@@ -525,8 +525,8 @@ def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
     cells.append(Cell(f"{_range(lost)} of {frames}"))
     after = [frames for o in outcomes for obj in o.objects.values() for frames in obj.returns]
     found = [frames for frames in after if frames is not None]
-    again = f"{len(found)} of {len(after)}" + f" after {_range(found)} frames" * bool(found)
-    return [*cells, Cell(again if after else "none")]
+    again = f"{len(found)} of {len(after)}" if after else "none"
+    return [*cells, Cell(f"{again} after {_range(found)} frames" if found else again)]
 
 
 def _range(values: list[int]) -> str:

@@ -267,6 +267,11 @@ def test_rates_and_runs(tmp_path):
         "2 of 4 after 3 frames",
         "20.0",
     ]
+    for returns, said in (([], "none"), ([None], "0 of 1"), ([0, 7], "2 of 2 after 0 to 7 frames")):
+        one = outcome(90)
+        objects = {"object": one.objects["object"].model_copy(update={"returns": returns})}
+        runs = {("Ours", "a"): [one.model_copy(update={"objects": objects})]}
+        assert paper_table(benchmark(tmp_path, runs, kind="runs")).rows[0][7].text == said
     absent = Outcome(key="k", status="not run", reason="no models")
     (row,) = paper_table(benchmark(tmp_path, {("Ours", "a"): [absent]}, kind="runs")).rows
     assert {(c.text, c.note) for c in row[2:]} == {("-", "no models")}, "every dash has its reason"
