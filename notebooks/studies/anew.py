@@ -24,7 +24,7 @@ LINE = "Made by earlier tracking code"
 
 
 def stale(folder: Path, only: Collection[str] = ()) -> DataFrame:
-    """A row for each table and figure of earlier code: its file, commit, command, and minutes of processor time.
+    """A row for each table and figure of earlier code, or not made yet: file, commit, command, and processor minutes.
 
     The shortest first. Where a note has no time, its runs are taken to be as long as those of the other notes (``~``).
     """
@@ -34,7 +34,12 @@ def stale(folder: Path, only: Collection[str] = ()) -> DataFrame:
     rows = []
     for item in ITEMS.itertuples():
         note, name = notes[item.file], Path(item.file).stem
-        if note is None or not of_earlier_code(folder, note) or (only and name not in only):
+        if only and name not in only:
+            continue
+        if note is None:
+            rows.append((item.file, "not made", item.command, float("inf"), "?"))
+            continue
+        if not of_earlier_code(folder, note):
             continue
         known = [s["cpu_min"] for s in note["sources"] if s.get("cpu_min")]
         runs = sum(len(s.get("runs", [0])) for s in note["sources"])
