@@ -8,7 +8,7 @@ export MKL_NUM_THREADS := $(THREADS)
 # ROS and others put packages of another Python there.
 unexport PYTHONPATH PYTHONHOME
 
-.PHONY: help setup reproduce test release test-backends docs mutants seeds bench lab figures lock
+.PHONY: help setup reproduce book test release test-backends docs mutants seeds bench lab figures lock
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 22
 
@@ -17,6 +17,12 @@ setup: ## set up .venv (about a minute the first time, instant when nothing has 
 
 reproduce: setup ## run every notebook on bundled data into out/quick (profile quick: CPU, no downloads)
 	@.venv/bin/p2p notebooks --profile quick --jobs 2
+
+book: docs ## notebooks as make reproduce left them, and the API reference, as one site to read: out/book/index.html
+	@test -f out/quick/index.html || $(MAKE) reproduce
+	@rm -rf out/book && mkdir -p out/book/notebooks
+	@cp out/quick/index.html out/book && cp out/quick/notebooks/*.html out/book/notebooks && cp -r out/docs out/book/api
+	@echo "Open out/book/index.html"
 
 figures: setup ## every table and figure of the paper from the data and backends present; goes on where it was stopped
 	@.venv/bin/p2p benchmark --present --out out/benchmark --tables out/full/tables

@@ -178,8 +178,11 @@ _ROWS = (
     ("", "the same as a plot", "runtime.png", "p2p figures", "09", "-", _BUNDLED),
     _table("Section 4.5, long range", "5 of 5 returns against 0 of 5", "long_range", "07, 09", "ycbmultitrack_real",
            _BUNDLED),
+    _table("", "the same, scored from the first visible pixel on", "long_range_every_pixel", "-", "-", _BUNDLED),
     _table("-", "README's first tables", "readme", "-", "-", f"{_AND_MUSTARD}, 7-Scenes, TUM RGB-D"),
     _table("-", "2D point trackers, and what of the built-in one is 2D alone", "trackers", "01", "-", _AND_MUSTARD),
+    _table("-", "whose method: the paper's text and ours, by 2D tracker", "presets", "09", "-",
+           f"{_AND_MUSTARD}, 7-Scenes"),
     _table("-", "faults of camera, depth, masks and time", "faults", "10", "-", _AND_MUSTARD),
 )  # fmt: skip
 #: The paper's figures, tables and statements: where each is found (``file``, below ``figures/``), what that is made
@@ -192,7 +195,8 @@ Written by `p2p figures`. *Made on* says whether what is here is of the paper's 
 or of a stand-in, which carries the word in the picture. Tables of data that was not there hold the paper's
 numbers and, for ours, dashes with the reason: what was measured on such data before is in the project's
 [README](../README.md). `make figures` makes all of it from what is on disk; `p2p benchmark --list` says what
-can run here.
+can run here. *Earlier code*: what decides the numbers has changed since; `p2p benchmark --stale` lists these with
+the minutes they take, and makes them anew with `--out DIR`.
 
 """
 
@@ -220,7 +224,8 @@ def _made(file: Path, on: str, day_of: Callable[[str], str]) -> tuple[str, str, 
         return "-", "-", "not run for this table: its data was not there"
     commit = asked.get("commit") or said.get("commit") or ""
     part = f", {asked['runs']} runs" if "runs" in asked else ""
-    return str(asked.get("seeds", "0")), f"{commit[:7]} {day_of(commit)}".strip() or "-", on + part
+    made = f"{commit[:7]} {day_of(commit)}".strip() or "-"
+    return str(asked.get("seeds", "0")), made + ", *earlier code*" * said.get("earlier", False), on + part
 
 
 def _day(commit: str) -> str:

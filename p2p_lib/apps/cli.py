@@ -259,6 +259,7 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     arg("--retry", action="store_true", help="try again what failed before"),
     arg("--present", action="store_true", help="instead of plans: all whose data is there, at least in part"),
     arg("--tables", type=Path, metavar="DIR", help="tables with notes of what they are of go here, too"),
+    arg("--stale", action="store_true", help="what of figures/ is of earlier code: marked so, with --out made anew"),
     _QUIET,
 )
 def _benchmark(a: argparse.Namespace) -> int:
@@ -275,6 +276,8 @@ def _benchmark(a: argparse.Namespace) -> int:
         for line in "\n".join([*found, last]).splitlines():
             print(fill(line, wide, subsequent_indent=" " * 6, break_long_words=False, break_on_hyphens=False))
         return 0
+    if a.stale:
+        return _stale(a)
     if a.present and not (present := present_plans()):
         warn("p2p benchmark: no dataset of a plan is below $P2P_DATA (see p2p data list), so there is nothing to run")
         return 0
@@ -302,6 +305,19 @@ def _benchmark(a: argparse.Namespace) -> int:
         return 0
     warn("p2p benchmark: nothing ran; the tables say why")
     return P2PError.exit_code
+
+
+def _stale(a: argparse.Namespace) -> int:
+    """What of the figures of a clone is of earlier code is listed, says so itself, and is made anew."""
+    from p2p_lib.apps.clone import study
+    from p2p_lib.core.paths import figure_dir
+    from p2p_lib.core.tables import as_text
+
+    anew, folder = study("anew"), figure_dir()
+    anew.say_so(folder)
+    found = anew.stale(folder, a.plan)
+    print(as_text(found) if len(found) else "All tables and figures are of this code.")
+    return 0 if a.out is None else anew.make_anew(folder, a.out, a.plan, partial(print, flush=True))
 
 
 @command(

@@ -12,6 +12,7 @@ import threading
 import traceback
 import warnings
 import webbrowser
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.log:
         logging.basicConfig(format="%(name)s %(levelname)s %(message)s")
         logging.getLogger("p2p_lib").setLevel(arguments.log.upper())
-    ended_by = [signal.SIGINT]
+    ended_by, doubts = [signal.SIGINT], Counter[str]()
 
     def terminated(number: int, frame: object) -> None:
         ended_by.append(signal.Signals(number))
@@ -67,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     before = signal.signal(signal.SIGTERM, terminated) if in_main else None
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = partial(_show_doubt, warnings.showwarning, arguments.name)
+            warnings.showwarning = partial(_show_doubt, warnings.showwarning, arguments.name, doubts)
             return arguments.command(arguments) or 0
     except BrokenPipeError:  # the reader of our output (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -82,6 +83,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         warn(f"p2p {arguments.name}: interrupted")
         return EXIT_INTERRUPTED + ended_by[-1]
     finally:
+        for doubt, count in doubts.items():
+            if count > 1:
+                warn(f"p2p {arguments.name}: {count - 1} more like: {doubt}")
         if in_main:
             signal.signal(signal.SIGTERM, before)
 
@@ -143,8 +147,12 @@ def open_page(url: str) -> bool:
     return bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)) and webbrowser.open(url)
 
 
-def _show_doubt(others: Callable, name: str, message: Any, category: type, *where: Any) -> None:
-    if issubclass(category, Doubt):
-        warn(f"p2p {name}: {message}")
-    else:
+def _show_doubt(others: Callable, name: str, doubts: Counter[str], message: Any, category: type, *where: Any) -> None:
+    """A doubt is said once, however often it comes with other numbers; how often is said at the end."""
+    if not issubclass(category, Doubt):
         others(message, category, *where)
+        return
+    alike = re.sub(r"\d+", "N", str(message))
+    doubts[alike] += 1
+    if doubts[alike] == 1:
+        warn(f"p2p {name}: {message}")

@@ -75,6 +75,13 @@ class Benchmark:
         statuses = [outcome.status for _, outcome in self.results]
         return {status: statuses.count(status) for status in ("done", "failed", "not run")}
 
+    @property
+    def cpu_min(self) -> float:
+        """Minutes of processor time that its finished runs took."""
+        done = [outcome for _, outcome in self.results if outcome.status == "done"]
+        ms = [o.ran.get("frames", 0) * sum(t for name, t in o.times.items() if "processor time" in name) for o in done]
+        return sum(ms) / 6e4
+
     def run(self, method: str, sequence: str = "") -> Run:
         """The poses of a method's first finished run (on a sequence)."""
         return load_run(run_path(self.out, self._finished(method, sequence)[0].key))
@@ -132,16 +139,18 @@ def run_benchmarks(
     wanted = ("not run", "failed") if retry else ("not run",)
     found: dict[str, Outcome] = {}
     interrupted = False
-    for alone in (False, True):  # what measures times runs when nothing else does
+    # What measures times runs when nothing else does; what needs a GPU, so many at a time as its memory has room for.
+    for alone, gpu in ((False, False), (False, True), (True, False)):
         todo = {
             job.key: job
             for benchmark in benchmarks
             if benchmark.plan.scope(profile).alone == alone
             for job, outcome in benchmark.results
-            if job.key and outcome.status in wanted and job.key not in found
+            if job.key and outcome.status in wanted and job.key not in found and (alone or job.method.gpu == gpu)
         }
         if todo and not interrupted:
-            at_a_time = min(jobs or (1 if alone else len(os.sched_getaffinity(0))), len(todo))
+            limit = min(benchmark.plan.gpu_jobs for benchmark in benchmarks) if gpu else len(todo)
+            at_a_time = min(jobs or (1 if alone else len(os.sched_getaffinity(0))), limit, len(todo))
             outcomes = execute(list(todo.values()), benchmarks[0].out, at_a_time, scheduler)
             ran = _run(outcomes, len(todo), benchmarks[0].out, progress)
             interrupted, found = len(ran) < len(todo), found | ran

@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -26,7 +27,7 @@ from p2p_lib.benchmark.jobs import Job, library_version, open_planned
 from p2p_lib.benchmark.outcome import Outcome, run_path
 from p2p_lib.benchmark.scoring import chamfer, fault_done, scored
 from p2p_lib.core import packages
-from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
+from p2p_lib.core.errors import BadInput, Doubt, MissingBackend, MissingData, P2PError
 from p2p_lib.core.files import replace_text
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.protocol import rate
@@ -50,13 +51,21 @@ def perform(work: Work, job: Any, out: Path, library: str) -> Outcome:
         if library != library_version():
             fix = "Install the same version of p2p-lib, numpy, scipy, opencv and gtsam on every worker."
             raise BadInput("benchmark worker", f"source {library_version()}", library, fix)
-        return work(job, out)
+        with warnings.catch_warnings():
+            warnings.showwarning = partial(_show_others, warnings.showwarning)
+            return work(job, out)
     except (MissingData, MissingBackend) as error:
         return Outcome(key=job.key, status="not run", reason=str(error))
     except Exception as error:  # noqa: BLE001 one failing run must not end the others
         replace_text(out / "failures" / f"{job.key}.txt", traceback.format_exc())
         kind = "" if isinstance(error, P2PError) else f"{type(error).__name__}: "
         return Outcome(key=job.key, status="failed", reason=f"{kind}{' '.join(str(error).split())}"[:500])
+
+
+def _show_others(shown: Callable, message: Any, category: type, *where: Any) -> None:
+    """What a run doubts it keeps itself, in its ``run.json``."""
+    if not issubclass(category, Doubt):
+        shown(message, category, *where)
 
 
 def measured(job: Job, out: Path) -> Outcome:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
@@ -19,22 +18,22 @@ from typing import Any, Literal
 import numpy as np
 
 from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, uses_clicks
-from p2p_lib.core.backends import make_detector
-from p2p_lib.core.config import SamplingConfig
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
+from p2p_lib.core.files import read_toml
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets import checkpoints, manifests
 from p2p_lib.datasets.models import find_models
+from p2p_lib.datasets.provenance import code_digest
 from p2p_lib.datasets.resized import Resized
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.synthetic.faults import Faulty
 
-_PACKAGE = Path(__file__).resolve().parents[1]
-# What only shows results cannot change them.
-_WITHOUT = {"figures", "apps"}
+#: Beside the sequences of ``DATASET/*``, written by whoever knows: ``[SEQUENCE]``, then a line ``OBJECT = "COLUMN"``
+#: each, with the column of the paper's table that it fills ("one object 1 sugar"). Others have columns of their own.
+COLUMNS = "columns.toml"
 _NUMERICS = ("numpy", "scipy", "opencv-python-headless", "gtsam")
 
 
@@ -91,13 +90,13 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
     """Every run of a plan in its order: sequences, methods, seeds. What cannot run says why, and nothing runs yet."""
     scope = plan.scope(profile)
     measures = ("poses", "tracks") if plan.tracks and scope.tracks else ("poses",)
-    methods = [_with_detector(method) for method in plan.methods(profile)]
+    methods = plan.methods(profile)
     lacking = {method.name: _lacking(method) for method in methods}
     known: dict[tuple, str] = {}  # of this call alone: files may change until the next
     jobs = []
     for planned in scope.planned:
         for sequence, missing in _present(planned):
-            for method in (m for m in methods if not m.only or planned.name in m.only):
+            for method in (method for method in methods if method.runs_on(planned.name)):
                 for measure in measures:
                     for seed in scope.seeds:
                         reason = missing or lacking[method.name]
@@ -126,10 +125,8 @@ def open_planned(job: Job) -> Sequence:
 
 @cache
 def library_version() -> str:
-    """A hash of this package's source (without what only shows results) and of the versions of its numerics."""
-    sources = [path for path in sorted(_PACKAGE.rglob("*.py")) if path.relative_to(_PACKAGE).parts[0] not in _WITHOUT]
-    lines = [f"{path.relative_to(_PACKAGE).as_posix()} {_sha(path.read_bytes())}" for path in sources]
-    return _sha("\n".join([*lines, *(f"{name} {version(name)}" for name in _NUMERICS)]).encode())[:12]
+    """A hash of the sources that decide a result (:func:`code_digest`) and of the versions of their numerics."""
+    return _sha("\n".join([code_digest(), *(f"{name} {version(name)}" for name in _NUMERICS)]).encode())[:12]
 
 
 def _keyed(job: Job, known: dict[tuple, str]) -> Job:
@@ -172,19 +169,11 @@ def _present(planned: PlannedSequence) -> Iterator[tuple[PlannedSequence, str]]:
     names = [path.name for path in sorted(root.glob("*")) if (path / "rgb").is_dir()]
     if not names:
         yield planned, f"{dataset}: no sequence in {of.folder} below $P2P_DATA"
+    own = root / COLUMNS
+    columns = read_toml(own, "sequences as tables: object = column of the paper's table") if own.is_file() else {}
     for name in names:
-        yield planned.model_copy(update={"name": f"{dataset}/{name}"}), ""
-
-
-def _with_detector(method: Method) -> Method:
-    """With the first of its detectors that is installed; the last one where none is, which then says what it needs."""
-    *others, chosen = [method.detector] if isinstance(method.detector, str) else method.detector
-    for name in others:
-        with suppress(MissingBackend):
-            make_detector(name, SamplingConfig(), np.random.default_rng(0))
-            chosen = name
-            break
-    return method.model_copy(update={"detector": chosen})
+        filled = columns.get(name, {})
+        yield planned.model_copy(update={"name": f"{dataset}/{name}", "columns": filled}), ""
 
 
 def _lacking(method: Method) -> str:
@@ -238,8 +227,11 @@ def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
 def _files_hash(job: Job) -> str:
     """Content of the truth, of the models, of the first image and its masks; names and sizes of everything else."""
     job = replace(job, sequence=job.sequence.model_copy(update={"fault": None}))
-    sequence, start = open_planned(job), job.sequence.start
-    first = sequence.frame(start)
+    sequence, planned, start = open_planned(job), job.sequence, job.sequence.start
+    first, last = sequence.frame(start), len(sequence) - 1
+    if job.method.masks == "dataset" and sequence.masks(start) is not None and sequence.masks(last) is None:
+        fix = 'Methods with masks = "first" or "clicks" need no more.'
+        raise MissingData(f"{planned.name}: masks", "there are some of the first frames alone", fix)
     parts = [("rgb", first.rgb.tobytes()), ("depth", first.depth_m.tobytes())]
     parts += [(name, mask.tobytes()) for name, mask in sorted((sequence.masks(start) or {}).items())]
     for name, truth in sorted(sequence.truth.items()):

@@ -33,13 +33,12 @@ class Method(Strict):
     paper     the method of the paper's table that it stands beside ("Ours", "No SDF refinement"), "" for none
     against   the method that it is compared with, run by run (a plan of kind ``pairs``)
     gpu       whether it is left out where there is no GPU: its networks take seconds a frame without one
-    detector  the first of these that is installed
     masks     as of ``p2p run``; clicks are the sequence's, or drawn where it has none
     settings  single parameters of the configuration, ``{"stage.key" = value}``
     synthetic parameters of synthetic sequences; ``noise`` is one of exact, realsense, hard
     scale     of the images, 1 = as they are
     count     only so many of the objects, 0 = all
-    only      names of the sequences that it runs on, none for all
+    only      names of the sequences that it runs on, none for all; ``but``, of those that it does not
     """
 
     name: Text
@@ -48,13 +47,18 @@ class Method(Strict):
     gpu: bool = False
     preset: Text = "default"
     tracker: Text = DEFAULT_TRACKER
-    detector: Text | list[Text] = DEFAULT_DETECTOR
+    detector: Text = DEFAULT_DETECTOR
     masks: Text = "dataset"
     settings: dict[str, Any] = {}
     synthetic: dict[str, Any] = {}
     scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     count: Count = 0
     only: list[Text] = []
+    but: list[Text] = []
+
+    def runs_on(self, sequence: str) -> bool:
+        """Whether it runs on the sequence of this name."""
+        return sequence not in self.but and (not self.only or sequence in self.only)
 
 
 class PlannedFault(Strict):
@@ -142,6 +146,8 @@ class Plan(Strict):
     name     of its file
     paper    LaTeX label of the paper's table that it re-creates, "" for none
     kind     how its table is arranged (see :mod:`p2p_lib.figures.final_tables`)
+    note     a sentence below its table, without its full stop
+    gpu_jobs so many runs at a time of methods that need a GPU
     chamfer  whether reconstructions are scored as well
     tracks   whether the 2D trackers are scored by themselves as well
     min_mask_px  frames in which less of an object's mask is to be seen are not scored: often the first of a return
@@ -150,7 +156,9 @@ class Plan(Strict):
     name: Annotated[str, AfterValidator(lambda name: file_name("name", name))]
     title: Text
     paper: str = ""
-    kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs", "pairs", "faults"] = "methods"
+    kind: Literal["sequences", "objects", "methods", "returns", "rates", "runs", "grid", "pairs", "faults"] = "methods"
+    note: str = ""
+    gpu_jobs: Annotated[int, Field(ge=1)] = 1
     chamfer: bool = False
     tracks: bool = False
     min_mask_px: Count = MIN_VISIBLE_PX

@@ -113,9 +113,14 @@ class DepthConfig(_Checked):
 
 @dataclass(frozen=True)
 class TrackingConfig(_Checked):
-    """Of the built-in tracker, but for ``forget_after``, which all trackers keep."""
+    """Of the built-in tracker, but for ``forget_after``, which all trackers keep, and what has a tracker's name."""
 
     forget_after: int = _p(0, "SH(n): points are dropped after so many invisible frames; 0: never.", "frames", low=0)
+    tapir_resolutions: str = _p(
+        "mean",
+        "TAPIR's answers at its resolutions are averaged, as its own forward does, or the last one is taken.",
+        choices=("mean", "last"),
+    )
     window_px: int = _p(13, "The Lucas-Kanade window has this side.", "px", low=5, high=63)
     templates: int = _p(5, "So many templates of a point's appearance are kept.", low=2, high=20)
     update_every: int = _p(3, "Templates, segments and landmarks are updated every so many frames.", "frames", low=1)
@@ -397,6 +402,7 @@ _TEXT: dict[str, Any] = {
 #: Where it is silent: the authors' released values.
 _RELEASE: dict[str, Any] = {
     "depth.max_m": 2.0,
+    "tracking.tapir_resolutions": "last",
     "sampling.max_visible": 50,
     "registration.iterations": 100,
     "registration.sample_size": 4,

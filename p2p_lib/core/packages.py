@@ -30,7 +30,7 @@ EXTRAS = {
     "realsense": "RealSense cameras and recordings, p2p live and p2p convert",
     "rerun": "recordings to look at frame by frame, p2p view --rerun",
     "sam2": "SAM 2 on a CPU: masks of prompts, --masks sam2",
-    "sam2-video": "segmentation and features by PyTorch networks: --masks sam2_video, --detector superpoint",
+    "sam2-video": "segmentation by a PyTorch network with a memory: --masks sam2_video",
 }
 
 

@@ -2,15 +2,49 @@
 
 from __future__ import annotations
 
+import ast
+import hashlib
 import platform
 import subprocess
 from contextlib import suppress
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from p2p_lib import __version__
 from p2p_lib.core import paths
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+# What only arranges, shows or hands on a result cannot change it; of benchmarks only what scores a run decides.
+_WITHOUT, _BUT = {"apps", "benchmark", "figures", "offline"}, {"benchmark/scoring.py"}
+
+
+@cache
+def code_digest() -> str:
+    """Twelve digits of the sources that decide a result: what is tracked, what tracks it, what scores it.
+
+    Comments, docstrings and layout change nothing, nor does the version of Python.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        name = path.relative_to(_PACKAGE).as_posix()
+        if name.partition("/")[0] not in _WITHOUT or name in _BUT:
+            digest.update(f"{name} {_syntax(ast.parse(path.read_bytes()))}\n".encode())
+    return digest.hexdigest()[:12]
+
+
+def _syntax(node: Any) -> Any:
+    """A syntax tree as nested tuples, without docstrings and without what is empty, which differs between Pythons."""
+    if isinstance(node, list):
+        return tuple(map(_syntax, node))
+    if not isinstance(node, ast.AST):
+        return node
+    fields = dict(ast.iter_fields(node))
+    if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node, clean=False):
+        fields["body"] = fields["body"][1:]
+    return (type(node).__name__, *((key, _syntax(value)) for key, value in fields.items() if value not in (None, [])))
 
 
 def provenance() -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 ``rgb/``, ``depth/`` (uint16 millimetres), ``cam_K.txt``, ``gt_mask/`` (masks from the arm's kinematics),
 ``annotated_poses/*.txt`` (4x4 T_cam_model, metres, OpenCV axes; the i-th belongs to the i-th image).
-``masks/``, a separate download, serves where ``gt_mask/`` is not there. Models lie in ``models/object/``, or by
-their YCB name in ``models/`` of the dataset, one folder above: the sequence's name begins with the object's.
+``masks/``, a separate download or the first image's mask alone, serves where ``gt_mask/`` is not there. Models lie in
+``models/object/``, or by their YCB name in ``models/`` of the dataset, one folder above: the sequence's name begins
+with the object's.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ YCB_NAMES = {
 
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
-    files = image_files(folder).with_masks(masks, [folder / "gt_mask", folder / "masks"], (OBJECT,))
+    places, whole = [folder / "gt_mask", folder / "masks"], (folder / "gt_mask").is_dir()
+    files = image_files(folder).with_masks(masks, places, (OBJECT,), some_frames=not whole)
     at = images.full(folder)
     known = [at.parent / "models" / ycb for begins, ycb in YCB_NAMES.items() if at.name.startswith(begins)]
 

@@ -105,14 +105,23 @@ class Numbers:
         seeds = ", ".join(map(str, self.seeds))
         spread = f"mean ± standard deviation over seeds {seeds}" if len(self.seeds) > 1 else f"seed {seeds} alone"
         scored = f"frames with less than {self.plan.min_mask_px} pixels of an object's mask are not scored"
-        return [f"{_HOW}; {scored}; {spread}", self.what_ran(), *([_REPORTED] if self.plan.paper else [])]
+        reported = [_REPORTED] if self.plan.paper else []
+        return [f"{_HOW}; {scored}; {spread}", *self.of_the_plan(), self.what_ran(), *reported]
+
+    def of_the_plan(self) -> list[str]:
+        """What the plan itself has to say below its table."""
+        return [self.plan.note] if self.plan.note else []
 
     def what_ran(self) -> str:
         """Trackers, detectors, masks, sequences, commit."""
         done = [(job, o) for job, o in self.benchmark.results if o.status == "done" and job.measure == "poses"]
         if not done:
             return "Nothing was run"
-        ran = {key: [str(o.ran.get(key)) for _, o in done] for key in ("tracker", "detector", "masks")}
+        ran = {
+            key: [str(o.ran.get(key)) for _, o in done]
+            for key in ("tracker", "detector", "masks", "segmenter")
+            if done[0][1].ran.get(key)
+        }
         ran["sequences"] = [shown_name(job).partition(" with ")[0] for job, _ in done]
         ran["commit"] = [str(o.ran.get("commit") or "unknown")[:7] for _, o in done]
         return "Ran: " + "; ".join(f"{key} {', '.join(dict.fromkeys(values))}" for key, values in ran.items())
@@ -177,10 +186,10 @@ def _metrics(numbers: Numbers, paper: Reported) -> list[str]:
     return [metric for metric in METRICS if metric in printed and (metric in _AREAS or numbers.plan.chamfer)]
 
 
-def _places(numbers: Numbers) -> dict[str, tuple[Job, str]]:
-    """Column to the first job and object that fill it; a job that did not run fills those that its plan gives it."""
+def _places(numbers: Numbers, method: str = "") -> dict[str, tuple[Job, str]]:
+    """Column to the first job (of a method) and object that fill it; one that did not run fills those of its plan."""
     places: dict[str, tuple[Job, str]] = {}
-    for job, outcome in numbers.benchmark.results:
+    for job, outcome in (at for at in numbers.benchmark.results if method in ("", at[0].method.name)):
         names = list(outcome.objects) or list(job.sequence.columns) or job.sequence.objects or [""]
         for name in names:
             own = shown_name(job) + (f" {name}" if len(names) > 1 else "")
@@ -223,7 +232,7 @@ def _reported_line(paper: Reported, row: object) -> _Line:
 def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method: Method) -> _Line:
     columns, cells, whole, same = _columns(paper), defaultdict(numbers.not_planned), set(), set()
     frames = {shown_name(j): o.ran.get("frames") for j, o in numbers.benchmark.results if j.method.name == method.name}
-    for column, (job, name) in _places(numbers).items():
+    for column, (job, name) in _places(numbers, method.name).items():
         cells[column] = numbers.cell(method.name, METRICS[metric][0], shown_name(job), name, form)
         if column in columns:
             part = _part(job, frames.get(shown_name(job)), paper.dataset)
@@ -234,7 +243,10 @@ def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method:
             cells[column] = replace(cells[column], note=cells[column].note or said)
     cells["Mean"] = numbers.cell(method.name, METRICS[metric][0], MEAN, "", form)
     if len(whole) < len(columns):
-        cells["Mean"] = Cell(note=f"{len(whole)} of the table's {len(columns)} columns were run in whole")
+        values = [float(cells[column].text.partition(" ")[0]) for column in whole if cells[column].text != FAIL]
+        count = f"{len(whole)} of the table's {len(columns)} columns"
+        some = f"of {count}, which were run in whole" if whole else f"{count} were run in whole"
+        cells["Mean"] = replace(number(float(np.mean(values)) if values else None), note=some)
     name = method.name if metric in _AREAS else f"{method.name}, {form}'s form"
     comparable = {*same, "Mean"} if len(same) == len(columns) else same
     return _Line("CAD-free", name, cells, comparable)
@@ -254,11 +266,7 @@ def _part(job: Job, frames: int | None, dataset: str) -> str:
 
 def by_method(numbers: Numbers) -> Table:
     """A row per method, with the spread over sequences: the paper's ablations, and the comparison of trackers."""
-    ran = {job.method.name: job.method.detector for job, _ in numbers.benchmark.results}
-    lines = []
-    for method in numbers.methods:
-        chosen = "" if isinstance(method.detector, str) else f" ({ran[method.name]})"
-        lines.append([Cell(method.name + chosen), *_areas(numbers, method)])
+    lines = [[Cell(method.name), *_areas(numbers, method)] for method in numbers.methods]
     heads, groups = ["Method"], [("", 1), ("Ours", 4)]
     heads += [head for area in _AREA_HEADS for head in (area, "std over sequences")]
     bold = [1, 3] if numbers.judges else []
@@ -318,7 +326,7 @@ def by_rate(numbers: Numbers) -> Table:
 
 
 def by_run(numbers: Numbers) -> Table:
-    """A row per method and sequence, means over objects: both alignments, range over seeds, frames lost, rate."""
+    """A row per method and sequence, means over objects: both alignments, frames lost, returns, rate."""
     done: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for job, outcome in numbers.benchmark.results:
         done[job.method.name, shown_name(job)] += [outcome] if outcome.objects else []
@@ -326,16 +334,65 @@ def by_run(numbers: Numbers) -> Table:
     hz = times[times.metric == "rate"].groupby(["method", "sequence"]).value.mean()
     lines = []
     for at, outcomes in done.items():
-        cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 5
+        cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 6
         rate = [number(hz[at], digits=1) if at in hz else numbers.missing(*at)] * numbers.judges
         lines.append([Cell(at[0]), Cell(at[1]), *cells, *rate])
-    heads = ["Method", "Sequence", *_AREA_HEADS, *_AREA_HEADS, "frames lost", *["rate (Hz)"] * numbers.judges]
-    groups = [("", 2), ("aligned at the first frame", 2), ("one constant over all", 2), ("", 1 + numbers.judges)]
+    heads = [
+        "Method",
+        "Sequence",
+        *_AREA_HEADS,
+        *_AREA_HEADS,
+        "frames lost",
+        "returns",
+        *["rate (Hz)"] * numbers.judges,
+    ]
+    groups = [("", 2), ("aligned at the first frame", 2), ("one constant over all", 2), ("", 2 + numbers.judges)]
     over = f"Mean over objects and seeds {', '.join(map(str, numbers.seeds))}"
     over += ", in brackets the lowest and the highest" * (len(numbers.seeds) > 1)
-    how = "Exact area under the curve, frames without a pose count as 0"
+    how = (
+        "Exact area under the curve, frames without a pose count as 0; returns after complete occlusion or out of view"
+    )
+    how += ", of all seeds: how many were found again, and after how many scored frames"
     how += "; the rate is this machine's, under its load" * numbers.judges
-    return Table(numbers.plan.title, heads, lines, groups, words=2, notes=[over, how, numbers.what_ran()])
+    return Table(
+        numbers.plan.title, heads, lines, groups, words=2, notes=[over, how, *numbers.of_the_plan(), numbers.what_ran()]
+    )
+
+
+def by_grid(numbers: Numbers) -> Table:
+    """A row per sequence, a column per method: both areas and the frames lost, means over objects and seeds."""
+    done: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
+    for job, outcome in numbers.benchmark.results:
+        done[shown_name(job), job.method.name] += [outcome] if outcome.objects else []
+    scenes, methods = list(dict.fromkeys(s for s, _ in done)), [method.name for method in numbers.methods]
+    found = {at: np.mean([_areas_and_lost(o) for o in outcomes], 0) for at, outcomes in done.items() if outcomes}
+    whole = [scene for scene in scenes if all((scene, method) in found for method in methods)]
+    lines = []
+    for scene in scenes:
+        cells = [found.get((scene, method)) for method in methods]
+        shown = [numbers.missing(method, scene) if c is None else _three(c) for c, method in zip(cells, methods)]
+        lines.append([Cell(scene.removeprefix(SYNTHETIC)), *shown])
+    if whole:
+        means = [np.mean([found[scene, method] for scene in whole], 0) for method in methods]
+        lines.append([Cell(f"mean of {len(whole)}"), *map(_three, means)])
+    presets = [method.name.partition(", ")[0] for method in numbers.methods]
+    groups = [("", 1), *((preset, presets.count(preset)) for preset in dict.fromkeys(presets))]
+    heads = ["Sequence", *(name.partition(", ")[2] for name in methods)]
+    notes = ["ADD-S / ADD area under the curve (%), in brackets frames lost of all objects; the mean is over sequences"]
+    notes[0] += " on which every method ran"
+    rules = [len(scenes)] if whole else []
+    return Table(numbers.plan.title, heads, lines, groups, rules=rules, notes=[*notes, *numbers.notes()])
+
+
+def _areas_and_lost(outcome: Outcome) -> list[float]:
+    """Of one run: ADD-S and ADD areas, means over objects, and how many frames had no pose."""
+    errors = [obj.errors_m("first") for obj in outcome.objects.values()]
+    areas = [float(np.mean([metrics.auc_exact(e[key]) for e in errors])) for key in ("adds_m", "add_m")]
+    return [*areas, sum(obj.lost for obj in outcome.objects.values())]
+
+
+def _three(values: np.ndarray) -> Cell:
+    return Cell("{:.1f} / {:.1f} ({:.0f})".format(*values))
 
 
 def by_pair(numbers: Numbers) -> Table:
@@ -420,6 +477,7 @@ KINDS: dict[str, Callable[[Numbers], Table]] = {
     "returns": by_return,
     "rates": by_rate,
     "runs": by_run,
+    "grid": by_grid,
     "pairs": by_pair,
     "faults": by_fault,
 }
@@ -455,7 +513,7 @@ def _returns(numbers: Numbers, method: Method) -> Cell:
 
 
 def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
-    """The areas under the curve and the frames lost of one method on one sequence with several seeds."""
+    """The areas under the curve, frames lost and returns of one method on one sequence with several seeds."""
     cells = []
     for align in ("first", "all"):
         for key in ("adds_m", "add_m"):
@@ -464,4 +522,12 @@ def _run_cells(outcomes: list[Outcome]) -> list[Cell]:
             cells.append(Cell(f"{np.mean(areas):.1f}{spread}"))
     lost = [sum(obj.lost for obj in o.objects.values()) for o in outcomes]
     frames = sum(len(obj.first["add_m"]) for obj in outcomes[0].objects.values())
-    return [*cells, Cell(f"{min(lost)}{f' to {max(lost)}' * (max(lost) > min(lost))} of {frames}")]
+    cells.append(Cell(f"{_range(lost)} of {frames}"))
+    after = [frames for o in outcomes for obj in o.objects.values() for frames in obj.returns]
+    found = [frames for frames in after if frames is not None]
+    again = f"{len(found)} of {len(after)}" if after else "none"
+    return [*cells, Cell(f"{again} after {_range(found)} frames" if found else again)]
+
+
+def _range(values: list[int]) -> str:
+    return f"{min(values)}{f' to {max(values)}' * (max(values) > min(values))}"

@@ -1,8 +1,9 @@
 """Figures, films and tables are written here alone, each with a note of what it was made from.
 
 Figures and films go to ``$P2P_FIGURES`` (else ``figures/`` of the project), tables to ``$P2P_TABLES`` (else
-``out/tables/``). Beside ``NAME.png`` lies ``NAME.json``: parameters, what was read, versions, commit. Neither holds a
-time or a folder of this machine, so that the same work gives the same bytes.
+``out/tables/``). Beside ``NAME.png`` lies ``NAME.json``: parameters, what was read, versions, commit, and a digest of
+the code that decides the numbers. Neither holds a time or a folder of this machine, so that the same work gives the
+same bytes.
 """
 
 from __future__ import annotations
@@ -22,11 +23,12 @@ from pandas import DataFrame
 from PIL import Image
 
 from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.packages import needed_for
 from p2p_lib.core.tables import as_html, as_markdown
-from p2p_lib.datasets.provenance import provenance
+from p2p_lib.datasets.provenance import code_digest, provenance
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.figures import style
@@ -34,7 +36,8 @@ from p2p_lib.figures.film import write_video
 from p2p_lib.figures.tables import Table
 
 _WHAT_RAN = "sequence objects start stop frames tracker masks preset seed commit modified".split()
-_OF_THE_CODE = {"versions", "commit", "modified", "run", "runs"}  # the name of a run holds the commit, too
+#: Of the code, not of the data; the name of a run holds the commit, too.
+_OF_THE_CODE = {"versions", "commit", "modified", "run", "runs", "cpu_min"}
 _SHOWN_PX = 900  # a notebook shows images at most this wide
 
 
@@ -145,7 +148,8 @@ def describe(source: Any) -> dict[str, Any]:
         return {"evaluation": _what_ran(source.info), "align": source.align}
     if isinstance(source, Benchmark):
         keys = sorted({outcome.key for _, outcome in source.results if outcome.status == "done"})
-        return {"benchmark": source.plan.name, "profile": source.profile, "runs": keys}
+        said = {"benchmark": source.plan.name, "profile": source.profile, "plan": _plan_digest(source.plan)}
+        return {**said, "cpu_min": round(source.cpu_min, 1), "runs": keys}
     if isinstance(source, str | Path):
         return {"file": Path(source).name, "sha256": _sha256(Path(source))}
     if hasattr(source, "frame") and hasattr(source, "camera"):
@@ -155,6 +159,22 @@ def describe(source: Any) -> dict[str, Any]:
         checksums["first frame"] = hashlib.sha256(first.rgb.tobytes() + first.depth_m.tobytes()).hexdigest()
         return {"sequence": source.name, "format": source.format, "frames": len(source), "sha256": checksums}
     raise BadInput("figure source", type(source).__name__, "a Run, an Evaluation, a Benchmark, a Sequence, or a file")
+
+
+def earlier(note: Mapping[str, Any]) -> bool:
+    """Whether a table or figure was measured by other code than this, or as its plan does not say any more."""
+    measured = False
+    for source in note["sources"]:
+        if "benchmark" in source and source["runs"]:
+            measured = True
+            if source.get("plan") != _plan_digest(read_plan(source["benchmark"])):
+                return True
+        measured |= "run" in source or "evaluation" in source
+    return measured and note.get("code") != code_digest()
+
+
+def _plan_digest(plan: Plan) -> str:
+    return hashlib.sha256(plan.model_dump_json(exclude_defaults=True).encode()).hexdigest()[:12]
 
 
 def _plain_words(caption: str) -> str:
@@ -207,6 +227,7 @@ def _write_note(
         "parameters": dict(parameters or {}),
         "sources": [describe(source) for source in sources],
         **made,
+        "code": code_digest(),
         "sha256": files,
     }
     path, text = target.with_name(f"{target.name}.json"), json.dumps(note, ensure_ascii=False, default=_plain)

@@ -34,7 +34,7 @@ def load(config: TrackingConfig, rng: np.random.Generator | None = None) -> Tapi
     weights = checkpoints.load_weights("tapir")
     model = new_model()
     checkpoints.fill(model, "tapir", weights)
-    return TapirTracker(model, checkpoints.device())
+    return TapirTracker(model, checkpoints.device(), resolutions=config.tapir_resolutions)
 
 
 def new_model() -> torch.nn.Module:
@@ -46,14 +46,17 @@ def new_model() -> torch.nn.Module:
 class TapirTracker(PointTracker):
     """Streams images through a TAPIR model, which searches every frame anew: rejections and suggestions are ignored.
 
+    resolutions  ``mean``: averaged over the model's resolutions, as its own forward does; ``last``: the finest alone
+
     Visible where (1 - occluded)(1 - expected to be far off) exceeds a half; the uncertainty is the second of these.
     """
 
     name = "tapir"
     latency_frames = 0
 
-    def __init__(self, model: torch.nn.Module, device: str = "cpu", size_px: int = SIZE_PX):
+    def __init__(self, model: torch.nn.Module, device: str = "cpu", size_px: int = SIZE_PX, resolutions: str = "mean"):
         self._model, self._device, self._size = model.to(device).eval(), device, size_px
+        self._last_alone = resolutions == "last"
         self._ids = PointIds()
 
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
@@ -111,8 +114,9 @@ class TapirTracker(PointTracker):
                 get_causal_context=True,
             )
             self._state = out["causal_context"]
-            # The last iteration at each resolution, averaged over the resolutions as the model's own forward does.
-            last = slice(self._model.num_pips_iter, None, self._model.num_pips_iter)
+            # The last iteration at each resolution, or that of the last resolution.
+            pips = self._model.num_pips_iter
+            last = slice(-1, None) if self._last_alone else slice(pips, None, pips)
             xy, occluded, far = (
                 torch.stack(out[key][last]).mean(0)[0, :, 0] for key in ("tracks", "occlusion", "expected_dist")
             )

@@ -450,9 +450,9 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     assert "$P2P_DATA is not set" in first and "--quick" in first and "nothing ran" in last
     assert cli.main(["benchmark", "--list"]) == 0
     first, *table = capsys.readouterr().out.splitlines()
-    assert re.match(r"\d+ of 17 plans can run here and now in full; \d+ of \d+ methods", first)
-    assert any(re.match(r"ycbineoat +0 of 18 +YCBInEOAT$", line) for line in table)
-    assert any(re.match(r"sampling_embedded +9 of 9 ", line) for line in table)
+    assert re.match(r"\d+ of 19 plans can run here and now in full; \d+ of \d+ methods", first)
+    assert any(re.match(r"ycbineoat +0 of 54 +YCBInEOAT$", line) for line in table)
+    assert any(re.match(r"sampling_embedded +18 of 30 ", line) for line in table)
     assert max(map(len, [first, *table])) <= 100
     assert cli.main(["benchmark", "--list", "ycbineoat", "runtime"]) == 0
     listed = " ".join(capsys.readouterr().out.split())
@@ -994,3 +994,14 @@ def test_the_installed_command_is_this_one():
 
 def test_errors_that_can_be_mended_have_their_exit_code():
     assert P2PError.exit_code == MissingData("x", "y").exit_code == 2
+
+
+def test_a_doubt_that_repeats_is_said_once_with_its_count(tmp_path, capsys):
+    """A mask of the whole image in every frame."""
+    folder = write_sequence(tmp_path / "slides", 6, 2)
+    for mask in (folder / "gt_mask").iterdir():
+        cv2.imwrite(str(mask), np.full((120, 160), 255, np.uint8))
+    cli.main(["run", str(folder), "--out", str(tmp_path / "out"), "--quiet", "--set", "method.surface=false"])
+    said = [line for line in capsys.readouterr().err.splitlines() if "Is it inverted?" in line]
+    whole = "mask of 'object': the whole image in frame"
+    assert said == [f"p2p run: {whole} 0. Is it inverted?", f"p2p run: 5 more like: {whole} N. Is it inverted?"]

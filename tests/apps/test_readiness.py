@@ -25,7 +25,7 @@ def test_a_plan_says_which_rows_can_run(nothing):
 
 def test_missing_data_is_said_in_few_words(nothing, tmp_path, monkeypatch):
     monkeypatch.setenv("P2P_DATA", str(tmp_path))
-    _, ours, _ = readiness("ho3d").splitlines()
+    _, ours, *_ = readiness("ho3d").splitlines()
     missing = "ho3d_v3/AP10: not below $P2P_DATA. See p2p data info ho3d_v3. (12 more likewise)"
     assert ours == f"  Ours: 0 of 13 sequences; else: {missing}"
 
@@ -36,7 +36,8 @@ def test_what_is_missing_names_sequences_frames_size_and_command(nothing, tmp_pa
     assert line.endswith("p2p data fetch ycbineoat")
     (line,) = what_to_fetch(load_benchmark("ho3d", tmp_path))
     assert line.count("ho3d_v3/") == 13 and line.endswith("by hand, see p2p data info ho3d_v3")
-    (line,) = what_to_fetch(load_benchmark("ycbmultitrack_synthetic", tmp_path))
+    own, line = what_to_fetch(load_benchmark("ycbmultitrack_synthetic", tmp_path))
+    assert "ycbmultitrack_synthetic/*" in own
     assert "synthetic/ycb_pitcher" in line and line.endswith("p2p data fetch ycb_models")
     assert what_to_fetch(load_benchmark("ablation_embedded", tmp_path)) == []
 
@@ -45,4 +46,4 @@ def test_plans_whose_data_is_there_are_found(nothing, tmp_path, monkeypatch):
     assert present_plans() == []
     monkeypatch.setenv("P2P_DATA", str(tmp_path))
     write_sequence(tmp_path / "YCBInEOAT/mustard0", 6, 2, seed=2)
-    assert set(present_plans()) == {"faults", "readme", "segmenters", "trackers", "ycbineoat"}
+    assert set(present_plans()) == {"faults", "presets", "readme", "segmenters", "trackers", "ycbineoat"}

@@ -143,6 +143,22 @@ def test_a_key_is_of_everything_that_decides_a_result(slides, plan, tmp_path, mo
     assert keys()[0] != same[0]
 
 
+def test_methods_that_need_a_gpu_share_it_as_the_plan_says(plan, tmp_path, monkeypatch):
+    ran = []
+
+    def none(jobs, out, at_a_time, scheduler):
+        ran.append(({job.method.name for job in jobs}, at_a_time))
+        return ((job, Outcome(key=job.key, status="failed")) for job in jobs)
+
+    monkeypatch.setattr("p2p_lib.benchmark.benchmark.execute", none)
+    monkeypatch.setattr("p2p_lib.datasets.checkpoints.device", lambda: "cuda")
+    (tmp_path / "on.toml").write_text(plan.read_text().replace('name = "No', 'gpu = true\nname = "No'))
+    asked = read_plan(tmp_path / "on.toml")
+    for limit in (1, 2):
+        run_benchmarks([asked.model_copy(update={"gpu_jobs": limit})], tmp_path / str(limit), jobs=4, progress=False)
+    assert ran == [({"Ours"}, 4), ({"No multi-hypothesis"}, 1), ({"Ours"}, 4), ({"No multi-hypothesis"}, 2)]
+
+
 # --- whatever ends it ----------------------------------------------------------------------------
 
 

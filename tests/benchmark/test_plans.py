@@ -1,5 +1,6 @@
 """The plans of the package: they fit the configuration, the paper's tables and the manifests."""
 
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from p2p_lib.datasets.manifests import manifest
 from p2p_lib.datasets.paper_reported import paper_reported
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.synthetic import SCENARIOS
+from tests.fixtures.sliding_board import write_sequence
 
 PLANS = plan_names()
 
@@ -30,7 +32,7 @@ def test_methods_fit_configuration_and_registry(name):
     for method in read_plan(name).method:
         RunOptions(preset=method.preset, settings=method.settings).config()
         assert method.tracker in {*TRACKERS, OracleTracker.name}
-        assert {method.detector} if isinstance(method.detector, str) else set(method.detector) <= set(DETECTORS)
+        assert method.detector in DETECTORS
 
 
 @pytest.mark.parametrize("name", PLANS)
@@ -73,7 +75,7 @@ def test_plans_are_part_of_an_installation():
 def test_what_is_not_there_says_why_and_costs_nothing(monkeypatch):
     monkeypatch.delenv("P2P_DATA", raising=False)
     jobs = jobs_of(read_plan("ycbineoat"), "full")
-    assert len(jobs) == 2 * 27 and not any(job.key for job in jobs)
+    assert len(jobs) == 6 * 27 and not any(job.key for job in jobs)
     assert {"below $P2P_DATA, which is not set" in job.reason for job in jobs if job.method.name == "Ours"} == {True}
     fetch = "; ".join(f"p2p data fetch {name}" for name in ("sam2_video", "superpoint", "tapir"))
     asked = {job.reason for job in jobs if job.method.name == "paper_full"}
@@ -94,17 +96,25 @@ def test_the_papers_own_configuration_stands_in_every_table_beside_ours():
             assert not plan.paper or method.paper in beside, f"{name}: {method.name}"
 
 
-def test_weights_without_a_gpu_are_not_enough(tmp_path, monkeypatch):
-    monkeypatch.setenv("P2P_DATA", str(tmp_path))
-    for name in ("sam2_video", "superpoint", "tapir"):
-        for file in manifest(name).files:
-            path = tmp_path / manifest(name).folder / file.path
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(b"weights")
+def test_weights_without_a_gpu_are_not_enough(monkeypatch):
+    monkeypatch.setattr(checkpoints, "checked_files", lambda name: [])
     for gpu in (False, True):
         monkeypatch.setattr(checkpoints, "device", lambda gpu=gpu: "cuda" if gpu else "cpu")
         (job,) = [job for job in jobs_of(read_plan("long_range"), "quick") if job.method.name == "paper_full"]
         assert bool(job.key) == gpu and ("no GPU here" in job.reason) != gpu
+
+
+def test_masks_of_some_frames_are_not_taken_for_masks_of_every_frame(tmp_path, monkeypatch):
+    """A copy of YCBInEOAT with the first image's mask alone: from it, and from clicks in it."""
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    folder = write_sequence(tmp_path / "YCBInEOAT/mustard0", 6, 2)
+    (folder / "masks").mkdir()
+    shutil.move(folder / "gt_mask/0000.png", folder / "masks/0000.png")
+    shutil.rmtree(folder / "gt_mask")
+    jobs = [job for job in jobs_of(read_plan("ycbineoat"), "full") if job.sequence.name == "ycbineoat/mustard0"]
+    reasons = {job.method.name: job.reason for job in jobs}
+    assert "some of the first frames alone" in reasons["Ours"]
+    assert reasons["Ours, first mask"] == reasons["Ours, from clicks"] == ""
 
 
 def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):
@@ -119,11 +129,21 @@ def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):
     assert ours and all("no files, expected colour" in reason for reason in ours), "and what is wrong with it"
 
 
-def test_a_detector_of_choice_is_the_first_that_is_there(monkeypatch):
-    monkeypatch.delenv("P2P_DATA", raising=False)
-    jobs = jobs_of(read_plan("sampling_embedded"), "quick")
-    chosen = {job.method.name: job.method.detector for job in jobs}
-    assert chosen == {"Proposed": "corners", "Detector only": "corners", "Uniform sampling": "uniform"}
+def test_whose_folders_are_which_rows_a_file_beside_them_says(tmp_path, monkeypatch):
+    """Both of YCBMultiTrack: what it names fills the paper's rows, the rest has rows of its own."""
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    for kind, column in (("real", "one object 2 mustard"), ("synthetic", "one object 1 sugar")):
+        root = tmp_path / "YCBMultiTrack" / kind
+        for name in ("a", "b"):
+            (root / name / "rgb").mkdir(parents=True)
+        (root / "columns.toml").write_text(f'[b]\nthing = "{column}"\n')
+        plan = read_plan(f"ycbmultitrack_{kind}")
+        jobs = [job for job in jobs_of(plan, "full") if job.sequence.name.startswith(f"ycbmultitrack_{kind}")]
+        assert {job.sequence.name.rpartition("/")[2]: job.sequence.column_of("thing") for job in jobs} == {
+            "a": "",
+            "b": column,
+        }
+        assert not {job.method.name for job in jobs} & {"Ours, exact depth", "Ours, sensor noise"}
 
 
 SMALL = 'title = "t"\n[[method]]\nname = "Ours"\n[quick]\nseeds = [0]\nsequence = [{ name = "a" }]\n'

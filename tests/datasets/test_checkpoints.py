@@ -49,7 +49,6 @@ def test_manifests_of_all_models_say_what_they_must():
         ("trackers.tapir", "tapnet"),
         ("trackers.tapnextpp", "tapnet"),
         ("trackers.cotracker", "co-tracker"),
-        ("detectors.superpoint", "transformers"),
         ("segmenters.sam2_video", "transformers"),
     ],
 )

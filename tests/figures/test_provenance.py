@@ -3,12 +3,13 @@
 import json
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.benchmark.outcome import Outcome
+from p2p_lib.benchmark.plan import read_plan
 from p2p_lib.core.errors import BadInput
 from p2p_lib.figures import plots, provenance
 from p2p_lib.figures.provenance import save_figure, save_table, save_video
@@ -80,9 +81,10 @@ def test_a_note_changes_only_with_what_it_is_of(made, folders, monkeypatch):
     save_figure(image(), "picture", sources=[later], parameters={"SEED": 0})
     assert path.read_text() == first
     for key in ("earlier", "later"):  # of the same job by other code
-        done = (None, SimpleNamespace(key=key, status="done"))
-        save_figure(image(), "measured", sources=[Benchmark(SimpleNamespace(name="plan"), "full", folder, (done,))])
-    assert json.loads((folder / "figures" / "measured.json").read_text())["sources"][0]["runs"] == ["earlier"]
+        done = (None, Outcome(key=key, status="done", ran={"frames": 600}, times={"processor time, all [ms]": 100.0}))
+        save_figure(image(), "measured", sources=[Benchmark(read_plan("readme"), "full", folder, (done,))])
+    (said,) = json.loads((folder / "figures" / "measured.json").read_text())["sources"]
+    assert said["runs"] == ["earlier"] and said["cpu_min"] == 1.0
     save_figure(image(), "picture", sources=[later], parameters={"SEED": 1})
     assert "0" * 40 in path.read_text()
     save_figure(image()[:20], "picture", sources=[made.run], parameters={"SEED": 1})

@@ -71,7 +71,7 @@ def run(key: str, value, settings: dict) -> list[np.ndarray]:
     return [np.stack(poses), model.map.p_obj, model.surface.weights()]
 
 
-@pytest.mark.parametrize("key", diff())
+@pytest.mark.parametrize("key", sorted(diff().keys() - {"tracking.tapir_resolutions"}))  # which TAPIR alone asks
 def test_every_key_in_which_the_presets_differ_changes_a_run(key):
     values, settings = OCCASIONS.get(key, (diff()[key], {}))
     one, other = (run(key, value, settings) for value in values)

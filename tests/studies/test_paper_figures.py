@@ -13,7 +13,10 @@ from p2p_lib.benchmark import plan_names, read_plan
 from p2p_lib.core.paths import PROJECT
 from p2p_lib.datasets.download import sha256
 from p2p_lib.datasets.paper_reported import paper_reported
+from p2p_lib.datasets.provenance import code_digest
+from p2p_lib.figures import provenance
 from p2p_lib.figures.provenance import save_figure
+from studies import anew
 from studies.final_figures import rate_figure
 from studies.paper_figures import ITEMS, index
 
@@ -41,10 +44,55 @@ def test_no_committed_figure_is_older_than_the_numbers_it_shows():
     assert outdated(FIGURES) == []
 
 
+def untold(folder: Path) -> list[str]:
+    """What was made by earlier code and does not say so, and what says so and was not."""
+    found = []
+    for file in ITEMS.file:
+        note, page = (folder / file).with_suffix(".json"), (folder / file).with_suffix(".md")
+        if note.is_file():
+            said = json.loads(note.read_text(encoding="utf-8"))
+            was = anew.of_earlier_code(folder, said)
+            told = {said.get("earlier", False)} | (
+                {f"\n{anew.LINE}, commit " in page.read_text()} if page.is_file() else set()
+            )
+            found += [file] if told != {was} else []
+    return found
+
+
+def test_whatever_earlier_code_made_says_so():
+    assert untold(FIGURES) == [], "Run: p2p benchmark --stale"
+
+
+def test_a_table_of_earlier_code_says_so_until_it_is_made_anew(tmp_path, monkeypatch):
+    (tmp_path / "tables").mkdir()
+    runs = {"benchmark": "readme", "plan": provenance._plan_digest(read_plan("readme")), "runs": ["a"], "cpu_min": 7.0}
+    note = {"parameters": {"commit": "c" * 40}, "sources": [runs], "code": code_digest(), "sha256": {}}
+    (tmp_path / "tables/readme.json").write_text(json.dumps(note))
+    (tmp_path / "tables/readme.md").write_text("| 1 |\n")
+    anew.say_so(tmp_path)
+    assert untold(tmp_path) == [] and (tmp_path / "tables/readme.md").read_text() == "| 1 |\n"
+    monkeypatch.setattr(provenance, "code_digest", lambda: "another")
+    assert untold(tmp_path) == ["tables/readme.md"]
+    for _ in range(2):
+        anew.say_so(tmp_path)
+        assert untold(tmp_path) == [] and outdated(tmp_path) == []
+        assert (tmp_path / "tables/readme.md").read_text().count("commit ccccccc; `p2p benchmark readme") == 1
+        assert "*earlier code*" in (tmp_path / "README.md").read_text()
+    row, *others = anew.stale(tmp_path).to_dict("records")
+    assert {other["commit"] for other in others} == {"not made"} and len(others) == len(ITEMS) - 1
+    assert (row["file"], row["commit"], row["CPU min"]) == ("tables/readme.md", "ccccccc", "7")
+    assert anew.stale(tmp_path, ["faults"]).file.tolist() == ["tables/faults.md"]
+    monkeypatch.setattr(provenance, "code_digest", lambda: note["code"])
+    anew.say_so(tmp_path)
+    assert (tmp_path / "tables/readme.md").read_text() == "| 1 |\n"
+    monkeypatch.setattr(provenance, "_plan_digest", lambda plan: "another")
+    assert untold(tmp_path) == ["tables/readme.md"], "its plan asks for something else by now"
+
+
 def test_the_index_is_current():
     text = (FIGURES / "README.md").read_text()
-    days = dict(re.findall(r"\| ([0-9a-f]{7}) (\d{4}-\d\d-\d\d) \|", text))
-    assert index(FIGURES, lambda commit: days.get(commit[:7], "")) == text, "Run: p2p figures"
+    days = dict(re.findall(r"\| ([0-9a-f]{7}) (\d{4}-\d\d-\d\d)", text))
+    assert index(FIGURES, lambda commit: days.get(commit[:7], "")) == text, "Run: p2p benchmark --stale"
 
 
 def test_committed_figures_are_small():

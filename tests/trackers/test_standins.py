@@ -60,6 +60,7 @@ class ColourTapir(torch.nn.Module):
     """Finds a query's colour anew in every picture. Its memory counts the pictures a query has seen."""
 
     num_pips_iter = 4
+    coarse_px = 0.0  # the answer at the coarse resolution is this far off
 
     def get_feature_grids(self, video, is_training):
         assert video.shape[:2] == (1, 1) and video.shape[2] == video.shape[3] and video.min() >= -1 and video.max() <= 1
@@ -91,7 +92,7 @@ class ColourTapir(torch.nn.Module):
         # Only the last iteration at each resolution counts: entries 4 and 8.
         wrong, far = torch.full_like(xy, -1e6), -2.0 - seen[..., None]
         return {
-            "tracks": [xy if k in (4, 8) else wrong for k in range(9)],
+            "tracks": [xy + self.coarse_px * (k == 4) if k in (4, 8) else wrong for k in range(9)],
             "occlusion": [lost[..., None]] * 9,
             "expected_dist": [far] * 9,
             "causal_context": [{"seen": seen[..., None].repeat(1, 1, 2)}] * 8,
@@ -117,6 +118,18 @@ def test_tapir_places():
         assert np.abs(off_px).max() < 0.7 and abs(off_px.mean()) < 0.4  # no half pixel lost
     gone = tracker.track(ramps(1, 100, 0))
     assert not gone.visible[1]  # its colour left the picture
+
+
+@pytest.mark.parametrize(("resolutions", "off_px"), [("mean", 6), ("last", 0)])
+def test_tapir_takes_the_mean_over_resolutions_or_the_last(resolutions, off_px):
+    model = ColourTapir()
+    model.coarse_px = 12.0
+    tracker = TapirTracker(model, size_px=96, resolutions=resolutions)
+    tracker.start(ramps())
+    tracker.add(UV[:1])
+    of = ramps(1)
+    raster_px = np.array([of.shape[1], of.shape[0]]) / 96
+    np.testing.assert_allclose(tracker.track(of).uv_px, UV[:1] + off_px * raster_px, atol=1)
 
 
 def test_tapir_memory_follows_its_point():

@@ -1,0 +1,53 @@
+"""The digest of the code changes with what decides a number, and with nothing else."""
+
+import ast
+
+import pytest
+
+from p2p_lib.datasets import provenance
+
+SOURCE = '"""Doc."""\n\n\ndef f(x: int) -> int:\n    """Doc."""\n    return x + 1  # one more\n'
+
+
+@pytest.fixture
+def digest(tmp_path, monkeypatch):
+    """Of a package of two files, whose first is given."""
+
+    def of(source: str = SOURCE, name: str = "core/a.py") -> str:
+        monkeypatch.setattr(provenance, "_PACKAGE", tmp_path)
+        for path in tmp_path.rglob("*.py"):
+            path.unlink()
+        for path, text in (("run.py", "A = 1\n"), (name, source)):
+            (tmp_path / path).parent.mkdir(exist_ok=True)
+            (tmp_path / path).write_text(text)
+        provenance.code_digest.cache_clear()
+        return provenance.code_digest()
+
+    yield of
+    provenance.code_digest.cache_clear()
+
+
+def test_words_and_layout_decide_nothing(digest):
+    same = digest()
+    assert digest(SOURCE.replace("Doc.", "Other words.").replace("  # one more", "")) == same
+    assert digest(SOURCE.replace("x: int", "\n    x: int,\n")) == same
+    assert digest(SOURCE, "figures/a.py") == digest("B = 2\n", "figures/a.py"), "what only shows results"
+
+
+def test_code_decides(digest):
+    same = digest()
+    for old, new in (("x + 1", "x + 2"), ("x + 1", "1 + x"), ("return x", "return -x"), ("f(x", "g(x")):
+        assert digest(SOURCE.replace(old, new)) != same, new
+    assert digest(SOURCE, "core/b.py") != same
+    assert digest(SOURCE, "benchmark/scoring.py") != digest("B = 2\n", "benchmark/scoring.py")
+
+
+def test_every_python_gives_the_same():
+    """What newer ones add to a tree is empty; a string at the head of a body is the only thing that is left out."""
+    tree = ast.parse(SOURCE)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            node.type_params = []
+            node._fields = (*node._fields, "type_params")
+    assert provenance._syntax(tree) == provenance._syntax(ast.parse(SOURCE))
+    assert provenance._syntax(ast.parse('x = """Doc."""\n')) != provenance._syntax(ast.parse("x = 1\n"))
