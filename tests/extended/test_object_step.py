@@ -579,7 +579,7 @@ def test_a_keyframe_takes_what_the_graph_finds_unless_it_was_refused(ok):
     moved_m = np.linalg.norm((lump.tracker.life.T_cam_obj - step.estimate.T_cam_obj)[:3, 3])
     assert moved_m == 0 if not ok else 0.0015 < moved_m < 0.0025, "what comes next starts where the graph has it"
     key = max(model.graph.keys)
-    off_m = np.linalg.norm((model.surface._views[key].T_cam_obj - step.estimate.T_cam_obj)[:3, 3])
+    off_m = np.linalg.norm((model.surface.views[key].T_cam_obj - step.estimate.T_cam_obj)[:3, 3])
     assert off_m == 0 if not ok else 0.0015 < off_m < 0.0025, "the view is fused where the graph has it"
 
 
