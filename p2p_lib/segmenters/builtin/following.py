@@ -10,7 +10,7 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, strange, warped
 from p2p_lib.segmenters.builtin.motion import scene_stays
-from p2p_lib.segmenters.builtin.patch import Patch, around, dilated, keep_seeded_components, support_plane
+from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, keep_seeded_components, support_plane
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX
 from p2p_lib.segmenters.builtin.target import Target
 from p2p_lib.segmenters.builtin.view import Claim, View
@@ -95,10 +95,8 @@ def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Cla
     return claim if told or not strange(patch, x > 0.5, target.colours) else None
 
 
-def holds(claim: Claim, uv_px: np.ndarray) -> bool:
+def holds(claim: tuple[Box, np.ndarray], uv_px: np.ndarray) -> bool:
     """Whether most of an object's own points (N, 2) are on what is claimed for it."""
-    if claim is None:
-        return True
     box, x = claim
     return bool(2 * in_mask(uv_px - [box.left, box.top], x > 0.5).sum() > len(uv_px))
 

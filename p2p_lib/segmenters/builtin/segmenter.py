@@ -158,7 +158,7 @@ class BuiltinSegmenter:
         due = target.confident and target.past.due(view.frame)
         target = with_room(view, target, hint) if due else target
         claim = follow(view, target, hint, predicted)
-        if agreed and not holds(claim, hint.uv_px):
+        if agreed and claim is not None and not holds(claim, hint.uv_px):
             if held:  # what the flow has lost, its points have not
                 claim = find(view, target, hint, taken) or claim
             else:
