@@ -144,6 +144,9 @@ def test_whose_folders_are_which_rows_a_file_beside_them_says(tmp_path, monkeypa
             "b": column,
         }
         assert not {job.method.name for job in jobs} & {"Ours, exact depth", "Ours, sensor noise"}
+        (root / "columns.toml").write_text(f'b = "{column}"\n')
+        with pytest.raises(BadInput, match=r"columns\.toml: got b: .*, expected a table \[SEQUENCE\] each"):
+            jobs_of(plan, "full")
 
 
 SMALL = 'title = "t"\n[[method]]\nname = "Ours"\n[quick]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
