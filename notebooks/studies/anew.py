@@ -17,7 +17,7 @@ from pandas import DataFrame
 from p2p_lib.core.files import replace_text
 from p2p_lib.datasets.download import sha256
 from p2p_lib.figures.provenance import earlier
-from studies.paper_figures import ITEMS, index
+from studies.paper_figures import ITEMS, commit_of, index, note_of
 
 #: How the line begins that a table of earlier code ends with.
 LINE = "Made by earlier tracking code"
@@ -28,7 +28,7 @@ def stale(folder: Path, only: Collection[str] = ()) -> DataFrame:
 
     The shortest first. Where a note has no time, its runs are taken to be as long as those of the other notes (``~``).
     """
-    notes = {item.file: _note(folder / item.file) for item in ITEMS.itertuples()}
+    notes = {item.file: note_of(folder / item.file) for item in ITEMS.itertuples()}
     timed = [s for note in notes.values() for s in (note or {}).get("sources", []) if s.get("cpu_min")]
     a_run = sum(s["cpu_min"] for s in timed) / max(sum(len(s["runs"]) for s in timed), 1)
     rows = []
@@ -52,14 +52,14 @@ def stale(folder: Path, only: Collection[str] = ()) -> DataFrame:
 
 def of_earlier_code(folder: Path, note: dict) -> bool:
     """Whether this is a table or figure of earlier code, or drawn from such a table."""
-    tables = [_note(folder / "tables" / source["file"]) for source in note["sources"] if "file" in source]
+    tables = [note_of(folder / "tables" / source["file"]) for source in note["sources"] if "file" in source]
     return any(earlier(said) for said in [note, *filter(None, tables)])
 
 
 def say_so(folder: Path) -> None:
     """Write into every table of earlier code that it is, and what makes it anew; into the index, of figures too."""
     for item in ITEMS.itertuples():
-        if (note := _note(folder / item.file)) is None:
+        if (note := note_of(folder / item.file)) is None:
             continue
         was = of_earlier_code(folder, note)
         path = (folder / item.file).with_suffix(".json")
@@ -81,18 +81,14 @@ def make_anew(folder: Path, out: Path, only: Collection[str], say: Callable[[str
     Killed, the same call goes on: what was run before is found in ``out``.
     """
     status = 0
-    for command in stale(folder, only).command.unique():
-        words = shlex.split(command.replace("DIR", str(out)).replace(" --poses PATH", ""))[1:]
+    places = {"DIR": str(out), "figures/tables": str(folder / "tables")}
+    for command in stale(folder, only).command.str.removesuffix(" --poses PATH").unique():
+        words = [places.get(word, word) for word in shlex.split(command)[1:]]
         say(shlex.join(["p2p", *words]))
         status = subprocess.run([sys.executable, "-m", "p2p_lib.apps.cli", *words], check=False).returncode or status
         say_so(folder)
     return status
 
 
-def _note(file: Path) -> dict | None:
-    path = file.with_suffix(".json")
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-
-
 def _commit(note: dict) -> str:
-    return (note["parameters"].get("commit") or note.get("commit") or "unknown")[:7]
+    return (commit_of(note) or "unknown")[:7]

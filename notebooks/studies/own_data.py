@@ -38,7 +38,7 @@ FAULT_GOALS = {"lies in it": 0.005, "lies after": 0.005, "longest": 5.0, "worst"
 
 @style.styled
 def fault_picture(table: DataFrame) -> Figure:
-    """A row per fault of ``faults.csv`` (:func:`~p2p_lib.figures.final_tables.by_fault`): its numbers against goals.
+    """A row per fault of ``faults.csv`` (:func:`~p2p_lib.figures.run_tables.by_fault`): its numbers against goals.
 
     The colour is the number by its goal: from 0 to twice as much or more, or never good again. What misses it is
     bold, what has no number grey.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -215,17 +215,26 @@ def index(folder: Path, day_of: Callable[[str], str] | None = None) -> str:
 
 def _made(file: Path, on: str, day_of: Callable[[str], str]) -> tuple[str, str, str]:
     """Seeds, commit with date, and what it was made on, as the note beside a file says."""
-    note = file.with_suffix(".json")
-    if not note.is_file() or not file.is_file():
+    if (said := note_of(file)) is None or not file.is_file():
         return "-", "-", "-"
-    said = json.loads(note.read_text(encoding="utf-8"))
     asked = said["parameters"]
     if asked.get("runs", "").startswith("0 of"):
         return "-", "-", "not run for this table: its data was not there"
-    commit = asked.get("commit") or said.get("commit") or ""
+    commit = commit_of(said)
     part = f", {asked['runs']} runs" if "runs" in asked else ""
     made = f"{commit[:7]} {day_of(commit)}".strip() or "-"
     return str(asked.get("seeds", "0")), made + ", *earlier code*" * said.get("earlier", False), on + part
+
+
+def note_of(file: Path) -> dict[str, Any] | None:
+    """What the note beside a figure or table says; None where there is none."""
+    note = file.with_suffix(".json")
+    return json.loads(note.read_text(encoding="utf-8")) if note.is_file() else None
+
+
+def commit_of(note: Mapping[str, Any]) -> str:
+    """The commit of the runs, else of the drawing; "" where a note says neither."""
+    return note["parameters"].get("commit") or note.get("commit") or ""
 
 
 def _day(commit: str) -> str:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, uses_clicks
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
@@ -27,6 +28,7 @@ from p2p_lib.datasets import checkpoints, manifests
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.provenance import code_digest
 from p2p_lib.datasets.resized import Resized
+from p2p_lib.datasets.schema import first_fault
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.synthetic.faults import Faulty
@@ -169,11 +171,20 @@ def _present(planned: PlannedSequence) -> Iterator[tuple[PlannedSequence, str]]:
     names = [path.name for path in sorted(root.glob("*")) if (path / "rgb").is_dir()]
     if not names:
         yield planned, f"{dataset}: no sequence in {of.folder} below $P2P_DATA"
-    own = root / COLUMNS
-    columns = read_toml(own, "sequences as tables: object = column of the paper's table") if own.is_file() else {}
+    columns = _columns(root / COLUMNS)
     for name in names:
-        filled = columns.get(name, {})
+        filled = columns.get(name, planned.columns)
         yield planned.model_copy(update={"name": f"{dataset}/{name}", "columns": filled}), ""
+
+
+def _columns(file: Path) -> dict[str, dict[str, str]]:
+    """Sequence, object and its column, as the file says; none where there is no file."""
+    expected = 'a table [SEQUENCE] each, with a line OBJECT = "COLUMN" for each object'
+    try:
+        said = read_toml(file, expected) if file.is_file() else {}
+        return TypeAdapter(dict[str, dict[str, str]]).validate_python(said)
+    except ValidationError as error:
+        raise BadInput(str(file), first_fault(error), expected) from None
 
 
 def _lacking(method: Method) -> str:
@@ -227,11 +238,9 @@ def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
 def _files_hash(job: Job) -> str:
     """Content of the truth, of the models, of the first image and its masks; names and sizes of everything else."""
     job = replace(job, sequence=job.sequence.model_copy(update={"fault": None}))
-    sequence, planned, start = open_planned(job), job.sequence, job.sequence.start
-    first, last = sequence.frame(start), len(sequence) - 1
-    if job.method.masks == "dataset" and sequence.masks(start) is not None and sequence.masks(last) is None:
-        fix = 'Methods with masks = "first" or "clicks" need no more.'
-        raise MissingData(f"{planned.name}: masks", "there are some of the first frames alone", fix)
+    sequence, start = open_planned(job), job.sequence.start
+    _check_masks(job, sequence)
+    first = sequence.frame(start)
     parts = [("rgb", first.rgb.tobytes()), ("depth", first.depth_m.tobytes())]
     parts += [(name, mask.tobytes()) for name, mask in sorted((sequence.masks(start) or {}).items())]
     for name, truth in sorted(sequence.truth.items()):
@@ -240,6 +249,14 @@ def _files_hash(job: Job) -> str:
     parts += [(name, path.read_bytes() if path.is_file() else b"") for name, path in models]
     parts += [] if sequence.path is None else [("files", _listing(sequence.path))]
     return _sha(b"".join(name.encode() + content for name, content in parts))
+
+
+def _check_masks(job: Job, sequence: Sequence) -> None:
+    """That a method by masks of every frame finds more than those of the first frames, which some copies have alone."""
+    of_every_frame = job.method.masks == "dataset" and sequence.masks(job.sequence.start) is not None
+    if of_every_frame and sequence.masks(len(sequence) - 1) is None:
+        fix = 'Methods with masks = "first" or "clicks" need no more.'
+        raise MissingData(f"{job.sequence.name}: masks", "there are some of the first frames alone", fix)
 
 
 def _listing(folder: Path) -> bytes:

@@ -28,6 +28,7 @@ from p2p_lib.core import paths
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.packages import needed_for
 from p2p_lib.core.tables import as_html, as_markdown
+from p2p_lib.datasets.download import sha256
 from p2p_lib.datasets.provenance import code_digest, provenance
 from p2p_lib.datasets.runs import Run
 from p2p_lib.evaluation.protocol import Evaluation
@@ -187,7 +188,7 @@ def _what_ran(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _sha256(path: Path) -> str | None:
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+    return sha256(path) if path.is_file() else None
 
 
 def _is_quick(sources: Iterable[Any], parameters: Mapping[str, Any] | None) -> bool:

@@ -10,7 +10,9 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,9 +20,10 @@ import pytest
 from p2p_lib.apps import cli
 from p2p_lib.benchmark import Plan, read_plan, run_benchmarks
 from p2p_lib.benchmark.benchmark import Benchmark
-from p2p_lib.benchmark.jobs import jobs_of
+from p2p_lib.benchmark.execution import perform
+from p2p_lib.benchmark.jobs import jobs_of, library_version
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome, load_outcome, save_outcome
-from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.errors import BadInput, Doubt, MissingBackend
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation import metrics
@@ -139,8 +142,12 @@ def test_a_key_is_of_everything_that_decides_a_result(slides, plan, tmp_path, mo
     pose = copy / "annotated_poses/0003.txt"
     pose.write_text(pose.read_text().replace("1.0", "1.000000001"))
     assert keys(**{str(slides[0]): str(copy)})[0] != same[0]
-    monkeypatch.setattr("p2p_lib.benchmark.jobs.library_version", lambda: "another")
-    assert keys()[0] != same[0]
+    with monkeypatch.context() as other_code:
+        other_code.setattr("p2p_lib.benchmark.jobs.code_digest", lambda: "another")
+        library_version.cache_clear()
+        assert keys()[0] != same[0]
+    library_version.cache_clear()
+    assert keys() == same
 
 
 def test_methods_that_need_a_gpu_share_it_as_the_plan_says(plan, tmp_path, monkeypatch):
@@ -220,6 +227,18 @@ def hold(job, out: Path) -> None:
     progress_bar("held", 1, shown=False)
     (out / "held").touch()
     time.sleep(60)
+
+
+def test_what_a_run_doubts_it_keeps_and_other_warnings_are_shown(tmp_path):
+    def doubtful(job, out):
+        warnings.warn(Doubt("a mask of the whole image"), stacklevel=1)
+        warnings.warn("something else", stacklevel=1)
+        return Outcome(key=job.key, status="done")
+
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        assert perform(doubtful, SimpleNamespace(key="a"), tmp_path, library_version()).status == "done"
+    assert [str(one.message) for one in shown] == ["something else"]
 
 
 INTERRUPTED = """

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from p2p_lib.benchmark import plan_names, read_plan
-from p2p_lib.benchmark.jobs import jobs_of
+from p2p_lib.benchmark.jobs import _present, jobs_of
+from p2p_lib.benchmark.plan import PlannedSequence
 from p2p_lib.core.backends import DETECTORS, TRACKERS
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
@@ -138,12 +139,18 @@ def test_whose_folders_are_which_rows_a_file_beside_them_says(tmp_path, monkeypa
             (root / name / "rgb").mkdir(parents=True)
         (root / "columns.toml").write_text(f'[b]\nthing = "{column}"\n')
         plan = read_plan(f"ycbmultitrack_{kind}")
-        jobs = [job for job in jobs_of(plan, "full") if job.sequence.name.startswith(f"ycbmultitrack_{kind}")]
-        assert {job.sequence.name.rpartition("/")[2]: job.sequence.column_of("thing") for job in jobs} == {
-            "a": "",
-            "b": column,
-        }
-        assert not {job.method.name for job in jobs} & {"Ours, exact depth", "Ours, sensor noise"}
+        jobs, methods = jobs_of(plan, "full"), {True: set(), False: set()}
+        for job in jobs:
+            methods[job.sequence.name.startswith(plan.name)].add(job.method.name)
+        columns = {job.sequence.name: job.sequence.column_of("thing") for job in jobs if plan.name in job.sequence.name}
+        assert columns == {f"{plan.name}/a": "", f"{plan.name}/b": column}
+        own = PlannedSequence(name=f"{plan.name}/*", columns={"thing": "the plan's"})
+        assert [one.column_of("thing") for one, _ in _present(own)] == ["the plan's", column]
+        assert not methods[True] & methods[False], "of the paper's files, or of ours"
+        assert not methods[True] & {"Ours, exact depth", "Ours, sensor noise"}
+        (root / "columns.toml").write_text(f'b = "{column}"\n')
+        with pytest.raises(BadInput, match=r"columns\.toml: got b: .*, expected a table \[SEQUENCE\] each"):
+            jobs_of(plan, "full")
 
 
 SMALL = 'title = "t"\n[[method]]\nname = "Ours"\n[quick]\nseeds = [0]\nsequence = [{ name = "a" }]\n'

@@ -13,7 +13,7 @@ from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome
 from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.benchmark.rows import shown_name
 from p2p_lib.datasets.paper_reported import FAIL, paper_reported
-from p2p_lib.figures.final_tables import paper_table, write_table
+from p2p_lib.figures.final_tables import KINDS, paper_table, write_table
 from p2p_lib.figures.tables import Cell, Table, emboldened
 from studies import final_figures
 
@@ -152,6 +152,15 @@ def test_a_grid_has_a_row_per_sequence_and_the_mean_of_those_that_all_methods_ra
     assert first == ["ycbineoat/bleach0", "85.0 / 85.0 (0)", "99.0 / 99.0 (0)"]
     assert second == ["ycbineoat/mustard0", "70.0 / 70.0 (0)", "-"]
     assert mean == ["mean of 1", *first[1:]]
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_what_a_plan_has_to_say_stands_below_its_table(tmp_path, kind):
+    papers = {"sequences": "tab:ycb_ineoat", "objects": "tab:ycbmultitrack_real"}
+    made = {"kind": kind, "of": "Point2Pose" if kind == "returns" else "Ours", "paper": papers.get(kind, "")}
+    runs = {("Ours", "mustard0"): [outcome(90)]}
+    assert "A word" not in paper_table(benchmark(tmp_path, runs, **made)).notes
+    assert paper_table(benchmark(tmp_path, runs, **made, note="A word")).notes.count("A word") == 1
 
 
 def test_where_only_the_quick_form_ran_the_shipped_table_is_shown(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from matplotlib.figure import Figure
@@ -87,6 +88,23 @@ def test_a_table_of_earlier_code_says_so_until_it_is_made_anew(tmp_path, monkeyp
     assert (tmp_path / "tables/readme.md").read_text() == "| 1 |\n"
     monkeypatch.setattr(provenance, "_plan_digest", lambda plan: "another")
     assert untold(tmp_path) == ["tables/readme.md"], "its plan asks for something else by now"
+
+
+def test_what_is_stale_is_made_anew_where_it_lies_each_command_once(tmp_path, monkeypatch):
+    ran = []
+
+    def run(command, check):
+        ran.append(command[3:])
+        return SimpleNamespace(returncode=3 if len(ran) == 1 else 0)
+
+    monkeypatch.setattr(anew.subprocess, "run", run)
+    figures, out = tmp_path / "my figures", tmp_path / "my runs"
+    figures.mkdir()
+    only = ["runtime", "faults", *(Path(file).stem for file in ITEMS.file if file.endswith(".png"))]
+    assert anew.make_anew(figures, out, only, lambda line: None) == 3
+    tables = ["--out", str(out), "--tables", str(figures / "tables")]
+    assert sorted(ran)[:3] == [*(["benchmark", name, *tables] for name in ("faults", "runtime")), ["figures"]]
+    assert all(command[0] == "notebooks" for command in sorted(ran)[3:])
 
 
 def test_the_index_is_current():

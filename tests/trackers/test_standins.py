@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.image import in_image
 from p2p_lib.core.raster import from_raster, to_raster
 from p2p_lib.core.types import Frame
-from p2p_lib.trackers import rollouts
+from p2p_lib.trackers import rollouts, tapir
 from p2p_lib.trackers.cotracker import tracker as cotracker
 from p2p_lib.trackers.rollouts import RolloutTracker
 from p2p_lib.trackers.tapir import TapirTracker
@@ -130,6 +131,17 @@ def test_tapir_takes_the_mean_over_resolutions_or_the_last(resolutions, off_px):
     of = ramps(1)
     raster_px = np.array([of.shape[1], of.shape[0]]) / 96
     np.testing.assert_allclose(tracker.track(of).uv_px, UV[:1] + off_px * raster_px, atol=1)
+
+
+def test_tapir_asks_the_configuration_for_its_resolutions(monkeypatch):
+    monkeypatch.setattr(tapir.checkpoints, "load_weights", lambda name: {})
+    monkeypatch.setattr(tapir.checkpoints, "fill", lambda *of: None)
+    monkeypatch.setattr(tapir, "new_model", ColourTapir)
+    asked = []
+    monkeypatch.setattr(tapir, "TapirTracker", lambda *of, resolutions: asked.append(resolutions))
+    for name in ("paper", "default"):
+        tapir.load(preset(name).tracking)
+    assert asked == ["last", "mean"]
 
 
 def test_tapir_memory_follows_its_point():
