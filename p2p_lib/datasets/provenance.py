@@ -17,8 +17,10 @@ from p2p_lib import __version__
 from p2p_lib.core import paths
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-# What only arranges, shows or hands on a result cannot change it; of benchmarks only what scores a run decides.
-_WITHOUT, _BUT = {"apps", "benchmark", "figures", "offline"}, {"benchmark/scoring.py"}
+# What only arranges, shows or hands on a result cannot change it, nor can the version's number; of benchmarks what
+# opens, runs and scores a sequence decides, and what makes numbers of that.
+_WITHOUT = {"__init__.py", "apps", "benchmark", "figures", "offline"}
+_BUT = {f"benchmark/{name}.py" for name in ("execution", "jobs", "rows", "scoring")}
 
 
 @cache

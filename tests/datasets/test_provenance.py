@@ -31,7 +31,8 @@ def test_words_and_layout_decide_nothing(digest):
     same = digest()
     assert digest(SOURCE.replace("Doc.", "Other words.").replace("  # one more", "")) == same
     assert digest(SOURCE.replace("x: int", "\n    x: int,\n")) == same
-    assert digest(SOURCE, "figures/a.py") == digest("B = 2\n", "figures/a.py"), "what only shows results"
+    for name in ("figures/a.py", "__init__.py"):
+        assert digest(SOURCE, name) == digest("B = 2\n", name), "what only shows results, and the version"
 
 
 def test_code_decides(digest):
@@ -39,7 +40,8 @@ def test_code_decides(digest):
     for old, new in (("x + 1", "x + 2"), ("x + 1", "1 + x"), ("return x", "return -x"), ("f(x", "g(x")):
         assert digest(SOURCE.replace(old, new)) != same, new
     assert digest(SOURCE, "core/b.py") != same
-    assert digest(SOURCE, "benchmark/scoring.py") != digest("B = 2\n", "benchmark/scoring.py")
+    for name in ("execution", "jobs", "rows", "scoring"):
+        assert digest(SOURCE, f"benchmark/{name}.py") != digest("B = 2\n", f"benchmark/{name}.py"), name
 
 
 def test_every_python_gives_the_same():
