@@ -102,6 +102,11 @@ def test_what_the_file_holds_is_shown_first(sequence, out):
     with Clicker(sequence, out) as clicker:
         assert json.loads(get(clicker.url + "session")[1])["objects"] == [one("cup", 1, [[30, 20]])]
         assert not clicker.wait(0)
+        painted = {"name": "lid", "frame": 2, "mask": run_lengths(np.eye(H, W, dtype=bool))}
+        assert post(clicker.url, {"objects": [one("cup", 1), painted]})[0] == 200
+    with Clicker(sequence, out) as clicker:
+        assert json.loads(get(clicker.url + "session")[1])["objects"] == [one("cup", 1), painted]
+    np.testing.assert_array_equal(load_prompts(out)[1].mask, np.eye(H, W, dtype=bool))
 
 
 REFUSED = {
@@ -116,6 +121,7 @@ REFUSED = {
         "mask of 'cup': got 3x1, expected 80x60",
     ),
     "runs that do not add up": ({"objects": [{"name": "cup", "mask": {"size": [2, 3], "counts": [1, 2]}}]}, "add up"),
+    "runs of no size": ({"objects": [{"name": "cup", "mask": {"size": [-2, -3], "counts": [6]}}]}, "add up"),
     "a number": ({"objects": [one() | {"points": 5}]}, "at least one [x, y]"),
     "nothing": ({"objects": []}, "prompts: got"),
     "a list": ([1, 2], "prompts: got"),
@@ -326,7 +332,9 @@ def test_the_masks_of_a_run_are_shown_to_be_mended(sequence, out, tmp_path):
         assert clicker.session()["names"] == ["board"] and clicker.session()["run"]
         status, found = post(clicker.url, {"objects": [], "frame": 0}, to="masks")
         assert status == 200 and found["masks"] == {"board": run_lengths(board)["counts"]}
-        assert post(clicker.url, {"objects": [], "frame": 3}, to="masks")[0] == 400
+        for refused in ({"objects": [], "frame": 3}, {"frame": None}, []):
+            assert post(clicker.url, refused, to="masks")[0] == 400
+        assert post(clicker.url, {"frame": 0}, to="masks")[1] == found
     command = ["click", str(sequence.path), "--out", str(out), "--run", str(tmp_path / "run"), "--no-browser"]
     process = subprocess.Popen([sys.executable, "-m", "p2p_lib.apps.cli", *command], stdout=subprocess.PIPE, text=True)
     try:
