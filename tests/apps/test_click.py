@@ -282,9 +282,11 @@ def test_the_page_undoes_renames_clears_and_zooms(sequence, out):
 def test_the_page_asks_for_the_masks_of_the_frame_that_is_shown(sequence, out):
     with Clicker(sequence, out) as clicker:
         seen = visit(clicker.session(), ["press", 50, 20], ["frame", 1], ["press", 30, 30])
+        nothing, of_run = (visit(clicker.session() | {"run": it}, ["frame", 1]) for it in (False, True))
     assert seen["asked"][0] == [{"name": "object", "frame": 0, "points": [[50, 20]]}]
     assert seen["asked"][-1] == [{"name": "object", "frame": 1, "points": [[30, 30]]}]
     assert seen["tinted"][-1] == [1, 1, 1, 8] and seen["doubts"] == "is it a table?"
+    assert not nothing["asked"] and of_run["asked"] and not any(of_run["asked"]), "the run's own"
 
 
 def disc(x: int, y: int, radius: int) -> np.ndarray:
