@@ -3,6 +3,7 @@
 import http.client
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -347,6 +348,9 @@ def test_the_masks_of_a_run_are_shown_to_be_mended(sequence, out, tmp_path):
     finally:
         process.kill()
     assert "the first new one in frame 0. Next: p2p run" in said and said.endswith("--force\n")
+    words = shlex.split(said.partition("Next: ")[2])
+    assert words[2:] == [str(sequence.path), "--out", str(tmp_path / "run"), *words[5:]]
+    assert words[words.index("--prompts") + 1] == str(out) and words.count("--save-masks") == 1
     assert first_change(load_prompts(out), load_prompts(out)) is None
     assert first_change(load_prompts(out)[:1], load_prompts(out)) == 2
 
