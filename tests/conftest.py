@@ -1,6 +1,7 @@
 """Shared fixtures. The suite passes without any data beside the project; tests that want some say so."""
 
 import html
+import importlib.util
 import json
 import os
 import re
@@ -49,6 +50,19 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"test data not present at {folder} (set P2P_SHARED_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def tool():
+    """A module of tools/, by its name."""
+
+    def load(name: str):
+        spec = importlib.util.spec_from_file_location(name, PROJECT / "tools" / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
 
 
 @pytest.fixture

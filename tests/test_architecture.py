@@ -23,6 +23,7 @@ LAYERS = [
     {"trackers", "detectors", "segmenters"},
     {"evaluation"},
     {"offline"},
+    {"keeper"},
     {"run"},
     {"benchmark"},
     {"figures"},

@@ -83,6 +83,21 @@ def test_links_lead_somewhere(name):
     assert not [link for link in links if not (PROJECT / link).exists()]
 
 
+def test_pages_lead_to_pages_and_dead_links_are_found(tool, tmp_path):
+    docs, linked = tool("docs"), []
+    text = "[a](LICENSE), [b](ros2/README.md#top), [c](tests), ![d](figures/x.png), [e](#here), [f](https://a.b/c.md)"
+    turned = docs._turned(text, "README.md", linked)
+    links = re.findall(r"\]\((.*?)\)", turned)
+    expected = ["LICENSE", "ros2/README.html#top", "tests/index.html", "figures/x.webp", "#here", "https://a.b/c.md"]
+    assert links == expected and linked == ["LICENSE", "ros2/README.md", "tests", "figures/x.png"]
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below/other.html").write_text('<p id="a place">')
+    hrefs = ("below/other.html#a%20place", "#here", "https://a.b/c", "gone.html", "below/other.html#gone", "#gone")
+    page = "".join(f'<a href="{href}">' for href in hrefs)
+    (tmp_path / "page.html").write_text(f'<h1 id="here">{page}<script>href="no link"</script>')
+    assert list(docs.dead_links(tmp_path)) == [f"page.html: {href}" for href in sorted(hrefs[3:])]
+
+
 def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     return dict(groups[0].choices) if groups else {}

@@ -37,11 +37,8 @@ PARTS |= {"nbclient": "papermill", "jinja2": "jinja2"}
 
 
 @pytest.fixture(scope="module")
-def bootstrap():
-    spec = importlib.util.spec_from_file_location("bootstrap", PROJECT / "tools" / "bootstrap.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def bootstrap(tool):
+    return tool("bootstrap")
 
 
 @pytest.fixture
@@ -225,11 +222,8 @@ def test_ci_calls_make_test():
     assert script.read_text().splitlines()[-1] == "exec make test"
 
 
-def test_a_release_is_what_its_tag_says(tmp_path):
-    spec = importlib.util.spec_from_file_location("release", PROJECT / "tools" / "release.py")
-    release = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(release)
-    version = PYPROJECT["project"]["version"]
+def test_a_release_is_what_its_tag_says(tool, tmp_path):
+    release, version = tool("release"), PYPROJECT["project"]["version"]
     assert list(release.problems(PROJECT, "")) == []
     for name in ("pyproject.toml", "CHANGELOG.md", *release.VERSIONS):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -275,8 +269,6 @@ def make_whole(checkout: Path, bootstrap) -> None:
 
 def test_the_quickstart_installs_what_it_lacks(monkeypatch):
     """Its first cell of code, as Colab runs it: without p2p_lib, and with it."""
-    import importlib.util
-
     import IPython
 
     cells = json.loads((PROJECT / "notebooks" / "00_quickstart.ipynb").read_text())["cells"]
@@ -324,5 +316,5 @@ def test_the_workflow_runs_the_two_commands_on_every_python():
     assert once_a_week == {"test-backends", "figures", "seeds"}
     targets = set(re.findall(r"(?m)^([a-z-]+):", (PROJECT / "Makefile").read_text()))
     assert {line.split()[1] for line in run if line.startswith("make ")} | once_a_week <= targets
-    for step in [*job["steps"], *weekly["steps"]]:
+    for step in [step for job in flow["jobs"].values() for step in job["steps"]]:
         assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", step.get("uses", "a@" + "0" * 40)), "an action at one commit"

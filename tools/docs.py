@@ -24,6 +24,8 @@ from PIL import Image
 import p2p_lib
 
 ROOT = Path(__file__).resolve().parents[1]
+#: What a page has of its own to the suffix of a file and how pages get it.
+_SHARED = {"style": ("css", '<link rel="stylesheet" href="{}">'), "script": ("js", '<script src="{}"></script>')}
 _LINK = re.compile(r"(\]\()([^)\s#:]*)(#[^)\s]*)?\)")
 _PAGE = """<!doctype html>
 <html lang="en">
@@ -91,11 +93,9 @@ def _turned(text, name, linked):
             return found[0]
         target = (ROOT / name).parent.joinpath(found[2]).resolve().relative_to(ROOT).as_posix()
         linked.append(target)
-        return (
-            f"{found[1]}{found[2].rstrip('/')}/index.html)"
-            if (ROOT / target).is_dir()
-            else (f"{found[1]}{_page(found[2])}{found[3] or ''})")
-        )
+        if (ROOT / target).is_dir():
+            return f"{found[1]}{found[2].rstrip('/')}/index.html)"
+        return f"{found[1]}{_page(found[2])}{found[3] or ''})"
 
     return _LINK.sub(turn, text)
 
@@ -140,11 +140,9 @@ def _share(out):
         up = "../" * (len(page.relative_to(out).parts) - 1)
 
         def linked(found, up=up):
-            kind = "css" if found[1] == "style" else "js"
-            name = files.setdefault(found[2], f"shared{len(files)}.{kind}")
-            return (
-                f'<link rel="stylesheet" href="{up}{name}">' if kind == "css" else f'<script src="{up}{name}"></script>'
-            )
+            suffix, link = _SHARED[found[1]]
+            name = files.setdefault(found[2], f"shared{len(files)}.{suffix}")
+            return link.format(up + name)
 
         text = re.sub(r"<(style|script)>(.*?)</\1>", linked, text, flags=re.DOTALL)
         page.write_text(re.sub(r'<a href="#_\w+">(.*?)</a>', r"\1", text), encoding="utf-8")

@@ -1,39 +1,47 @@
-"""The commands of ``p2p``. Each is declared where it is carried out, by one call into the library."""
+"""The commands of ``p2p`` that track, score and show; those for data are in :mod:`p2p_lib.apps.data_commands`.
+
+Each is declared where it is carried out, by one call into the library.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import fill
 from typing import Any
 
-from p2p_lib.apps.command_line import arg, command, main, open_page, run_options, warn
+from p2p_lib.apps.command_line import (
+    JSON,
+    NO_BROWSER,
+    QUIET,
+    SEQUENCE,
+    again,
+    arg,
+    command,
+    main,
+    open_page,
+    run_options,
+    warn,
+)
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.options import RunOptions, lengths_m, names, pairs
 from p2p_lib.offline import PRODUCTS
 
 #: Options that choose the method and its parameters.
 METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "detector")
-_SEQUENCE = arg("sequence", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA")
 _RUN = arg("run", type=Path, metavar="DIR", help="folder written by p2p run")
-_DATASET = arg("dataset", metavar="NAME")
 _FILES = (
     "poses as bop: p2p_SEQ-test.csv; tum: OBJECT.txt; poses: annotated_poses/OBJECT/FRAME.txt, 4x4 (all in DIR);"
     " bop-dataset: labelled images, masks and models; foundationpose: images, first mask, mesh; model: textured meshes"
 )
-_POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
-_JSON = arg("--json", action="store_true", help="JSON instead of a table")
-_QUIET = arg("--quiet", action="store_true", help="no progress bar")
 _OVERLAY = arg("--overlay", type=Path, metavar="FILE", help="besides a film of it: .mp4, .gif or .webp (see p2p film)")
-_NO_BROWSER = arg("--no-browser", action="store_true", help="only say where the page is")
 _FORCE = arg("--force", dest="if_exists", action="store_const", const="replace", help="replace an earlier run in DIR")
 _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
 
@@ -65,7 +73,7 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     ),
     run_options(),
     _OVERLAY,
-    _QUIET,
+    QUIET,
 )
 def _run(a: argparse.Namespace) -> int:
     from p2p_lib.run import run
@@ -121,7 +129,7 @@ def _run(a: argparse.Namespace) -> int:
     arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
     _FORCE,
     _OVERLAY,
-    _NO_BROWSER,
+    NO_BROWSER,
 )
 def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
@@ -165,7 +173,7 @@ def _live(a: argparse.Namespace) -> None:
     arg("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)"),
     arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
     run_options("start", "stop", "models", "sizes", format="layout of --sequence (default: recognised)"),
-    _JSON,
+    JSON,
     arg("--rows", action="store_true", help="every number as a CSV row: all forms, Chamfer, returns"),
     arg("--align", choices=("first", "all"), default="first", help="object frame: by the first scored frame, or all"),
     _MIN_VISIBLE,
@@ -216,14 +224,11 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
         warn("p2p eval: --models is not used, because the run has no truth.")
     _show(score or replace(consistency(run), not_scored=not_scored), a.json)
     if not (score or a.json or (a.run / MASK_LOG).is_file()):
-        asked = RunOptions(**(run.info.get("options") or {}))
-        again = " ".join(
-            ["p2p run", run.info["path"] or run.info["sequence"], f"--out {a.run} --force", *asked.words()]
-        )
-        warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. Next: {again}")
+        then = f"Next: {again(run.info, a.run)} --force"
+        warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")
 
 
-@command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, _JSON, _MIN_VISIBLE)
+@command("eval-masks", "score the masks that a run kept against the dataset's own", _RUN, JSON, _MIN_VISIBLE)
 def _eval_masks(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.evaluation.mask_score import evaluate_masks
@@ -234,11 +239,11 @@ def _eval_masks(a: argparse.Namespace) -> None:
 @command(
     "eval-tracks",
     "score a 2D point tracker against true tracks",
-    _SEQUENCE,
+    SEQUENCE,
     run_options("settings", "seed", "tracker", "format", "depth_scale", "stop", models="meshes; else measured depth"),
     arg("--queries", type=int, default=256, metavar="N", help="points to follow (default 256)"),
     arg("--search", choices=("image", "masks"), default="image", help="where invisible points are looked for"),
-    _JSON,
+    JSON,
 )
 def _eval_tracks(a: argparse.Namespace) -> None:
     from p2p_lib.run import evaluate_tracker
@@ -260,7 +265,7 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     arg("--present", action="store_true", help="instead of plans: all whose data is there, at least in part"),
     arg("--tables", type=Path, metavar="DIR", help="tables with notes of what they are of go here, too"),
     arg("--stale", action="store_true", help="what of figures/ is of earlier code: marked so, with --out made anew"),
-    _QUIET,
+    QUIET,
 )
 def _benchmark(a: argparse.Namespace) -> int:
     from p2p_lib.apps.readiness import overview, present_plans, readiness, what_to_fetch
@@ -325,7 +330,7 @@ def _stale(a: argparse.Namespace) -> int:
     "draw the paper's qualitative figures and write the index of all its figures and tables",
     arg("--out", type=Path, metavar="DIR", help="runs, found again the next time (default out/benchmark)"),
     arg("--poses", type=Path, metavar="PATH", help="a competitor's on synthetic/occlusion, drawn beside ours"),
-    _QUIET,
+    QUIET,
 )
 def _figures(a: argparse.Namespace) -> None:
     from p2p_lib.apps.clone import study
@@ -342,7 +347,7 @@ def _figures(a: argparse.Namespace) -> None:
     "refine",
     "go over a finished run with the whole video; its better poses and surfaces go to DIR/offline",
     _RUN,
-    _QUIET,
+    QUIET,
 )
 def _refine(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import OFFLINE
@@ -364,7 +369,7 @@ def _refine(a: argparse.Namespace) -> None:
     arg("--frame", choices=("object", "model"), help="the tracker's (bop without truth needs it) or the model's"),
     arg("--min-confidence", type=float, metavar="C", help="leave less confident poses out (default 0, of labels 0.5)"),
     arg("--faces", type=int, default=5000, metavar="N", help="of a textured model, at most (default 5000)"),
-    _QUIET,
+    QUIET,
 )
 def _export(a: argparse.Namespace) -> None:
     if a.format in PRODUCTS:
@@ -385,7 +390,7 @@ def _export(a: argparse.Namespace) -> None:
     _RUN,
     arg("--out", type=Path, metavar="FILE", help="the page (default DIR/view.html); it needs nothing else"),
     arg("--rerun", type=Path, metavar="FILE", help="instead: a Rerun recording, with video and tracks"),
-    _NO_BROWSER,
+    NO_BROWSER,
 )
 def _view(a: argparse.Namespace) -> None:
     if a.rerun is not None:
@@ -432,228 +437,6 @@ def _notebooks(a: argparse.Namespace) -> None:
     study("runner").run_notebooks(a.profile, **how)
 
 
-# --- data ----------------------------------------------------------------------------------------
-
-
-@command(
-    "click",
-    "collect clicks on objects, and masks painted with a brush, in the browser, for p2p run --prompts",
-    _SEQUENCE,
-    arg("--out", type=Path, required=True, metavar="FILE", help="the prompts; what it holds is shown first"),
-    arg("--frame", type=int, default=0, metavar="I", help="frame to begin with (default 0)"),
-    arg("--run", type=Path, metavar="DIR", help="show the masks that a run kept (--save-masks), to be mended"),
-    arg("--port", type=int, default=0, metavar="N", help="of the page (default: a free one)"),
-    _NO_BROWSER,
-    run_options("format", "depth_scale", seed="of a synthetic sequence (default 0)"),
-)
-def _click(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.click import Clicker, check_writable, first_change, wait_for_clicks
-    from p2p_lib.datasets.runs import load_run
-    from p2p_lib.datasets.sequence import open_sequence
-
-    check_writable(a.out)
-    sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed or 0)
-    shown = load_run(a.run) if a.run is not None else None
-    page = Clicker(sequence, a.out, a.frame, a.port, shown)
-    before = page.prompts
-    prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)
-    again, changed = f"p2p run {a.sequence} --prompts {a.out} --save-masks --out", first_change(before, prompts)
-    if shown is None or changed is None:
-        print(f"{len(prompts)} prompts in {a.out}. Next: {again} DIR")
-    else:
-        asked = replace(RunOptions(**(shown.info.get("options") or {})), prompts=None)
-        words = " ".join([again, str(a.run), *(w for w in asked.words() if w != "--save-masks")])
-        how = f"--resume --from {changed}" if changed > shown.info["start"] else "--force"
-        print(f"{len(prompts)} prompts in {a.out}, the first new one in frame {changed}. Next: {words} {how}")
-
-
-@command(
-    "check",
-    "look at data of your own: what is wrong with it and what to do",
-    arg("sequence", metavar="FOLDER", help="rgb/ depth/ cam_K.txt masks/, or any sequence"),
-    run_options("format", "depth_scale", "sizes", prompts="clicks, where there are no masks"),
-    _JSON,
-)
-def _check(a: argparse.Namespace) -> int:
-    from p2p_lib.apps.check import check_folder
-    from p2p_lib.core.findings import Level, as_lines
-    from p2p_lib.datasets.prompts import load_prompts
-
-    prompts = load_prompts(a.prompts) if a.prompts else ()
-    how = {"format": a.format, "depth_scale": a.depth_scale, "sizes": RunOptions.of_arguments(a).sizes}
-    findings = check_folder(a.sequence, prompts=prompts, **how)
-    fine = "Nothing is wrong with it as far as can be seen."
-    print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings, fine))
-    return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
-
-
-@command(
-    "convert",
-    "make a folder for p2p run of a recording (ROS, RealSense, Azure Kinect) or of another layout",
-    arg("source", type=Path, metavar="SOURCE", help=".bag, .db3, .mcap, .mkv, a ROS 2 folder, or any sequence"),
-    arg("--out", type=Path, required=True, metavar="DIR", help="a new folder"),
-    arg("--colour", metavar="TOPIC", help="of a ROS recording (default: the likeliest)"),
-    arg("--depth", metavar="TOPIC", help="of a ROS recording, registered to colour (default: the likeliest)"),
-    run_options("format", "depth_scale"),
-    _QUIET,
-)
-def _convert(a: argparse.Namespace) -> None:
-    from p2p_lib.datasets.convert import convert
-
-    count = convert(a.source, a.out, a.format, a.depth_scale, a.colour, a.depth, not a.quiet)
-    print(f"{count} frames in {a.out}. Next: p2p check {a.out}")
-
-
-@command(
-    "synth",
-    "render a synthetic sequence in the YCBMultiTrack layout, with exact truth",
-    arg("scenario", nargs="?", metavar="SCENARIO", help="what happens; --list shows all"),
-    arg("--list", action="store_true", help="list the scenarios"),
-    arg("--out", type=Path, metavar="DIR", help="a new folder for the sequence"),
-    arg("--seed", type=int, default=0, metavar="N", help="of labels, paths and noise (default 0)"),
-    arg("--noise", default="realsense", metavar="NAME", help="exact, realsense (default) or hard"),
-    arg(
-        "--models",
-        type=Path,
-        metavar="DIR",
-        help="YCB models, for ycb_, in_hand and thin_ scenarios (default: procedural ones)",
-    ),
-    arg("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop"),
-)
-def _synth(a: argparse.Namespace) -> None:
-    from p2p_lib.datasets.sequence import SYNTHETIC
-    from p2p_lib.synthetic import SCENARIOS, describe, write_sequence
-
-    if a.list:
-        print("\n".join(f"{name:18}{re.sub('`+', '', describe(name))}" for name in SCENARIOS))
-        return
-    if a.scenario is None or a.out is None:
-        raise BadInput("synth", "no scenario or no --out", "SCENARIO --out DIR; p2p synth --list names the scenarios")
-    out = write_sequence(a.scenario.removeprefix(SYNTHETIC), a.out, a.seed, a.noise, a.models or "", a.bop)
-    print(f"Written to {out}. Next: p2p run {out} --out RUN")
-
-
-@command("data list", "list every dataset and checkpoint that is known")
-def _data_list(a: argparse.Namespace) -> None:
-    from p2p_lib.datasets.inventory import overview
-
-    print(overview())
-
-
-@command("data info", "say what a dataset is, its licence and how to get it", _DATASET)
-def _data_info(a: argparse.Namespace) -> None:
-    from p2p_lib.datasets.inventory import describe, manifest
-
-    print(describe(manifest(a.dataset)))
-
-
-@command(
-    "data fetch",
-    "download into $P2P_DATA, check and unpack; unpack what was had by hand",
-    _DATASET,
-    arg("--only", metavar="PART,PART", help="only the files whose names contain one of these"),
-    arg("--from", dest="source", type=Path, metavar="FILE", help="take them from a file, folder or archive you have"),
-    _QUIET,
-)
-def _data_fetch(a: argparse.Namespace) -> None:
-    from p2p_lib.datasets.inventory import fetch, manifest
-
-    for line in fetch(manifest(a.dataset), names(a.only) or (), not a.quiet, a.source):
-        print(line, flush=True)
-
-
-@command(
-    "data verify",
-    "check what is on disk: checksums, sequences, frames, truth",
-    _DATASET,
-    arg("--every-frame", action="store_true", help="read every image, not only the first and the last"),
-)
-def _data_verify(a: argparse.Namespace) -> int:
-    from p2p_lib.datasets.inventory import manifest, verify
-
-    good = True
-    for finding in verify(manifest(a.dataset), a.every_frame):
-        print(finding.line(), flush=True)
-        good &= finding.fine
-    return 0 if good else P2PError.exit_code
-
-
-@command(
-    "data record-truth",
-    "add truth by motion capture to a folder of one's own",
-    arg("folder", type=Path, metavar="FOLDER", help="rgb/ depth/ cam_K.txt times.txt, and masks/ if any"),
-    arg("--object", required=True, metavar="NAME", help="the object's name, as of its masks"),
-    arg("--mocap", type=Path, required=True, metavar="LOG", help=f"its marker body in the world: {_POSE_LOG}"),
-    arg("--camera", type=Path, required=True, metavar="LOG", help="the model in the camera, at image times"),
-    arg("--model", type=Path, metavar="FILE", help="its model, which says when it is in the image"),
-)
-def _data_record_truth(a: argparse.Namespace) -> None:
-    from p2p_lib.datasets.recording import record_truth
-
-    found = record_truth(a.folder, a.object, a.camera, a.mocap, a.model)
-    print(f"clocks {found.offset_s:.4f} s apart, known to {found.std_s * 1000:.1f} ms. Truth in {a.folder}")
-
-
-@command("data where", "print the folder of a dataset, checkpoint or sequence", _DATASET)
-def _data_where(a: argparse.Namespace) -> None:
-    from p2p_lib.datasets.inventory import where
-
-    print(where(a.dataset))
-
-
-@command(
-    "config",
-    "list and explain the parameters, or how the presets differ",
-    arg("only", nargs="?", metavar="STAGE[.KEY]", help="only this one: registration, tsdf.voxel_m, ..."),
-    arg("--diff", action="store_true", help="only those in which the presets paper and default differ"),
-    run_options("preset", "config_file", "settings"),
-    _JSON,
-)
-def _config(a: argparse.Namespace) -> None:
-    from p2p_lib.core import config as configuration
-    from p2p_lib.extended.default import MECHANISMS, chosen
-
-    config = RunOptions.of_arguments(a).config()
-    rows, on = configuration.parameters(config, a.only), chosen(config)
-    if a.diff:
-        paper = {key: left for key, (left, _) in configuration.diff().items()}
-        rows = [{"key": r["key"], "paper": paper[r["key"]], **r} for r in rows if r["key"] in paper]
-    if a.json:
-        print(json.dumps(rows))
-        return
-    for row in rows:
-        value = f"{row['value']} {row['unit']}".strip()
-        value += f" (paper: {row['paper']})" if a.diff else ""
-        print(f"{row['key']} = {value}\n    {row['meaning']} [{row['source']}]")
-        for name, does in MECHANISMS.items() if row["key"] == "method.mechanisms" else ():
-            print(f"        {name}{'' if name in on else ' (left out)'}: {does}")
-    whose = "paper (its text), release (the authors' configuration) or ours"
-    print(f"In brackets, whose value it is: {whose}. Change one with --set KEY=VALUE.")
-
-
-@command(
-    "doctor",
-    "check this installation and say how to mend it",
-    arg(
-        "--warm-up",
-        action="store_true",
-        help="instead compile what is compiled once on a machine, and say how long it took",
-    ),
-)
-def _doctor(a: argparse.Namespace) -> int:
-    if a.warm_up:
-        from p2p_lib.core.compiled import warm_up
-
-        print(f"Inner loops are ready, after {warm_up(warn):.1f} s.")
-        return 0
-    from p2p_lib.apps.doctor import run_doctor
-    from p2p_lib.core.findings import Level, as_lines
-
-    findings = run_doctor()
-    print(as_lines(findings, "All that is required is there. A dash is optional."))
-    return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
-
-
 def _film_wanted(path: Path | None) -> Callable[..., Path] | None:
     """What writes the film of a run, if one is wanted; a name that it cannot have is refused at once."""
     if path is None:
@@ -667,6 +450,8 @@ def _film_wanted(path: Path | None) -> Callable[..., Path] | None:
 def _show(score: Any, as_json: bool) -> None:
     print(json.dumps(score.as_dict()) if as_json else score.as_table())
 
+
+from p2p_lib.apps import data_commands  # noqa: E402, F401 - declared, and listed by --help, after those above
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -105,10 +105,10 @@ class Clicker(AbstractContextManager):
 
         ``masks`` are run lengths of each object that its prompts can start, or of which the run kept a mask.
         """
-        frame = content.get("frame") if isinstance(content, dict) else None
+        given = content if isinstance(content, dict) else {}
+        frame, prompts = given.get("frame"), parse_prompts(given) if given.get("objects") else ()
         if not isinstance(frame, int) or not 0 <= frame < len(self.sequence):
             raise BadInput("frame", repr(frame), f"a number from 0 to {len(self.sequence) - 1}")
-        prompts = parse_prompts(content) if isinstance(content, dict) and content["objects"] else ()
         found = self.run.masks(self.sequence, frame) if self.run else {}
         with self._segmenting, warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", Doubt)
@@ -142,8 +142,8 @@ def _plain(prompt: Prompt) -> dict[str, Any]:
 
 def first_change(before: Iterable[Prompt], after: Iterable[Prompt]) -> int | None:
     """The first frame of which other things are said; None where nothing has changed."""
-    one, other = ({json.dumps(_plain(prompt)): prompt.frame for prompt in prompts} for prompts in (before, after))
-    return min((dict([*one.items(), *other.items()])[key] for key in one.keys() ^ other.keys()), default=None)
+    one, other = ({(prompt.frame, json.dumps(_plain(prompt))) for prompt in prompts} for prompts in (before, after))
+    return min((frame for frame, _ in one ^ other), default=None)
 
 
 def clicked_masks(sequence: Sequence, prompts: Iterable[Prompt], config: Config | None = None) -> FirstMasks:

@@ -13,13 +13,16 @@ import traceback
 import warnings
 import webbrowser
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from p2p_lib import __version__
 from p2p_lib.core.errors import Doubt, P2PError, did_you_mean
-from p2p_lib.core.options import add_options
+from p2p_lib.core.options import RunOptions, add_options
 
 EXIT_INTERRUPTED = 128  # and the signal's number: 130 for Ctrl-C, 143 for SIGTERM
 
@@ -35,6 +38,13 @@ def arg(*flags: str, **how: Any) -> Argument:
 def run_options(*wanted: str, **helps: str) -> Argument:
     """Options of a run (:class:`RunOptions`) that a command has as well; ``helps`` says what some mean to it."""
     return lambda parser: add_options(parser, *wanted, **helps)
+
+
+#: What several commands take.
+SEQUENCE = arg("sequence", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA")
+JSON = arg("--json", action="store_true", help="JSON instead of a table")
+QUIET = arg("--quiet", action="store_true", help="no progress bar")
+NO_BROWSER = arg("--no-browser", action="store_true", help="only say where the page is")
 
 
 def command(name: str, help: str, *arguments: Argument) -> Callable:
@@ -135,6 +145,13 @@ class _Parser(argparse.ArgumentParser):
 def _meant(word: str, known: list[str]) -> str:
     meant = did_you_mean(word, [option for option in known if option != "--force"])  # it replaces an earlier run
     return f". {meant}" if meant else ""
+
+
+def again(info: Mapping[str, Any], out: Path, **changes: Any) -> str:
+    """The command that makes a run in its folder ``out`` once more, with ``changes`` of its options."""
+    asked = replace(RunOptions(**(info.get("options") or {})), **changes)
+    place = info["path"] or info["sequence"]
+    return " ".join(["p2p run", quote(place), "--out", quote(str(out)), *asked.words()])
 
 
 def warn(line: object) -> None:

@@ -30,7 +30,8 @@ from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
-from p2p_lib.run import Keeper, noted, recall, told
+from p2p_lib.keeper import Keeper, noted
+from p2p_lib.run import recall, told
 
 #: Made-up images that are tracked before a camera starts.
 _WARM_FRAMES = 4

@@ -101,7 +101,8 @@ def _of_runs(what: str, given: Any) -> np.ndarray:
     try:
         height, width = map(int, given["size"])
         counts = np.array(given["counts"], int)
-        if not 0 < height * width <= _MOST_PX or counts.ndim != 1 or counts.min() < 0 or counts.sum() != height * width:
+        total = sum(counts.tolist())  # which cannot overflow, as numpy's can
+        if min(height, width, counts.min()) < 0 or not 0 < total == height * width <= _MOST_PX:
             raise ValueError
     except (KeyError, TypeError, ValueError, OverflowError):
         expected = '{"size": [height, width], "counts": [...]} that add up to its pixels'

@@ -147,9 +147,7 @@ class RunWriter:
                 _clear(self.path, earlier)
             self._write_info()  # by which the folder is known to be a run's: before anything else
         elif self.redo_from is not None:
-            gone = [f"poses/{name}.txt" for name in self.resumed.objects.keys() - self._estimates.keys()]
-            _unlink(self.path, [*gone, *_maps(self.resumed.objects)])
-            _clear_refined(self.path)
+            self._clear_redone(self.resumed.objects)
         replace_text(self.path / "config.toml", self._config.to_toml())
         if self._points:
             _save_arrays(self.path / "models.npz", self._points)
@@ -158,6 +156,18 @@ class RunWriter:
         self._write_timings()
         self.begun = True
         self.flush()
+
+    def _clear_redone(self, objects: Iterable[str]) -> None:
+        """Take away what the run that is resumed said from ``redo_from`` on, and all of objects that are no more."""
+        patterns = [KEYPOINTS, MASK_LOG, *_maps(objects)]
+        for name in objects:
+            gone = name not in self._estimates
+            patterns += [f"poses/{name}.txt"] if gone else []
+            if (self.info.get("options") or {}).get("save_masks"):
+                frames = range(self.info["start"] if gone else self.redo_from, self.info["stop"])
+                patterns += [f"masks/{name}/{frame:06d}.png" for frame in frames]
+        _unlink(self.path, patterns)
+        _clear_refined(self.path)
 
     def kept_map(self, name: str) -> int:
         """The map of an object that the run keeps to: that of the most poses so far."""
@@ -238,7 +248,7 @@ class RunWriter:
                 info["prompts"] = [said for said in info.get("prompts") or [] if said["frame"] < start]
                 info["options"] = {**(info.get("options") or {}), "prompts": None}
             theirs["objects"] = mine["objects"]  # their poses tell
-            fix = "Say --from FRAME of the first change."
+            fix = "Say --from FRAME of the first change." if mine["prompts"] != theirs["prompts"] else fix
         differ = [key for key in mine if theirs[key] != mine[key] and key not in _MAY_DIFFER]
         if not differ and parameters:
             return

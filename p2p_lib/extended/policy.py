@@ -95,10 +95,8 @@ class OurPolicy(Policy):
         self.on = on
         self.shape = ShapeSearch(self.observer, self.config, self.stopwatch, "shape_search" in on)
         self.frozen = False  # whether the map does not grow
-        self._lies: tuple[np.ndarray | None, np.ndarray | None] = (
-            None,
-            None,
-        )  # the last pose, and where what had it lies since, as seen last
+        # The last pose, and where what had it lies since, as seen last.
+        self._lies: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
         self.trusted: Sight | None = None  # the newest without a doubt; None once it was hidden since
 
     # -- propose -------------------------------------------------------------------------------

@@ -256,35 +256,55 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert contents(out) == before
 
 
-def test_a_run_goes_on_from_a_frame_with_other_prompts(sequence, tmp_path, capsys):
-    """As a run that had them from the start; what is said of earlier frames has to stay."""
+def test_a_run_goes_on_from_a_frame_with_other_prompts(sequence, tmp_path, capsys, monkeypatch):
+    """As a run that had them from the start; what is said of earlier frames has to stay, and nothing else does."""
 
     def prompts(*more: Prompt) -> list[str]:
         first = Prompt("object", 0, mask=mask)
         return ["--prompts", str(save_prompts(tmp_path / "p.json", [first, *more]))]
 
     mask = open_sequence(sequence).masks(0)["object"]
-    hidden = Prompt("object", 5, mask=np.zeros_like(mask))
-    out, anew = tmp_path / "out", tmp_path / "anew"
-    assert run(sequence, out, *prompts(), "--save-masks") == 0
+    hidden, gone = Prompt("object", 5, mask=np.zeros_like(mask)), Prompt("gone", 6, mask=mask[::-1, ::-1])
+    out, anew, step = tmp_path / "out", tmp_path / "anew", Point2Pose.step
+    assert run(sequence, out, *prompts(gone), "--save-masks") == 0
+    refined = shutil.copytree(out, tmp_path / "refined")
+    (refined / "run.json").write_text(json.dumps(json.loads((out / "run.json").read_text()) | {"offline": True}))
+    refined.rename(out / "offline")
+    (out / "meshes").mkdir()
+    (out / "meshes/object.ply").write_text("of all frames")
     before = contents(out)
+    assert {"poses/gone.txt", "masks/gone/000000.png", "offline/poses.npz"} <= before.keys()
     more = [*prompts(hidden), "--save-masks"]
     for words, said in (
         (["--resume"], "out: prompts: got"),
         (["--resume", "--from", "6"], "Say --from FRAME of the first change"),
         (["--resume", "--from", "0"], f"from: got frame 0, expected one from 1 to {FRAMES - 1}"),
+        (["--resume", "--from", "5", "--seed", "9"], "got --seed 9, expected no --seed, as it began. Ask for the same"),
     ):
         capsys.readouterr()
         assert run(sequence, out, *more, *words) == 2 and said in one_line(capsys)
     assert contents(out) == before
-    assert run(sequence, out, *more, "--resume", "--from", "5") == run(sequence, anew, *more) == 0
+
+    def interrupted(self, frame, masks=None):
+        if frame.index == 6:
+            raise MissingData("frame 6", "a disk that is gone")
+        return step(self, frame, masks)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Point2Pose, "step", interrupted)
+        assert run(sequence, out, *more, "--resume", "--from", "5") == 2
+    assert [path.name for path in sorted((out / "masks").rglob("*.png"))] == [f"{k:06d}.png" for k in range(6)]
+    assert not {"keypoints.npz", "masks.npz", "offline/run.json"} & contents(out).keys()
     assert "its frames before 5 are tracked again" in capsys.readouterr().err
+    assert run(sequence, out, *more, "--resume") == run(sequence, anew, *more) == 0
+    capsys.readouterr()
+    assert contents(out).keys() == contents(anew).keys()
     mine, theirs = load_run(out), load_run(anew)
     for column in ("status", "T_cam_obj", "reason"):
         np.testing.assert_array_equal(*(getattr(r.objects["object"], column) for r in (mine, theirs)))
     assert mine.objects["object"].status[5] == "occluded" and mine.info["prompts"] == theirs.info["prompts"]
-    images = sorted((anew / "masks/object").iterdir())
-    assert all(path.read_bytes() == (out / "masks/object" / path.name).read_bytes() for path in images)
+    images = [name for name in contents(anew) if name.startswith("masks/")]
+    assert len(images) == FRAMES and all(contents(out)[name] == contents(anew)[name] for name in images)
     assert run(sequence, tmp_path / "none", *more, "--resume", "--from", "5") == 2 and "no run" in one_line(capsys)
 
 

@@ -3,6 +3,7 @@
 import http.client
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -102,6 +103,11 @@ def test_what_the_file_holds_is_shown_first(sequence, out):
     with Clicker(sequence, out) as clicker:
         assert json.loads(get(clicker.url + "session")[1])["objects"] == [one("cup", 1, [[30, 20]])]
         assert not clicker.wait(0)
+        painted = {"name": "lid", "frame": 2, "mask": run_lengths(np.eye(H, W, dtype=bool))}
+        assert post(clicker.url, {"objects": [one("cup", 1), painted]})[0] == 200
+    with Clicker(sequence, out) as clicker:
+        assert json.loads(get(clicker.url + "session")[1])["objects"] == [one("cup", 1), painted]
+    np.testing.assert_array_equal(load_prompts(out)[1].mask, np.eye(H, W, dtype=bool))
 
 
 REFUSED = {
@@ -116,6 +122,7 @@ REFUSED = {
         "mask of 'cup': got 3x1, expected 80x60",
     ),
     "runs that do not add up": ({"objects": [{"name": "cup", "mask": {"size": [2, 3], "counts": [1, 2]}}]}, "add up"),
+    "runs of no size": ({"objects": [{"name": "cup", "mask": {"size": [-2, -3], "counts": [6]}}]}, "add up"),
     "a number": ({"objects": [one() | {"points": 5}]}, "at least one [x, y]"),
     "nothing": ({"objects": []}, "prompts: got"),
     "a list": ([1, 2], "prompts: got"),
@@ -276,9 +283,11 @@ def test_the_page_undoes_renames_clears_and_zooms(sequence, out):
 def test_the_page_asks_for_the_masks_of_the_frame_that_is_shown(sequence, out):
     with Clicker(sequence, out) as clicker:
         seen = visit(clicker.session(), ["press", 50, 20], ["frame", 1], ["press", 30, 30])
+        nothing, of_run = (visit(clicker.session() | {"run": it}, ["frame", 1]) for it in (False, True))
     assert seen["asked"][0] == [{"name": "object", "frame": 0, "points": [[50, 20]]}]
     assert seen["asked"][-1] == [{"name": "object", "frame": 1, "points": [[30, 30]]}]
     assert seen["tinted"][-1] == [1, 1, 1, 8] and seen["doubts"] == "is it a table?"
+    assert not nothing["asked"] and of_run["asked"] and not any(of_run["asked"]), "the run's own"
 
 
 def disc(x: int, y: int, radius: int) -> np.ndarray:
@@ -326,7 +335,9 @@ def test_the_masks_of_a_run_are_shown_to_be_mended(sequence, out, tmp_path):
         assert clicker.session()["names"] == ["board"] and clicker.session()["run"]
         status, found = post(clicker.url, {"objects": [], "frame": 0}, to="masks")
         assert status == 200 and found["masks"] == {"board": run_lengths(board)["counts"]}
-        assert post(clicker.url, {"objects": [], "frame": 3}, to="masks")[0] == 400
+        for refused in ({"objects": [], "frame": 3}, {"frame": None}, []):
+            assert post(clicker.url, refused, to="masks")[0] == 400
+        assert post(clicker.url, {"frame": 0}, to="masks")[1] == found
     command = ["click", str(sequence.path), "--out", str(out), "--run", str(tmp_path / "run"), "--no-browser"]
     process = subprocess.Popen([sys.executable, "-m", "p2p_lib.apps.cli", *command], stdout=subprocess.PIPE, text=True)
     try:
@@ -337,6 +348,9 @@ def test_the_masks_of_a_run_are_shown_to_be_mended(sequence, out, tmp_path):
     finally:
         process.kill()
     assert "the first new one in frame 0. Next: p2p run" in said and said.endswith("--force\n")
+    words = shlex.split(said.partition("Next: ")[2])
+    assert words[2:] == [str(sequence.path), "--out", str(tmp_path / "run"), *words[5:]]
+    assert words[words.index("--prompts") + 1] == str(out) and words.count("--save-masks") == 1
     assert first_change(load_prompts(out), load_prompts(out)) is None
     assert first_change(load_prompts(out)[:1], load_prompts(out)) == 2
 

@@ -112,7 +112,7 @@ def test_points_and_objects_are_of_the_same_frames(folder, made):
     assert messages["durationSeconds"] == pytest.approx(obj.time_s[-1] - obj.time_s[0] + 1 / 30)
 
 
-def test_points_do_not_cover_a_surface(folder, made):
+def test_points_do_not_cover_a_surface(folder, made, monkeypatch):
     """Those on the box are left out where it stands; in frame 8 it has no pose, and they are all there."""
     shown, bare = Playback.of(folder, made.sequence), Playback.of(made.run.path, made.sequence)
     half_m, frame = shown.meshes["box"].extents / 2, shown.frame(20)
@@ -126,6 +126,8 @@ def test_points_do_not_cover_a_surface(folder, made):
     assert away_m(bare).min() < 0.002 and away_m(shown).min() > 0.01
     assert (away_m(bare) > 0.015).sum() == len(away_m(shown))
     assert len(shown.cloud(8, shown.frame(8), 3000)[0]) == len(bare.cloud(8, bare.frame(8), 3000)[0])
+    monkeypatch.setattr(Playback, "of_kept_map", lambda self, name: np.zeros(len(self.frame_index), bool))
+    assert len(away_m(shown)) == len(away_m(bare)), "of another map it is not drawn"
 
 
 def test_the_page_needs_nothing_from_outside(page):

@@ -1,12 +1,11 @@
 """Starts the node on the topics of a camera: ``ros2 launch point2pose_ros point2pose.launch.py rgb:=TOPIC ...``."""
 
+from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
-
-from launch import LaunchDescription
 
 #: Argument to its default, those of realsense2_camera with align_depth.enable:=true, and its meaning.
 TOPICS = {

@@ -1,0 +1,130 @@
+"""Keeps what a tracker says as a run's folder: what ``p2p run`` and ``p2p live`` share."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.core.errors import BadInput, Doubt
+from p2p_lib.core.memory import save_memory
+from p2p_lib.core.mesh import save as save_mesh
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.types import Frame, PoseEstimate
+from p2p_lib.datasets import sequence as sequences
+from p2p_lib.datasets.cameras import Stream
+from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
+from p2p_lib.datasets.first_masks import FirstMasks
+from p2p_lib.datasets.keypoint_log import KeypointLog
+from p2p_lib.datasets.mask_log import MaskLog
+from p2p_lib.datasets.run_writer import RunWriter
+from p2p_lib.datasets.runs import load_run
+from p2p_lib.evaluation.consistency import consistency
+from p2p_lib.evaluation.known_size import size_doubts
+from p2p_lib.extended.default import Point2Pose
+from p2p_lib.method.object_model import Known
+
+#: Frames whose images are looked at when a run is judged at its end; ``p2p eval`` looks at more.
+RUN_LOOKS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Keeper:
+    """Keeps what a tracker says as a run's folder: frame by frame poses, times and masks, and its maps at the end.
+
+    masks    whether to keep the masks as images
+    prompts  what started the objects, to be drawn with their first masks
+    sizes_m  how long objects are known to be
+    doubts   what was doubted meanwhile: a list that the caller fills (:func:`noted`)
+    """
+
+    writer: RunWriter
+    method: Point2Pose
+    masks: bool = False
+    prompts: Iterable[Prompt] = ()
+    sizes_m: Mapping[str, float] = field(default_factory=dict)
+    doubts: list[str] = field(default_factory=list)
+    keypoints: KeypointLog = field(default_factory=KeypointLog)
+
+    @cached_property
+    def mask_log(self) -> MaskLog:
+        """The masks so far, coarsely."""
+        return MaskLog(self.method.camera)
+
+    @cached_property
+    def first_masks(self) -> FirstMasks:
+        """The picture of what the objects were started with."""
+        return FirstMasks(self.writer.path / FIRST_MASKS, self.prompts)
+
+    def add(self, frame: Frame, estimates: Mapping[str, PoseEstimate]) -> list[str]:
+        """The frame that has just been estimated; which objects have their first mask in it."""
+        method = self.method
+        for name, obj in method.objects.items():
+            seen = method.tracks.visible & np.isin(method.tracks.ids, obj.model.map.ids)
+            self.keypoints.add(frame.index, name, method.tracks.ids[seen], method.tracks.uv_px[seen])
+        stages_ms = dict(method.stopwatch.last_ms)
+        self.writer.add(frame, estimates, stages_ms.pop("total"), stages_ms)
+        if self.masks:
+            self.writer.add_masks(frame, method.masks)
+        for name, mask in method.masks.items():
+            if mask is not None:
+                self.mask_log.add(frame, name, mask)
+        return self.first_masks.add(frame, method.masks)
+
+    def save_maps(self) -> None:
+        """``meshes/<object>.ply`` and ``maps/<object>.npz`` of each surface in its object's frame, and the two logs."""
+        objects = self.method.objects.items()
+        kept = {name: obj.known_as(self.writer.kept_map(name)) for name, obj in objects}
+        models = {name: known.model for name, known in kept.items() if known is not None}
+        for name, model in models.items():
+            if model.surface is not None and len((mesh := model.surface.mesh()).faces):
+                save_mesh(mesh, self.writer.path / "meshes" / f"{name}.ply")
+        self._save_memories({name: known for name, known in kept.items() if known is not None})
+        maps = {name: (model.map.ids, model.map.p_obj, model.map.promoted) for name, model in models.items()}
+        self.keypoints.save(self.writer.path, maps)
+        self.mask_log.save(self.writer.path)
+
+    def _save_memories(self, kept: Mapping[str, Known]) -> None:
+        """Of the objects of which enough is known to find them again."""
+        info = self.writer.info
+        made_of = {key: info[key] for key in ("sequence", "tracker", "start", "stop") if key in info}
+        for name, known in kept.items():
+            with suppress(BadInput):
+                memory = self.method.memory(name, known, **made_of, map_id=known.map_id)
+                save_memory(self.writer.path / "maps" / f"{name}.npz", memory)
+
+    def judge(self, sequence: sequences.Sequence | None = None) -> None:
+        """Have ``run.json`` say what was doubted, and what to look at before the run is believed; when all is kept.
+
+        sequence  whose images are looked at; None where they are gone
+        """
+        self.writer.info["doubts"] = list(dict.fromkeys(self.doubts))
+        self.writer.flush()
+        seen = (sequence, RUN_LOOKS) if sequence is not None else (Stream("", self.method.camera), 0)
+        found = consistency(load_run(self.writer.path), *seen)
+        told = {name: [suspicion.text for suspicion in of] for name, of in found.suspicions.items()}
+        for name, text in size_doubts(self.writer.path, self.sizes_m).items():
+            told[name] = [text, *told[name]]
+        self.writer.info["look_at"] = told
+
+
+@contextmanager
+def noted(doubts: list[str]) -> Iterator[None]:
+    """Keeps what is doubted inside (:class:`~p2p_lib.core.errors.Doubt`), which is shown as before."""
+    shown = warnings.showwarning
+
+    def note(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
+        if issubclass(category, Doubt):
+            doubts.append(str(message))
+        shown(message, category, *where, **how)
+
+    warnings.showwarning = note
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown
