@@ -52,7 +52,7 @@ def search(frame: Frame) -> ImageSearch:
     return ImageSearch(frame, CAMERA, preset().depth)
 
 
-@pytest.mark.parametrize("by_m", [(0, 0, 0), (0.05, 0, 0), (-0.03, 0.04, 0.04)])
+@pytest.mark.parametrize("by_m", [(0, 0, 0), (0.05, 0, 0), (-0.03, 0.04, 0.04), (0.06, 0.06, -0.05)])
 def test_it_is_found_near_where_it_is_expected(by_m):
     found = search(ball_in_front_of_a_wall()).about(moved(*by_m), sample_of_the_ball())
     assert found.share > 0.9

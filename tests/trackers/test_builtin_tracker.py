@@ -14,6 +14,7 @@ from p2p_lib.trackers.builtin import features
 from p2p_lib.trackers.builtin.image_only import ImageOnlyTracker
 from p2p_lib.trackers.builtin.tracker import BuiltinTracker
 from p2p_lib.trackers.lk import LkTracker
+from tests.trackers import made_up
 
 SHAPE, HIDDEN, LENGTH = (300, 400), range(20, 55), 75
 CARD = (110, 140)
@@ -157,6 +158,22 @@ def test_points_come_back_elsewhere_turned_and_scaled():
     assert right.mean() > 0.7 and (error_px(tracks, back)[tracks.visible] < 4).mean() > 0.95
     plain = follow(LkTracker(TrackingConfig()), film())[back - 1]
     assert (plain.visible & (error_px(plain, back) < 4)).mean() < 0.05
+
+
+def test_what_comes_into_view_is_remembered():
+    """A camera that goes past a printed wall sees points that it follows from other sides."""
+    tracker, uv_px = BuiltinTracker(TrackingConfig()), made_up.grid((40, 140), (60, 180), 12)
+    tracker.start(_seen_past(0), made_up.CAMERA)
+    tracker.add(uv_px)
+    (segment,) = tracker._segments.segments
+    for dx in range(8, 160, 8):
+        tracker.track(_seen_past(dx))
+    assert len(segment.landmarks.views) >= 2
+
+
+def _seen_past(dx: int) -> Frame:
+    rgb = np.roll(made_up.texture(), dx, 1)
+    return Frame(dx // 8, dx / 240, rgb, np.full(made_up.SHAPE, made_up.DEPTH_M, np.float32))
 
 
 def test_uncertainty_grows_with_the_error():
