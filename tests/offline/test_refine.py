@@ -236,7 +236,8 @@ def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what):
         depth_m[v[u > np.median(u)], u[u > np.median(u)]] += 0.05
     if what == "colours":  # as it was, but three times as strong
         rgb = middle + 3 * (rgb - middle)
-    if what == "pattern":  # the same colours elsewhere
+    if what == "pattern":  # the same colours elsewhere, beside a frame in whose light they are far off as well
+        sight._light[k - 1] = 3 * sight._usual, 0.9
         v, u = np.nonzero(mask)
         rgb[v, u] = rgb[v, u][np.random.default_rng(0).permutation(len(v))]
     seen = replace(frame, depth_m=depth_m, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
