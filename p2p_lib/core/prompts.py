@@ -105,12 +105,11 @@ def check_apart(others: Iterable[Prompt], prompt: Prompt) -> None:
 
 
 def check_depth(prompt: Prompt, frame: Frame) -> None:
-    """Refuse clicks where nothing is measured, and a box in which nothing is."""
-    missing = ~np.isfinite(depths_at(prompt.points_px, frame))
-    if missing.any():
-        got = f"{_pixel(prompt.points_px[missing][0])} has no depth in frame {frame.index}"
-        fix = "Click beside the hole."
-        raise BadInput(f"clicks on {prompt.name!r}", got, "pixels with a depth measurement", fix)
+    """Refuse clicks none of which has depth, for they say where in space the object is; a box without any in it."""
+    at = prompt.points_px
+    if len(at) and not np.isfinite(depths_at(at, frame)).any():
+        got = f"{_pixel(at[0])} has no depth in frame {frame.index}"
+        raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel with a depth measurement", "Click beside the hole.")
     if prompt.box_px is not None and not len(prompt.points_px) and not len(points_in_box(prompt.box_px, frame)):
         got = f"no depth inside it in frame {frame.index}"
         raise BadInput(f"box around {prompt.name!r}", got, "measured pixels in its middle", "Click on the object.")

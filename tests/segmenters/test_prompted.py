@@ -12,6 +12,8 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
+from p2p_lib.segmenters.builtin.patch import Patch
+from p2p_lib.segmenters.builtin.prompted import Cutter
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
 CAMERA = Camera(300.0, 310.0, 158.3, 121.7, 320, 240)
@@ -47,6 +49,67 @@ def segmenter() -> BuiltinSegmenter:
 
 def iou(one: np.ndarray, other: np.ndarray) -> float:
     return (one & other).sum() / max((one | other).sum(), 1)
+
+
+def on_a_table(thing: np.ndarray, colour: tuple[int, ...], shade: np.ndarray, seed: int) -> Frame:
+    """A thing (H, W) bool as flat as the pale, shaded table that it lies on; the floor beyond is dark."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[:240, :320]
+    rgb = (np.array([190.0, 175, 150]) - 0.25 * v[..., None] + 8 * np.sin(u / 25)[..., None]) * shade[..., None]
+    rgb[thing] = colour
+    rgb[200:] = 35, 35, 30
+    depth = np.where(v < 200, 0.7, 1.2) + rng.normal(0, 0.0015, v.shape)
+    rgb = np.clip(cv2.GaussianBlur(rgb, (0, 0), 0.7) + rng.normal(0, 3, rgb.shape), 0, 255).astype(np.uint8)
+    return Frame(0, 0.0, rgb, depth.astype(np.float32))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_clicks_along_something_thin_select_it_and_not_the_table(seed):
+    """Clicks at both ends of a knife are far apart, and most of what lies between them and around is table."""
+    v, u = np.mgrid[:240, :320]
+    shadow = 1 - 0.2 * np.exp(-(((u - 168) / 22) ** 2) - ((v - 120) / 45) ** 2)
+    knife = cv2.line(np.zeros((240, 320), np.uint8), (150, 90), (175, 150), 1, 7) > 0
+    clicks = Prompt("knife", points_px=[[151, 93], [162, 119], [173, 146]])
+    assert iou(segmenter().segment(on_a_table(knife, (30, 28, 30), shadow, seed), [clicks]) == 1, knife) > 0.8
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_clicks_close_together_select_all_of_a_cover(seed):
+    """Of a printed book, as flat as the table, a fifth lies between the clicks."""
+    cover = rectangle(90, 70, 210, 180)
+    frame = on_a_table(cover, (120, 70, 130), np.ones(cover.shape), seed)
+    rng = np.random.default_rng(seed)
+    for line in range(12):
+        frame.rgb[95 + 6 * line : 98 + 6 * line, 110 : 110 + rng.integers(40, 80)] = 190, 170, 200
+    clicks = Prompt("cover", points_px=[[135, 110], [155, 118], [145, 130]])
+    assert iou(segmenter().segment(frame, [clicks]) == 1, cover) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("ties", "chosen"), [((0.44, 0.45, 0.42), 1.0), ((0.44, 0.45, 0.36), 2.5), ((0.3, 0.45, 0.42), 0.4)]
+)
+def test_another_scale_than_that_of_the_clicks_has_to_be_clearly_better(monkeypatch, ties, chosen):
+    """With a towel the outline of a mug is as good as without."""
+    cut_at, asked = Cutter._cut_at, []
+
+    def cut(self, scale):
+        patch, x = cut_at(self, scale)
+        asked.append(scale)
+        monkeypatch.setattr(Patch, "outline_tie", lambda patch, _: ties[asked.index(patch.scale)])
+        object.__setattr__(patch, "scale", scale)
+        return patch, np.full_like(x, scale)
+
+    monkeypatch.setattr(Cutter, "_cut_at", cut)
+    prompt = Prompt("left", points_px=[[110, 100], [120, 110]])
+    _, x = Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))).start()
+    np.testing.assert_allclose(x, chosen)
+
+
+def test_one_click_in_a_hole_of_the_depth_does_no_harm():
+    frame = picture()
+    frame.depth_m[95:106, 105:116] = 0
+    clicks = Prompt("left", points_px=[[110, 100], [130, 120], [100, 125]]), Prompt("right", points_px=[[175, 110]])
+    assert iou(segmenter().segment(frame, clicks) == 1, LEFT) > 0.9
 
 
 @pytest.mark.parametrize("wrong_px", [(0, 0, 0, 0), (-4, 3, 5, -2), (2, 2, -2, -2)])

@@ -117,6 +117,12 @@ class Patch:
         lab = cv2.cvtColor(self.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
         return random_walk.edge_weights(lab, self.depth_m, self.step_m)
 
+    def outline_tie(self, mask: np.ndarray) -> float:
+        """Mean tie across the outline of a mask (h, w) bool: 0 if all of it is edges, 1 if none is or there is none."""
+        right, below = self.edge_weights
+        ties = np.concatenate([right[mask[:, 1:] != mask[:, :-1]], below[mask[1:] != mask[:-1]]])
+        return float(ties.mean()) if len(ties) else 1.0
+
     @property
     def shape(self) -> tuple[int, int]:
         """(h, w) of the grid."""

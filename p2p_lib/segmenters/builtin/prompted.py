@@ -58,6 +58,13 @@ _TIED = 0.02
 _TOLERANCE_PX = 3.0
 #: Cuts in the wide box and in the one that fits; a click beside the object counts as this many pixels of background.
 _ROUNDS, _ROUNDS_MORE, _OTHERS = 3, 2, 30.0
+#: Clicks may be close together on something large, or at both ends of something thin: it may be so many times as far
+#: across as they are.
+_SCALES = (0.4, 1.0, 2.5)
+#: Another scale than that of the clicks has to have this much less of its outline beside edges.
+_MARGIN = 0.9
+#: So many pixels of the grid around a click on something else belong to that.
+_AROUND_PX = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +81,19 @@ class Cutter:
     others_px: np.ndarray
 
     def start(self) -> tuple[Box, np.ndarray]:
-        """From clicks or a box: in a wide box at low resolution, then in one that fits."""
+        """From clicks or a box: of cuts at several scales the one whose outline is along edges the most."""
+        cuts = {scale: self._cut_at(scale) for scale in _SCALES}
+        doubt = {scale: self._doubtful(*cut) * (_MARGIN if scale == 1 else 1) for scale, cut in cuts.items()}
+        patch, x = cuts[min(doubt, key=doubt.__getitem__)]
+        return patch.box, patch.up(x)
+
+    def _doubtful(self, patch: Patch, x: np.ndarray) -> float:
+        """How little of a cut's outline is along edges, and how much of what is clicked as something else is inside."""
+        mask, others = x > 0.5, patch.dots(self._others_px, _AROUND_PX)
+        return patch.outline_tie(mask) + (mask[others].mean() if others.any() else 0.0)
+
+    def _cut_at(self, scale: float) -> tuple[Patch, np.ndarray]:
+        """In a wide box at low resolution, then in one that fits: something ``scale`` times as far across as clicks."""
         cfg, frame, around_px = self.config, self.frame, self.prompt.box_px
         clicks = self.prompt.points_px if len(self.prompt.points_px) else points_in_box(around_px, frame)
         z_m = float(np.nanmedian(depths_at(clicks, frame)))
@@ -85,7 +104,7 @@ class Cutter:
             box = self._room(around_px[:2], around_px[2:])
         moved = replace(self, frame=with_depth_moved(frame, depth_offset_px(frame, box)))
         patch = Patch.of(moved.frame, box, self.camera, cfg)
-        clicked = Clicked.of(patch, clicks, z_m)
+        clicked = Clicked.of(patch, clicks, z_m, scale)
         height = Height.of(patch, clicked)
         connected = by_connection(patch, clicked, height) + self._nearer_to_others(patch, clicked)
         prior = clicked.prior_beside(connected)
@@ -94,12 +113,12 @@ class Cutter:
         whole[patch.box.slices], there[patch.box.slices] = patch.up(x), patch.up(connected)
         fits = self._room(*patch.ends_px(x > 0.5))
         patch = Patch.of(moved.frame, fits, self.camera, replace(cfg, side_px=2 * cfg.side_px))
-        clicked = Clicked.of(patch, clicks, z_m)
+        clicked = Clicked.of(patch, clicks, z_m, scale)
         height = height.on(patch, clicked)
         connected = patch.down(there)
         geometry = by_distance(patch, z_m, cfg) + height.log_odds + connected
         x = moved._cut_out(patch, clicked, clicked.prior_beside(connected) / 2, geometry, patch.down(whole))
-        return patch.box, patch.up(x)
+        return patch, x
 
     def correct(self, was: np.ndarray, known_px: np.ndarray) -> tuple[Box, np.ndarray]:
         """Anew, from clicks that say what is wrong with a mask (H, W) bool, and from what is right about it.
@@ -180,14 +199,21 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
             got = f"{np.count_nonzero(mask)} pixels, flat in what is around it, as a table or a wall is"
             fix = "If it is not the object, click in the object's middle; else see that depth is in metres."
             return doubt(who, got, fix)
+    beside = {
+        other: there
+        for other, there in others.items()
+        if there.any() and _touch_unparted(patch, inside, patch.down(there.astype(np.float32)) > 0.5)
+    }
+    if not beside:
+        return None
     alone = np.zeros(frame.shape, bool)
     box, x = replace(cutter, others_px=NO_PX).start()
     alone[box.slices] = x > 0.5
-    for other, there in others.items():
-        taken = there.any() and (alone & there).sum() > there.sum() / 2
-        if taken and _touch_unparted(patch, inside, patch.down(there.astype(np.float32)) > 0.5):
+    for other, there in beside.items():
+        if (alone & there).sum() > there.sum() / 2:
             fix = "If both are one body, leave one out; else give each clicks beside it (negative), on the other."
             doubt(who, f"most of {other!r} belongs to what is clicked", fix)
+    return None
 
 
 def _touch_unparted(patch: Patch, one: np.ndarray, other: np.ndarray) -> bool:

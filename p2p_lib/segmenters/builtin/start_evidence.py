@@ -54,15 +54,15 @@ class Clicked:
     extents: np.ndarray
 
     @classmethod
-    def of(cls, patch: Patch, clicks_px: np.ndarray, z_m: float) -> Clicked:
-        """Of clicks (N, 2) in the image at a depth."""
+    def of(cls, patch: Patch, clicks_px: np.ndarray, z_m: float, scale: float = 1.0) -> Clicked:
+        """Of clicks (N, 2) in the image at a depth, on something ``scale`` times as far across as they are."""
         seeds = patch.dots(clicks_px, 1)
         at = (clicks_px - [patch.box.left, patch.box.top] + 0.5) / patch.cell_px - 0.5
         hull = np.zeros(patch.shape, np.uint8)
         cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(at).astype(np.int32)[:, None]), 1)
         hull = (hull > 0) | seeds
         least_m = _EXTENT_M if len(clicks_px) > 1 else _LONE_M
-        extent = max(float(np.ptp(at, 0).max()), least_m * patch.camera.fx / z_m / patch.cell_px)
+        extent = scale * max(float(np.ptp(at, 0).max()), least_m * patch.camera.fx / z_m / patch.cell_px)
         away = cv2.distanceTransform((~hull).astype(np.uint8), cv2.DIST_L2, 5)
         return cls(seeds, hull, away / extent)
 
