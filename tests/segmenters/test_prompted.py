@@ -12,8 +12,8 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.patch import Patch
-from p2p_lib.segmenters.builtin.prompted import Cutter
+from p2p_lib.segmenters.builtin.patch import Box, Patch
+from p2p_lib.segmenters.builtin.prompted import Cutter, doubt_start
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
 CAMERA = Camera(300.0, 310.0, 158.3, 121.7, 320, 240)
@@ -103,6 +103,31 @@ def test_another_scale_than_that_of_the_clicks_has_to_be_clearly_better(monkeypa
     prompt = Prompt("left", points_px=[[110, 100], [120, 110]])
     _, x = Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))).start()
     np.testing.assert_allclose(x, chosen)
+
+
+@pytest.mark.parametrize(
+    ("doubtful", "mask", "others", "said"),
+    [
+        (0.33, LEFT, {}, True),
+        (0.40, LEFT, {}, False),  # its outline is worse
+        (0.33, LEFT, {"right": RIGHT}, False),  # that is another object
+        (0.33, RIGHT, {}, False),  # not what was cut out: SAM 2 knows better
+    ],
+)
+def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, mask, others, said):
+    box = Box(0, 0, 320, 240)
+    cuts = [(0.3, box, LEFT.astype(np.float32)), (doubtful, box, (LEFT | RIGHT).astype(np.float32))]
+    monkeypatch.setattr(Cutter, "cuts", cuts)
+    prompt = Prompt("left", points_px=[[110, 100]])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        doubt_start(Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))), mask, others)
+    assert bool(caught) == said
+    if said:
+        found = re.search(
+            r"3600 pixels; 6600 have as good an outline. See where \((\d+), (\d+)\)", str(caught[0].message)
+        )
+        assert RIGHT[int(found[2]), int(found[1])]
 
 
 def test_one_click_in_a_hole_of_the_depth_does_no_harm():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -65,6 +66,9 @@ _SCALES = (0.4, 1.0, 2.5)
 _MARGIN = 0.9
 #: So many pixels of the grid around a click on something else belong to that.
 _AROUND_PX = 3
+#: Cuts are as good as each other where their doubts differ by less than a factor; of two things if their sizes do more.
+#: Masks are the same where they overlap by this.
+_AS_GOOD, _OTHER_SIZE, _SAME = 1.2, 1.5, 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +86,17 @@ class Cutter:
 
     def start(self) -> tuple[Box, np.ndarray]:
         """From clicks or a box: of cuts at several scales the one whose outline is along edges the most."""
-        cuts = {scale: self._cut_at(scale) for scale in _SCALES}
-        doubt = {scale: self._doubtful(*cut) * (_MARGIN if scale == 1 else 1) for scale, cut in cuts.items()}
-        patch, x = cuts[min(doubt, key=doubt.__getitem__)]
-        return patch.box, patch.up(x)
+        _, box, x = self.cuts[0]
+        return box, x
+
+    @cached_property
+    def cuts(self) -> list[tuple[float, Box, np.ndarray]]:
+        """Cuts at several scales, the best first: how doubtful each is, where it is, and its probabilities there."""
+        found = []
+        for scale in _SCALES:
+            patch, x = self._cut_at(scale)
+            found.append((self._doubtful(patch, x) * (_MARGIN if scale == 1 else 1), patch.box, patch.up(x)))
+        return sorted(found, key=lambda cut: cut[0])
 
     def _doubtful(self, patch: Patch, x: np.ndarray) -> float:
         """How little of a cut's outline is along edges, and how much of what is clicked as something else is inside."""
@@ -179,8 +190,9 @@ class Cutter:
 
 
 def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> None:
-    """Warn if the prompt that started an object with a mask (H, W) bool selected background or another object.
+    """Warn if the prompt that started an object with a mask (H, W) bool may have selected something else.
 
+    cutter  of the prompt alone, as if there were no other objects
     others  object to mask (H, W) bool, of the other objects in this frame
     """
     frame, name = cutter.frame, cutter.prompt.name
@@ -204,16 +216,32 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
         for other, there in others.items()
         if there.any() and _touch_unparted(patch, inside, patch.down(there.astype(np.float32)) > 0.5)
     }
-    if not beside:
-        return None
-    alone = np.zeros(frame.shape, bool)
-    box, x = replace(cutter, others_px=NO_PX).start()
-    alone[box.slices] = x > 0.5
+    cuts = [(doubtful, _whole(frame, box, x)) for doubtful, box, x in cutter.cuts]
     for other, there in beside.items():
-        if (alone & there).sum() > there.sum() / 2:
+        if (cuts[0][1] & there).sum() > there.sum() / 2:
             fix = "If both are one body, leave one out; else give each clicks beside it (negative), on the other."
-            doubt(who, f"most of {other!r} belongs to what is clicked", fix)
+            return doubt(who, f"most of {other!r} belongs to what is clicked", fix)
+    taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *others.values()])
+    best = cuts[0][1] & ~taken
+    if (best & mask).sum() < _SAME * (best | mask).sum():
+        return None  # the mask is somebody else's
+    for doubtful, cut_out in cuts[1:]:
+        another = cut_out & ~taken
+        sizes = sorted([np.count_nonzero(mask), np.count_nonzero(another)])
+        if doubtful < _AS_GOOD * cuts[0][0] and 0 < _OTHER_SIZE * sizes[0] < sizes[1]:
+            apart = cv2.distanceTransform((another ^ mask).astype(np.uint8), cv2.DIST_L2, 3)
+            v, u = np.unravel_index(apart.argmax(), apart.shape)
+            got = f"{np.count_nonzero(mask)} pixels; {np.count_nonzero(another)} have as good an outline"
+            fix = f"See where ({u}, {v}) belongs: click there, too, or beside the object (negative)."
+            return doubt(who, got, fix)
     return None
+
+
+def _whole(frame: Frame, box: Box, x: np.ndarray) -> np.ndarray:
+    """(H, W) bool of a cut in a box."""
+    whole = np.zeros(frame.shape, bool)
+    whole[box.slices] = x > 0.5
+    return whole
 
 
 def _touch_unparted(patch: Patch, one: np.ndarray, other: np.ndarray) -> bool:
