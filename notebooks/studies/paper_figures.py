@@ -36,10 +36,10 @@ PLAN = "paper_figures"
 _OURS, _MESHES = "Ours", "Ours, YCB meshes"
 #: Line by line, what stands in each image's corner, and whose it is.
 _TWO_BY_TWO = {
-    "long memory, scene": _OURS,
-    "long memory": "Ours, points alone",
-    "scene": "Ours, SH(10)",
-    "neither": "Ours, points alone, SH(10)",
+    "memory and scene": _OURS,
+    "memory alone: the paper's": "Ours, points alone",
+    "scene alone": "Ours, SH(10)",
+    "neither: P2P-SH(10)": "Ours, points alone, SH(10)",
 }
 _AIRPLANE, _HIDDEN = "synthetic/ycb_airplane_can", "synthetic/occlusion"
 _OTHER = "stand-in: rendered, not the paper's sequence"
