@@ -37,14 +37,17 @@ _OURS, _MESHES = "Ours", "Ours, YCB meshes"
 #: Line by line, what stands in each image's corner, and whose it is.
 _TWO_BY_TWO = {
     "memory and scene": _OURS,
-    "memory alone: the paper's": "Ours, points alone",
+    "memory alone": "Ours, points alone",
     "scene alone": "Ours, SH(10)",
-    "neither: P2P-SH(10)": "Ours, points alone, SH(10)",
+    "neither": "Ours, points alone, SH(10)",
 }
 _AIRPLANE, _HIDDEN = "synthetic/ycb_airplane_can", "synthetic/occlusion"
 _OTHER = "stand-in: rendered, not the paper's sequence"
 _RIVAL = "A return: ours above, a competitor's poses below."
-_RETURN = "A return, two by two: above with long memory, below without; left with our search by shape and scene."
+_RETURN = (
+    "A return, two by two: above with long memory, below without; left with our search by shape and scene. "
+    "Right is the paper's pair, Point2Pose and P2P-SH(10)."
+)
 
 
 def draw_all(runs: Benchmark, folder: Path, poses: Path | None = None) -> list[Saved]:
@@ -171,7 +174,7 @@ _ROWS = (
      "ycb_models", _STAND_IN),
     ("Figure 4", "texture: tracks on low and high texture, Sobel gradient against track error and ADD",
      "texture.png", "p2p notebooks --profile full --only 08", "08", "ho3d_v3", _STAND_IN),
-    ("Figure 5", "a return beside a competitor's poses", "fig5_return.png", "p2p figures --poses PATH", "07",
+    ("Figure 5", "a return, by memory and scene; or beside a competitor's poses", "fig5_return.png", "p2p figures --poses PATH", "07",
      "ycbmultitrack_real, a competitor's poses", _STAND_IN),
     _table("Table 1", "HO3D", "ho3d", "09", "ho3d_v3", "the paper's data"),
     _table("Table 2", "YCBInEOAT", "ycbineoat", "09", "ycbineoat", "the paper's data"),
