@@ -73,7 +73,7 @@ def rate_figure(table: Path) -> Figure:
         else:
             axis.plot(at, [values[k] for k in at], "o-", color=style.METHODS[0])
             axis.set_xlim(0, None)
-        axis.set(xlabel=label, ylim=(0, None))
+        axis.set(xlabel=label, ylim=(0, 1.1 * max(values.values())))
     axes[0].set_ylabel("processor time a frame [ms]")
     return figure
 

@@ -116,7 +116,8 @@ def _box(axis: Axes, name: str, x: float, y: float, marked: bool, pages: Mapping
     box.set(linestyle=line, zorder=3, url=pages.get(stage.notebook))
     axis.add_patch(box)
     axis.text(x, y + 0.07, stage.title, ha="center", va="center", fontsize=8.5, color=ink, zorder=4, weight="bold")
-    axis.text(x, y - 0.12, stage.source, ha="center", va="center", fontsize=6, color=ink, zorder=4, family="monospace")
+    small = {"fontsize": 6 * min(1, 22 / len(stage.source)), "family": "monospace"}  # so many characters fit
+    axis.text(x, y - 0.12, stage.source, ha="center", va="center", color=ink, zorder=4, **small)
     number = {"ha": "right", "va": "top", "fontsize": 6.5, "zorder": 4, "color": ink}
     axis.text(x + w / 2 - 0.04, y + h / 2 - 0.03, stage.notebook, **number)
 

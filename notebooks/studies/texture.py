@@ -376,10 +376,10 @@ def _against_texture(axes: Sequence[Axes], measures: Mapping[str, DataFrame], si
             axis.scatter(many.texture, many[key], size, color=[colour], label=label, **edge)
     for axis, label in zip(axes, (_TRACK, _ADD)):
         axis.set(xlabel=_TEXTURE, ylabel=label)
-        logarithmic(axis.xaxis)
-        low, high = axis.get_xlim()
-        axis.set_xticks([t for t in (0.5, 1, 2, 5, 10, 20) if low <= t <= high])
-    logarithmic(axes[0].yaxis)
+    for scale in (axes[0].xaxis, axes[1].xaxis, axes[0].yaxis):
+        logarithmic(scale)
+        low, high = scale.get_view_interval()
+        scale.set_ticks([t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if low <= t <= high])
     axes[1].set_ylim(0, 102)
 
 

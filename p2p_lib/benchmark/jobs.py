@@ -15,10 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, uses_clicks
+from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, prompts_file, prompts_places, uses_clicks
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
 from p2p_lib.core.files import read_toml
 from p2p_lib.core.options import RunOptions
@@ -26,8 +25,9 @@ from p2p_lib.core.paths import data_dir
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets import checkpoints, manifests
 from p2p_lib.datasets.models import find_models
+from p2p_lib.datasets.prompts import load_prompts
 from p2p_lib.datasets.provenance import code_digest
-from p2p_lib.datasets.resized import Resized
+from p2p_lib.datasets.resized import Resized, resized_prompt
 from p2p_lib.datasets.schema import first_fault
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
@@ -68,19 +68,20 @@ class Job:
         """The seed of a synthetic sequence."""
         return self.seed if self.sequence.seed is None else self.sequence.seed
 
-    def options(self, known: tuple[str, ...] = ()) -> RunOptions:
-        """What its run is asked for, on a sequence of the ``known`` objects.
+    @property
+    def prompts(self) -> tuple[Prompt, ...]:
+        """What is kept for its sequence, where its method starts from clicks; where nothing is, the run draws some."""
+        file = prompts_file(self.sequence.name) if uses_clicks(self.method) else None
+        return tuple(resized_prompt(prompt, self.method.scale) for prompt in load_prompts(file)) if file else ()
 
-        Where the method starts from clicks and the plan has none, the run draws some.
-        """
-        planned, method, prompts = self.sequence, self.method, None
-        if uses_clicks(method) and planned.clicks:
-            prompts = [Prompt(name, planned.start, np.array(at) * method.scale) for name, at in planned.clicks.items()]
-        objects = tuple(planned.objects) or (tuple(planned.clicks) if prompts else known)
+    def options(self, known: tuple[str, ...] = ()) -> RunOptions:
+        """What its run is asked for, on a sequence of the ``known`` objects."""
+        planned, method, prompts = self.sequence, self.method, self.prompts
+        objects = tuple(planned.objects) or tuple(dict.fromkeys(p.name for p in prompts)) or known
         return RunOptions(
             **method.model_dump(include={"preset", "settings", "tracker", "detector", "masks"}),
             seed=self.seed,
-            prompts=prompts,
+            prompts=prompts or None,
             objects=objects[: method.count or None] or None,
             start=planned.start,
             stop=planned.stop,
@@ -145,7 +146,7 @@ def _keyed(job: Job, known: dict[tuple, str]) -> Job:
             "sequence": _fingerprint(job, known),
             "cut": [planned.start, planned.stop, planned.objects],
             "fault": planned.fault and [planned.fault.model_dump(), planned.during],
-            "clicks": planned.clicks if uses_clicks(method) else {},
+            "prompts": [[p.as_dict(), "" if p.mask is None else _sha(p.mask.tobytes())] for p in job.prompts],
             "chamfer": job.chamfer,
             "min_mask_px": job.min_mask_px,
         }
@@ -239,7 +240,7 @@ def _files_hash(job: Job) -> str:
     """Content of the truth, of the models, of the first image and its masks; names and sizes of everything else."""
     job = replace(job, sequence=job.sequence.model_copy(update={"fault": None}))
     sequence, start = open_planned(job), job.sequence.start
-    _check_masks(job, sequence)
+    _check_start(job, sequence)
     first = sequence.frame(start)
     parts = [("rgb", first.rgb.tobytes()), ("depth", first.depth_m.tobytes())]
     parts += [(name, mask.tobytes()) for name, mask in sorted((sequence.masks(start) or {}).items())]
@@ -251,12 +252,26 @@ def _files_hash(job: Job) -> str:
     return _sha(b"".join(name.encode() + content for name, content in parts))
 
 
-def _check_masks(job: Job, sequence: Sequence) -> None:
-    """That a method by masks of every frame finds more than those of the first frames, which some copies have alone."""
-    of_every_frame = job.method.masks == "dataset" and sequence.masks(job.sequence.start) is not None
-    if of_every_frame and sequence.masks(len(sequence) - 1) is None:
+def _check_start(job: Job, sequence: Sequence) -> None:
+    """That the sequence has what the method starts from; :class:`MissingData` says what to put where."""
+    name, by = job.sequence.name, RunOptions(masks=job.method.masks).mask_source().name
+    if prompts := job.prompts:
+        if unknown := sorted({prompt.name for prompt in prompts} - set(sequence.objects)) if sequence.truth else ():
+            expected = f"the sequence's own names: {', '.join(sequence.objects)}"
+            raise BadInput(str(prompts_file(name)), f"clicks on {unknown[0]!r}", expected, "It could not be scored.")
+        return
+    if all(sequence.masks(i) is None for i in range(job.sequence.start, len(sequence))):
+        places = prompts_places(name)
+        if by != "clicks":
+            raise MissingData(f"{name}: masks", "there are none", 'Methods with masks = "clicks" need none.')
+        if not places:
+            raise MissingData(f"{name}: masks", "none to draw clicks from", "Prompts are kept by names, not paths.")
+        fix = f"Make it once: p2p click {name} --out {places[0]}"
+        raise MissingData(str(places[0]), "no such file, and the sequence has no masks to draw clicks from", fix)
+    # Some copies have masks of the first frames alone.
+    if by == "dataset" and sequence.masks(job.sequence.start) is not None and sequence.masks(len(sequence) - 1) is None:
         fix = 'Methods with masks = "first" or "clicks" need no more.'
-        raise MissingData(f"{job.sequence.name}: masks", "there are some of the first frames alone", fix)
+        raise MissingData(f"{name}: masks", "there are some of the first frames alone", fix)
 
 
 def _listing(folder: Path) -> bytes:

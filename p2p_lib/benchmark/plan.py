@@ -6,7 +6,7 @@ package lie in ``plans/`` and are known by their names.
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
@@ -15,13 +15,14 @@ from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_TRACKER
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import file_name, read_toml
 from p2p_lib.core.options import RunOptions
+from p2p_lib.core.paths import data_dir
 from p2p_lib.datasets.schema import Strict, first_fault
 from p2p_lib.datasets.sequence import SYNTHETIC
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 
 PROFILES = ("quick", "full")
-#: Where the plans of this package lie.
-PLANS = Path(__file__).parent / "plans"
+#: Where the plans of this package lie, and the prompts of sequences that methods from clicks start from.
+PLANS, PROMPTS = Path(__file__).parent / "plans", Path(__file__).parent / "prompts"
 
 Text = Annotated[str, Field(min_length=1)]
 Count = Annotated[int, Field(ge=0)]
@@ -33,7 +34,8 @@ class Method(Strict):
     paper     the method of the paper's table that it stands beside ("Ours", "No SDF refinement"), "" for none
     against   the method that it is compared with, run by run (a plan of kind ``pairs``)
     gpu       whether it is left out where there is no GPU: its networks take seconds a frame without one
-    masks     as of ``p2p run``; clicks are the sequence's, or drawn where it has none
+    masks     as of ``p2p run``; clicks are those kept for the sequence (:func:`prompts_file`), or drawn where there are
+              none
     settings  single parameters of the configuration, ``{"stage.key" = value}``
     synthetic parameters of synthetic sequences; ``noise`` is one of exact, realsense, hard
     scale     of the images, 1 = as they are
@@ -87,7 +89,6 @@ class PlannedSequence(Strict):
     seed       of a synthetic sequence; None: that of the run
     synthetic  parameters of a synthetic sequence; ``models = "DATASET"`` stands for that dataset's folder
     models     object to model file or folder, relative to ``$P2P_DATA``, where the layout has none
-    clicks     object to pixels [u, v] in frame ``start``, for methods that start from clicks
     column     of the paper's table; with several objects, ``columns`` has one for each
     fault      what goes wrong in it, and in which frames, from and to, where that is for a while
     """
@@ -99,7 +100,6 @@ class PlannedSequence(Strict):
     seed: Count | None = None
     synthetic: dict[str, Any] = {}
     models: dict[str, Text] = {}
-    clicks: dict[str, list[list[float]]] = {}
     column: str = ""
     columns: dict[str, str] = {}
     fault: PlannedFault | None = None
@@ -218,6 +218,23 @@ def read_plan(plan: str | Path) -> Plan:
         return Plan.model_validate({"name": path.stem, **content})
     except ValidationError as error:
         raise BadInput(f"plan {path.name}", first_fault(error), expected) from None
+
+
+def prompts_places(sequence: str) -> tuple[Path, ...]:
+    """Where prompts are looked for of a sequence that a plan calls so, ``DATASET/SEQUENCE``; none for an absolute path.
+
+    That is ``prompts/DATASET/SEQUENCE.json`` below ``$P2P_DATA``, then the same of this package.
+    """
+    relative = PurePosixPath(f"{sequence}.json")
+    if relative.is_absolute() or ".." in relative.parts:
+        return ()
+    own = data_dir()
+    return (*([own / "prompts" / relative] if own else []), PROMPTS / relative)
+
+
+def prompts_file(sequence: str) -> Path | None:
+    """The first of :func:`prompts_places` that is there."""
+    return next((path for path in prompts_places(sequence) if path.is_file()), None)
 
 
 def uses_clicks(method: Method) -> bool:

@@ -178,7 +178,7 @@ def _over_sequences(plan: Plan, profile: str, group: Results) -> list[Row]:
     done = [(job, outcome) for job, outcome in group if outcome.status == "done"]
     objects = [obj for _, outcome in done for obj in outcome.objects.values()]
     fallen = [job for job, outcome in group if outcome.status == "failed"]
-    failed = sum(len(job.sequence.objects or job.sequence.columns or job.sequence.clicks) or 1 for job in fallen)
+    failed = sum(len(job.options().objects or job.sequence.columns) or 1 for job in fallen)
     if not objects and not failed:
         return []
     head = _head(plan, profile, *(done or group)[0]) | {"object": "", "column": "", "key": ""}

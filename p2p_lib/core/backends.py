@@ -33,6 +33,9 @@ SEGMENTERS = {
     "builtin": "p2p_lib.segmenters.anchored:builtin",
     "sam2": "p2p_lib.segmenters.anchored:sam2",
     "sam2_video": "p2p_lib.segmenters.sam2_video:load",
+    "sam2_video_small": "p2p_lib.segmenters.sam2_video:load_small",
+    "sam2_video_base_plus": "p2p_lib.segmenters.sam2_video:load_base_plus",
+    "sam2_video_large": "p2p_lib.segmenters.sam2_video:load_large",
 }
 #: What a class of somebody else has at least (:mod:`p2p_lib.core.interfaces`); ``name`` may be made by its __init__.
 PROMISES = {

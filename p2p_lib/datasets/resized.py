@@ -10,6 +10,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import Sequence
 
@@ -33,7 +34,7 @@ class Resized:
     def camera(self) -> Camera:
         """The original's camera with its pixels merged; integer pixels are pixel centres."""
         camera = self.original.camera
-        width, height = round(camera.width * self.scale), round(camera.height * self.scale)
+        width, height = _size((camera.height, camera.width), self.scale)
         sx, sy = width / camera.width, height / camera.height
         return replace(
             camera,
@@ -53,11 +54,8 @@ class Resized:
 
     def masks(self, i: int) -> dict[str, np.ndarray] | None:
         """The masks at frame i, smaller."""
-        masks, size = self.original.masks(i), (self.camera.width, self.camera.height)
-        if masks is None:
-            return None
-        nearest = cv2.INTER_NEAREST_EXACT
-        return {k: cv2.resize(m.astype(np.uint8), size, interpolation=nearest) > 0 for k, m in masks.items()}
+        masks = self.original.masks(i)
+        return None if masks is None else {name: _smaller(mask, self.scale) for name, mask in masks.items()}
 
     def __len__(self) -> int:
         return len(self.original)
@@ -65,3 +63,23 @@ class Resized:
     def __getattr__(self, name: str) -> Any:
         """The original's names, times, truth, models and sizes of masks."""
         return getattr(self.original, name)
+
+
+def resized_prompt(prompt: Prompt, scale: float) -> Prompt:
+    """A prompt of a sequence, in the pixels of its :class:`Resized`."""
+    points, negative, box = (
+        None if px is None else (px + 0.5) * scale - 0.5 for px in (prompt.points_px, prompt.negative_px, prompt.box_px)
+    )
+    mask = None if prompt.mask is None else _smaller(prompt.mask, scale)
+    return replace(prompt, points_px=points, negative_px=negative, box_px=box, mask=mask)
+
+
+def _size(shape: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Width and height of an image (H, W) that is scaled."""
+    return round(shape[1] * scale), round(shape[0] * scale)
+
+
+def _smaller(mask: np.ndarray, scale: float) -> np.ndarray:
+    """A mask (H, W) bool, scaled."""
+    size = _size(mask.shape, scale)
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0

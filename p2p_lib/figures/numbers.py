@@ -72,9 +72,12 @@ class Numbers:
         """What is to be said of every number of ours, and of those that the paper reports."""
         seeds = ", ".join(map(str, self.seeds))
         spread = f"mean ± standard deviation over seeds {seeds}" if len(self.seeds) > 1 else f"seed {seeds} alone"
-        scored = f"frames with less than {self.plan.min_mask_px} pixels of an object's mask are not scored"
         reported = [_REPORTED] if self.plan.paper else []
-        return [f"{_HOW}; {scored}; {spread}", *self.about(), *reported]
+        return [f"{_HOW}; {self.scored()}; {spread}", *self.about(), *reported]
+
+    def scored(self) -> str:
+        """Which frames count."""
+        return f"frames with less than {self.plan.min_mask_px} pixels of an object's mask are not scored"
 
     def about(self) -> list[str]:
         """What the plan itself has to say below its table, and what ran."""

@@ -29,8 +29,8 @@ def by_run(numbers: Numbers) -> Table:
     groups = [("", 2), ("aligned at the first frame", 2), ("one constant over all", 2), ("", 2 + numbers.judges)]
     over = f"Mean over objects and seeds {', '.join(map(str, numbers.seeds))}"
     over += ", in brackets the lowest and the highest" * (len(numbers.seeds) > 1)
-    how = "Exact area under the curve, frames without a pose count as 0; returns after complete occlusion or out of "
-    how += "view, of all seeds: how many were found again, and after how many scored frames"
+    how = f"Exact area under the curve, frames without a pose count as 0; {numbers.scored()}; returns after complete "
+    how += "occlusion or out of view, of all seeds: how many were found again, and after how many scored frames"
     how += "; the rate is this machine's, under its load" * numbers.judges
     return Table(numbers.plan.title, heads, lines, groups, words=2, notes=[over, how, *numbers.about()])
 
@@ -106,7 +106,8 @@ def by_pair(numbers: Numbers) -> Table:
     groups = [("", 3), ("over all runs", 2), ("ADD (%) by scene", len(scenes))]
     how = "First line of a tracker: its areas under the curve. Below: with the component less without it, in points, "
     how += "and the 95 % interval of the mean by bootstrap over runs; bold where that leaves out 0"
-    return Table(numbers.plan.title, heads, lines, groups, words=2, rules=rules, notes=[how, *numbers.about()])
+    notes = [how, numbers.scored().capitalize(), *numbers.about()]
+    return Table(numbers.plan.title, heads, lines, groups, words=2, rules=rules, notes=notes)
 
 
 def by_fault(numbers: Numbers) -> Table:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate, status_word
 from p2p_lib.datasets.runs import ObjectRun, Run
-from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures import overlay, style
@@ -33,7 +33,7 @@ class Scene:
 
     def __init__(
         self,
-        sequence: Sequence,
+        sequence: Video,
         run: Run,
         evaluation: Evaluation | None = None,
         boxes: Mapping[str, Box] | None = None,
@@ -205,15 +205,21 @@ class Scene:
         return Label(text, self.colours[name], (*uv.min(0), *uv.max(0)))
 
 
-def beside(scenes: Mapping[str, Scene], count: int, width_px: int = 300, axes: bool = False) -> np.ndarray:
-    """A line of images for each method under its name: the moments that tell the story of the first."""
+def beside(
+    scenes: Mapping[str, Scene], shown: int | Sequence[int], width_px: int = 300, axes: bool = False, across: int = 1
+) -> np.ndarray:
+    """The same frames of each method under its name, one method a line, or ``across`` of them.
+
+    shown  frames, or how many moments that tell the story of the first
+    """
     first = next(iter(scenes.values()))
-    frames = next(iter(first.objects.values())).frame_index[first.moments(count)]
+    if isinstance(shown, int):
+        shown = next(iter(first.objects.values())).frame_index[first.moments(shown)].tolist()
     region_px, images = first.region(), []
     for name, scene in scenes.items():
-        for index in frames.tolist():
+        for index in shown:
             images.append(scene.draw(scene.row(index), region_px, width_px, axes=axes, trail=0, note=name))
-    return overlay.montage(images, columns=count)
+    return overlay.montage(images, columns=across * len(shown))
 
 
 def draw_live(

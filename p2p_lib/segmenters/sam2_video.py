@@ -9,6 +9,7 @@ go; the image's features, which are most of the work, are computed once for all 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,14 +37,23 @@ _READ_ONCE = ("pred_masks", "high_res_masks")
 _SPATIAL = ("maskmem_features", "maskmem_pos_enc")
 
 
-def load(camera: Camera, config: SegmentationConfig) -> Sam2VideoSegmenter:
-    """The segmenter with its checkpoint; :class:`MissingBackend` says what to fetch or install."""
+def load(camera: Camera, config: SegmentationConfig, checkpoint: str = "sam2_video") -> Sam2VideoSegmenter:
+    """The segmenter with a checkpoint, by default that of the smallest network.
+
+    :class:`MissingBackend` says what to fetch or install.
+    """
     packages.load("torch", "sam2_video", "transformers")
     transformers = packages.load("transformers", "sam2_video", "transformers")
-    folder = checkpoints.checked_files("sam2_video")[0].parent
+    folder = checkpoints.checked_files(checkpoint)[0].parent
     # Nothing but tensors is in a file of this kind, and nothing is fetched from elsewhere.
     model = transformers.Sam2VideoModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-    return Sam2VideoSegmenter(model, camera, checkpoints.device())
+    return Sam2VideoSegmenter(model, camera, checkpoints.device(), checkpoint)
+
+
+#: The same with the larger networks.
+load_small, load_base_plus, load_large = (
+    partial(load, checkpoint=f"sam2_video_{size}") for size in ("small", "base_plus", "large")
+)
 
 
 class Sam2VideoSegmenter:
@@ -52,9 +62,8 @@ class Sam2VideoSegmenter:
     It looks at colour alone: hints are not used, and unmeasured pixels are labelled too.
     """
 
-    name = "sam2_video"
-
-    def __init__(self, model: torch.nn.Module, camera: Camera, device: str = "cpu"):
+    def __init__(self, model: torch.nn.Module, camera: Camera, device: str = "cpu", name: str = "sam2_video"):
+        self.name = name
         self._model, self._device, self._camera = model.to(device).eval(), device, camera
         self._size = int(model.config.image_size)
         self._sessions: dict[str, Any] = {}  # None where nothing has been seen of the object yet

@@ -1,7 +1,8 @@
 """TAPNext++ (arXiv:2604.10582): a recurrent tracker of points as tokens, through the official package ``tapnet``.
 
-Causal, frame by frame; its state takes no further queries. Code and weights: Apache-2.0. Last run with tapnet 0.1.0 at
-c2cbab8 (July 2026).
+Causal, frame by frame; its state takes no further queries. Its points see each other, so each query has company, as in
+the authors' submission to VOTSp2026: points around it that are followed with it and not reported. Code and weights:
+Apache-2.0. Last run with tapnet 0.1.0 at c2cbab8 (July 2026).
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 #: Side of the square that images are scaled to; coordinates have one bin per pixel of it.
 SIZE_PX = 256
+#: Points around each query: a grid of so many to a side, which reaches this far from it, in pixels of the raster.
+SUPPORT_SIDE, SUPPORT_REACH_PX = 8, SIZE_PX / 16
 # The uncertainty is the probability that the model puts farther off than this, in pixels of its raster.
 _NEAR_PX = 8
 
@@ -55,22 +58,31 @@ class TapNextRollout:
 
         self._model, self._device, (rgb,) = model, device, images
         xy = to_raster(uv_px, rgb.shape[:2], SIZE_PX)
+        self._count = len(xy)
+        xy = np.concatenate([xy, support_points(xy)])
         tyx = np.concatenate([np.zeros((len(xy), 1)), xy[:, ::-1]], 1).astype(np.float32)
         self._state = self._forward(rgb, query_points=torch.from_numpy(tyx).to(device)[None])[-1]
 
     def step(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions (Q, 2) in pixels, visible (Q,), uncertainty (Q,) in the next image."""
         yx, logits, visible, self._state = self._forward(rgb, state=self._state)
-        yx, logits = yx[0, 0].double(), logits[0, 0].double()
+        yx, logits, visible = (told[0, 0, : self._count].double() for told in (yx, logits, visible))
         sure = _mass_near(yx[:, 0], logits[:, :SIZE_PX]) * _mass_near(yx[:, 1], logits[:, SIZE_PX:])
         uv = from_raster(yx.flip(-1).cpu().numpy(), rgb.shape[:2], SIZE_PX)
-        return uv, (visible[0, 0, :, 0] > 0).cpu().numpy(), 1 - sure.cpu().numpy()
+        return uv, (visible[:, 0] > 0).cpu().numpy(), 1 - sure.cpu().numpy()
 
     def _forward(self, rgb: np.ndarray, **given: Any) -> tuple:
         import torch
 
         with torch.inference_mode():
             return self._model(video=square(rgb, SIZE_PX, self._device), **given)
+
+
+def support_points(xy: np.ndarray) -> np.ndarray:
+    """Points (64 Q, 2) of the raster around queries (Q, 2) of it; none lies farther out than the outermost pixels."""
+    cells = (np.arange(SUPPORT_SIDE) + 0.5) / SUPPORT_SIDE
+    offsets = SUPPORT_REACH_PX * (2 * np.stack(np.meshgrid(cells, cells), -1).reshape(-1, 2) - 1)
+    return np.clip(xy[:, None] + offsets, 0.5, SIZE_PX - 0.5).reshape(-1, 2)
 
 
 def _mass_near(at: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:

@@ -27,7 +27,7 @@ def test_missing_data_is_said_in_few_words(nothing, tmp_path, monkeypatch):
     monkeypatch.setenv("P2P_DATA", str(tmp_path))
     _, ours, *_ = readiness("ho3d").splitlines()
     missing = "ho3d_v3/AP10: not below $P2P_DATA. See p2p data info ho3d_v3. (12 more likewise)"
-    assert ours == f"  Ours: 0 of 13 sequences; else: {missing}"
+    assert ours == f"  Ours; Ours, from clicks: 0 of 13 sequences; else: {missing}"
 
 
 def test_what_is_missing_names_sequences_frames_size_and_command(nothing, tmp_path):

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -93,7 +94,9 @@ def test_frames_in_which_too_little_is_to_be_seen_are_left_out(plan, tmp_path):
     path.write_text("min_mask_px = 1_000_000\n" + plan.read_text())
     found = run_benchmark(path, tmp_path / "out", profile="quick", progress=False, jobs=1)
     assert all("1000000 visible pixels" in outcome.reason for _, outcome in found.results)
-    assert "less than 1000000 pixels" in paper_table(found).files()[".md"]
+    for kind in ("methods", "returns", "runs", "grid", "pairs"):
+        shown = replace(found, plan=found.plan.model_copy(update={"kind": kind}))
+        assert "less than 1000000 pixels" in paper_table(shown).files()[".md"], kind
 
 
 def test_the_summary_spreads_over_seeds(whole):
@@ -243,6 +246,7 @@ def test_what_a_run_doubts_it_keeps_and_other_warnings_are_shown(tmp_path):
 
 INTERRUPTED = """
 import os, signal, sys, threading, time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from p2p_lib.benchmark.execution import execute

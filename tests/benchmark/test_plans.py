@@ -4,20 +4,24 @@ import shutil
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from p2p_lib.benchmark import plan_names, read_plan
+from p2p_lib.benchmark.execution import measured
 from p2p_lib.benchmark.jobs import _present, jobs_of
-from p2p_lib.benchmark.plan import PlannedSequence
+from p2p_lib.benchmark.plan import PROMPTS, PlannedSequence, prompts_file, prompts_places
 from p2p_lib.core.backends import DETECTORS, TRACKERS
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets import checkpoints
 from p2p_lib.datasets.manifests import manifest
 from p2p_lib.datasets.paper_reported import paper_reported
+from p2p_lib.datasets.prompts import load_prompts, save_prompts
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.synthetic import SCENARIOS
-from tests.fixtures.sliding_board import write_sequence
+from tests.fixtures.sliding_board import write_ho3d, write_sequence
 
 PLANS = plan_names()
 
@@ -70,7 +74,7 @@ def test_plans_are_part_of_an_installation():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     patterns = project["tool"]["setuptools"]["package-data"]["p2p_lib"]
     root = Path(__file__).parents[2] / "p2p_lib"
-    assert {path.stem for pattern in patterns for path in root.glob(pattern)} >= set(PLANS)
+    assert {path.stem for pattern in patterns for path in root.glob(pattern)} >= {*PLANS, "mustard0"}
 
 
 def test_what_is_not_there_says_why_and_costs_nothing(monkeypatch):
@@ -116,6 +120,44 @@ def test_masks_of_some_frames_are_not_taken_for_masks_of_every_frame(tmp_path, m
     reasons = {job.method.name: job.reason for job in jobs}
     assert "some of the first frames alone" in reasons["Ours"]
     assert reasons["Ours, first mask"] == reasons["Ours, from clicks"] == ""
+
+
+def test_ho3d_without_masks_starts_from_the_clicks_that_are_kept(tmp_path, monkeypatch):
+    """Without a file it says which is missing and what makes it; with one, that is what the run starts from."""
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    write_ho3d(tmp_path / "HO3D_v3", "SM1")
+    asked = read_plan("ho3d")
+    ours = [method for method in asked.method if method.name in ("Ours", "Ours, from clicks")]
+    mine = [sequence for sequence in asked.full.sequence if sequence.name == "ho3d_v3/SM1"]
+    plan = asked.model_copy(update={"method": ours, "full": asked.full.model_copy(update={"sequence": mine})})
+    by_masks, by_clicks = jobs_of(plan, "full")[::3]
+    file = tmp_path / "prompts/ho3d_v3/SM1.json"
+    assert "ho3d_v3/SM1: masks: there are none" in by_masks.reason, "not run, which no mean counts as 0"
+    assert f"{file}: no such file" in by_clicks.reason
+    assert f"p2p click ho3d_v3/SM1 --out {file}" in by_clicks.reason
+    clicks = np.array([[60.0, 50], [40, 30], [70, 60]])
+    save_prompts(file, [Prompt("can", points_px=clicks)])
+    assert "clicks on 'can', expected the sequence's own names: object" in jobs_of(plan, "full")[3].reason
+    save_prompts(file, [Prompt("object", points_px=clicks)])
+    job = jobs_of(plan, "full")[3]
+    assert job.key and job.options().prompts[0].points_px.tolist() == clicks.tolist()
+    outcome = measured(job, tmp_path / "out")
+    assert max(outcome.objects["object"].first["add_m"]) < 0.005 and outcome.ran["masks"] == "clicks"
+    save_prompts(file, [Prompt("object", points_px=clicks + 1)])
+    assert jobs_of(plan, "full")[3].key not in ("", job.key), "other clicks are another run"
+
+
+def test_clicks_of_ones_own_come_before_those_of_the_package(tmp_path, monkeypatch):
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    shipped = sorted(path.relative_to(PROMPTS).with_suffix("").as_posix() for path in PROMPTS.rglob("*.json"))
+    named = {sequence.name for name in PLANS for sequence in read_plan(name).full.sequence}
+    assert shipped and set(shipped) <= named
+    for name in shipped:
+        assert all(prompt.starts for prompt in load_prompts(prompts_file(name)))
+    own = tmp_path / "prompts" / f"{shipped[0]}.json"
+    save_prompts(own, [Prompt("object", points_px=np.array([[1.0, 2]]))])
+    assert prompts_file(shipped[0]) == own and prompts_file(shipped[1]) == PROMPTS / f"{shipped[1]}.json"
+    assert prompts_places("/somewhere/x") == prompts_places("../x") == () and prompts_file("unheard/of") is None
 
 
 def test_every_sequence_of_a_dataset_that_is_there(tmp_path, monkeypatch):

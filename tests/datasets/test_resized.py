@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.errors import BadInput
-from p2p_lib.datasets.resized import Resized
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.datasets.resized import Resized, resized_prompt
 from p2p_lib.datasets.sequence import open_sequence
 
 
@@ -37,6 +38,19 @@ def test_masks_shrink_and_the_scored_frames_stay(half):
         assert 4 * mask.sum() == pytest.approx(large[name].sum(), rel=0.03)
     assert half.visible_px(3) == half.original.visible_px(3)
     assert half.truth is half.original.truth and len(half) == len(half.original) and half.name == half.original.name
+
+
+def test_a_prompt_stays_on_what_it_was_said_of(half):
+    """Two large pixels' centres meet in the small one's; a mask is that of the smaller image."""
+    mask = half.original.masks(3)["box"]
+    clicks = Prompt(
+        "box", 3, np.array([[0.5, 0.5], [101, 60]]), np.array([[20.5, 8.5]]), np.array([10.5, 4.5, 30.5, 8.5])
+    )
+    small = resized_prompt(clicks, 0.5)
+    assert small.points_px.tolist() == [[0, 0], [50.25, 29.75]] and small.negative_px.tolist() == [[10, 4]]
+    assert small.box_px.tolist() == [5, 2, 15, 4] and small.frame == 3
+    painted = resized_prompt(Prompt("box", 3, mask=mask), 0.5)
+    np.testing.assert_array_equal(painted.mask, half.masks(3)["box"])
 
 
 @pytest.mark.parametrize("scale", [0, -0.5, 1.5])

@@ -4,6 +4,7 @@ What the weights would say is not looked at: coordinates, memory and absence are
 """
 
 import importlib.util
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -301,7 +302,44 @@ def test_it_says_what_to_install_or_fetch(monkeypatch):
         assert "p2p data fetch sam2_video" in str(error.value)
 
 
-def test_the_manifest_names_its_licence_and_option():
-    of = manifest("sam2_video")
-    assert "Apache" in of.licence and of.used_by == "--masks sam2_video"
-    assert {f.path for f in of.files} == {"model.safetensors", "config.json"}
+SIZES = {"sam2_video": "tiny", "sam2_video_small": "small"}
+SIZES |= {"sam2_video_base_plus": "base-plus", "sam2_video_large": "large"}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_the_manifest_names_its_licence_and_option(name):
+    of = manifest(name)
+    assert "Apache" in of.licence and of.used_by == f"--masks {name}"
+    assert {file.path for file in of.files} == {"model.safetensors", "config.json"}
+    assert {file.url.split("/resolve/")[0] for file in of.files} == {of.page}
+    assert of.page.endswith(f"/sam2.1-hiera-{SIZES[name]}")
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_a_size_is_chosen_by_name_and_has_weights_of_its_own(name, tmp_path, monkeypatch):
+    import torch
+
+    class Network(torch.nn.Module):
+        """Knows the folder that it was read from."""
+
+        config = SimpleNamespace(image_size=SIDE)
+
+        @classmethod
+        def from_pretrained(cls, folder, **how):
+            assert how == {"local_files_only": True, "use_safetensors": True}
+            network = cls()
+            network.weights = (folder / "model.safetensors").read_text()
+            return network
+
+    monkeypatch.setattr(packages, "load", lambda *of: SimpleNamespace(Sam2VideoModel=Network))
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    for other in SIZES:
+        for file in manifest(other).files:
+            path = tmp_path / manifest(other).folder / file.path
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(other)
+    segmenter = make_segmenter(name, CAMERA, preset().segmentation)
+    assert segmenter.name == name and segmenter._model.weights == name
+    (tmp_path / manifest(name).folder / "config.json").unlink()
+    with pytest.raises(MissingBackend, match=f"p2p data fetch {name}$"):
+        make_segmenter(name, CAMERA, preset().segmentation)

@@ -16,7 +16,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.image import in_image
 from p2p_lib.core.raster import from_raster, to_raster
 from p2p_lib.core.types import Frame
-from p2p_lib.trackers import rollouts, tapir
+from p2p_lib.trackers import rollouts, tapir, tapnextpp
 from p2p_lib.trackers.cotracker import tracker as cotracker
 from p2p_lib.trackers.rollouts import RolloutTracker
 from p2p_lib.trackers.tapir import TapirTracker
@@ -306,10 +306,90 @@ def test_an_object_hidden_for_300_frames_keeps_its_points(late):
         elif answered >= back and returned is None and len(mine) and mine.visible.all():
             returned = answered - back
             np.testing.assert_allclose(mine.uv_px, [(10 + 3 * k + 40, 20) for k in range(1, 13)])
-    running = [q for q in tracker._queries if q.rollout is not None]
+    running = [q for q in tracker._queries if q.run is not None]
     assert returned is not None and returned <= 6, "all of them, and soon"
     assert len(running) <= rollouts.MAX_ROLLOUTS and max(passes) <= 24
     assert len(tracker._queries) - len(running) <= rollouts.MAX_KEPT
+
+
+class Forgetful:
+    """Knows a point by its number (red) and its look (green), which it follows as that changes slowly.
+
+    A point that it has not seen for ``forgets`` pictures it never sees again.
+    """
+
+    tells, forgets = 10, 20
+
+    def __init__(self, pictures, uv_px):
+        u, v = np.round(uv_px).astype(int).T
+        self.number, self.look = pictures[0][v, u, 0].astype(int), pictures[0][v, u, 1].astype(int)
+        self.unseen = np.zeros(len(uv_px), int)
+
+    def step(self, rgb):
+        uv = np.full((len(self.number), 2), np.nan)
+        self.unseen += 1
+        for row in np.flatnonzero(self.unseen <= self.forgets):
+            for v, u in np.argwhere(rgb[..., 0] == self.number[row])[:1]:
+                if abs(int(rgb[v, u, 1]) - self.look[row]) <= self.tells:
+                    uv[row], self.look[row], self.unseen[row] = (u, v), int(rgb[v, u, 1]), 0
+        return uv, np.isfinite(uv[:, 0]), np.full(len(uv), 0.1)
+
+
+def looks(t, look, numbers=range(1, 9), dx=0):
+    """A black picture with points of these numbers in a row, all of one look."""
+    rgb = np.zeros((*SHAPE, 3), np.uint8)
+    for number in numbers:
+        rgb[20, 10 * number + dx, :2] = number, look
+    return Frame(t, t / 30, rgb, np.ones(SHAPE, np.float32))
+
+
+ROW = np.array([[10.0 * number, 20] for number in range(1, 9)])
+
+
+@pytest.mark.parametrize("back_as", [100, 2])
+def test_what_was_hidden_is_asked_again_as_it_left_and_as_it_was_made(back_as):
+    """It turns slowly, is hidden for longer than the model remembers, and comes back elsewhere."""
+    tracker = RolloutTracker("forgetful", Forgetful, 0)
+    tracker.start(looks(0, 0))
+    tracker.add(ROW)
+    for t in range(1, 101):
+        assert tracker.track(looks(t, t)).visible.all()
+    for t in range(101, 200):
+        assert not tracker.track(looks(t, 0, numbers=())).visible.any()
+    for t in range(200, 203):
+        tracks = tracker.track(looks(t, back_as, dx=5))
+    assert tracks.visible.all()
+    np.testing.assert_allclose(tracks.uv_px - ROW, np.tile([5, 0], (8, 1)))
+    assert len(tracker._queries) == 1
+
+
+def test_a_point_that_the_view_did_not_show_comes_back_with_the_view_that_does():
+    tracker = RolloutTracker("forgetful", Forgetful, 0)
+    tracker.start(looks(0, 0))
+    ids = tracker.add(ROW)
+    for t in range(1, 101):
+        tracker.track(looks(t, t, numbers=range(1, 9) if t < 60 else range(1, 8)))
+    for t in range(101, 200):
+        tracker.track(looks(t, 0, numbers=()))
+    for t in range(200, 203):
+        seen = tracker.track(looks(t, 100)).visible
+    assert seen[:7].all() and not seen[7], "it is asked from a view without it"
+    for t in range(203, 203 + 100 + rollouts.PATIENCE):
+        tracks = tracker.track(looks(t, max(0, 302 - t)))
+    assert tracks.visible.all() and tracks.ids.tolist() == ids.tolist()
+
+
+def test_a_view_in_which_points_are_wrong_is_none_to_ask_them_from():
+    tracker = RolloutTracker("forgetful", Forgetful, 0)
+    tracker.start(looks(0, 0))
+    ids = tracker.add(ROW)
+    for t in range(1, 101):
+        tracker.track(looks(t, t))
+        tracker.reject(ids[6:] if t < 100 else ids[2:])  # at last too many for a view
+    tracker.track(looks(101, 0, numbers=()))
+    (queries,) = tracker._queries
+    assert queries.best.rgb[20, 10, 1] == 99, "not the picture in which most are wrong"
+    assert np.isfinite(queries.best.uv_px[:, 0]).tolist() == [True] * 6 + [False] * 2
 
 
 def test_kept_queries_are_bounded(monkeypatch):
@@ -323,6 +403,52 @@ def test_kept_queries_are_bounded(monkeypatch):
         tracks = tracker.track(value(t))
     assert len(tracker._queries) == 5 and len(tracks) == 15
     assert not any(2 in queries.ids for queries in tracker._queries), "the fewest go first"
+
+
+# --- TAPNext++ -----------------------------------------------------------------------------------
+
+
+class ColourTapNext(torch.nn.Module):
+    """Looks for each point's colour, takes the first place that has it, and moves all points as most of them moved."""
+
+    def forward(self, video, query_points=None, state=None):
+        picture = video[0, 0]
+        if state is None:
+            assert (query_points[..., 0] == 0).all() and query_points[..., 1:].min() >= 0
+            at = query_points[0, :, 1:]
+            assert at.max() < picture.shape[0]
+            state = at, picture[at[:, 0].long(), at[:, 1].long()]
+        start, colour = state
+        best = torch.cdist(colour, picture.reshape(-1, 3)).argmin(1)
+        found = torch.stack([best // picture.shape[1], best % picture.shape[1]], -1) + 0.5
+        yx = start + (found - (start.floor() + 0.5)).median(0).values
+        bins = torch.arange(picture.shape[1]) + 0.5
+        logits = torch.cat([-(bins - yx[:, k : k + 1]).abs() for k in range(2)], 1)
+        return yx[None, None], logits[None, None], torch.ones(1, 1, len(yx), 1), state
+
+
+def test_a_point_without_texture_of_its_own_is_followed_by_its_surroundings():
+    """Its colour is seen first elsewhere in the picture; what is around it tells where it went."""
+    tracker, uv = tapnextpp.tracker(ColourTapNext()), np.array([[90.0, 60]])
+    pictures = []
+    for t, moved in enumerate((0, 2, 5)):
+        rgb = ramps(t, moved, moved).rgb.copy()
+        rgb[59 + moved : 62 + moved, 89 + moved : 92 + moved] = rgb[2:5, 2:5] = 0
+        pictures.append(Frame(t, t / 30, rgb, np.ones(SHAPE, np.float32)))
+    tracker.start(pictures[0])
+    ids = tracker.add(uv)
+    for picture, moved in zip(pictures[1:], (2, 5), strict=True):
+        tracks = tracker.track(picture)
+        assert tracks.ids.tolist() == ids.tolist() and tracks.visible.all()
+        np.testing.assert_allclose(tracks.uv_px, uv + moved, atol=0.6)
+        assert tracks.uncertainty[0] < 0.01
+
+
+def test_support_points_lie_around_their_query_and_within_the_picture():
+    around = tapnextpp.support_points(np.array([[128.0, 100], [3, 255]])).reshape(2, 64, 2)
+    np.testing.assert_allclose(around[0].mean(0), [128, 100])
+    assert np.abs(around[0] - [128, 100]).max() == 14 and len(np.unique(around[0], axis=0)) == 64
+    assert around[1].min() == 0.5 and around[1].max() == 255.5
 
 
 # --- CoTracker3 ----------------------------------------------------------------------------------
