@@ -110,7 +110,7 @@ def check_folder(
             masks.append(sequence.masks(i) or {})
         except P2PError as error:
             wrong.append(_unreadable("files", error))
-    if wrong:
+    if wrong := wrong or _cut_off(sequence):
         return wrong
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", Doubt)
@@ -152,6 +152,16 @@ def _unreadable(name: str, error: P2PError, fix: str = "") -> Finding:
         return Finding(name, Level.WRONG, text, fix or error.fix)
     text = f"{error.name}: {error.expected}" if isinstance(error, MissingData) and fix else str(error)
     return Finding(name, Level.WRONG, text, fix)
+
+
+def _cut_off(sequence: Sequence) -> list[Finding]:
+    """Images that end too early: of all, not only of those that are looked at."""
+    files = [*getattr(sequence, "rgb", ()), *getattr(sequence, "depth", ())]
+    found = [path for path in files if path.is_file() and images.is_cut_off(path)]
+    if not found:
+        return []
+    text = f"{len(found)} of {len(files)} images end too early, the first: {found[0]} ({found[0].stat().st_size} bytes)"
+    return [Finding("files", Level.WRONG, text, f"Copy them again. {images.SKIP_BAD}")]
 
 
 def _files(folder: Path) -> list[Finding]:

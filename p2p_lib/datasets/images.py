@@ -185,6 +185,14 @@ def read_raw_depth(path: Path) -> np.ndarray:
     return raw
 
 
+def is_cut_off(path: Path) -> bool:
+    """Whether a file is empty, or a PNG without its end, as when it was copied in part; without decoding it."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - 12, 0))
+        return size == 0 or (path.suffix.lower() == ".png" and b"IEND" not in file.read())
+
+
 def check_size(
     path: Path, image: np.ndarray, shape: tuple[int, int], like: str = "the colour image", fix: str = ""
 ) -> None:

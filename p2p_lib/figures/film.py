@@ -14,7 +14,7 @@ from PIL import Image
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.packages import needed_for
 from p2p_lib.core.progress import progress_bar
-from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.datasets.sequence import LIVE, Sequence, reopen
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.scenes import Scene
 
@@ -43,6 +43,8 @@ def write_film(
     check_suffix(out)
     playback = Playback.of(run, sequence)
     if playback.sequence is None:
+        if playback.run.info["format"] == LIVE:
+            reopen(playback.run.info)  # says why there are none
         where = playback.run.info["path"] or playback.run.info["sequence"]
         raise MissingData(str(where), "no such folder, so there are no images to draw on", "Put it back there.")
     scene, for_a_page = Scene.of(playback), Path(out).suffix != ".mp4"
