@@ -97,12 +97,12 @@ def check_folder(
 
     Files that are missing or cannot be read are findings too, all that can be told without each other.
     """
-    config = config or preset()
+    config, other = config or preset(), format not in (None, "folder")
     try:
         opened = open_sequence(sequence, format, depth_scale)
     except P2PError as error:
-        own = isinstance(sequence, str | Path) and format in (None, "folder")
-        return (_files(Path(sequence).expanduser()) if own else []) or [_unreadable("files", error)]
+        own = _files(Path(sequence).expanduser()) if isinstance(sequence, str | Path) and not other else []
+        return own or [_unreadable("files", error)]
     sequence, frames, masks, wrong = opened, [], [], []
     for i in np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist():
         try:
@@ -140,8 +140,8 @@ def check_folder(
             findings.append(_size(name, sizes_m[name], frame, mask, sequence.camera))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         findings.append(_range(name, frame, mask, config, scale))
-        own = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
-        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in own]
+        said = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
+        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in said]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
     return findings
 

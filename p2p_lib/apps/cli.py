@@ -194,7 +194,7 @@ def _eval(a: argparse.Namespace) -> None:
     elif a.poses is not None:
         from p2p_lib.run import evaluate_poses
 
-        how = {"format": options.format, "start": options.start, "stop": options.stop}
+        how: dict[str, Any] = {"format": options.format, "start": options.start, "stop": options.stop}
         _show(evaluate_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how), a.json)
     else:
         _eval_run(a, options)
@@ -301,9 +301,9 @@ def _benchmark(a: argparse.Namespace) -> int:
         print("".join(f"{line}\n" for line in what_to_fetch(benchmark)), end="")
         if a.tables:
             done = [(job, outcome) for job, outcome in benchmark.results if outcome.status == "done"]
-            made = {"runs": f"{len(done)} of {len(benchmark.results)}"}
+            made: dict[str, str | None] = {"runs": f"{len(done)} of {len(benchmark.results)}"}
             made |= {"seeds": ", ".join(map(str, sorted({job.seed for job, _ in done})))}
-            made |= {"commit": next((str(outcome.ran.get("commit")) for _, outcome in done), None)}
+            made["commit"] = next((str(outcome.ran.get("commit")) for _, outcome in done), None)
             save_table(paper_table(benchmark), benchmark.plan.name, sources=[benchmark], parameters=made, to=a.tables)
     if any(benchmark.interrupted for benchmark in benchmarks):
         raise KeyboardInterrupt

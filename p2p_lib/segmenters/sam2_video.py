@@ -54,7 +54,7 @@ class Sam2VideoSegmenter:
 
     name = "sam2_video"
 
-    def __init__(self, model: torch.nn.Module, camera: Camera, device: str = "cpu"):
+    def __init__(self, model: Any, camera: Camera, device: str = "cpu"):
         self._model, self._device, self._camera = model.to(device).eval(), device, camera
         self._size = int(model.config.image_size)
         self._sessions: dict[str, Any] = {}  # None where nothing has been seen of the object yet

@@ -96,7 +96,7 @@ class RolloutTracker(PointTracker):
         tracks = self._ids.unseen()
         for queries in self._queries:
             if queries.rollout is not None:
-                self._step(queries, frame, tracks)
+                self._step(queries, queries.rollout, frame, tracks)
         self._bound()
         return tracks
 
@@ -118,9 +118,9 @@ class RolloutTracker(PointTracker):
         """A rollout of these queries; the image in which they were made stands in the place of the one answered."""
         queries.rollout = self._make([queries.rgb, *list(self._recent)[1:]], queries.uv_px)
 
-    def _step(self, queries: _Queries, frame: Frame, tracks: Tracks) -> None:
-        """Put what a rollout says of the next frame into the tracks."""
-        uv, visible, uncertainty = queries.rollout.step(frame.rgb)
+    def _step(self, queries: _Queries, rollout: Rollout, frame: Frame, tracks: Tracks) -> None:
+        """Put what a rollout of these queries says of the next frame into the tracks."""
+        uv, visible, uncertainty = rollout.step(frame.rgb)
         live = np.isin(queries.ids, tracks.ids)
         rows = np.searchsorted(tracks.ids, queries.ids[live])
         tracks.uv_px[rows], tracks.uncertainty[rows] = uv[live], np.clip(uncertainty[live], 0, 1)

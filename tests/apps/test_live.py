@@ -22,6 +22,7 @@ from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
 from p2p_lib.apps.live_words import Outlet, Words
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
+from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -35,6 +36,7 @@ from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import write_film
 from p2p_lib.run import run
+from p2p_lib.trackers.lk import LkTracker
 from tests.apps.test_cli import POINTS_ALONE
 from tests.fixtures.sliding_board import H, K, W, write_sequence
 
@@ -174,6 +176,13 @@ def test_slow_processing_drops_frames_and_counts_them(folder):
     assert [e.frame_index for e in got] == sorted({e.frame_index for e in got}) and got[0].frame_index == 0
     assert count.dropped == got[-1].frame_index + 1 - len(got), "what lies between two that were tracked"
     assert f"{count.frames} frames in " in str(count) and f"{count.dropped} dropped" in str(count)
+
+
+def test_a_tracker_that_is_made_already_is_taken(folder):
+    got: list[PoseEstimate] = []
+    options = RunOptions(settings=SETTINGS, tracker=LkTracker(preset().tracking, np.random.default_rng(0)), stop=4)
+    track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, got.append, options)
+    assert [estimate.frame_index for estimate in got] == [0, 1, 2, 3]
 
 
 def test_live_estimates_are_those_of_a_run(folder, tmp_path):
