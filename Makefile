@@ -57,8 +57,10 @@ bench: setup ## what it costs as it grows, beside its peers, into benchmarks/REA
 lab: setup ## open JupyterLab on the notebooks
 	@P2P_FIGURES="$(CURDIR)/out/lab/figures" .venv/bin/jupyter lab $(if $(filter 0,$(shell id -u)),--allow-root) --log-level=WARN --notebook-dir=. notebooks/00_quickstart.ipynb
 
-lock: setup ## resolve requirements.lock anew from pyproject.toml and pins.txt (no host in it)
-	@.venv/bin/uv pip compile --quiet --upgrade --universal --python-version 3.11 --extra dev --constraint pins.txt \
-	    --no-emit-package p2p-lib --no-emit-index-url --no-annotate --no-header --output-file .venv/resolved pyproject.toml
+lock: setup ## resolve requirements.lock anew from pyproject.toml and pins.txt, and constraints.txt (no host in them)
+	@.venv/bin/uv pip compile --quiet --upgrade --universal --python-version 3.11 --extra dev --generate-hashes \
+	    --no-emit-package p2p-lib --no-emit-index-url --no-annotate --no-header --output-file .venv/resolved \
+	    pyproject.toml pins.txt
 	@# What torch's CUDA build needs is pinned by torch itself, and its CPU build does without.
-	@grep -vE '^(nvidia-|cuda-|triton)' .venv/resolved > requirements.lock
+	@awk '/^[^ ]/ { keep = !/^(nvidia-|cuda-|triton)/ } keep' .venv/resolved > requirements.lock
+	@sed -n 's/ \\$$//; /^[^ ]/p' requirements.lock > constraints.txt

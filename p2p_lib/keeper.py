@@ -25,7 +25,6 @@ from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation.consistency import consistency
-from p2p_lib.evaluation.known_size import size_doubts
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.method.object_model import Known
 
@@ -105,12 +104,9 @@ class Keeper:
         """
         self.writer.info["doubts"] = list(dict.fromkeys(self.doubts))
         self.writer.flush()
-        seen = (sequence, RUN_LOOKS) if sequence is not None else (Stream("", self.method.camera), 0)
-        found = consistency(load_run(self.writer.path), *seen)
-        told = {name: [suspicion.text for suspicion in of] for name, of in found.suspicions.items()}
-        for name, text in size_doubts(self.writer.path, self.sizes_m).items():
-            told[name] = [text, *told[name]]
-        self.writer.info["look_at"] = told
+        seen, looks = (Stream("", self.method.camera), 0) if sequence is None else (sequence, RUN_LOOKS)
+        found = consistency(load_run(self.writer.path), seen, looks, self.sizes_m)
+        self.writer.info["look_at"] = {name: [why.text for why in of] for name, of in found.suspicions.items()}
 
 
 @contextmanager

@@ -381,7 +381,8 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
     except MissingData as error:
         evaluation, not_scored = None, str(error)
     if not any(obj.has_truth.any() for obj in done.objects.values()):
-        not_scored = "the sequence has no truth (looked for in annotated_poses/ of a folder)"
+        of = f" of {', '.join(done.objects)}, only of {', '.join(job.sequence.truth)}" if job.sequence.truth else ""
+        not_scored = f"the sequence has no truth{of or ' (looked for in annotated_poses/ of a folder)'}"
     tracked = any(obj.has_pose.any() for obj in done.objects.values())
     advice = "" if interrupted else _advice(done, job)
     look_at = [f"{name}: {text}" for name, of in (done.info.get("look_at") or {}).items() for text in of]
@@ -414,7 +415,9 @@ def _advice(run: Run, job: _Job) -> str:
     if not reasons:
         return ""
     why = " ".join(reasons.values())
-    if "pixels with depth" in why:
+    if set(reasons) <= set(job.memories):
+        fix = "is it in view, and seen from a side that was learnt? Else click on it"
+    elif "pixels with depth" in why:
         fix = "its depth is missing or out of range, or in another unit (--depth-scale)"
     elif "not seen yet" in why and not job.masks.every_mask:
         fix = "click in the middle of it, elsewhere"

@@ -19,6 +19,8 @@ from p2p_lib import Point2Pose, preset
 from p2p_lib.apps import cli, command_line  # noqa: F401 - importing cli declares the commands
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame, Status
+from p2p_lib.datasets.images import save_png
+from p2p_lib.datasets.sequence import open_sequence
 from studies.runner import list_notebooks
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -140,6 +142,27 @@ def test_the_example_tracker_tracks():
         estimate = method.step(Frame(k, k / 30, rgb, np.full((120, 160), 0.8, np.float32)), {"poster": mask})["poster"]
     assert estimate.status is Status.TRACKED and estimate.inliers >= 20
     np.testing.assert_allclose(estimate.T_cam_obj[:3, :3], np.eye(3), atol=1e-6)
+
+
+def test_the_example_loader_loads(tmp_path, monkeypatch):
+    """The loader of CONTRIBUTING.md, taken from there, by ``--format``'s name for it."""
+    source = re.search(
+        r"```python\n(import numpy as np\n\nfrom p2p_lib import Camera.*?)```", read("CONTRIBUTING.md"), re.DOTALL
+    )
+    (tmp_path / "documented_loader.py").write_text(source[1])
+    monkeypatch.syspath_prepend(str(tmp_path))
+    mask = np.zeros((480, 640), bool)
+    mask[100:200, 100:200] = True
+    for part, image in (
+        ("color", np.zeros((480, 640, 3), np.uint8)),
+        ("depth16", np.full((480, 640), 6000, np.uint16)),
+    ):
+        save_png(tmp_path / "mine" / part / "0.png", image)
+    save_png(tmp_path / "mine/masks/mug/0.png", mask)
+    np.savetxt(tmp_path / "mine/K.txt", [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+    sequence = open_sequence(tmp_path / "mine", format="documented_loader:load")
+    assert np.allclose(sequence.frame(0).depth_m, 0.6) and sequence.camera.fx == 500
+    np.testing.assert_array_equal(sequence.masks(0)["mug"], mask)
 
 
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):

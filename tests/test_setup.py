@@ -21,7 +21,7 @@ import p2p_lib
 
 PROJECT = Path(__file__).resolve().parents[1]
 PYPROJECT = tomllib.loads((PROJECT / "pyproject.toml").read_text())
-LOCK = (PROJECT / "requirements.lock").read_text()
+HASHED, LOCK = ((PROJECT / name).read_text() for name in ("requirements.lock", "constraints.txt"))
 REQUIRED = set("jupyterlab numpy torch opencv-python-headless gtsam open3d trimesh matplotlib pandas papermill".split())
 OURS = {"p2p_lib", "studies"}
 #: Import name to distribution, where they differ; and what comes as a part of another.
@@ -46,7 +46,7 @@ def checkout(tmp_path):
     """What the bootstrap reads, in a folder with a space in its name."""
     folder = tmp_path / "a clone"
     (folder / "tools").mkdir(parents=True)
-    for name in ("tools/bootstrap.py", "pyproject.toml", "requirements.lock", "pins.txt"):
+    for name in ("tools/bootstrap.py", "pyproject.toml", "requirements.lock", "constraints.txt", "pins.txt"):
         shutil.copy(PROJECT / name, folder / name)
     return folder
 
@@ -115,6 +115,34 @@ def test_lock_pins_everything_declared_and_names_no_host():
             assert need.specifier.contains(version), f"{need} but the lock has {version}: run make lock"
 
 
+def test_the_lock_has_a_hash_for_everything_and_the_constraints_are_the_same_without():
+    entries = re.findall(r"(?m)^(\S.*?)((?: \\\n    --hash=sha256:[0-9a-f]{64})*)$", HASHED)
+    assert [pin for pin, _ in entries] == LOCK.splitlines()
+    assert [pin for pin, hashes in entries if not hashes] == []
+    assert "://" not in HASHED and set(re.findall(r"--[\w-]+", HASHED)) == {"--hash"}
+
+
+def test_the_installer_is_held_by_a_hash_too(bootstrap):
+    hand = [line.split()[0] for line in (PROJECT / "pins.txt").read_text().splitlines() if line.startswith("uv")]
+    assert [bootstrap.locked("uv").split()[0]] == hand and bootstrap.locked("uv").count("--hash=sha256:") > 5
+    assert len(re.findall(r"(?m)^\w", bootstrap.locked("uv"))) == 1
+
+
+@pytest.mark.parametrize("build", ["cpu", "cuda"])
+def test_everything_is_installed_by_its_hash(checkout, bootstrap, monkeypatch, build):
+    """But for the libraries of CUDA, where torch is the build that needs them."""
+    use(bootstrap, checkout, monkeypatch)
+    (checkout / f".venv/lib/python3/site-packages/torch-2.13.0+{build}.dist-info").mkdir(parents=True)
+    asked = []
+    monkeypatch.setattr(bootstrap, "run", lambda *command, **_: asked.append([str(word) for word in command]) or True)
+    bootstrap.install_packages(build)
+    free = [
+        words for words in asked if "--require-hashes" not in words and "-e" not in words and "uninstall" not in words
+    ]
+    assert all("--no-deps" in words for words in asked if words not in free)
+    assert [words[-1] for words in free if "--no-deps" not in words] == ["torch==2.13.0"] * (build == "cuda")
+
+
 def test_lock_fits_every_python():
     for version in ("3.11.7", "3.12.1", "3.13.0"):
         environment = {"python_full_version": version, "python_version": version[:4], "sys_platform": "linux"}
@@ -151,7 +179,9 @@ def test_second_call_is_instant_and_changes_nothing(checkout, bootstrap):
     assert time.monotonic() - start < 5  # an installation takes far longer, a busy machine not
 
 
-@pytest.mark.parametrize("changed", ["requirements.lock", "pyproject.toml", "pins.txt", "tools/bootstrap.py"])
+@pytest.mark.parametrize(
+    "changed", ["requirements.lock", "constraints.txt", "pyproject.toml", "pins.txt", "tools/bootstrap.py"]
+)
 def test_a_change_sets_up_anew(checkout, bootstrap, changed):
     make_whole(checkout, bootstrap)
     with open(checkout / changed, "a") as file:

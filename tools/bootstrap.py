@@ -12,6 +12,7 @@ A stamp in .venv makes the next call instant. A call that was killed half-way is
 import fcntl
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,7 +24,8 @@ ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 STAMP = VENV / ".p2p-stamp"
-LOCK, PINS = ROOT / "requirements.lock", ROOT / "pins.txt"
+# Every package with the hashes of its files, the same without, and what was chosen by hand.
+LOCK, CONSTRAINTS, PINS = ROOT / "requirements.lock", ROOT / "constraints.txt", ROOT / "pins.txt"
 UNFINISHED = "unfinished"
 # Where Debian and Fedora keep the certificates they trust, those of a company's proxy among them.
 CERTIFICATES = (Path("/etc/ssl/certs/ca-certificates.crt"), Path("/etc/pki/tls/certs/ca-bundle.crt"))
@@ -83,7 +85,7 @@ def torch_build():
 
 def stamp_of(root, build):
     """Where and what a finished set-up is of; anything else in the stamp means: set up again."""
-    names = ("requirements.lock", "pins.txt", "pyproject.toml", "tools/bootstrap.py")
+    names = ("requirements.lock", "constraints.txt", "pins.txt", "pyproject.toml", "tools/bootstrap.py")
     parts = [(root / name).read_bytes() for name in names]
     return f"{root}\n{hashlib.sha256(build.encode().join(parts)).hexdigest()}"
 
@@ -107,13 +109,21 @@ def create_venv():
         sys.exit(f"p2p: this Python cannot make environments. On Debian/Ubuntu: sudo apt-get install -y {package}")
 
 
+def pinned_torch():
+    return next(line.split()[0] for line in PINS.read_text().splitlines() if line.startswith("torch=="))
+
+
+def cpu_build():
+    """Whether .venv has torch's build for the CPU."""
+    return any(VENV.glob("lib/*/site-packages/torch-*+cpu.dist-info"))
+
+
 def install_torch(uv, build):
     """The CPU build from pip's find-links, else this machine's build from PyTorch's index, else PyPI's by the lock."""
-    torch = next(line.split()[0] for line in PINS.read_text().splitlines() if line.startswith("torch=="))
-    has_cpu = any(VENV.glob("lib/*/site-packages/torch-*+cpu.dist-info"))
-    if has_cpu and build == "cpu":
+    torch = pinned_torch()
+    if cpu_build() and build == "cpu":
         return
-    if has_cpu:
+    if cpu_build():
         run(*uv[:2], "uninstall", *uv[3:], "torch")
     if build == "cpu":
         with tempfile.TemporaryDirectory(dir=VENV) as folder:
@@ -129,20 +139,32 @@ def install_torch(uv, build):
         say("that index cannot be reached; PyPI's build follows (CUDA, 2.6 GB, runs without a GPU as well)")
 
 
+def locked(name):
+    """The lines of a package in the lock: its version, and the hashes that its file has to have."""
+    return re.search(rf"(?m)^{name}==.*(?:\n +--hash=.*)+", LOCK.read_text())[0]
+
+
 def install_packages(build):
     if any(path.exists() for path in CERTIFICATES):
         os.environ.setdefault("UV_SYSTEM_CERTS", "true")
     say("installer")
     pip = [PYTHON, "-m", "pip", "install", "-q", "--disable-pip-version-check"]
-    if not run(*pip, "-c", PINS, "uv"):
+    with tempfile.TemporaryDirectory(dir=VENV) as folder:
+        (Path(folder) / "uv.txt").write_text(locked("uv"))
+        installed = run(*pip, "--require-hashes", "--no-deps", "-r", Path(folder) / "uv.txt")
+    if not installed:
         sys.exit("p2p: pip cannot install uv: is there a network, or a mirror in pip's configuration?")
     quiet = [] if sys.stderr.isatty() else ["-q"]
     uv = [VENV / "bin" / "uv", "pip", "install", *quiet, "--python", PYTHON]
     install_torch(uv, build)
     say("packages of requirements.lock")
     # Plain pip is slower and knows mirrors that are configured for pip alone.
-    if not (run(*uv, "-r", LOCK) or run(*pip, "-r", LOCK)):
+    # The lock is whole: with --no-deps nothing comes that is not in it.
+    whole = ("--require-hashes", "--no-deps", "-r", LOCK)
+    if not (run(*uv, *whole) or run(*pip, *whole)):
         sys.exit("p2p: installing requirements.lock failed, see above; `make setup` tries again")
+    if not cpu_build():  # the libraries of CUDA, of which torch itself names the versions
+        run(*uv, "-c", CONSTRAINTS, pinned_torch()) or run(*pip, "-c", CONSTRAINTS, pinned_torch())
     if not (run(*uv, "--no-deps", "-e", ROOT) or run(*pip, "--no-deps", "-e", ROOT)):
         sys.exit("p2p: installing p2p_lib failed, see above; `make setup` tries again")
     for name, text in JUPYTER_SETTINGS.items():

@@ -57,8 +57,8 @@ def tried(artefact, home):
     """What a clean environment with it alone says of its version, after it has tracked a few frames."""
     python = home / "bin/python"
     subprocess.run([UV, "venv", "--quiet", "--python", sys.executable, home], check=True)
-    lock = ROOT / "requirements.lock"
-    subprocess.run([UV, "pip", "install", "--quiet", "--python", python, "-c", lock, artefact], check=True)
+    versions = ROOT / "constraints.txt"
+    subprocess.run([UV, "pip", "install", "--quiet", "--python", python, "-c", versions, artefact], check=True)
     env = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL_ENV"))}
     how = {"cwd": home, "env": env, "check": True, "text": True, "stdout": subprocess.PIPE}
     subprocess.run([python.with_name("p2p"), "run", "synthetic/crossing", "--stop", "3", "--out", "run"], **how)

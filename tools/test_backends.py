@@ -47,7 +47,7 @@ def install():
     names = ("transformers", "einshape", "tree", "einops", *ALONE)
     missing = set(subprocess.check_output([PYTHON, "-c", lacking, *names], text=True).split())
     if missing - set(ALONE):
-        subprocess.run([*uv, "-c", ROOT / "requirements.lock", *WHOLE], check=True)
+        subprocess.run([*uv, "-c", ROOT / "constraints.txt", *WHOLE], check=True)
     for name in missing & set(ALONE):
         subprocess.run([*uv, "--no-deps", ALONE[name]], check=True)
     install_torchvision(uv)

@@ -97,12 +97,12 @@ def check_folder(
 
     Files that are missing or cannot be read are findings too, all that can be told without each other.
     """
-    config = config or preset()
+    config, other = config or preset(), format not in (None, "folder")
     try:
         opened = open_sequence(sequence, format, depth_scale)
     except P2PError as error:
-        own = isinstance(sequence, str | Path) and format in (None, "folder")
-        return (_files(Path(sequence).expanduser()) if own else []) or [_unreadable("files", error)]
+        own = _files(Path(sequence).expanduser()) if isinstance(sequence, str | Path) and not other else []
+        return own or [_unreadable("files", error)]
     sequence, frames, masks, wrong = opened, [], [], []
     for i in np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist():
         try:
@@ -110,7 +110,7 @@ def check_folder(
             masks.append(sequence.masks(i) or {})
         except P2PError as error:
             wrong.append(_unreadable("files", error))
-    if wrong:
+    if wrong := wrong or _cut_off(sequence):
         return wrong
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", Doubt)
@@ -140,8 +140,8 @@ def check_folder(
             findings.append(_size(name, sizes_m[name], frame, mask, sequence.camera))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         findings.append(_range(name, frame, mask, config, scale))
-        own = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
-        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in own]
+        said = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
+        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in said]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
     return findings
 
@@ -152,6 +152,16 @@ def _unreadable(name: str, error: P2PError, fix: str = "") -> Finding:
         return Finding(name, Level.WRONG, text, fix or error.fix)
     text = f"{error.name}: {error.expected}" if isinstance(error, MissingData) and fix else str(error)
     return Finding(name, Level.WRONG, text, fix)
+
+
+def _cut_off(sequence: Sequence) -> list[Finding]:
+    """Images that end too early: of all, not only of those that are looked at."""
+    files = [*getattr(sequence, "rgb", ()), *getattr(sequence, "depth", ())]
+    found = [path for path in files if path.is_file() and images.is_cut_off(path)]
+    if not found:
+        return []
+    text = f"{len(found)} of {len(files)} images end too early, the first: {found[0]} ({found[0].stat().st_size} bytes)"
+    return [Finding("files", Level.WRONG, text, f"Copy them again. {images.SKIP_BAD}")]
 
 
 def _files(folder: Path) -> list[Finding]:

@@ -194,7 +194,7 @@ def _eval(a: argparse.Namespace) -> None:
     elif a.poses is not None:
         from p2p_lib.run import evaluate_poses
 
-        how = {"format": options.format, "start": options.start, "stop": options.stop}
+        how: dict[str, Any] = {"format": options.format, "start": options.start, "stop": options.stop}
         _show(evaluate_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how), a.json)
     else:
         _eval_run(a, options)
@@ -211,8 +211,7 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
 
     run = load_run(a.run)
     score, not_scored = None, ""
-    for name, text in size_doubts(a.run, lengths_m(options.sizes, run.objects)).items():
-        warn(f"p2p eval: {name}: {text}")
+    known_m = lengths_m(options.sizes, run.objects)
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
             score = evaluate(run, options.models, a.align, a.min_visible_px)
@@ -222,7 +221,9 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
             not_scored = str(error)
     elif given_models(options.models or {}, run.objects):
         warn("p2p eval: --models is not used, because the run has no truth.")
-    _show(score or replace(consistency(run), not_scored=not_scored), a.json)
+    for name, text in size_doubts(a.run, known_m).items() if score else ():
+        warn(f"p2p eval: {name}: {text}")
+    _show(score or replace(consistency(run, known_m=known_m), not_scored=not_scored), a.json)
     if not (score or a.json or (a.run / MASK_LOG).is_file()):
         then = f"Next: {again(run.info, a.run)} --force"
         warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")
@@ -300,9 +301,9 @@ def _benchmark(a: argparse.Namespace) -> int:
         print("".join(f"{line}\n" for line in what_to_fetch(benchmark)), end="")
         if a.tables:
             done = [(job, outcome) for job, outcome in benchmark.results if outcome.status == "done"]
-            made = {"runs": f"{len(done)} of {len(benchmark.results)}"}
+            made: dict[str, str | None] = {"runs": f"{len(done)} of {len(benchmark.results)}"}
             made |= {"seeds": ", ".join(map(str, sorted({job.seed for job, _ in done})))}
-            made |= {"commit": next((str(outcome.ran.get("commit")) for _, outcome in done), None)}
+            made["commit"] = next((str(outcome.ran.get("commit")) for _, outcome in done), None)
             save_table(paper_table(benchmark), benchmark.plan.name, sources=[benchmark], parameters=made, to=a.tables)
     if any(benchmark.interrupted for benchmark in benchmarks):
         raise KeyboardInterrupt
@@ -413,10 +414,12 @@ def _view(a: argparse.Namespace) -> None:
     arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF)"),
 )
 def _film(a: argparse.Namespace) -> None:
+    from p2p_lib.datasets.runs import read_info
     from p2p_lib.figures.film import write_film
 
     print(f"Written to {write_film(a.run, a.out or a.run / 'film.mp4', width_px=a.width, progress=True)}")
-    if not (a.run / "masks").is_dir():
+    info = read_info(a.run) or {}
+    if info.get("masks") != "dataset" and not (a.run / info.get("masks_in", "") / "masks").is_dir():
         warn("p2p film: no masks were kept, so none is outlined. p2p run --save-masks keeps them.")
 
 

@@ -195,10 +195,12 @@ class _Handler(BaseHTTPRequestHandler):
         token, slash, place = self.path.removeprefix("/").partition("/")
         # A page from elsewhere whose name leads to this machine says that name; one that sends something, its own.
         if not _HERE.fullmatch(host) or origin not in (None, f"http://{host}"):
-            return self._refuse(HTTPStatus.FORBIDDEN, "expected Host and Origin of this machine")
-        if not slash or not secrets.compare_digest(token.encode(), self.clicker.token.encode()):
-            return self._refuse(HTTPStatus.NOT_FOUND, "no such page: take the whole address that was printed")
-        return place
+            self._refuse(HTTPStatus.FORBIDDEN, "expected Host and Origin of this machine")
+        elif not slash or not secrets.compare_digest(token.encode(), self.clicker.token.encode()):
+            self._refuse(HTTPStatus.NOT_FOUND, "no such page: take the whole address that was printed")
+        else:
+            return place
+        return None
 
     def do_GET(self) -> None:
         place = self._place()

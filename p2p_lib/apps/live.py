@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -107,19 +108,21 @@ def track_live(
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
     warm_up(say)
     recall(method, memories, options.frozen)
-    if options.tracker.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
+    named = options.tracker if isinstance(options.tracker, str) else ""
+    if named.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
     said = list(prompts)
     with ExitStack() as kept:
-        listeners = [lambda _, estimates: [on_estimate(estimate) for estimate in estimates.values()]]
+        listeners: list[Listener] = [lambda _, estimates: deque(map(on_estimate, estimates.values()), 0)]
         if overlay is not None:
             listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
         if out is not None:
             listeners.append(kept.enter_context(_kept(out, camera, method, options, said, memories, if_exists)))
 
         def tell(estimates: dict[str, PoseEstimate]) -> None:
-            for listen in listeners if method.frame is not None else ():
-                listen(method.frame, estimates)
+            if (of := method.frame) is not None:
+                for listen in listeners:
+                    listen(of, estimates)
 
         start_s = monotonic()
         newest = kept.enter_context(Newest(camera, {p.frame for p in prompts}, backlog))

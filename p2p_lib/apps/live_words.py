@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, in_a_line
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.datasets.prompts import parse_prompts
+from p2p_lib.datasets.prompts import KEYS, parse_prompts
 from p2p_lib.extended.default import Point2Pose
 
 _FORM = '{"name": "mug", "points": [[x, y], ...]} or {"remove": "mug"}'
@@ -67,7 +67,12 @@ def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
         raise BadInput("line", f"{line.strip()[:60]} ({in_a_line(error)})", _FORM) from None
     if isinstance(said, dict) and said.keys() == {"remove"} and isinstance(said["remove"], str):
         return [(said["remove"], None)]
-    prompts = parse_prompts(said if isinstance(said, dict) and "objects" in said else {"objects": [said]})
+    if isinstance(said, dict) and "objects" in said:
+        prompts = parse_prompts(said)
+    elif isinstance(said, dict) and {"name"} < said.keys() <= KEYS:
+        prompts = parse_prompts({"objects": [said]})
+    else:
+        raise BadInput("line", line.strip()[:60], _FORM)
     return [(prompt.name, prompt) for prompt in prompts]
 
 

@@ -6,7 +6,7 @@ from collections import defaultdict
 from textwrap import shorten
 
 from p2p_lib.benchmark.benchmark import Benchmark
-from p2p_lib.benchmark.jobs import jobs_of
+from p2p_lib.benchmark.jobs import Job, jobs_of
 from p2p_lib.benchmark.plan import plan_names, read_plan
 from p2p_lib.core.tables import as_text
 from p2p_lib.datasets import manifests
@@ -72,5 +72,5 @@ def what_to_fetch(benchmark: Benchmark) -> list[str]:
     return lines
 
 
-def _on_data(job: object) -> bool:
+def _on_data(job: Job) -> bool:
     return not job.sequence.name.startswith((SYNTHETIC, "/"))

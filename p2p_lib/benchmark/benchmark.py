@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -185,7 +185,9 @@ def load_or_run_quick(plans: Iterable[str], out: str | Path, profile: str) -> di
     return full | {b.plan.name: b for b in quick}
 
 
-def _run(outcomes: Iterator[tuple[Job, Outcome]], total: int, out: Path, progress: bool) -> dict[str, Outcome]:
+def _run(
+    outcomes: Generator[tuple[Job, Outcome], None, None], total: int, out: Path, progress: bool
+) -> dict[str, Outcome]:
     """Keep each outcome as it comes; Ctrl-C ends it with those that came."""
     found: dict[str, Outcome] = {}
     with progress_bar("benchmark", total, "run", shown=progress) as bar:

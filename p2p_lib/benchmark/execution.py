@@ -11,7 +11,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -83,7 +83,7 @@ def _poses(job: Job, out: Path) -> Outcome:
         if result.interrupted:
             raise KeyboardInterrupt
         done = load_run(unfinished)
-        judge = fault_done if job.sequence.fault else chamfer if job.chamfer else None
+        judge: Callable[..., Any] | None = fault_done if job.sequence.fault else chamfer if job.chamfer else None
         judge = judge and partial(judge, done, sequence, job.models)
         outcome = scored(done, job.models, judge, job.key, job.min_mask_px)
         times = _times(done, cpu_s) | {"width_px": sequence.camera.width}
@@ -115,7 +115,7 @@ def _tracks(job: Job) -> Outcome:
 
 def execute(
     jobs: Sequence[Any], out: Path, at_a_time: int, scheduler: str | None, work: Work = measured
-) -> Iterator[tuple[Any, Outcome]]:
+) -> Generator[tuple[Any, Outcome], None, None]:
     """The outcomes of jobs as they come, of each what ``work`` makes of it; closing it ends what is still running.
 
     scheduler  address of a Dask scheduler, whose workers see ``out`` under the same path; None: this machine. By
@@ -126,7 +126,9 @@ def execute(
     return _on_cluster(jobs, out, scheduler, work)
 
 
-def _on_this_machine(jobs: Iterable[Any], out: Path, at_a_time: int, work: Work):
+def _on_this_machine(
+    jobs: Iterable[Any], out: Path, at_a_time: int, work: Work
+) -> Generator[tuple[Any, Outcome], None, None]:
     """A process for each run, so many at a time. One that dies, of a lack of memory say, takes no other with it."""
     for library in ("OMP", "OPENBLAS", "MKL"):  # runs share the cores: more threads would wait for each other
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
@@ -160,11 +162,13 @@ def _end_with_parent() -> None:
     """The process of a run ends with its parent, which alone hears Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system, which is left when the process is killed
-    gone = multiprocessing.parent_process().sentinel
-    threading.Thread(target=lambda: wait([gone]) and os._exit(1), daemon=True).start()
+    if (parent := multiprocessing.parent_process()) is not None:
+        threading.Thread(target=lambda: wait([parent.sentinel]) and os._exit(1), daemon=True).start()
 
 
-def _on_cluster(jobs: Sequence[Any], out: Path, scheduler: str, work: Work):
+def _on_cluster(
+    jobs: Sequence[Any], out: Path, scheduler: str, work: Work
+) -> Generator[tuple[Any, Outcome], None, None]:
     """Dask distributes the runs; a worker that dies fails its run alone."""
     distributed = packages.load("distributed", "--scheduler", "distributed")
     try:
@@ -176,6 +180,6 @@ def _on_cluster(jobs: Sequence[Any], out: Path, scheduler: str, work: Work):
         futures = [client.submit(perform, work, job, out, library_version(), pure=False) for job in jobs]
         by_key = {future.key: job for future, job in zip(futures, jobs, strict=True)}
         for future in distributed.as_completed(futures):
-            job, error = by_key[future.key], future.exception()
-            reason = f"its worker was lost ({type(error).__name__})"
-            yield job, Outcome(key=job.key, status="failed", reason=reason) if error else future.result()
+            job, lost = by_key[future.key], future.exception()
+            reason = f"its worker was lost ({type(lost).__name__})"
+            yield job, Outcome(key=job.key, status="failed", reason=reason) if lost else future.result()

@@ -92,7 +92,7 @@ class Job:
 def jobs_of(plan: Plan, profile: str) -> list[Job]:
     """Every run of a plan in its order: sequences, methods, seeds. What cannot run says why, and nothing runs yet."""
     scope = plan.scope(profile)
-    measures = ("poses", "tracks") if plan.tracks and scope.tracks else ("poses",)
+    measures: list[Literal["poses", "tracks"]] = ["poses", "tracks"] if plan.tracks and scope.tracks else ["poses"]
     methods = plan.methods(profile)
     lacking = {method.name: _lacking(method) for method in methods}
     known: dict[tuple, str] = {}  # of this call alone: files may change until the next
@@ -117,12 +117,14 @@ def open_planned(job: Job) -> Sequence:
 
         scenario = planned.name.removeprefix(SYNTHETIC)
         folder = scenario_dir(scenario, job.sequence_seed, **_synthetic(planned, method)[0])
-        sequence = replace(open_sequence(folder, "ycbmultitrack", masks=masks), name=planned.name)
+        rendered: Any = open_sequence(folder, "ycbmultitrack", masks=masks)  # of files
+        sequence: Sequence = replace(rendered, name=planned.name)
     else:
         sequence = open_sequence(planned.name, masks=masks)
     if (fault := planned.fault) is not None:
         severity = 1.0 if fault.severity is None else fault.severity
-        sequence = Faulty(sequence, fault.name, severity, *planned.during, seed=job.seed)
+        start, stop = planned.during
+        sequence = Faulty(sequence, fault.name, severity, start or 0, stop, seed=job.seed)
     return Resized(sequence, method.scale) if method.scale != 1 else sequence
 
 

@@ -103,13 +103,14 @@ class PlannedSequence(Strict):
     column: str = ""
     columns: dict[str, str] = {}
     fault: PlannedFault | None = None
-    fault_frames: list[Count] = Field([30, 60], min_length=2, max_length=2)
+    fault_frames: list[Count] = Field(default=[30, 60], min_length=2, max_length=2)
 
     @property
     def during(self) -> list[int | None]:
         """The frames of its fault, from and to; None: to the end."""
         when = self.fault.when if self.fault else ""
-        return {"always": [0, None], "at first": [self.start, self.start + 1]}.get(when, self.fault_frames)
+        whole: dict[str, list[int | None]] = {"always": [0, None], "at first": [self.start, self.start + 1]}
+        return whole.get(when, [*self.fault_frames])
 
     def column_of(self, object: str) -> str:
         """The column of the paper's table that this object belongs to, "" for none."""
@@ -181,7 +182,8 @@ class Plan(Strict):
     def data(self) -> list[str]:
         """What it needs in full below ``$P2P_DATA``: datasets, and models of rendered sequences."""
         names = [s.name.partition("/")[0] for s in self.full.sequence if not s.name.startswith((SYNTHETIC, "/"))]
-        models = [s.synthetic.get("models") for s in (*self.full.sequence, *self.methods("full"))]
+        rendered = [*(s.synthetic for s in self.full.sequence), *(m.synthetic for m in self.methods("full"))]
+        models = [parameters.get("models") for parameters in rendered]
         return list(dict.fromkeys([*names, *(str(m) for m in models if m)]))
 
     def scope(self, profile: str) -> Scope:

@@ -91,12 +91,12 @@ def mean(numbers: Iterable[Number], failed: int = 0) -> list[Number]:
     ``failed`` more of them gave nothing: they count as 0 where failures do, and are left out elsewhere. Of Chamfer
     distances and returns, which have no worst value, they are always left out.
     """
-    by_kind = defaultdict(list)
-    for *kind, value in numbers:
-        by_kind[tuple(kind)] += [value] if np.isfinite(value) else []
+    by_kind: dict[Number, list[float]] = defaultdict(list)  # each kind as a number without its value
+    for number in numbers:
+        by_kind[number._replace(value=0.0)] += [number.value] if np.isfinite(number.value) else []
     for kind, values in by_kind.items():
         values += [0.0] * failed if "zero" in kind else []
-    return [Number(*kind, float(np.mean(values)) if values else np.nan) for kind, values in by_kind.items()]
+    return [kind._replace(value=float(np.mean(v)) if v else np.nan) for kind, v in by_kind.items()]
 
 
 def result_rows(plan: Plan, profile: str, results: Results) -> list[Row]:
@@ -108,12 +108,12 @@ def result_rows(plan: Plan, profile: str, results: Results) -> list[Row]:
         if job.measure == "poses":
             groups[job.method.name, job.seed].append((job, outcome))
         if outcome.status != "done":
-            about = {"object": ", ".join(job.sequence.objects), "column": job.sequence.column}
-            rows.append(head | about | {"metric": outcome.status, "reason": outcome.reason})
+            whole = {"object": ", ".join(job.sequence.objects), "column": job.sequence.column}
+            rows.append(head | whole | {"metric": outcome.status, "reason": outcome.reason})
         for metric, value in outcome.tracks.items():
             rows.append(head | Number(f"2D {metric}", "-", "-", "-", "share", value)._asdict())
         for name, obj in outcome.objects.items():
-            about = {"object": name, "column": job.sequence.column_of(name)}
+            about: Row = {"object": name, "column": job.sequence.column_of(name)}
             about |= {"frames": len(obj.first["add_m"]), "lost": obj.lost}
             rows += [head | about | number._asdict() for number in _numbers(obj)]
             if obj.no_chamfer:

@@ -59,7 +59,9 @@ def unpack(
             if size > shutil.disk_usage(folder).free:
                 raise BadInput(str(archive), f"{name} of {size} bytes", f"room for it in {folder}")
             target.parent.mkdir(parents=True, exist_ok=True)
-            with open_member() as source, target.open("wb") as sink:
+            if (content := open_member()) is None:
+                raise BadInput(str(archive), f"{name!r}, which is neither a file nor a folder", "files and folders")
+            with content as source, target.open("wb") as sink:
                 shutil.copyfileobj(source, sink, 1 << 20)
             written[target.relative_to(folder).as_posix()] = target.stat().st_size
             if progress is not None:
@@ -81,7 +83,7 @@ def _members(archive: Path) -> Iterator[_Member]:
                 kind = stat.S_IFMT(entry.external_attr >> 16)
                 refused = "" if kind in (0, stat.S_IFREG, stat.S_IFDIR) else "a link or a device"
                 refused = "locked by a password" if entry.flag_bits & 1 else refused
-                reader = None if entry.is_dir() else partial(zipped.open, entry)
+                reader: Callable[[], IO[bytes] | None] | None = None if entry.is_dir() else partial(zipped.open, entry)
                 # The name as stored: zipfile's own has backslashes and NULs already mended.
                 yield entry.orig_filename, entry.file_size, refused, reader
     else:

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -54,13 +54,13 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     numbers = [_number(path) for path in rgb]
     camera, scale_mm = _camera(folder / "scene_camera.json", numbers, rgb[0])
     files = ImageSequence(folder, rgb, depth, camera, (np.array(numbers) - numbers[0]) / images.DEFAULT_HZ)
-    listed = _named(_lists(folder / "scene_gt.json", _Pose), numbers)
+    listed = _named(_lists(folder / "scene_gt.json", dict[int, list[_Pose]]), numbers)
     objects = tuple(sorted({obj for at in listed for obj in at}))
     own = _visible_masks(folder, numbers, listed, objects, files.shape)
     files = replace(files, own_masks=own).with_masks(masks, objects=objects)
 
     def read_truth() -> dict[str, ObjectTruth]:
-        info = _lists(folder / "scene_gt_info.json", _Info)
+        info = _lists(folder / "scene_gt_info.json", dict[int, list[_Info]])
         return {obj: _truth(folder, obj, numbers, listed, info) for obj in objects}
 
     model_places = {obj: _model_places(folder, obj) for obj in objects}
@@ -86,9 +86,9 @@ def _camera(path: Path, numbers: list[int], image: Path) -> tuple[Camera, float]
     return camera_for(image, np.reshape(K, (3, 3)), str(path)), scale_mm
 
 
-def _lists(path: Path, entry: type) -> dict[int, list]:
-    """Image number to its list of entries; nothing where there is no such file."""
-    return read_json(path, dict[int, list[entry]], "a list of objects for each image") if path.is_file() else {}
+def _lists(path: Path, of: Any) -> dict[int, list]:
+    """Image number to its list of entries, as the type ``of`` has them; nothing where there is no such file."""
+    return read_json(path, of, "a list of objects for each image") if path.is_file() else {}
 
 
 def _named(scene: dict[int, list[_Pose]], numbers: list[int]) -> list[dict[str, tuple[int, _Pose]]]:
@@ -114,6 +114,7 @@ def _visible_masks(folder: Path, numbers, listed, objects, shape: tuple[int, int
         found = listed[at].get(obj)
         return None if found is None else where / f"{numbers[at]:06d}_{found[0]:06d}.png"
 
+    files: dict[str, Mapping[int, Path | None]]
     files = {obj: {at: file(obj, at) for at in range(len(numbers))} for obj in objects}
     return MaskFiles(files, dict.fromkeys(objects), shape)
 
@@ -219,11 +220,12 @@ def write_models(folder: str | Path, models: Mapping[int, str | Path]) -> None:
     for number, path in sorted(models.items()):
         points_mm = load_points(path) * 1000
         if Path(path).suffix.lower() == ".xyz":
-            shape = trimesh.PointCloud(points_mm)
+            shape: trimesh.PointCloud | trimesh.Trimesh = trimesh.PointCloud(points_mm)
         else:
             vertices, faces = load_mesh(path)
             shape = trimesh.Trimesh(vertices * 1000, faces, process=False)
-        (folder / f"obj_{number:06d}.ply").write_bytes(shape.export(file_type="ply"))
+        ply: Any = shape.export(file_type="ply")  # bytes, of this kind of file
+        (folder / f"obj_{number:06d}.ply").write_bytes(ply)
         # The two points farthest apart are corners of the hull.
         corners = points_mm[ConvexHull(points_mm, qhull_options="QJ").vertices]
         info[str(number)] = {"diameter": float(pdist(corners).max())}

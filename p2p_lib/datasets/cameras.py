@@ -15,11 +15,13 @@ from threading import Condition, Event
 from time import monotonic
 from typing import Protocol
 
+import numpy as np
+
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.plugins import find, is_place
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.sequence import ObjectTruth, Sequence, open_sequence
+from p2p_lib.datasets.sequence import LIVE, ObjectTruth, Sequence, open_sequence
 
 DEFAULT_RATE_HZ = 30.0
 #: So many frames may wait: a search or a keyframe takes as long as some frames, and those after it make up for that.
@@ -29,8 +31,13 @@ DEFAULT_BACKLOG = 4
 class LiveCamera(Protocol):
     """A stream of frames; a frame's index counts the camera's own from 0, so that dropped ones leave gaps."""
 
-    name: str
-    camera: Camera
+    @property
+    def name(self) -> str:
+        """What results call it."""
+
+    @property
+    def camera(self) -> Camera:
+        """Its intrinsics, and the size of its images."""
 
     def read(self) -> Frame | None:
         """The next frame, as soon as there is one; None after the last, or once closed."""
@@ -46,17 +53,25 @@ class Stream:
     name: str
     camera: Camera
     kept: Frame | None = None
-    format: str = "live"
+    format: str = LIVE
     path: None = None
     objects: tuple[str, ...] = ()
-    truth: Mapping[str, ObjectTruth] = field(default_factory=dict)
+    times_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    frame_names: tuple[str, ...] = ()
+    truth: dict[str, ObjectTruth] = field(default_factory=dict)
+    model_places: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return int(self.kept is not None)
 
-    def frame(self, i: int) -> Frame | None:
-        """The frame that is kept, whatever its number."""
+    def frame(self, i: int) -> Frame:
+        """The frame that is kept, whatever its number; :class:`BadInput` where none is."""
+        if self.kept is None:
+            raise BadInput(f"{self.name}: frame", i, "none: the images of a live camera are not kept")
         return self.kept
+
+    def masks(self, i: int) -> None:
+        """None."""
 
     def visible_px(self, i: int) -> None:
         """Unknown."""
@@ -92,6 +107,35 @@ class FolderCamera:
         self._closed.set()
 
 
+class OwnCamera:
+    """Somebody else's camera: what it gives is checked, and it is closed once, however often that is asked for.
+
+    Raises :class:`BadInput` for one without a name or a :class:`~p2p_lib.core.camera.Camera`.
+    """
+
+    def __init__(self, spec: str, own: LiveCamera):
+        self._spec, self._own, self._closed = spec, own, False
+        name, camera = getattr(own, "name", None), getattr(own, "camera", None)
+        if not isinstance(name, str):
+            raise BadInput(f"camera {spec}: name", repr(name), "a text")
+        if not isinstance(camera, Camera):
+            raise BadInput(f"camera {spec}: camera", type(camera).__name__, "a p2p_lib.Camera")
+        self.name, self.camera = name, camera
+
+    def read(self) -> Frame | None:
+        """Its next frame; :class:`BadInput` for anything else."""
+        frame = self._own.read()
+        if frame is not None and not isinstance(frame, Frame):
+            raise BadInput(f"camera {self._spec}: read()", type(frame).__name__, "a p2p_lib.Frame, or None at the end")
+        return frame
+
+    def close(self) -> None:
+        """Close it, unless that was done."""
+        if not self._closed:
+            self._closed = True
+            self._own.close()
+
+
 def open_camera(spec: str, rate_hz: float | None = None) -> LiveCamera:
     """The camera that ``realsense``, ``realsense:RECORDING``, ``folder:PATH`` or ``package.module:Class`` names.
 
@@ -103,7 +147,7 @@ def open_camera(spec: str, rate_hz: float | None = None) -> LiveCamera:
     if kind == "folder" and what:
         return FolderCamera(open_sequence(what), DEFAULT_RATE_HZ if rate_hz is None else rate_hz)
     if kind != "realsense" and is_place(spec) and rate_hz is None:
-        return find("camera", spec, {}, has=("read", "close"))()
+        return OwnCamera(spec, find("camera", spec, {}, has=("read", "close"))())
     if kind != "realsense":
         fix = f"Did you mean folder:{spec}?" if Path(spec).is_dir() else ""
         expected = "realsense, realsense:RECORDING, folder:PATH or your own as module:Class"

@@ -34,6 +34,8 @@ def download(file: RemoteFile, folder: Path, known_sha256: str | None, progress:
     """
     import requests
 
+    if file.url is None:
+        raise MissingData(file.path, "it is had by hand only", "See p2p data info.")
     target = folder / file.path
     if target.is_file() and known_sha256 in (None, digest := sha256(target)):
         return digest

@@ -85,8 +85,8 @@ def _new(path: Path) -> Path:
 
 
 def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: Sequence | None) -> list[Path]:
-    known = sequence is not None and set(poses) <= set(sequence.objects)  # a folder without masks knows no names
-    numbers = _obj_ids(sequence.objects if known else tuple(run.objects))
+    known = () if sequence is None else sequence.objects
+    numbers = _obj_ids(known if set(poses) <= set(known) else tuple(run.objects))  # without masks it knows no names
     total_ms = run.timings.get("total_ms", np.empty(0))
     lines = [BOP_HEADER]
     for name, T in poses.items():
@@ -241,9 +241,9 @@ def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
 
 
 def _bop_rows(path: Path) -> list[dict[str, str]]:
-    rows = csv.DictReader(read_text(path, "a BOP results CSV").splitlines())
+    reader = csv.DictReader(read_text(path, "a BOP results CSV").splitlines())
     try:
-        header, rows = rows.fieldnames or [], list(rows)
+        header, rows = reader.fieldnames or [], list(reader)
     except csv.Error as error:
         raise BadInput(str(path), f"unreadable ({error})", BOP_HEADER) from None
     if header != BOP_HEADER.split(","):

@@ -101,7 +101,8 @@ def _draw_prompts(
             cv2.drawMarker(image, uv, _WHITE, cv2.MARKER_TILTED_CROSS, 10, 4)
             cv2.drawMarker(image, uv, colour, cv2.MARKER_TILTED_CROSS, 10, 2)
         if prompt.box_px is not None:
-            cv2.rectangle(image, *at(prompt.box_px.reshape(2, 2)), colour, 1)
+            corner, opposite = at(prompt.box_px.reshape(2, 2))
+            cv2.rectangle(image, corner, opposite, colour, 1)
 
 
 def _write(image: np.ndarray, text: str, colour: str = "#101010") -> None:

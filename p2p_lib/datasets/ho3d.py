@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -60,7 +61,7 @@ def read_meta(path: Path) -> dict:
     meta = load_plain(path)
     if not isinstance(meta, dict):
         raise BadInput(str(path), f"a {type(meta).__name__}", "a dict with camMat, objTrans, objRot")
-    K = meta.get("camMat")
+    K: Any = meta.get("camMat")
     if not isinstance(K, np.ndarray) or K.shape != (3, 3) or K.dtype.kind not in "fiu":
         raise BadInput(f"{path}: camMat", f"{type(K).__name__} {np.shape(K)}", "an array of 3x3 numbers")
     return meta
@@ -71,7 +72,7 @@ def read_pose(path: Path, meta: dict, camera: Camera) -> np.ndarray:
 
     ``meta`` is what ``path`` holds, its camera must be the sequence's.
     """
-    if Camera.from_K(meta.get("camMat"), camera.width, camera.height, name=f"{path}: camMat") != camera:
+    if Camera.from_K(meta["camMat"], camera.width, camera.height, name=f"{path}: camMat") != camera:
         raise BadInput(f"{path}: camMat", "another camera than the first frame's", "one camera for the whole sequence")
     t, w = meta.get("objTrans"), meta.get("objRot")
     if t is None or w is None:

@@ -121,8 +121,9 @@ class ImageSequence:
         def find(where: Path) -> MaskFiles:
             return find_masks(where, self.rgb, self.shape, objects, some_frames or where == given)
 
-        inside = None if asked is None else self.path / asked
-        given = inside if inside is None or inside.is_dir() else Path(asked).expanduser()
+        given = None if asked is None else self.path / asked
+        if asked is not None and given is not None and not given.is_dir():
+            given = Path(asked).expanduser()
         own = next((find(where) for where in places if where.is_dir()), self.own_masks)
         chosen = find(given) if given else own
         objects = objects or (tuple(chosen.files) if chosen else self.objects)

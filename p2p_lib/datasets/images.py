@@ -23,6 +23,7 @@ LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
 DEPTH = (*LOSSLESS, ".npy")
 DEPTH_SCALE = 0.001  # metres per raw unit: all layouts here store millimetres
 DEFAULT_HZ = 30.0
+_UNDECODED: tuple[type[Exception], ...] = (*UNREADABLE, cv2.error)
 #: What to do about a frame that cannot be read, where nobody can mend it.
 SKIP_BAD = "p2p run --skip-bad goes on without such frames."
 # YCBInEOAT's rotations are orthonormal to 0.3 % only: nearer than this they are made rigid, beyond refused.
@@ -140,7 +141,7 @@ def read_image(path: Path, flags: int, expected: str) -> np.ndarray:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except BadInput:
         raise
-    except (*UNREADABLE, cv2.error):
+    except _UNDECODED:
         raise unreadable from None
     if image is None:
         raise unreadable
@@ -183,6 +184,14 @@ def read_raw_depth(path: Path) -> np.ndarray:
     if raw.ndim != 2 or raw.dtype not in (np.uint16, np.float32):
         raise BadInput(str(path), f"{'x'.join(map(str, raw.shape))} {raw.dtype}", "one channel, uint16 or float32")
     return raw
+
+
+def is_cut_off(path: Path) -> bool:
+    """Whether a file is empty, or a PNG without its end, as when it was copied in part; without decoding it."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - 12, 0))
+        return size == 0 or (path.suffix.lower() == ".png" and b"IEND" not in file.read())
 
 
 def check_size(

@@ -55,7 +55,7 @@ class KeypointLog:
 
     def save(self, folder: Path, maps: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
         """Write the file; ``maps`` is object to ids, p_obj and promoted."""
-        arrays = {}
+        arrays: dict[str, np.ndarray] = {}
         for name, (ids, p_obj, promoted) in maps.items():
             seen = self._seen[name]
             frames = np.repeat([f for f, _, _ in seen], [len(i) for _, i, _ in seen]).astype(np.int32)

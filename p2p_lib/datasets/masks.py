@@ -30,8 +30,8 @@ class MaskFiles:
     def read(self, i: int) -> dict[str, np.ndarray] | None:
         """Object to (H, W) bool at frame i; None where no object has a mask for it."""
         at_i = {name: files[i] for name, files in self.files.items() if i in files}
-        images = {path: read_labels(path, self.shape) for path in set(at_i.values()) if path}
-        images[None] = np.zeros(self.shape, np.uint8)
+        images: dict[Path | None, np.ndarray] = {None: np.zeros(self.shape, np.uint8)}
+        images |= {path: read_labels(path, self.shape) for path in set(at_i.values()) if path}
         masks = {}
         for name, path in at_i.items():
             label = self.labels[name]
@@ -79,9 +79,12 @@ def find_masks(
     if below:
         return MaskFiles({name: paired(folder / name) for name in names}, dict.fromkeys(names), shape)
     files = paired(folder)
-    found = range(1, len(objects) + 1) if objects else _labels_in(files.values(), shape)
-    names = objects or [f"object_{k}" for k in found]
-    labels = dict(zip(names, found)) if len(found) > 1 else dict.fromkeys(objects or ["object"])
+    present = (path for path in files.values() if path is not None)
+    found = range(1, len(objects) + 1) if objects else _labels_in(present, shape)
+    names = objects or tuple(f"object_{k}" for k in found)
+    labels: dict[str, int | None] = dict.fromkeys(objects or ["object"])
+    if len(found) > 1:
+        labels = dict(zip(names, found))
     return MaskFiles(dict.fromkeys(labels, files), labels, shape)
 
 

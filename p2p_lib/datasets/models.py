@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -106,7 +106,7 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
 
     data, kind = read_bytes(path, "a mesh"), path.suffix[1:].lower()
     try:
-        mesh = trimesh.load(BytesIO(data), file_type=kind, process=False, force="mesh", skip_materials=True)
+        mesh: Any = trimesh.load(BytesIO(data), file_type=kind, process=False, force="mesh", skip_materials=True)
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces).reshape(-1, 3)
     except UNREADABLE as error:
         raise BadInput(str(path), f"an unreadable mesh ({in_a_line(error)})", "vertices and faces") from None
@@ -136,4 +136,5 @@ def _read_obj(data: bytes) -> np.ndarray:
 def _read_ply(data: bytes) -> np.ndarray:
     import trimesh
 
-    return np.asarray(trimesh.load(BytesIO(data), file_type="ply", process=False).vertices, float)
+    loaded: Any = trimesh.load(BytesIO(data), file_type="ply", process=False)  # a mesh, or points
+    return np.asarray(loaded.vertices, float)

@@ -11,6 +11,7 @@ import io
 import pickle
 import pickletools
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ class _Bytes:
 
 
 # NumPy moved these modules in version 2; a pickle has the names that were current when it was written.
-_ADMITTED = {
+_ADMITTED: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _Dtype,
     ("_codecs", "encode"): _Bytes,
@@ -106,7 +107,7 @@ def load_plain(path: str | Path) -> Any:
     try:
         for operation, argument, _ in pickletools.genops(data):
             # Python makes room for as many values as the largest of these numbers says, whatever there is.
-            if operation.name.endswith("PUT") and argument > len(data):
+            if operation.name.endswith("PUT") and isinstance(argument, int) and argument > len(data):
                 raise ValueError(f"a value with the number {argument}")
         # latin1: HO-3D's files were written by Python 2, whose strings are bytes.
         return _Plain().value(_ArraysOnly(io.BytesIO(data), encoding="latin1").load(), 0)

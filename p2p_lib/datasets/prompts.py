@@ -29,7 +29,8 @@ from p2p_lib.datasets.sequence import Sequence
 _FORM = '{"objects": [{"name": "mug", "frame": 0, "points": [[x, y], ...]}]}'
 _MOST = 2000
 _MOST_PX = 100_000_000  # of a mask
-_KEYS = {"name", "frame", "points", "negative", "box", "mask"}
+#: What an entry may have.
+KEYS = frozenset({"name", "frame", "points", "negative", "box", "mask"})
 #: Clicks that are drawn from a mask lie within this share of its inscribed circle.
 _WELL_INSIDE = 0.6
 #: A mask that grows by more than this from frame to frame belongs to an object still coming into view.
@@ -70,7 +71,7 @@ def parse_prompts(content: object, folder: Path | None = None) -> tuple[Prompt, 
 
 def _prompt(given: Any, folder: Path | None) -> Prompt:
     """An entry of a file."""
-    if not isinstance(given, dict) or not {"name"} < given.keys() <= _KEYS:
+    if not isinstance(given, dict) or not {"name"} < given.keys() <= KEYS:
         raise BadInput("prompts", f"the object {str(given)[:60]}", _FORM)
     mask = None
     if isinstance(given.get("mask"), dict):
@@ -80,8 +81,8 @@ def _prompt(given: Any, folder: Path | None) -> Prompt:
             raise BadInput(f"mask of {given['name']!r}", repr(given["mask"])[:60], "an image beside the prompts")
         mask = read_image(folder / given["mask"], cv2.IMREAD_GRAYSCALE, "a mask image") > 0
     file_name("object name", given["name"])
-    fields = {"points_px": given.get("points"), "negative_px": given.get("negative"), "box_px": given.get("box")}
-    fields = {key: value for key, value in fields.items() if value is not None}
+    called = {"points_px": "points", "negative_px": "negative", "box_px": "box"}
+    fields: dict[str, Any] = {field: given[key] for field, key in called.items() if given.get(key) is not None}
     return Prompt(given["name"], given.get("frame", 0), **fields, mask=mask)
 
 

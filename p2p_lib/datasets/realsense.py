@@ -56,7 +56,9 @@ class RealSenseCamera:
         self._closed, self._waiting, self._last = Event(), Lock(), -1
         self.name = str(recording) if recording else "realsense"
         self._pipeline, self._align = self._rs.pipeline(), self._rs.align(self._rs.stream.color)
-        self._playback = self._play(recording, every) if recording else self._start()
+        self._playback = None if recording is None else self._play(recording, every)
+        if recording is None:
+            self._start()
         for _ in range(0 if recording else WARM_UP):
             self._pair()
         self._first = self._pair()

@@ -91,7 +91,7 @@ def record_truth(folder: Path, name: str, camera: Path, mocap: Path, model: Path
         raise BadInput(str(mocap), "no pose at the times of the images", "a log that covers the recording")
     visible, in_image = seen.copy(), np.zeros(len(T), bool)
     for i in np.flatnonzero(seen):
-        counts = sequence.visible_px(i)
+        counts = sequence.visible_px(int(i))
         visible[i] = counts is None or counts.get(name, 1) > 0
         in_image[i] = sequence.camera.inside(sequence.camera.project(se3.transform(T[i], points))).any()
     last = np.maximum.accumulate(np.where(seen, np.arange(len(T)), np.argmax(seen)))

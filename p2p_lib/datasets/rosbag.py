@@ -105,6 +105,7 @@ class RosRecording:
         """(time_s, rgb, depth_m) of each colour image with a depth image near to it."""
         colours: deque[tuple[float, Any]] = deque()
         depths: deque[tuple[float, Any]] = deque()
+        colour_topic, depth_topic = self._topics["colour"] or "", self._topics["depth"] or ""
         last_s, ended = -np.inf, [("", None)]
         for what, message in chain(self._messages("colour", "depth"), ended):
             if message is not None:
@@ -117,7 +118,7 @@ class RosRecording:
                 if abs(depths[0][0] - time_s) <= APART_S and time_s > last_s:
                     last_s = time_s
                     depth = depths[0][1]
-                    yield time_s, read_rgb(self._topics["colour"], colour), read_depth_m(self._topics["depth"], depth)
+                    yield time_s, read_rgb(colour_topic, colour), read_depth_m(depth_topic, depth)
 
 
 class _Lens:
@@ -150,12 +151,12 @@ def _likeliest(topics: list[str], kind: str) -> str | None:
     of_depth = [topic for topic in topics if "depth" in topic.replace("aligned_depth_to_color/image", "depth")]
     if kind == "depth":
         rank = [next((k for k, word in enumerate(REGISTERED) if word in topic), len(REGISTERED)) for topic in of_depth]
-        chosen = zip(rank, ["ompressed" in topic for topic in of_depth], of_depth)
+        chosen = [(k, "ompressed" in topic, False, topic) for k, topic in zip(rank, of_depth)]
     else:
         others = [topic for topic in topics if topic not in of_depth and "infra" not in topic and "/ir/" not in topic]
         named = [not any(word in topic for word in ("color", "colour", "rgb")) for topic in others]
-        chosen = zip(named, ["rect" not in topic for topic in others], ["ompressed" in t for t in others], others)
-    return min(chosen, default=(None,))[-1]
+        chosen = [(no, "rect" not in topic, "ompressed" in topic, topic) for no, topic in zip(named, others)]
+    return min(chosen)[-1] if chosen else None
 
 
 def _info_of(topic: str | None, infos: list[str]) -> str | None:

@@ -147,7 +147,7 @@ class RunWriter:
                 _clear(self.path, earlier)
             self._write_info()  # by which the folder is known to be a run's: before anything else
         elif self.redo_from is not None:
-            self._clear_redone(self.resumed.objects)
+            self._clear_redone(self.resumed.objects, self.redo_from)
         replace_text(self.path / "config.toml", self._config.to_toml())
         if self._points:
             _save_arrays(self.path / "models.npz", self._points)
@@ -157,14 +157,14 @@ class RunWriter:
         self.begun = True
         self.flush()
 
-    def _clear_redone(self, objects: Iterable[str]) -> None:
-        """Take away what the run that is resumed said from ``redo_from`` on, and all of objects that are no more."""
+    def _clear_redone(self, objects: Iterable[str], start: int) -> None:
+        """Take away what the run that is resumed said from frame ``start`` on, and all of objects that are no more."""
         patterns = [KEYPOINTS, MASK_LOG, *_maps(objects)]
         for name in objects:
             gone = name not in self._estimates
             patterns += [f"poses/{name}.txt"] if gone else []
             if (self.info.get("options") or {}).get("save_masks"):
-                frames = range(self.info["start"] if gone else self.redo_from, self.info["stop"])
+                frames = range(self.info["start"] if gone else start, self.info["stop"])
                 patterns += [f"masks/{name}/{frame:06d}.png" for frame in frames]
         _unlink(self.path, patterns)
         _clear_refined(self.path)
@@ -183,7 +183,7 @@ class RunWriter:
 
     def keep_whole_frames(self) -> None:
         """After an interrupt, perhaps while a frame was written: the frames before it are kept, whole."""
-        kept = [*self._estimates.values(), self._visible_px, self._frames, self._timings]
+        kept: list[list] = [*self._estimates.values(), self._visible_px, self._frames, self._timings]
         whole = min(map(len, kept))
         for rows in kept:
             del rows[whole:]
@@ -197,7 +197,7 @@ class RunWriter:
         n = len(self._frames)
         self._flush_at = 2 * n if n <= 32 else n + max(50, n // 10)
         if self._frames:
-            arrays = {}
+            arrays: dict[str, np.ndarray] = {}
             for name, estimates in self._estimates.items():
                 run = ObjectRun.of(name, estimates, self._sequence, self._visible_px)
                 arrays |= {f"{name}/{column}": getattr(run, column) for column in COLUMNS}
@@ -241,7 +241,7 @@ class RunWriter:
         """That what is to be resumed was asked for in the same words."""
         mine, fix = json.loads(json.dumps(self.info)), f"Ask for the same, or run it anew: {_ANEW}."
         parameters = read_text(self.path / "config.toml", "the parameters of the run") == self._config.to_toml()
-        theirs = {key: earlier.get(key) for key in mine}
+        theirs: dict[str, Any] = {key: earlier.get(key) for key in mine}
         theirs["objects"] = theirs["objects"][: len(mine["objects"])]  # others may have come later
         if (start := self.redo_from) is not None:
             for info in (mine, theirs):
@@ -369,7 +369,8 @@ def _unlink(out: Path, patterns: Iterable[str]) -> None:
 def _clear_refined(out: Path) -> None:
     """Take away what was refined of a run."""
     refined = out / OFFLINE  # of poses that are gone: it would pass for one of the new run
-    if (refined / "run.json").is_file() and not refined.is_symlink() and (of := read_info(refined)).get("offline"):
+    of = None if refined.is_symlink() else read_info(refined)
+    if of is not None and of.get("offline"):
         _clear(refined, of)
         (refined / "run.json").unlink()
         for folder in (refined / "poses", refined / "meshes", refined):

@@ -241,8 +241,9 @@ def load_run(folder: str | Path, every_map: bool = False) -> Run:
             n = arrays[f"{name}/frame_index"].size
             of_older_runs = {"map_id": np.zeros(n, int), "joined_map": np.full(n, -1)}
             of_older_runs["T_obj_joined"] = np.tile(NO_POSE, (n, 1, 1))
-            columns = {column: arrays.get(f"{name}/{column}", of_older_runs.get(column)) for column in COLUMNS}
-            if lacking := [column for column, values in columns.items() if values is None]:
+            found = {column: arrays.get(f"{name}/{column}", of_older_runs.get(column)) for column in COLUMNS}
+            columns = {column: values for column, values in found.items() if values is not None}
+            if lacking := [column for column in COLUMNS if column not in columns]:
                 raise BadInput(str(folder / "poses.npz"), f"no {name}/{lacking[0]}", "what p2p run wrote")
             obj = ObjectRun(**columns)
             objects[name] = obj if every_map else obj.of_one_map()

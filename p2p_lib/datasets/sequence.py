@@ -42,6 +42,8 @@ RECORDINGS = {
 }
 _VIDEOS = (".mp4", ".avi", ".mov", ".webm", ".m4v")
 
+#: What a run's ``format`` is where its images came from a camera and were not kept.
+LIVE = "live"
 #: Sequences that are generated rather than read are called ``synthetic/NAME``.
 SYNTHETIC = "synthetic/"
 #: Renders those; imported when one is asked for.
@@ -67,24 +69,43 @@ class ObjectTruth:
 
 
 class Sequence(Protocol):
-    """RGB-D frames of one video, with masks and truth where the dataset has them.
+    """RGB-D frames of one video, with masks and truth where the dataset has them."""
 
-    name     what results call it; path its folder, None where it has none
-    objects  names of the objects it knows; a single unnamed one is called ``object``
-    times_s  (N,) seconds, increasing; frame_names what each frame's image is called, without its ending
-    truth    object to its truth, empty where there is none; read when first asked for
-    model_places  object to the files and folders where its model may lie, best first
-    """
+    @property
+    def name(self) -> str:
+        """What results call it."""
 
-    name: str
-    format: str
-    path: Path | None
-    camera: Camera
-    objects: tuple[str, ...]
-    times_s: np.ndarray
-    frame_names: tuple[str, ...]
-    truth: dict[str, ObjectTruth]
-    model_places: Mapping[str, tuple[Path, ...]]
+    @property
+    def format(self) -> str:
+        """The name of its layout."""
+
+    @property
+    def path(self) -> Path | None:
+        """Its folder; None where it has none."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that all frames are of."""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects it knows; a single unnamed one is called ``object``."""
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """(N,) seconds, increasing."""
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """What each frame's image is called, without its ending."""
+
+    @property
+    def truth(self) -> dict[str, ObjectTruth]:
+        """Object to its truth, empty where there is none; read when first asked for."""
+
+    @property
+    def model_places(self) -> Mapping[str, tuple[Path, ...]]:
+        """Object to the files and folders where its model may lie, best first."""
 
     def __len__(self) -> int: ...
 
@@ -126,6 +147,8 @@ def open_sequence(
     """
     if not isinstance(path_or_name, str | Path):
         return path_or_name
+    from p2p_lib.datasets.image_sequence import ImageSequence
+
     if depth_scale is not None and not 0 < depth_scale <= 1:
         fix = "Millimetres are 0.001, metres are 1."
         raise BadInput("depth_scale", depth_scale, "metres per raw unit, above 0 and at most 1", fix)
@@ -140,11 +163,17 @@ def open_sequence(
     format = format or recognise(folder)
     with gaps_allowed(gaps):
         read = (read_folder or _loader(format))(folder, masks)
+    if not isinstance(read, ImageSequence):
+        what = f"format {format}: what load(folder, masks) gives"
+        raise BadInput(what, type(read).__name__, "an ImageSequence, see CONTRIBUTING.md")
     return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale)
 
 
 def reopen(info: Mapping[str, Any]) -> Sequence:
     """The sequence that a run was made on, as its ``run.json`` says; raises as :func:`open_sequence`."""
+    if info["format"] == LIVE:
+        fix = "To have them afterwards, record them as a folder and give that to p2p run."
+        raise MissingData(f"images of {info['sequence']}", "it was a live camera's, of which none are kept", fix)
     asked = info.get("options") or {}
     depth_scale, gaps = asked.get("depth_scale"), bool(asked.get("skip_bad"))
     return open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, info["seed"], gaps=gaps)

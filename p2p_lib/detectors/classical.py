@@ -29,7 +29,7 @@ class CornerDetector:
 
     def __init__(self, config: SamplingConfig, rng: np.random.Generator | None = None):
         self._limit = config.candidates
-        self._sift = cv2.SIFT_create(config.candidates, contrastThreshold=0.01, enable_precise_upscale=True)
+        self._sift = cv2.SIFT.create(config.candidates, contrastThreshold=0.01, enable_precise_upscale=True)
 
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Candidates in the mask, best first."""
@@ -38,15 +38,16 @@ class CornerDetector:
         gray, inside, corner_px = _cropped(frame, mask, _CORNER_PATCH_PX)
         blobs = self._sift.detect(gray, inside)
         corners, quality = cv2.goodFeaturesToTrackWithQuality(gray, self._limit, 0.01, 3, inside, blockSize=5)[:2]
-        uv, score = [np.zeros((0, 2))], [np.zeros(0)]
+        uv: list[np.ndarray] = [np.zeros((0, 2))]
+        scores: list[np.ndarray] = [np.zeros(0)]
         if blobs:
             response = np.array([p.response for p in blobs])
-            uv.append(cv2.KeyPoint.convert(blobs))
-            score.append(0.5 + 0.5 * response / response.max())
+            uv.append(np.asarray(cv2.KeyPoint.convert(blobs)))
+            scores.append(0.5 + 0.5 * response / response.max())
         if corners is not None:
             uv.append(corners.reshape(-1, 2))
-            score.append(0.5 * quality.ravel() / quality.max())
-        uv_px, score = np.concatenate(uv) + corner_px, np.concatenate(score).astype(float)
+            scores.append(0.5 * quality.ravel() / quality.max())
+        uv_px, score = np.concatenate(uv) + corner_px, np.concatenate(scores).astype(float)
         order = np.argsort(-score, kind="stable")[: self._limit]
         return Candidates(uv_px[order], score[order])
 
@@ -96,7 +97,7 @@ class OrbDetector:
 
     def __init__(self, config: SamplingConfig, rng: np.random.Generator | None = None):
         # The default threshold finds nothing on plain objects.
-        self._orb = cv2.ORB_create(config.candidates, edgeThreshold=_ORB_PATCH_PX, fastThreshold=5)
+        self._orb = cv2.ORB.create(config.candidates, edgeThreshold=_ORB_PATCH_PX, fastThreshold=5)
 
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Corners in the mask, best first."""
@@ -106,7 +107,7 @@ class OrbDetector:
             return NO_CANDIDATES
         response = np.array([point.response for point in points])
         order = np.argsort(-response, kind="stable")
-        uv_px = cv2.KeyPoint.convert(points).astype(float) + corner_px
+        uv_px = np.asarray(cv2.KeyPoint.convert(points), float) + corner_px
         return Candidates(uv_px[order], np.clip(response[order] / max(response.max(), 1e-12), 0, 1))
 
 

@@ -84,10 +84,10 @@ class SuperPointDetector:
         crop = frame.rgb[y0 : rows.stop, x0 : columns.stop]
         gray = torch.from_numpy(cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)).to(self._device).float() / 255
         with torch.inference_mode():
-            score = probabilities(self._net, gray)
-            best = torch.nn.functional.max_pool2d(score[None], 2 * _APART_PX + 1, 1, _APART_PX)[0]
-            found = torch.nonzero((score == best) & (score > 0)).cpu().numpy()
-            score = score.cpu().numpy()
+            likely = probabilities(self._net, gray)
+            best = torch.nn.functional.max_pool2d(likely[None], 2 * _APART_PX + 1, 1, _APART_PX)[0]
+            found = torch.nonzero((likely == best) & (likely > 0)).cpu().numpy()
+            score = likely.cpu().numpy()
         uv_px = found[:, ::-1] + [x0, y0]
         size = np.array(mask.shape[::-1])
         inside = in_mask(uv_px, mask) & ((uv_px >= _BORDER_PX) & (uv_px < size - _BORDER_PX)).all(1)

@@ -25,6 +25,7 @@ from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation.evidence import ON_M, drawn_m, gathered, on_surface, reprojected, surface_in_view
+from p2p_lib.evaluation.known_size import size_doubts
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, WHAT_RAN, rate
 from p2p_lib.evaluation.suspicions import Suspicion, median_of_known, suspicions
 
@@ -104,22 +105,27 @@ class Consistency:
         return [f"look at {name}: {found.text}" for name, of in self.suspicions.items() for found in of]
 
 
-def consistency(run: Run, sequence: Sequence | None = None, looks: int = LOOKS) -> Consistency:
+def consistency(
+    run: Run, sequence: Sequence | None = None, looks: int = LOOKS, known_m: Mapping[str, float] | None = None
+) -> Consistency:
     """What can be said of a run without truth; of its images where they can still be had.
 
     sequence  that the run was made on (default: opened as the run says)
     looks     frames of which the images are looked at, evenly spread; where there are none to be had, 0
+    known_m   how long objects are known to be: what was measured is compared with it
     """
     with suppress(P2PError):
         sequence = reopen(run.info) if sequence is None else sequence
     keypoints, masks, every = load_keypoints(run.path), load_masks(run.path), load_run(run.path, every_map=True)
+    sizes = size_doubts(run.path, known_m or {})
     objects, found = {}, {}
     for name, obj in run.objects.items():
         mesh = run.path / "meshes" / f"{name}.ply"
         fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks)
         told = tuple(text for text in run.info.get("doubts") or () if _is_about(text, name))
         evidence = gathered(obj, every.objects[name], sequence, masks.get(name), keypoints.get(name), fit, told)
-        found[name] = suspicions(evidence)
+        off = (Suspicion("known size", sizes[name]),) if name in sizes else ()
+        found[name] = off + suspicions(evidence)
         numbers = dict.fromkeys(HEADS, float("nan")) | {"pose": 100 * float(obj.has_pose.mean())}
         if obj.has_pose.any():
             numbers["doubted"] = 100 * float(obj.doubted.sum() / obj.has_pose.sum())

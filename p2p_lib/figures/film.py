@@ -7,11 +7,12 @@ from contextlib import AbstractContextManager
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput
 from p2p_lib.core.packages import needed_for
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.sequence import Sequence
@@ -42,11 +43,8 @@ def write_film(
     """
     check_suffix(out)
     playback = Playback.of(run, sequence)
-    if playback.sequence is None:
-        where = playback.run.info["path"] or playback.run.info["sequence"]
-        raise MissingData(str(where), "no such folder, so there are no images to draw on", "Put it back there.")
     scene, for_a_page = Scene.of(playback), Path(out).suffix != ".mp4"
-    width_px = width_px or min(playback.sequence.camera.width, _PAGE_PX if for_a_page else 1 << 16)
+    width_px = width_px or min(playback.images.camera.width, _PAGE_PX if for_a_page else 1 << 16)
     every = max(1, round(playback.rate_hz / _PAGE_HZ)) if for_a_page else 1
     rows = range(0, len(playback), every)
     with Film(out, playback.rate_hz / every) as film, progress_bar(film.path.name, len(rows), shown=progress) as bar:
@@ -84,10 +82,12 @@ class Film(AbstractContextManager):
 
     def __init__(self, path: str | Path, fps: float = 30.0):
         check_suffix(path)
-        self.path, self._fps, self._shape = Path(path), fps, None
+        self.path, self._fps = Path(path), fps
+        self._shape: tuple[int, ...] | None = None
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._images: list[tuple[float, Image.Image]] = []  # of what is written as a whole
-        self._container = self._stream = None
+        self._container: Any = None  # PyAV's, and its stream
+        self._stream: Any = None
 
     def add(self, image: np.ndarray, time_s: float) -> None:
         """One more image (H, W, 3) uint8, red first, shown from ``time_s`` on; :class:`BadInput` for another size."""
@@ -121,11 +121,10 @@ class Film(AbstractContextManager):
         if kind is None and self._shape is None:
             raise BadInput("film", "no images", "at least one")
         if self._images:
-            (_, first), *rest = self._images
             times_s = [time_s for time_s, _ in self._images]
+            first, *images = [image for _, image in self._images]
             shown_ms = np.rint(1000 * np.diff([*times_s, times_s[-1] + 1 / self._fps])).astype(int).tolist()
-            how = {"quality": _WEBP_QUALITY} if self.path.suffix == ".webp" else {}
-            images = [image for _, image in rest]
+            how: dict[str, Any] = {"quality": _WEBP_QUALITY} if self.path.suffix == ".webp" else {}
             first.save(self.path, save_all=True, append_images=images, duration=shown_ms, loop=0, **how)
         if self._container is not None:
             self._container.mux(self._stream.encode())

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from pandas import DataFrame
@@ -20,7 +21,7 @@ from p2p_lib.benchmark.plan import Method
 from p2p_lib.benchmark.rows import MEAN, POOLED, shown_name
 from p2p_lib.core.files import replace_text
 from p2p_lib.datasets import manifests
-from p2p_lib.datasets.paper_reported import FAIL, paper_reported
+from p2p_lib.datasets.paper_reported import FAIL, Row, paper_reported
 from p2p_lib.datasets.paper_reported import Table as Reported
 from p2p_lib.datasets.sequence import SYNTHETIC
 from p2p_lib.figures.numbers import AREA_HEADS, AREA_KEYS, METRICS, Numbers
@@ -65,7 +66,8 @@ def by_sequence(numbers: Numbers) -> Table:
     """A column per sequence, metrics and methods below each other: the paper's tables on HO3D and YCBInEOAT."""
     paper = paper_reported().table(numbers.plan.paper)
     columns = [*_columns(paper), "Mean", *_own_columns(numbers, paper)]
-    rows, rules = [], []
+    rows: list[list[Cell]] = []
+    rules: list[int] = []
     for metric in _metrics(numbers, paper):
         rules.append(len(rows))
         for line in _lines(numbers, paper, metric):
@@ -81,7 +83,9 @@ def by_object(numbers: Numbers) -> Table:
     found = {metric: _lines(numbers, paper, metric) for metric in _metrics(numbers, paper)}
     lines = [line for group in found.values() for line in group]
     labels = _columns(paper) | _own_columns(numbers, paper) | {"Mean": ("Mean", "")}
-    rows, rules, last = [], [], ""
+    rows: list[list[Cell]] = []
+    rules: list[int] = []
+    last = ""
     for column, (sequence, object) in labels.items():
         if sequence != last and rows:
             rules.append(len(rows))
@@ -137,12 +141,12 @@ def _lines(numbers: Numbers, paper: Reported, metric: str) -> list[_Line]:
     return lines
 
 
-def _reported_line(paper: Reported, row: object) -> _Line:
+def _reported_line(paper: Reported, row: Row) -> _Line:
     columns = _columns(paper)
-    cells = [Cell(FAIL) if value == FAIL else number(float(value)) for value in row.values]
+    printed = [Cell(FAIL) if value == FAIL else number(float(value)) for value in row.values]
     name = "Point2Pose" if row.method == "Ours" else row.method
     comparable = set() if row.cad else {*columns, "Mean"}
-    cells = defaultdict(lambda: _NOT_IN_PAPER, zip(columns, cells, strict=True), Mean=number(row.mean))
+    cells = defaultdict(lambda: _NOT_IN_PAPER, zip(columns, printed, strict=True), Mean=number(row.mean))
     return _Line("CAD" if row.cad else "CAD-free", f"{name} (reported)", cells, comparable)
 
 
@@ -195,7 +199,9 @@ def by_method(numbers: Numbers) -> Table:
     if numbers.plan.paper:
         bold += [len(heads), len(heads) + 1]
         heads, groups = [*heads, *AREA_HEADS], [*groups, ("reported", len(AREA_KEYS))]
-        printed = {(r.method, r.metric): r.mean for r in paper_reported().table(numbers.plan.paper).rows}
+        printed: dict[tuple[str, str], float] = {
+            (r.method, r.metric): r.mean for r in paper_reported().table(numbers.plan.paper).rows
+        }
         for line, method in zip(lines, numbers.methods, strict=True):
             values = [printed.get((method.paper, metric)) for metric in AREA_KEYS]
             line += [number(value) if value else _NOT_IN_PAPER for value in values]
@@ -211,7 +217,7 @@ def by_return(numbers: Numbers) -> Table:
     events = paper.statement("occlusion_events").value
     for method in numbers.methods:
         line = [Cell(method.name), _returns(numbers, method), *_areas(numbers, method)[::2]]
-        values = {s.key: s.value for s in paper.text if s.of == method.paper}
+        values: dict[str, Any] = {s.key: s.value for s in paper.text if s.of == method.paper}
         if "recovered_events" in values:
             line.append(Cell(f"{values['recovered_events']:g}/{events:g}"))
             line += [number(values[f"mustard_{metric}"]) for metric in AREA_KEYS]
@@ -236,7 +242,7 @@ def by_rate(numbers: Numbers) -> Table:
         [Cell(method.name), *(number(found.get((method.name, metric)), digits=1) for metric in heads)]
         for method in numbers.methods
     ]
-    reported = paper_reported().statement("rate").value
+    reported: Any = paper_reported().statement("rate").value  # from and to
     notes = [f"The paper reports {reported[0]:g} to {reported[1]:g} Hz, on its machine", *numbers.about()]
     notes += ["Wall-clock on this machine under the load that it had; processor time does not depend on the load"]
     return Table(numbers.plan.title, ["Setting", *heads.values()], lines, notes=notes)
@@ -279,7 +285,8 @@ def _track_score(numbers: Numbers, method: Method, score: str) -> Cell:
 def _returns(numbers: Numbers, method: Method) -> Cell:
     """Recovered of all returns, summed over seeds."""
     forms = ("recovered within 30 frames", "all")
-    rows = [numbers.row(method.name, "returns", POOLED, form=form) for form in forms]
-    if None in rows:
+    found = [numbers.row(method.name, "returns", POOLED, form=form) for form in forms]
+    rows = [row for row in found if row is not None]
+    if len(rows) < len(found):
         return numbers.mean(method, "ADD AUC")
     return Cell("/".join(str(round(row["value"] * len(row["seeds"].split()))) for row in rows))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,7 +43,8 @@ def as_body(mesh: trimesh.Trimesh) -> Mesh:
     faces = np.asarray(mesh.faces)
     side = int(np.ceil(np.sqrt(len(faces))))
     texture = np.zeros((side, side, 3), np.uint8)
-    colours = np.asarray(mesh.visual.vertex_colors)[:, :3]
+    visual: Any = mesh.visual  # of vertices
+    colours = np.asarray(visual.vertex_colors)[:, :3]
     row, column = np.divmod(np.arange(len(faces)), side)
     texture[row, column] = colours[faces].mean(1)
     uv = np.stack([(column + 0.5) / side, 1 - (row + 0.5) / side], -1)
@@ -68,8 +69,8 @@ def portrait(
     radius_m = float(np.linalg.norm(filling - centre, axis=1).max())
     focal_px = 1.4 * min(height_px, width_px)
     camera = Camera(focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, width_px, height_px)
-    tilt, turn = se3.exp(np.radians([[25, 0, 0, 0, 0, 0], [0, turn_deg, 0, 0, 0, 0]]))
-    away, centred = se3.from_rt(np.eye(3), [0, 0, 3.2 * radius_m]), se3.from_rt(np.eye(3), -centre)
+    tilt, turn = se3.exp(np.radians(np.array([[25.0, 0, 0, 0, 0, 0], [0, turn_deg, 0, 0, 0, 0]])))
+    away, centred = se3.from_rt(np.eye(3), np.array([0, 0, 3.2 * radius_m])), se3.from_rt(np.eye(3), -centre)
     return draw_mesh(mesh, camera, away @ tilt @ turn @ centred)
 
 

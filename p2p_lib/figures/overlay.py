@@ -101,8 +101,8 @@ def draw_mask(image: np.ndarray, mask: np.ndarray, colour: str, width_px: int = 
         image[mask] = np.rint((1 - fill) * image[mask] + fill * np.array(style.rgb(colour))).astype(np.uint8)
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
 
-    def draw(on: np.ndarray, *paint) -> np.ndarray:
-        return cv2.drawContours(on, outlines, -1, *paint, cv2.LINE_AA)
+    def draw(on: np.ndarray, paint: Sequence[float] | float, thickness: int) -> np.ndarray:
+        return cv2.drawContours(on, outlines, -1, paint, thickness, cv2.LINE_AA)
 
     return _rimmed(image, draw, np.concatenate(outlines)[:, 0], colour, width_px) if outlines else image
 
@@ -294,8 +294,8 @@ def _stroke(
     """Segments (M, 2, 2) in pixels; ``rim`` is how dark the rim is, ``strength`` how opaque the line."""
     lines = list(np.rint(segments * (1 << _SHIFT)).astype(np.int32)[:, :, None])
 
-    def draw(on: np.ndarray, *paint) -> np.ndarray:
-        return cv2.polylines(on, lines, False, *paint, cv2.LINE_AA, _SHIFT)
+    def draw(on: np.ndarray, paint: Sequence[float] | float, thickness: int) -> np.ndarray:
+        return cv2.polylines(on, lines, False, paint, thickness, cv2.LINE_AA, _SHIFT)
 
     return _rimmed(image, draw, segments.reshape(-1, 2), colour, width_px, rim, strength) if lines else image.copy()
 
@@ -328,7 +328,7 @@ def _dashes(segments: np.ndarray) -> np.ndarray:
 
 
 def _free_place(
-    size: tuple[int, int], around: tuple[float, ...], taken: list[tuple[int, ...]], shape: tuple[int, ...]
+    size: tuple[int, int], around: tuple[float, ...], taken: list[tuple[int, int, int, int]], shape: tuple[int, ...]
 ) -> tuple[int, int]:
     """Upper left corner for a label: the first place beside its rectangle that is inside and free."""
     w, h = size

@@ -13,12 +13,12 @@ from pandas import Series
 from scipy.spatial import cKDTree
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import P2PError
+from p2p_lib.core.errors import MissingData, P2PError
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.models import read_mesh
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
-from p2p_lib.datasets.sequence import Sequence, reopen
+from p2p_lib.datasets.sequence import LIVE, Sequence, reopen
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
 from p2p_lib.figures import style
 
@@ -50,6 +50,16 @@ class Playback:
             with contextlib.suppress(P2PError):
                 sequence = reopen(run.info)
         return cls(run, sequence, load_keypoints(run.path))
+
+    @property
+    def images(self) -> Sequence:
+        """The sequence; :class:`MissingData` where it is gone."""
+        if self.sequence is None:
+            if self.run.info["format"] == LIVE:
+                reopen(self.run.info)  # says why there are none
+            where = self.run.info["path"] or self.run.info["sequence"]
+            raise MissingData(str(where), "no such folder, so there are no images to draw on", "Put it back there.")
+        return self.sequence
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -126,7 +136,7 @@ class Playback:
         v, u = (a.ravel() for a in np.mgrid[step // 2 : h : step, step // 2 : w : step])
         near = (frame.depth_m[v, u] > 0) & (frame.depth_m[v, u] < CLOUD_MAX_M)
         u, v = u[near], v[near]
-        p_cam = self.sequence.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
+        p_cam = self.images.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u])
         for name, tree in self._surfaces.items():
             obj = self.objects[name]
             if obj.has_pose[i] and self.of_kept_map(name)[i]:

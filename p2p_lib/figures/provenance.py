@@ -247,6 +247,6 @@ def _of_the_data(note: Any) -> Any:
 
 def _plain(value: Any) -> Any:
     """As JSON holds a dataclass, a path (by its last part alone) or an array."""
-    if is_dataclass(value):
+    if is_dataclass(value) and not isinstance(value, type):
         return asdict(value)
     return value.name if isinstance(value, Path) else value.tolist()

@@ -143,7 +143,7 @@ def _log_shape(rr: Any, stream: Any, playback: Playback, name: str, whole: bool)
     if not whole:
         return
     if name in playback.meshes:
-        mesh = playback.meshes[name]
+        mesh: Any = playback.meshes[name]
         surface = rr.Mesh3D(
             vertex_positions=mesh.vertices,
             triangle_indices=mesh.faces,

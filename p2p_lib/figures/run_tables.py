@@ -87,7 +87,8 @@ def by_pair(numbers: Numbers) -> Table:
         if outcome.objects:
             areas[job.method.name][shown_name(job), job.seed] = _areas(outcome)
     scenes = list(dict.fromkeys(scene for runs in areas.values() for scene, _ in runs))
-    lines, rules = [], []
+    lines: list[list[Cell]] = []
+    rules: list[int] = []
     for method in numbers.methods:
         own, base = areas[method.name], areas[method.against or method.name]
         if not method.against:

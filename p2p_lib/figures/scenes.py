@@ -71,14 +71,14 @@ class Scene:
     def of(cls, playback: Playback) -> Scene:
         """With all that the run's folder holds: keypoints, masks, and a box around each reconstructed surface."""
         boxes = {name: overlay.tight_box(mesh) for name, mesh in playback.meshes.items()}
-        scene = cls(playback.sequence, playback.run, boxes=boxes, truth=False, objects=playback.objects)
+        scene = cls(playback.images, playback.run, boxes=boxes, truth=False, objects=playback.objects)
         scene._playback = playback
         return scene
 
     @classmethod
     def scored(cls, playback: Playback) -> Scene:
         """With the model's box, true and as estimated: in each map of an object by the first frame that has both."""
-        return cls(playback.sequence, playback.run, playback.evaluation, objects=playback.objects)
+        return cls(playback.images, playback.run, playback.evaluation, objects=playback.objects)
 
     def __len__(self) -> int:
         return len(next(iter(self.objects.values())))
@@ -117,7 +117,8 @@ class Scene:
         labels = [Label(note, "#222222", foot)] if note else []
         for name, obj in self.objects.items():
             image = self._draw_object(image, camera, name, obj, row, axes, trail)
-            labels.append(self._label(camera, name, obj, row))
+            if (label := self._label(camera, name, obj, row)) is not None:
+                labels.append(label)
         if dots is not None:
             image = overlay.draw_points(image, overlay.zoomed_px(dots[0], whole, camera), dots[1], 3)
         if not words:
@@ -145,13 +146,13 @@ class Scene:
 
     def region(self, margin: float = 0.08) -> tuple[int, int, int, int]:
         """The rectangle of the objects over the whole run, with a margin (a fraction of the image's width)."""
-        camera, uv = self.sequence.camera, [np.zeros((0, 2))]
+        camera, corners = self.sequence.camera, [np.zeros((0, 2))]
         for name, obj in self.objects.items():
             shown = [(self._model_boxes.get(name), obj.T_cam_model[obj.has_truth])]
             for map_id in np.unique(obj.map_id).tolist():
                 shown.append((self._boxes.get((name, map_id)), obj.T_cam_obj[obj.has_pose & (obj.map_id == map_id)]))
-            uv += [camera.project(box.corners(T)).reshape(-1, 2) for box, T in shown if box]
-        uv = np.concatenate(uv)
+            corners += [camera.project(box.corners(T)).reshape(-1, 2) for box, T in shown if box]
+        uv = np.concatenate(corners)
         uv = uv[camera.inside(uv)]
         if not len(uv):
             return 0, 0, camera.width, camera.height
@@ -192,6 +193,7 @@ class Scene:
     def _label(self, camera: Camera, name: str, obj: ObjectRun, row: int) -> Label | None:
         """The object's name and status, at its estimated box, else its true one, else where it was last seen."""
         before = np.flatnonzero(obj.has_pose[: row + 1])
+        box: Box | None
         if not obj.has_pose[row] and name in self._model_boxes and obj.has_truth[row]:
             box, T_cam_obj = self._model_boxes[name], obj.T_cam_model[row]
         elif len(before):

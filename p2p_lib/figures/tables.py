@@ -73,7 +73,8 @@ def emboldened(cells: Sequence[Cell], more_is_better: bool) -> list[Cell]:
     return [replace(cell, bold=value == best) for cell, value in zip(cells, values.tolist(), strict=True)]
 
 
-_TEX = {"\\": r"\textbackslash{}", "±": r"$\pm$", "Δ": r"$\Delta$", "°": r"$^\circ$", "~": r"\textasciitilde{}"}
+_TEX: dict[str, str | int | None] = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}"}
+_TEX |= {"±": r"$\pm$", "Δ": r"$\Delta$", "°": r"$^\circ$"}
 _TEX |= {c: "\\" + c for c in "&%$#_{}"} | {"^": r"\textasciicircum{}"}
 
 
@@ -130,7 +131,7 @@ class Table:
     def markdown(self) -> str:
         """For pages and README files: one table, or where that is wider than a page, one for each group."""
         whole, groups = self._frame(_MARKDOWN, ": "), [span for _, span in self.groups]
-        columns = [range(len(self.heads))]
+        columns: list[Sequence[int]] = [range(len(self.heads))]
         if groups and len(self.heads) > _MARKDOWN_COLUMNS:
             columns = [[*range(groups[0]), *range(a, b)] for a, b in pairwise(np.cumsum(groups).tolist())]
         table = "\n".join(as_markdown(whole.iloc[:, list(at)], self.words) for at in columns)

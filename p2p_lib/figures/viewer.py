@@ -98,7 +98,7 @@ class _Scene:
         middle = np.median(places, 0) if len(places) else np.array([0.0, 0.0, 0.7])
         server.initial_camera.position = tuple(middle + middle[2] * np.array([0.35, -0.5, -1.0]))
         server.initial_camera.look_at = tuple(middle)
-        self._camera = None
+        self._camera: Any = None
         if playback.sequence is not None:
             camera = playback.sequence.camera
             self._camera = server.scene.add_camera_frustum(

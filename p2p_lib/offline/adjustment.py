@@ -65,9 +65,9 @@ def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> tuple[n
         b = _summed(seen.pose, np.einsum("mia,mi->ma", A, g), K)
         C = _summed(seen.point, V, N) + 1e-3 * np.eye(3)
         c = _summed(seen.point, g, N)
-        E = np.zeros((K, 6, N, 3))
-        np.add.at(E, (seen.pose, slice(None), seen.point), AV)
-        E = E.reshape(6 * K, 3 * N)
+        blocks = np.zeros((K, N, 6, 3))
+        np.add.at(blocks, (seen.pose, seen.point), AV)
+        E = blocks.swapaxes(1, 2).reshape(6 * K, 3 * N)
         C_inverse = np.linalg.inv(C)
         F = np.einsum("anj,njk->ank", E.reshape(6 * K, N, 3), C_inverse).reshape(6 * K, 3 * N)
         S = -F @ E.T

@@ -51,7 +51,7 @@ def outline(silhouette: Silhouette, depth_m: np.ndarray) -> Outline:
 
 def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, mask: np.ndarray | None):
     """How well a label fits: IoU of what shows with the mask, and how far nine of ten depths are off at most, mm."""
-    iou = np.nan if mask is None else np.count_nonzero(shown & mask) / max(np.count_nonzero(shown | mask), 1)
+    iou = np.nan if mask is None else np.count_nonzero(shown & mask) / max(int(np.count_nonzero(shown | mask)), 1)
     both = shown & (depth_m > 0)
     off_m = np.abs(silhouette.depth_in(depth_m)[both] - depth_m[both])
     return float(iou), float(1000 * np.quantile(off_m, 0.9)) if len(off_m) else np.nan
@@ -94,22 +94,26 @@ class _Labels:
 
     def frame(self, i: int) -> Frame:
         """The image, with everything rendered into it."""
+        return self._rendered(i)[0]
+
+    def _rendered(self, i: int) -> tuple[Frame, dict[str, Silhouette]]:
+        """The image, and each object in it as if nothing hid it; of the last one asked for at no cost."""
         if self._seen is None or self._seen[0] != i:
             poses = {name: of.T_cam_model[i] for name, of in self.truth.items() if of.labelled[i]}
             frame = self.made.sequence.frame(i)
             self._seen = i, frame, {name: self._render[name](T) for name, T in poses.items()}
-        return self._seen[1]
+        return self._seen[1:]
 
     def masks(self, i: int) -> dict[str, np.ndarray]:
         """What shows of each object."""
-        frame = self.frame(i)
-        return {name: visible(silhouette, frame.depth_m) for name, silhouette in self._seen[2].items()}
+        frame, silhouettes = self._rendered(i)
+        return {name: visible(silhouette, frame.depth_m) for name, silhouette in silhouettes.items()}
 
     def outlines(self, i: int) -> dict[str, Outline]:
         """The objects as if nothing hid them; notes how well the labels fit."""
-        frame, shown, given = self.frame(i), self.masks(i), self.made.masks(i)
-        whole = {name: outline(silhouette, frame.depth_m) for name, silhouette in self._seen[2].items()}
-        for name, silhouette in self._seen[2].items():
+        (frame, silhouettes), shown, given = self._rendered(i), self.masks(i), self.made.masks(i)
+        whole = {name: outline(silhouette, frame.depth_m) for name, silhouette in silhouettes.items()}
+        for name, silhouette in silhouettes.items():
             fits = agreement(silhouette, shown[name], frame.depth_m, given.get(name))
             obj = self.made.run.objects[name]
             sure = obj.confidence[np.searchsorted(obj.frame_index, i)]

@@ -79,7 +79,7 @@ def features(frame: Frame, mask: np.ndarray, camera: Camera, config: DepthConfig
     if scale > 1:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         inside = cv2.resize(inside, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    found, descriptors = cv2.SIFT_create(_MOST, contrastThreshold=0.02).detectAndCompute(grey, inside)
+    found, descriptors = cv2.SIFT.create(_MOST, contrastThreshold=0.02).detectAndCompute(grey, inside)
     if descriptors is None:
         return nothing
     uv_px = (np.array([point.pt for point in found]) + 0.5) / scale - 0.5 + (cut[1].start, cut[0].start)

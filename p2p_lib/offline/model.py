@@ -374,5 +374,6 @@ def write_glb(textured: Textured, path: Path) -> None:
     visual = trimesh.visual.TextureVisuals(uv=corners[:, 1:], material=material)
     vertices = shape.vertices[corners[:, 0].astype(int)]
     mesh = trimesh.Trimesh(vertices, which.reshape(-1, 3), visual=visual, process=False)
+    glb: Any = mesh.export(file_type="glb")  # bytes, of this kind of file
     with replacing(path) as file:
-        file.write(mesh.export(file_type="glb"))
+        file.write(glb)

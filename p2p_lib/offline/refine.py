@@ -120,7 +120,7 @@ def _columns(
     causal = obj.T_cam_obj @ se3.inverse(T_new_old)
     stays = _stays(T, causal, evidence, sight)
     for k in np.flatnonzero(stays):
-        stays[k] = poses.cost_at(k, causal[k]) <= _GROSS * poses.limit
+        stays[k] = poses.cost_at(int(k), causal[k]) <= _GROSS * poses.limit
     A = se3.adjoint(se3.inverse(T_new_old))
     T, covariance = T @ T_new_old, A @ covariance @ A.T
     T[stays], covariance[stays] = obj.T_cam_obj[stays], obj.covariance[stays]
@@ -174,7 +174,8 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
     new = parts / "whole"
     shutil.rmtree(new, ignore_errors=True)
     (new / "poses").mkdir(parents=True)
-    arrays, told, disagrees = {}, [], {}
+    arrays: dict[str, np.ndarray] = {}
+    told, disagrees = [], {}
     for name, obj in made.run.objects.items():
         part = load_arrays(parts / f"{name}.npz")
         offline = _merged(obj, part) if part else obj

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,7 +58,7 @@ class Sight:
 
     def __init__(self, made: Finished, name: str, config: Config, volume: TsdfVolume, T: np.ndarray, sure: np.ndarray):
         self._made, self._name, self._config, self._volume = made, name, config, volume
-        mesh = volume.mesh()
+        mesh: Any = volume.mesh()  # its colours are those of vertices
         colours = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float)
         self._colours = colours[mesh.faces].mean(1)
         self._render = Renderer(mesh.vertices, mesh.faces, made.sequence.camera)
@@ -93,7 +93,7 @@ class Sight:
             if look.off > _OTHER_COLOURS * usual or look.alike < _LESS_ALIKE * alike:
                 continue
             cost = float(off_surface(self._volume, T, look.cloud).mean())
-            if best is None or cost < best.cost:
+            if covariance is not None and (best is None or cost < best.cost):
                 best = Found(T, covariance, cost)
         return best
 

@@ -78,6 +78,7 @@ class SurfacePoses:
                 two = 0 <= k - 2 * step < len(T) and cost[k - 2 * step] <= self.limit
                 before = T[k - 2 * step] if two else T[k - step]
                 on = T[k - step] @ se3.inverse(before) @ T[k - step]  # goes on as it moved, else stays
+                found: Found | None
                 if shown[k]:
                     found = self._best_of(k, [T[k - step], on])
                 else:

@@ -20,19 +20,21 @@ _ROOM_PX = 8
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """An object in a frame: its pose T_cam_obj (4, 4) and its mask (H, W) bool."""
+    """An object in a frame: its pose T_cam_obj (4, 4), None where it is not known, and its mask (H, W) bool."""
 
     frame: Frame
-    T_cam_obj: np.ndarray
+    T_cam_obj: np.ndarray | None
     mask: np.ndarray
 
 
 def carried(then: Moment, now: Moment, camera: Camera) -> np.ndarray | None:
-    """(H, W) bool: the mask of ``then`` in the frame of ``now``; None where too little of it is seen again.
+    """(H, W) bool: the mask of ``then`` in the frame of ``now``; None for an unknown pose, or too little seen again.
 
     Each measured pixel of now is looked up where it was then, if it moved as the object did. What was hidden then, and
     what is not measured, stays as the mask of ``now`` has it.
     """
+    if then.T_cam_obj is None or now.T_cam_obj is None:
+        return None
     T_then_now = then.T_cam_obj @ se3.inverse(now.T_cam_obj)
     moved_px = _moved_px(then, se3.inverse(T_then_now), camera)
     if not len(moved_px):

@@ -154,8 +154,6 @@ class _Answered:
         self, frame: Frame, T_cam_obj: np.ndarray | None, followed: np.ndarray, camera: Camera
     ) -> np.ndarray | None:
         """(H, W) bool: the newest mask in this frame; None where a pose is not known, or it is not seen again."""
-        if T_cam_obj is None or self.newest.T_cam_obj is None:
-            return None
         return carried(self.newest, Moment(frame, T_cam_obj, followed), camera)
 
 
@@ -187,7 +185,7 @@ class Sam2Refiner:
         self.name = "builtin+sam2" if every is None else "sam2"
         self._network, self._camera, self._config, self._every = network, camera, config, every
         self._beside = ThreadPoolExecutor(1, "sam2") if beside else None
-        self._working: tuple[Frame, Future[dict[str, _Answer]]] | None = None
+        self._working: _Working | None = None
         self._answered: dict[str, _Answered] = {}
         self._frames = 0
 
@@ -203,8 +201,8 @@ class Sam2Refiner:
         prompts  those of this frame that are no masks
         found    every object that the segmenter located, to its mask (H, W) bool, which may be empty
         """
-        waits = self._beside is None or self._frames == 0
-        due = self._every is not None and (not waits or self._frames % self._every == 0)
+        beside = self._beside if self._frames else None  # the first image waits
+        due = self._every is not None and (beside is not None or self._frames % self._every == 0)
         self._frames += 1
         if any(name in self._answered for name in prompts):
             self._working = None  # what is thought of it is wrong, as the answer to come may be
@@ -212,11 +210,11 @@ class Sam2Refiner:
         arrived = self._arrived(frame, found, hints)
         if self._working is None and (questions := self._questions(frame, prompts, found, hints, due)):
             T_cam_obj = {name: hints.get(name, _NO_HINT).T_cam_obj for name in questions}
-            if waits:
+            if beside is None:
                 answers = _answers(self._network, frame, questions)
                 self._keep(frame, answers, T_cam_obj)
                 return {name: answer.mask for name, answer in answers.items()}
-            self._working = _Working(frame, self._beside.submit(_answers, self._network, frame, questions), T_cam_obj)
+            self._working = _Working(frame, beside.submit(_answers, self._network, frame, questions), T_cam_obj)
         return arrived
 
     def _place(self, frame: Frame, hints: Mapping[str, Hint]) -> None:
@@ -337,7 +335,7 @@ def _shares(uv_px: np.ndarray, masks: Iterable[np.ndarray], none: float) -> np.n
 
 
 def _iou(one: np.ndarray, other: np.ndarray) -> float:
-    return np.count_nonzero(one & other) / max(1, np.count_nonzero(one | other))
+    return np.count_nonzero(one & other) / max(1, int(np.count_nonzero(one | other)))
 
 
 def _without_flaws(mask: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ CHECKPOINT, PACKAGE = "sam2", "onnxruntime"
 #: Sides of the images that the encoder takes, and of the decoder's masks.
 SIDE, MASK_SIDE = 1024, 256
 #: ImageNet's mean and deviation, by which colours in [0, 1] are scaled.
-_MEAN, _DEVIATION = np.float32((0.485, 0.456, 0.406)), np.float32((0.229, 0.224, 0.225))
+_MEAN, _DEVIATION = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.float32)
 #: What a point says, as the network numbers it: it is on the object, beside it, a corner of the box around it.
 _ON, _BESIDE, _CORNERS = 1, 0, [2, 3]
 #: A mask that is handed to the network, as logits: as sure as its own are.
@@ -101,7 +101,7 @@ class Sam2Image:
     def features(self, rgb: np.ndarray) -> Features:
         """Of an image (H, W, 3) uint8; those of the image before are kept."""
         rgb = np.ascontiguousarray(rgb)
-        image, newest = hashlib.blake2b(rgb).digest() + str(rgb.shape).encode(), self._newest
+        image, newest = hashlib.blake2b(rgb.data).digest() + str(rgb.shape).encode(), self._newest
         if newest is None or newest[0] != image:
             newest = self._newest = image, self._encoded(rgb)
         return newest[1]

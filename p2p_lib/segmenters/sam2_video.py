@@ -62,7 +62,7 @@ class Sam2VideoSegmenter:
     It looks at colour alone: hints are not used, and unmeasured pixels are labelled too.
     """
 
-    def __init__(self, model: torch.nn.Module, camera: Camera, device: str = "cpu", name: str = "sam2_video"):
+    def __init__(self, model: Any, camera: Camera, device: str = "cpu", name: str = "sam2_video"):
         self.name = name
         self._model, self._device, self._camera = model.to(device).eval(), device, camera
         self._size = int(model.config.image_size)

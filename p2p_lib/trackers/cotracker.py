@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,7 +33,7 @@ def load(config: TrackingConfig, rng: np.random.Generator | None = None) -> Roll
     return tracker(predictor, checkpoints.device())
 
 
-def new_predictor() -> torch.nn.Module:
+def new_predictor() -> Any:
     """The official predictor with random weights, from torch.hub's folder or an installed package; never downloads."""
     import torch
 
@@ -44,7 +44,7 @@ def new_predictor() -> torch.nn.Module:
     return module.CoTrackerOnlinePredictor(checkpoint=None, window_len=16)
 
 
-def tracker(predictor: torch.nn.Module, device: str = "cpu") -> RolloutTracker:
+def tracker(predictor: Any, device: str = "cpu") -> RolloutTracker:
     """A tracker that runs the predictor's model."""
     predictor.model.to(device).eval()
     return RolloutTracker("cotracker3", partial(CoTrackerRollout, predictor, device), predictor.step - 1)
@@ -53,7 +53,7 @@ def tracker(predictor: torch.nn.Module, device: str = "cpu") -> RolloutTracker:
 class CoTrackerRollout:
     """The model's sliding window with a fixed set of queries. It keeps its state in the model: swapped in and out."""
 
-    def __init__(self, predictor: torch.nn.Module, device: str, images: list[np.ndarray], uv_px: np.ndarray):
+    def __init__(self, predictor: Any, device: str, images: list[np.ndarray], uv_px: np.ndarray):
         import torch
 
         self._model, self._device = predictor.model, device

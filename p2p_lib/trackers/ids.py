@@ -22,15 +22,16 @@ class PointIds:
         """Begin a stream: no points, numbers from 0."""
         self._next, self.live = 0, np.zeros(0, np.int64)
 
-    def check_started(self) -> None:
-        """:class:`BadInput` before a stream has begun."""
+    def check_started(self) -> int:
+        """The next number; :class:`BadInput` before a stream has begun."""
         if self._next is None:
             raise BadInput("tracker", "queries or a frame to track before any start", "start(frame) first")
+        return self._next
 
     def add(self, count: int) -> np.ndarray:
         """Rows for new points at the end; returns their ids (count,)."""
-        self.check_started()
-        ids = np.arange(self._next, self._next + count)
+        first = self.check_started()
+        ids = np.arange(first, first + count)
         self.extend(ids)
         return ids
 

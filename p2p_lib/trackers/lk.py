@@ -16,7 +16,7 @@ from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.trackers.ids import PointIds
 
-_FLOW = {"winSize": (21, 21), "maxLevel": 3}
+_WINDOW_PX, _LEVELS = (21, 21), 3
 _FORWARD_BACKWARD_PX = 1.0
 
 
@@ -50,8 +50,8 @@ class LkTracker(PointTracker):
         at = np.flatnonzero(now.visible)
         if len(at):
             here = now.uv_px[at].astype(np.float32)
-            there, found, _ = cv2.calcOpticalFlowPyrLK(previous, self._gray, here, None, **_FLOW)
-            home, back, _ = cv2.calcOpticalFlowPyrLK(self._gray, previous, there, None, **_FLOW)
+            there, found = _flow(previous, self._gray, here)
+            home, back = _flow(self._gray, previous, there)
             error_px = np.linalg.norm(home - here, axis=1)
             ok = (found[:, 0] > 0) & (back[:, 0] > 0) & (error_px < _FORWARD_BACKWARD_PX)
             ok &= in_image(there, frame.shape)
@@ -68,3 +68,10 @@ class LkTracker(PointTracker):
     def reject(self, ids: np.ndarray) -> None:
         """Take these tracks for invisible."""
         self._tracks.visible[np.isin(self._ids.live, ids)] = False
+
+
+def _flow(one: np.ndarray, other: np.ndarray, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where points (N, 2) float32 of one grey image are in the other, and (N, 1) whether they were found."""
+    empty = np.empty_like(uv_px)  # to be filled
+    there, found, _ = cv2.calcOpticalFlowPyrLK(one, other, uv_px, empty, winSize=_WINDOW_PX, maxLevel=_LEVELS)
+    return there, found

@@ -37,7 +37,7 @@ def load(config: TrackingConfig, rng: np.random.Generator | None = None) -> Tapi
     return TapirTracker(model, checkpoints.device(), resolutions=config.tapir_resolutions)
 
 
-def new_model() -> torch.nn.Module:
+def new_model() -> Any:
     """The official class as the online checkpoint wants it, with random weights."""
     module = packages.load("tapnet.torch.tapir_model", "tapir", "tapnet")
     return module.TAPIR(pyramid_level=1, use_casual_conv=True)
@@ -54,7 +54,7 @@ class TapirTracker(PointTracker):
     name = "tapir"
     latency_frames = 0
 
-    def __init__(self, model: torch.nn.Module, device: str = "cpu", size_px: int = SIZE_PX, resolutions: str = "mean"):
+    def __init__(self, model: Any, device: str = "cpu", size_px: int = SIZE_PX, resolutions: str = "mean"):
         self._model, self._device, self._size = model.to(device).eval(), device, size_px
         self._last_alone = resolutions == "last"
         self._ids = PointIds()

@@ -316,6 +316,16 @@ def test_depth_that_was_cut_off_must_be_exported_again(good, tmp_path):
     assert wrong.name == "depth" and "cut off at 65.5 m" in wrong.text and "export the depth again" in wrong.fix
 
 
+def test_an_image_that_ends_too_early_is_found_wherever_it_is(good, tmp_path, monkeypatch):
+    """Of those between the images that are looked at, too."""
+    monkeypatch.setattr(check, "FRAMES", 2)
+    torn = open_sequence(shutil.copytree(good, tmp_path / "torn")).depth[3]
+    torn.write_bytes(torn.read_bytes()[:-500])
+    (wrong,) = alarms(check_folder(tmp_path / "torn"))
+    assert wrong.level is Level.WRONG and wrong.text.startswith(f"1 of 12 images end too early, the first: {torn} (")
+    assert "--skip-bad" in wrong.fix
+
+
 def test_what_is_missing_is_named(good, tmp_path):
     folder = shutil.copytree(good, tmp_path / "less")
     (folder / "masks/box/000000.png").unlink()

@@ -376,6 +376,22 @@ def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(seque
     assert run(sequence, tmp_path / "run", "--skip-bad", "--save-masks", "--resume") == 0
 
 
+@pytest.mark.parametrize(
+    "masks, kept, told", [("first", False, True), ("first", True, False), ("dataset", False, False)]
+)
+def test_a_film_says_where_it_has_no_masks_to_draw(sequence, tmp_path, capsys, masks, kept, told):
+    """An offline run's are in the folder above, and the dataset's own need not be kept."""
+    words = ["--stop", "3", "--masks", masks, *["--save-masks"] * kept]
+    assert run(sequence, tmp_path / "run", *words) == 0
+    shutil.copytree(tmp_path / "run", tmp_path / "run/offline", ignore=shutil.ignore_patterns("masks"))
+    info = json.loads((tmp_path / "run/offline/run.json").read_text())
+    (tmp_path / "run/offline/run.json").write_text(json.dumps(info | {"masks_in": ".."}))
+    for of in ("run", "run/offline"):
+        capsys.readouterr()
+        assert cli.main(["film", str(tmp_path / of), "--out", str(tmp_path / "film.webp")]) == 0
+        assert ("no masks were kept" in capsys.readouterr().err) == told
+
+
 def test_a_torn_frame_is_left_out_too_but_not_one_that_a_prompt_is_made_on(sequence, tmp_path, capsys):
     for k in (0, 3):
         (sequence / f"depth/000{k}.png").write_bytes(b"torn")

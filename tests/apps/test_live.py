@@ -1,5 +1,6 @@
 """Live: a few frames wait, what is dropped is counted, and a line of JSON says what was seen."""
 
+import io
 import json
 import queue
 import re
@@ -21,6 +22,7 @@ from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
 from p2p_lib.apps.live_words import Outlet, Words
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
+from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -34,6 +36,7 @@ from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import write_film
 from p2p_lib.run import run
+from p2p_lib.trackers.lk import LkTracker
 from tests.apps.test_cli import POINTS_ALONE
 from tests.fixtures.sliding_board import H, K, W, write_sequence
 
@@ -173,6 +176,13 @@ def test_slow_processing_drops_frames_and_counts_them(folder):
     assert [e.frame_index for e in got] == sorted({e.frame_index for e in got}) and got[0].frame_index == 0
     assert count.dropped == got[-1].frame_index + 1 - len(got), "what lies between two that were tracked"
     assert f"{count.frames} frames in " in str(count) and f"{count.dropped} dropped" in str(count)
+
+
+def test_a_tracker_that_is_made_already_is_taken(folder):
+    got: list[PoseEstimate] = []
+    options = RunOptions(settings=SETTINGS, tracker=LkTracker(preset().tracking, np.random.default_rng(0)), stop=4)
+    track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, got.append, options)
+    assert [estimate.frame_index for estimate in got] == [0, 1, 2, 3]
 
 
 def test_live_estimates_are_those_of_a_run(folder, tmp_path):
@@ -487,6 +497,7 @@ def test_words_that_do_not_fit_are_said_and_change_nothing():
             '{"remove": "mug"}',
             '{"name": "mug", "points": [[900, 10]]}',
             '{"name": "mug"}',
+            '{"mug": [[320, 240]]}',
             "[]",
             " ",
         ):
@@ -500,10 +511,12 @@ def test_words_that_do_not_fit_are_said_and_change_nothing():
         "line: got hello",
         "remove_object: got 'mug', expected one of no objects",
         "clicks on 'mug'",
-        "prompts: got",
+        'line: got {"name": "mug"}, expected {"name": "mug", "points": [[x, y], ...]} or {"remove": "mug"}',
+        'line: got {"mug": [[320, 240]]}, expected {"name"',
+        "line: got []",
     ):
         assert part in said
-    assert len(errors) == 5
+    assert len(errors) == 6
 
 
 @pytest.mark.parametrize("kind", ["tcp", "udp"])
@@ -567,6 +580,44 @@ def test_a_camera_of_somebody_elses(folder, tmp_path, capsys, monkeypatch):
     assert line["T_world_obj"] == line["T_cam_obj"] is not None
     assert cli.main(["live", "--camera", "their_camera:Frame", "--prompts", str(prompts)]) == 2
     assert "a class without read, close" in capsys.readouterr().err
+
+
+def test_a_camera_of_somebody_elses_is_closed_once_and_what_it_gives_is_checked(folder, tmp_path, capsys, monkeypatch):
+    (tmp_path / "odd_cameras.py").write_text(
+        "from p2p_lib import Camera\n"
+        "closed = []\n"
+        "class Ends:\n"
+        f"    name, camera = 'ends', Camera.from_K({np.asarray(K).tolist()!r}, {W}, {H})\n"
+        "    def read(self): return None\n"
+        "    def close(self): closed.append(self.name)\n"
+        "class Pair(Ends):\n"
+        "    def read(self): return ('rgb', 'depth')\n"
+        "class Nameless(Ends):\n"
+        "    name = None\n"
+        "class Matrix(Ends):\n"
+        "    camera = [[1]]\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    assert cli.main(["live", "--camera", "odd_cameras:Ends", "--listen", *WORDS]) == 0
+    assert sys.modules["odd_cameras"].closed == ["ends"]
+    for name, said in (
+        ("Pair", "camera odd_cameras:Pair: read(): got tuple, expected a p2p_lib.Frame, or None at the end"),
+        ("Nameless", "camera odd_cameras:Nameless: name: got None"),
+        ("Matrix", "camera odd_cameras:Matrix: camera: got list, expected a p2p_lib.Camera"),
+    ):
+        capsys.readouterr()
+        assert cli.main(["live", "--camera", f"odd_cameras:{name}", "--listen", *WORDS]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_a_live_run_says_that_its_images_are_gone(scripted, folder, tmp_path, capsys):
+    for given in (*(open_sequence(folder).frame(k) for k in range(3)), None):
+        scripted.hand.put(given)
+    track_live(scripted, PROMPTS, lambda estimate: None, RunOptions(settings=SETTINGS), out=tmp_path / "run")
+    for command in (["refine"], ["film", "--out", str(tmp_path / "f.webp")]):
+        assert cli.main([command[0], str(tmp_path / "run"), *command[1:]]) == 2
+        assert "it was a live camera's, of which none are kept. To have them" in capsys.readouterr().err
 
 
 def test_frames_up_to_the_stop_are_all_counted(folder):

@@ -1,10 +1,12 @@
 """``p2p run`` keeps what it learnt of each object, and ``--memory`` looks for it in another video."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from p2p_lib.apps.cli import main
-from p2p_lib.core.memory import load_memory
+from p2p_lib.core.memory import load_memory, save_memory
 from p2p_lib.datasets.runs import load_run
 
 CROSSING = ["run", "synthetic/crossing", "--quiet"]
@@ -31,6 +33,16 @@ def test_each_object_is_kept_and_all_are_found_without_masks(learnt, tmp_path):
         T_obj_model = np.linalg.inv(before.objects[name].T_cam_obj[0]) @ before.objects[name].T_cam_model[0]
         off_m = (obj.T_cam_obj[3:] @ T_obj_model - obj.T_cam_model[3:])[:, :3, 3]
         assert np.linalg.norm(off_m, axis=1).max() < 0.01
+
+
+def test_one_that_is_not_there_is_no_fault_of_the_data(learnt, tmp_path, capsys):
+    """Everything is behind the board. That the sequence has truth, of others, is said as well."""
+    save_memory(tmp_path / "cup.npz", replace(load_memory(learnt / "maps/box.npz"), name="cup"))
+    words = ["--start", "170", "--stop", "174", "--memory", str(tmp_path / "cup.npz"), "--out", str(tmp_path / "out")]
+    assert main([*CROSSING, *words]) == 2
+    out, err = capsys.readouterr()
+    assert "cup never had a pose" in err and "is it in view, and seen from a side that was learnt?" in err
+    assert "not scored, the sequence has no truth of cup, only of box, can." in out
 
 
 @pytest.mark.parametrize(

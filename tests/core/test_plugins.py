@@ -41,6 +41,8 @@ def load(folder, masks):
     return plain.load(folder, masks)
 
 load.patterns = ("gt_mask.marked/",)
+
+def nothing(folder, masks): ...
 """
 OFFERED = """
 [p2p_lib.trackers]
@@ -104,7 +106,7 @@ def test_our_names_stay_ours(theirs):
     assert type(make_tracker("builtin", preset().tracking)).__module__.startswith("p2p_lib.")
 
 
-def test_what_cannot_be_had_is_said_in_one_line(theirs):
+def test_what_cannot_be_had_is_said_in_one_line(theirs, sequence):
     tracking, sampling = preset().tracking, preset().sampling
     with pytest.raises(BadInput, match=r"expected one of builtin, .*somebodys, .*Did you mean somebodys"):
         make_tracker("somebody", tracking)
@@ -121,6 +123,8 @@ def test_what_cannot_be_had_is_said_in_one_line(theirs):
         make_segmenter("their_parts:Mine", Camera(100, 100, 10, 10, 20, 20), preset().segmentation)
     with pytest.raises(BadInput, match=r"format: got 'marks', .* or your own as package.module:Class"):
         open_sequence("nowhere", format="marks")
+    with pytest.raises(BadInput, match=r"their_parts:nothing: .* gives: got NoneType, expected an ImageSequence"):
+        open_sequence(sequence, format="their_parts:nothing")
 
 
 def test_a_folder_of_masks_is_no_segmenter(theirs):

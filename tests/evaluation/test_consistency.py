@@ -9,7 +9,7 @@ import trimesh
 from p2p_lib.core import se3
 from p2p_lib.core.image import in_mask
 from p2p_lib.datasets.keypoint_log import KeypointLog
-from p2p_lib.datasets.mask_log import MaskLog
+from p2p_lib.datasets.mask_log import MaskLog, load_masks
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, load_points
 from p2p_lib.evaluation.consistency import HEADS, consistency
 from tests.fixtures.made_run import T_OBJ_MODEL
@@ -68,6 +68,14 @@ def test_what_was_doubted_when_it_was_made_is_to_be_looked_at(made, run):
     assert [s.text for s in found.suspicions["box"]] == doubts and [s.text for s in found.suspicions["can"]] == doubts[
         1:
     ]
+
+
+def test_a_known_size_that_does_not_fit_is_to_be_looked_at(made, run):
+    length_m = float(np.nanmax(load_masks(run.path)["box"].size_m))
+    assert consistency(run, made.sequence, known_m={"box": length_m}).verdict("box") == "good"
+    found = consistency(run, made.sequence, known_m={"box": 3 * length_m})
+    assert (found.verdict("box"), found.verdict("can")) == ("look", "good")
+    assert "focal length or depth scale is wrong" in found.as_table()
 
 
 def put_off(run, xi):
