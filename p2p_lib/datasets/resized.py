@@ -67,9 +67,8 @@ class Resized:
 
 def resized_prompt(prompt: Prompt, scale: float) -> Prompt:
     """A prompt of a sequence, in the pixels of its :class:`Resized`."""
-    points, negative, box = (
-        None if px is None else (px + 0.5) * scale - 0.5 for px in (prompt.points_px, prompt.negative_px, prompt.box_px)
-    )
+    points, negative = ((px + 0.5) * scale - 0.5 for px in (prompt.points_px, prompt.negative_px))
+    box = None if prompt.box_px is None else (prompt.box_px + 0.5) * scale - 0.5
     mask = None if prompt.mask is None else _smaller(prompt.mask, scale)
     return replace(prompt, points_px=points, negative_px=negative, box_px=box, mask=mask)
 

@@ -215,13 +215,14 @@ def beside(
     shown  frames, or how many moments that tell the story of the first
     """
     first = next(iter(scenes.values()))
-    if isinstance(shown, int):
-        shown = next(iter(first.objects.values())).frame_index[first.moments(shown)].tolist()
+    frames = shown
+    if isinstance(frames, int):
+        frames = next(iter(first.objects.values())).frame_index[first.moments(frames)].tolist()
     region_px, images = first.region(), []
     for name, scene in scenes.items():
-        for index in shown:
+        for index in frames:
             images.append(scene.draw(scene.row(index), region_px, width_px, axes=axes, trail=0, note=name))
-    return overlay.montage(images, columns=across * len(shown))
+    return overlay.montage(images, columns=across * len(frames))
 
 
 def draw_live(

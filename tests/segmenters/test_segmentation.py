@@ -204,6 +204,27 @@ def test_what_is_covered_is_absent_whatever_covers_it():
     assert iou(found, card((30, 150))) > 0.9
 
 
+def test_what_was_found_by_its_colours_alone_is_left_for_where_its_points_are():
+    """Something of its colours stood where its motion led; then it comes out elsewhere."""
+    at, alike, back, follow = (40, 90), (230, 95), (130, 150), segmenter()
+
+    def red(k: int, *where: tuple[int, int]) -> Frame:
+        frame = picture(k, [(corner, 1) for corner in where], None if where else card(at, (160, 120)))
+        for corner in where:
+            frame.rgb[card(corner)] = 200, 40, 30
+        return frame
+
+    follow.segment(red(0, at), on(card=at))
+    assert not (follow.segment(red(1)) == 1).any()
+    place = CAMERA.unproject(np.add([alike], [30, 25]), np.array([CARD_M + 0.05]))[0]
+    found = follow.segment(red(2, alike), hints={"card": Hint(place=np.append(place, 0.05))}) == 1
+    assert iou(found, card(alike)) > 0.9
+    points = np.add([[8, 8], [50, 10], [30, 20], [12, 30], [45, 40], [25, 42], [52, 28], [18, 18]], back).astype(float)
+    for k in (3, 4):
+        found = follow.segment(red(k, alike, back), hints={"card": Hint(points, T_cam_obj=np.eye(4))}) == 1
+        assert iou(found, card(back)) > 0.9
+
+
 def test_what_comes_out_where_its_motion_leads_is_known_by_its_colours():
     """No point of it is found again, since it shows another side."""
     at, back, follow = (40, 90), (230, 95), segmenter()

@@ -154,12 +154,14 @@ class BuiltinSegmenter:
         if hint.gone:
             return target, None
         if predicted is None or hint.sighted:  # what has been followed is not where the object was found
-            return target, find(view, target, hint, taken)
+            return replace(target, proven=agreed or hint.sighted), find(view, target, hint, taken)
         due = target.confident and target.past.due(view.frame)
         target = with_room(view, target, hint) if due else target
         claim = follow(view, target, hint, predicted)
-        if agreed and claim is not None and not holds(claim, hint.uv_px):
-            if held:  # what the flow has lost, its points have not
+        if agreed and claim is not None:
+            if holds(claim, hint.uv_px):
+                target = replace(target, proven=True)
+            elif held or not target.proven:  # what the flow has lost, or colours have never found, its points have
                 claim = find(view, target, hint, taken) or claim
             else:
                 target = replace(target, confident=False)

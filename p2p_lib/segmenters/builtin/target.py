@@ -38,6 +38,7 @@ class Target:
     room_m     (2,) how far parts that may belong to it reach from the centre of what was seen
     past       frames that it was seen in, with its poses
     confident  whether enough points agreed on its pose when it was cut out last
+    proven     whether its points were ever on it since it was found: by its colours it may be something else
     given      the newest frame with a mask that was given and showed something. Nothing is learnt from it yet: that
                costs time, and where every frame brings a mask it is never needed
     """
@@ -48,6 +49,7 @@ class Target:
     room_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
     past: Past = field(default_factory=Past)
     confident: bool = False
+    proven: bool = True
     given: tuple[Frame, np.ndarray] | None = None
 
     def with_given(self, frame: Frame, mask: np.ndarray) -> Target:
