@@ -60,10 +60,8 @@ _TOLERANCE_PX = 3.0
 #: Cuts in the wide box and in the one that fits; a click beside the object counts as this many pixels of background.
 _ROUNDS, _ROUNDS_MORE, _OTHERS = 3, 2, 30.0
 #: Clicks may be close together on something large, or at both ends of something thin: it may be so many times as far
-#: across as they are.
-_SCALES = (0.4, 1.0, 2.5)
-#: Another scale than that of the clicks has to have this much less of its outline beside edges.
-_MARGIN = 0.9
+#: across as they are. Then less of its outline is beside edges, by this factor: print inside an object is sharp, too.
+_SCALES = {0.4: 0.5, 1.0: 1.0, 2.5: 0.9}
 #: So many pixels of the grid around a click on something else belong to that.
 _AROUND_PX = 3
 #: Cuts are as good as each other where their doubts differ by less than a factor; of two things if their sizes do more.
@@ -93,9 +91,9 @@ class Cutter:
     def cuts(self) -> list[tuple[float, Box, np.ndarray]]:
         """Cuts at several scales, the best first: how doubtful each is, where it is, and its probabilities there."""
         found = []
-        for scale in _SCALES:
+        for scale, share in _SCALES.items():
             patch, x = self._cut_at(scale)
-            found.append((self._doubtful(patch, x) * (_MARGIN if scale == 1 else 1), patch.box, patch.up(x)))
+            found.append((self._doubtful(patch, x) / share, patch.box, patch.up(x)))
         return sorted(found, key=lambda cut: cut[0])
 
     def _doubtful(self, patch: Patch, x: np.ndarray) -> float:
