@@ -181,7 +181,7 @@ def test_slow_processing_drops_frames_and_counts_them(folder):
 def test_a_tracker_that_is_made_already_is_taken(folder):
     got: list[PoseEstimate] = []
     options = RunOptions(settings=SETTINGS, tracker=LkTracker(preset().tracking, np.random.default_rng(0)), stop=4)
-    track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, got.append, options)
+    track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, got.append, options, backlog=1000)
     assert [estimate.frame_index for estimate in got] == [0, 1, 2, 3]
 
 

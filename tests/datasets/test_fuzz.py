@@ -49,7 +49,6 @@ name = "synthetic/mug"
 seeds = [0]
 [[full.sequence]]
 name = "ycbineoat/*"
-clicks = {object = [[1.5, 2.0]]}
 """
 PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n"
 PLY += "property list uchar int vertex_indices\nend_header\n0 0 0\n0 0 1\n0 1 0\n3 0 1 2\n"

@@ -792,10 +792,11 @@ def test_a_correction_mends_what_was_wrong():
         assert iou(method.masks["right"], masks["right"] & (frame.depth_m > 0)) > 0.85
 
 
-def with_hole(frame: Frame, at: np.ndarray) -> Frame:
-    """A frame without depth around a pixel (x, y)."""
+def with_holes(frame: Frame, at: np.ndarray) -> Frame:
+    """A frame without depth around pixels (N, 2)."""
     depth_m = frame.depth_m.copy()
-    depth_m[at[1] - 4 : at[1] + 5, at[0] - 4 : at[0] + 5] = 0
+    for x, y in at:
+        depth_m[y - 4 : y + 5, x - 4 : x + 5] = 0
     return Frame(frame.index, frame.time_s, frame.rgb, depth_m)
 
 
@@ -806,7 +807,7 @@ def test_a_click_without_depth_stops_nobody_and_is_not_used_later():
         each.add_object("left", clicks=clicks_on(frames[0][1]["left"]))
     on_right = clicks_on(frames[2][1]["right"])
     for k, (frame, masks) in enumerate(frames):
-        frame = with_hole(frame, on_right[1]) if k == 2 else frame
+        frame = with_holes(frame, on_right) if k == 2 else frame
         if k == 2:
             method.add_object("right", clicks=on_right)
         if k == 6:
@@ -816,7 +817,7 @@ def test_a_click_without_depth_stops_nobody_and_is_not_used_later():
         assert_same([{"left": estimates["left"]}], [{"left": expected["left"]}])
         if 2 <= k < 6:
             assert str(estimates["right"].status) == "initialising" and not method.masks["right"]
-            x, y = on_right[1]
+            x, y = on_right[0]
             why = f"clicks on 'right': got ({x}, {y}) has no depth in frame 2"
             assert estimates["right"].reason.startswith(why) and str(method.refused["right"]).startswith(why)
     assert str(estimates["right"].status) == "tracked" and not method.refused
@@ -828,7 +829,7 @@ def test_a_correction_without_depth_is_doubted_and_changes_nothing():
         each.add_object("left", clicks=clicks_on(frames[0][1]["left"]))
     for k, (frame, masks) in enumerate(frames):
         at = clicks_on(masks["left"])
-        frame = with_hole(frame, at[1]) if k == 3 else frame
+        frame = with_holes(frame, at) if k == 3 else frame
         expected = alone.step(frame)
         if k == 3:
             method.correct("left", clicks=at)

@@ -89,9 +89,12 @@ class Cutter:
 
     @cached_property
     def cuts(self) -> list[tuple[float, Box, np.ndarray]]:
-        """Cuts at several scales, the best first: how doubtful each is, where it is, and its probabilities there."""
+        """Cuts at several scales, the best first: how doubtful each is, where it is, and its probabilities there.
+
+        A box says itself how large the object is.
+        """
         found = []
-        for scale, share in _SCALES.items():
+        for scale, share in _SCALES.items() if self.prompt.box_px is None else [(1.0, 1.0)]:
             patch, x = self._cut_at(scale)
             found.append((self._doubtful(patch, x) / share, patch.box, patch.up(x)))
         return sorted(found, key=lambda cut: cut[0])
