@@ -223,8 +223,8 @@ def read_plan(plan: str | Path) -> Plan:
         if first["type"] != "extra_forbidden":
             raise BadInput(f"plan {path.name}", first_fault(error), expected) from None
         word, known = str(first["loc"][-1]), {key for part in Strict.__subclasses__() for key in part.model_fields}
-        where = ".".join(map(str, first["loc"]))
-        raise BadInput(f"plan {path.name}", f"{where}, a key unknown there", expected, did_you_mean(word, known)) from None
+        got = f"{'.'.join(map(str, first['loc']))}, a key unknown there"
+        raise BadInput(f"plan {path.name}", got, expected, did_you_mean(word, known)) from None
 
 
 def prompts_places(sequence: str) -> tuple[Path, ...]:
