@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from p2p_lib.core.backends import DEFAULT_DETECTOR, DEFAULT_TRACKER
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, did_you_mean
 from p2p_lib.core.files import file_name, read_toml
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
@@ -219,7 +219,12 @@ def read_plan(plan: str | Path) -> Plan:
     try:
         return Plan.model_validate({"name": path.stem, **content})
     except ValidationError as error:
-        raise BadInput(f"plan {path.name}", first_fault(error), expected) from None
+        first = error.errors()[0]
+        if first["type"] != "extra_forbidden":
+            raise BadInput(f"plan {path.name}", first_fault(error), expected) from None
+        word, known = str(first["loc"][-1]), {key for part in Strict.__subclasses__() for key in part.model_fields}
+        got = f"{'.'.join(map(str, first['loc']))}, a key unknown there"
+        raise BadInput(f"plan {path.name}", got, expected, did_you_mean(word, known)) from None
 
 
 def prompts_places(sequence: str) -> tuple[Path, ...]:

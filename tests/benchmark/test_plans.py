@@ -202,7 +202,7 @@ SMALL += '[full]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('name = "Ours"', 'name = "Ours"\ntraker = "lk"', r"method\.0\.traker: Extra inputs"),
+        ('name = "Ours"', 'name = "Ours"\ntraker = "lk"', r"method\.0\.traker, a key unknown .* Did you mean tracker"),
         ("seeds = [0]", "seeds = [0.5]", r"quick\.seeds\.0: Input should be a valid integer"),
         ("seeds = [0]", "seeds = []", r"quick\.seeds: List should have at least 1"),
         ('name = "a" }', 'name = "a", stop = -1 }', r"quick\.sequence\.0\.stop"),
