@@ -61,7 +61,7 @@ _TOLERANCE_PX = 3.0
 _ROUNDS, _ROUNDS_MORE, _OTHERS = 3, 2, 30.0
 #: Clicks may be close together on something large, or at both ends of something thin: it may be so many times as far
 #: across as they are. Then less of its outline is beside edges, by this factor: print inside an object is sharp, too.
-_SCALES = {0.4: 0.5, 1.0: 1.0, 2.5: 0.9}
+_SCALES = {0.4: 0.5, 1.0: 1.0, 2.5: 0.7}
 #: So many pixels of the grid around a click on something else belong to that.
 _AROUND_PX = 3
 #: Cuts are as good as each other where their doubts differ by less than a factor; of two things if their sizes do more.
@@ -89,12 +89,9 @@ class Cutter:
 
     @cached_property
     def cuts(self) -> list[tuple[float, Box, np.ndarray]]:
-        """Cuts at several scales, the best first: how doubtful each is, where it is, and its probabilities there.
-
-        A box says itself how large the object is.
-        """
+        """Cuts at several scales, the best first: how doubtful each is, where it is, and its probabilities there."""
         found = []
-        for scale, share in _SCALES.items() if self.prompt.box_px is None else [(1.0, 1.0)]:
+        for scale, share in _SCALES.items():
             patch, x = self._cut_at(scale)
             found.append((self._doubtful(patch, x) / share, patch.box, patch.up(x)))
         return sorted(found, key=lambda cut: cut[0])
