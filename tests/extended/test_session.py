@@ -9,6 +9,7 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import NOT_FOUND, Status, status_text, status_word
+from p2p_lib.datasets import open_sequence
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.segmenters.anchored import builtin
 from tests.method.test_pipeline import CAMERA, HIDDEN, assert_same, film, quick, track
@@ -20,6 +21,16 @@ def followed(method: Point2Pose, frames) -> list:
     for name in ("left", "right"):
         method.add_object(name)
     return [method.step(frame, masks) for frame, masks in frames]
+
+
+def test_a_look_alike_that_shows_first_gets_no_map():
+    """README's example: where the carton went behind a board comes a tin in its colours, then the carton beside it."""
+    sequence = open_sequence("synthetic/crossing")
+    with Point2Pose(sequence.camera) as method:
+        method.add_object("box", clicks=[[170, 245], [190, 220], [150, 270]])
+        found = [method.step(sequence.frame(i))["box"] for i in range(215)]
+    assert all(estimate.T_cam_obj is None for estimate in found[170:202]), "the board hides it"
+    assert all(estimate.T_cam_obj is not None and estimate.map_id == 0 for estimate in found[206:])
 
 
 def test_after_a_reset_a_tracker_is_as_new():
