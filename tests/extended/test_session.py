@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from p2p_lib import open_sequence
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import NOT_FOUND, Status, status_text, status_word
-from p2p_lib.datasets import open_sequence
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.segmenters.anchored import builtin
 from tests.method.test_pipeline import CAMERA, HIDDEN, assert_same, film, quick, track
