@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,8 +14,9 @@ from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.patch import Box, Patch
-from p2p_lib.segmenters.builtin.prompted import Cutter, doubt_start
+from p2p_lib.segmenters.builtin.prompted import Cut, Cutter
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
+from p2p_lib.segmenters.builtin.start_doubts import doubt_start
 
 CAMERA = Camera(300.0, 310.0, 158.3, 121.7, 320, 240)
 
@@ -91,14 +93,12 @@ def test_clicks_close_together_select_all_of_a_cover(seed):
 )
 def test_another_scale_than_that_of_the_clicks_has_to_be_clearly_better(monkeypatch, ties, chosen):
     """With a towel the outline of a mug is as good as without."""
-    cut_at, asked = Cutter._cut_at, []
+    told, cut_at = iter(ties), Cutter._cut_at  # one scale after the other, the smallest first
+    monkeypatch.setattr(Patch, "outline_tie", lambda patch, mask: next(told))
 
-    def cut(self, scale):
-        patch, x = cut_at(self, scale)
-        asked.append(scale)
-        monkeypatch.setattr(Patch, "outline_tie", lambda patch, _: ties[asked.index(patch.scale)])
-        object.__setattr__(patch, "scale", scale)
-        return patch, np.full_like(x, scale)
+    def cut(self, scale, *more):
+        made = cut_at(self, scale, *more)
+        return replace(made, x=np.full_like(made.x, scale))
 
     monkeypatch.setattr(Cutter, "_cut_at", cut)
     prompt = Prompt("left", points_px=[[110, 100], [120, 110]])
@@ -117,7 +117,7 @@ def test_another_scale_than_that_of_the_clicks_has_to_be_clearly_better(monkeypa
 )
 def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, mask, others, said):
     box = Box(0, 0, 320, 240)
-    cuts = [(0.3, box, LEFT.astype(np.float32)), (doubtful, box, (LEFT | RIGHT).astype(np.float32))]
+    cuts = [Cut(0.3, box, LEFT.astype(np.float32)), Cut(doubtful, box, (LEFT | RIGHT).astype(np.float32))]
     monkeypatch.setattr(Cutter, "cuts", cuts)
     prompt = Prompt("left", points_px=[[110, 100]])
     with warnings.catch_warnings(record=True) as caught:

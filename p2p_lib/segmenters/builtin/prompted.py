@@ -5,7 +5,6 @@ A prompt starts an object, or corrects its mask.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,8 +14,6 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depths_at
-from p2p_lib.core.errors import doubt
-from p2p_lib.core.image import bounds
 from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.cut import cut
@@ -25,10 +22,7 @@ from p2p_lib.segmenters.builtin.patch import (
     Box,
     Patch,
     around,
-    dilated,
     keep_seeded_components,
-    plane_heights,
-    support_plane,
 )
 from p2p_lib.segmenters.builtin.start_evidence import (
     Clicked,
@@ -45,16 +39,12 @@ ROOM_PX = 6
 #: About so many pixels of a mask stand for what is right about it.
 _MIDDLE = 40
 NO_PX = np.zeros((0, 2))
-#: Standard deviations of depth below which an object's median height above the plane around it is none.
-_FLAT = 2.0
 #: A box is drawn a little too tight now and then, by this share of its size.
 _TIGHT = 0.05
 #: Length of a step between like pixels, where one across the strongest edge has length 1.
 _LIKE = 0.1
 #: Log odds of what lies nearer to a click beside the object than to one on it: more than geometry says.
 _NOT_IT = 3.0
-#: Two things are parted by an edge where their outline's ties, which are 1 between like pixels, are less in the mean.
-_TIED = 0.02
 #: Depth may end this many pixels beside the outline that colour shows.
 _TOLERANCE_PX = 3.0
 #: Cuts in the wide box and in the one that fits; a click beside the object counts as this many pixels of background.
@@ -64,9 +54,25 @@ _ROUNDS, _ROUNDS_MORE, _OTHERS = 3, 2, 30.0
 _SCALES = {0.4: 0.5, 1.0: 1.0, 2.5: 0.7}
 #: So many pixels of the grid around a click on something else belong to that.
 _AROUND_PX = 3
-#: Cuts are as good as each other where their doubts differ by less than a factor; of two things if their sizes do more.
-#: Masks are the same where they overlap by this.
-_AS_GOOD, _OTHER_SIZE, _SAME = 1.2, 1.5, 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """An object cut out in a box, its probability x (rows, columns).
+
+    doubtful  how little of its outline is along edges, and how much of what is clicked as something else is inside;
+              more for another scale than that of the clicks
+    """
+
+    doubtful: float
+    box: Box
+    x: np.ndarray
+
+    def whole(self, shape: tuple[int, int]) -> np.ndarray:
+        """(H, W) bool: in the whole image."""
+        mask = np.zeros(shape, bool)
+        mask[self.box.slices] = self.x > 0.5
+        return mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,25 +90,12 @@ class Cutter:
 
     def start(self) -> tuple[Box, np.ndarray]:
         """From clicks or a box: of cuts at several scales the one whose outline is along edges the most."""
-        _, box, x = self.cuts[0]
-        return box, x
+        best = self.cuts[0]
+        return best.box, best.x
 
     @cached_property
-    def cuts(self) -> list[tuple[float, Box, np.ndarray]]:
-        """Cuts at several scales, the best first: how doubtful each is, where it is, and its probabilities there."""
-        found = []
-        for scale, share in _SCALES.items():
-            patch, x = self._cut_at(scale)
-            found.append((self._doubtful(patch, x) / share, patch.box, patch.up(x)))
-        return sorted(found, key=lambda cut: cut[0])
-
-    def _doubtful(self, patch: Patch, x: np.ndarray) -> float:
-        """How little of a cut's outline is along edges, and how much of what is clicked as something else is inside."""
-        mask, others = x > 0.5, patch.dots(self._others_px, _AROUND_PX)
-        return patch.outline_tie(mask) + (mask[others].mean() if others.any() else 0.0)
-
-    def _cut_at(self, scale: float) -> tuple[Patch, np.ndarray]:
-        """In a wide box at low resolution, then in one that fits: something ``scale`` times as far across as clicks."""
+    def cuts(self) -> list[Cut]:
+        """From clicks or a box, at several scales, the best first."""
         cfg, frame, around_px = self.config, self.frame, self.prompt.box_px
         clicks = self.prompt.points_px if len(self.prompt.points_px) else points_in_box(around_px, frame)
         z_m = float(np.nanmedian(depths_at(clicks, frame)))
@@ -113,21 +106,29 @@ class Cutter:
             box = self._room(around_px[:2], around_px[2:])
         moved = replace(self, frame=with_depth_moved(frame, depth_offset_px(frame, box)))
         patch = Patch.of(moved.frame, box, self.camera, cfg)
-        clicked = Clicked.of(patch, clicks, z_m, scale)
+        found = [moved._cut_at(scale, patch, clicks, z_m) for scale in _SCALES]
+        return sorted(found, key=lambda cut: cut.doubtful)
+
+    def _cut_at(self, scale: float, patch: Patch, clicks_px: np.ndarray, z_m: float) -> Cut:
+        """On a wide patch at low resolution, then on one that fits; ``scale`` times as far across as the clicks."""
+        cfg = self.config
+        clicked = Clicked.of(patch, clicks_px, z_m, scale)
         height = Height.of(patch, clicked)
         connected = by_connection(patch, clicked, height) + self._nearer_to_others(patch, clicked)
         prior = clicked.prior_beside(connected)
-        x = moved._cut_out(patch, clicked, prior, by_distance(patch, z_m, cfg) + height.log_odds + connected)
-        whole, there = np.zeros((2, *frame.shape), np.float32)
+        x = self._cut_out(patch, clicked, prior, by_distance(patch, z_m, cfg) + height.log_odds + connected)
+        whole, there = np.zeros((2, *self.frame.shape), np.float32)
         whole[patch.box.slices], there[patch.box.slices] = patch.up(x), patch.up(connected)
         fits = self._room(*patch.ends_px(x > 0.5))
-        patch = Patch.of(moved.frame, fits, self.camera, replace(cfg, side_px=2 * cfg.side_px))
-        clicked = Clicked.of(patch, clicks, z_m, scale)
+        patch = Patch.of(self.frame, fits, self.camera, replace(cfg, side_px=2 * cfg.side_px))
+        clicked = Clicked.of(patch, clicks_px, z_m, scale)
         height = height.on(patch, clicked)
         connected = patch.down(there)
         geometry = by_distance(patch, z_m, cfg) + height.log_odds + connected
-        x = moved._cut_out(patch, clicked, clicked.prior_beside(connected) / 2, geometry, patch.down(whole))
-        return patch, x
+        x = self._cut_out(patch, clicked, clicked.prior_beside(connected) / 2, geometry, patch.down(whole))
+        mask, others = x > 0.5, patch.dots(self._others_px, _AROUND_PX)
+        inside = mask[others].mean() if others.any() else 0.0
+        return Cut(float(patch.outline_tie(mask) + inside) / _SCALES[scale], patch.box, patch.up(x))
 
     def correct(self, was: np.ndarray, known_px: np.ndarray) -> tuple[Box, np.ndarray]:
         """Anew, from clicks that say what is wrong with a mask (H, W) bool, and from what is right about it.
@@ -185,71 +186,6 @@ class Cutter:
         """A box with room around the pixels from ``low`` to ``high`` (x, y)."""
         half = (high - low) / 2 * (1 + 2 * self.config.margin) + ROOM_PX
         return around((low + high) / 2, half, self.frame.shape)
-
-
-def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> None:
-    """Warn if the prompt that started an object with a mask (H, W) bool may have selected something else.
-
-    cutter  of the prompt alone, as if there were no other objects
-    others  object to mask (H, W) bool, of the other objects in this frame
-    """
-    frame, name = cutter.frame, cutter.prompt.name
-    who = f"{'clicks on' if len(cutter.prompt.points_px) else 'box around'} {name!r} in frame {frame.index}"
-    if not mask.any():
-        fix = "Click in its middle, on parts that look different, or draw a box."
-        return doubt(who, "no object is found there", fix)
-    rows, columns = bounds(mask)
-    corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
-    patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)
-    plane = support_plane(patch, patch.depth_m > 0)
-    inside = (patch.down(mask.astype(np.float32)) > 0.5) & (patch.depth_m > 0)
-    if plane is not None and inside.any():
-        height = np.median(np.abs(plane_heights(patch, plane)[inside]) / patch.sigma_m[inside])
-        if height < _FLAT:
-            got = f"{np.count_nonzero(mask)} pixels, flat in what is around it, as a table or a wall is"
-            fix = "If it is not the object, click in the object's middle; else see that depth is in metres."
-            return doubt(who, got, fix)
-    beside = {
-        other: there
-        for other, there in others.items()
-        if there.any() and _touch_unparted(patch, inside, patch.down(there.astype(np.float32)) > 0.5)
-    }
-    cuts = [(doubtful, _whole(frame, box, x)) for doubtful, box, x in cutter.cuts]
-    for other, there in beside.items():
-        if (cuts[0][1] & there).sum() > there.sum() / 2:
-            fix = "If both are one body, leave one out; else give each clicks beside it (negative), on the other."
-            return doubt(who, f"most of {other!r} belongs to what is clicked", fix)
-    taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *others.values()])
-    best = cuts[0][1] & ~taken
-    if (best & mask).sum() < _SAME * (best | mask).sum():
-        return None  # the mask is somebody else's
-    for doubtful, cut_out in cuts[1:]:
-        another = cut_out & ~taken
-        sizes = sorted([np.count_nonzero(mask), np.count_nonzero(another)])
-        if doubtful < _AS_GOOD * cuts[0][0] and 0 < _OTHER_SIZE * sizes[0] < sizes[1]:
-            apart = cv2.distanceTransform((another ^ mask).astype(np.uint8), cv2.DIST_L2, 3)
-            v, u = np.unravel_index(apart.argmax(), apart.shape)
-            got = f"{np.count_nonzero(mask)} pixels; {np.count_nonzero(another)} have as good an outline"
-            fix = f"See where ({u}, {v}) belongs: click there, too, or beside the object (negative)."
-            return doubt(who, got, fix)
-    return None
-
-
-def _whole(frame: Frame, box: Box, x: np.ndarray) -> np.ndarray:
-    """(H, W) bool of a cut in a box."""
-    whole = np.zeros(frame.shape, bool)
-    whole[box.slices] = x > 0.5
-    return whole
-
-
-def _touch_unparted(patch: Patch, one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two masks (h, w) bool touch, and not along an edge of colour or depth alone."""
-    right, below = patch.edge_weights
-    tie = np.ones(patch.shape, np.float32)
-    tie[:, :-1] = np.minimum(tie[:, :-1], right)
-    tie[:-1] = np.minimum(tie[:-1], below)
-    tied = cv2.erode(tie, np.ones((3, 3), np.uint8))[dilated(one, 1) & dilated(other, 1)]
-    return bool(len(tied)) and tied.mean() > _TIED
 
 
 def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:

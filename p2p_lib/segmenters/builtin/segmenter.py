@@ -25,7 +25,8 @@ from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.finding import find, near_last
 from p2p_lib.segmenters.builtin.following import Prediction, follow, holds, predict, with_room
 from p2p_lib.segmenters.builtin.patch import Box
-from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter, doubt_start
+from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
+from p2p_lib.segmenters.builtin.start_doubts import doubt_start
 from p2p_lib.segmenters.builtin.target import Target, seen_in
 from p2p_lib.segmenters.builtin.view import Claim, View
 
@@ -82,7 +83,8 @@ class BuiltinSegmenter:
         _check(frame, said, self.camera)
         self._frames += 1
         view = View(frame, self._previous, self.camera, self.config)
-        new = [p for p in said.values() if p.mask is None and p.name not in self._targets]
+        cutters = {name: _cutter(view, prompt, said) for name, prompt in said.items() if prompt.mask is None}
+        new = [name for name in cutters if name not in self._targets]
         masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
         due, claims = self._due(), {}
         taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
@@ -90,12 +92,13 @@ class BuiltinSegmenter:
             if name in masks:
                 self._targets[name] = self._targets.get(name, Target()).with_given(frame, masks[name])
             else:
-                self._targets[name], claims[name] = self._locate(view, name, said, hints, taken, name in due)
+                asked = cutters.get(name), hints, taken, name in due
+                self._targets[name], claims[name] = self._locate(view, name, *asked)
                 _mark(taken, claims[name])
         claims |= self._refined(frame, said, claims, hints)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
-        self._doubt_starts(view, labels, new)
+        self._doubt_starts(labels, [cutters[name] for name in new])
         self._previous = frame
         return labels
 
@@ -118,16 +121,14 @@ class BuiltinSegmenter:
         self,
         view: View,
         name: str,
-        said: Mapping[str, Prompt],
+        cutter: Cutter | None,
         hints: Mapping[str, Hint],
         taken: np.ndarray,
         due: bool,
     ) -> tuple[Target, Claim]:
         """Locate one object outside what is ``taken`` (H, W) bool; the updated target and its probability map."""
         target = self._targets.get(name, Target()).with_learnt(view.previous, view.focal_px, view.config)
-        if name in said:
-            others_px = np.concatenate([NO_PX, *(p.points_px for n, p in said.items() if n != name)])
-            cutter = Cutter(view.frame, view.camera, view.config, said[name], others_px)
+        if cutter is not None:
             claim = self._segment_prompt(view, cutter, target, hints.get(name, _NO_HINT), taken)
             return Target(), claim  # its colours and its size are learnt anew
         predicted = None if target.seen is None else predict(view, target)
@@ -211,13 +212,19 @@ class BuiltinSegmenter:
                 part[mask] = 0
         return labels
 
-    def _doubt_starts(self, view: View, labels: np.ndarray, new: Iterable[Prompt]) -> None:
-        """Warn if a prompt that started an object selected something else."""
+    def _doubt_starts(self, labels: np.ndarray, cutters: Iterable[Cutter]) -> None:
+        """Warn if a prompt that started an object may have selected something else."""
         label_of = {name: label for label, name in enumerate(self._targets, 1)}
-        for prompt in new:
-            others = {name: labels == label for name, label in label_of.items() if name != prompt.name}
-            cutter = Cutter(view.frame, view.camera, view.config, prompt, NO_PX)
-            doubt_start(cutter, labels == label_of[prompt.name], others)
+        for cutter in cutters:
+            name = cutter.prompt.name
+            others = {other: labels == label for other, label in label_of.items() if other != name}
+            doubt_start(cutter, labels == label_of[name], others)
+
+
+def _cutter(view: View, prompt: Prompt, said: Mapping[str, Prompt]) -> Cutter:
+    """What cuts out the object of a prompt, by what is ``said`` of the others, too."""
+    others_px = np.concatenate([NO_PX, *(p.points_px for name, p in said.items() if name != prompt.name)])
+    return Cutter(view.frame, view.camera, view.config, prompt, others_px)
 
 
 def _check(frame: Frame, said: Mapping[str, Prompt], camera: Camera) -> None:

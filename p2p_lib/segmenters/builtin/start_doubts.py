@@ -1,0 +1,99 @@
+"""What is doubtful about the mask that a prompt started an object with: said once, with the click that settles it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from p2p_lib.core.errors import doubt
+from p2p_lib.core.image import bounds
+from p2p_lib.segmenters.builtin.patch import Patch, around, dilated, plane_heights, support_plane
+from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
+
+#: Standard deviations of depth below which an object's median height above the plane around it is none.
+_FLAT = 2.0
+#: Two things are parted by an edge where their outline's ties, which are 1 between like pixels, are less in the mean.
+_TIED = 0.02
+#: Cuts are as good as each other where their doubts differ by less than a factor; of two things if their sizes do more.
+#: Masks are the same where they overlap by this.
+_AS_GOOD, _OTHER_SIZE, _SAME = 1.2, 1.5, 0.7
+
+
+def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> None:
+    """Warn if the prompt that started an object with a mask (H, W) bool may have selected something else.
+
+    cutter  which cut it out
+    others  object to mask (H, W) bool, of the other objects in this frame
+    """
+    frame, name = cutter.frame, cutter.prompt.name
+    who = f"{'clicks on' if len(cutter.prompt.points_px) else 'box around'} {name!r} in frame {frame.index}"
+    if not mask.any():
+        fix = "Click in its middle, on parts that look different, or draw a box."
+        return doubt(who, "no object is found there", fix)
+    rows, columns = bounds(mask)
+    corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
+    patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)
+    inside = (patch.down(mask.astype(np.float32)) > 0.5) & (patch.depth_m > 0)
+    if _flat(patch, inside):
+        got = f"{np.count_nonzero(mask)} pixels, flat in what is around it, as a table or a wall is"
+        fix = "If it is not the object, click in the object's middle; else see that depth is in metres."
+        return doubt(who, got, fix)
+    if one_body := _one_body(cutter, patch, inside, others):
+        fix = "If both are one body, leave one out; else give each clicks beside it (negative), on the other."
+        for other in one_body:
+            doubt(who, f"most of {other!r} belongs to what is clicked", fix)
+    elif (another := _as_good(cutter, mask, others)) is not None:
+        pixels, (u, v) = another
+        got = f"{np.count_nonzero(mask)} pixels; {pixels} have as good an outline"
+        doubt(who, got, f"See where ({u}, {v}) belongs: click there, too, or beside the object (negative).")
+    return None
+
+
+def _flat(patch: Patch, inside: np.ndarray) -> bool:
+    """Whether what is measured of an object (h, w) bool does not rise above the plane around it."""
+    plane = support_plane(patch, patch.depth_m > 0)
+    if plane is None or not inside.any():
+        return False
+    return bool(np.median(np.abs(plane_heights(patch, plane)[inside]) / patch.sigma_m[inside]) < _FLAT)
+
+
+def _one_body(cutter: Cutter, patch: Patch, inside: np.ndarray, others: Mapping[str, np.ndarray]) -> list[str]:
+    """The other objects most of which would be taken for part of this one, if nobody had clicked on them."""
+    touched = {
+        other: there
+        for other, there in others.items()
+        if there.any() and _touch_unparted(patch, inside, patch.down(there.astype(np.float32)) > 0.5)
+    }
+    if not touched:
+        return []
+    alone = replace(cutter, others_px=NO_PX).cuts[0].whole(cutter.frame.shape)
+    return [other for other, there in touched.items() if (alone & there).sum() > there.sum() / 2]
+
+
+def _as_good(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> tuple[int, tuple[int, int]] | None:
+    """The pixels of a cut of another size with as good an outline, and one that tells it from the mask (H, W) bool."""
+    taken = np.logical_or.reduce([np.zeros(mask.shape, bool), *others.values()])
+    best = cutter.cuts[0].whole(mask.shape) & ~taken
+    if (best & mask).sum() < _SAME * (best | mask).sum():
+        return None  # the mask is somebody else's
+    for cut in cutter.cuts[1:]:
+        another = cut.whole(mask.shape) & ~taken
+        small, large = sorted([np.count_nonzero(mask), np.count_nonzero(another)])
+        if cut.doubtful < _AS_GOOD * cutter.cuts[0].doubtful and 0 < _OTHER_SIZE * small < large:
+            apart = cv2.distanceTransform((another ^ mask).astype(np.uint8), cv2.DIST_L2, 3)
+            v, u = np.unravel_index(apart.argmax(), apart.shape)
+            return np.count_nonzero(another), (int(u), int(v))
+    return None
+
+
+def _touch_unparted(patch: Patch, one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two masks (h, w) bool touch, and not along an edge of colour or depth alone."""
+    right, below = patch.edge_weights
+    tie = np.ones(patch.shape, np.float32)
+    tie[:, :-1] = np.minimum(tie[:, :-1], right)
+    tie[:-1] = np.minimum(tie[:-1], below)
+    tied = cv2.erode(tie, np.ones((3, 3), np.uint8))[dilated(one, 1) & dilated(other, 1)]
+    return bool(len(tied)) and tied.mean() > _TIED
