@@ -97,12 +97,12 @@ def check_folder(
 
     Files that are missing or cannot be read are findings too, all that can be told without each other.
     """
-    config, other = config or preset(), format not in (None, "folder")
+    config = config or preset()
     try:
         opened = open_sequence(sequence, format, depth_scale)
     except P2PError as error:
-        own = _files(Path(sequence).expanduser()) if isinstance(sequence, str | Path) and not other else []
-        return own or [_unreadable("files", error)]
+        own = isinstance(sequence, str | Path) and format in (None, "folder")
+        return (_files(Path(str(sequence)).expanduser()) if own else []) or [_unreadable("files", error)]
     sequence, frames, masks, wrong = opened, [], [], []
     for i in np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist():
         try:

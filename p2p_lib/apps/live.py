@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -113,7 +112,7 @@ def track_live(
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
     said = list(prompts)
     with ExitStack() as kept:
-        listeners: list[Listener] = [lambda _, estimates: deque(map(on_estimate, estimates.values()), 0)]
+        listeners: list[Listener] = [_each(on_estimate)]
         if overlay is not None:
             listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
         if out is not None:
@@ -159,6 +158,16 @@ def _warm_up(method: Point2Pose) -> None:
 
 
 Listener = Callable[[Frame, dict[str, PoseEstimate]], object]
+
+
+def _each(on_estimate: Callable[[PoseEstimate], None]) -> Listener:
+    """One that hears of each object by itself."""
+
+    def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
+        for estimate in estimates.values():
+            on_estimate(estimate)
+
+    return listen
 
 
 def _filmed(film: Film, name: str, method: Point2Pose, first: Frame | None) -> Listener:
