@@ -107,17 +107,18 @@ def test_another_scale_than_that_of_the_clicks_has_to_be_clearly_better(monkeypa
 
 
 @pytest.mark.parametrize(
-    ("doubtful", "mask", "others", "said"),
+    ("doubtful", "another", "mask", "others", "said"),
     [
-        (0.33, LEFT, {}, True),
-        (0.40, LEFT, {}, False),  # its outline is worse
-        (0.33, LEFT, {"right": RIGHT}, False),  # that is another object
-        (0.33, RIGHT, {}, False),  # not what was cut out: SAM 2 knows better
+        (0.33, LEFT | RIGHT, LEFT, {}, True),
+        (0.40, LEFT | RIGHT, LEFT, {}, False),  # its outline is worse
+        (0.33, rectangle(90, 80, 160, 140), LEFT, {}, False),  # about the same
+        (0.33, LEFT | RIGHT, LEFT, {"right": RIGHT}, False),  # that is another object
+        (0.33, LEFT | RIGHT, RIGHT, {}, False),  # not what was cut out: SAM 2 knows better
     ],
 )
-def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, mask, others, said):
+def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, another, mask, others, said):
     box = Box(0, 0, 320, 240)
-    cuts = [Cut(0.3, box, LEFT.astype(np.float32)), Cut(doubtful, box, (LEFT | RIGHT).astype(np.float32))]
+    cuts = [Cut(0.3, box, LEFT.astype(np.float32)), Cut(doubtful, box, another.astype(np.float32))]
     monkeypatch.setattr(Cutter, "cuts", cuts)
     prompt = Prompt("left", points_px=[[110, 100]])
     with warnings.catch_warnings(record=True) as caught:
@@ -129,6 +130,15 @@ def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, 
             r"3600 pixels; 6600 have as good an outline. See where \((\d+), (\d+)\)", str(caught[0].message)
         )
         assert RIGHT[int(found[2]), int(found[1])]
+
+
+def test_all_others_that_belong_to_what_is_clicked_are_named():
+    prompts = [Prompt(name, points_px=[at]) for name, at in (("a", [100, 90]), ("b", [140, 130]), ("c", [120, 110]))]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        segmenter().segment(picture(), prompts)
+    of_c = [str(doubt.message) for doubt in caught if "'c' in frame" in str(doubt.message)]
+    assert [any(f"most of {other!r}" in text for text in of_c) for other in "ab"] == [True, True]
 
 
 def test_one_click_in_a_hole_of_the_depth_does_no_harm():
