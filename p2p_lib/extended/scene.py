@@ -105,7 +105,7 @@ class Scene:
         if not turn:
             chosen = np.unique(np.concatenate([nearest[:2], oldest[:3]]))
         pairs = [self._matched(self._views[k], seen) for k in chosen]
-        p_world, p_cam, corner = (np.concatenate(column) for column in zip(*pairs, strict=True))
+        p_world, p_cam = (np.concatenate(column) for column in zip(*pairs, strict=True))
         if len(p_world) < _MIN_AGREEING:
             return None
         limit_m = np.maximum(_INLIER_M, 3 * depth_noise_m(p_cam[:, 2], self._config))
@@ -114,18 +114,16 @@ class Scene:
             return None
         among = np.ones(len(p_cam), bool)
         fit = robust.refit(T, p_world, p_cam, limit_m, 1 / limit_m**2, _MIN_AGREEING, among)
-        agreeing = 0 if fit is None else len(np.unique(corner[fit.inliers]))
-        return se3.inverse(fit.T_a_b) if agreeing >= _MIN_AGREEING else None
+        return None if fit is None else se3.inverse(fit.T_a_b)
 
     @staticmethod
-    def _matched(view: _View, seen: _View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Corners p (M, 3) of a view with those they match, p_cam (M, 3), and which these are (M,)."""
+    def _matched(view: _View, seen: _View) -> tuple[np.ndarray, np.ndarray]:
+        """Corners p (M, 3) of a view with those they match, p_cam (M, 3)."""
         if len(seen.descriptors) < 2:
-            return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int)
+            return np.zeros((0, 3)), np.zeros((0, 3))
         nearest, distance, second = two_nearest(view.descriptors.view(np.uint64), seen.descriptors.view(np.uint64))
         good = distance < _RATIO * second
-        at = nearest[good]
-        return view.p[good], seen.p[at], at
+        return view.p[good], seen.p[nearest[good]]
 
 
 @compiled("u8[:,::1], u8[:,::1]")

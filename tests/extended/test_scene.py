@@ -1,5 +1,7 @@
 """The static scene tells how the camera moved, whatever moves in it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -79,6 +81,21 @@ def test_objects_are_no_part_of_it():
         T, T_fooled = tracked.locate(with_board(shift), board), fooled.locate(with_board(shift), None)
     assert off(T, np.eye(4))[0] < 0.01
     assert T_fooled is None or off(T_fooled, np.eye(4))[0] > 0.02
+
+
+def test_the_oldest_views_outweigh_those_that_have_drifted():
+    """Of views that overlap, the newest are off by what the way there has added up."""
+    tracked = scene()
+    for x_m in (0.0, 0.17, 0.34):
+        tracked.locate(wall_seen_from(moved(x_m)), None)
+    drift = se3.from_rt(np.eye(3), np.array([0.05, 0.05, 0.0]))
+    for x_m in np.linspace(0.1, 0.3, 5):
+        seen = tracked._corners(wall_seen_from(moved(x_m)), None)
+        T = drift @ moved(x_m)
+        tracked._views.append(replace(seen, p=se3.transform(T, seen.p), T_world_cam=T))
+    tracked._T_world_cam = drift @ moved(0.2)
+    apart_m, _ = off(tracked.locate(wall_seen_from(moved(0.2)), None), moved(0.2))
+    assert apart_m < 0.02
 
 
 @pytest.mark.parametrize("depth_m", [0.0, 9.0])
