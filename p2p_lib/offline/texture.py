@@ -1,4 +1,4 @@
-"""The texture of a model: baked from the sharpest views all around, each texel from those that face it most.
+"""The texture of a model: baked from the sharpest views all around, each texel most by those that show it best.
 
 The exposure of the views is evened out first: a gain per view and channel, by what several of them show. What no view
 shows keeps the surface's own colour.
@@ -26,8 +26,6 @@ HELD_OUT_EVERY = 10
 _BEHIND_M, _MEASURED_M = 0.004, 0.015
 #: Texels seen more obliquely than this cosine are not taken from a view.
 _FACING = 0.25
-#: How much better views outweigh others: near 1 blurs by poses' errors, large numbers show seams.
-_SHARP = 6.0
 #: Pixels at a mask's border that may be of something else.
 _BORDER_PX = 3
 
@@ -122,12 +120,14 @@ def evened(views: list[View], camera: Camera, p_obj: np.ndarray, normal: np.ndar
 
 
 def baked(views: Iterable[View], camera: Camera, p_obj: np.ndarray, normal: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(N, 3) uint8 of surface points (N, 3): from the views that show each best, else its ``own`` colour (N, 3)."""
+    """(N, 3) uint8 of surface points (N, 3): the mean of the views by how well each shows it, else its ``own`` colour.
+
+    A mean, not the best view: its pose is off by a pixel or two, and so is that of the next image.
+    """
     total, weight = np.zeros((len(p_obj), 3), np.float32), np.zeros(len(p_obj), np.float32)
     for view in views:
         rows, colour, shown = sampled(view, camera, p_obj, normal)
-        # Weights of a power relative to a usual one, so that nothing overflows.
-        w = (shown / 1e4).astype(np.float32) ** _SHARP
+        w = shown.astype(np.float32)
         total[rows] += w[:, None] * colour
         weight[rows] += w
     found = weight > 0

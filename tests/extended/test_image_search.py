@@ -157,3 +157,21 @@ def test_of_one_colour_with_the_wall_only_the_ball_is_tried():
     assert len(places) > 10 and (places[:, 2] < 0.7).all()
     found = looked.among(laid_at(PLACE[None], places, sample), sample)
     assert found and all(np.linalg.norm(one.T_cam_obj[:3, 3] - PLACE[:3, 3]) < 0.005 for one in found)
+
+
+def test_of_many_places_those_that_differ_are_looked_at():
+    """Most of what is proposed lies on one of two balls that look alike: the other is found as well."""
+    near, beside = ball_in_front_of_a_wall(), moved(0.15, 0.02, 0.05)
+    other = ball_in_front_of_a_wall(centre=beside[:3, 3])
+    shows = other.depth_m < WALL_M
+    both = replace(
+        near, rgb=np.where(shows[..., None], other.rgb, near.rgb), depth_m=np.where(shows, other.depth_m, near.depth_m)
+    )
+    many = [moved(*by_m) for by_m in np.random.default_rng(0).normal(scale=0.001, size=(40, 3))]
+    aside = beside.copy()
+    aside[:3, 3] += [0.015, 0, 0]
+    found = [
+        sighting.T_cam_obj[:3, 3] for sighting in search(both).among(np.stack([*many, aside]), sample_of_the_ball())
+    ]
+    for centre in (PLACE[:3, 3], beside[:3, 3]):
+        assert np.linalg.norm(found - centre, axis=1).min() < 0.005

@@ -1,6 +1,7 @@
 """Models to take away: what they look like, opened by other libraries, and how near they are to the truth."""
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from p2p_lib.core.native import load_open3d
 from p2p_lib.core.raycasting import SurfaceDistance
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh
 from p2p_lib.offline import model, texture
+from p2p_lib.offline.finished import evenly
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
 
@@ -97,6 +99,31 @@ def test_fewer_faces_keep_the_shape_and_what_is_guessed():
     assert len(few.faces) <= 100 and few.guessed.any()
     assert (few.vertices[few.faces[few.guessed]].mean(1)[:, 2] > 0.04).all()
     assert SurfaceDistance(few.vertices, few.faces)(shape.vertices).max() < 0.002
+
+
+def test_of_one_direction_the_sharpest_frame_is_taken(monkeypatch):
+    sharpness = np.random.default_rng(0).uniform(1, 9, 40)
+    T = np.tile(se3.from_rt(np.eye(3), np.array([0, 0, 0.5])), (40, 1, 1))
+    T[20:] = T[20:] @ se3.exp(np.array([0, 1.0, 0, 0, 0, 0]))  # seen from two sides
+    made = SimpleNamespace(run=SimpleNamespace(objects={"box": SimpleNamespace(T_cam_obj=T)}))
+    nothing = np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), bool), np.zeros((1, 1), np.float32)
+    shown = lambda made, name, row, render: texture.View(row, T[row], *nothing, sharpness[row])  # noqa: E731
+    monkeypatch.setattr(texture, "view_of", shown)
+    chosen = [view.frame for view in texture.chosen_rows(made, "box", np.arange(40), None)]
+    looked_at = [evenly(np.arange(20), 4), evenly(np.arange(20, 40), 4)]
+    assert chosen == [rows[sharpness[rows].argmax()] for rows in looked_at]
+
+
+def test_what_shows_a_point_better_counts_more():
+    camera, T = Camera(300, 300, 79.5, 59.5, 160, 120), se3.from_rt(np.eye(3), np.array([0, 0, 0.5]))
+    depth_m, shows = np.full((120, 160), 0.5, np.float32), np.ones((120, 160), bool)
+    views = [
+        texture.View(k, T, np.full((120, 160, 3), grey, np.float32), shows, depth_m, sharpness)
+        for k, (grey, sharpness) in enumerate(((100, 9.0), (200, 1.0)))
+    ]
+    p, towards = np.zeros((1, 3)), np.array([[0, 0, -1.0]])
+    assert (texture.baked(views, camera, p, towards, np.zeros((1, 3))) == 110).all()
+    assert (texture.baked([], camera, p, towards, np.full((1, 3), 7)) == 7).all()
 
 
 def test_exposure_is_evened_out():
