@@ -330,14 +330,17 @@ def _dashes(segments: np.ndarray) -> np.ndarray:
 def _free_place(
     size: tuple[int, int], around: tuple[float, ...], taken: list[tuple[int, int, int, int]], shape: tuple[int, ...]
 ) -> tuple[int, int]:
-    """Upper left corner for a label: the first place beside its rectangle that is inside and free."""
+    """Upper left corner for a label: the first free place beside its rectangle, else the nearest in the image."""
     w, h = size
     left, top, right, bottom = around
     middle, centre = (left + right - w) / 2, (top + bottom - h) / 2
     wanted = [(middle, top - h - 4), (middle, bottom + 4), (right + 4, centre), (left - w - 4, centre)]
-    wanted += [(middle, top - k * (h + 2) - 4) for k in (2, 3, 4)]
-    for u, v in wanted:
-        u, v = round(min(max(u, 0), shape[1] - w)), round(min(max(v, 0), shape[0] - h))
-        if not any(u < x1 and x0 < u + w and v < y1 and y0 < v + h for x0, y0, x1, y1 in taken):
-            return u, v
-    return round(middle), round(top)
+    anywhere = [(u, v) for v in range(0, shape[0], h + 2) for u in (0, middle, shape[1])]
+    wanted += sorted(anywhere, key=lambda at: np.hypot(at[0] - middle, at[1] - top))
+    within = [(round(min(max(u, 0), shape[1] - w)), round(min(max(v, 0), shape[0] - h))) for u, v in wanted]
+    free = (
+        (u, v)
+        for u, v in within
+        if not any(u < x1 and x0 < u + w and v < y1 and y0 < v + h for x0, y0, x1, y1 in taken)
+    )
+    return next(free, within[0])

@@ -206,11 +206,11 @@ def test_a_label_keeps_clear_of_the_caption():
 
 
 def test_labels_do_not_cover_each_other():
-    where = (300.0, 200.0, 400.0, 300.0)
-    labels = [Label(f"object {k}: tracked", style.OBJECTS[k], where) for k in range(5)]
-    together = overlay.draw_labels(picture(), labels)
+    where = (300.0, 10.0, 400.0, 300.0)  # up to the caption
+    labels = [Label(f"object {k}: tracked", style.OBJECTS[k], where) for k in range(len(style.OBJECTS))]
+    together = overlay.draw_labels(picture(200), labels, "synthetic/eight_objects 1.00 s, a run of many objects")
     for label in labels:
-        alone = overlay.draw_labels(picture(), [label])
+        alone = overlay.draw_labels(picture(200), [label])
         count = [(image == style.rgb(label.colour)).all(2).sum() for image in (alone, together)]
         assert count[0] == count[1] > 500
 
