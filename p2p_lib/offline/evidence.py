@@ -84,7 +84,7 @@ class VideoPoses:
         self.key, self.views, self.tracks = np.array(evidence.key, int), evidence.views, evidence.tracks
 
     def tied(self) -> tuple[np.ndarray, list[loops.Tie]]:
-        """Poses (n, 4, 4) that follow the strongest ties, NaN where nothing tells, and the ties that count."""
+        """Poses (n, 4, 4), NaN where nothing tells, keyframes by their strongest ties, and the ties that count."""
         T, key = self.obj.T_cam_obj.copy(), self.key
         if len(key) < 2:
             return T, []
@@ -93,11 +93,6 @@ class VideoPoses:
         pairs = [(tie.a, tie.b, tie.T_a_b, tie.strength) for tie in strong]
         pairs += [pair for a in range(len(key) - 1) if (pair := self._tracked(a, a + 1))]
         T_key = loops.along_ties(T[key], pairs)
-        has = np.isfinite(T[key][:, 0, 0]) & np.isfinite(T_key[:, 0, 0])
-        if has.any():  # frames between go with the nearest keyframe
-            posed = np.flatnonzero(self.obj.has_pose)
-            nearest = np.flatnonzero(has)[np.abs(key[has] - posed[:, None]).argmin(1)]
-            T[posed] = T[posed] @ se3.inverse(T[key[nearest]]) @ T_key[nearest]
         T[key] = np.where(np.isfinite(T_key), T_key, T[key])
         return T, strong
 

@@ -65,7 +65,6 @@ class Sight:
         looks = (self._look(self._frame(k), T[k]) for k in evenly(sure, _CALIBRATED))
         usual = [look.off for look in looks if look]
         self._usual = float(np.median(usual)) if usual else 0.0
-        self._light: dict[int, tuple[float, float]] = {}
 
     def _frame(self, k: int) -> Frame:
         return self._made.sequence.frame(int(self._made.frames[k]))
@@ -76,10 +75,8 @@ class Sight:
         beside  a frame next to it with its pose, in the same light
         """
         frame, best = self._frame(k), None
-        if beside not in self._light:  # what was found so passes on what it was found by: errors do not add up
-            known = self._look(self._frame(beside), T_beside)
-            self._light[beside] = (max(self._usual, known.off), known.alike) if known else (self._usual, 1.0)
-        self._light[k] = usual, alike = self._light[beside]
+        known = self._look(self._frame(beside), T_beside)
+        usual, alike = (max(self._usual, known.off), known.alike) if known else (self._usual, 1.0)
         for T in candidates:
             covariance = None
             for _ in range(3):

@@ -223,7 +223,7 @@ def test_frames_keep_the_causal_object_frame_and_what_does_not_fit_has_no_pose(m
 
 
 @pytest.mark.parametrize("what", ["as it is", "behind", "colours", "pattern"])
-def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what):
+def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what, monkeypatch):
     of, T, config = Finished(made.run, made.sequence), made.run.objects["can"].T_cam_obj, preset()
     rows = np.arange(0, 12)
     sight = Sight(of, "can", config, fused(of, "can", T, rows, config, 0.004), T, rows)
@@ -237,7 +237,13 @@ def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what):
     if what == "colours":  # as it was, but three times as strong
         rgb = middle + 3 * (rgb - middle)
     if what == "pattern":  # the same colours elsewhere, beside a frame in whose light they are far off as well
-        sight._light[k - 1] = 3 * sight._usual, 0.9
+        look = sight._look
+        in_that_light = lambda frame, *how, **more: (  # noqa: E731
+            look(frame, *how, **more)._replace(off=3 * sight._usual, alike=0.9)
+            if frame.index == k - 1
+            else look(frame, *how, **more)
+        )
+        monkeypatch.setattr(sight, "_look", in_that_light)
         v, u = np.nonzero(mask)
         rgb[v, u] = rgb[v, u][np.random.default_rng(0).permutation(len(v))]
     seen = replace(frame, depth_m=depth_m, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
@@ -247,11 +253,60 @@ def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what):
     assert found is None or np.linalg.norm((found.T_cam_obj - T[k])[:3, 3]) < 0.003
 
 
+def printed(rgb: np.ndarray, mask: np.ndarray) -> loops.Features:
+    """What is recognised of what a mask holds, half a metre away."""
+    frame = Frame(0, 0.0, rgb, np.full(mask.shape, 0.5, np.float32))
+    return loops.features(frame, mask, CAMERA, preset().depth)
+
+
+def test_of_a_small_object_enough_is_recognised():
+    """A fine print of 50 px has about as many features as one of 160 px; as it is, a twentieth of them."""
+    grains = np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)
+    count = []
+    for px in (50, 160):
+        rgb, mask = np.full((240, 320, 3), 128, np.uint8), np.zeros((240, 320), bool)
+        rgb[40 : 40 + px, 60 : 60 + px] = cv2.resize(grains, (px, px), interpolation=cv2.INTER_CUBIC)
+        mask[40 : 40 + px, 60 : 60 + px] = True
+        count.append(len(printed(rgb, mask).p_cam))
+    assert count[0] > 0.5 * count[1] > 50, count
+
+
+def test_what_ties_matched_is_adjusted_as_one_point():
+    rng, T = np.random.default_rng(0), np.tile(se3.from_rt(np.eye(3), np.array([0, 0, 0.5])), (2, 1, 1))
+    away = np.array([0, 0, 0.5])
+    views = [loops.Features(away + rng.normal(0, 0.02, (n, 3)), np.zeros((n, 128)), *[None] * 2) for n in (6, 5)]
+    tracks = [(np.array([7, 8]), views[0].p_cam[:2]), (np.array([8, 9]), views[1].p_cam[:2])]
+    told = evidence.Evidence(tracks=tracks, key=[0, 1], views=views)
+    made = SimpleNamespace(sequence=SimpleNamespace(camera=CAMERA), run=SimpleNamespace(info={"seed": 0}))
+    video = evidence.VideoPoses(made, SimpleNamespace(T_cam_obj=T), preset(), told)
+    tie = loops.Tie(0, 1, np.eye(4), np.array([5, 1, 0]), np.array([2, 4, 3]), 9.0)
+    for strong, shared in (([], 1), ([tie], 4)):  # track 8, and three matches
+        found = video.sightings(strong)
+        assert len(np.intersect1d(found.point[found.pose == 0], found.point[found.pose == 1])) == shared
+        assert len(found.p_cam) == 4 + 6 * bool(strong)
+
+
+def test_a_neighbour_helps_where_it_fits_better_with_a_mask_or_by_sight():
+    """Frame 1 has no mask, frame 3 has one, in which nothing fits better than what is there."""
+    better, worse = (Found(np.full((4, 4), k), np.eye(6), cost) for k, cost in ((5.0, 0.2), (6.0, 0.95)))
+    poses = SimpleNamespace(
+        T=np.tile(np.eye(4), (5, 1, 1)),
+        covariance=np.tile(np.eye(6), (5, 1, 1)),
+        cost=np.array([0.1, 0.9, 0.1, 0.9, 0.1]),
+        limit=0.5,
+        _evidence=SimpleNamespace(shown=np.array([True, False, True, True, True])),
+        _best_of=lambda k, candidates: worse,
+    )
+    SurfacePoses.ask_neighbours(poses, SimpleNamespace(found=lambda *of: better))
+    assert (poses.T[1] == 5).all() and poses.cost[1] == 0.2
+    assert (poses.T[3] == np.eye(4)).all() and poses.cost[3] == 0.9
+
+
 def test_features_keep_away_from_the_border_of_the_mask():
     """What shows there, or through a handle, may be of something else, which does not move with the object."""
     rgb = cv2.resize(np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8), (320, 240))
     mask = np.zeros((240, 320), bool)
     mask[100:150, 140:200] = True
-    found = loops.features(Frame(0, 0.0, rgb, np.full((240, 320), 0.5, np.float32)), mask, CAMERA, preset().depth)
+    found = printed(rgb, mask)
     u, v = CAMERA.project(found.p_cam).T
     assert len(u) > 40 and ((u > 141) & (u < 198) & (v > 101) & (v < 148)).all()
