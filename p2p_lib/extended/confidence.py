@@ -19,6 +19,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.method.object_model import Known, ObjectModel
 from p2p_lib.method.observation import Observation
 from p2p_lib.method.policy import Candidate, Policy
+from p2p_lib.method.refinement import Refinement
 
 #: Pixels to each side of a point that make its surroundings.
 _AROUND_PX = 5
@@ -93,7 +94,7 @@ class Belief:
         config = policy.config
         bounds = config.tracking.textureless_contrast, config.lifecycle.return_inliers
         constrained = not texture or _constrained(obs, best, policy.observer.camera, *bounds)
-        free, slides = best.refined.free_rotations, may_slide(best, config.refinement.min_eigenvalue)
+        free, slides = best.refined.free_rotations, may_slide(best.refined, config.refinement.min_eigenvalue)
         return cls(policy.covariance(obs, known, best), free, slides, constrained, support, agreement)
 
     def at(
@@ -149,7 +150,7 @@ def contrast_along(
     return sum(change * flow_px[:, [k]] for k, change in enumerate(over_two_px)).std(-1)
 
 
-def may_slide(best: Candidate, min_eigenvalue: float) -> bool:
-    """Whether a refined pose may move along the surface without leaving it, besides turns."""
-    held = best.refined.eigenvalues
-    return held is not None and bool((held < min_eigenvalue).sum() > len(best.refined.free_rotations))
+def may_slide(refined: Refinement, min_eigenvalue: float, ways: int = 1) -> bool:
+    """Whether a refined pose may move along the surface in so many ways without leaving it, besides turns."""
+    held = refined.eigenvalues
+    return held is not None and bool((held < min_eigenvalue).sum() >= len(refined.free_rotations) + ways)

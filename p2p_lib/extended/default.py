@@ -56,6 +56,7 @@ MECHANISMS = {
     "return_gate": "A return needs many agreeing points, or shape and colour.",
     "surface_gate": "A pose without agreeing points needs a surface that fits.",
     "sliding_gate": "Of something flat, whose surface leaves free where it is, points have to agree with a pose.",
+    "contour": "What is flat and plain is held by where its mask ends.",
     "rest": "What lay still in the scene is not back elsewhere unless its points say so.",
     "size": "Nothing is learnt where depth shows the object and the scene in another size.",
     "outline": "Nothing is learnt where the mask does not end where depth has steps.",

@@ -21,8 +21,8 @@ _SIZE, _SIZE_SIGMAS = 0.05, 3.0
 #: A mask is doubted of whose outline less than this share lies where depth has steps, of what did before. One that
 #: stays so for this many frames is taken for right.
 OUTLINE, _LONGEST_DOUBT = 0.45, 60
-#: So many points fix a pose.
-_FIXED_BY = 3
+#: So many points fix a pose, or so much of its contour.
+FIXED_BY, _CONTOUR = 3, 0.7
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Evidence:
     carried        whether its motion before the gap still says where it is
     slides         whether the pose may move along the surface without leaving it, as that of something flat
     rests          whether an object that lay still is where the scene has it; None where nobody knows
+    contour        share of its contour that shows where its mask ends; 0 where nobody has looked
     """
 
     support: int
@@ -51,6 +52,7 @@ class Evidence:
     carried: bool = False
     slides: bool = False
     rests: bool | None = None
+    contour: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,8 @@ def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: Life
 
 def _few_points_on_flat(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
     """What is flat lies on a table as well as on itself: its own points have to say where."""
-    fixed = evidence.support >= _FIXED_BY or (evidence.sighting or 0.0) >= SIGHTED
+    points = evidence.support >= FIXED_BY or (evidence.sighting or 0.0) >= SIGHTED
+    fixed = points or evidence.contour >= _CONTOUR
     free = evidence.slides and not fixed
     return f"only {evidence.support} points agree, and the surface leaves free where it is" if free else ""
 

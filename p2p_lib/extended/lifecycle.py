@@ -49,6 +49,7 @@ class Lifecycle(Life):
     lost_frames     frames since the newest proven pose in which it was in view
     doubted_frames  newest frames in a row whose pose was doubted by one of :data:`~p2p_lib.extended.gates.DOUBTS`
     seen_m2         the most that a keyframe showed of it, across the line of sight
+    contour         (K, 3) where something flat ends, as it was seen under a sure pose; None before
     in_sight        it has had a mask in every frame since its newest pose, or since its motion still led to it
     """
 
@@ -64,6 +65,7 @@ class Lifecycle(Life):
     doubted_frames: int = 0
     in_sight: bool = False
     seen_m2: float = 0.0
+    contour: np.ndarray | None = None
 
     @property
     def followed(self) -> bool:
@@ -100,7 +102,9 @@ class Lifecycle(Life):
         """The same in another object frame; T_old_new (4, 4) maps it to the one so far."""
         poses = {name: getattr(self, name) for name in ("T_cam_obj", "T_previous", "T_left", "T_world_obj")}
         motion = self.motion and self.motion.in_frame(T_old_new)
-        return replace(self, motion=motion, **{n: None if T is None else T @ T_old_new for n, T in poses.items()})
+        contour = None if self.contour is None else se3.transform(se3.inverse(T_old_new), self.contour)
+        moved = {n: None if T is None else T @ T_old_new for n, T in poses.items()}
+        return replace(self, motion=motion, contour=contour, **moved)
 
     def placed(self, T_world_cam: np.ndarray | None) -> Lifecycle:
         """The state with the newest pose's place in the scene, once a return has been confirmed.

@@ -10,17 +10,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.types import DOUBTED, Status
 from p2p_lib.extended.agreement import scene_ratio, size_ratio
 from p2p_lib.extended.confidence import Belief, may_slide
-from p2p_lib.extended.gates import SIGHTED, Evidence, Judgement, judge, off_size
+from p2p_lib.extended.contour import REACH_PX, ContourFit, on_plane
+from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Evidence, Judgement, judge, off_size
 from p2p_lib.extended.graph import explained
 from p2p_lib.extended.image_search import laid_on
 from p2p_lib.extended.lifecycle import TELLING, Lifecycle, same_place
 from p2p_lib.extended.motion import motion_weight
 from p2p_lib.extended.shape_search import ShapeSearch
 from p2p_lib.extended.sight import Sight, cut_off, empty
-from p2p_lib.method import registration
+from p2p_lib.method import refinement, registration
 from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
 from p2p_lib.method.policy import Admission, Candidate, Policy, Verdict
 from p2p_lib.method.refinement import Refinement as Refinement  # the type of an inherited field
@@ -162,6 +164,28 @@ class OurPolicy(Policy):
 
     # -- choose --------------------------------------------------------------------------------
 
+    def refined(self, obs: Sight, known: Known, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None) -> Refinement:
+        """As in the paper; something flat that no points hold is held by where it ends, while it is followed."""
+        found = super().refined(obs, known, T_cam_obj, agrees)
+        held = known.life.unconfirmed or (agrees is not None and agrees.sum() >= FIXED_BY)
+        fit = None if held else self._contour(obs, known, found)
+        for reach_px in () if fit is None else REACH_PX:
+            if (pairs := fit.pairs(found.T_cam_obj, reach_px)) is None:
+                break
+            surface, cfg = known.model.surface, self.config.refinement
+            found = refinement.refine(found.T_cam_obj, obs.cloud, surface, cfg, keypoints=pairs)
+        return found
+
+    def _contour(self, obs: Sight, known: Known, refined: Refinement) -> ContourFit | None:
+        """The contour that something flat is known by beside the one that is seen; None where there is none."""
+        if not self._flat(refined) or known.life.contour is None:
+            return None
+        return ContourFit(known.life.contour, obs.contour_px, obs.frame, self.observer.camera)
+
+    def _flat(self, refined: Refinement) -> bool:
+        """Whether the contour has a say: where the surface leaves free to all sides where the object is."""
+        return "contour" in self.on and may_slide(refined, self.config.refinement.min_eigenvalue, 2)
+
     def choose(self, obs: Sight, known: Known, hypotheses: list[Hypothesis]) -> tuple[Proposal | None, str]:
         """The best of some hypotheses, refined, and why. The paper selects one and refines that; ours refines all."""
         candidates = [Proposal(hypothesis) for hypothesis in hypotheses]
@@ -221,9 +245,11 @@ class OurPolicy(Policy):
         size = self._size(obs, known, best) if "size" in self.on else None
         outline = self.outline(obs) if "outline" in self.on else 1.0
         carried = self.carried(known, obs.frame.time_s)
-        slides = "sliding_gate" in self.on and may_slide(best, self.config.refinement.min_eigenvalue)
+        slides = "sliding_gate" in self.on and may_slide(best.refined, self.config.refinement.min_eigenvalue)
+        fit = self._contour(obs, known, best.refined)
         rests = self._rests(obs, known, best) if "rest" in self.on else None
         told = {"size": size, "outline": outline, "still": obs.still, "carried": carried, "slides": slides}
+        told["contour"] = 0.0 if fit is None else fit.share(best.T_cam_obj)
         evidence = replace(best.evidence, rests=rests, **told)
         return judge(known.life, evidence, self.on, self.config.lifecycle)
 
@@ -300,14 +326,25 @@ class OurPolicy(Policy):
     def begun(self, obs: Sight, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
         """As in the paper, with its place in the scene; the frame is one to compare others with."""
         self.trusted = obs
-        return super().begun(obs, T_cam_obj, verdict).placed(obs.frame.T_world_cam)
+        life = super().begun(obs, T_cam_obj, verdict).placed(obs.frame.T_world_cam)
+        return self._outlined(life, obs, T_cam_obj) if "contour" in self.on else life
 
     def followed(
         self, obs: Sight, known: Known, best: Proposal, admission: BelievedAdmission, sure: float
     ) -> Lifecycle:
         """A frame that is learnt from tells its place in the scene and its motion, too."""
         life = admission.life
-        return life.placed(obs.frame.T_world_cam).moved(sure) if admission.learns else life
+        if not admission.learns:
+            return life
+        certain = best.hypothesis.support >= self.config.lifecycle.return_inliers
+        if (certain or life.contour is None) and self._flat(best.refined):
+            life = self._outlined(life, obs, best.T_cam_obj)
+        return life.placed(obs.frame.T_world_cam).moved(sure)
+
+    def _outlined(self, life: Lifecycle, obs: Sight, T_cam_obj: np.ndarray) -> Lifecycle:
+        """The life with the contour that is seen under a pose, where that can be known."""
+        p_cam = on_plane(obs.contour_px, obs.cloud, self.observer.camera)
+        return life if p_cam is None else replace(life, contour=se3.transform(se3.inverse(T_cam_obj), p_cam))
 
     def expected(self, obs: Sight, known: Known) -> np.ndarray | None:
         """Where it was left lying in the static scene, as the camera saw that last; else as in the paper."""

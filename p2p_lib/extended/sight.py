@@ -12,6 +12,7 @@ from p2p_lib.core.image import bounds
 from p2p_lib.core.types import Frame as Frame  # the type of an inherited field
 from p2p_lib.core.types import Tracks
 from p2p_lib.extended.agreement import outline_share
+from p2p_lib.extended.contour import contour_px
 from p2p_lib.extended.frame_guard import StillFrame
 from p2p_lib.extended.image_search import Sighting
 from p2p_lib.method.observation import Observation, Observer
@@ -36,6 +37,11 @@ class Sight(Observation):
     sighting: Sighting | None = None
     given: bool = True
     other: Sight | None = None
+
+    @cached_property
+    def contour_px(self) -> np.ndarray:
+        """(N, 2) where its mask ends because the object does."""
+        return np.zeros((0, 2)) if self.mask is None else contour_px(self.frame, self.mask)
 
     @property
     def still(self) -> bool:
