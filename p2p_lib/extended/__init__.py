@@ -11,6 +11,7 @@ are composed in three ways:
   ``outlook`` answers where an object should show, ``scene`` how the camera moved, ``shape_search`` and
   ``image_search`` whether a surface shows;
 - inside an object's step: ``policy`` answers what the paper's policy answers. ``gates`` judge a pose, ``agreement``
-  says whether camera and masks agree with themselves, ``motion`` where an object goes, ``confidence`` how well a pose
-  is known, ``lifecycle`` what an object has been through; ``model``, ``graph`` and ``views`` are what it is known by.
+  says whether camera and masks agree with themselves, ``contour`` where something flat ends, ``motion`` where an object
+  goes, ``confidence`` how well a pose is known, ``lifecycle`` what an object has been through; ``model``, ``graph`` and
+  ``views`` are what it is known by.
 """
