@@ -101,7 +101,7 @@ def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: Life
 
 
 def _few_points_on_flat(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
-    """What is flat lies on a table as well as on itself: its own points have to say where."""
+    """What is flat lies on a table as well as on itself: its own points, or where it ends, have to say where."""
     points = evidence.support >= FIXED_BY or (evidence.sighting or 0.0) >= SIGHTED
     fixed = points or evidence.contour >= _CONTOUR
     free = evidence.slides and not fixed

@@ -50,7 +50,7 @@ class Frontend:
     _streaming: bool = False
 
     def track(self, asked: Asked) -> Asked | None:
-        """Follow all points into a frame; the frame that the tracks are of, earlier where they come late, else None."""
+        """Track all points into a frame; the frame that the tracks are of, None until a late tracker answers."""
         self.waiting.append(asked)
         tracks = self._tracked(asked.frame, asked.masks)
         if len(self.waiting) <= self.tracker.latency_frames:

@@ -98,7 +98,7 @@ class Point2Pose(Objects):
 
     @property
     def tracks(self) -> Tracks:
-        """Everybody's 2D tracks in that frame."""
+        """The 2D tracks of all objects in the frame that the newest estimates are of."""
         return self.front.tracks
 
     # -- a frame -------------------------------------------------------------------------------
@@ -112,7 +112,7 @@ class Point2Pose(Objects):
         Where the 2D tracker answers late, so does this: the estimates are of the frame ``latency_frames`` ago,
         and there are none for the first of the stream until then. ``self.frame`` is the one that they are of (None
         while there are none), ``self.masks`` keeps the masks that they were made with, the segmenter's included, and
-        ``self.tracks`` everybody's 2D tracks.
+        ``self.tracks`` the 2D tracks of all objects.
         """
         with self.alone(), self.stopwatch.frame(), uninterrupted():
             tracked = self.front.track(self._asked(frame, masks or {}))
@@ -134,7 +134,7 @@ class Point2Pose(Objects):
         return Asked(self._parts.before(frame) if self._parts.before else frame, given, said)
 
     def finish(self) -> Iterator[dict[str, PoseEstimate]]:
-        """After the last frame: the estimates still owed, oldest first. None are unless the tracker answers late."""
+        """After the last frame: the estimates that a tracker which answers late still owes, oldest first."""
         waiting = list(self.front.waiting)
         for _ in range(self.tracker.latency_frames if waiting else 0):
             owed, last = len(self.front.waiting) == self.tracker.latency_frames, waiting[-1]
