@@ -7,13 +7,13 @@ object: find, then accept or absent), then at the parts of a step in its order:
   its dense cloud;
 - propose: ``registration`` gives pose hypotheses against the keypoints of ``keypoint_map``;
 - choose: ``selection``, then ``refinement`` moves the pose onto the surface of ``tsdf``;
-- judge, admit, request: ``policy`` has the paper's answers, to these questions and to the two before;
+- judge, admit, request: ``policy`` has the paper's answers to these questions and to the two before;
 - extend: ``object_model`` holds map, surface (``tsdf``), graph (``factor_graph``) and views (``keyframe_views``);
   ``sampling`` chooses new points.
 
 What is ours is composed around these parts by :mod:`p2p_lib.extended`, which this package knows nothing of.
 README.md beside this file lists where the paper's preset departs from the paper and its release.
 
-The 2D tracker, the detector of candidates and the segmenter are parts that it is given; what it asks of them is in
-:mod:`p2p_lib.core.interfaces`.
+The 2D tracker, the detector of candidates and the segmenter are given to it; :mod:`p2p_lib.core.interfaces` says
+what it asks of them.
 """

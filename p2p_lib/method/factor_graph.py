@@ -22,7 +22,7 @@ from p2p_lib.core.errors import BadInput
 
 # gtsam's keys: a letter in the highest byte.
 _X, _P = ord("x") << 56, ord("p") << 56
-# Points that a keyframe must share with the others where no relative pose holds it.
+# A keyframe without a relative pose must share this many points with earlier ones.
 _ANCHORING_POINTS = 3
 # Noise of the prior on the first pose (rad, m): it defines the object frame, so there is next to none.
 _PRIOR_SIGMA = 1e-4
@@ -77,7 +77,7 @@ _Fit = tuple[np.ndarray | None, float, float]
 class GraphResult:
     """What the graph knows after a solve; after a failed one, what it knew before.
 
-    ok, reason             whether the newest keyframe was solved for; else why it was left out
+    ok, reason             whether the newest keyframe was solved for; why not, or why without covariance
     keys (M,)              as returned by ``add_keyframe``
     T_cam_obj (M, 4, 4)    poses of those keyframes
     point_ids (N,), p_obj (N, 3)  keypoints, sorted by id
@@ -104,7 +104,7 @@ class ObjectGraph:
         self.config = config
         self._keyframes: dict[int, Keyframe] = {}
         self._points: dict[int, np.ndarray] = {}
-        self._new: list[int] = []  # added since the last solve that went well
+        self._new: list[int] = []  # added since the last solve
         self.next_key = 0  # of the keyframe to be added next
         self._fit: _Fit = None, 0.0, 0.0
         self._anchor = se3.IDENTITY
@@ -131,10 +131,10 @@ class ObjectGraph:
         T_cam_obj     (4, 4) from registration. The first keyframe's is where the prior anchors the graph
         point_ids     (N,) distinct; p_cam (N, 3) their observations. Rows that are not finite are left out
         p_obj_init    (N, 3) where points that the graph does not know yet start from
-        covariance    (6, 6) of the pose relative to the keyframe before, right tangent of T_cam_obj, as far
-                      as it comes from elsewhere than these observations (the surface): what is counted
-                      twice makes the result too sure, as the keypoints' small share in a refined pose's. None: the
-                      configured noise, at the object
+        covariance    (6, 6) of the pose relative to the keyframe before, right tangent of T_cam_obj, by other
+                      evidence than these observations (the surface): what is counted twice makes the result too
+                      certain, slightly so where keypoints helped to refine. None: the configured noise, about the
+                      points' centre
         sigma_rad, sigma_m  noise of bearings and ranges, (N,) or one for all; configured values where None
         """
         T_obj_cam = se3.inverse(se3.check("keyframe T_cam_obj", T_cam_obj))
@@ -193,7 +193,7 @@ class ObjectGraph:
         return self._result(True, "no covariance: nothing anchors the graph" if fit[0] is None else "")
 
     def _link(self, T_obj_cam: np.ndarray, p_obj: np.ndarray, covariance: np.ndarray | None) -> Link:
-        """The relative pose to the newest keyframe; its noise moved from the object to X's right tangent."""
+        """The relative pose to the newest keyframe, its covariance moved from T_cam_obj's right tangent to X's."""
         if not _is_covariance(covariance):
             sigmas = np.repeat([self.config.between_sigma_rad, self.config.between_sigma_m], 3)
             covariance = about(p_obj, sigmas)
@@ -207,7 +207,7 @@ class ObjectGraph:
         return max(self._keyframes)
 
     def _why_not(self) -> str:
-        """What keeps the graph from being solved, as far as its structure tells; empty if nothing does."""
+        """Why the graph cannot be solved, as far as its structure tells; empty if it may be."""
         if not self._keyframes:
             return "no keyframes"
         first = min(self._keyframes)
@@ -231,7 +231,7 @@ class ObjectGraph:
 
 
 def about(p_obj: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
-    """(6, 6) covariance of a motion with sigmas (6,) about the middle of points p_obj (N, 3)."""
+    """(6, 6) covariance of a motion with sigmas (6,), rotation first, about the mean of points p_obj (N, 3)."""
     A = se3.adjoint(se3.from_rt(np.eye(3), p_obj.mean(0) if len(p_obj) else np.zeros(3)))
     return A @ np.diag(sigmas**2) @ A.T
 

@@ -1,4 +1,4 @@
-"""What all objects share of a frame: tracked in one pass, segmented, observed; and what they ask of the tracker."""
+"""The steps that all objects share: track in one pass, segment, observe, and pass requests to the tracker."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from p2p_lib.method.object_model import NO_IDS, Requests
 from p2p_lib.method.object_tracker import ObjectTracker
 from p2p_lib.method.observation import Observation
 
-#: Object to (H, W) bool; None where nobody knows.
+#: Object to (H, W) bool; None where unknown.
 Masks = dict[str, np.ndarray | None]
 NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bool), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """A frame, the masks given with it (None: to be found), and what is said of objects in it."""
+    """A frame, the masks given with it (None: to be segmented) and the prompts for it, by object."""
 
     frame: Frame
     masks: Masks
@@ -50,7 +50,7 @@ class Frontend:
     _streaming: bool = False
 
     def track(self, asked: Asked) -> Asked | None:
-        """Track all points into a frame; the frame that the tracks are of, None until a late tracker answers."""
+        """Follow all points into a frame; returns the frame that the tracks are of, None while a late tracker has none."""
         self.waiting.append(asked)
         tracks = self._tracked(asked.frame, asked.masks)
         if len(self.waiting) <= self.tracker.latency_frames:
@@ -76,7 +76,7 @@ class Frontend:
     def segment(self, asked: Asked) -> None:
         """Every object's mask: the one given, else the segmenter's, which learns from those that are given."""
         frame = asked.frame
-        # Some may be gone again, and one that was added since has no mask in this frame. Their order means nothing.
+        # With a late tracker objects may have come or gone since. Sorted: the caller's order must not matter.
         self.masks = masks = {name: mask for name, mask in sorted(asked.masks.items()) if name in self.objects}
         said = {name: prompt for name, prompt in sorted(asked.said.items()) if name in masks}
         said |= {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items() if mask is not None}
@@ -90,16 +90,16 @@ class Frontend:
             self.masks = masks | {name: labels == label_of[name] for name in looked_after}
 
     def hints(self, frame: Frame, sought: Sequence[str]) -> Mapping[str, Hint]:
-        """Where these objects should be."""
+        """Where the ``sought`` objects should be."""
         objects = self.objects
         return LazyHints(sought, lambda name: objects[name].hint(objects[name].observe(frame, None, self.tracks)))
 
     def observe(self, asked: Asked) -> Mapping[str, Observation]:
-        """Every object's share of the frame."""
+        """What the frame shows of every object."""
         return {name: self.objects[name].observe(asked.frame, mask, self.tracks) for name, mask in self.masks.items()}
 
     def apply(self, requests: Mapping[str, Requests]) -> None:
-        """Hand what all objects ask for to the shared tracker: nobody's answer depends on who is asked first."""
+        """Pass all objects' requests to the shared tracker, after all steps: the order of objects does not matter."""
         rejected = np.concatenate([NO_IDS, *(request.reject for request in requests.values())])
         if len(rejected):
             self.tracker.reject(rejected)

@@ -1,4 +1,4 @@
-"""From where one object has been seen: the poses of its keyframes (appendix, "Sampling Criteria")."""
+"""The views that one object has been seen from: its keyframe poses (appendix, "Sampling Criteria")."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from p2p_lib.core import se3
 
-#: Views remembered; beyond it a new one takes the place of the most similar. Bounds memory and time on long videos.
+#: At most so many views are remembered, which bounds memory and time on long videos.
 _MOST = 1000
 
 
 class KeyframeViews:
-    """Keyframe poses T_cam_obj (N, 4, 4) as registered: a new view asks for a keyframe."""
+    """Keyframe poses T_cam_obj (N, 4, 4) as registered; a view far from all of them asks for a keyframe."""
 
     def __init__(self, most: int = _MOST):
         self._most = most
@@ -21,11 +21,11 @@ class KeyframeViews:
         return len(self.T_cam_obj)
 
     def turned_rad(self, T_cam_obj: np.ndarray) -> float:
-        """The turn to the nearest of the views; infinite before the first."""
+        """Angle to the nearest view; infinite before the first."""
         return self.nearest(T_cam_obj)[0]
 
     def add(self, T_cam_obj: np.ndarray) -> None:
-        """One more view; beyond the cap it replaces the one that it is most like."""
+        """Add a view; beyond the cap it replaces the most similar one."""
         if len(self) >= self._most:
             self.remove(self.nearest(T_cam_obj)[1])
         self.T_cam_obj = np.concatenate([self.T_cam_obj, T_cam_obj[None]])
@@ -35,7 +35,7 @@ class KeyframeViews:
         self.T_cam_obj = np.delete(self.T_cam_obj, row, 0)
 
     def nearest(self, T_cam_obj: np.ndarray) -> tuple[float, int]:
-        """The turn to the nearest of the views, and which it is; infinite and -1 without any."""
+        """Angle (rad) to the nearest view, and its row; infinite and -1 without any."""
         if not len(self):
             return np.inf, -1
         turned = se3.angle_rad(se3.inverse(self.T_cam_obj) @ T_cam_obj)

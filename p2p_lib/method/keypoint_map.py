@@ -4,8 +4,8 @@ New points are pending until they have proved themselves over several frames in 
 are keypoints p_n in the object frame that frames are registered to. Where the main text (a score
 within a time window) and the appendix (a streak of consecutive frames) differ, this follows the appendix.
 
-Ours beyond the paper: a point has to move with the object. What is mirrored in a turning object stands still before
-the camera, and is tight enough for a keypoint for as long as the object turns slowly.
+Ours beyond the paper: a point may be required to move with the object. A reflection on a slowly turning object stands
+still before the camera, yet scatters little enough in the object frame to be promoted.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import KeypointMapConfig
 
 _HISTORY = 16  # observations kept of a pending point
-#: A keypoint is retired when, of at least so many registrations, it agreed with less than this share.
+#: Under a cap a keypoint is retired when, of at least so many registrations, it agreed with less than this share.
 _RETIRE_AFTER, _RETIRE_SHARE = 10, 0.3
 
 
@@ -52,10 +52,10 @@ class KeypointMap:
         confidence: float = 1.0,
         p_cam: np.ndarray | None = None,
     ) -> None:
-        """New points (N,) at p_obj (N, 3), with larger keys than all before. The first frame's are promoted at once.
+        """Add points at p_obj (N, 3), with keys (N,) larger than all before.
 
-        They define the map. ``confidence`` is that of the pose that places them, ``p_cam`` (N, 3) where the camera
-        sees them. Their ids are unknown until :meth:`assign`.
+        The first frame's define the map and are ``promoted`` at once. ``confidence`` is that of the pose that places
+        them, ``p_cam`` (N, 3) are their positions in the camera frame. Their ids are unknown until :meth:`assign`.
         """
         n = len(keys)
         histories = np.full((2, n, _HISTORY, 3), np.nan)
@@ -77,7 +77,7 @@ class KeypointMap:
             setattr(self, name, np.concatenate([getattr(self, name), new.get(name, nothing)]))
 
     def join(self, other: KeypointMap, T_obj_other: np.ndarray, shift: int) -> None:
-        """Take in another map's points, behind its own, with keys larger by ``shift``; T_obj_other (4, 4) of frames."""
+        """Append another map's points, moved into this frame by T_obj_other (4, 4), their keys raised by ``shift``."""
         moved = {"keys": other.keys + shift, "p_obj": se3.transform(T_obj_other, other.p_obj)}
         moved["_in_object"] = se3.transform(T_obj_other, other._in_object)
         for name in self._columns():
@@ -99,8 +99,8 @@ class KeypointMap:
                      in the mask with depth
         uncertainty  (N,) of the tracks
         stable       the pose moved little since the last frame ("Pose Stability")
-        p_cam        (N, 3) where the camera sees them: those that are stiller there than in the object are not
-                     promoted. None: nothing is asked of it
+        p_cam        (N, 3) in the camera frame: a point that scatters less there than in the object frame is not
+                     promoted. None: this is not tested
         """
         cfg = self.config
         self._age += 1
@@ -116,7 +116,7 @@ class KeypointMap:
             return np.zeros(0, np.int64)
         centre, scatter_m = _scatter(self._in_object[ready])
         tight = scatter_m < cfg.max_scatter_m
-        if p_cam is not None:  # noise is the same in both, so that the smaller one tells, however small they are
+        if p_cam is not None:  # noise is the same in both, so even small scatters can be compared
             tight &= scatter_m < _scatter(self._in_camera[ready])[1]
         rows = ready[tight]
         self.p_obj[rows], self.promoted[rows], self._age[rows] = centre[tight], True, 0
@@ -133,11 +133,11 @@ class KeypointMap:
         self.p_obj[np.searchsorted(self.keys, keys[known])] = p_obj[known]
 
     def retire(self) -> tuple[np.ndarray, np.ndarray]:
-        """Remove pending points past their time, keypoints that mostly disagree, and keypoints beyond the cap.
+        """Remove pending points past their time; under a cap, keypoints that mostly disagree or are too many.
 
-        Those that agreed in the smallest share of the frames since their promotion go first: a cap on the
-        count alone would close the map of an object that turns to new points. The pending are bounded by
-        their time. Returns the keys removed, and the tracker's ids of those that have one.
+        Of too many, those that agreed in the smallest share of the frames since their promotion go: refusing new
+        ones instead would close the map to sides that come into view. The cap leaves out pending points, whose time
+        bounds them. Returns the keys removed, and the tracker's ids of those that have one.
         """
         cfg = self.config
         stale = ~self.promoted & (self._age > cfg.pending_ttl)
@@ -158,6 +158,6 @@ class KeypointMap:
 
 
 def _scatter(history_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of observations (N, K, 3), NaN where there are fewer: their median (N, 3), the median distance from it (N,)."""
+    """Median (N, 3) of observations (N, K, 3), NaN where there are fewer, and median distance from it (N,)."""
     centre = np.nanmedian(history_m, 1)
     return centre, np.nanmedian(np.linalg.norm(history_m - centre[:, None], axis=-1), 1)

@@ -24,17 +24,18 @@ if TYPE_CHECKING:
 NO_IDS = np.zeros(0, np.int64)
 #: A frame with a larger move or turn verifies no point (appendix, "Point Promotion Strategy").
 _STABLE_M, _STABLE_DEG = 0.01, 2.0
-#: A return is marked as recovered for so many frames; for more while few points agree.
+#: A return is marked as recovered for the first number of frames; for the second where few points agree at first.
 CONFIRM_FRAMES, CONFIRM_LONGER = 5, 15
 
 
 @dataclass(frozen=True, eq=False)
 class Requests:
-    """What an object asks of the tracker that all objects share, applied when every object has been looked at.
+    """What an object asks of the shared tracker, applied after the steps of all objects.
 
     reject  (K,) ids of tracks that contradict the object's motion
     drop    (L,) ids of points that the map has given up
-    add_px  (M, 2) pixels of new points in this frame, and keys (M,) of them in the map
+    add_px  (M, 2) pixels of new points in this frame
+    keys    (M,) their keys in the map
     """
 
     reject: np.ndarray = field(default_factory=lambda: NO_IDS)
@@ -46,9 +47,9 @@ class Requests:
 class ObjectModel:
     """Keypoints, surface and graph of one object; rows of observations are rows of ``map``.
 
-    Mapping runs ``beside`` whatever comes next: the graph is solved and views are fused until surface or graph are
-    asked for. What the graph finds is taken into the map by :meth:`adopt`, at the start of the next frame, however
-    long it took: what comes out is the same whatever the number of threads.
+    Mapping, the graph's solution and the fusion of views, runs in the background by the executor ``beside``; reading
+    surface or graph waits for it. :meth:`adopt` waits, too, and takes the solution into the map in the next frame:
+    results do not depend on threads or timing.
     """
 
     make_graph, make_views = ObjectGraph, KeyframeViews
@@ -61,8 +62,8 @@ class ObjectModel:
         self.views = self.make_views()
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
         self._observer, self._stopwatch, self._beside = observer, stopwatch, beside
-        self._mapping: Future | None = None  # the newest of what runs beside, one after the other
-        self._solved: Future[GraphResult | None] | None = None  # by the graph, to be adopted
+        self._mapping: Future | None = None  # the newest background job; each waits for the one before
+        self._solved: Future[GraphResult | None] | None = None  # the graph's newest solution, to be adopted
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
         self._since_keyframe, self._next_key = 0, 0
 
@@ -73,18 +74,18 @@ class ObjectModel:
 
     @property
     def surface(self) -> TsdfVolume | None:
-        """With all that was given to it; None where the configuration wants none."""
+        """The surface, with every view fused; None where the configuration wants none."""
         self._settle()
         return self._surface
 
     @property
     def graph(self) -> ObjectGraph | None:
-        """With all keyframes; None where the configuration wants none."""
+        """The graph, with every keyframe solved; None where the configuration wants none."""
         self._settle()
         return self._graph
 
     def _beside_after(self, work: Callable[..., object], *args: object) -> Future:
-        """Do this beside what comes next, after all that was begun so; mapping is one thing after the other."""
+        """Run ``work`` in the background, after all earlier jobs: mapping is sequential."""
         before = self._mapping
 
         def after() -> object:
@@ -96,14 +97,14 @@ class ObjectModel:
         return self._mapping
 
     def _settle(self) -> None:
-        """Wait for what runs beside."""
+        """Wait for the background jobs."""
         if self._mapping is not None:
             with self._stopwatch("fusion"):
                 self._mapping.result()
             self._mapping = None
 
     def adopt(self) -> np.ndarray | None:
-        """Take into the map what the graph found since the frame before; (4, 4) where it has that frame's pose."""
+        """Take the graph's new solution into the map; the newest keyframe's T_cam_obj (4, 4), None if there is none."""
         if self._solved is None:
             return None
         with self._stopwatch("graph"):
@@ -162,7 +163,7 @@ class ObjectModel:
         covariance: np.ndarray | None = None,
         confidence: float = 1.0,
     ) -> Requests:
-        """New points, a vertex of the graph, a view of the surface.
+        """Add new points to the map, a vertex to the graph, a view to the surface.
 
         uv_px, p_cam  (M, 2) and (M, 3) of points to be added
         agrees        (N,) bool: points of the map whose observation the pose agrees with
@@ -191,11 +192,11 @@ class ObjectModel:
         covariance: np.ndarray | None,
         gone: np.ndarray,
     ) -> GraphResult | None:
-        """Solve the graph with a new vertex, and fuse its view where the graph has it.
+        """Add a vertex, solve the graph, and fuse the keyframe's view at the solved pose.
 
-        keys (N,) and p_cam (N, 3)  what is seen; gone (M,) points that the map has given up since
+        keys (N,) and p_cam (N, 3)  the points seen; gone (M,)  keys of points that the map has retired
 
-        Only what the graph still holds can be moved later: images of keyframes that it has merged are let go.
+        Views of keyframes that the graph has merged away cannot be moved any more: their images are let go.
         """
         vertex, result = None, None
         if self._graph is not None:
@@ -230,7 +231,7 @@ class ObjectModel:
 
 @dataclass(frozen=True, eq=False)
 class Life:
-    """The state of one object between two frames, as a value: each frame makes the next one.
+    """The state of one object between two frames, as a value: each frame makes a new one.
 
     status      of the newest frame
     T_cam_obj   newest pose, of whatever frame; None before the first
@@ -265,7 +266,7 @@ class Life:
         return replace(self, status=status, T_cam_obj=T_cam_obj, seen_s=time_s, confirming=left)
 
     def corrected(self, T_cam_obj: np.ndarray) -> Self:
-        """With the newest pose as the graph has it: what comes next starts from there."""
+        """With the newest pose replaced by the graph's, from which the next frame starts."""
         return replace(self, T_cam_obj=T_cam_obj)
 
     def moved_from_last(self, T_cam_obj: np.ndarray) -> tuple[float, float] | None:
@@ -278,7 +279,7 @@ class Life:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known of an object in one object frame: a model, and what it has been through since that was begun."""
+    """What is known of an object in one object frame: its model, and its life since that was begun."""
 
     model: ObjectModel
     life: Life = field(default_factory=Life)
@@ -295,7 +296,7 @@ class Known:
 
 
 def _volume(config: Config) -> TsdfVolume:
-    """An empty surface. What makes meshes takes seconds to import: when there is to be one, not at an absence."""
+    """An empty surface. The mesh libraries take seconds to import: here, not in the middle of tracking."""
     import skimage.measure  # noqa: F401
     import trimesh  # noqa: F401
 

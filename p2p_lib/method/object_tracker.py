@@ -1,8 +1,7 @@
 """One object's step: observe, find, then accept or go without (paper: Fig. "Overview of the framework").
 
-:class:`p2p_lib.method.pipeline.Point2Pose` tracks and segments for all objects; here one object's share of a frame
-becomes its pose. Whatever the object wants of the shared tracker it returns as
-:class:`p2p_lib.method.object_model.Requests`.
+:class:`p2p_lib.method.pipeline.Point2Pose` tracks and segments for all objects; here the observation of one becomes
+its pose. What it asks of the shared tracker it returns as :class:`p2p_lib.method.object_model.Requests`.
 """
 
 from __future__ import annotations
@@ -37,10 +36,10 @@ class ObjectStep:
 
 
 class ObjectTracker:
-    """State and step of one object: ``known`` is its map and what it has been through.
+    """State and step of one object; ``known`` holds its model and its life so far.
 
-    policy  answers what the step leaves open; the paper's by default
-    model   what a map is made of
+    policy  makes what decides the open questions of a step; the paper's by default
+    model   makes an empty model
     """
 
     def __init__(
@@ -74,7 +73,7 @@ class ObjectTracker:
 
     @property
     def life(self) -> Life:
-        """What the object has been through."""
+        """Its status and newest pose."""
         return self.known.life
 
     @life.setter
@@ -93,7 +92,7 @@ class ObjectTracker:
     # -- the step ------------------------------------------------------------------------------
 
     def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
-        """The object's share of a frame; mask (H, W) bool, None where it is not known, and everybody's tracks."""
+        """What a frame shows of the object, by its mask (H, W) bool, None where unknown, and all objects' tracks."""
         with self._stopwatch("observation"):
             return self.observer.observe(frame, mask, tracks.select(self.map.ids))
 
@@ -105,7 +104,7 @@ class ObjectTracker:
         return self.absent(obs, verdict) if best is None or not verdict.accepted else self.accept(obs, best, verdict)
 
     def find(self, obs: Observation) -> tuple[Candidate | None, Verdict]:
-        """Register, select and refine, judge: the pose, None where there is none, and whether it stands."""
+        """Register, select, refine and judge: the candidate, None where there is none, and the verdict on it."""
         if self.policy.hidden(obs):
             return None, Verdict(False, Status.OCCLUDED, f"{obs.mask_px} mask pixels")
         best, reason = self.policy.choose(obs, self.known, self.policy.propose(obs, self.known))
@@ -166,7 +165,7 @@ class ObjectTracker:
         return ObjectStep(estimate, requests)
 
     def _sample(self, obs: Observation) -> tuple[np.ndarray, np.ndarray]:
-        """New points where the objective wants them: uv_px (M, 2) and p_cam (M, 3)."""
+        """New points chosen by the sampling objective: uv_px (M, 2) and p_cam (M, 3)."""
         with self._stopwatch("sampling"):
             cfg = self.config.sampling
             depth = self.config.depth
@@ -180,7 +179,7 @@ class ObjectTracker:
             return candidates.uv_px[chosen], p_cam[chosen]
 
     def _estimate(self, obs: Observation, verdict: Verdict, **pose: Any) -> PoseEstimate:
-        """The estimate of a frame that ``life`` has already taken in; what it says of a ``pose`` where there is one."""
+        """The estimate of a frame, after ``life`` is updated; ``pose`` has the fields of one with a pose."""
         life = self.life
         return PoseEstimate(
             self.name,
@@ -199,18 +198,18 @@ class ObjectTracker:
     # -- between the steps ---------------------------------------------------------------------
 
     def adopt(self) -> None:
-        """Take in what was found beside since the frame before; before anything else in a frame."""
+        """Take in what the graph found since the frame before; called before the frame is observed."""
         T_cam_obj = self.model.adopt()
         if T_cam_obj is not None:
             self.life = self.life.corrected(T_cam_obj)
 
     def awaited(self, mask: np.ndarray | None) -> bool:
-        """Whether the object had no pose until now and its mask says that it is back."""
+        """Whether the object had no pose in the frame before and its mask says that it is back."""
         away = not self.model.empty and not self.life.has_pose
         return away and mask is not None and np.count_nonzero(mask) >= self.config.lifecycle.min_mask_px
 
     def hint(self, obs: Observation) -> Hint:
-        """Where this object should be by its tracks and its model, for a segmenter: before the frame is segmented."""
+        """Where the object should be by its tracks and its model, for the segmenter; ``obs`` has no mask yet."""
         if self.model.empty:
             return Hint()
         best = max(self.policy.propose(obs, self.known), key=lambda h: h.support, default=None)
@@ -227,7 +226,7 @@ class ObjectTracker:
 
 
 def hint_at(frame: Frame, known: Known, observer: Observer, uv_px: np.ndarray, T_cam_obj: np.ndarray) -> Hint:
-    """The hint of a pose, with the distances of all depth from the surface under it; uv_px (K, 2) agree with it."""
+    """The hint of a pose: points uv_px (K, 2) that agree with it, and the measured pixels' distances to the surface."""
     distance_m, model = None, known.model
     if model.has_surface:
         distance_m = surface_distance(model.surface, frame.depth_m, observer.camera, T_cam_obj)

@@ -16,18 +16,18 @@ from p2p_lib.core.types import Frame, Tracks
 
 #: Depth this near the mask's border mixes the object with what is behind it.
 _BORDER_PX = 2
-#: A larger step in the 3x3 neighbourhood of a pixel of the cloud is an edge, m.
+#: A larger depth step in the 3x3 neighbourhood of a cloud pixel is an edge, m.
 _CLOUD_EDGE_M = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One frame's share of one object; rows are those of its keypoint map.
+    """What one frame shows of one object; rows are those of its keypoint map.
 
     mask      (H, W) bool; None where no mask is known
     tracks    of the map's points
-    p_cam     (N, 3) their lifted positions; NaN where not visible, outside the mask, or without depth
-    cloud     (M, 3) depth points in the mask, camera frame
+    p_cam     (N, 3) their measured positions, m; NaN where not visible, outside the mask, or without depth
+    cloud     (M, 3) depth points in the mask, camera frame, m
     """
 
     frame: Frame
@@ -50,14 +50,14 @@ class Observation:
 class Observer:
     """Makes observations with one camera.
 
-    cloud_points  of the dense cloud at most; 0 makes none
+    cloud_points  the most points of a dense cloud; 0: no cloud
     """
 
     def __init__(self, camera: Camera, config: DepthConfig, cloud_points: int):
         self.camera, self.config, self.cloud_points = camera, config, cloud_points
 
     def observe(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> Observation:
-        """The observation of an object whose points have these ``tracks``."""
+        """The observation of the object that these ``tracks`` belong to."""
         nothing = np.zeros((0, 3))
         cloud = nothing
         if mask is not None:
@@ -65,7 +65,7 @@ class Observer:
         return Observation(frame, mask, tracks, self.lifted(frame, mask, tracks), cloud)
 
     def lifted(self, frame: Frame, mask: np.ndarray | None, tracks: Tracks) -> np.ndarray:
-        """(N, 3) where tracks are in the camera frame; NaN where not visible, outside the mask, or without depth."""
+        """(N, 3) tracks lifted to the camera frame; NaN where not visible, outside the mask, or without depth."""
         p_cam, rows = np.full((len(tracks), 3), np.nan), np.flatnonzero(tracks.visible)
         if mask is not None:
             rows = rows[in_mask(tracks.uv_px[rows], mask)]
@@ -73,11 +73,11 @@ class Observer:
         return p_cam
 
     def lift(self, frame: Frame, uv_px: np.ndarray) -> np.ndarray:
-        """(N, 3) points behind pixels (N, 2); NaN where there is no trustworthy depth."""
+        """(N, 3) camera-frame points seen at pixels (N, 2); NaN where there is no trustworthy depth."""
         return lift(frame, uv_px, self.camera, self.config)
 
     def noise_m(self, p_cam: np.ndarray) -> np.ndarray:
-        """(N,) standard deviation of measured points (N, 3)."""
+        """(N,) standard deviation, m, of measured points (N, 3), by their depth."""
         return depth_noise_m(p_cam[:, 2], self.config)
 
     def measured(self, observation: Observation) -> np.ndarray:
@@ -85,7 +85,7 @@ class Observer:
         return observation.mask & in_range(observation.frame.depth_m, self.config)
 
     def in_image(self, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> np.ndarray:
-        """(N,) bool: the points p_obj (N, 3) that a pose puts into the image, whatever may hide them."""
+        """(N,) bool: whether a pose projects points p_obj (N, 3) into the image, hidden or not."""
         return self.camera.inside(self.camera.project(se3.transform(T_cam_obj, p_obj)), -0.5)
 
 
@@ -94,8 +94,7 @@ def sample_cloud(
 ) -> np.ndarray:
     """(N, 3) measured points of a masked depth image in the camera frame, N <= max_points.
 
-    Of the pixels :func:`~p2p_lib.core.depth.of_one_surface`. Deterministic, spread over the whole mask. Empty where
-    nothing is left.
+    Only pixels that pass :func:`~p2p_lib.core.depth.of_one_surface`, spread evenly over the mask; deterministic.
     """
     cut = bounds(mask, 1)
     top, left = cut[0].start, cut[1].start

@@ -37,7 +37,7 @@ _LOG = logging.getLogger("p2p_lib")
 class Parts:
     """What the method is composed of; the paper's parts by default.
 
-    before  looks at a frame before anything else does
+    before  takes each frame first and returns the one to use; None: frames are used as they come
     front   tracks, segments and observes for all objects
     object  makes the tracker of one object
     """
@@ -52,8 +52,7 @@ class Point2Pose(Objects):
 
     config  parameters, or the name of a preset
 
-    What becomes of the objects is logged as ``p2p_lib``. :meth:`close` ends its threads, and so does the end of a
-    ``with`` block.
+    Changes of status go to the logger ``p2p_lib``. :meth:`close`, or the end of a ``with`` block, ends its threads.
     """
 
     def __init__(
@@ -88,17 +87,17 @@ class Point2Pose(Objects):
 
     @property
     def segmenter(self) -> Segmenter:
-        """What finds the objects in frames without their masks."""
+        """Finds the objects in frames that bring no mask of them."""
         return self.front.segmenter
 
     @property
     def masks(self) -> Masks:
-        """Object to (H, W) bool, None where nobody knows: those that the newest estimates were made with."""
+        """The masks of the newest estimates: object to (H, W) bool, None where unknown."""
         return self.front.masks
 
     @property
     def tracks(self) -> Tracks:
-        """The 2D tracks of all objects in the frame that the newest estimates are of."""
+        """All objects' 2D tracks in the frame of the newest estimates."""
         return self.front.tracks
 
     # -- a frame -------------------------------------------------------------------------------
@@ -106,13 +105,12 @@ class Point2Pose(Objects):
     def step(self, frame: Frame, masks: Mapping[str, np.ndarray | None] | None = None) -> dict[str, PoseEstimate]:
         """One frame in, one estimate per object out.
 
-        masks  object -> (H, W) bool, its visible pixels, which are taken as they are; an empty mask says that it is
-               hidden. The segmenter looks after the objects that are left out, or whose mask is None.
+        masks  object -> (H, W) bool, its visible pixels, used as given; an empty mask says that it is hidden.
+               The segmenter finds the objects that are left out, or whose mask is None.
 
-        Where the 2D tracker answers late, so does this: the estimates are of the frame ``latency_frames`` ago,
-        and there are none for the first of the stream until then. ``self.frame`` is the one that they are of (None
-        while there are none), ``self.masks`` keeps the masks that they were made with, the segmenter's included, and
-        ``self.tracks`` the 2D tracks of all objects.
+        With a 2D tracker that answers late, the estimates are of the frame ``latency_frames`` ago, and the first
+        calls return none. ``self.frame`` is the frame of the estimates (None while there are none); ``self.masks``
+        and ``self.tracks`` are the masks, given or segmented, and all objects' 2D tracks in it.
         """
         with self.alone(), self.stopwatch.frame(), uninterrupted():
             tracked = self.front.track(self._asked(frame, masks or {}))
@@ -129,12 +127,12 @@ class Point2Pose(Objects):
         return estimates
 
     def _asked(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> Asked:
-        """The frame, with every object's checked mask in it: None for one that the segmenter has to find."""
+        """The frame, every object's checked mask (None: the segmenter has to find it) and the prompts for it."""
         given, said = self.take_said(frame, masks)
         return Asked(self._parts.before(frame) if self._parts.before else frame, given, said)
 
     def finish(self) -> Iterator[dict[str, PoseEstimate]]:
-        """After the last frame: the estimates that a tracker which answers late still owes, oldest first."""
+        """After the last frame: the estimates still owed by a tracker that answers late, oldest first."""
         waiting = list(self.front.waiting)
         for _ in range(self.tracker.latency_frames if waiting else 0):
             owed, last = len(self.front.waiting) == self.tracker.latency_frames, waiting[-1]
@@ -144,13 +142,13 @@ class Point2Pose(Objects):
         self.front.waiting.clear()
 
     def begin(self, name: str) -> None:
-        """A new object, without anything known of it."""
+        """Start an object of which nothing is known."""
         rng = np.random.default_rng([self.config.seed, *name.encode()])
         made_of = self.camera, self.config, self.detector, rng, self.stopwatch, self._beside
         self.objects[name] = self._parts.object(name, *made_of)
 
     def _log(self, estimates: Mapping[str, PoseEstimate]) -> None:
-        """Say what has become of objects since the frame before."""
+        """Log every object whose status has changed."""
         for name, estimate in estimates.items():
             if estimate.status != self._status.get(name):
                 self._status[name] = estimate.status
@@ -160,7 +158,7 @@ class Point2Pose(Objects):
     # -- the end -------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """End the threads, after what they are at; nothing can be tracked any more."""
+        """End the threads once their work is done; afterwards nothing can be tracked."""
         self.closed = True
         self._beside.shutdown()
 

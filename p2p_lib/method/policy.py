@@ -1,8 +1,8 @@
 """What an object's step leaves open, and the paper's answers: propose, choose, judge, admit, request.
 
-:class:`~p2p_lib.method.object_tracker.ObjectTracker` asks these questions in its step, and believes the answers. The
-paper takes the hypothesis that lies nearest to the surface, believes every pose that it finds, and learns from every
-frame with a pose (Sec. "Object Registration", appendix "Sampling Criteria").
+:class:`~p2p_lib.method.object_tracker.ObjectTracker` asks these questions in its step. The paper takes the hypothesis
+that lies nearest to the surface, accepts every pose that it finds, and learns from every frame with a pose (Sec.
+"Object Registration", appendix "Sampling Criteria").
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from p2p_lib.method.registration import Hypothesis
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A hypothesis, and its pose refined on the surface once it is known."""
+    """A hypothesis, and its refinement on the surface once there is one."""
 
     hypothesis: Hypothesis
     refined: Refinement | None = None
 
     @property
     def T_cam_obj(self) -> np.ndarray:
-        """(4, 4) the best pose known of it."""
+        """(4, 4) the refined pose, else the hypothesis's."""
         return (self.refined or self.hypothesis).T_cam_obj
 
 
@@ -47,8 +47,9 @@ class Verdict:
 class Admission:
     """What of a frame with a pose enters the model.
 
-    covariance  (6, 6) of the pose, right tangent of T_cam_obj
-    confidence  of the pose; the paper gives none: 1 in every pose that it reports
+    agrees      (N,) bool: keypoints whose observations agree with the pose
+    covariance  (6, 6) of the pose, right tangent of T_cam_obj, [rotation rad, translation m]
+    confidence  of the pose, in [0, 1]; the paper has none, so its poses have 1
     learns      whether the keypoint map takes the frame in
     keyframe    whether it may become a keyframe
     in_camera   whether a point must move with the object to become a keypoint
@@ -67,24 +68,24 @@ class Admission:
         return obs.seen & (self.agrees | ~model.map.promoted)
 
     def rated(self, model: ObjectModel) -> tuple[np.ndarray, float]:
-        """Covariance (6, 6) and confidence that are reported of the pose: the map may be wrong, too, says the graph."""
+        """Covariance (6, 6) and confidence to report: the newest keyframe's covariance, by the graph, is added."""
         return self.covariance + model.covariance, self.confidence
 
 
 @dataclass(eq=False)
 class Policy:
-    """The paper's answers for one object; ``known`` is what they are asked of."""
+    """The paper's answers for one object; ``known`` is its model and its life so far."""
 
     observer: Observer
     config: Config
     rng: np.random.Generator
     stopwatch: Stopwatch
-    life: Life = field(default_factory=Life)  # of an object that has not been seen
+    life: Life = field(default_factory=Life)  # before the object has been seen
 
     # -- propose -------------------------------------------------------------------------------
 
     def propose(self, obs: Observation, known: Known) -> list[Hypothesis]:
-        """Candidate poses by the keypoints seen."""
+        """Candidate poses from the visible keypoints."""
         with self.stopwatch("registration"):
             use, _ = self.correspondences(obs, known)
             return self.register(known, np.where(use[:, None], obs.p_cam, np.nan))
@@ -100,20 +101,20 @@ class Policy:
         return (use if use.sum() >= self.few_keypoints(known) else certain), certain
 
     def few_keypoints(self, known: Known) -> int:
-        """With fewer visible keypoints, pending ones help to register (the release's)."""
+        """With fewer visible keypoints than this, pending points help to register (the release's number)."""
         return 12
 
     def register(
         self, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray] | None = None
     ) -> list[Hypothesis]:
-        """Hypotheses from the points measured at p_cam (N, 3), as far as they are finite."""
+        """Hypotheses from the map's points as measured, p_cam (N, 3); rows of NaN are ignored."""
         cfg, sigma_m = self.config.registration, known.model.noise_m(p_cam)
         return registration.register(known.map.p_obj, p_cam, cfg, self.rng, sigma_m=sigma_m, priors=priors)
 
     # -- choose --------------------------------------------------------------------------------
 
     def choose(self, obs: Observation, known: Known, hypotheses: list[Hypothesis]) -> tuple[Candidate | None, str]:
-        """One of the hypotheses, refined on the surface, and why it is that one."""
+        """One of the hypotheses, refined on the surface, and the reason for the choice."""
         best, reason = self.select(obs, known, [Candidate(hypothesis) for hypothesis in hypotheses])
         return (None if best is None else self.refine(obs, known, best)), reason
 
@@ -138,7 +139,7 @@ class Policy:
     def refined(
         self, obs: Observation, known: Known, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None
     ) -> Refinement:
-        """The pose refined on the surface, with the keypoints that agree (N,) where the configuration says so."""
+        """The pose refined on the surface, with the keypoints ``agrees`` (N,) bool where the configuration says so."""
         cfg, keypoints = self.config.refinement, None
         if cfg.residuals == "none" or not known.model.has_surface or not len(obs.cloud):
             return Refinement(T_cam_obj, reason="no surface")
@@ -150,7 +151,7 @@ class Policy:
     # -- judge, admit, request -----------------------------------------------------------------
 
     def start(self, known: Known, points: int) -> Verdict:
-        """Whether a map may begin with so many points."""
+        """Whether a map may begin with this number of ``points``."""
         enough = points >= self.config.registration.min_inliers
         return Verdict(enough, Status.TRACKED, "" if enough else f"only {points} points to start from")
 
@@ -166,7 +167,7 @@ class Policy:
         return Admission(verdict, best.hypothesis.inliers, self.covariance(obs, known, best))
 
     def covariance(self, obs: Observation, known: Known, best: Candidate) -> np.ndarray:
-        """(6, 6) of the pose relative to the map: by the refinement, else by the keypoints alone."""
+        """(6, 6) of the pose relative to the map: from the refinement, else from the keypoints alone."""
         if best.refined.covariance is not None:
             return best.refined.covariance
         noise_m = self.observer.noise_m(obs.p_cam)
@@ -176,7 +177,7 @@ class Policy:
         """No track is rejected."""
         return Requests()
 
-    # -- what the object has been through ------------------------------------------------------
+    # -- the object's life ---------------------------------------------------------------------
 
     def begun(self, obs: Observation, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
         """The life of a map after its first frame."""

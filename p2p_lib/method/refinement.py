@@ -4,8 +4,8 @@ Minimises, over D in SE(3), the Huber loss of the surface's signed distance at t
 ``sum rho_H(Phi(T^-1 D^-1 p)^2)``, with ``T <- D T``. The increment is parameterised on the right,
 ``D = T exp(xi) T^-1``, which makes ``D T = T exp(xi)``: the same pose, in our tangent.
 
-Ours beyond the paper: directions that the shape leaves free are not moved by it, keypoint residuals
-can join (texture holds what shape leaves free), and the result says how well each direction is known.
+Ours beyond the paper: the surface does not move the pose along directions that the shape leaves free,
+keypoint residuals can hold these, and the result says how well each direction is known.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 #: Fewer points on the observed surface than this determine nothing.
 MIN_POINTS = 10
-#: Levenberg-Marquardt: the initial damping, and the factor by which it rises or falls as steps fail or succeed. The
-#: release's, as are the two bounds of a step.
+#: Levenberg-Marquardt: the initial damping, and the factor by which it falls when a step succeeds; its square is the
+#: rise when one fails. The release's, as are the two bounds of a step.
 _DAMPING, _DAMPING_FACTOR = 1e-4, 5.0
 _MAX_STEP_M, _MAX_STEP_RAD = 0.02, 0.2
-#: A smaller gain, in squared standard deviations, ends the iterations.
+#: A smaller change of the cost, in squared standard deviations, ends the iterations.
 _TOLERANCE = 0.2
 #: Residuals beyond so many median absolute deviations are left out (the release's).
 _MAD_TRIM = 2.5
@@ -43,7 +43,7 @@ _MAD_TO_SIGMA = 1.4826
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Map points met again: p_obj (M, 3) in the map, p_cam (M, 3) as measured, sigma_m (M,) of each coordinate."""
+    """Keypoints seen in the frame: p_obj (M, 3), p_cam (M, 3) as measured, sigma_m (M,) noise of each coordinate."""
 
     p_obj: np.ndarray
     p_cam: np.ndarray
@@ -59,11 +59,11 @@ class Refinement:
     rms_m        root mean square distance of the used points to the surface; NaN where none
     inliers      share of the given points that lie on observed surface and were not trimmed
     iterations   Levenberg-Marquardt steps tried
-    eigenvalues  (6,): how well the shape determines each of :attr:`directions`, the mean squared change of the
-                 points' distance per squared displacement; a plane has three at 0, a can one
+    eigenvalues  (6,) ascending: how well the shape determines each of :attr:`directions`, as the mean squared change
+                 of the points' distance per squared displacement; a plane has three at 0, a can one
     directions   (6, 6) rows: unit tangents about the cloud's centre, rotation scaled by the cloud's radius
-    free_rotations  (K, 6) right tangents of T_cam_obj, a radian each: how it may turn without leaving the surface
-    reason       why the pose was left alone, or what was held; empty otherwise
+    free_rotations  (K, 6) right tangents of T_cam_obj, a radian each: turns that do not change the fit
+    reason       why the pose was not refined, or how many directions the shape leaves free; else empty
     """
 
     T_cam_obj: np.ndarray
@@ -84,11 +84,11 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class _Linear:
-    """The surface at one pose: distances, and normal equations per point about the cloud's centre.
+    """The surface residuals at one pose, linearised about the cloud's centre.
 
-    distance_m is that of every point, without its sign, infinite off the observed surface. ``rows`` are the points
-    used, J (n, 6) the derivatives of their distances. H and g are means over them; rotations are scaled by the cloud's
-    radius, so that everything is in metres.
+    distance_m is every point's unsigned distance, infinite off the observed surface. ``rows`` are the points used, J
+    (n, 6) the derivatives of their distances. H and g are means over them; rotations are scaled by the cloud's radius,
+    so that every variable is in metres.
 
     eigenvalues (6,) and directions (6, 6), columns, are those of :func:`p2p_lib.core.observability.eigen`.
     """
@@ -176,15 +176,15 @@ class _Problem:
     # -- the two kinds of residual -----------------------------------------------------------------
 
     def surface(self, T: np.ndarray, widest_m: float = 0.0, beside: _Linear | None = None) -> _Linear | None:
-        """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points count.
+        """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points can be used.
 
-        Trims beyond so many MADs, but nothing within ``widest_m`` nor within Huber's threshold. What the shape holds
-        is taken from ``beside``, a pose nearby, where there is one: it hardly changes.
+        Trims outliers by the MAD, but nothing within ``widest_m`` nor within Huber's threshold. The eigenvectors are
+        those of ``beside``, a pose nearby, where it is given: they hardly change.
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj)
         huber_m, least_m = self.config.huber_m, max(self.config.huber_m, widest_m)
-        # The least standard deviation of a distance, and where the distance is no longer known.
+        # The smallest standard deviation of a distance, and the distance at which truncation begins.
         floor_m, reach_m = _SIGMA_FLOOR_VOXELS * self.volume.voxel_m, 0.98 * self.volume.tau_m
         points = p_obj, self.centre, self.radius, value, gradient, valid
         used, J, H, g, cut, rms, sigma = _linearised(*points, floor_m, reach_m, huber_m, least_m)
@@ -202,7 +202,7 @@ class _Problem:
         return observability.eigen(J, pairs[:, (first >= 0) & (second >= 0)])
 
     def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normal equations of T^-1 p_cam - p_obj in standard deviations, same variables."""
+        """Normal equations of T^-1 p_cam - p_obj in standard deviations, in the variables of :meth:`surface`."""
         k = self.keypoints
         return _keypoint_system(se3.inverse(T), k.p_obj, k.p_cam, k.sigma_m, self.centre, self.radius)
 
@@ -224,7 +224,7 @@ class _Problem:
 
     @property
     def floor(self) -> float:
-        """The eigenvalue from which on a direction counts as determined by the shape; the paper moves all."""
+        """The smallest eigenvalue of a direction that the shape determines; 0, as in the paper, moves all."""
         return self.config.min_eigenvalue if self.config.residuals == "surface_and_keypoints" else 0.0
 
     def step(self, H: np.ndarray, g: np.ndarray, damping: float) -> np.ndarray:
@@ -285,7 +285,7 @@ _HUBER = 1.345
 
 @compiled("f8[::1], f8, f8")
 def _huber_loss(e: np.ndarray, threshold: float, most: float) -> float:
-    """Twice Huber's loss of residuals (N,) at least 0 and, as they count, at most ``most``, summed."""
+    """Twice the Huber loss, summed over residuals e (N,), 0 or more, each cut at ``most``."""
     total = 0.0
     for x in np.minimum(e, most):
         total += x * x if x < threshold else 2 * threshold * x - threshold * threshold
@@ -301,7 +301,7 @@ def _upper_median(x: np.ndarray) -> float:
 def _linearised(p_obj, centre, radius, value, gradient, valid, floor_m, reach_m, huber_m, least_m):
     """Of points (N, 3) with these distances: rows (n,) used, their J (n, 6), H, g, the cut, the rms and the noise.
 
-    Points beyond ``reach_m`` know no distance. Those that scatter beyond the median, but at least ``least_m``, are cut.
+    Points beyond ``reach_m`` are truncated and left out; so are outliers by the MAD, unless within ``least_m``.
     """
     near = np.flatnonzero(valid & (np.abs(value) < reach_m))
     H, g = np.zeros((6, 6)), np.zeros(6)
@@ -326,7 +326,7 @@ def _linearised(p_obj, centre, radius, value, gradient, valid, floor_m, reach_m,
 
 @compiled()
 def surface_jacobian(q: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """(N, 6) derivative of Phi at points q (N, 3) when the pose turns right by xi: q -> exp(-xi) q.
+    """(N, 6) derivative of Phi at points q (N, 3) by a right tangent xi of the pose: q -> exp(-xi) q.
 
     ``gradient`` (N, 3) is that of Phi at q. Rotation first, about q's origin.
     """
@@ -392,15 +392,15 @@ def _usable_keypoints(keypoints: Keypoints | None, config: RefinementConfig) -> 
     return Keypoints(keypoints.p_obj[ok], keypoints.p_cam[ok], keypoints.sigma_m[ok]) if ok.sum() >= 3 else None
 
 
-#: Every how many pixels an image's depth is held against the surface.
+#: Every second row and column of an image is compared with the surface.
 _STRIDE = 2
 
 
 def surface_distance(volume: TsdfVolume, depth_m: np.ndarray, camera: Camera, T_cam_obj: np.ndarray) -> np.ndarray:
     """(H, W) float32 signed distance of each measured pixel to the surface under a pose, in metres.
 
-    Positive in front of it, infinite off the volume; NaN where it is not known. Every second pixel is asked, where
-    the surface can be seen.
+    Positive in front of it, infinite off the volume; NaN where it is not known. In the volume's part of the image every
+    second row and column is computed, and repeated.
     """
     distance = np.where(depth_m > 0, np.float32(np.inf), np.float32(np.nan))
     corners = volume.corners_m()

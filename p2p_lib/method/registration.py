@@ -1,8 +1,8 @@
 """Frame-to-map registration: from 3D correspondences to several candidate poses (paper: "Frame-to-Map Registration").
 
-:func:`register` runs sequential RANSAC + SVD; which of its hypotheses is right is told by the dense
-surface (:mod:`p2p_lib.method.selection`). :func:`covariance` says how well the correspondences determine each
-direction of the chosen pose.
+:func:`register` runs sequential RANSAC + SVD; the dense surface tells which of its hypotheses is right
+(:mod:`p2p_lib.method.selection`). :func:`covariance` says how well the correspondences determine each direction of
+the chosen pose.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from p2p_lib.core import robust, se3
 from p2p_lib.core.config import RegistrationConfig
 from p2p_lib.core.robust import fit_rigid_inertia
 
-# A set of points determines the turn about its long axis when noise of a third of the inlier
-# threshold turns it by less than this; below, the set counts as collinear.
+# Points count as collinear when noise of a third of the inlier threshold would turn them about their
+# long axis by this or more.
 _DETERMINED_RAD = 0.35
 # What is known of a pose before any point is seen: keeps covariances finite.
 _UNKNOWN_RAD, _UNKNOWN_M = np.pi, 1.0
@@ -55,14 +55,15 @@ def register(
     sigma_m: np.ndarray | None = None,
     priors: Mapping[str, np.ndarray] | None = None,
 ) -> list[Hypothesis]:
-    """The hypotheses that correspondences p_obj, p_cam (N, 3) support, the largest consensus first.
+    """The hypotheses that correspondences p_obj, p_cam (N, 3) support: RANSAC's in its order, then those of priors.
 
     ``config.method`` is "sequential_ransac", the paper's: the transformation with the most inliers, its consensus set
-    removed, and again on the rest; or "svd", its ablation: one fit to all, outliers removed by the fixed threshold,
-    a second fit. Rows that are not finite are ignored. Too few or collinear points: an empty list.
+    removed, and again on the rest; or "svd", its ablation: one fit to all, outliers removed by the threshold, a second
+    fit. Rows that are not finite are ignored. Too few points, or collinear ones without a prior: an empty list.
 
-    sigma_m  (N,) noise of each p_cam: the threshold grows with it and fits are weighted. None: one threshold for all
-    priors   name to T_cam_obj (4, 4): poses that compete too, refit on the points that agree with them
+    sigma_m  (N,) noise of each p_cam: the threshold grows with it, and RANSAC's and priors' fits are weighted by it.
+             None: one threshold for all
+    priors   name to T_cam_obj (4, 4): poses that compete beside RANSAC's, refit on the points that agree with them
     """
     matches, usable = _Matches.of(p_obj, p_cam, sigma_m, config)
     if len(matches.p_obj) < max(3, config.min_inliers):
@@ -83,7 +84,7 @@ def refit(
     config: RegistrationConfig,
     sigma_m: np.ndarray | None = None,
 ) -> list[Hypothesis]:
-    """The hypothesis that grows from a given pose, refit on the correspondences that agree with it; or none."""
+    """A given pose refit on the correspondences that agree with it: one hypothesis, or none."""
     matches, usable = _Matches.of(p_obj, p_cam, sigma_m, config)
     return [_in_all_rows(hypothesis, usable) for hypothesis in _from_priors(matches, {origin: T_cam_obj}, config)]
 
@@ -112,7 +113,7 @@ def covariance(hypothesis: Hypothesis, p_obj: np.ndarray, p_cam: np.ndarray, sig
 
 @dataclass(frozen=True, eq=False)
 class _Matches:
-    """The finite correspondences, with the residual that still counts and the weight of each."""
+    """The finite correspondences (N, 3), each with its inlier threshold (m) and its weight in fits."""
 
     p_obj: np.ndarray
     p_cam: np.ndarray
@@ -121,7 +122,7 @@ class _Matches:
 
     @classmethod
     def of(cls, p_obj, p_cam, sigma_m, config: RegistrationConfig) -> tuple[_Matches, np.ndarray]:
-        """Of the rows that are finite; and (N,) bool which those are."""
+        """The finite rows, and (N,) bool which ones they are."""
         p_obj, p_cam = np.asarray(p_obj, float).reshape(-1, 3), np.asarray(p_cam, float).reshape(-1, 3)
         usable = np.isfinite(p_obj).all(1) & np.isfinite(p_cam).all(1)
         if sigma_m is not None:
@@ -152,7 +153,7 @@ def _sequential(matches: _Matches, config: RegistrationConfig, rng: np.random.Ge
             break
         hypothesis, determined = refit
         pool &= ~hypothesis.inliers
-        if determined:  # else a line of points, which must make room for what it hides
+        if determined:  # else collinear points, removed to uncover other hypotheses
             found.append(hypothesis)
     return found
 
@@ -165,7 +166,7 @@ def _refit(
     config: RegistrationConfig,
     R_prior: np.ndarray | None = None,
 ) -> tuple[Hypothesis, bool] | None:
-    """The hypothesis refit on its inliers in ``pool`` (N,) bool, None without enough; do they determine its turn?"""
+    """The hypothesis refit on its inliers in ``pool`` (N,) bool, and whether they fix its turn; None with too few."""
     m = matches
     fit = robust.refit(T, m.p_obj, m.p_cam, m.limit_m, m.weight, config.min_inliers, pool, R_prior)
     if fit is None:
@@ -194,7 +195,7 @@ def _svd_twice(matches: _Matches, config: RegistrationConfig) -> list[Hypothesis
 
 
 def _without_duplicates(found: list[Hypothesis], matches: _Matches, config: RegistrationConfig) -> list[Hypothesis]:
-    """Drops poses that move no point by a tenth of the threshold from where an earlier one puts it."""
+    """Drops poses that put every point within a tenth of the threshold of where an earlier pose puts it."""
     if len(found) < 2:
         return found
     placed = se3.transform(np.stack([h.T_cam_obj for h in found]), matches.p_obj)

@@ -23,7 +23,7 @@ _EDGE_MARGIN_PX = 2
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The three terms of J as they enter it, each of the shape that was asked for; their sum is J.
+    """The three terms of J with their weights and signs, each of the shape of the scores; their sum is J.
 
     trackability  lambda s, 0 or more
     spread        (1 - lambda) min(d / r_ideal, 1), 0 or more
@@ -41,7 +41,7 @@ class Terms:
 
 
 def terms(score: np.ndarray, d_px: np.ndarray, config: SamplingConfig) -> Terms:
-    """The terms of J for scores at distances d_px from everything chosen or stored."""
+    """The terms of J for scores at distances d_px from the nearest point chosen or stored."""
     lam = config.score_weight
     spread = np.minimum(d_px / config.r_ideal_px, 1)
     crowding = np.maximum(0, (config.r_min_px - d_px) / config.r_min_px) if config.r_min_px > 0 else 0.0 * spread
@@ -62,7 +62,7 @@ def choose(candidates: Candidates, stored_px: np.ndarray, count: int, config: Sa
     for _ in range(min(count, n)):
         J = np.where(free, terms(candidates.score, d, config).total, -np.inf)
         best = int(J.argmax())
-        # The paper says K <= N_k, not when to stop short of K: here once crowding costs more than the best is worth.
+        # The paper does not say when to stop short of K points: here, once the best candidate left is worth nothing.
         if J[best] <= 0:
             break
         chosen.append(best)

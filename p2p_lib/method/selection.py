@@ -1,9 +1,8 @@
 """Which pose hypothesis to go on with (paper: "Multi-Hypothesis Pose Generation and Selection").
 
 The paper takes the hypothesis whose dense points lie nearest to the surface (rule "surface"). Ours (rule "support")
-keeps the one that most keypoints agree with unless the surface prefers another one significantly: where that one is
-nearer by more than ``surface_sigmas`` standard errors and a small margin. The same points are compared under both
-poses, so the difference of each counts.
+keeps the one that most keypoints agree with, unless the surface prefers another one significantly: that one fits the
+surface, and is nearer to it by more than a small margin and ``surface_sigmas`` standard errors of the mean difference.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ import numpy as np
 from p2p_lib.core.config import SelectionConfig
 from p2p_lib.method.registration import Hypothesis
 
-#: A smaller difference of the mean distances tells nothing, however certain it is, m.
+#: A smaller difference of the mean distances does not matter, however certain it is, m.
 _MARGIN_M = 2e-4
-#: A surface that no pose fits closer tells nothing either: it is bent, or depth and colour are not of one moment.
+#: The mean distance of a pose that fits is smaller; else the map is bent, or depth and colour are out of step, m.
 _FITS_M = 0.004
 
 

@@ -1,9 +1,8 @@
 """3D reconstruction: one truncated signed distance volume per object (paper: 3D Reconstruction, appendix).
 
 A dense grid in the object frame, in memory or on a CUDA device (:mod:`p2p_lib.core.voxels`).
-The grid grows in blocks with the object and never beyond ``max_voxels``, whatever a wild depth pixel
-asks for. Every sum of the weighted mean is kept apart from its weight, so an observation can be taken
-out again and put back where the factor graph has moved its keyframe.
+The grid grows in blocks with the object, never beyond ``max_voxels``. Weighted sums and weights are kept
+apart, so that an observation can be taken out and fused again where the factor graph has moved its keyframe.
 """
 
 from __future__ import annotations
@@ -35,17 +34,17 @@ _REGION_POINTS = 4000
 _DEPTH_GAP_M = 0.05
 #: Step of the numeric gradient (the release's).
 _GRADIENT_VOXELS = 0.5
-#: Annotated poses of real datasets are rounded; fusing needs an affine map only, so they are taken as they come.
+#: A pose may be off a rigid one by this: annotated poses are rounded, and fusing needs an affine map only.
 _POSE_TOLERANCE = 5e-3
-#: Background nearer than this to the mask does not carve: mask and pose are good to a pixel or two.
+#: Background this near to the mask does not carve: mask and pose are not exact to a pixel.
 _CARVE_MARGIN_PX = 1
 
 
 @dataclass(frozen=True, eq=False)
 class View(Image):
-    """One masked RGB-D observation with a border of a pixel; its box is fixed, so that taking out mirrors putting in.
+    """One masked RGB-D observation with a border of a pixel; its box is kept, so that it can be taken out exactly.
 
-    corner    column and row of the cut's first inner pixel
+    corner    column and row in the image of the cut's first pixel inside the border
     """
 
     corner: tuple[int, int]
@@ -60,7 +59,7 @@ class View(Image):
 
 
 def _clear_of(mask: np.ndarray) -> np.ndarray:
-    """Pixels beyond :data:`_CARVE_MARGIN_PX` of the mask."""
+    """(H, W) bool: pixels farther than :data:`_CARVE_MARGIN_PX` from the mask."""
     kernel = np.ones((2 * _CARVE_MARGIN_PX + 1,) * 2, np.uint8)
     return cv2.dilate(mask.astype(np.uint8), kernel) == 0
 
@@ -147,7 +146,8 @@ class TsdfVolume:
 
         Projective update of the appendix: d(v) = D(pi(v)) - z(v) with depth sampled at the nearest
         pixel; a voxel outside the image or mask, at an invalid depth, or with d < -tau is left alone;
-        the others take min(1, d / tau) into their weighted mean.
+        the others take min(1, d / tau) into their weighted mean. With ``config.carve`` (ours) voxels
+        before the background, d >= tau, take 1, too.
 
         depth_m (H, W) metres, 0 or not finite = invalid; rgb (H, W, 3) uint8; mask (H, W) bool.
         With ``key`` the observation is kept and can be moved (:meth:`move`) or taken out (:meth:`remove`),
@@ -166,7 +166,7 @@ class TsdfVolume:
         return self._fuse(view, 1.0)
 
     def put(self, lo: np.ndarray, index: np.ndarray, value: np.ndarray, weight: np.ndarray, rgbw: np.ndarray) -> None:
-        """Set voxels as :meth:`CpuGrid.put` does, of a grid that begins at lattice index ``lo`` (3,) and grows on."""
+        """Set voxels as :meth:`CpuGrid.put` does, in a grid that begins at lattice index ``lo`` (3,) and may grow."""
         self._grid.put(index, value, weight, rgbw)
         self.lo, self.grows, self._total = lo.copy(), True, float(weight.sum())
 
@@ -208,9 +208,9 @@ class TsdfVolume:
         return [known[i] for i in order[:limit]]
 
     def join(self, other: TsdfVolume, T_obj_other: np.ndarray, shift: int) -> None:
-        """Fuse what another volume keeps, whose frame maps to this one's by T_obj_other (4, 4), its keys + ``shift``.
+        """Fuse another volume's kept observations, moved into this frame by T_obj_other (4, 4), at keys + ``shift``.
 
-        What it has let go of is not in there.
+        Observations that it has let go of are lost.
         """
         for key, view in other.views.items():
             self._put(key + shift, view, view.T_cam_obj @ se3.inverse(T_obj_other))
@@ -255,7 +255,7 @@ class TsdfVolume:
         return View(depth, inside, rgbw, self.lo, self.lo, (left, top), camera, T_cam_obj)
 
     def _window(self, view: View) -> tuple[int, int, int, int]:
-        """Columns and rows [left, top, right, bottom) that the grid projects to, all where it reaches the camera."""
+        """Window [left, top, right, bottom) that the grid projects to; the whole image where it reaches the camera."""
         p_cam = se3.transform(view.T_cam_obj, self.corners_m())
         width, height = view.camera.width, view.camera.height
         if p_cam[:, 2].min() <= 0.01:
@@ -316,7 +316,7 @@ class TsdfVolume:
         return lo, hi
 
     def _frustum_box(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Lattice box [lo, hi) of the grid's voxels that may lie behind the view's pixels, before depth + tau."""
+        """Lattice box [lo, hi) of the grid's voxels that project into the view and lie before its depth + tau."""
         lo, hi = self.lo, self.lo + self.shape
         corners = np.array(np.meshgrid(*zip(lo, hi - 1, strict=True), indexing="ij")).reshape(3, -1).T
         z = se3.transform(view.T_cam_obj, self.anchor_m + self.voxel_m * corners)[:, 2]
@@ -368,7 +368,7 @@ class TsdfVolume:
         return np.where(valid, value[0], 0.0), np.where(valid[:, None], gradient, 0.0), valid
 
     def _sample(self, p_obj: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Metres (K, N) at points (N, 3) moved by offsets (K, 3) in voxels, and whether all K are valid (N,)."""
+        """Distances (K, N), m, at points (N, 3) moved by offsets (K, 3) in voxels; (N,) whether all K are valid."""
         if min(self.shape) < 2 or not len(p_obj):
             return np.zeros((len(offsets), len(p_obj))), np.zeros(len(p_obj), bool)
         index = (p_obj - self.origin_m) / self.voxel_m
