@@ -50,7 +50,7 @@ class Frontend:
     _streaming: bool = False
 
     def track(self, asked: Asked) -> Asked | None:
-        """Follow all points into a frame; returns the frame that the tracks are of, None while a late tracker has none."""
+        """Follow all points into a frame; returns the frame of the tracks, None while a late tracker has none."""
         self.waiting.append(asked)
         tracks = self._tracked(asked.frame, asked.masks)
         if len(self.waiting) <= self.tracker.latency_frames:

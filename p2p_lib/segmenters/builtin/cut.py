@@ -22,21 +22,21 @@ from p2p_lib.segmenters.builtin.patch import (
     plane_heights,
 )
 
-#: Weight of a pixel's certain evidence beside a tie to a like neighbour.
+#: Weight of a pixel's evidence at certainty; a tie to a neighbour that is alike weighs 1.
 _EVIDENCE = 0.06
-#: Log-odds that weigh as much as a tie to a like neighbour where the outline is sharp, and the weight of certainty.
+#: Where the outline is sharp: log-odds that weigh as much as such a tie, and the weight of what is certain.
 _TIE, _CERTAIN = 10.0, 50.0
-#: Mean log-odds of a mask's colours below which it is not the object.
+#: A mask whose colours have lower mean log-odds than this is not the object.
 _STRANGE = -1.0
-#: Measured points this near to the reconstructed surface are on it, and twice as far before it are not.
+#: Points measured this near to the reconstructed surface are on it; those twice as far in front of it are not.
 _ON_SURFACE_M = 0.008
-#: Less of a component than this on the patch's border is an accident.
+#: A component may cover up to this share of the patch's border by accident.
 _AT_THE_BORDER = 0.02
 #: Height in standard deviations of depth at which something stands out of its support.
 _STANDS_OUT = 2.0
-#: A strip of this height above the plane, besides noise, belongs to the plane: its fit is no better.
+#: Points up to this height above the plane, besides noise, belong to it: its fit is no better.
 _PLANE_SLACK_M = 0.003
-#: Pixels of the smallest image whose optical flow is taken.
+#: Least side of an image whose optical flow is taken, px.
 _SMALLEST_FLOW = 32
 
 
@@ -52,11 +52,11 @@ def by_geometry(
     config: SegmentationConfig,
     motions: Motions | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """An object is connected in depth and is not what it stands on.
+    """Evidence that an object is connected in depth and is not what it stands on.
 
-    seeds (h, w) bool lie on the object, ``plane`` is what may support it. Returns the evidence (h, w) and the
-    component (h, w) bool: what is connected with the seeds, where that looks like one object; else nothing. Parts
-    beside it that share its ``motions`` are of it.
+    seeds (h, w) bool lie on the object, ``plane`` (4,) may support it. Returns the log-odds (h, w) and the
+    component (h, w) bool that is connected with the seeds, empty unless it looks like one object. Parts beside it
+    that share its ``motions`` are added to it.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
@@ -81,33 +81,33 @@ def by_geometry(
         parts = parts_that_follow(patch, part, component, motions)
         component |= parts
         log_odds[parts] += config.geometry_weight
-    # What is as low as the plane may touch it: that counts once, and colour may contradict it.
+    # What is as low as the plane has its penalty already: colour can outweigh one.
     log_odds[measured & ~dilated(component, 1) & (free | ~patch.smooth)] -= config.geometry_weight
     if component[patch.border()].mean() > _AT_THE_BORDER:
-        return log_odds, nothing  # it goes on beyond the patch: more than one object is connected
+        return log_odds, nothing  # it goes on beyond the patch: it is more than this object
     log_odds[component] += config.geometry_weight
     return log_odds, component
 
 
 def by_colour(patch: Patch, own: np.ndarray, outside: np.ndarray, config: SegmentationConfig) -> np.ndarray:
-    """Each pixel's colour is likelier among the object's ``own`` (4096,) shares, or ``outside`` (h, w) bool."""
+    """(h, w) log-odds of colours: the object's ``own`` (4096,) shares against those of ``outside`` (h, w) bool."""
     return config.colour_weight * evidence(own, histogram(patch.codes[outside]))[patch.codes]
 
 
 def strange(patch: Patch, mask: np.ndarray, own: np.ndarray) -> bool:
-    """Whether a mask (h, w) bool shows the colours of what surrounds it, not the object's ``own`` (4096,) shares."""
+    """Whether a mask (h, w) bool has the colours of the rest of the patch, not the object's ``own`` (4096,)."""
     if mask.all() or not mask.any():
         return False
     return bool(evidence(own, histogram(patch.codes[~mask]))[patch.codes[mask]].mean() < _STRANGE)
 
 
 def by_surface(patch: Patch, hint: Hint, config: SegmentationConfig) -> np.ndarray:
-    """The object's reconstructed surface passes here, or its outside does; nothing of it is far from it."""
+    """(h, w) log-odds for pixels on the object's reconstructed surface, and against those before it or far off."""
     if hint.distance_m is None:
         return np.zeros(patch.shape, np.float32)
     distance_m = patch.nearest(hint.distance_m)
     on, before = np.abs(distance_m) < _ON_SURFACE_M, distance_m > 2 * _ON_SURFACE_M
-    far = np.isinf(distance_m) & (len(hint.uv_px) >= config.find_points)  # by a pose that can be trusted
+    far = np.isinf(distance_m) & (len(hint.uv_px) >= config.find_points)  # only if the pose can be trusted
     return config.surface_weight * (on.astype(np.float32) - before - far)
 
 
@@ -122,7 +122,7 @@ def cut(
 ) -> np.ndarray:
     """(h, w) probability of the object, by a random walk; ``seeds`` and ``background`` (h, w) bool are certain.
 
-    sharp  with a short outline: several times as long as a plain walk
+    sharp  prefer a short outline, which costs several plain walks
     """
     target, certain = (log_odds > 0).astype(np.float32), _CERTAIN if sharp else 1.0
     says = np.abs(log_odds) / _TIE if sharp else _EVIDENCE * np.tanh(np.abs(log_odds) / 2)
@@ -136,7 +136,7 @@ def cut(
 
 
 def warped(was: np.ndarray, before: Patch, patch: Patch) -> tuple[np.ndarray, np.ndarray]:
-    """A mask (h, w) of the patch before, in [0, 1], and its depth, warped by the optical flow to this patch."""
+    """The mask ``was`` (h, w) in [0, 1] and the depth of the patch before, warped to this one by optical flow."""
     v, u = np.mgrid[: patch.shape[0], : patch.shape[1]]
     at = _flow(patch.gray, before.gray) + np.stack([u, v], -1).astype(np.float32)
     mask = cv2.remap(was.astype(np.float32), at, None, cv2.INTER_LINEAR, borderValue=0)
@@ -146,8 +146,8 @@ def warped(was: np.ndarray, before: Patch, patch: Patch) -> tuple[np.ndarray, np
 def _flow(gray: np.ndarray, before: np.ndarray) -> np.ndarray:
     """(h, w, 2) optical flow in pixels from an image (h, w) uint8 to the one before.
 
-    OpenCV chooses the levels of its pyramid by the longer side and reads beyond the coarsest one where the shorter side
-    is not as long as its windows there: the images are padded to a square that is large enough for one level at least.
+    OpenCV chooses its pyramid levels by the longer side, and reads out of bounds where the shorter side of the coarsest
+    one is smaller than its window: the images are padded to a square that is large enough for one level.
     """
     h, w = gray.shape
     side = max(h, w, _SMALLEST_FLOW)

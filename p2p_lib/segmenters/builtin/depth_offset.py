@@ -1,4 +1,4 @@
-"""By how many pixels depth lies beside colour: a camera that turns fast takes the two at different moments."""
+"""The offset of depth against colour in pixels: in a camera that turns fast the two are of different moments."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.patch import Box, depth_step_m
 
-#: Offsets that are tried, px to each side; one at the end of the range is none.
+#: Offsets tried, px to each side; a best one at the end of the range is rejected.
 _RANGE_PX = 10
-#: Fewer pixels on the near side of depth steps tell nothing.
+#: With fewer pixels on the near side of depth steps there is no answer.
 _MIN_EDGE_PX = 150
-#: An offset must raise the mean colour gradient on depth edges by this, in its standard deviations; the farthest one
-#: loses as much as _NEAR_ZERO for its length.
+#: An offset must raise the mean brightness gradient on depth edges by this, in standard deviations; one of length
+#: _RANGE_PX has to make up for a loss of _NEAR_ZERO.
 _MIN_GAIN, _NEAR_ZERO = 0.2, 0.3
 #: Gradients count up to this, in grey levels: one strong edge does not outvote the others.
 _STRONGEST = 80.0
-#: Standard deviations that blur a gradient and that its surroundings are taken of, px.
+#: Standard deviations of the blurs of the gradient, and of its surroundings, px.
 _BLUR_PX, _AROUND_PX = 1.5, 12.0
 
 
 def depth_offset_px(frame: Frame, box: Box) -> tuple[int, int]:
-    """(x, y) by which depth has to move so that its steps in a box lie on edges of colour; (0, 0) in doubt."""
+    """(x, y) px by which depth has to move so that its steps in a box lie on edges of brightness; (0, 0) in doubt."""
     z = frame.depth_m[box.slices]
     around = np.ones((3, 3), np.uint8)
     near_side = (cv2.dilate(z, around) - z > 2 * depth_step_m(z)) & (cv2.erode(z, around) > 0)
@@ -41,7 +41,7 @@ def depth_offset_px(frame: Frame, box: Box) -> tuple[int, int]:
 
 
 def with_depth_moved(frame: Frame, offset_px: tuple[int, int]) -> Frame:
-    """A frame with its depth moved by (x, y) pixels; what comes in from outside is unmeasured."""
+    """A frame with its depth moved by (x, y) pixels; what moves in from outside the image is unmeasured."""
     if offset_px == (0, 0):
         return frame
     moved = np.float32([[1, 0, offset_px[0]], [0, 1, offset_px[1]]])

@@ -1,4 +1,4 @@
-"""An object that was absent: found where its tracked points are back, or by its colours where its motion leads."""
+"""Find an object that was absent, where its tracked points are back, or by its colours where its motion leads."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from p2p_lib.segmenters.builtin.prompted import NO_PX, ROOM_PX
 from p2p_lib.segmenters.builtin.target import Target
 from p2p_lib.segmenters.builtin.view import Claim, View
 
-#: A component of this many pixels, likelier by this much in the object's colours (nats), is the expected object.
+#: The expected object has at least this many pixels, with mean log-odds of colour (nats) of at least this.
 _MIN_COMPONENT_PX, _MIN_LIKELIER = 80, 1.0
-#: So far an object may leap from one frame to the next, m.
+#: An object may move this far from one frame to the next, m.
 _LEAP_M = 0.15
 
 
 def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
-    """Where enough of its points are back, or it is expected, on nothing ``taken`` (H, W) by another object."""
+    """Find a target where enough of its points are back or it is expected, outside ``taken`` (H, W) bool."""
     frame, cfg, uv_px = view.frame, view.config, hint.uv_px[~in_mask(hint.uv_px, taken)]
     if target.colours is None:
         return None
@@ -58,7 +58,7 @@ def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
 
 
 def near_last(view: View, target: Target, hint: Hint) -> Hint:
-    """A hint that expects an object where it was seen last, unless it says itself where that is."""
+    """A hint that expects the object where it was seen last, unless the hint itself says where it is."""
     if hint.place is not None or len(hint.uv_px) >= view.config.find_points:
         return hint
     centre_m = view.camera.unproject(target.seen.centre_px[None], np.array([target.seen.z_m]))[0]
@@ -81,7 +81,7 @@ def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarra
     plane, free = support_plane(patch, measured), patch.smooth
     if plane is not None:
         free = free & (plane_heights(patch, plane) > max_plane_height_m(patch.sigma_m))
-    # What is connected with another object belongs to that one, whatever its mask has left out.
+    # What depth connects with another object belongs to that one, even outside its mask.
     like = near & (colour > 0) & free & ~components_touching(connected_components(free), taken[patch.box.slices])
     component = np.where(like, connected_components(dilated(like, 1)), 0)
     size = np.bincount(component.ravel())

@@ -1,4 +1,4 @@
-"""An object that was seen a frame ago: its mask moved by the optical flow, then cut out anew around it."""
+"""Follow an object that was seen a frame ago: move its mask by the optical flow, then cut it out anew."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from p2p_lib.segmenters.builtin.prompted import ROOM_PX
 from p2p_lib.segmenters.builtin.target import Target
 from p2p_lib.segmenters.builtin.view import Claim, View
 
-#: The flow is doubted where more of the mask jumped in depth, its area changed by more, or more of it has no depth.
+#: The flow is doubted if more of the mask jumped in depth, its area changed by more, or more of it lacks depth.
 _MAX_JUMPED, _MAX_AREA_CHANGE, _MAX_UNMEASURED = 0.03, 0.1, 0.25
-#: What shows again after nothing of an object was measured is near to where it was.
+#: Depth that returns after none of the object's was measured is its own within this distance of its last, m.
 _REAPPEARS_WITHIN_M = 0.1
 
 
@@ -26,8 +26,8 @@ class Prediction:
     """An object's mask of a frame ago, moved by the optical flow: on a patch of this frame, its probability (h, w).
 
     jumped    (h, w) bool: its depth changed, so that something else has come before it or it has gone
-    shown     (h, w) bool: it has a depth and had none; that of the object or of what has come before it
-    left      whether what lay behind it shows where it should be: it is not covered but has left
+    shown     (h, w) bool: it has depth now and had none, of the object or of what has come before it
+    left      whether the depth of most of it grew: it has not been covered but has left
     doubtful  whether the flow alone says too little
     """
 
@@ -48,7 +48,7 @@ def predict(view: View, target: Target) -> Prediction:
     """Move the mask of an object that was seen a frame ago by the optical flow."""
     frame, cfg, seen = view.frame, view.config, target.seen
     px_m = view.focal_px / seen.z_m
-    # Room for all of it to either side of what showed.
+    # Room for its full size, also where only a part of it showed.
     half = np.maximum(target.size_m / 2, target.room_m) * px_m * (1 + cfg.margin) + ROOM_PX
     patch = Patch.of(frame, around(seen.centre_px, half, frame.shape), view.camera, cfg)
     before = Patch.like(view.previous, patch.box, patch.cell_px, view.camera)
@@ -69,7 +69,7 @@ def predict(view: View, target: Target) -> Prediction:
 def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Claim:
     """Cut the object out around its predicted mask.
 
-    None where it has left: what shows there lies behind it, or has the colours of its surroundings and not its points.
+    None if it has left: what shows there lies behind it, or has the surroundings' colours without its points.
     """
     cfg, patch, prior, jumped = view.config, predicted.patch, predicted.prior, predicted.jumped
     core = (prior > 0.8) & ~(jumped | predicted.shown)
@@ -79,7 +79,7 @@ def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Cla
     motions = target.past.motions(view.frame, hint.T_cam_obj) if target.confident else None
     log_odds, component = by_geometry(patch, core, plane, cfg, motions)
     stays = cfg.prior_weight * np.where(jumped | predicted.shown, 0, 2 * prior - 1)
-    stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours have as much to say
+    stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours shall count as much
     # Parts that come into view are connected with those that were seen before.
     log_odds += np.where(component, np.maximum(stays, 0), stays)
     log_odds[jumped] -= cfg.geometry_weight
@@ -90,19 +90,19 @@ def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Cla
     claim = patch.box, patch.up(x)
     if predicted.left and not (x > 0.5).any():
         return None
-    # Exposure changes colours; what its points agree on is it.
+    # Exposure changes colours: points that agree overrule them.
     told = target.confident and holds(claim, hint.uv_px)
     return claim if told or not strange(patch, x > 0.5, target.colours) else None
 
 
 def holds(claim: tuple[Box, np.ndarray], uv_px: np.ndarray) -> bool:
-    """Whether most of an object's own points (N, 2) are on what is claimed for it."""
+    """Whether most of an object's own points uv_px (N, 2) lie on its claim."""
     box, x = claim
     return bool(2 * in_mask(uv_px - [box.left, box.top], x > 0.5).sum() > len(uv_px))
 
 
 def with_room(view: View, target: Target, hint: Hint) -> Target:
-    """An object with room for parts that move with it, which may reach farther than all that it has shown."""
+    """The target with room for parts that move with it, which may reach farther than what it has shown so far."""
     cfg, px_m = view.config, view.focal_px / target.seen.z_m
     patch = Patch.of(view.frame, around(hint.uv_px.mean(0), cfg.reach_m * px_m, view.frame.shape), view.camera, cfg)
     motions = target.past.motions(view.frame, hint.T_cam_obj)

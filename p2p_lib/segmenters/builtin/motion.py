@@ -1,4 +1,4 @@
-"""What moves with an object: pixels of now, held against an earlier frame as if they had moved as the object did."""
+"""What moves with an object: pixels of this frame, compared with an earlier one under the object's motion."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.patch import Patch, depth_step_m, dilated
 
-#: Two looks at one place differ by less than this in colour, as a mean over the channels.
+#: Two views of one point differ by less than this in colour, as a mean over the channels.
 _SAME_COLOUR = 40.0
-#: So much of a part agrees with the object's motion, at most so much with standing still, and so much of a still scene.
+#: A part follows if more of it agrees with the object's motion, less with standing still; of a still scene more stays.
 _AGREES, _UNDECIDED, _STAYS = 0.75, 0.5, 0.7
-#: A part of which more was not there in the first frame has come to the object since.
+#: A part of which this share was not there in the first frame has come to the object since.
 _ABSENT = 0.3
-#: A part of fewer pixels of the grid proves nothing; one this near to the object may hang together with it.
+#: A part of fewer cells of the grid proves nothing; one within so many cells of the object may belong to it.
 _FEWEST, _NEAR = 12, 4
-#: Less of a part than this on the patch's border is an accident.
+#: A part may cover up to this share of the patch's border by accident.
 _AT_THE_BORDER = 0.02
-#: Every how many frames one is remembered, and how many are besides the first.
+#: One frame in so many is remembered, and so many besides the first are kept.
 EVERY, _KEPT = 5, 6
-#: Every how many pixels the scene is looked at.
+#: One row and column in so many of the scene is looked at.
 _SCENE_STRIDE = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """How an object moved until ``now``: since a frame of the last second, and since the first that it was seen in.
+    """How an object moved until ``now``: since a recent frame, and since the first that it was seen in.
 
-    Each is that frame and T_then_now (4, 4), from the camera's frame of now to that of then.
+    Each is that frame and T_then_now (4, 4): as part of the object, from camera coordinates of now to those of then.
     """
 
     now: Frame
@@ -41,7 +41,7 @@ class Motions:
 
 @dataclass(frozen=True, eq=False)
 class Past:
-    """Frames that an object was seen in, with its poses T_cam_obj (4, 4): the first, and some of the last second."""
+    """Frames that an object was seen in, with its poses T_cam_obj (4, 4): the first, and some recent ones."""
 
     seen: tuple[tuple[Frame, np.ndarray], ...] = ()
 
@@ -50,11 +50,11 @@ class Past:
         return not self.seen or frame.index >= self.seen[-1][0].index + EVERY
 
     def with_frame(self, frame: Frame, T_cam_obj: np.ndarray) -> Past:
-        """With one more frame: the oldest but the first gives way to it."""
+        """With one more frame; beyond the limit the oldest but the first is dropped."""
         return Past((*self.seen[:1], *self.seen[1:][1 - _KEPT :], (frame, T_cam_obj)))
 
     def motions(self, now: Frame, T_cam_obj: np.ndarray) -> Motions | None:
-        """The motions since one of these frames, each in its turn, and since the first; None where there is none."""
+        """The motions since one of the recent frames, taken in turns, and since the first; None without frames."""
         if not self.seen:
             return None
         T_obj_cam, recent = se3.inverse(T_cam_obj), self.seen[1:] or self.seen
@@ -65,9 +65,9 @@ class Past:
 def agrees(
     p_cam: np.ndarray, rgb: np.ndarray, camera: Camera, then: Frame, T_then_now: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether points p_cam (..., 3) of now, of colours rgb, were seen in an earlier frame, if they moved like this.
+    """Whether points p_cam (..., 3) of now, with colours rgb (..., 3), moved by T_then_now, were seen in ``then``.
 
-    Returns those that were, (...,) bool, and those that were not there: what is behind them was seen then.
+    Returns (...,) bool those that were, and those that were not there: what is behind them was seen.
     """
     p_then = se3.transform(T_then_now, p_cam)
     uv_px = camera.project(p_then)
@@ -81,9 +81,9 @@ def agrees(
 
 
 def scene_stays(patch: Patch, motions: Motions) -> bool:
-    """Whether what lies around a patch stayed where it was, rather than moved as the object did.
+    """Whether what lies around a patch stayed in the camera frame, rather than moved as the object did.
 
-    Before a moving camera all that lies still moves alike; before a slow one, walls of one colour seem to have stayed.
+    With a moving camera all that is at rest moves alike; with a slow one walls of one colour seem to have stayed.
     """
     frame, (then, T_then_now) = motions.now, motions.recent
     around = np.ones(frame.shape, bool)
@@ -106,7 +106,7 @@ def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, mot
 
     part  (h, w) int, see :func:`p2p_lib.segmenters.builtin.patch.connected_components`
 
-    What was not there in the first frame, a hand that took the object, is not of it.
+    What was not there in the first frame, as a hand that took the object since, does not belong to it.
     """
     size = np.bincount(part.ravel())
     count = len(size)

@@ -16,18 +16,18 @@ from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import colour_codes
 
-#: Depth changes from pixel to pixel of the grid by this much on surfaces seen at a slant.
+#: Depth changes by this much from cell to cell of the grid on surfaces seen at a slant.
 _SLANT_M = 0.004
-#: So many values tell their median.
+#: At most so many values are used for a median.
 _ENOUGH = 400
-#: Points that tell of a support plane, and planes that are tried.
+#: Points drawn to find a support plane, and planes tried.
 _PLANE_POINTS, _PLANES = 250, 150
-#: Twice the area of the smallest triangle that tells a plane, m2.
+#: Twice the area of the smallest triangle that determines a plane, m2.
 _SMALLEST_M2 = 1e-3
-#: The points of each plane: steps of an irrational share of all of them, which repeat no pattern (Roberts 2018).
+#: The three points of each plane, by a low-discrepancy sequence (Roberts 2018).
 _STEPS = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 _TRIPLES = ((0.5 + np.arange(_PLANES) * _STEPS[:, None]) % 1 * _PLANE_POINTS).astype(int)
-#: A plane that holds less than this share of the pixels supports nothing.
+#: A support plane holds at least this share of the pixels.
 _SUPPORTS = 0.2
 
 
@@ -63,10 +63,10 @@ def around(centre: np.ndarray, half: np.ndarray, shape: tuple[int, int]) -> Box:
 class Patch:
     """A box of a frame on a grid of square cells, no side longer than ``config.side_px`` cells.
 
-    cell_px   side of a cell in pixels: a whole number, by which images are scaled several times faster than by another
+    cell_px   side of a cell in pixels: a whole number, by which images are scaled several times faster
     rgb       (h, w, 3) uint8, averaged
     depth_m   (h, w) reading at the centre, 0 = not measured
-    sigma_m   (h, w) noise of the depth
+    sigma_m   (h, w) standard deviation of the depth
     """
 
     box: Box
@@ -78,13 +78,13 @@ class Patch:
 
     @classmethod
     def of(cls, frame: Frame, box: Box, camera: Camera, config: SegmentationConfig) -> Patch:
-        """The patch of a frame's box, which is made larger to hold whole cells; at the image's end it may be cut."""
+        """The patch of a frame's box, enlarged to whole cells; at the end of the image it may be cut instead."""
         cell_px = -(-max(box.shape) // config.side_px)
         return cls.like(frame, _whole_cells(box, cell_px, frame.shape), cell_px, camera)
 
     @classmethod
     def like(cls, frame: Frame, box: Box, cell_px: int, camera: Camera) -> Patch:
-        """The patch of another frame on the same grid."""
+        """The patch of a frame on a given grid: a box of whole cells."""
         rgb, z = _averaged(frame.rgb[box.slices], cell_px), _middles(frame.depth_m[box.slices], cell_px)
         return cls(box, cell_px, camera, rgb, z, depth_noise_m(z))
 
@@ -100,7 +100,7 @@ class Patch:
 
     @cached_property
     def step_m(self) -> np.ndarray:
-        """(h, w): a larger change of depth from pixel to pixel is an edge, beyond noise and slant."""
+        """(h, w): a larger change of depth from cell to cell is an edge, beyond noise and slant."""
         return depth_step_m(self.depth_m)
 
     @cached_property
@@ -113,7 +113,7 @@ class Patch:
 
     @cached_property
     def edge_weights(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of neighbours, see :func:`p2p_lib.segmenters.builtin.random_walk.edge_weights`."""
+        """Ties of neighbouring cells, see :func:`p2p_lib.segmenters.builtin.random_walk.edge_weights`."""
         lab = cv2.cvtColor(self.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
         return random_walk.edge_weights(lab, self.depth_m, self.step_m)
 
@@ -133,16 +133,16 @@ class Patch:
         return _averaged(image[self.box.slices], self.cell_px)
 
     def nearest(self, image: np.ndarray) -> np.ndarray:
-        """An image (H, W) on the grid, each pixel that of its nearest."""
+        """An image (H, W) on the grid, sampled at the cells' middles."""
         return _middles(image[self.box.slices], self.cell_px)
 
     def up(self, values: np.ndarray) -> np.ndarray:
-        """Values (h, w) of the grid at the pixels of the box."""
+        """Values (h, w) of the grid, interpolated at the pixels of the box."""
         h, w = self.box.shape
         return cv2.resize(values.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
 
     def dots(self, uv_px: np.ndarray, radius: int) -> np.ndarray:
-        """(h, w) bool: squares around pixels (N, 2) of the image; those outside the grid are left out."""
+        """(h, w) bool: squares of ``radius`` cells around pixels (N, 2) of the image; those outside are left out."""
         dots = np.zeros(self.shape, bool)
         at = np.rint((uv_px - [self.box.left, self.box.top] + 0.5) / self.cell_px - 0.5).astype(int)
         u, v = at[((at >= 0) & (at < self.shape[::-1])).all(1)].T
@@ -150,15 +150,15 @@ class Patch:
         return dilated(dots, radius)
 
     def ends_px(self, region: np.ndarray) -> np.ndarray:
-        """(2, 2) x, y in the image where a region (h, w) bool begins, and where it has ended."""
+        """(2, 2) x, y of the first pixel of a region (h, w) bool in the image, and of the first beyond it."""
         rows, columns = bounds(region)
         ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
         return ends * self.cell_px + [self.box.left, self.box.top]
 
     def nearer(self, one: np.ndarray, other: np.ndarray, like: float) -> np.ndarray:
-        """(h, w) bool: the pixels that are nearer to ``one`` (h, w) bool than to ``other``, over like pixels.
+        """(h, w) bool: the cells that are nearer to ``one`` (h, w) bool than to ``other``, by paths along like cells.
 
-        like  length of a step between pixels that are alike; one across the strongest edge has length 1
+        like  length of a step between cells that are alike; one across the strongest edge is longer by 1
         """
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
@@ -187,7 +187,7 @@ class Patch:
         return np.stack(np.broadcast_arrays(x, y[:, None], 1.0), -1) * self.depth_m[..., None]
 
     def squared_distances_m2(self, p_cam: np.ndarray) -> np.ndarray:
-        """(h, w) from a point (3,) in the camera's frame; of an unmeasured pixel it means nothing."""
+        """(h, w) from a point (3,) in the camera's frame; meaningless where nothing is measured."""
         x, y = self.rays()
         z, (x_m, y_m, z_m) = self.depth_m, p_cam.astype(np.float32)
         return (x.astype(np.float32) * z - x_m) ** 2 + (y[:, None].astype(np.float32) * z - y_m) ** 2 + (z - z_m) ** 2
@@ -198,7 +198,7 @@ class Patch:
         return (u - self.camera.cx) / self.camera.fx, (v - self.camera.cy) / self.camera.fy
 
     def centres_px(self) -> tuple[np.ndarray, np.ndarray]:
-        """The pixels (w,) and (h,) of the image in which columns and rows have their middles."""
+        """Image coordinates of the middles of the grid's columns (w,) and rows (h,)."""
         u, v = ((np.arange(n) + 0.5) * self.cell_px - 0.5 for n in self.shape[::-1])
         return u + self.box.left, v + self.box.top
 
@@ -212,23 +212,23 @@ def _whole_cells(box: Box, cell_px: int, shape: tuple[int, int]) -> Box:
 
 
 def _averaged(image: np.ndarray, cell_px: int) -> np.ndarray:
-    """An image (rows, columns, ...) by the means of its cells."""
+    """The means of an image (rows, columns, ...) over its cells."""
     size = image.shape[1] // cell_px, image.shape[0] // cell_px
     return image.copy() if cell_px == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def _middles(image: np.ndarray, cell_px: int) -> np.ndarray:
-    """An image (rows, columns, ...) by one pixel of each cell."""
+    """An image (rows, columns, ...) sampled at the middle of each cell."""
     return image[cell_px // 2 :: cell_px, cell_px // 2 :: cell_px].copy()
 
 
 def approximate_median(values: np.ndarray) -> float:
-    """The median of values (N,), of some hundreds of them where there are many: it costs more than all else here."""
+    """The median of values (N,), by some hundreds of them where there are many: exact medians are slow."""
     return float(np.median(values[:: 1 + len(values) // _ENOUGH]))
 
 
 def depth_step_m(depth_m: np.ndarray) -> np.ndarray:
-    """Of what depth (...,): a larger change than this is an edge, beyond noise and slant."""
+    """(...,) the change of depth (...,) beyond which it is an edge, not noise or slant."""
     return 3 * depth_noise_m(depth_m) + _SLANT_M
 
 
@@ -258,10 +258,10 @@ def keep_seeded_components(x: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 def support_plane(patch: Patch, where: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray | None:
     """(4,) n, d with n . p = d and n towards the camera: the plane of at least a fifth of the pixels; else None.
 
-    where   (h, w) bool, the pixels that may be of it
-    weight  (h, w) how much each counts; all alike where it is None
+    where   (h, w) bool, the pixels that may belong to it; fewer than 100 have no plane
+    weight  (h, w) of each; None: all the same
 
-    Planes through three of some evenly spread pixels are compared, the best is fitted. Nothing is left to chance.
+    Planes through three of some evenly spread pixels are compared, and the best is refitted: a deterministic RANSAC.
     """
     at = np.flatnonzero(where)
     if len(at) < 100:
@@ -293,6 +293,6 @@ def support_plane(patch: Patch, where: np.ndarray, weight: np.ndarray | None = N
 
 
 def plane_heights(patch: Patch, plane: np.ndarray) -> np.ndarray:
-    """(h, w) metres above a plane, towards the camera; those of unmeasured pixels mean nothing."""
+    """(h, w) metres above a plane, towards the camera; meaningless where nothing is measured."""
     x, y = patch.rays()
     return (plane[0] * x + plane[1] * y[:, None] + plane[2]) * patch.depth_m - plane[3]

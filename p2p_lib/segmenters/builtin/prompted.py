@@ -34,25 +34,25 @@ from p2p_lib.segmenters.builtin.start_evidence import (
     tolerant,
 )
 
-#: Room around an object, besides a share of its size: small ones move by pixels too.
+#: Room around an object on top of ``config.margin``, which is too little for small ones, px.
 ROOM_PX = 6
-#: About so many pixels of a mask stand for what is right about it.
+#: About so many pixels of a mask's middle count as clicks on the object when it is corrected.
 _MIDDLE = 40
 NO_PX = np.zeros((0, 2))
-#: A box is drawn a little too tight now and then, by this share of its size.
+#: A box may be drawn too tight by this share of its size.
 _TIGHT = 0.05
-#: Length of a step between like pixels, where one across the strongest edge has length 1.
+#: Length of a step between pixels that are alike, relative to about 1 across the strongest edge.
 _LIKE = 0.1
-#: Log odds of what lies nearer to a click beside the object than to one on it: more than geometry says.
+#: Log-odds against pixels nearer to a click beside the object than to one on it: more than geometry's.
 _NOT_IT = 3.0
-#: Depth may end this many pixels beside the outline that colour shows.
+#: Depth edges may be this many image pixels beside the outline that colour shows.
 _TOLERANCE_PX = 3.0
-#: Cuts in the wide box and in the one that fits; a click beside the object counts as this many pixels of background.
+#: Cuts in the wide box and in the tight one; weight, in the background's colours, of a cell at a click beside it.
 _ROUNDS, _ROUNDS_MORE, _OTHERS = 3, 2, 30.0
-#: Clicks may be close together on something large, or at both ends of something thin: it may be so many times as far
-#: across as they are. Then less of its outline is beside edges, by this factor: print inside an object is sharp, too.
+#: Clicks may be close together on something large, or at the ends of something thin: the scales tried, as the object's
+#: extent over theirs. A cut's doubt is divided by the scale's value: the print inside an object has edges, too.
 _SCALES = {0.4: 0.5, 1.0: 1.0, 2.5: 0.7}
-#: So many pixels of the grid around a click on something else belong to that.
+#: A click on something else claims the cells of the grid within this radius.
 _AROUND_PX = 3
 
 
@@ -60,8 +60,8 @@ _AROUND_PX = 3
 class Cut:
     """An object cut out in a box, its probability x (rows, columns).
 
-    doubtful  how little of its outline is along edges, and how much of what is clicked as something else is inside;
-              more for another scale than that of the clicks
+    doubtful  mean tie across its outline, low along edges, plus the share of clicks on something else that it holds;
+              larger for scales other than 1
     """
 
     doubtful: float
@@ -69,7 +69,7 @@ class Cut:
     x: np.ndarray
 
     def whole(self, shape: tuple[int, int]) -> np.ndarray:
-        """(H, W) bool: in the whole image."""
+        """(H, W) bool: the mask in the whole image."""
         mask = np.zeros(shape, bool)
         mask[self.box.slices] = self.x > 0.5
         return mask
@@ -89,13 +89,13 @@ class Cutter:
     others_px: np.ndarray
 
     def start(self) -> tuple[Box, np.ndarray]:
-        """From clicks or a box: of cuts at several scales the one whose outline is along edges the most."""
+        """From clicks or a box: of the cuts at several scales the least doubtful one."""
         best = self.cuts[0]
         return best.box, best.x
 
     @cached_property
     def cuts(self) -> list[Cut]:
-        """From clicks or a box, at several scales, the best first."""
+        """From clicks or a box, at several scales, the least doubtful first."""
         cfg, frame, around_px = self.config, self.frame, self.prompt.box_px
         clicks = self.prompt.points_px if len(self.prompt.points_px) else points_in_box(around_px, frame)
         z_m = float(np.nanmedian(depths_at(clicks, frame)))
@@ -110,7 +110,7 @@ class Cutter:
         return sorted(found, key=lambda cut: cut.doubtful)
 
     def _cut_at(self, scale: float, patch: Patch, clicks_px: np.ndarray, z_m: float) -> Cut:
-        """On a wide patch at low resolution, then on one that fits; ``scale`` times as far across as the clicks."""
+        """Cut on a wide, coarse patch, then on one that fits, an object ``scale`` times as far across as the clicks."""
         cfg = self.config
         clicked = Clicked.of(patch, clicks_px, z_m, scale)
         height = Height.of(patch, clicked)
@@ -131,11 +131,11 @@ class Cutter:
         return Cut(float(patch.outline_tie(mask) + inside) / _SCALES[scale], patch.box, patch.up(x))
 
     def correct(self, was: np.ndarray, known_px: np.ndarray) -> tuple[Box, np.ndarray]:
-        """Anew, from clicks that say what is wrong with a mask (H, W) bool, and from what is right about it.
+        """Cut anew, from the clicks that correct a mask (H, W) bool, and from what is right about the mask.
 
-        known_px  (K, 2) pixels that are thought to be on the object, as is the middle of the mask: those are that lie
-                  nearer to a click on it than to one beside it; with clicks beside it alone, the third that
-                  is farthest from them
+        known_px  (K, 2) pixels that are probably on the object, as is the mask's middle. Of both are used those nearer
+                  to a click on the object than to one beside it; with clicks beside it alone, the third that is
+                  farthest from them
         """
         inner = cv2.distanceTransform(np.pad(was, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
         v, u = np.nonzero(inner >= inner.max() / 2)
@@ -153,8 +153,8 @@ class Cutter:
     ) -> np.ndarray:
         """(h, w) probability of what is connected with the clicks, which count as certain.
 
-        The colours of object and background are learnt from each cut for the next one; before the first, from
-        what lies around the clicks and what lies beyond. ``x`` (h, w) is a cut on another patch.
+        Each cut gives the next one the colours of object and background; the first takes them from around the clicks
+        and from farther away, or from ``x`` (h, w), a cut on another patch.
         """
         seeds, cfg = clicked.seeds, self.config
         others = patch.dots(self._others_px, 1) & ~seeds
@@ -172,11 +172,11 @@ class Cutter:
 
     @property
     def _others_px(self) -> np.ndarray:
-        """(K, 2) clicks that are not on the object: beside it, and on others."""
+        """(K, 2) clicks that are not on the object: negative ones, and those on other objects."""
         return np.concatenate([self.prompt.negative_px, self.others_px])
 
     def _nearer_to_others(self, patch: Patch, clicked: Clicked) -> np.ndarray:
-        """(h, w) log-odds of what lies nearer to a click that is not on the object than to one on it."""
+        """(h, w) log-odds against pixels nearer to a click that is not on the object than to one on it."""
         others = patch.dots(self._others_px, 0) & ~clicked.seeds
         if not others.any():
             return np.zeros(patch.shape, np.float32)

@@ -1,29 +1,29 @@
-"""Cutting an image in two: a random walker with priors (Grady 2005) on a small RGB-D grid.
+"""Segmentation by a random walker with priors (Grady 2005) on a small RGB-D grid.
 
 Every pixel is pulled towards object or background by its own evidence and tied to its neighbours, less
-where colour and depth change between them. The answer is the probability that a walker who
-starts at the pixel and prefers large edge weights ends at the object: the minimum of a quadratic energy.
+where colour or depth change between them. The answer is the probability that a walker who starts at the
+pixel, and prefers large edge weights, ends at the object: the minimum of a quadratic energy.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Edge weight across the strongest contrast: no pixel is ever quite alone.
+#: Least edge weight, across the strongest contrast: no pixel is cut off completely.
 _LOOSE = 1e-4
-#: Factor of the edge weight between a measured and an unmeasured pixel: depth is missing mostly beside silhouettes.
+#: Factor of edge weights between measured and unmeasured pixels: depth is missing mostly along silhouettes.
 _INTO_THE_UNMEASURED = 0.05
 #: Conjugate gradients end when the residual is below this, in root mean square, or after so many steps.
 _SETTLED, _STEPS = 3e-4, 40
-#: Differences count as this at least, walk by walk, where outlines are sharpened.
+#: Least differences in the reweighting of :func:`sharpen`, one for each of its walks.
 _LEAST_DIFFERENCE = (0.5, 0.25)
 
 
 def edge_weights(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weights in (0, 1] of neighbours along a row (H, W-1) and along a column (H-1, W).
 
-    colour (H, W, C) float, its contrast is judged by the image's own mean; depth_m (H, W), 0 = not measured;
-    step_m (H, W): a depth step of this size is an edge.
+    colour (H, W, C) float, its contrast taken relative to the image's mean contrast; depth_m (H, W), 0 = not
+    measured; step_m (H, W): a depth step of this size is an edge.
     """
     across = colour[:, 1:] - colour[:, :-1], colour[1:] - colour[:-1]
     contrast = [np.einsum("ijk,ijk->ij", d, d) for d in across]
@@ -71,10 +71,10 @@ def walk(
 def sharpen(
     target: np.ndarray, strength: np.ndarray, weights: tuple[np.ndarray, np.ndarray], start: np.ndarray
 ) -> np.ndarray:
-    """(H, W) float32 in [0, 1]: a walk whose outline is short, by its absolute differences instead of their squares.
+    """(H, W) float32 in [0, 1]: a walk with absolute differences instead of squared ones, which shortens the outline.
 
-    The x that minimises sum strength |x - target| + sum weights |x_i - x_j|, a minimum cut, by iteratively reweighted
-    least squares: a few walks, each from the one before.
+    Approximates the x that minimises sum strength |x - target| + sum weights |x_i - x_j|, a minimum cut, by iteratively
+    reweighted least squares: two walks, each from the one before.
     """
     x, (right, below) = start, weights
     for least in _LEAST_DIFFERENCE:

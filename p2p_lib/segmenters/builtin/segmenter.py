@@ -1,12 +1,12 @@
 """Which pixels belong to which object (input of the paper: "a segmentation mask of each object").
 
 A segmenter takes a few clicks on each object in some frame and labels every frame from there on, causally.
-The built-in one needs no weights. It weighs evidence of colour, depth, geometry, of where the object was a
-frame ago and of what the rest of the pipeline knows as per-pixel foreground log-odds, and cuts along edges by a random
-walker (:mod:`p2p_lib.segmenters.builtin.random_walk`). Depth is missing just where a silhouette is doubtful: there
-colours decide, and only beside what is measured.
+The built-in one has no learned weights. It sums per-pixel foreground log-odds of colour, depth, geometry, the mask of
+the frame before and what the rest of the pipeline knows, and cuts along edges by a random walker
+(:mod:`p2p_lib.segmenters.builtin.random_walk`). Depth is often missing along silhouettes: there colours decide, and
+only next to measured pixels.
 
-This page is the order in which a frame goes through its parts (see the package's text).
+This module is the order of the stages in a frame; the package's docstring says where each is.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class Refiner(Protocol):
 
 
 class BuiltinSegmenter:
-    """The segmenter without weights. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
+    """The segmenter without learned weights. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
 
-    refiner  may replace what is claimed for an object in a frame, before it is labelled and learnt from
+    refiner  may replace an object's mask in a frame, before it is labelled and learnt from
     """
 
     def __init__(self, camera: Camera, config: SegmentationConfig, refiner: Refiner | None = None):
@@ -78,7 +78,7 @@ class BuiltinSegmenter:
         prompts: Iterable[Prompt] = (),
         hints: Mapping[str, Hint] | None = None,
     ) -> np.ndarray:
-        """One frame in, one label image out; where two objects claim a pixel the likelier one has it."""
+        """One frame in, one (H, W) label image out; a pixel that two objects claim goes to the likelier one."""
         said, hints = {prompt.name: prompt for prompt in prompts}, hints or {}
         _check(frame, said, self.camera)
         self._frames += 1
@@ -103,11 +103,11 @@ class BuiltinSegmenter:
         return labels
 
     def _due(self) -> set[str]:
-        """The objects whose turn it is to be cut out."""
+        """The objects whose turn it is to be cut out anew."""
         return {name for turn, name in enumerate(self._targets) if (self._frames - turn) % _TURNS == 0}
 
     def _absent_last(self, said: Mapping[str, Prompt], hints: Mapping[str, Hint], due: set[str]) -> list[str]:
-        """The objects in the order in which they are located: one that is absent is not found on one in view."""
+        """The order in which objects are located: absent ones last, so that none is found on an object in view."""
         names = dict.fromkeys([*self._targets, *said])
         absent = {}
         for name in names:
@@ -137,7 +137,7 @@ class BuiltinSegmenter:
         return self._cut_out(view, target, hints.get(name, _NO_HINT), taken, predicted)
 
     def _segment_prompt(self, view: View, cutter: Cutter, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
-        """Segments from a prompt; a correction starts from the predicted mask."""
+        """Segment from a prompt; clicks on an object that has a mask in this frame correct that mask."""
         was = np.zeros(view.frame.shape, bool)
         predicted = None if target.seen is None else predict(view, target)
         if cutter.prompt.box_px is None:
@@ -149,12 +149,12 @@ class BuiltinSegmenter:
     def _cut_out(
         self, view: View, target: Target, hint: Hint, taken: np.ndarray, predicted: Prediction | None
     ) -> tuple[Target, Claim]:
-        """Follow an object that was seen, or find one that was absent outside what is ``taken`` (H, W) bool."""
+        """Follow an object that was seen a frame ago, else find it outside what is ``taken`` (H, W) bool."""
         agreed = hint.T_cam_obj is not None and len(hint.uv_px) >= view.config.find_points
         held, target = target.confident, replace(target, confident=agreed)
         if hint.gone:
             return target, None
-        if predicted is None or hint.sighted:  # what has been followed is not where the object was found
+        if predicted is None or hint.sighted:  # a sighting overrules the mask that was followed
             return replace(target, proven=agreed or hint.sighted), find(view, target, hint, taken)
         due = target.confident and target.past.due(view.frame)
         target = with_room(view, target, hint) if due else target
@@ -162,11 +162,11 @@ class BuiltinSegmenter:
         if agreed and claim is not None:
             if holds(claim, hint.uv_px):
                 target = replace(target, proven=True)
-            elif held or not target.proven:  # what the flow has lost, or colours have never found, its points have
+            elif held or not target.proven:  # its points overrule the flow, or a find by colour
                 claim = find(view, target, hint, taken) or claim
             else:
                 target = replace(target, confident=False)
-        if claim is None:  # it has moved faster than the flow: it is not far from where it was
+        if claim is None:  # too fast for the flow: look near its last place
             return target, find(view, target, near_last(view, target, hint), taken)
         past = target.past.with_frame(view.frame, hint.T_cam_obj) if due else target.past
         return replace(target, past=past), claim
@@ -174,7 +174,7 @@ class BuiltinSegmenter:
     def _refined(
         self, frame: Frame, said: Mapping[str, Prompt], claims: Mapping[str, Claim], hints: Mapping[str, Hint]
     ) -> dict[str, Claim]:
-        """The claims that the refiner replaces."""
+        """The refiner's claims, of the objects whose masks it replaces."""
         if self._refiner is None:
             return {}
         masks = {name: np.zeros(frame.shape, bool) for name in claims}
@@ -186,11 +186,11 @@ class BuiltinSegmenter:
 
     @staticmethod
     def _cuts(target: Target, due: bool) -> bool:
-        """Whether an object that was seen is cut out anew, whatever its flow says."""
+        """Whether an object that was seen is cut out anew even where its flow is not doubtful."""
         return due or not target.confident
 
     def _assign(self, view: View, claims: Mapping[str, Claim]) -> np.ndarray:
-        """The label image of all claims; every target is updated by the pixels that it won."""
+        """The label image of all claims; every target is updated by the pixels that it has won."""
         frame, cfg = view.frame, view.config
         labels, best = np.zeros(frame.shape, np.int32), np.zeros(frame.shape, np.float32)
         for label, name in enumerate(self._targets, 1):
@@ -222,7 +222,7 @@ class BuiltinSegmenter:
 
 
 def _cutter(view: View, prompt: Prompt, said: Mapping[str, Prompt]) -> Cutter:
-    """What cuts out the object of a prompt, by what is ``said`` of the others, too."""
+    """The cutter of a prompt's object; the clicks on other objects in ``said`` count as background."""
     others_px = np.concatenate([NO_PX, *(p.points_px for name, p in said.items() if name != prompt.name)])
     return Cutter(view.frame, view.camera, view.config, prompt, others_px)
 
@@ -235,7 +235,7 @@ def _check(frame: Frame, said: Mapping[str, Prompt], camera: Camera) -> None:
 
 
 def _mark(taken: np.ndarray, claim: Claim) -> None:
-    """Mark in ``taken`` (H, W) bool the pixels that a claim holds for likelier than not."""
+    """Mark in ``taken`` (H, W) bool the pixels of a claim with a probability above a half."""
     if claim is not None:
         box, x = claim
         taken[box.slices] |= x > 0.5

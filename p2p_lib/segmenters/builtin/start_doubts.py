@@ -1,4 +1,4 @@
-"""What is doubtful about the mask that a prompt started an object with: said once, with the click that settles it."""
+"""Warnings about the mask that a prompt started an object with, each with what settles it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from p2p_lib.core.image import bounds
 from p2p_lib.segmenters.builtin.patch import Patch, around, dilated, plane_heights, support_plane
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
 
-#: Standard deviations of depth below which an object's median height above the plane around it is none.
+#: An object is flat if its median height over the plane around it is less than this, in standard deviations of depth.
 _FLAT = 2.0
-#: Two things are parted by an edge where their outline's ties, which are 1 between like pixels, are less in the mean.
+#: Two masks are parted by an edge if the mean tie along their contact is at most this; it is 1 between like pixels.
 _TIED = 0.02
-#: Cuts are as good as each other where their doubts differ by less than a factor; of two things if their sizes do more.
-#: Masks are the same where they overlap by this.
+#: Two cuts are equally good if their doubts differ by less than the first factor, and show different things if their
+#: sizes differ by more than the second. Two masks are the same from this intersection over union on.
 _AS_GOOD, _OTHER_SIZE, _SAME = 1.2, 1.5, 0.7
 
 
 def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> None:
     """Warn if the prompt that started an object with a mask (H, W) bool may have selected something else.
 
-    cutter  which cut it out
-    others  object to mask (H, W) bool, of the other objects in this frame
+    cutter  the one that cut it out
+    others  the other objects' masks (H, W) bool in this frame
     """
     frame, name = cutter.frame, cutter.prompt.name
     who = f"{'clicks on' if len(cutter.prompt.points_px) else 'box around'} {name!r} in frame {frame.index}"
@@ -53,7 +53,7 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
 
 
 def _flat(patch: Patch, inside: np.ndarray) -> bool:
-    """Whether what is measured of an object (h, w) bool does not rise above the plane around it."""
+    """Whether the measured pixels ``inside`` (h, w) bool an object do not rise above the plane around it."""
     plane = support_plane(patch, patch.depth_m > 0)
     if plane is None or not inside.any():
         return False
@@ -61,7 +61,7 @@ def _flat(patch: Patch, inside: np.ndarray) -> bool:
 
 
 def _one_body(cutter: Cutter, patch: Patch, inside: np.ndarray, others: Mapping[str, np.ndarray]) -> list[str]:
-    """The other objects most of which would be taken for part of this one, if nobody had clicked on them."""
+    """The other objects most of which would be cut out with this one, had nobody clicked on them."""
     touched = {
         other: there
         for other, there in others.items()
@@ -74,11 +74,11 @@ def _one_body(cutter: Cutter, patch: Patch, inside: np.ndarray, others: Mapping[
 
 
 def _as_good(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> tuple[int, tuple[int, int]] | None:
-    """The pixels of a cut of another size with as good an outline, and one that tells it from the mask (H, W) bool."""
+    """The size in pixels of an equally good cut of another size, and a pixel (u, v) that only one of the two holds."""
     taken = np.logical_or.reduce([np.zeros(mask.shape, bool), *others.values()])
     best = cutter.cuts[0].whole(mask.shape) & ~taken
     if (best & mask).sum() < _SAME * (best | mask).sum():
-        return None  # the mask is somebody else's
+        return None  # it is not this cutter's mask: another object or a refiner changed it
     for cut in cutter.cuts[1:]:
         another = cut.whole(mask.shape) & ~taken
         small, large = sorted([np.count_nonzero(mask), np.count_nonzero(another)])
@@ -90,7 +90,7 @@ def _as_good(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray])
 
 
 def _touch_unparted(patch: Patch, one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two masks (h, w) bool touch, and not along an edge of colour or depth alone."""
+    """Whether two masks (h, w) bool touch without an edge of colour or depth between them."""
     right, below = patch.edge_weights
     tie = np.ones(patch.shape, np.float32)
     tie[:, :-1] = np.minimum(tie[:, :-1], right)

@@ -1,6 +1,6 @@
-"""What says of a pixel, in the frame that starts an object, that it belongs to the clicks; on a patch's grid.
+"""Evidence, in the frame that starts an object, that a pixel belongs to what was clicked; on a patch's grid.
 
-All of it is foreground log-odds (h, w) and adds up.
+All of it is foreground log-odds (h, w), to be added up.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from p2p_lib.segmenters.builtin.patch import (
     support_plane,
 )
 
-#: Clicks on one object are this far apart at least, and a lone one stands for this extent: nobody can tell, m.
+#: Least extent of clicks on one object, and the extent that a lone click stands for, m.
 _EXTENT_M, _LONE_M = 0.03, 0.1
-#: Log-odds between the clicks, right beside them, lost with each of their extents farther away, and at least.
+#: Log-odds between the clicks; right beside them; their loss with each extent of distance; and their least.
 _BETWEEN, _BESIDE, _PER_EXTENT, _FAR = 2.0, 0.8, 2.0, -2.5
-#: What is lower than this many standard deviations and metres above its support is flat.
+#: What rises less than this many standard deviations plus this many metres above its support is flat.
 _FLAT_SIGMAS, _FLAT_M = 2.0, 0.003
 #: A plane's fit adds this to the noise of depth, m.
 _PLANE_SIGMA_M = 0.001
-#: Log-odds of a pixel in the support plane and of one above it at most: things stand there that are not the object.
+#: Log-odds of a pixel in the support plane, and most of one above it: other things stand on it, too.
 _IN_PLANE, _ABOVE_PLANE = -2.0, 0.5
 #: Log-odds of what depth connects with the clicks, and of what it does not.
 _CONNECTED, _APART = 2.5, -1.5
-#: Less of a component than this on the patch's border is an accident.
+#: A component may cover up to this share of the patch's border by accident.
 _AT_THE_BORDER = 0.02
 #: An unmeasured pixel has this share of its nearest measured one's log-odds.
 _UNMEASURED = 0.8
@@ -45,7 +45,7 @@ class Clicked:
     """Where the clicks on an object are, on a patch.
 
     seeds     (h, w) bool, squares around them
-    hull      (h, w) bool, what lies between them
+    hull      (h, w) bool, their convex hull and the seeds
     extents   (h, w) distance from the hull, in extents of the clicks
     """
 
@@ -67,28 +67,28 @@ class Clicked:
         return cls(seeds, hull, away / extent)
 
     def prior_beside(self, connected: np.ndarray) -> np.ndarray:
-        """(h, w) log-odds by the distance from the clicks, which tells nothing against what is ``connected`` (h, w)."""
+        """(h, w) log-odds by distance from the clicks; never against pixels whose ``connected`` (h, w) is positive."""
         beside = np.clip(_BESIDE - _PER_EXTENT * self.extents, np.where(connected > 0, 0, _FAR), None)
         return np.where(self.hull, _BETWEEN, beside).astype(np.float32)
 
     @property
     def near(self) -> np.ndarray:
-        """(h, w) share in the object's colours before it is cut out."""
+        """(h, w) weight in the object's colours before it is cut out."""
         return np.exp(-4 * self.extents)
 
     @property
     def beyond(self) -> np.ndarray:
-        """(h, w) share in the background's colours before the object is cut out."""
+        """(h, w) weight in the background's colours before the object is cut out."""
         return (self.extents > min(1.0, self.extents.max() / 2)).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Height:
-    """What the height above the support plane says.
+    """The evidence of height above the support plane.
 
     plane     (4,) the plane around the clicks; None where there is none
-    flat      whether the clicks are in it, so that it tells nothing, or there is none
-    log_odds  (h, w): a height is that of the plane with its noise, or any up to twice that of the clicks
+    flat      whether height tells nothing: the clicks are in the plane, or there is none
+    log_odds  (h, w) of a height, uniform up to twice that of the clicks, against the plane with its noise
     """
 
     plane: np.ndarray | None
@@ -97,7 +97,7 @@ class Height:
 
     @classmethod
     def of(cls, patch: Patch, clicked: Clicked) -> Height:
-        """By the plane that supports most of what surrounds the clicks."""
+        """By the plane that holds most of what surrounds the clicks."""
         weight = np.exp(-((clicked.extents / 2) ** 2) / 2) + 0.05
         plane = support_plane(patch, (patch.depth_m > 0) & (clicked.extents > 0.5), weight)
         return cls(plane, True, np.zeros(patch.shape, np.float32)).on(patch, clicked)
@@ -111,7 +111,7 @@ class Height:
         clicks_m = approximate_median(height[at])
         if clicks_m < _FLAT_SIGMAS * approximate_median(patch.sigma_m[at]) + _FLAT_M:
             return replace(self, flat=clicks_m > -_FLAT_M, log_odds=nothing)
-        # The density of noise at 0, sqrt(2 pi) sigma to one, against an even one up to twice the height of the clicks.
+        # The peak of the noise's density, 1 / (2.5 sigma), over a uniform one up to twice the height of the clicks.
         surprise = np.log(np.maximum(2 * clicks_m / (2.5 * sigma_m), 1.05))
         log_odds = np.maximum(height, 0) ** 2 / (2 * sigma_m**2) - surprise
         log_odds = np.where(patch.depth_m > 0, np.clip(log_odds, _IN_PLANE, _ABOVE_PLANE), 0)
@@ -119,13 +119,13 @@ class Height:
 
 
 def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndarray:
-    """No object reaches farther in depth than ``config.reach_m`` from its clicks."""
+    """Evidence against what is farther in depth from the clicks than ``config.reach_m``."""
     far = (patch.depth_m > 0) & (np.abs(patch.depth_m - z_m) > config.reach_m)
     return np.where(far, -config.geometry_weight, 0).astype(np.float32)
 
 
 def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
-    """What depth connects with the clicks above their support is of the object, where it ends within the patch."""
+    """Evidence for what depth connects with the clicks above their support, if it ends within the patch."""
     log_odds = np.zeros(patch.shape, np.float32)
     if height.flat:
         return log_odds
@@ -137,13 +137,13 @@ def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
 
 
 def by_shares(patch: Patch, own: np.ndarray, other: np.ndarray, config: SegmentationConfig) -> np.ndarray:
-    """Each pixel's colour is likelier where the object is, or where it is not, by weights (h, w) of all pixels."""
+    """Evidence of colour: shares weighted by ``own`` (h, w), the object, against ``other`` (h, w), the rest."""
     shares = (histogram(patch.codes.ravel(), weights.ravel()) for weights in (own, other))
     return config.colour_weight * evidence(*shares)[patch.codes]
 
 
 def filled(log_odds: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """With a share of the nearest measured pixel's log-odds where nothing is ``measured`` (h, w) bool."""
+    """Log-odds (h, w); where nothing is ``measured`` (h, w) bool, a share of the nearest measured pixel's."""
     if measured.all() or not measured.any():
         return log_odds
     _, nearest = cv2.distanceTransformWithLabels(
@@ -155,7 +155,7 @@ def filled(log_odds: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def tolerant(log_odds: np.ndarray, radius: float) -> np.ndarray:
-    """Without what a shift by ``radius`` pixels would change: depth ends beside the outline that colour shows."""
+    """Log-odds (h, w) that hold within ``radius`` cells: depth ends beside the outline that colour shows."""
     if radius < 0.5:
         return log_odds
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius) + 1,) * 2)

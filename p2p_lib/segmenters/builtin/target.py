@@ -16,7 +16,7 @@ from p2p_lib.segmenters.builtin.patch import Box, approximate_median
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Where an object was: mask (rows, columns) bool of a box of the image, and its median depth (m)."""
+    """Where an object was: its mask (rows, columns) bool in a box of the image, and its median depth (m)."""
 
     box: Box
     mask: np.ndarray
@@ -33,14 +33,14 @@ class Target:
     """One object between two frames.
 
     seen       in the newest frame; None while it is absent
-    colours    (4096,) shares of the colours it has shown; None if it has not been seen yet
+    colours    (4096,) histogram of the colours it has shown; None if it has not been seen yet
     size_m     (2,) its largest width and height so far
-    room_m     (2,) how far parts that may belong to it reach from the centre of what was seen
+    room_m     (2,) how far parts that move with it reach from the centre of what was seen, in x and y
     past       frames that it was seen in, with its poses
     confident  whether enough points agreed on its pose when it was cut out last
-    proven     whether its points were ever on it since it was found: by its colours it may be something else
-    given      the newest frame with a mask that was given and showed something. Nothing is learnt from it yet: that
-               costs time, and where every frame brings a mask it is never needed
+    proven     whether its points were ever on it since it was found; found by colours alone it may be something else
+    given      the newest frame with a mask that was given and not empty. It is learnt from only when needed, which it
+               never is where every frame brings a mask
     """
 
     seen: Seen | None = None
@@ -57,7 +57,7 @@ class Target:
         return replace(self, seen=None, given=(frame, mask) if mask.any() else self.given)
 
     def with_learnt(self, previous: Frame | None, focal_px: np.ndarray, config: SegmentationConfig) -> Target:
-        """With colour and size model updated from the last given mask."""
+        """With colours and size updated from the last given mask."""
         if self.given is None:
             return self
         frame, mask = self.given
@@ -66,7 +66,7 @@ class Target:
         return replace(target, given=None, seen=target.seen if frame is previous else None)
 
     def with_seen(self, frame: Frame, seen: Seen | None, focal_px: np.ndarray, config: SegmentationConfig) -> Target:
-        """With colour and size model updated from where it is in a frame; None where it is absent."""
+        """With colours and size updated from where it is ``seen`` in a frame, None where it is absent."""
         if seen is None:
             return replace(self, seen=None)
         size_m = np.array(seen.mask.shape[::-1]) * seen.z_m / focal_px
@@ -80,9 +80,9 @@ class Target:
 
 
 def seen_in(frame: Frame, mask: np.ndarray, box: Box, min_px: int, z_m: float | None = None) -> Seen | None:
-    """Where a mask (rows, columns) of a box lies; None where it is small.
+    """Where a mask (rows, columns) of a box lies; None with fewer pixels than ``min_px``.
 
-    z_m  its depth where nothing of it is measured; None where that is not known either, which makes it absent
+    z_m  its depth if fewer than ``min_px`` pixels of it are measured; None if unknown: then it counts as absent
     """
     if np.count_nonzero(mask) < min_px:
         return None

@@ -1,4 +1,4 @@
-"""One frame as the stages of the segmenter share it."""
+"""One frame, as the segmenter's stages get it, and what they claim in it."""
 
 from __future__ import annotations
 
@@ -26,5 +26,5 @@ class View:
 
     @property
     def focal_px(self) -> np.ndarray:
-        """(2,) focal lengths."""
+        """(2,) focal lengths, fx and fy."""
         return np.array([self.camera.fx, self.camera.fy])
