@@ -202,7 +202,7 @@ class PoseEstimate:
     map_id          0, and one more for each map that was started since: another map has another object frame
     joined          (id, T_obj_joined) of a map that became part of this one at this frame, else None: a point of its
                     object frame is T_obj_joined times it in this one
-    last_T_cam_obj  the newest pose known, and last_seen_s its time: for those who want to guess
+    last_T_cam_obj  the newest pose known, a keyframe's as the graph has it, and last_seen_s its time: for a guess
     T_world_obj     (4, 4) the pose in the world, where there is a pose and the frame brought ``T_world_cam``; else None
     """
 
