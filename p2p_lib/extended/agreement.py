@@ -1,7 +1,7 @@
-"""Does what camera and masks say agree with itself: measures from values alone (not in the paper).
+"""Consistency of depth, colour and masks over time, measured without any truth (not in the paper).
 
-They know no truth. What follows for an object is in :data:`p2p_lib.extended.gates.DOUBTS`; depth and colour that are
-not of one moment are left out in :mod:`p2p_lib.extended.frame_guard`.
+What follows for an object is in :data:`p2p_lib.extended.gates.DOUBTS`; depth that is not of the moment of its colour
+is handled in :mod:`p2p_lib.extended.frame_guard`.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from p2p_lib.core.types import SPARSE, Frame
 
 #: Keypoints nearer to each other say little of the size, m; so many are needed.
 _APART_M, _KEYPOINTS = 0.02, 8
-#: What has changed by less is the same thing: each of red, green and blue, in grey levels.
+#: Pixels that changed by less in each of red, green and blue, in grey levels, look the same.
 _SAME_GREY = 12
-#: So much of an image has to look the same before it tells of the scene.
+#: At least this share of an image has to look the same.
 _LOOKS_THE_SAME = 0.2
-#: Where a mask ends, depth is compared so many pixels to either side of so many pixels at least; a step is larger, m.
+#: Depth is compared this many px to either side of the outline, at this many places at least; a step is larger, m.
 _BESIDE_PX, _OUTLINE, _DEPTH_STEP_M = 4, 20, 0.02
-#: The outline's direction is that from so many of its pixels before to so many behind.
+#: The outline's direction is taken between the pixels this many before and after.
 _ALONG = 3
 
 
 def size_ratio(p_obj: np.ndarray, p_cam: np.ndarray, noise_m: np.ndarray) -> tuple[float, float] | None:
-    """How many times as large as in the map (N, 3) the object is measured (N, 3), with the standard deviation of that.
+    """Measured size of the object, p_cam (N, 3), over that in its map, p_obj (N, 3), and the standard deviation.
 
-    A rigid object has one size. Depth that is scaled or offset changes it; a wrong pose or a few wrong points do not:
-    the median over pairs of keypoints. ``noise_m`` (N,) is that of the points; None where too few keypoints are seen.
+    Scaled or offset depth changes the size; a wrong pose or a few wrong points do not: it is the median over pairs of
+    keypoints. ``noise_m`` (N,) is that of the points; None where too few keypoints are seen.
     """
     from scipy.spatial.distance import pdist
 
@@ -43,9 +43,9 @@ def size_ratio(p_obj: np.ndarray, p_cam: np.ndarray, noise_m: np.ndarray) -> tup
 
 
 def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.ndarray) -> float:
-    """How many times as far as in a frame before what looks the same beside an object is measured: the median.
+    """Median ratio of depths, now over before, of pixels beside the object that look the same.
 
-    1 where too little looks the same, as before a moving camera: nothing is said then.
+    1 where too few look the same, as with a moving camera.
     """
     now, now_m, then, then_m = (of.sparse[name] for of in (frame, before) for name in ("rgb", "depth_m"))
     same = (now_m > 0) & (then_m > 0) & ~(mask[SPARSE] | mask_before[SPARSE])
@@ -56,8 +56,8 @@ def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.n
 def outline_share(frame: Frame, mask: np.ndarray, own: bool = False) -> float | None:
     """Share of a mask's (H, W) outline where the measured depth has a step, as it has where an object ends.
 
-    Of the mask's largest part; None where too little is measured on both sides. At the image's border there is none.
-    With ``own``, steps alone where the mask is the nearer side: elsewhere something else ends before it.
+    Of the longest contour; None where too little is measured on both sides. At the image's border there is no step.
+    With ``own`` only steps with the mask on the nearer side count: at others something in front ends.
     """
     cut = bounds(mask, 1)
     found, _ = cv2.findContours(mask[cut].astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

@@ -1,8 +1,8 @@
 """How well a pose is known: its covariance, and how likely it is right, within 2 cm and 5 degrees of the truth.
 
 The confidence is a logistic regression on what is known without the truth: how well the pose is determined, how many
-keypoints agree on it, and which share of those seen that is. Points that a wrong pose placed agree with it for ever
-after, so each counts as much as the confidence of the pose that placed it.
+keypoints agree with it, and their share of those seen. Points that a wrong pose placed agree with it for ever
+after, so each is weighted by the confidence of the pose that placed it.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from p2p_lib.method.observation import Observation
 from p2p_lib.method.policy import Candidate, Policy
 from p2p_lib.method.refinement import Refinement
 
-#: Pixels to each side of a point that make its surroundings.
+#: Half the side of a point's surroundings, px.
 _AROUND_PX = 5
-#: The noise of points is set for a poor sensor; what is left of the covariance, measured on ``synthetic/crossing``.
+#: Scale of covariances, measured on ``synthetic/crossing``: the noise of points is set for a poor sensor.
 _COVARIANCE_SCALE = 0.55
-#: Points on a round body drift along it by this share of its accumulated rotation. Where nothing on it is seen to turn,
-#: its turn is known to this, rad: the error of plain bodies in turning scenes.
+#: Points on a round body drift along it by this share of its accumulated rotation. Where no
+#: texture shows its turn, that is known to this, rad: the error of plain bodies in turning scenes.
 _DRIFT_SHARE, _UNCONSTRAINED_RAD = 0.03, 1.0
 #: Weights of the log odds: constant, logarithm of the largest standard deviation of rotation in degrees, logarithm of
 #: the agreeing keypoints + 1, their share of those seen. Fitted on ``fading_label``, ``weak_texture`` and ``crossing``,
@@ -55,10 +55,10 @@ def pose_covariance(
 
 
 def confidence(covariance: np.ndarray, inliers: float, agreement: float) -> float:
-    """How likely a pose is right, 0 to 1.
+    """The probability, 0 to 1, that a pose is right.
 
     covariance  (6, 6) of the pose, rotation (rad) first
-    inliers     keypoints that agree with the pose, each counted by the confidence of the pose that placed it
+    inliers     keypoints that agree with the pose, each weighted by the confidence of the pose that placed it
     agreement   their share of the keypoints seen, 0 to 1
     """
     sigma_deg = np.degrees(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))
@@ -68,13 +68,13 @@ def confidence(covariance: np.ndarray, inliers: float, agreement: float) -> floa
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What a candidate rests on; asked before a keyframe changes the rows of the map.
+    """The evidence of a candidate, taken before a keyframe changes the rows of the map.
 
     of_frame        (6, 6) covariance of the pose relative to the map, right tangent of T_cam_obj
     free_rotations  (K, 6) tangents of one radian each that the shape leaves free
-    slides          whether it leaves more free than that
+    slides          whether the shape leaves more free than these
     constrained     whether the texture at the points that agree constrains these turns
-    support         keypoints that agree, each counted by the confidence of the pose that placed it
+    support         keypoints that agree, each weighted by the confidence of the pose that placed it
     agreement       their share of the points that took part
     """
 
@@ -87,7 +87,7 @@ class Belief:
 
     @classmethod
     def of(cls, obs: Observation, best: Candidate, known: Known, policy: Policy, texture: bool = True) -> Belief:
-        """Of a candidate in the map ``known``; ``texture``: whether it is asked whether that constrains free turns."""
+        """Of a candidate in the map ``known``; without ``texture`` free turns count as constrained, unchecked."""
         (keypoints, _), agrees = policy.correspondences(obs, known), best.hypothesis.inliers
         support = known.map.confidence[agrees].sum()
         agreement = (agrees & keypoints).sum() / max(keypoints.sum(), 1)
@@ -100,10 +100,10 @@ class Belief:
     def at(
         self, T_cam_obj: np.ndarray, model: ObjectModel, most: float, constrained: bool | None = None
     ) -> tuple[np.ndarray, float]:
-        """Covariance (6, 6) and confidence of a pose, what the map as it is now may be wrong by included.
+        """Covariance (6, 6) and confidence of a pose, including the error of the map as it is now.
 
-        most  the confidence at most
-        constrained  in the place of its own
+        most         upper bound of the confidence
+        constrained  used instead of the belief's own, if given
         """
         accumulated_rad = model.views.accumulated_rad(T_cam_obj)
         constrained = self.constrained if constrained is None else constrained
@@ -111,7 +111,7 @@ class Belief:
         return covariance, min(confidence(covariance, self.support, self.agreement), most)
 
     def confidence_given_turn(self, covariance: np.ndarray) -> float:
-        """The confidence in all but turns, where the shape leaves nothing else free: these bend no surface."""
+        """The confidence given the free turns, unless the shape leaves more free: they bend no surface."""
         axes = np.pad(self.free_rotations[: 0 if self.slides else None, :3], ((0, 0), (0, 3)))
         shared = covariance @ axes.T
         held = covariance - shared @ np.linalg.pinv(axes @ shared) @ shared.T
@@ -128,10 +128,10 @@ def _constrained(obs: Observation, best: Candidate, camera: Camera, least: float
 def contrast_along(
     frame: Frame, camera: Camera, T_cam_obj: np.ndarray, p_cam: np.ndarray, turn: np.ndarray
 ) -> np.ndarray:
-    """(N,) by how much a turn of the object, (6,) right tangent of a pose, would change the image around points (N, 3).
+    """(N,) how much a turn of the object, (6,) right tangent of a pose, would change the image around points (N, 3).
 
-    In grey levels: the standard deviation, around each point, of what a motion by two pixels changes. An edge along the
-    motion, as the rim of a tin, changes nothing, and neither does shading, which is even and stays where it is.
+    In grey levels: the standard deviation, around each point, of the change by a motion of two pixels. An edge along
+    the motion, as the rim of a tin, adds nothing, and neither does even shading.
     """
     if not len(p_cam):
         return np.zeros(0)

@@ -1,7 +1,6 @@
 """The one list of what is ours: preset ``default`` composes it around the paper's method.
 
-Taking a mechanism out is deleting its line here; leaving it out of one run is its name in ``method.mechanisms``:
-``all but NAME``.
+Deleting a line here takes a mechanism out; ``method.mechanisms = "all but NAME"`` leaves it out of one run.
 """
 
 from __future__ import annotations
@@ -95,9 +94,8 @@ class Point2Pose(pipeline.Point2Pose):
 
     config  parameters, or the name of a preset (default: ``default``)
 
-    What becomes of the objects is logged as ``p2p_lib``. :meth:`close` ends its threads, and so does the end of a
-    ``with`` block. One thread at a time calls it, whichever that is; another one that comes meanwhile gets
-    :class:`BadInput`.
+    Changes of status go to the logger ``p2p_lib``. :meth:`close`, or the end of a ``with`` block, ends its threads.
+    One thread at a time may call it: another one that calls meanwhile gets :class:`BadInput`.
     """
 
     def __init__(
@@ -116,7 +114,7 @@ class Point2Pose(pipeline.Point2Pose):
     def reset(self) -> None:
         """Forget all objects and the stream: as new, with the same camera, parameters and parts.
 
-        What was given as an object, a 2D tracker or a segmenter, is kept and starts anew.
+        A 2D tracker or a segmenter that was given as an instance is kept, and starts anew.
         """
         self.closed = False
         with self.alone():
@@ -133,7 +131,7 @@ class Point2Pose(pipeline.Point2Pose):
         """As in :class:`p2p_lib.core.objects.Objects`, or an object that is known from a memory.
 
         memory  as :func:`p2p_lib.core.memory.load_memory` reads it: the object is looked for in every frame until it is
-                found, and its pose is in the frame of the map that it was learnt in. Nothing else is said of it
+                found, and its pose is in the object frame of the memory's map. No clicks or masks go with it
         frozen  whether that map stays as it is
 
         Raises :class:`BadInput` for a memory together with clicks or masks, and with preset ``paper``.
@@ -151,7 +149,7 @@ class Point2Pose(pipeline.Point2Pose):
         self.objects[name] = Remembered(self.objects[name].own, memory, self._recogniser, frozen)
 
     def save(self, path: str | Path) -> None:
-        """Keep what is known of all objects, as plain data: :meth:`load` goes on with it, on another day if need be.
+        """Keep what is known of all objects, as plain data, for :meth:`load`.
 
         :class:`BadInput` for an object of which too little is known to find it again.
         """
@@ -165,7 +163,7 @@ class Point2Pose(pipeline.Point2Pose):
     def load(cls, path: str | Path, camera: Camera | None = None, **parts: Any) -> Self:
         """A tracker that knows what another one knew when it was saved; its objects are looked for, and found, anew.
 
-        camera  where it is another one now; ``parts`` are a tracker, detector or segmenter in place of those named
+        camera  if it is another one now; ``parts``: a tracker, detector or segmenter in place of the saved ones
         """
         about, learnt = read_memories(path, _SAVED, _SAVED_BY)
         try:
@@ -180,8 +178,10 @@ class Point2Pose(pipeline.Point2Pose):
     def memory(self, name: str, known: Known | None = None, **made_of: Any) -> ObjectMemory:
         """What is known of an object now, to be kept by :func:`p2p_lib.core.memory.save_memory`.
 
-        known    in another of its maps than the newest
-        made_of  where it comes from, plain values. Raises :class:`BadInput` where it could not be found again by it
+        known    the map to keep; None: the one in which the object is followed
+        made_of  plain values that say where it comes from
+
+        Raises :class:`BadInput` where too little is known to find it again.
         """
         if name not in self.objects:
             raise BadInput("memory", repr(name), "one of " + (", ".join(self.objects) or "no objects"))

@@ -9,7 +9,7 @@ import numpy as np
 from p2p_lib.core.errors import doubt
 from p2p_lib.core.types import Frame
 
-#: Depth, colour or both may be that of a frame before for so long, s: some cameras deliver one more seldom.
+#: Depth, colour or both may repeat for so long, s: some cameras deliver one of them less often.
 _STANDS_S = 0.08
 
 
@@ -25,7 +25,7 @@ class FrameGuard:
 
     def __init__(self, moments: bool = True):
         self._moments = moments
-        self._time_s: float | None = -np.inf  # of the frame before; None once it is said that time runs backwards
+        self._time_s: float | None = -np.inf  # of the frame before; None once the warning is given
         self._stale = StaleFrames()
         self._newest: Frame | None = None
 
@@ -42,7 +42,7 @@ class FrameGuard:
         return self._newest
 
     def _check_time(self, frame: Frame) -> None:
-        """Warn, once, of frames that come in another order than they were taken."""
+        """Warn, once, of frames whose time does not increase."""
         if self._time_s is not None and frame.time_s <= self._time_s:
             got = f"{frame.time_s:.6f} s after {self._time_s:.6f} s"
             doubt(f"time of frame {frame.index}", got, "It did not go on: give frames as they were taken.")
@@ -52,7 +52,7 @@ class FrameGuard:
 
 
 def _without_depth(frame: Frame) -> Frame:
-    """A frame of which depth and colour are not of one moment: points can wait for depth."""
+    """The frame without its depth, which is not of the moment of its colour: points can wait for depth."""
     got = "one is the same image again and again while the other goes on"
     doubt("depth and colour", got, "Until both go on, depth counts as missing.")
     return replace(frame, depth_m=np.zeros_like(frame.depth_m))
@@ -60,20 +60,20 @@ def _without_depth(frame: Frame) -> Frame:
 
 @dataclass(frozen=True, eq=False)
 class StaleFrames:
-    """Since when the newest depth and the newest colour have been the same to the last bit: no sensor measures so.
+    """Since when the newest depth and colour have been identical to the last bit, which no sensor measures.
 
-    first_depth, first_rgb  the first frames that had them; of nothing, none
+    first_depth, first_rgb  the first frames that had them; None where the newest image is empty
     """
 
     first_depth: Frame | None = None
     first_rgb: Frame | None = None
 
     def with_frame(self, frame: Frame) -> StaleFrames:
-        """After one more."""
+        """After one more frame."""
         return StaleFrames(_first(self.first_depth, frame, "depth_m"), _first(self.first_rgb, frame, "rgb"))
 
     def for_long(self, time_s: float) -> tuple[bool, bool]:
-        """Whether one has stood for a while though the other goes on: not of one moment; and whether both have."""
+        """Whether depth or colour alone has stood still for a while: not of one moment; and whether both have."""
         firsts = [first for first in (self.first_depth, self.first_rgb) if first is not None]
         stand = sum(time_s - first.time_s > _STANDS_S for first in firsts)
         return len(firsts) == 2 and stand == 1, stand == 2

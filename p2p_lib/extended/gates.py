@@ -1,7 +1,7 @@
-"""Does a pose stand, and is it learnt from: the gates that refuse it, and what makes it doubtful.
+"""Whether a pose stands, and whether its frame is learnt from.
 
-:data:`GATES` is the list of reasons for which a pose is refused, :data:`DOUBTS` that of reasons for which nothing is
-learnt from it: camera and masks contradict themselves. Each is one mechanism by its name. The paper refuses none.
+:data:`GATES` are the reasons to refuse a pose; :data:`DOUBTS` are the reasons to learn nothing from it, since depth or
+masks contradict earlier ones. Each is the mechanism of its name. The paper refuses none.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from p2p_lib.core.types import Status
 from p2p_lib.extended.lifecycle import Lifecycle
 from p2p_lib.method.policy import Verdict
 
-#: Shape and colour have found an object where this share of its surface shows.
+#: Shape and colour have found an object if this share of its surface shows; the second while it has a pose.
 SIGHTED, SIGHTED_STILL = 0.5, 0.3
-#: Another size is one that is off by this and so many standard deviations.
+#: A size has changed if its ratio is off 1 by this plus so many standard deviations.
 _SIZE, _SIZE_SIGMAS = 0.05, 3.0
-#: A mask is doubted of whose outline less than this share lies where depth has steps, of what did before. One that
-#: stays so for this many frames is taken for right.
+#: A mask is doubted if less of its outline is along depth steps than this share of what was before. After so many
+#: doubted frames in a row it is accepted.
 OUTLINE, _LONGEST_DOUBT = 0.45, 60
 #: So many points fix a pose, or so much of its contour.
 FIXED_BY, _CONTOUR = 3, 0.7
@@ -31,10 +31,10 @@ class Evidence:
 
     support        keypoints that agree with it
     surface_share  share of the depth points that lie on the surface under it; None where no surface was asked
-    sighting       share of the surface that shows in the image where and as it should; None where nobody has looked
-    lead           share of that which is more than where it is turned otherwise; None where nobody has compared
-    size           times as large as its keypoint map it is measured, and the standard deviation; None: few are seen
-    outline        what of its mask's outline lies where depth has steps, as a share of what did before any doubt
+    sighting       share of the surface that shows in the image where and as it should; None: not looked for
+    lead           how much more shows than under the best other turn, as a share; None: not compared
+    size           measured size over that in the map, and its standard deviation; None: size is not in question
+    outline        share of its mask's outline along depth steps, relative to that before any doubt
     still          whether the same image has come again and again
     carried        whether its motion before the gap still says where it is
     slides         whether the pose may move along the surface without leaving it, as that of something flat
@@ -59,9 +59,9 @@ class Evidence:
 class Judgement(Verdict):
     """Whether a pose stands, and what may be made of it.
 
-    doubted  whether what it rests on contradicts itself: a pose that nothing is learnt from
-    proven   whether enough speaks for it to confirm a return: more than a surface that fits where the motion leads
-    joins    whether by it two maps become one
+    doubted  whether depth or mask contradict earlier ones: nothing is learnt from the pose
+    proven   whether its evidence can confirm a return: more than a surface that fits where the motion leads
+    joins    whether it joins two maps
     """
 
     doubted: bool = False
@@ -70,7 +70,7 @@ class Judgement(Verdict):
 
 
 def judge(life: Lifecycle, evidence: Evidence, on: Container[str], config: LifecycleConfig) -> Judgement:
-    """The verdict on a pose: refused by the first gate ``on`` that refuses it, else accepted."""
+    """The verdict on a pose: refused by the first gate ``on`` with a reason, else accepted, perhaps with a doubt."""
     for name, gate in GATES.items():
         if name in on and (reason := gate(life, evidence, config)):
             return Judgement(False, Status.LOST, reason)
@@ -129,18 +129,18 @@ def _same_image(life: Lifecycle, evidence: Evidence) -> str:
 
 
 def off_size(ratio: float, sigma: float = 0.0) -> bool:
-    """Whether something is measured so many times as large as before that it is not the same."""
+    """Whether a ratio of sizes or depths differs from 1 by more than its standard deviation ``sigma`` allows."""
     return abs(ratio - 1) > _SIZE + _SIZE_SIGMAS * sigma
 
 
-#: Every reason to doubt a pose that no gate refuses: what camera and masks say contradicts itself.
+#: Every reason to doubt a pose that no gate refuses: state and evidence to words, or "".
 DOUBTS: dict[str, Callable[[Lifecycle, Evidence], str]] = {
     "size": _another_size,
     "outline": _mask_off_steps,
     "still": _same_image,
 }
 
-#: Every reason to refuse a pose, in the order in which they are asked: state, evidence and bounds to words, or "".
+#: Every reason to refuse a pose, in this order: state, evidence and bounds to words, or "".
 GATES: dict[str, Callable[[Lifecycle, Evidence, LifecycleConfig], str]] = {
     "return_gate": _few_points_on_return,
     "surface_gate": _no_points_and_off_surface,

@@ -1,8 +1,7 @@
-"""What is ours about an object's graph: it stays bounded, it takes in another one, and no stray point bends it.
+"""What we add to an object's graph: it stays bounded, can take in another graph, and keeps stray points out.
 
-A graph over ever more keyframes costs ever more. :func:`merge_keyframes` keeps their number bounded without
-throwing observations away: of two keyframes with nearly the same view, one
-takes over what the other saw.
+:func:`merge_keyframes` bounds the number of keyframes, and so the cost of a solve, without dropping observations: of
+two keyframes with nearly the same view, one takes over the observations of the other.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import FactorGraphConfig
 from p2p_lib.method.factor_graph import GraphResult, Keyframe, Link, ObjectGraph, about
 
-# Noise of an observation moved to another keyframe, in its own: the relative pose by which it moves
-# adds to it. Measured: without, the covariance after much merging is too sure by half.
+# An observation moved to another keyframe has this many times its noise: that of the relative pose adds to it.
+# Measured: without this, the covariance after much merging is too sure by half.
 _MOVED_SIGMA = 1.25
-#: No noise explains an observation that is off by more standard deviations, poses a little off included.
+#: A stray observation is off by more standard deviations than this; small errors of poses are allowed for.
 _STRAY_SIGMAS = 8.0
 # Noise of a landmark that a memory places, m.
 _REMEMBERED_M = 0.002
-# Noise of the relative pose that ties a graph to the one it joins (rad, m): next to none beside what points say.
+# Noise of the relative pose that ties a graph to the one it joins (rad, m): so large that the points decide.
 _JOINED_SIGMAS = np.repeat([0.05, 0.01], 3)
 
 
@@ -41,7 +40,7 @@ class BoundedGraph(ObjectGraph):
         return result
 
     def remember(self, point_ids: np.ndarray, p_obj: np.ndarray) -> None:
-        """Points (N, 3) of a memory, which the first keyframe stands for: seen from it as sure as a map is."""
+        """Add points (N, 3) of a memory, as observed by the first keyframe, which stands for it, with a map's noise."""
         first = self._keyframes[min(self._keyframes)]
         p_cam = se3.transform(se3.inverse(first.T_obj_cam), p_obj)
         sigma_rad = _REMEMBERED_M / np.linalg.norm(p_cam, axis=1)
@@ -54,8 +53,8 @@ class BoundedGraph(ObjectGraph):
     def join(self, other: BoundedGraph, T_obj_other: np.ndarray, point_shift: int) -> None:
         """Take in another graph of the same object, whose frame maps to this one's by T_obj_other (4, 4).
 
-        Ids of its points grow by ``point_shift``. A loose relative pose ties its first keyframe to the newest one here;
-        keyframes to come that see points of both tie them well.
+        Ids of its points are raised by ``point_shift``. A loose relative pose ties its first keyframe to the newest one
+        here; later keyframes that see points of both tie them well.
         """
         shift, p_obj = self.next_key, se3.transform(T_obj_other, np.array([*other._points.values()]).reshape(-1, 3))
         for key, k in other._keyframes.items():
@@ -70,14 +69,14 @@ class BoundedGraph(ObjectGraph):
         self.next_key += other.next_key
 
     def _newest(self) -> int:
-        # A new pose is one in this graph's frame, of which a graph that has just been joined knows little.
+        # A new pose is relative to this graph's own keyframes: those just taken in are tied loosely.
         return max(self._keyframes.keys() - self._joined)
 
 
 def seen_from(keyframe: Keyframe, T_obj_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A keyframe's observations as another camera would have made them: p_cam (N, 3) and sigma (N, 2).
 
-    Noise along the old ray and across it has its shares along and across the new one.
+    Noise along and across the old ray is resolved along and across the new one.
     """
     T = se3.inverse(T_obj_cam) @ keyframe.T_obj_cam
     p_cam, old_ray = se3.transform(T, keyframe.p_cam), keyframe.p_cam @ T[:3, :3].T
@@ -148,11 +147,11 @@ def _sums(row: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def explained(p_obj: np.ndarray, p_cam: np.ndarray, T_cam_obj: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """(N,) bool: points of the map p_obj (N, 3) that are seen where a pose has them, as far as noise can say.
+    """(N,) bool: map points p_obj (N, 3) that are measured where a pose has them, within the noise.
 
-    sigma  (N, 2) noise of bearing (rad) and range (m) of what is measured, p_cam (N, 3)
+    sigma  (N, 2) noise of bearing (rad) and range (m) of the measured p_cam (N, 3)
 
-    Others would bend the graph, whose robust loss never lets go of them: what is mirrored in an object slides over
-    it, a little from keyframe to keyframe, and takes poses and keypoints along.
+    Others would bend the graph, whose Huber loss never rejects them: a reflection slides over an object, a little from
+    keyframe to keyframe, and takes poses and keypoints along.
     """
     return misfit(se3.transform(T_cam_obj, p_obj), p_cam, sigma) <= _STRAY_SIGMAS

@@ -1,8 +1,8 @@
-"""Search by shape and colour: an object's surface, laid into the image under many poses at once (not in the paper).
+"""Search by shape and colour: an object's surface, projected into the image under many poses (not in the paper).
 
-Where points do not suffice, a pose that something else has proposed is judged by what it predicts for every pixel: a
-point of the surface should be measured where it is, in its colour; where the depth goes on behind it, it is not there;
-where the depth ends before it, something hides it, which says nothing.
+Where tracked points do not suffice, a pose from elsewhere is judged by what it predicts: a point of the surface should
+be measured at its depth, in its colour. Depth behind it contradicts the pose; depth before it means that it is hidden,
+which counts less.
 """
 
 from __future__ import annotations
@@ -23,40 +23,40 @@ from p2p_lib.core.types import Frame, Rows
 if TYPE_CHECKING:
     import trimesh
 
-#: Points of the surface that are compared, and the fewest of them in the image that say anything.
+#: Points of the surface that are compared, and the fewest that have to be in the image.
 _POINTS, _FEWEST = 300, 40
-#: Cosine of normal and view up to which a point faces the camera.
+#: A point faces the camera if the cosine of its normal and its ray is less.
 _FACING = -0.25
-#: A measured point this near to the surface is on it, m: while searching, at last.
+#: A measured point this near to the surface is on it, m: while searching, and at the end.
 _ROUGH_M, _FINE_M = 0.02, 0.01
-#: Largest distance in CIELAB's a and b (8 bit), and of the logarithm of the lightness beside that of the whole.
+#: A colour agrees within this distance in CIELAB's a and b (8 bit), and this log-lightness ratio off the mean one.
 _CHROMA, _LIGHTNESS = 20.0, 0.45
 #: A measured point is on the surface up to so many standard deviations of its depth, too.
 _SIGMAS = 2.0
-#: A hidden point counts this much against a pose, and at least this share of those that face the camera must not be.
+#: A hidden point counts this much against a pose; at least this share of those facing the camera must not be hidden.
 _HIDDEN, _SHOWN = 0.5, 0.3
 #: Steps of the search about a proposed pose, m, and their number to each side.
 _STEP_M, _STEPS = 0.03, 2
-#: Of two poses that show as much the one nearer to the proposal is taken: what it shows weighs so much more, per m.
+#: A pose's share is reduced by this per metre from the proposal, so that of equal ones the nearest is taken.
 _STAY_PER_M = 2.0
-#: The search compares every so many points, and so many of its best poses are aligned.
+#: The search compares one in so many points, and so many of its best poses are aligned.
 _COARSE, _TRIED = 3, 3
-#: Of turns, so many are aligned that are so far apart, rad, moved by this step about the depth points, m.
+#: So many turns are aligned, this far apart, rad, shifted by this step about the depth points, m.
 _TRIED_TURNS, _APART_RAD, _NEAR_M = 6, np.radians(20), 0.015
-#: Pixels between the places of a search anywhere, and so many of them that have the right colours (bins of CIELAB).
+#: Pixels between the places of a search anywhere; places of the right colour that are kept; width of a CIELAB bin.
 _LATTICE_PX, _PLACES, _BIN = 8, 200, 8
-#: Directions in which it is looked beyond a place, by so many times half the surface's length; what is behind, m.
+#: Directions from a place, in which background this much farther, m, is looked for at so many half lengths.
 _AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4), np.sin(np.pi * np.arange(8) / 4)], -1)
 _BEYOND, _BEHIND_M = 1.15, 0.03
-#: Of many poses so many are ranked, so many that differ are aligned, and so many of these polished.
+#: Of many poses so many are ranked, so many distinct ones aligned, and so many of these polished.
 _RANKED, _TRIED_PLACES, _POLISHED = 200, 8, 4
-#: A place is no evidence where the surface, moved by its own size along itself, keeps this much of what it shows.
+#: A place is no evidence if the surface, moved along itself by its own size, still shows more than this share.
 _ANYWHERE = 0.7
-#: From this share on a pose is polished: by small motions (rad, m), all at first, then smaller ones about the best.
+#: From this share on a pose is polished: by random small motions (rad, m), then by smaller ones about the best.
 _PROMISING, _POLISH_SCALES = 0.3, (1.0, 0.4)
 _NEARBY = np.random.default_rng(0).normal(size=(150, 6)) * np.repeat([0.06, 0.015], 3)
 _NEARBY[0] = 0
-#: Iterations of the alignment, and what keeps it where the shape leaves it free: rad, m.
+#: Iterations of the alignment, and its regularisation: a prior of these standard deviations, rad and m.
 _ITERATIONS, _FREE = 6, np.diag(np.repeat([0.1, 0.03], 3) ** -2.0)
 
 
@@ -70,7 +70,7 @@ class SurfaceSample(Rows):
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> SurfaceSample:
-        """Of what has been reconstructed so far, with colours."""
+        """A random sample of a mesh's vertices, always the same."""
         at = np.sort(np.random.default_rng(0).permutation(len(mesh.vertices))[:_POINTS])
         rgb = np.asarray(mesh.visual.vertex_colors)[at, :3] if len(at) else np.zeros((0, 3), np.uint8)
         lab = cv2.cvtColor(np.ascontiguousarray(rgb)[None], cv2.COLOR_RGB2LAB)[0] if len(at) else rgb
@@ -79,10 +79,10 @@ class SurfaceSample(Rows):
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A pose and what speaks for it.
+    """A pose and its evidence.
 
     T_cam_obj  (4, 4)
-    share      of the points of the surface that should show: those that do, less those that are contradicted
+    share      points of the surface that show less those contradicted, over those that should show
     uv_px      (K, 2) where points were found on the surface in their colour
     """
 
@@ -99,7 +99,7 @@ class ImageSearch:
         self._lens, self._noise = (camera.fx, camera.fy, camera.cx, camera.cy), (config.noise_m, config.noise_per_m2)
 
     def about(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
-        """The best pose near a proposed one; None where too little of the surface would be in the image."""
+        """The best pose near a proposed one; None where none is promising."""
         uv_px = self._camera.project(se3.transform(T_cam_obj, sample.p_obj))
         if len(uv_px) < _FEWEST or not in_image(uv_px, self._depth_m.shape).any():
             return None
@@ -108,13 +108,13 @@ class ImageSearch:
         return self._best(self._all_aligned(poses[np.argsort(-share)[:_TRIED]], sample), sample, T_cam_obj)
 
     def turned(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> Sighting | None:
-        """The best pose of the object that these depth points (M, 3) are of, near the turns of T_cam_obj (V, 4, 4)."""
+        """The best pose near the turns of T_cam_obj (V, 4, 4), for an object with these depth points (M, 3)."""
         return self._best(self._turns(turns, cloud, sample), sample)
 
     def otherwise(
         self, T_cam_obj: np.ndarray, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample
     ) -> Sighting | None:
-        """As :meth:`turned`, the best of those that differ from a pose by their turn."""
+        """As :meth:`turned`, the best of those that are turned otherwise than a pose."""
         found = self._turns(turns, cloud, sample)
         other = [s for s in found if se3.angle_rad(se3.inverse(T_cam_obj) @ s.T_cam_obj) > _APART_RAD]
         return max(other, key=lambda s: s.share, default=None)
@@ -122,7 +122,7 @@ class ImageSearch:
     def places(self, free: np.ndarray, sample: SurfaceSample, rng: np.random.Generator) -> np.ndarray:
         """(P, 3) some measured points of ``free`` pixels (H, W) bool where the surface may be.
 
-        They have one of its colours, and stand out from what is around them: nothing ends amid a wall.
+        They have one of its colours, and stand out from the background: nothing ends amid a wall.
         """
         known = np.zeros((256 // _BIN,) * 2, np.uint8)
         known[tuple((sample.lab[:, 1:] // _BIN).astype(int).T)] = 1
@@ -137,7 +137,7 @@ class ImageSearch:
         return self._camera.unproject(px, self._depth_m[px[:, 1], px[:, 0]].astype(float))
 
     def _stands_out(self, px: np.ndarray, length_m: float) -> np.ndarray:
-        """(P,) bool: pixels (P, 2) around which, beyond something so long, most is measured farther away."""
+        """(P,) bool: pixels (P, 2) around which, beyond an object of this length, most depth is farther away."""
         z = self._depth_m[px[:, 1], px[:, 0]]
         radius_px = _BEYOND * length_m / 2 * self._camera.fx / np.maximum(z, 1e-3)
         around = px[:, None] + radius_px[:, None, None] * _AROUND
@@ -146,7 +146,7 @@ class ImageSearch:
         return behind.sum(1) >= len(_AROUND) / 2
 
     def among(self, poses: np.ndarray, sample: SurfaceSample) -> list[Sighting]:
-        """The best of many poses (H, 4, 4) that differ, aligned and polished."""
+        """The best distinct ones of many poses (H, 4, 4), aligned and polished."""
         if len(sample) < _FEWEST or not len(poses):
             return []
         share, best = self._roughly(poses, sample), []
@@ -162,7 +162,7 @@ class ImageSearch:
         return [sighting for sighting in found if sighting is not None]
 
     def _turns(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> list[Sighting]:
-        """The best poses near some turns that differ, aligned."""
+        """The best poses near distinct turns, aligned."""
         if len(sample.p_obj) < _FEWEST or not len(cloud) or not len(turns):
             return []
         poses = np.concatenate([_shifted(T, _NEAR_M, 1) for T in laid_on(turns, cloud, sample)])
@@ -187,14 +187,14 @@ class ImageSearch:
     def _best(
         self, found: list[Sighting], sample: SurfaceSample, proposed: np.ndarray | None = None
     ) -> Sighting | None:
-        """The best of some, polished, near what was ``proposed`` (4, 4) if anything was; None where it is none."""
+        """The best of some, polished, near the ``proposed`` pose (4, 4) if any; None where none is good enough."""
         best = max(found, key=lambda s: s.share - _strayed(s.T_cam_obj, proposed, sample), default=None)
         if best is None or best.share < _PROMISING or not self._distinct(best, sample):
             return None
         return self.at(self._polished(best, sample, proposed), sample)
 
     def _distinct(self, found: Sighting, sample: SurfaceSample) -> bool:
-        """Whether the surface fits worse beside the place: what a table shows as well anywhere proves nothing."""
+        """Whether the surface fits worse beside its place: what fits a table anywhere proves nothing."""
         spread = np.linalg.svd(sample.p_obj - sample.p_obj.mean(0), full_matrices=False)
         along = 2 * spread[2][:2] * spread[1][:2, None] / np.sqrt(len(sample))
         poses = np.repeat(found.T_cam_obj[None], 4, 0)
@@ -203,7 +203,7 @@ class ImageSearch:
         return (share > _ANYWHERE * found.share).sum() < 2
 
     def _polished(self, found: Sighting, sample: SurfaceSample, proposed: np.ndarray | None) -> np.ndarray:
-        """The pose nearby that shows most: colours tell where the shape does not, as on a flat cover."""
+        """The nearby pose that shows most: colours decide where the shape does not, as on a flat cover."""
         T_cam_obj, centre = found.T_cam_obj, sample.p_obj.mean(0)
         about, back = se3.from_rt(np.eye(3), centre), se3.from_rt(np.eye(3), -centre)
         for scale in _POLISH_SCALES:
@@ -213,12 +213,12 @@ class ImageSearch:
         return se3.orthonormalised(T_cam_obj)
 
     def at(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
-        """What speaks for one pose; None where too little of the surface would be in the image."""
+        """The evidence of one pose; None where too little of the surface would show."""
         (share,), (found,), (uv_px,) = self._compare(T_cam_obj[None], sample, _FINE_M)
         return Sighting(T_cam_obj, float(share), uv_px[found]) if np.isfinite(share) else None
 
     def _aligned(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> np.ndarray:
-        """The pose moved until its points lie in the tangent planes of those measured at their pixels, robustly."""
+        """The pose after robust point-to-plane alignment with the points measured at its pixels."""
         for _ in range(_ITERATIONS):
             arrays = np.ascontiguousarray(T_cam_obj), sample.p_obj, sample.n_obj, self._depth_m
             A, b, centre = _normal_equations(*arrays, self._lens)
@@ -237,7 +237,7 @@ class ImageSearch:
 
 @compiled("f8[:,::1], f8[:,::1], f8[:,::1], f4[:,::1], UniTuple(f8, 4)")
 def _normal_equations(T, p_obj, n_obj, depth_m, lens):
-    """A (6, 6), b (6,) of the motion about a centre (3,) that lays points into the planes of those at their pixels."""
+    """A (6, 6), b (6,) of a point-to-plane alignment with the depth at the points' pixels, and its centre (3,)."""
     (height, width), (fx, fy, cx, cy) = depth_m.shape, lens
     R_obj_cam = np.ascontiguousarray(T[:3, :3].T)
     p_cam, normal = p_obj @ R_obj_cam + T[:3, 3], n_obj @ R_obj_cam
@@ -304,7 +304,7 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
         agree = 0
         for m in range(points):
             if found[h, m]:
-                # Exposure may have changed for all alike.
+                # Lightness is compared with the mean change: the exposure may have changed.
                 column, row = int(np.rint(uv_px[h, m, 0])), int(np.rint(uv_px[h, m, 1]))
                 a, b = float(seen[row, column, 1]) - lab[m, 1], float(seen[row, column, 2]) - lab[m, 2]
                 same = np.sqrt(a * a + b * b) < _CHROMA and abs(lighter[m] - exposure / on) < _LIGHTNESS
@@ -316,9 +316,9 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
 
 
 def _strayed(T_cam_obj: np.ndarray, proposed: np.ndarray | None, sample: SurfaceSample) -> np.ndarray:
-    """(...,) what counts against poses (..., 4, 4) for being away from the one proposed; 0 where none was.
+    """(...,) penalty of poses (..., 4, 4) for their distance from the one ``proposed``; 0 without one.
 
-    What is alike all along, as a keyboard, shows as much a few centimetres farther on.
+    Something repetitive, as a keyboard, shows as much a few centimetres farther on.
     """
     if proposed is None:
         return np.zeros(T_cam_obj.shape[:-2])
@@ -328,7 +328,7 @@ def _strayed(T_cam_obj: np.ndarray, proposed: np.ndarray | None, sample: Surface
 
 
 def laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.ndarray:
-    """(V, 4, 4) poses of these turns, the points that face the camera about where the cloud (M, 3) is."""
+    """(V, 4, 4) poses of these turns with their camera-facing points centred on the cloud (M, 3)."""
     centre, poses = cloud.mean(0), turns.copy()
     for T in poses:
         facing = sample.n_obj @ T[:3, :3].T @ centre < 0
@@ -337,7 +337,7 @@ def laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.n
 
 
 def laid_at(turns: np.ndarray, p_cam: np.ndarray, sample: SurfaceSample) -> np.ndarray:
-    """(V * P, 4, 4) poses of turns (V, 4, 4), what faced the camera then about where points (P, 3) are."""
+    """(V * P, 4, 4) poses of turns (V, 4, 4) with what faced the camera then centred on points (P, 3)."""
     poses = np.repeat(turns, len(p_cam), 0)
     for k, T in enumerate(turns):
         facing = ((sample.n_obj @ T[:3, :3].T) * se3.transform(T, sample.p_obj)).sum(1) < 0
@@ -347,7 +347,7 @@ def laid_at(turns: np.ndarray, p_cam: np.ndarray, sample: SurfaceSample) -> np.n
 
 
 def _shifted(T_cam_obj: np.ndarray, step_m: float, count: int) -> np.ndarray:
-    """(H, 4, 4) a pose moved by so many steps to each side along the camera's axes."""
+    """(H, 4, 4) a pose moved by up to ``count`` steps to each side along the camera's axes."""
     steps = step_m * np.arange(-count, count + 1)
     poses = np.repeat(T_cam_obj[None], len(steps) ** 3, 0)
     poses[:, :3, 3] += np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)

@@ -1,6 +1,6 @@
-"""What an object has been through, as a value: what the gates, the search for it and its second map go by.
+"""The state of an object between frames, which gates, search and second map go by.
 
-:class:`Lifecycle` never changes: each frame makes the next one.
+:class:`Lifecycle` is immutable: each frame makes a new one.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from p2p_lib.method.object_model import Life
 if TYPE_CHECKING:
     from p2p_lib.extended.gates import Judgement
 
-#: A return has to be confirmed for so many frames, and is marked as recovered meanwhile; for more without points.
+#: A return has to be confirmed for the first number of frames, for the second where few points agree.
 CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES = 5, 15
-#: A longer time between two frames is a pause, s, if it is so many times what it was before, too.
+#: A time between two frames is a pause if it is longer than this, s, and than so many times the one before.
 _PAUSE_S, _PAUSE = 0.25, 5
-#: The motion so far is that of poses with more confidence.
+#: The motion so far is that of poses with more confidence than this.
 _CONFIDENT = 0.5
-#: Seen so often in the same place of the scene, an object lies still there. The same place is this near, m: what
-#: cameras that are located by the scene are off by.
+#: Seen so often in a row at one place in the scene, an object lies still. One place extends this far, m: the error of
+#: cameras located by the scene.
 _RESTED, _NEAR_M = 3, 0.08
-#: Shape and colour tell a turn from all others by this lead, and leave no doubt by this one.
+#: With the first lead shape and colour tell a turn from all others, with the second beyond doubt.
 TELLING, CLEAR = 0.25, 0.5
 
 
@@ -35,18 +35,18 @@ TELLING, CLEAR = 0.25, 0.5
 class Lifecycle(Life):
     """The state of one object between two frames.
 
-    Beside what the paper's has:
+    In addition to the paper's:
 
     pace_s          time between the newest two frames that followed each other with poses; infinite before
     T_previous      pose of the frame before it; None after a gap
     T_left          newest pose before the absence; an unconfirmed return falls back to it
     confirming      frames for which a return still has to be confirmed
     T_world_obj     newest pose in the scene that many points agreed with, where the camera was known; None before
-    rested          how often in a row it was seen there again
-    motion          how it moves, by the sure poses; None before the first
+    rested          how often in a row it was seen at T_world_obj again
+    motion          how it moves, by the confident poses; None before the first
     start_px        pixels of the newest mask, in a frame without a pose; None without a mask
-    doubted         since a gap nothing has told its turn from others that look alike
-    lost_frames     frames since the newest proven pose in which it was in view
+    doubted         whether, since a gap, its turn has not been told from others that look alike
+    lost_frames     frames in view since the newest proven pose
     doubted_frames  newest frames in a row whose pose was doubted by one of :data:`~p2p_lib.extended.gates.DOUBTS`
     seen_m2         the most that a keyframe showed of it, across the line of sight
     contour         (K, 3) where something flat ends, as it was seen under a sure pose; None before
@@ -69,7 +69,7 @@ class Lifecycle(Life):
 
     @property
     def followed(self) -> bool:
-        """Whether two frames that followed each other ever had poses: else the map may be of something else."""
+        """Whether two consecutive frames ever had poses: else the map may be of something else."""
         return self.pace_s < float("inf")
 
     @property
@@ -83,7 +83,7 @@ class Lifecycle(Life):
         return replace(self, status=Status.LOST) if paused else self
 
     def motion_priors(self) -> dict[str, np.ndarray]:
-        """Where the object is if it stays or moves on evenly: origin to T_cam_obj; empty after a gap."""
+        """T_cam_obj if the object stays, or moves on evenly, by name; empty after a gap."""
         if not self.has_pose or self.T_cam_obj is None:
             return {}
         priors = {"last pose": self.T_cam_obj}
@@ -92,14 +92,14 @@ class Lifecycle(Life):
         return priors
 
     def scene_prior(self, T_world_cam: np.ndarray | None) -> dict[str, np.ndarray]:
-        """Where a sought object is if it has lain still: origin to T_cam_obj; empty where nobody knows."""
+        """T_cam_obj of a sought object if it has lain still, by name; empty where unknown."""
         known = T_world_cam is not None and self.T_world_obj is not None
         if not known or (self.has_pose and not self.sought):
             return {}
         return {"scene": se3.orthonormalised(se3.inverse(T_world_cam) @ self.T_world_obj)}
 
     def in_frame(self, T_old_new: np.ndarray) -> Lifecycle:
-        """The same in another object frame; T_old_new (4, 4) maps it to the one so far."""
+        """The same in a new object frame, which T_old_new (4, 4) maps to the present one."""
         poses = {name: getattr(self, name) for name in ("T_cam_obj", "T_previous", "T_left", "T_world_obj")}
         motion = self.motion and self.motion.in_frame(T_old_new)
         contour = None if self.contour is None else se3.transform(se3.inverse(T_old_new), self.contour)
@@ -109,7 +109,7 @@ class Lifecycle(Life):
     def placed(self, T_world_cam: np.ndarray | None) -> Lifecycle:
         """The state with the newest pose's place in the scene, once a return has been confirmed.
 
-        A pose that few points agree with, as one of a sliver at the image's border, places nothing again.
+        A degraded pose, as of a sliver at the image's border, does not replace a known place.
         """
         if T_world_cam is None or self.confirming or (self.status is Status.DEGRADED and self.T_world_obj is not None):
             return self
@@ -123,7 +123,7 @@ class Lifecycle(Life):
         return self.rested >= _RESTED
 
     def moved(self, confidence: float) -> Lifecycle:
-        """The state with its motion, which goes on with the newest pose where that is sure."""
+        """The state with its motion updated by the newest pose, if that is confident."""
         if confidence <= _CONFIDENT:
             return self
         known = self.motion is not None and self.motion.time_s < self.seen_s
@@ -131,7 +131,7 @@ class Lifecycle(Life):
         return replace(self, motion=go_on(self.T_cam_obj, self.seen_s))
 
     def corrected(self, T_cam_obj: np.ndarray) -> Lifecycle:
-        """With the newest pose as the graph has it: what comes next starts from there."""
+        """With the newest pose replaced by the graph's, from which the next frame starts."""
         lies = self.T_world_obj
         lies = None if lies is None else lies @ se3.inverse(self.T_cam_obj) @ T_cam_obj
         return replace(self, T_cam_obj=T_cam_obj, T_world_obj=lies)
@@ -139,7 +139,7 @@ class Lifecycle(Life):
     def with_verdict(
         self, T_cam_obj: np.ndarray, time_s: float, verdict: Judgement, lead: float | None = None
     ) -> Lifecycle:
-        """The state after a frame with an accepted pose, and the lead by which it was."""
+        """The state after a frame with an accepted pose, and that pose's lead over other turns."""
         clear = verdict.status is not Status.DEGRADED or (lead is not None and lead >= CLEAR)
         longest = CONFIRM_FRAMES if clear else CONFIRM_SIGHTED_FRAMES
         return replace(
@@ -159,7 +159,7 @@ class Lifecycle(Life):
         )
 
     def without_pose(self, status: Status, mask_px: int | None = None, carried: bool = False) -> Lifecycle:
-        """The state after a frame without a pose, where its motion leads or not.
+        """The state after a frame without a pose; ``carried``: its motion still leads to it.
 
         A return that was not confirmed is taken back.
         """

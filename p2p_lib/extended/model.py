@@ -1,4 +1,4 @@
-"""What an object is known by, where a map can take in another one: a bounded graph, and views that add up."""
+"""An object's model that can take in another one: with a bounded graph, and views with accumulated turns."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class JoinableModel(ObjectModel):
     revision = 0
 
     def insert_keyframe(self, *args: Any) -> Requests:
-        """As in the paper."""
+        """As in the paper, counted in ``revision``."""
         self.revision += 1
         return super().insert_keyframe(*args)
 
     def recall(self, memory: ObjectMemory) -> None:
-        """Begin with what a memory says, in its frame; its landmarks come in one by one (:meth:`remember`)."""
+        """Begin with a memory, in its frame; its landmarks are added when they are seen (:meth:`remember`)."""
         kept, config = memory.surface, self.config.tsdf
         if self._surface is not None:
             voxel_m = float(kept.voxel_m)
@@ -44,7 +44,7 @@ class JoinableModel(ObjectModel):
     def remember(self, p_obj: np.ndarray, confidence: np.ndarray) -> np.ndarray:
         """Take in landmarks (N, 3) of the memory that are seen now, as keypoints; returns their keys (N,).
 
-        The graph has them from its first keyframe, which stands for the memory: so they stay where they were.
+        In the graph the first keyframe, which stands for the memory, observes them: so they stay where they were.
         """
         keys = self._next_key + np.arange(len(p_obj))
         self._next_key += len(keys)
@@ -55,9 +55,9 @@ class JoinableModel(ObjectModel):
         return keys
 
     def join(self, other: JoinableModel, T_obj_other: np.ndarray) -> None:
-        """Take in what another model knows of the same object; T_obj_other (4, 4) maps its frame to this one's.
+        """Take in another model of the same object; T_obj_other (4, 4) maps its frame to this one's.
 
-        Its points come behind the map's own.
+        Its points are appended to the map's own.
         """
         self.map.join(other.map, T_obj_other, self._next_key)
         vertices = 0 if self.graph is None else self.graph.next_key

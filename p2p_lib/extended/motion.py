@@ -1,4 +1,4 @@
-"""How one object moves: a prior that outlives a gap (not in the paper)."""
+"""How one object moves: a prior that lasts through gaps (not in the paper)."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 
 from p2p_lib.core import se3
 
-#: The newest velocity counts by this share in what it was, which smooths the noise of poses.
+#: Weight of the newest velocity in the running mean, which smooths the noise of poses.
 _NEWEST = 0.1
-#: What it has been for so long says where the object is, s.
+#: The velocity says where an object is for so long after its last confident pose, s.
 _CARRIED_S = 1.5
-#: What it leaves open grows by this, m/s.
+#: The uncertainty of that place grows by this, m/s.
 _OPEN_M_S = 0.2
 #: This turn, or this move, off the motion so far halves the support of a hypothesis.
 MOTION_DEG, MOTION_M = 5.0, 0.02
@@ -22,7 +22,7 @@ MOTION_DEG, MOTION_M = 5.0, 0.02
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What the sure poses of an object say of its motion; a value that each of them makes anew.
+    """The motion of an object by its confident poses; immutable: each pose makes a new one.
 
     T_cam_obj  (4, 4) the newest of them
     time_s     its time
@@ -44,21 +44,21 @@ class Motion:
         return time_s - self.time_s <= _CARRIED_S
 
     def reach_m(self, time_s: float) -> float:
-        """How far from where it would be the object may be."""
+        """How far the object may be from the predicted place, m."""
         return _OPEN_M_S * (time_s - self.time_s)
 
     def at(self, time_s: float) -> np.ndarray:
-        """(4, 4) T_cam_obj if it has gone on as it did."""
+        """(4, 4) T_cam_obj if the motion has gone on."""
         turn, moved_m = np.split(self.velocity * (time_s - self.time_s), 2)
         return se3.from_rt(cv2.Rodrigues(turn)[0] @ self.T_cam_obj[:3, :3], self.T_cam_obj[:3, 3] + moved_m)
 
     def in_frame(self, T_old_new: np.ndarray) -> Motion:
-        """The same of another object frame; T_old_new (4, 4) maps it to the one so far."""
+        """The same in a new object frame, which T_old_new (4, 4) maps to the present one."""
         return Motion(self.T_cam_obj @ T_old_new, self.time_s, self.velocity)
 
 
 def motion_weight(T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray]) -> np.ndarray | None:
-    """(H,) by how much the support of poses counts less for being off the nearest of the priors; None without priors.
+    """(H,) factors of poses' support by their distance from the nearest of the priors; None without priors.
 
     1 on a prior, 1/2 at ``MOTION_DEG`` or ``MOTION_M`` from it: heavy tails, because objects may be pushed at any time.
     """

@@ -25,7 +25,7 @@ _LOOK_EVERY = 3
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """By what is ``known`` of one object, and where it is absent by its ``other`` map."""
+    """By what is ``known`` of one object, or by its ``other`` map where that finds nothing."""
 
     known: Known
     policy: OurPolicy
@@ -37,7 +37,7 @@ class Outlook:
         return not self.known.model.empty and self.known.life.sought
 
     def misplaced(self, obs: Sight, within: np.ndarray | None) -> Requests:
-        """Tracks that an absent object has elsewhere, on a look-alike perhaps: to be looked for anew.
+        """Requests to reject an absent object's tracks that are elsewhere, perhaps on a look-alike.
 
         within  (H, W) bool, where they may be; None: anywhere
         """
@@ -46,10 +46,10 @@ class Outlook:
         return Requests(reject=self.known.map.ids[obs.tracks.visible & ~in_mask(obs.tracks.uv_px, within)])
 
     def expected_px(self, obs: Sight) -> np.ndarray | None:
-        """(N, 2) where keypoints show under the best hypothesis, NaN where not: what guided re-detection looks for.
+        """(N, 2) where keypoints should show under the best hypothesis, NaN where not: for guided re-detection.
 
-        None where enough are seen, or there is no pose to go by. A few points that agree say where all the others
-        should show, which the tracker checks by their appearance: so an object is back in the frame of its return.
+        None where enough are seen, or no hypothesis. A few points that agree predict all the others, which the
+        tracker checks by their appearance: so an object is back in the very frame of its return.
         """
         known, unknown = self.known, obs.mask is None or self.known.model.empty
         if unknown or self.policy.hidden(obs):
@@ -61,7 +61,7 @@ class Outlook:
         return None if best is None else self.points_px(obs, best.T_cam_obj)
 
     def points_px(self, obs: Sight, T_cam_obj: np.ndarray) -> np.ndarray:
-        """(N, 2) where keypoints show under a pose; NaN where not."""
+        """(N, 2) where keypoints should show under a pose; NaN where not."""
         keypoints = np.where(self.known.map.promoted[:, None], self.known.map.p_obj, np.nan)
         return expected_px(self.policy.observer, obs, T_cam_obj, keypoints)
 
@@ -72,9 +72,9 @@ class Outlook:
         return self.policy.shape.sighted(obs, self.known, self.policy.carried(self.known, obs.frame.time_s))
 
     def hint(self, obs: Sight) -> tuple[Hint, Requests]:
-        """Where this object should be, by its tracks and its model, before the frame is segmented.
+        """Where the object should be by its tracks and its model, for the segmenter; and the tracks to reject.
 
-        Also the tracks to reject: while the object is away, points that agree on no pose are somewhere else.
+        While the object is away, points that do not agree on a pose are on something else.
         """
         known, requests = self.known, Requests()
         if known.model.empty:
@@ -101,7 +101,7 @@ class Outlook:
         return replace(hint_at(frame, self.known, self.policy.observer, uv_px, T_cam_obj), sighted=sighted)
 
     def _gone(self, frame: Frame) -> bool:
-        """Whether nothing of an absent object would show in the image if it has lain still; False if nobody knows."""
+        """Whether an absent object, if it has lain still, is outside the image; False if unknown."""
         return any(not self._inside(T).any() for T in self.known.life.scene_prior(frame.T_world_cam).values())
 
     def _place(self, time_s: float) -> np.ndarray | None:
@@ -113,5 +113,5 @@ class Outlook:
         return np.append(middle, motion.reach_m(time_s))
 
     def _inside(self, T_cam_obj: np.ndarray) -> np.ndarray:
-        """(N,) bool: the keypoints that a pose puts into the image, whatever may hide them."""
+        """(N,) bool: whether a pose projects the keypoints into the image, hidden or not."""
         return self.policy.observer.in_image(T_cam_obj, self.known.map.p_obj)

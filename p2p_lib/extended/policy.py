@@ -1,6 +1,6 @@
-"""An object's answers by default: its motion proposes too, gates judge, contradictions keep frames out of the map.
+"""The default policy of an object: its motion proposes poses, too, gates judge, doubted frames stay out of the map.
 
-Each of :mod:`~p2p_lib.extended.default`'s mechanisms that :class:`OurPolicy` knows is ``on`` or left out by its name.
+The mechanisms of :mod:`~p2p_lib.extended.default` that :class:`OurPolicy` has are ``on`` or off by name.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from p2p_lib.method.policy import Admission, Candidate, Policy, Verdict
 from p2p_lib.method.refinement import Refinement as Refinement  # the type of an inherited field
 from p2p_lib.method.registration import Hypothesis
 
-#: A pose that nothing has told from others since a gap is compared again every so many frames.
+#: A pose that could not be told from other turns since a gap is compared with them again every so many frames.
 _COMPARE_EVERY = 5
-#: Where depth has steps at less of a mask's outline than this, it does not tell where the object ends.
+#: With depth steps along less of a mask's outline than this, depth does not tell where the object ends.
 _CLEAR_OUTLINE = 0.3
-#: A pose of less confidence makes no keyframe: what it places agrees with it for ever after. One that the surface
-#: alone determines well has more.
+#: A pose of less confidence makes no keyframe: the points that it places agree with it for ever after. A pose that the
+#: surface alone determines well has more.
 MAPPED = 0.1
-#: Why a pose is degraded that nothing contradicts.
+#: The reason of a pose that is degraded although nothing contradicts it.
 _UNCONSTRAINED = "rotation not constrained by shape or texture"
 
 
@@ -43,8 +43,8 @@ _UNCONSTRAINED = "rotation not constrained by shape or texture"
 class Proposal(Candidate):
     """A hypothesis with what shape and colour say of it.
 
-    sighting  share of the surface that shows under its pose; None where nobody has looked
-    lead      share of that which is more than where it is turned otherwise; None where nobody has compared
+    sighting  share of the surface that shows under its pose; None: not looked for
+    lead      how much more shows than under the best other turn, as a share; None: not compared
     """
 
     sighting: float | None = None
@@ -57,7 +57,7 @@ class Proposal(Candidate):
         return Evidence(self.hypothesis.support, share, self.sighting, self.lead)
 
     def agreement(self, keypoints: np.ndarray) -> float:
-        """The keypoints seen, (N,) bool, that agree, less those that do not, as a share of all."""
+        """Of the keypoints seen (N,) bool, the share that agrees less the share that does not."""
         return float(np.where(self.hypothesis.inliers[keypoints], 1, -1).mean()) if keypoints.any() else 0.0
 
 
@@ -65,10 +65,11 @@ class Proposal(Candidate):
 class BelievedAdmission(Admission):
     """What of a frame enters the model, and how far its pose is believed.
 
-    T_cam_obj    (4, 4) the pose, and life after it
-    belief       what the pose rests on; None: its confidence is not asked
-    most         the confidence at most
-    stray_sigma  (N, 2) noise in bearing and range by which no stray point enters the graph; None: all enter
+    T_cam_obj    (4, 4) the pose
+    life         the state after it
+    belief       what the pose rests on; None: its confidence is not computed
+    most         upper bound of the confidence
+    stray_sigma  (N, 2) noise in bearing and range by which stray points are kept out of the graph; None: all enter
     """
 
     T_cam_obj: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -78,14 +79,14 @@ class BelievedAdmission(Admission):
     stray_sigma: np.ndarray | None = None
 
     def rows(self, obs: Sight, model: ObjectModel) -> np.ndarray:
-        """As in the paper, without the stray."""
+        """As in the paper, without stray points."""
         rows = super().rows(obs, model)
         if self.stray_sigma is None:
             return rows
         return rows & explained(model.map.p_obj, obs.p_cam, self.T_cam_obj, self.stray_sigma)
 
     def rated(self, model: ObjectModel) -> tuple[np.ndarray, float]:
-        """What the map as it is now may be wrong by is included."""
+        """Covariance (6, 6) and confidence; the error of the map as it is now is included."""
         return super().rated(model) if self.belief is None else self.belief.at(self.T_cam_obj, model, self.most)
 
 
@@ -97,14 +98,14 @@ class OurPolicy(Policy):
         self.on = on
         self.shape = ShapeSearch(self.observer, self.config, self.stopwatch, "shape_search" in on)
         self.frozen = False  # whether the map does not grow
-        # The last pose, and where what had it lies since, as seen last.
+        # The last pose, and where the object lies that had it, by the scene as seen last.
         self._lies: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
-        self.trusted: Sight | None = None  # the newest without a doubt; None once it was hidden since
+        self.trusted: Sight | None = None  # the newest frame without a doubt; None if the object was hidden since
 
     # -- propose -------------------------------------------------------------------------------
 
     def propose(self, obs: Sight, known: Known) -> list[Hypothesis]:
-        """Candidate poses from the keypoints seen; with motion, from the last poses too."""
+        """Candidate poses from the visible keypoints and from priors: the last poses, a sighting."""
         cfg = self.config.registration
         with self.stopwatch("registration"):
             use, certain = self.correspondences(obs, known)
@@ -115,20 +116,20 @@ class OurPolicy(Policy):
             found = self.register(known, p_cam, priors)
             most = max((h.support for h in found), default=0)
             if priors and cfg.method != "svd" and most < cfg.contradicted * use.sum():
-                # Most points are wrong, whichever: pending ones may tell, or those that agree with the surface.
+                # Most keypoints contradict the best pose: pending points may decide, or those that fit the surface.
                 p_cam = np.where(certain[:, None], obs.p_cam, np.nan)
                 found = self.register(known, p_cam, priors)
                 found += self._along_surface(obs, known, p_cam, priors)
             return found or self._surface_only(known, priors)
 
     def few_keypoints(self, known: Known) -> int:
-        """While an object is followed, fast turns leave few keypoints sooner than they leave few points."""
+        """While an object is followed, more: a fast turn leaves pending points where keypoints are few."""
         if "pending_points" in self.on and not known.life.unconfirmed:
             return self.config.keypoint_map.keyframe_min_points
         return super().few_keypoints(known)
 
     def _motion_priors(self, obs: Sight, known: Known) -> dict[str, np.ndarray]:
-        """Where the object is by its motion: name to T_cam_obj."""
+        """Where the object is by its motion: name to T_cam_obj (4, 4)."""
         priors = known.life.motion_priors() if "motion_prior" in self.on else {}
         return priors or self._carried_on(obs, known)
 
@@ -138,7 +139,7 @@ class OurPolicy(Policy):
         return "motion_over_gaps" in self.on and motion is not None and motion.holds(time_s)
 
     def _carried_on(self, obs: Sight, known: Known) -> dict[str, np.ndarray]:
-        """Where an absent object is if it has gone on as it did, and where its depth is, turned like that."""
+        """Where an absent object is if its motion went on, and that turn placed on its measured depth."""
         motion, time_s = known.life.motion, obs.frame.time_s
         if not (self.carried(known, time_s) and len(obs.cloud) and self.shape.knows(known)):
             return {}
@@ -150,7 +151,7 @@ class OurPolicy(Policy):
     def _along_surface(
         self, obs: Sight, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray]
     ) -> list[Hypothesis]:
-        """The hypothesis that grows from where the surface alone leads."""
+        """The hypothesis that is refit from the pose that the surface alone leads to; or none."""
         start = self.refined(obs, known, list(priors.values())[-1])
         if not start.refined:
             return []
@@ -158,7 +159,7 @@ class OurPolicy(Policy):
         return registration.refit(start.T_cam_obj, "surface", known.map.p_obj, p_cam, cfg, sigma_m)
 
     def _surface_only(self, known: Known, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
-        """Too few points to register: the surface may track from where the object should be."""
+        """Hypotheses without points, at the priors, for when too few points register: the surface may refine them."""
         no_inliers, no_residual = np.zeros(len(known.map), bool), np.full(len(known.map), np.inf)
         return [Hypothesis(T_cam_obj, no_inliers, no_residual, name) for name, T_cam_obj in priors.items()]
 
@@ -214,9 +215,9 @@ class OurPolicy(Policy):
         return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
 
     def _compared(self, obs: Sight, known: Known, best: Proposal) -> Proposal:
-        """The pose of a return with its lead over the best that is turned otherwise, or that one, where it shows more.
+        """The pose of a return with its lead over the best other turn, or that turn if much more of the surface shows.
 
-        Asked again now and then until a lead tells. Where no other turn is known, points have to agree with this one.
+        Repeated now and then until the lead is telling. Where no other turn is known, the keypoints' agreement leads.
         """
         life = known.life
         due = life.unconfirmed or (life.doubted and not obs.frame.index % _COMPARE_EVERY)
@@ -234,14 +235,14 @@ class OurPolicy(Policy):
     # -- judge ---------------------------------------------------------------------------------
 
     def start(self, known: Known, points: int) -> Verdict:
-        """The surface may carry an object from fewer points than registration takes."""
+        """A map may begin with fewer points than registration needs, if the surface can track."""
         verdict = super().start(known, points)
         if verdict.accepted or known.model.surface is None or "motion_prior" not in self.on:
             return verdict
         return Verdict(True, Status.DEGRADED, f"only {points} points")
 
     def judge(self, obs: Sight, known: Known, best: Proposal) -> Judgement:
-        """Whether the pose stands, by what speaks for it and by whether camera and masks agree with themselves."""
+        """Whether the pose stands, by its evidence and by the consistency of depth and masks."""
         size = self._size(obs, known, best) if "size" in self.on else None
         outline = self.outline(obs) if "outline" in self.on else 1.0
         carried = self.carried(known, obs.frame.time_s)
@@ -254,11 +255,11 @@ class OurPolicy(Policy):
         return judge(known.life, evidence, self.on, self.config.lifecycle)
 
     def judge_other(self, obs: Sight, known: Known, best: Proposal) -> Judgement:
-        """The same in a second map, by what speaks for the pose alone."""
+        """The same in the other map, by the pose's own evidence alone."""
         return judge(known.life, replace(best.evidence, still=obs.still), self.on, self.config.lifecycle)
 
     def _rests(self, obs: Sight, known: Known, best: Proposal) -> bool | None:
-        """Whether what lay still is where the scene has it; None where nobody knows, or its place is seen empty."""
+        """Whether an object that lay still is where the scene has it; None if unknown, or the place is seen empty."""
         place = known.life.scene_prior(obs.frame.T_world_cam).get("scene") if known.life.lay_still else None
         if place is None:
             return None
@@ -266,14 +267,14 @@ class OurPolicy(Policy):
         return near or (None if empty(self.observer, obs.frame, place, known.map.p_obj) else False)
 
     def _before(self, obs: Sight) -> Sight | None:
-        """The newest frame in which nothing was doubted, where its mask and this one's can be compared."""
+        """The newest frame without a doubt; None unless both it and this one have a mask."""
         before = self.trusted
         return None if obs.mask is None or before is None or before.mask is None else before
 
     def _size(self, obs: Sight, known: Known, best: Proposal) -> tuple[float, float] | None:
-        """How large it is measured, where the scene beside it is measured otherwise than before, too; else None.
+        """The size ratio and its deviation, if the scene beside the object has changed its depth, too; else None.
 
-        Points that slide over an object change its size alone.
+        Points that slide over an object change only the object's size.
         """
         before = self._before(obs)
         if before is None or not off_size(scene_ratio(obs.frame, obs.mask, before.frame, before.mask)):
@@ -285,7 +286,7 @@ class OurPolicy(Policy):
         return size_ratio(known.map.p_obj[sized], p_cam, self.observer.noise_m(p_cam))
 
     def outline(self, obs: Sight) -> float:
-        """What of the mask's outline lies where depth has steps, as a share of what did before any doubt."""
+        """Share of the mask's outline along depth steps, relative to that in the newest frame without a doubt."""
         before = self._before(obs)
         then, now = None if before is None else before.outline_share, obs.outline_share
         return 1.0 if then is None or now is None or then < _CLEAR_OUTLINE else now / then
@@ -293,20 +294,20 @@ class OurPolicy(Policy):
     # -- admit and request ---------------------------------------------------------------------
 
     def admit(self, obs: Sight, known: Known, best: Proposal, verdict: Judgement) -> BelievedAdmission:
-        """Nothing is learnt from a pose that is doubted, and no keyframe made of one that is hardly believed."""
+        """Nothing is learnt from a doubted pose, and one of little confidence makes no keyframe."""
         belief = Belief.of(obs, best, known, self, "texture" in self.on) if "confidence" in self.on else None
         life = known.life.with_verdict(best.T_cam_obj, obs.frame.time_s, verdict, best.lead)
         most = DOUBTED if verdict.doubted or life.doubted else 1.0
         kept = {"life": life, "T_cam_obj": best.T_cam_obj, "belief": belief, "most": most}
         kept |= {"learns": not verdict.doubted, "in_camera": "moving_points" in self.on}
-        if "stray_points" in self.on and not verdict.joins:  # two maps that become one lie as far off as poses tell
+        if "stray_points" in self.on and not verdict.joins:  # joined maps are only as well aligned as their poses
             sigma_m = self.observer.noise_m(obs.p_cam)
             bearing_rad = np.full_like(sigma_m, self.config.factor_graph.bearing_sigma_rad)
             kept["stray_sigma"] = np.stack([bearing_rad, sigma_m], -1)
         kept["keyframe"] = not self.frozen
         if belief is None:
             return BelievedAdmission(verdict, best.hypothesis.inliers, self.covariance(obs, known, best), **kept)
-        # A turn that nothing tells bends no map.
+        # For the map an unconstrained turn does not count: it bends nothing.
         covariance, confidence = belief.at(best.T_cam_obj, known.model, most, constrained=True)
         kept["keyframe"] &= "sure_keyframes" not in self.on or (
             not life.confirming and belief.confidence_given_turn(covariance) >= MAPPED
@@ -316,15 +317,15 @@ class OurPolicy(Policy):
         return BelievedAdmission(verdict, best.hypothesis.inliers, belief.of_frame, confidence, **kept)
 
     def request(self, obs: Sight, known: Known, best: Proposal, admission: Admission) -> Requests:
-        """Tracks of keypoints that contradict the pose are rejected, where the pose is learnt from."""
+        """Tracks of keypoints that contradict the pose are rejected, if the frame is learnt from."""
         if "rejection" not in self.on or not admission.learns:
             return Requests()
         return Requests(reject=known.map.ids[known.keypoints(obs) & ~best.hypothesis.inliers])
 
-    # -- what the object has been through ------------------------------------------------------
+    # -- the object's life ---------------------------------------------------------------------
 
     def begun(self, obs: Sight, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
-        """As in the paper, with its place in the scene; the frame is one to compare others with."""
+        """As in the paper, with its place in the scene; the frame becomes the trusted one."""
         self.trusted = obs
         life = super().begun(obs, T_cam_obj, verdict).placed(obs.frame.T_world_cam)
         return self._outlined(life, obs, T_cam_obj) if "contour" in self.on else life
@@ -332,7 +333,7 @@ class OurPolicy(Policy):
     def followed(
         self, obs: Sight, known: Known, best: Proposal, admission: BelievedAdmission, sure: float
     ) -> Lifecycle:
-        """A frame that is learnt from tells its place in the scene and its motion, too."""
+        """A frame that is learnt from updates its place in the scene and its motion, too."""
         life = admission.life
         if not admission.learns:
             return life
@@ -347,7 +348,7 @@ class OurPolicy(Policy):
         return life if p_cam is None else replace(life, contour=se3.transform(se3.inverse(T_cam_obj), p_cam))
 
     def expected(self, obs: Sight, known: Known) -> np.ndarray | None:
-        """Where it was left lying in the static scene, as the camera saw that last; else as in the paper."""
+        """Where it was left in the static scene, by the newest frame that located the camera; else as in the paper."""
         last = super().expected(obs, known)
         if known.life.lay_still and (prior := known.life.scene_prior(obs.frame.T_world_cam)):
             self._lies = last, prior["scene"]
@@ -355,6 +356,6 @@ class OurPolicy(Policy):
         return lies if since is last and since is not None else last
 
     def missed(self, obs: Sight, known: Known, verdict: Verdict) -> Lifecycle:
-        """After a frame in which the object was hidden nothing is compared with what was before."""
+        """After a frame in which the object was hidden, later ones are not compared with those before."""
         self.trusted = self.trusted if verdict.status is Status.LOST else None
         return known.life.without_pose(verdict.status, obs.mask_px, self.carried(known, obs.frame.time_s))

@@ -1,7 +1,7 @@
 """Around track and segment: an absent object is looked for where motion, scene, shape and colour say.
 
-The camera is located beside the 2D tracker; objects that are sought are looked for before the frame is segmented, and
-the tracker looks for their points there; what was observed says which tracks are on something else.
+The camera is located while the 2D tracker runs. Sought objects are looked for before the frame is segmented, and the
+tracker looks for their points there; the observations then show which tracks are on something else.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method.frontend import Asked, Frontend, Masks
 from p2p_lib.method.object_model import Requests
 
-#: The camera is located every so many frames: while all objects have poses, while one is away.
+#: The camera is located every so many frames: while all objects have poses; while one is away.
 _LOCATE_EVERY, _LOCATE_EVERY_AWAY = 5, 2
 
 
@@ -38,10 +38,10 @@ class Reacquisition(Frontend):
         self.on, self.scene = on, scene
         self._unlocated = _LOCATE_EVERY
         self._sightings: Mapping[str, Sighting] = {}
-        self._turn = 0  # of the objects that are known from memories
+        self._turn = 0  # counts frames: which remembered object is searched for
 
     def track(self, asked: Asked) -> Asked | None:
-        """The camera is located meanwhile."""
+        """As in the paper; the camera is located meanwhile."""
         answers = len(self.waiting) >= self.tracker.latency_frames
         locating = self._locate((self.waiting[0] if self.waiting else asked).frame) if answers else None
         tracked = super().track(asked)
@@ -51,7 +51,7 @@ class Reacquisition(Frontend):
             return replace(tracked, frame=replace(tracked.frame, T_world_cam=locating.result()))
 
     def _locate(self, frame: Frame) -> Future[np.ndarray | None] | None:
-        """The camera's pose, sought beside the 2D tracker: often while an object is away, else now and then."""
+        """The camera's pose, computed in the background: often while an object is away, else now and then."""
         self._unlocated += 1
         sought = any(obj.outlook.sought for obj in self.objects.values())
         every = _LOCATE_EVERY_AWAY if sought else _LOCATE_EVERY
@@ -62,12 +62,12 @@ class Reacquisition(Frontend):
         return self.beside.submit(self.scene.locate, frame, either(known) if known else None)
 
     def segment(self, asked: Asked) -> None:
-        """Sought objects are looked for first."""
+        """As in the paper, after the search for sought objects."""
         self._sightings = self._sighted(asked.frame, asked.masks)
         super().segment(self._recalled(asked))
 
     def _recalled(self, asked: Asked) -> Asked:
-        """With the mask of an object that is known from a memory, where it is found: one is looked for in a frame."""
+        """With the mask of a remembered object, if it is found: one of them is looked for in each frame."""
         sought = [n for n, obj in sorted(self.objects.items()) if isinstance(obj, Remembered) and obj.recalls]
         sought = [name for name in sought if name in asked.masks and name not in asked.said]
         if not sought:
@@ -108,7 +108,7 @@ class Reacquisition(Frontend):
         return obj.outlook.hint(obj.observe(frame, None, self.tracks, sighting))
 
     def observe(self, asked: Asked) -> Mapping[str, Sight]:
-        """Every object's share of the frame, after its misplaced tracks are rejected and others are looked for."""
+        """What the frame shows of every object, after misplaced tracks are rejected and missing points looked for."""
         seen = {
             name: self.objects[name].observe(
                 asked.frame, mask, self.tracks, self._sightings.get(name), asked.masks[name] is not None
@@ -122,7 +122,7 @@ class Reacquisition(Frontend):
     def _misplaced(self, seen: Mapping[str, Sight], given: Masks) -> dict[str, Requests]:
         """Tracks of absent objects that are on something else.
 
-        Where the segmenter finds nothing of an object it went by these very tracks: only other objects are elsewhere.
+        An empty mask by the segmenter rejects only tracks on other objects: it was made by means of these tracks.
         """
         nowhere = {name for name, obs in seen.items() if given[name] is None and obs.mask_px == 0}
         elsewhere = ~either(self.masks.values()) if nowhere else None
@@ -130,7 +130,7 @@ class Reacquisition(Frontend):
         return {name: self.objects[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
     def _redetect(self, seen: Mapping[str, Sight]) -> dict[str, Sight]:
-        """Guided re-detection: the tracker looks for points where their objects expect them; what is seen then."""
+        """Guided re-detection: the tracker looks for points where objects expect them; the new observations."""
         looked = {name: self.objects[name].outlook.expected_px(obs) for name, obs in seen.items()}
         expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}
         self._suggest(expected)

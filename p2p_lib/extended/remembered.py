@@ -1,11 +1,11 @@
 """An object that is known from a memory: one that was lost before the video began (not in the paper).
 
-Until it is found it is looked for in the whole image by its landmarks; where enough of them agree on a pose, and the
-surface shows there, it may be there. It is claimed to be once it has been found again, by another image alone, at the
-same place: what only resembles it in one image is not found twice. Then the segmenter starts from what lies on the
-surface and the 2D tracker follows the landmarks; a claim whose points are lost is renewed by its landmarks, or
-withdrawn, and nothing is learnt before points have borne it out. From there on it is an object like any other, in the
-frame of its old map. Landmarks of sides that come into view later become keypoints as they show.
+It is looked for in the whole image by its landmarks: where enough of them agree on a pose, and the surface shows
+there, it may be. It is claimed to be there once another image alone finds it at the same place: what only resembles it
+in one image is not found twice. Then the segmenter starts from what lies on the surface, and the 2D tracker follows
+the landmarks. A claim that loses its points is renewed by its landmarks, or withdrawn, and nothing is learnt before
+points have confirmed it. Then it is an object like any other, in the frame of its old map. Landmarks of sides that
+come into view later become keypoints when they are seen.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
 from p2p_lib.method.policy import Verdict
 from p2p_lib.method.refinement import surface_distance
 
-#: Where so many landmarks agree on a pose by themselves, and so much of the surface shows there, it is the object's. (A
-#: label that repeats on the other side of a tin has half of its colours right.)
+#: A pose on which so many landmarks agree, and under which this share of the surface shows, is the object's. (A label
+#: that repeats on the other side of a tin has half of its colours right.)
 _AGREEING, _RECOGNISED = 8, 0.65
-#: So many things that look alike are told from each other by how much of the surface shows.
+#: So many places that look alike are compared by how much of the surface shows.
 _ALIKE = 3
-#: Else so many have to show under a pose, and so many of those that a keyframe gave (of so many keyframes, as if each
-#: had its own); so much of the surface, too, and along so much of its outline the depth has to have a step.
+#: Else under a pose have to show: so many landmarks; this share of a keyframe's (all, divided by the keyframes, at most
+#: by this number); this share of the surface; and depth steps along this share of its outline.
 _FEWEST, _OF_A_VIEW, _VIEWS, _SHARE, _OUTLINE = 4, 0.1, 10, 0.8, 0.45
-#: Else it is looked for as it was turned in so many of its keyframes.
+#: Without such a pose, turns of so many keyframes are tried.
 _TURNS = 12
-#: Pixels are of a found object whose depth is this near to its surface, m.
+#: Pixels with depth this near to its surface belong to a found object, m.
 _ON_SURFACE_M = 0.012
-#: Landmarks are looked for on a followed object every so many frames while fewer than so many are seen on it.
+#: On a followed object landmarks are looked for every so many frames, while fewer than so many are seen.
 _EVERY, _ENOUGH = 5, 60
-#: It is found again, in so many looks, where it is turned by less, rad, and lies within half its length and what it may
-#: have moved in the camera frame meanwhile, m/s.
+#: It is found again if, within so many looks, it has turned by less than this, rad, and moved by less than half its
+#: length plus this speed in the camera frame, m/s.
 _LOOKS, _ALIKE_RAD, _FASTEST_M_S = 8, np.radians(25), 1.0
-#: A claim that so few points agree with is looked for anew, and is withdrawn after so many looks in vain.
+#: A claim with fewer agreeing points is looked for anew, and withdrawn after so many looks in vain.
 _BARE, _PATIENCE = 4, 5
 
 
@@ -81,7 +81,7 @@ class Remembered(TwoMaps):
         self._begin()
 
     def _begin(self) -> None:
-        """What is known is the memory alone."""
+        """Reset what is known to the memory alone."""
         own, memory = self.own, self._memory
         own.known = Known(own.new_model(), replace(self.policy.life, seen_m2=float(memory.seen_m2)))
         own.model.recall(memory)
@@ -103,23 +103,23 @@ class Remembered(TwoMaps):
 
     @property
     def forsaken(self) -> bool:
-        """Whether it was claimed to be there, and neither points nor landmarks bear that out."""
+        """Whether it was claimed to be there, and neither points nor landmarks have confirmed that."""
         return self._claimed and not self._sure and self._in_vain >= _PATIENCE
 
     def withdraw(self) -> Requests:
-        """Take the claim back, with what has come of it."""
+        """Withdraw the claim, with everything learnt since."""
         ids = self.ids
         self._begin()
         return Requests(drop=ids[ids >= 0])
 
     def began_with(self, map_id: int) -> ObjectMemory | None:
-        """The memory, of the map that began with it."""
+        """The memory that this map began with; None for a later map."""
         return self._memory if map_id == 0 else None
 
     def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool.
 
-        It is found where one of the last looks found it, too, or where its pose has it; at once in a mask.
+        It counts as found where one of the last looks found it, too, or where its pose has it; in a mask, at once.
         """
         found = self._look(frame, mask, taken)
         T = None if found is None else found.sighting.T_cam_obj
@@ -132,7 +132,7 @@ class Remembered(TwoMaps):
         return found if again else None
 
     def _alike(self, T_cam_obj: np.ndarray, other: np.ndarray | None, after_s: float) -> bool:
-        """Whether two poses (4, 4), one so long after the other, may be of one object."""
+        """Whether two poses (4, 4), ``after_s`` apart in time, may be of one object."""
         if other is None or se3.angle_rad(se3.inverse(other) @ T_cam_obj) > _ALIKE_RAD:
             return False
         p_obj = self.policy.shape.sample(self.model).p_obj
@@ -167,7 +167,7 @@ class Remembered(TwoMaps):
     def _sightings(
         self, frame: Frame, search: ImageSearch, mask: np.ndarray | None, taken: np.ndarray | None
     ) -> list[tuple[Sighting, bool]]:
-        """Where it may be, and whether landmarks that agree say so or its looks alone."""
+        """Where it may be, and whether by agreeing landmarks (True) or by shape and colour alone."""
         p_obj, sample = self._memory.p_obj, self.policy.shape.sample(self.model)
         pairs = self._recogniser.pairs(frame, self._memory.descriptors)
         if recognised := self._recognised(search, pairs):
@@ -184,7 +184,7 @@ class Remembered(TwoMaps):
         return [(sighting, False) for sighting in found if sighting.share >= _SHARE]
 
     def _recognised(self, search: ImageSearch, pairs: Any) -> list[Sighting]:
-        """Where landmarks agree on a pose and the surface shows: more than one place where others look alike."""
+        """Where landmarks agree on a pose and the surface shows: several places if something looks alike."""
         p_obj, sample, found = self._memory.p_obj, self.policy.shape.sample(self.model), []
         for _ in range(_ALIKE):
             agreeing = self._recogniser.agreeing(pairs, p_obj)
@@ -196,7 +196,7 @@ class Remembered(TwoMaps):
         return [sighting for sighting in found if sighting is not None and sighting.share >= _RECOGNISED]
 
     def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
-        """(H, W) bool: what lies on the surface under a pose, as far as it holds together with pixels (M, 2) on it."""
+        """(H, W) bool: pixels on the surface under a pose that are connected with pixels uv_px (M, 2) on it."""
         distance_m = surface_distance(self.model.surface, frame.depth_m, self.observer.camera, T_cam_obj)
         near = (np.abs(distance_m) < _ON_SURFACE_M).astype(np.uint8)
         near = cv2.morphologyEx(near, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
@@ -206,7 +206,7 @@ class Remembered(TwoMaps):
         return np.isin(label, held[held > 0])
 
     def taken_in(self, rows: np.ndarray) -> np.ndarray:
-        """Landmarks (M,) as keypoints of the map, anew where they were lost: their keys."""
+        """Add landmarks, by rows (M,), as keypoints of the map, again if they were lost; returns their keys."""
         memory = self._memory
         keys = self.model.remember(memory.p_obj[rows].astype(float), memory.confidence[rows])
         self._key[rows] = keys
@@ -253,15 +253,15 @@ class Remembered(TwoMaps):
 
 
 def _certain(landmarks: float, share: float, outline: Callable[[], float | None]) -> bool:
-    """Whether landmarks, as a multiple of the fewest, a share of the surface and of the outline are the object's.
+    """Whether landmarks, as a multiple of the fewest, and shares of surface and outline suffice to be the object's.
 
-    What is bland and smooth lies on a wall as well as on itself: but nothing ends there.
+    A bland, smooth surface fits a wall, too: but the depth has no steps there.
     """
     return landmarks >= 1 and share >= _SHARE and (outline() or 0.0) >= _OUTLINE
 
 
 def follow(obj: Remembered, found: Found, tracker: PointTracker, tracks: Tracks) -> Tracks:
-    """Have the tracker follow what was found; everybody's tracks in this frame, with these."""
+    """Have the tracker follow the landmarks found; returns all objects' tracks in this frame, with these."""
     keys, ids = obj.taken_in(found.rows), tracker.add(found.uv_px)
     obj.map.assign(keys, ids)
     count = len(ids)

@@ -1,7 +1,7 @@
 """What is known of an object as a memory, and a surface from one (:mod:`p2p_lib.core.memory`; not in the paper).
 
-Landmarks are described in the images that the surface keeps of its keyframes: what tracks the points has no say, so a
-memory that was made with one 2D tracker serves another.
+Landmarks are described in the keyframe images that the surface keeps, independently of the 2D tracker: a memory that
+was made with one tracker serves another.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from p2p_lib.method.tsdf import TsdfVolume
 if TYPE_CHECKING:
     from p2p_lib.method.object_model import Known
 
-#: Landmarks of one memory, and how far from the image's own depth a keypoint may be to show in it, m.
+#: Most landmarks of a memory, and the largest difference from the measured depth of a keypoint that shows, m.
 _LANDMARKS, _SHOWS_M = 1500, 0.01
-#: Weights of voxels are kept up to this: it is what later frames are averaged with.
+#: Voxel weights are cut at this, so that later frames still change the average.
 _MOST_WEIGHT = 200.0
 
 
@@ -79,7 +79,7 @@ def _landmarks(known: Known, surface: TsdfVolume) -> tuple[np.ndarray, ...]:
 
 
 def _on_surface(surface: TsdfVolume, p_obj: np.ndarray) -> np.ndarray:
-    """Points (N, 3) measured in one image, laid on the surface that all images made."""
+    """Points (N, 3) measured in one image, moved onto the fused surface."""
     distance_m, gradient, valid = surface.query_with_gradient(p_obj)
     slope = np.maximum((gradient**2).sum(1), 0.25)
     return p_obj - np.where(valid, distance_m / slope, 0.0)[:, None] * gradient

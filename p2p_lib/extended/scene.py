@@ -1,6 +1,6 @@
-"""The static background as a light map of corners, which tells how the camera has moved (not in the paper; ours).
+"""The static background as a sparse map of corners, which tells how the camera has moved (not in the paper; ours).
 
-An object that lies still while the camera looks elsewhere is, when the camera returns, where the scene says: a
+An object that lies still while the camera looks elsewhere is where the scene says when the camera returns: a
 hypothesis for :mod:`p2p_lib.extended.policy`, which points and surface have to confirm.
 """
 
@@ -19,9 +19,9 @@ from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.image import nearest_px
 from p2p_lib.core.types import Frame
 
-#: Corners of an image, and the room left around objects, px.
+#: Most corners of an image, and the margin left around objects, px.
 _CORNERS, _ROOM_PX = 600, 10
-#: Depth that is still of use for the camera's motion, m: it only has to lead to an object.
+#: Farthest depth used for the camera's pose, m: that only has to lead to an object.
 _MAX_M = 5.0
 #: A descriptor is matched when it is nearer than this share of the second nearest.
 _RATIO = 0.8
@@ -29,8 +29,9 @@ _RATIO = 0.8
 _MIN_AGREEING, _INLIER_M = 15, 0.02
 #: A view is kept when the camera has moved (m) or turned (rad) by this from all others; so many at most.
 _MOVED_M, _TURNED_RAD, _VIEWS = 0.15, np.radians(12), 100
-#: A frame is matched to so many views near the newest pose, or, after a failure, to as many others in turn.
+#: A frame is matched to so many views near the newest pose or, after a failure, to as many others in turn.
 _NEAR = 5
+#: Views nearer to the newest pose than this, in units of _MOVED_M or _TURNED_RAD, overlap it.
 _OVERLAPS = 4.0
 _SAMPLES = 300
 
@@ -45,7 +46,7 @@ class _View:
 
 
 class Scene:
-    """Tracks the camera in the world, the frame of the first camera, as long as it sees places that it has seen."""
+    """Tracks the camera in the world, the frame of the first camera, while it sees places that it has seen before."""
 
     def __init__(self, camera: Camera, config: DepthConfig, rng: np.random.Generator):
         self._camera, self._config, self._rng = camera, config, rng
@@ -90,13 +91,13 @@ class Scene:
         return _View(p_cam, descriptors, self._T_world_cam)
 
     def _away(self, T_world_cam: np.ndarray) -> np.ndarray:
-        """(V,) how far the views are from a pose; from 1 on another place."""
+        """(V,) how far the views are from a pose; above 1 it is another place."""
         poses = np.stack([view.T_world_cam for view in self._views])
         moved_m = np.linalg.norm(poses[:, :3, 3] - T_world_cam[:3, 3], axis=1)
         return np.maximum(moved_m / _MOVED_M, se3.angle_rad(se3.inverse(T_world_cam) @ poses) / _TURNED_RAD)
 
     def _registered(self, seen: _View) -> np.ndarray | None:
-        """The camera's pose by the views next in turn: those near the newest pose first."""
+        """The camera's pose by the two nearest and the three oldest overlapping views; when lost, by others in turn."""
         away = self._away(self._T_world_cam)
         nearest = np.argsort(away, kind="stable")
         oldest = np.flatnonzero(away < _OVERLAPS)
@@ -128,7 +129,7 @@ class Scene:
 
 @compiled("u8[:,::1], u8[:,::1]")
 def two_nearest(descriptors, others):
-    """Of binary descriptors (M, W) uint64: the nearest (M,) of others (N, W), and how many bits it and the next differ.
+    """Nearest (M,) of others (N, W) to binary descriptors (M, W) uint64; bits (M,) by which it and the next differ.
 
     A third of the time of OpenCV's search, whose ordered lists cost more than the distances.
     """

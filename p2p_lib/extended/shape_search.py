@@ -1,6 +1,6 @@
-"""Where an object shows by shape and colour, when points do not say it: its last places, its motion, its known turns.
+"""Where an object shows by shape and colour when points do not say it: near known places, in known turns.
 
-What it is compared with is the surface, by :class:`p2p_lib.extended.image_search.ImageSearch` (not in the paper).
+Frames are compared with the surface by :class:`p2p_lib.extended.image_search.ImageSearch` (not in the paper).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from p2p_lib.method.object_model import Known, ObjectModel
 from p2p_lib.method.observation import Observer
 from p2p_lib.method.refinement import surface_distances
 
-#: A lost object is looked for in every so many frames, turned as in so many of its keyframes at most. Depth this near
-#: its surface is on it, m.
+#: One frame in so many looks for a lost object in its mask, in the turns of at most so many keyframes. Depth this near
+#: to its surface is on it, m.
 _TURN_EVERY, _TURNS, _ON_M = 2, 40, 0.01
 
 
@@ -32,11 +32,11 @@ class ShapeSearch:
         self._samples: WeakKeyDictionary[ObjectModel, tuple[int, SurfaceSample]] = WeakKeyDictionary()
 
     def knows(self, known: Known) -> bool:
-        """Whether shape and colour have a say."""
+        """Whether there is a surface to search with."""
         return self._on and known.model.has_surface and len(self.sample(known.model)) > 0
 
     def sample(self, model: ObjectModel) -> SurfaceSample:
-        """Points of the surface as it was first asked for since the newest keyframe."""
+        """Points of the surface, sampled when first asked for after a keyframe."""
         revision, sample = self._samples.get(model, (None, None))
         if revision != model.revision:
             sample = SurfaceSample.of(model.surface.mesh())
@@ -44,15 +44,15 @@ class ShapeSearch:
         return sample
 
     def at(self, obs: Sight, known: Known, poses: list[np.ndarray]) -> list[Sighting | None]:
-        """What of the surface shows under each of some poses; None where too little would be in the image."""
+        """What of the surface shows under each of some poses; None where too little would show."""
         search = self._search(obs.frame)
         return [search.at(T_cam_obj, self.sample(known.model)) for T_cam_obj in poses]
 
     def sighted(self, obs: Sight, known: Known, carried: bool) -> Sighting | None:
-        """Where a sought object shows: near where scene or motion say, or where it was a frame ago; or in its mask."""
+        """Where a sought object shows: near its place by scene, motion or the frame before, or in its mask."""
         life, model, time_s = known.life, known.model, obs.frame.time_s
         proposed = [*life.scene_prior(obs.frame.T_world_cam).values()]
-        if obs.mask is None and carried:  # in a mask it is laid on its depth besides
+        if obs.mask is None and carried:  # with a mask the policy proposes it, on its depth, too
             proposed.append(life.motion.at(time_s))
         proposed += [life.T_cam_obj] if life.has_pose else []
         with self._stopwatch("search"):
@@ -71,7 +71,7 @@ class ShapeSearch:
             return search.at(T_cam_obj, sample), search.otherwise(T_cam_obj, views, obs.cloud, sample)
 
     def _turned(self, obs: Sight, known: Known, search: ImageSearch) -> Sighting | None:
-        """Where a lost object shows in its mask, turned as in one of its keyframes. Of a part of it any turn may be."""
+        """Where a lost object shows in its mask, in a turn of one of its keyframes, if enough depth fits."""
         found = search.turned(known.model.views.some(_TURNS), obs.cloud, self.sample(known.model))
         if found is None:
             return None

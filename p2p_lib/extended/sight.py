@@ -1,4 +1,4 @@
-"""What one frame shows of one object beside what the paper asks: whose its mask is, where it was found, how whole."""
+"""What one frame shows of one object, with more than the paper asks: who made its mask, where it was sighted."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from p2p_lib.method.observation import Observation, Observer
 
 #: A mask this near to the border of what is measured may be cut off by it.
 _BORDER_PX = 2
-#: A keypoint farther from the depth measured at its pixel is hidden, m.
+#: A keypoint farther than this from the depth measured at its pixel does not show, m.
 _HIDDEN_M = 0.015
-#: What is measured this far behind a point shows that nothing is there, m.
+#: Depth this far behind a point shows that the point is not there, m.
 _EMPTY_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Sight(Observation):
-    """One frame's share of one object.
+    """What one frame shows of one object.
 
     sighting  where an absent object was found by shape and colour; None where it was not
-    given     whether the caller vouches for the mask; else the segmenter made it
-    other     the same of a second map of the object; None where there is none
+    given     whether the caller gave the mask; else the segmenter made it
+    other     the same for the object's other map; None where there is none
     """
 
     sighting: Sighting | None = None
@@ -45,12 +45,12 @@ class Sight(Observation):
 
     @property
     def still(self) -> bool:
-        """Whether the image is the same as for a while."""
+        """Whether the camera has given the same image for a while."""
         return isinstance(self.frame, StillFrame)
 
     @cached_property
     def outline_share(self) -> float | None:
-        """What of the mask's outline lies where depth has steps; None where nobody knows."""
+        """Share of the mask's outline along depth steps; None where unknown."""
         return None if self.mask is None else outline_share(self.frame, self.mask)
 
 
@@ -60,15 +60,15 @@ def with_tracks(observer: Observer, obs: Sight, tracks: Tracks) -> Sight:
 
 
 def area_m2(observer: Observer, obs: Observation) -> float:
-    """What is measured of the object, as an area across the line of sight."""
+    """Area of the object that is measured, across the line of sight."""
     z = obs.frame.depth_m[observer.measured(obs)]
     return float((z.astype(float) ** 2).sum() / (observer.camera.fx * observer.camera.fy))
 
 
 def cut_off(observer: Observer, obs: Observation) -> bool:
-    """Whether the mask ends where depth does: at the border of the image, or of what of it is registered.
+    """Whether the mask ends where the measured part of the image does.
 
-    An object before nothing that is measured does so on all four sides, and is whole.
+    An object before a background without depth does so on all four sides, and is whole.
     """
     seen, measured = bounds(observer.measured(obs)), bounds(obs.frame.depth_m > 0)
     both = list(zip(seen, measured, strict=True))
@@ -95,7 +95,7 @@ def expected_px(observer: Observer, obs: Observation, T_cam_obj: np.ndarray, p_o
 
 
 def empty(observer: Observer, frame: Frame, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> bool:
-    """Whether points p_obj (N, 3) of an object are not where a pose has them: what is behind most of them is seen."""
+    """Whether most points p_obj (N, 3) of an object are not where a pose has them: depth is measured behind them."""
     p_cam = se3.transform(T_cam_obj, p_obj)
     uv_px = observer.camera.project(p_cam)
     at = np.flatnonzero((p_cam[:, 2] > 0) & observer.camera.inside(uv_px))

@@ -40,7 +40,7 @@ _STILL_GROWING = "still coming into view"
 
 @dataclass(frozen=True, eq=False)
 class Relation:
-    """Where a second map's frame lies in the first one's, by the newest frames that fit both and say so alike.
+    """Where the other map's object frame lies in this one's, by the newest frames that fit both maps and agree.
 
     T_obj_other  (K, 4, 4), one of each such frame
     """
@@ -48,7 +48,7 @@ class Relation:
     T_obj_other: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
     def with_frame(self, T_obj_other: np.ndarray, p_other: np.ndarray) -> Relation:
-        """With one more frame's (4, 4); where it moves the second map's middle or turns it, it begins anew."""
+        """With one more frame's (4, 4); one that disagrees with the last, at the points p_other, starts anew."""
         if len(self.T_obj_other):
             last, middle = self.T_obj_other[-1], p_other.mean(0, keepdims=True)
             moved_m = np.linalg.norm(se3.transform(T_obj_other, middle) - se3.transform(last, middle))
@@ -69,13 +69,13 @@ class Relation:
 
 
 def seen_together(own: Sight, other: Sight) -> Sight:
-    """One frame's observation of a map that has taken in another: its points, then the other's."""
+    """The observation of a map that has taken in another: its own points, then the other's."""
     p_cam = np.concatenate([own.p_cam, other.p_cam])
     return replace(own, tracks=joined([own.tracks, other.tracks]), p_cam=p_cam, other=None)
 
 
 def agreeing_together(own: Hypothesis, other: Hypothesis) -> Hypothesis:
-    """A pose in the frame of the one map, with the points of both that agree."""
+    """The hypothesis ``own`` with the agreeing points of both maps."""
     inliers, residual_m = ([own.inliers, other.inliers], [own.residual_m, other.residual_m])
     return replace(own, inliers=np.concatenate(inliers), residual_m=np.concatenate(residual_m))
 
@@ -83,7 +83,7 @@ def agreeing_together(own: Hypothesis, other: Hypothesis) -> Hypothesis:
 class TwoMaps:
     """One object: ``own`` follows it, ``other`` is asked whether it knows the object again.
 
-    It stands in the place of the :class:`~p2p_lib.method.object_tracker.ObjectTracker` that it is made from.
+    It takes the place of the :class:`~p2p_lib.method.object_tracker.ObjectTracker` that it is made from.
     """
 
     def __init__(self, own: ObjectTracker):
@@ -95,7 +95,7 @@ class TwoMaps:
 
     @property
     def known(self) -> Known:
-        """The map in which the object is followed, and what it has been through in it."""
+        """The map in which the object is followed, and its life in it."""
         return self.own.known
 
     @property
@@ -110,7 +110,7 @@ class TwoMaps:
 
     @property
     def life(self) -> Lifecycle:
-        """What the object has been through in it."""
+        """The object's state in this map."""
         return self.own.life
 
     @life.setter
@@ -124,7 +124,7 @@ class TwoMaps:
 
     @property
     def outlook(self) -> Outlook:
-        """Where it should show."""
+        """Answers where the object should show."""
         return Outlook(self.known, self.policy, None if self.other is None else self.other.known)
 
     def known_as(self, map_id: int) -> Known | None:
@@ -133,11 +133,11 @@ class TwoMaps:
         return next((known for tracker in maps if tracker and (known := tracker.known_as(map_id))), None)
 
     def adopt(self) -> None:
-        """As in the paper; nothing is ever found for the other map: it has been adopted before it became that."""
+        """As in the paper. The other map needs none: its last solution was adopted before it became the other."""
         self.own.adopt()
 
     def awaited(self, mask: np.ndarray | None) -> bool:
-        """Whether the object was hidden or lost until now and its mask says that it is back."""
+        """Whether the object had no pose in the frame before and its mask says that it is back."""
         return self.own.awaited(mask)
 
     # -- observe -------------------------------------------------------------------------------
@@ -150,13 +150,13 @@ class TwoMaps:
         sighting: Sighting | None = None,
         given: bool = True,
     ) -> Sight:
-        """The object's share of a frame; mask (H, W) bool, None where it is not known, and everybody's tracks."""
+        """What a frame shows of the object, by its mask (H, W) bool, None where unknown, and all objects' tracks."""
         obs = self.own.observe(frame, mask, tracks)
         sight = Sight(obs.frame, obs.mask, obs.tracks, obs.p_cam, obs.cloud, sighting, given)
         return self._with_other(sight, tracks)
 
     def seen_anew(self, obs: Sight, tracks: Tracks) -> Sight:
-        """The observation again, with tracks that have been added to."""
+        """The observation again, with all objects' newest tracks."""
         return self._with_other(with_tracks(self.observer, obs, tracks.select(self.map.ids)), tracks)
 
     def _with_other(self, obs: Sight, tracks: Tracks) -> Sight:
@@ -199,25 +199,25 @@ class TwoMaps:
     # -- a new map -----------------------------------------------------------------------------
 
     def _still_growing(self, obs: Sight) -> bool:
-        """Whether the object still comes into view.
+        """Whether the object is still coming into view.
 
-        Points on the first sliver of it would all be at its rim, and what is known may be about to return.
+        Points on its first sliver would all be at its rim; or a side that its map knows may be about to return.
         """
         before, now = self.life.start_px, obs.mask_px
         return "growing" in self._on and now is not None and before is not None and now > _GROWTH * before
 
     def _outgrown(self, obs: Sight) -> bool:
-        """Whether an object that stays lost shows much more than its map was ever founded on, or never was followed."""
+        """Whether a lost object shows much more than its keyframes ever did, or was never followed."""
         if "outgrown" not in self._on or self.life.lost_frames < _PATIENCE or obs.mask is None:
             return False
         more = area_m2(self.observer, obs) > _OUTGROWN * self.life.seen_m2
         return not self.life.followed or (more and self.policy.outline(obs) >= OUTLINE)
 
     def _turned_over(self, obs: Sight) -> bool:
-        """Whether a known object stays lost in plain view: it shows a side that nobody knows.
+        """Whether a known object stays lost in plain view: it shows a side that its map does not have.
 
-        Its mask is given, or it has been in sight since: what the segmenter takes later for an object that was hidden,
-        and that agrees with nothing known of it, may be anything.
+        Its mask must be given, or it must have been in sight since: what the segmenter takes for an object that was
+        hidden, and that agrees with nothing known of it, may be something else.
         """
         room = self.other is None or _first_view_alone(self.other.known)
         known = "second_map" in self._on and room and self.life.lost_frames >= _STAYS_LOST
@@ -228,7 +228,7 @@ class TwoMaps:
         return plain and self.policy.outline(obs) >= OUTLINE
 
     def _begin_anew(self, obs: Sight, keep: bool) -> ObjectStep:
-        """A new map; the one so far becomes the other one, or is let go where it knows a sliver alone."""
+        """Begin a new map; with ``keep`` the one so far becomes the other one, else it is dropped."""
         if self._still_growing(obs):
             return self.own.absent(obs, Verdict(False, Status.LOST, _STILL_GROWING))
         own, new = self.own, copy(self.own)
@@ -253,7 +253,7 @@ class TwoMaps:
     # -- two maps ------------------------------------------------------------------------------
 
     def _by_other(self, obs: Sight, best: Proposal | None, verdict: Verdict) -> ObjectStep | None:
-        """The step by the other map, where it alone knows the object, or the two become one; else None."""
+        """The step by the other map, if it alone finds the object, or by the joined maps; else None."""
         other = self.other
         known = None if other is None or obs.other is None else self._known_again(obs.other, other.known)
         if known is None:
@@ -279,12 +279,12 @@ class TwoMaps:
         return (best, verdict) if fits else None
 
     def _exchanged(self, obs: Sight) -> Sight:
-        """Go on in the other map, with its observation; this one becomes the other instead."""
+        """Exchange the two maps; returns the observation of the one to go on in."""
         self.own, self.other, self._relation = self.other, _lost(self.own), Relation()
         return replace(obs.other, other=replace(obs, other=None))
 
     def _joined(self, obs: Sight, best: Proposal, known: Proposal) -> ObjectStep:
-        """Two maps that fit this frame become one, in the frame of the older; a keyframe ties what both have seen."""
+        """Join two maps that fit this frame, in the frame of the older; a keyframe ties the points of both."""
         T_obj_other = self._relation.mean
         if self.other.known.map_id < self.known.map_id:
             life = self.life.in_frame(T_obj_other)

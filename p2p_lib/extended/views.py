@@ -1,8 +1,8 @@
 """How far an object has turned, view by view, up to each of its keyframes.
 
-A map is made view by view: each is registered to what the one beside it saw, so that small errors with one cause add
-up. On a round body, whose shape does not determine its turn, the keypoints all drift a little as it rotates; no sum
-over independent points shows that.
+A map grows view by view, each registered to the one beside it, so that systematic errors add up. On a round body,
+whose shape does not determine its turn, all keypoints drift a little as it rotates, which a covariance of independent
+points does not show.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class AccumulatedViews(KeyframeViews):
         self._accumulated_rad = np.zeros(0)
 
     def accumulated_rad(self, T_cam_obj: np.ndarray) -> float:
-        """How far the object has turned since the first view, along the views that lead here; 0 before it."""
+        """Rotation (rad) of the object since the first view, along the views that lead here; 0 before it."""
         turned, row = self.nearest(T_cam_obj)
         return turned + self._accumulated_rad[row] if len(self) else 0.0
 
@@ -29,7 +29,7 @@ class AccumulatedViews(KeyframeViews):
         return self.T_cam_obj[np.unique(np.linspace(0, len(self) - 1, min(len(self), most)).astype(int))]
 
     def add(self, T_cam_obj: np.ndarray) -> None:
-        """One more view, as far along as it is from the nearest."""
+        """Add a view; its accumulated rotation is that of the nearest view plus the turn from it."""
         accumulated = self.accumulated_rad(T_cam_obj)
         super().add(T_cam_obj)
         self._accumulated_rad = np.append(self._accumulated_rad, accumulated)
