@@ -1,9 +1,9 @@
-"""What is made of a finished run, ours: poses that know the whole video, labelled datasets, models to take away.
+"""What is made of a finished run (ours): poses by the whole video, labelled datasets, textured models.
 
 :mod:`p2p_lib.offline.finished` opens a run with its images, masks and surfaces, and says which poses are trusted; look
 there first. ``adjustment.py``, ``loops.py`` and :mod:`p2p_lib.offline.refine` are ``p2p refine``; ``dataset.py``,
 ``model.py`` and ``texture.py`` are ``p2p export``.
 """
 
-#: What ``p2p export`` makes of a run besides files of poses.
+#: What ``p2p export`` writes besides files of poses.
 PRODUCTS = ("bop-dataset", "foundationpose", "model")

@@ -1,9 +1,9 @@
-"""Poses and points that agree best with what a whole video shows: a bundle adjustment of points measured in 3D.
+"""A bundle adjustment of poses and of points measured in 3D over a whole video.
 
 Minimises, over poses T_k in SE(3) and points p_j of the object, ``sum rho(e^T W e)`` with ``e = T_k p_j - z_kj``: z is
-where point j was measured in the camera of frame k, W the information of that measurement, which knows pixels better
-than depth. Gauss-Newton with the points eliminated (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000); rho
-is Geman and McClure's, so that a track that slid away counts for nothing.
+where point j was measured in the camera of frame k, W the information of that measurement, larger across its ray than
+along it. Gauss-Newton with the points eliminated (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000); rho
+is Geman and McClure's, so that a track that slid away has no weight.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import numpy as np
 
 from p2p_lib.core import se3
 
-#: Residuals count a quarter at so many standard deviations; at first at as many times more, less by this each step.
+#: A residual of so many standard deviations has weight 1/4; at first one so many times larger, less by this each step.
 _HALF, _WIDE, _NARROWER = 3.0, 8.0, 0.6
-#: Steps at most; a smaller mean step, in metres and radians, ends them.
+#: Most steps; a mean step below this, in metres and radians, ends them.
 _ITERATIONS, _TOLERANCE = 15, 2e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """M sightings: of which pose (M,) and which point (M,), p_cam (M, 3), and the information (M, 3, 3) of each."""
+    """M sightings: rows (M,) of pose and of point, measured p_cam (M, 3), and information (M, 3, 3)."""
 
     pose: np.ndarray
     point: np.ndarray
@@ -30,19 +30,19 @@ class Sightings:
     information: np.ndarray
 
     def select(self, rows: np.ndarray) -> Sightings:
-        """Those at these rows or under this mask."""
+        """The sightings at these rows, or under a mask (M,) bool."""
         return Sightings(self.pose[rows], self.point[rows], self.p_cam[rows], self.information[rows])
 
 
 def information(p_cam: np.ndarray, lateral_m: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
-    """(M, 3, 3) of points (M, 3) known to these standard deviations (M,) across their ray and along it."""
+    """(M, 3, 3) of points p_cam (M, 3) with standard deviations (M,) across their ray and along it, m."""
     ray = p_cam / np.linalg.norm(p_cam, axis=1, keepdims=True)
     along = ray[:, :, None] * ray[:, None]
     return (np.eye(3) - along) / lateral_m[:, None, None] ** 2 + along / depth_m[:, None, None] ** 2
 
 
 def placed(T_cam_obj: np.ndarray, seen: Sightings, count: int) -> np.ndarray:
-    """(count, 3) points where the poses have them, the median of each one's sightings; NaN where there are none."""
+    """(count, 3) points in the object frame, the median of each one's sightings at these poses; NaN without any."""
     p_obj = se3.transform(se3.inverse(T_cam_obj[seen.pose]), seen.p_cam[:, None])[:, 0]
     order = np.argsort(seen.point, kind="stable")
     starts = np.searchsorted(seen.point[order], np.arange(count + 1))
@@ -53,10 +53,10 @@ def placed(T_cam_obj: np.ndarray, seen: Sightings, count: int) -> np.ndarray:
 
 
 def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (K, 4, 4) and points (N, 3) from these; every pose and point has a sighting at least."""
+    """Poses (K, 4, 4) and points (N, 3) adjusted from these; each must have a sighting at least."""
     T, p = np.array(T_cam_obj, float), np.array(p_obj, float)
     K, N = len(T), len(p)
-    same = np.tile(np.eye(6), (K, 1)) / np.sqrt(K)  # all poses by one change of the object frame: nothing tells
+    same = np.tile(np.eye(6), (K, 1)) / np.sqrt(K)  # gauge: one change of the object frame for all poses
     for step_number in range(_ITERATIONS):
         V, e, A = _linear(T, p, seen, max(_WIDE * _NARROWER**step_number, 1.0))
         AV = np.einsum("mia,mij->maj", A, V)
@@ -85,7 +85,7 @@ def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> tuple[n
 
 
 def locate(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> np.ndarray:
-    """Each pose (K, 4, 4) by itself on points (N, 3) that stay; a pose with few sightings hardly moves."""
+    """Each pose (K, 4, 4) adjusted by itself to fixed points (N, 3); one with few sightings hardly moves."""
     T, K = np.array(T_cam_obj, float), len(T_cam_obj)
     weak = np.diag(np.repeat([0.5, 0.1], 3) ** -2.0)
     for step_number in range(_ITERATIONS):

@@ -1,7 +1,7 @@
 """A run as a dataset for others: a BOP scene with labels (``bop-dataset``), and the folders of FoundationPose.
 
-Labels are the run's trusted poses of the run's own surfaces. As in the BOP toolkit a surface is visible where nothing
-that was measured lies more than 15 mm before it; where nothing was measured it counts as visible.
+Labels are the run's trusted poses, of the run's own surfaces. As in the BOP toolkit a surface is hidden where the
+measured depth is more than 15 mm before it; where nothing was measured it counts as visible.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from p2p_lib.datasets.bop import Outline, write_models, write_scene
 from p2p_lib.datasets.sequence import ObjectTruth
 from p2p_lib.offline.finished import RULE, Finished, Renderer, Silhouette, new_folder
 
-#: What is measured no more than this before a surface does not hide it (the BOP toolkit's).
+#: Depth up to this far before a surface does not hide it, m (the BOP toolkit's).
 VISIBLE_M = 0.015
-#: What ``labels.csv`` says of each label, from which one tells whether it is good.
+#: Columns of ``labels.csv``: how well each label fits.
 COLUMNS = ("image", "object", "obj_id", "confidence", "visib_fract", "mask_iou", "depth_off_mm")
 SCENE = "train/000001"
 
@@ -50,7 +50,7 @@ def outline(silhouette: Silhouette, depth_m: np.ndarray) -> Outline:
 
 
 def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, mask: np.ndarray | None):
-    """How well a label fits: IoU of what shows with the mask, and how far nine of ten depths are off at most, mm."""
+    """How well a label fits: IoU of the visible surface with the mask, and the 90th percentile of depth errors, mm."""
     iou = np.nan if mask is None else np.count_nonzero(shown & mask) / max(int(np.count_nonzero(shown | mask)), 1)
     both = shown & (depth_m > 0)
     off_m = np.abs(silhouette.depth_in(depth_m)[both] - depth_m[both])
@@ -59,7 +59,7 @@ def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, ma
 
 @dataclass(eq=False)
 class _Labels:
-    """The run as a sequence whose truth are its trusted poses; says of each label how well it fits."""
+    """The run as a sequence with its trusted poses as truth; ``rows`` say how well each label fits."""
 
     made: Finished
     min_confidence: float
@@ -93,11 +93,11 @@ class _Labels:
         return len(self.made.sequence)
 
     def frame(self, i: int) -> Frame:
-        """The image, with everything rendered into it."""
+        """The image."""
         return self._rendered(i)[0]
 
     def _rendered(self, i: int) -> tuple[Frame, dict[str, Silhouette]]:
-        """The image, and each object in it as if nothing hid it; of the last one asked for at no cost."""
+        """The image, and each labelled object in it as if nothing hid it; the last one is cached."""
         if self._seen is None or self._seen[0] != i:
             poses = {name: of.T_cam_model[i] for name, of in self.truth.items() if of.labelled[i]}
             frame = self.made.sequence.frame(i)

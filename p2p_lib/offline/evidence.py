@@ -1,7 +1,7 @@
-"""What a whole video shows of an object, and the poses that all of it agrees on.
+"""What a whole video shows of an object, and the poses that fit all of it best.
 
-One pass over the video gathers it for all objects. Keyframes are tied wherever they show the same (``loops.py``), poses
-follow the strongest ties, then a bundle adjustment (``adjustment.py``) of what was tracked and what ties matched.
+One pass over the video gathers it for all objects. Keyframes that show the same features are tied (``loops.py``), poses
+follow the strongest ties, then a bundle adjustment (``adjustment.py``) takes tracks and matched features together.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from p2p_lib.offline.finished import Finished, evenly
 
 #: Keyframes that are compared with each other, and poses that are adjusted together.
 KEYFRAMES, TOGETHER = 60, 200
-#: A tie stronger than this counts (see :class:`~p2p_lib.offline.loops.Tie`); one by tracks at least so much.
+#: The least strength of a tie that counts (see :class:`~p2p_lib.offline.loops.Tie`), and of one by tracks.
 _STRONG, _LEAST = 5.0, 1e-3
 #: Pixels at larger steps of depth are left out of clouds and surfaces, m.
 STEP_M = 0.02
@@ -35,9 +35,11 @@ STEP_M = 0.02
 class Evidence:
     """What the n frames of a run show of an object.
 
-    clouds  (n,) points (P, 3) float32 of its surface each; mask_px (n,) pixels of its mask
-    tracks  (n,) of each frame whose points the tracker followed, (M,), and where they were measured, (M, 3)
-    key     (K,) rows of frames, views (K,) what can be recognised there
+    clouds   (n,) each (P, 3) float32, points of its surface in the camera frame
+    mask_px  (n,) pixels of its mask
+    tracks   (n,) each the ids (M,) of its tracks and their measured points (M, 3) in the camera frame
+    key      (K,) rows of keyframes
+    views    (K,) their features
     """
 
     clouds: list[np.ndarray] = field(default_factory=list)
@@ -77,7 +79,7 @@ def gather(made: Finished, names: list[str], config: Config, bar: Any) -> dict[s
 
 
 class VideoPoses:
-    """An object's poses by all that was tracked and recognised of it."""
+    """An object's poses by all its tracks and features."""
 
     def __init__(self, made: Finished, obj: ObjectRun, config: Config, evidence: Evidence):
         self.obj, self.camera, self.config, self.seed = obj, made.sequence.camera, config, made.run.info["seed"]
@@ -97,7 +99,7 @@ class VideoPoses:
         return T, strong
 
     def _tracked(self, a: int, b: int) -> tuple[int, int, np.ndarray, float] | None:
-        """Two keyframes as the tracker ties them: by tracks that agree with its poses."""
+        """The tie of two keyframes by the causal poses, with as much strength as tracks agree; None without poses."""
         T = self.obj.T_cam_obj[self.key[[a, b]]]
         if not np.isfinite(T).all():
             return None
@@ -108,7 +110,7 @@ class VideoPoses:
         return a, b, T_a_b, max(strength, _LEAST)
 
     def sightings(self, strong: list[loops.Tie]) -> Sightings:
-        """Of tracks, and of features that ties match: ``pose`` is the frame's row."""
+        """The sightings of tracks and of features matched by ties; ``pose`` is the frame's row."""
         ids, points = (np.concatenate(part) for part in zip(*self.tracks))
         pose = np.repeat(np.arange(len(self.tracks)), [len(of) for of, _ in self.tracks])
         known, point = np.unique(ids, return_inverse=True)
@@ -126,9 +128,9 @@ class VideoPoses:
         return Sightings(pose, point, points, sure)
 
     def adjusted(self, T: np.ndarray, found: Sightings) -> tuple[np.ndarray, np.ndarray, Sightings]:
-        """Poses, points (N, 3) and what is seen of them, in the order of frames.
+        """Adjusted poses, points (N, 3) and their sightings, in the order of frames.
 
-        Keyframes and some others are adjusted together; the rest is located on the points that these agree on.
+        Keyframes and some others are adjusted together; the other frames are located by the points of these.
         """
         posed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
         some = evenly(np.setdiff1d(posed, self.key), TOGETHER - len(self.key))
@@ -148,7 +150,7 @@ class VideoPoses:
         T, (rest, pose) = T.copy(), np.unique(seen.pose, return_inverse=True)
         T[rest] = locate(T[rest], points, replace(seen, pose=pose))
         T[together] = best
-        # Frames without a pose see these points too: they tell what their neighbours' poses are worth there.
+        # Frames without a pose see these points, too: by them the poses of neighbours can be judged there.
         found = found.select(np.isin(found.point, known))
         found = replace(found, point=np.searchsorted(known, found.point))
         return T, points, found.select(np.argsort(found.pose, kind="stable"))

@@ -1,4 +1,4 @@
-"""A finished run with all that it can be used for: its images, masks and surfaces, and which poses are trusted."""
+"""A finished run with its images, masks and surfaces, and which of its poses are trusted."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RULE = (
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """A run with its sequence; raises :class:`MissingData` and :class:`BadInput` where something of it is gone.
+    """A run with its sequence; raises :class:`MissingData` and :class:`BadInput` if any of it is missing.
 
     run       as :func:`~p2p_lib.datasets.runs.load_run` reads it: poses of one map an object
     sequence  on which it was made
@@ -61,7 +61,7 @@ class Finished:
 
     @property
     def about(self) -> dict[str, Any]:
-        """By what the run was made, for what is made of it."""
+        """How the run was made, to be noted in its products."""
         keys = ("sequence", "tracker", "preset", "seed", "commit", "offline")
         return {key: self.run.info[key] for key in keys if self.run.info.get(key) is not None}
 
@@ -76,11 +76,11 @@ class Finished:
 
     @cached_property
     def exact_masks(self) -> bool:
-        """Whether the masks that served are there pixel by pixel (``--save-masks``, or the dataset's own)."""
+        """Whether the masks that the run used are there at full resolution (``--save-masks``, or the dataset's own)."""
         return bool(self.run.masks(self.sequence, int(self.frames[0])))
 
     def masks(self, frame: int) -> dict[str, np.ndarray]:
-        """Object to (H, W) bool that served at a frame; coarse ones, every fourth pixel, where no others were kept."""
+        """Object to the (H, W) bool mask used at a frame; by every fourth pixel, where no exact ones were kept."""
         if self.exact_masks:
             return self.run.masks(self.sequence, frame)
         shape = self.sequence.camera.height, self.sequence.camera.width
@@ -97,7 +97,7 @@ class Finished:
         return read_mesh(path)
 
     def trusted(self, min_confidence: float = DOUBTED) -> dict[str, np.ndarray]:
-        """Object to (n,) bool: its poses that are labels, in the frames of :data:`RULE`."""
+        """Object to (n,) bool: its poses that are labels, by :data:`RULE`; unseen objects must have no pose at all."""
         objects = {name: self.run.objects[name] for name in self.tracked}
         sure = {name: obj.has_pose & (obj.confidence > min_confidence) for name, obj in objects.items()}
         unseen = {name: np.ones(len(obj), bool) for name, obj in objects.items()}
@@ -112,7 +112,7 @@ class Finished:
 
 
 def evenly(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of rows (n, ...), spread evenly over them; the first and the last are among them."""
+    """At most ``most`` of the rows (n, ...), evenly spread; of several the first and the last are among them."""
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), max(most, 0))).astype(int)]
 
 
@@ -120,7 +120,8 @@ def evenly(rows: np.ndarray, most: int) -> np.ndarray:
 class Silhouette:
     """A surface as a camera sees it: a cut of an image that may reach beyond its borders.
 
-    corner   column and row of its first pixel; depth_m (h, w) along the optical axis, infinite where it is not met
+    corner   column and row of its first pixel in the image
+    depth_m  (h, w) along the optical axis, infinite where it is not met
     face     (h, w) which face, -1 where none
     """
 
@@ -157,7 +158,7 @@ class Renderer:
         self._scene = ray_scene(vertices, faces)
 
     def __call__(self, T_cam_obj: np.ndarray) -> Silhouette:
-        """The surface at a pose, up to one image's size beyond each border."""
+        """The surface at a pose, up to an image's size beyond each border; empty if any of it is behind the camera."""
         camera = self.camera
         uv_px = camera.project(se3.transform(T_cam_obj, self.vertices))
         size = np.array([camera.width, camera.height])
@@ -177,9 +178,9 @@ class Renderer:
 
 @contextmanager
 def new_folder(out: str | Path) -> Iterator[Path]:
-    """A folder to write into that takes the name ``out`` when all is written; nothing of it stays where that fails.
+    """A folder to write into that is renamed to ``out`` when all is written, and removed if that fails.
 
-    Raises :class:`BadInput` where ``out`` holds something already.
+    Raises :class:`BadInput` if ``out`` holds something already.
     """
     out = Path(out)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):

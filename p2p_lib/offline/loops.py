@@ -1,7 +1,7 @@
-"""Views of one object met again at other times: features matched between keyframes, and poses along the best matches.
+"""Loop closure: features of one object matched between any two keyframes, and poses along the best matches.
 
-A causal tracker that took a wrong turn goes on from there; here any two keyframes may be tied, by tracks that both see
-or by SIFT features of one surface, and poses follow the maximum spanning tree of what ties them.
+A causal tracker never recovers from a wrong turn; here any two keyframes may be tied, by common tracks or by matched
+SIFT features, and poses follow the maximum spanning tree of the ties.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from p2p_lib.core.robust import fit_rigid, residual_m
 from p2p_lib.core.types import Frame
 from p2p_lib.offline.finished import evenly
 
-#: A match needs to be so much nearer than the next best, and a tie so many matches that move as one.
+#: A match is nearer than this share of the next best, and a tie has at least so many matches that move rigidly.
 _RATIO, MIN_MATCHES = 0.8, 9
-#: RANSAC: samples of three pairs, and how far pairs may be off: standard deviations of depth, and at least this.
+#: RANSAC: samples of three pairs; the inlier threshold in standard deviations of depth, and at least this, m.
 _SAMPLES, _SIGMAS, _LEAST_M = 200, 3.0, 0.004
-#: Smaller views are enlarged twice before features are looked for.
+#: Views smaller than this are enlarged twice, px; room around the mask, px; most features; most points of a cloud.
 _SMALL_PX, _ROOM_PX, _MOST, _CLOUD = 220, 4, 400, 1000
-#: Features are looked for so far inside the mask, and not at a step in depth.
+#: Features lie so far inside the mask, px, and off steps in depth, m.
 _BORDER_PX, _STEP_M = 2, 0.02
-#: A point that would float this far before what was measured, m and standard deviations, contradicts a pose.
+#: A point that a pose puts this far before the measured depth, m or standard deviations, contradicts it.
 _FLOATS_M, _FLOATS_SIGMAS = 0.006, 3.0
-#: A tie with so large a share of contradicting points counts for a third.
+#: The share of contradicting points that reduces a tie to 1/e.
 _CONTRADICTED = 0.03
 
 
@@ -49,9 +49,9 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Tie:
-    """Two keyframes a and b in which matched points (rows of each, (M,)) move as one: T_a_b (4, 4).
+    """Two keyframes a and b whose matched points (rows of each, (M,)) move rigidly by T_a_b (4, 4).
 
-    strength  how many agree, less where depth contradicts it: what shines stands still while a thing turns
+    strength  how many agree, less if depth contradicts it: reflections stand still while the object turns
     """
 
     a: int
@@ -63,7 +63,7 @@ class Tie:
 
 
 def features(frame: Frame, mask: np.ndarray, camera: Camera, config: DepthConfig) -> Features:
-    """What can be recognised of an object, with depth."""
+    """SIFT features of an object with depth."""
     smooth = off_edges(frame.depth_m, _STEP_M)
     vu = evenly(np.argwhere(mask & smooth), _CLOUD)
     cloud = camera.unproject(vu[:, ::-1], frame.depth_m[tuple(vu.T)])
@@ -72,7 +72,7 @@ def features(frame: Frame, mask: np.ndarray, camera: Camera, config: DepthConfig
     if not mask.any():
         return nothing
     tight, cut = bounds(mask), bounds(mask, _ROOM_PX)
-    # What shows at a mask's border, or through a handle, stands still while the object moves: it would be recognised.
+    # Background at the mask's border, or through a handle, stands still while the object moves, and would match.
     own = cv2.erode(mask.astype(np.uint8), np.ones((2 * _BORDER_PX + 1,) * 2)) * smooth
     grey, inside = cv2.cvtColor(frame.rgb[cut], cv2.COLOR_RGB2GRAY), own[cut].astype(np.uint8)
     scale = 2.0 if max(span.stop - span.start for span in tight) < _SMALL_PX else 1.0
@@ -89,7 +89,7 @@ def features(frame: Frame, mask: np.ndarray, camera: Camera, config: DepthConfig
 
 
 def matched(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of a and of b that are each other's nearest, and clearly so."""
+    """Rows of a and of b that are mutual nearest neighbours and pass the ratio test."""
     if min(len(a.p_cam), len(b.p_cam)) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     likeness = a.descriptors @ b.descriptors.T / 512**2  # SIFT's have length 512
@@ -122,7 +122,7 @@ def rigid(p_a: np.ndarray, p_b: np.ndarray, rng: np.random.Generator) -> tuple[n
 
 
 def agreeing(T_a_b: np.ndarray, p_a: np.ndarray, p_b: np.ndarray) -> np.ndarray:
-    """(N,) bool: pairs of points (N, 3) that are one at T_a_b, as far as they are measured."""
+    """(N,) bool: pairs of points (N, 3) that coincide at T_a_b within their noise."""
     return residual_m(T_a_b, p_b, p_a) < _within_m(p_a, p_b)
 
 
@@ -132,13 +132,13 @@ def _within_m(p_a: np.ndarray, p_b: np.ndarray) -> np.ndarray:
 
 
 def rated(T_a_b: np.ndarray, matches: int, a: Features, b: Features, camera: Camera) -> float:
-    """The strength of a tie of so many matches: less by the larger share of one view's points that the other denies."""
+    """The strength of a tie: its matches, less by the larger share of one view's points that the other contradicts."""
     share = max(_contradicted(T_a_b, a, b.cloud, camera), _contradicted(se3.inverse(T_a_b), b, a.cloud, camera))
     return float(matches * np.exp(-share / _CONTRADICTED))
 
 
 def _contradicted(T_a_b: np.ndarray, a: Features, cloud_b: np.ndarray, camera: Camera) -> float:
-    """The share of the points (N, 3) of one view, where they fall into the other, that would float before its depth."""
+    """Of the points cloud_b (N, 3) that project into view a, the share that would float before its depth."""
     p_a = se3.transform(T_a_b, cloud_b)
     uv_px = camera.project(p_a)
     inside = camera.inside(uv_px)
@@ -169,7 +169,7 @@ def ties(views: list[Features], camera: Camera, rng: np.random.Generator) -> lis
 def along_ties(T_cam_obj: np.ndarray, pairs: list[tuple[int, int, np.ndarray, float]]) -> np.ndarray:
     """Poses (K, 4, 4), NaN where none, along the maximum spanning tree of pairs (a, b, T_a_b, strength).
 
-    The keyframe that is tied most keeps its pose. What no tie reaches from there keeps its own.
+    The keyframe with the strongest ties keeps its pose, and so do those that no tie connects with it.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree

@@ -1,6 +1,6 @@
-"""Models to take away: a run's surfaces cleaned, closed where they may be, simplified and textured.
+"""Textured models: a run's surfaces cleaned, holes closed where allowed, simplified and textured.
 
-Of each object a folder: ``textured_simple.obj`` with ``.mtl`` and ``.png``, ``textured_simple.glb``,
+A folder per object: ``textured_simple.obj`` with ``.mtl`` and ``.png``, ``textured_simple.glb``,
 ``collision.obj`` (convex) and ``model.json``, which says what they are. All in metres, in the object frame of the
 run's poses. Faces that nobody saw are in the OBJ's group ``guessed``.
 """
@@ -29,7 +29,7 @@ from p2p_lib.offline.finished import Finished, Renderer, evenly, new_folder
 NAME = "textured_simple"
 #: Components with less of the largest one's area are left out.
 _MIN_COMPONENT = 0.05
-#: Where a camera measured this much behind a patch there is no surface, m; so many views have to say so.
+#: A patch is open if depth this far behind it, m, was measured in at least so many views.
 _SEEN_THROUGH_M, _SEEN_THROUGH_VIEWS = 0.012, 2
 #: Faces of a collision mesh, at most.
 _HULL_FACES = 256
@@ -39,7 +39,7 @@ TEXTURE_PX, _GUTTER_PX = (512, 2048), 2
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A surface: vertices (V, 3) metres, faces (F, 3), colours (V, 3) 0 to 255, guessed (F,) bool: nobody saw it."""
+    """A surface: vertices (V, 3) metres, faces (F, 3), colours (V, 3) 0 to 255, guessed (F,) bool: not seen."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -68,8 +68,8 @@ def write_models(
 ) -> str:
     """Write a model of each object of the run in ``folder`` below the new folder ``out``; what they are, in words.
 
-    faces           of a model, at most
-    min_confidence  views of poses with no more are not looked at
+    faces           most faces of a model
+    min_confidence  only views with poses of more confidence are used
 
     Needs Open3D; raises :class:`MissingBackend` without, :class:`BadInput` where ``faces`` is no number of faces.
     """
@@ -141,7 +141,7 @@ def cleaned(surface: Any) -> Shape:
     component, area = np.asarray(component), np.asarray(area)
     legacy.remove_triangles_by_mask(area[component] < _MIN_COMPONENT * area.max())
     legacy.remove_unreferenced_vertices()
-    # Twice a step out and in: voxels' steps go, and the shape keeps its size.
+    # Taubin smoothing removes the steps of voxels without shrinking the shape.
     legacy = legacy.filter_smooth_taubin(number_of_iterations=5)
     vertices, faces = np.asarray(legacy.vertices), np.asarray(legacy.triangles)
     colours = np.asarray(surface.visual.vertex_colors)[cKDTree(surface.vertices).query(vertices)[1], :3]
@@ -162,7 +162,7 @@ def _tensor(shape: Shape) -> Any:
 
 
 def closed(shape: Shape, camera: Any, views: list[tuple[np.ndarray, np.ndarray]]) -> Shape:
-    """The same with its holes filled where no view (T_cam_obj, depth_m) looked through the patch."""
+    """The shape with its holes filled where no views (T_cam_obj, depth_m) looked through."""
     tensor = _tensor(shape)  # whose memory holds what is filled
     filled = tensor.fill_holes(10.0)
     vertices, faces = filled.vertex.positions.numpy().astype(float), filled.triangle.indices.numpy()
@@ -177,7 +177,7 @@ def closed(shape: Shape, camera: Any, views: list[tuple[np.ndarray, np.ndarray]]
 
 
 def _patches(faces: np.ndarray) -> list[np.ndarray]:
-    """Rows of faces (F, 3) that hang together by edges, patch by patch."""
+    """Rows of the faces (F, 3) of each edge-connected patch."""
     import trimesh
 
     if not len(faces):
@@ -187,7 +187,7 @@ def _patches(faces: np.ndarray) -> list[np.ndarray]:
 
 
 def _seen_through(triangles: np.ndarray, camera: Any, views: list[tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Whether views measured depth well behind a patch (F, 3, 3) at a third of its points in the image, or more."""
+    """Whether enough views measured depth well behind more than a third of the points of a patch (F, 3, 3)."""
     points = np.concatenate([triangles.mean(1), (triangles + triangles.mean(1, keepdims=True)).reshape(-1, 3) / 2])
     through = 0
     for T_cam_obj, depth_m in views:
@@ -201,7 +201,7 @@ def _seen_through(triangles: np.ndarray, camera: Any, views: list[tuple[np.ndarr
 
 
 def simplified(shape: Shape, faces: int) -> Shape:
-    """The same with at most so many faces, by quadric error; what was guessed stays marked."""
+    """The shape with at most so many faces, by quadric error; guessed faces stay marked."""
     from scipy.spatial import cKDTree
 
     # Marching cubes' faces are so regular and so many slivers that the atlas takes minutes: half of them say the same.
@@ -238,7 +238,7 @@ def collision(shape: Shape) -> Any:
 
 
 def with_texture(shape: Shape, views: list[texture.View], camera: Any) -> Textured:
-    """A shape with an atlas, and what views show of it."""
+    """A shape with an atlas, textured from views."""
     size = texture_px(shape, views, camera)
     mesh, to = _tensor(shape), load_open3d().core.Tensor
     uv = atlas(len(shape.faces), size)
@@ -267,7 +267,7 @@ def texture_px(shape: Shape, views: list[texture.View], camera: Any) -> int:
 
 
 def _squares(faces: int) -> int:
-    """Along each edge of a texture, of two faces each."""
+    """The number of squares, of two faces each, along an edge of a texture."""
     return int(np.ceil(np.sqrt(np.ceil(faces / 2))))
 
 
@@ -321,9 +321,9 @@ def _corners(render: Renderer, T_cam_obj: np.ndarray) -> tuple[np.ndarray, np.nd
 def errors(
     made: Finished, name: str, rows: np.ndarray, textured: Textured, render: Renderer, surface: Any
 ) -> dict[str, float]:
-    """Mean colour error in frames ``rows`` that the texture is not of: the model's, and of vertex colours instead.
+    """Mean colour error in held-out frames ``rows``: of the texture, and of the surface's vertex colours.
 
-    render  of the run's ``surface``
+    render  renders the run's ``surface``
     """
     colours, off = np.asarray(surface.visual.vertex_colors)[:, :3].astype(float), []
     for row in rows:

@@ -1,4 +1,4 @@
-"""What ``p2p export`` makes of a run besides files of poses, by the name of its form."""
+"""What ``p2p export`` writes besides files of poses, by format."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def write_product(
 ) -> str:
     """Write the run in a folder in one of :data:`~p2p_lib.offline.PRODUCTS` into a new one; what it holds, in words.
 
-    min_confidence  poses of no more are not used (default: those that are doubted)
-    faces           of a textured model, at most
+    min_confidence  only poses of more confidence are used; None: all but the doubted
+    faces           most faces of a textured model
 
     Raises :class:`BadInput` and :class:`MissingData` where that cannot be; nothing is left of ``out`` then.
     """

@@ -1,10 +1,10 @@
 """``p2p refine``: the whole video counts for every frame of a finished run.
 
-For each object: what the whole video shows of it, and the poses that all of it agrees on (``evidence.py``). On the
-surface that these poses fuse each frame is refined, from where it was tracked, where it was adjusted, and, from the end
-backwards and then forwards, from its neighbours; the best stands (``surface.py``, ``sight.py``). A frame that had no
-pose gets one where it fits as well as the others do. Where the surface fills the masks better at the causal poses, they
-stay. The surface is fused anew at half the voxel.
+For each object: what the whole video shows of it, and the poses that fit all of it best (``evidence.py``). A surface is
+fused at these poses, and each frame is refined on it from its tied and its adjusted pose and, where that fits badly,
+from its neighbours' poses, backwards and then forwards; the best is kept (``surface.py``, ``sight.py``). A frame
+without a pose gets one that fits as well as the others do. Causal poses at which the surface fits the masks better are
+kept. The surface is fused anew with half the voxel size.
 
 Written to ``RUN/offline``, a run's folder of its own that says ``"offline": true``: causal results stay as they are.
 """
@@ -38,9 +38,9 @@ from p2p_lib.offline.surface import SurfacePoses, fused
 _PARTS = ".offline.partial"
 #: Views fused while refining and at the end.
 FUSED, FUSED_LAST = 80, 150
-#: Old and new poses are judged in every so many-th frame, by the mean over so many of them.
+#: Old and new poses are compared in one frame in so many, by the mean over so many of those.
 _JUDGED_EVERY, _JUDGED = 3, 7
-#: A causal pose that costs so many times what a good one may was wrong in that frame alone, and does not stay.
+#: A causal pose that costs more than this times the limit was wrong in that frame, and is not kept.
 _GROSS = 2.0
 #: Of a squared Mahalanobis distance with six degrees of freedom: three standard deviations (99.73 %).
 _CHI2_6 = 20.06
@@ -49,8 +49,8 @@ _CHI2_6 = 20.06
 def refine_run(folder: str | Path, progress: bool = False) -> list[str]:
     """Refine the run in ``folder`` into ``folder/offline``; a line on each object, and where it disagrees.
 
-    What an interrupted call has finished, object by object, the next one takes up. Raises :class:`MissingData` and
-    :class:`BadInput` where images, masks or tracks are gone.
+    Objects that an interrupted call has finished are not repeated. Raises :class:`MissingData` and :class:`BadInput`
+    where images, masks or tracks are missing.
     """
     folder = Path(folder)
     made = Finished.of(folder)
@@ -109,7 +109,7 @@ def _part(made: Finished, name: str, config: Config, evidence: Evidence, parts: 
 def _columns(
     obj: ObjectRun, poses: SurfacePoses, evidence: Evidence, sight: Sight | None
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """What a run keeps of the poses, in the causal object frame, and which (n,) fit; causal poses stay where better."""
+    """Columns of a run, in the causal object frame, and (n,) bool which poses fit; better causal poses are kept."""
     fits, T, covariance = poses.cost <= poses.limit, poses.T.copy(), poses.covariance.copy()
     lost = ~obj.has_pose & ~fits
     T[lost], covariance[lost] = NO_POSE, np.nan
@@ -130,10 +130,10 @@ def _columns(
 
 
 def _stays(T: np.ndarray, causal: np.ndarray, evidence: Evidence, sight: Sight | None) -> np.ndarray:
-    """(n,) bool: where the surface at the causal pose (n, 4, 4) fills the mask better than at the new one T.
+    """(n,) bool: where the surface at the causal pose (n, 4, 4) fits the mask better than at the new one T.
 
-    The new poses fit the surface, which was fused with them; the masks are not of their making. Of one frame a mask
-    says little: the mean over its neighbours decides.
+    The new poses fit the surface anyway, which was fused at them; masks are independent. One mask says little: the mean
+    over neighbouring frames decides.
     """
     has = np.isfinite(T[:, 0, 0]) & np.isfinite(causal[:, 0, 0])
     rows = np.flatnonzero(has & evidence.shown)[::_JUDGED_EVERY]

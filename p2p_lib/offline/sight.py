@@ -1,4 +1,4 @@
-"""Is an object's surface where a pose has it? By the frame's mask, by depth and colours where there is none."""
+"""Whether an object's surface is where a pose has it: by the frame's mask, or by depth and colours without one."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.offline.dataset import agreement, visible
 from p2p_lib.offline.finished import Finished, Renderer, evenly
 
-#: A distance from the surface beyond this counts as this, m.
+#: Distances from the surface are cut at this, m.
 _FAR_M = 0.01
-#: What is measured this near the rendered surface is taken for it while it is sought; once found, this or three sigmas.
+#: Depth this near to the rendered surface is on it, m: while it is sought; once found, or within three sigmas.
 _SEEK_M, _ON_M = 0.02, 0.006
-#: Where no mask tells of the object: so much of its surface may be seen through, and colours may be so many times as
-#: far off as usual, and correlate so many times as well at least. This many frames tell what is usual.
+#: Without a mask: depth may be behind this share of the surface; colour errors may be this many times the usual one;
+#: the correlation must be this share of the usual one. So many frames say what is usual.
 _BEHIND, _OTHER_COLOURS, _LESS_ALIKE, _CALIBRATED = 0.15, 1.4, 0.6, 12
-#: How much brighter or darker than on the surface a colour may be, by the light.
+#: Range of the gain of a frame's colours over the surface's, by the light.
 _GAINS = 0.7, 1.4
 
 
 class Found(NamedTuple):
-    """A pose (4, 4) of a frame, its covariance (6, 6), and what it costs."""
+    """A pose (4, 4) of a frame, its covariance (6, 6), and its cost."""
 
     T_cam_obj: np.ndarray
     covariance: np.ndarray
@@ -36,7 +36,7 @@ class Found(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """Points (N, 3) measured on the surface, the share measured behind, how far colours are off and correlate."""
+    """Points (N, 3) measured on the surface, the share measured behind it, mean error and correlation of colours."""
 
     cloud: np.ndarray
     behind: float
@@ -45,7 +45,7 @@ class _Look(NamedTuple):
 
 
 def off_surface(volume: TsdfVolume, T_cam_obj: np.ndarray, cloud: np.ndarray) -> np.ndarray:
-    """(N,) how far points (N, 3) are off a surface at a pose: 1 is far, or where nobody knows of a surface."""
+    """(N,) distance of points (N, 3) from a surface at a pose, 0 to 1: 1 is far, or off the observed surface."""
     distance_m, valid = volume.query(se3.transform(se3.inverse(T_cam_obj), cloud.astype(float)))
     return np.where(valid, np.minimum(np.abs(distance_m), _FAR_M), _FAR_M) / _FAR_M
 
@@ -53,7 +53,7 @@ def off_surface(volume: TsdfVolume, T_cam_obj: np.ndarray, cloud: np.ndarray) ->
 class Sight:
     """Looks at one object's surface, which has faces, in the frames of a run.
 
-    sure  rows of frames in which it is where T (n, 4, 4) says: they tell how its colours usually look
+    sure  rows of frames with a certain pose in T (n, 4, 4): they say how its colours usually look
     """
 
     def __init__(self, made: Finished, name: str, config: Config, volume: TsdfVolume, T: np.ndarray, sure: np.ndarray):
@@ -101,7 +101,7 @@ class Sight:
         return agreement(silhouette, visible(silhouette, frame.depth_m), frame.depth_m, mask)[0]
 
     def _look(self, frame: Frame, T: np.ndarray, wide: bool = False) -> _Look | None:
-        """What a frame shows where a pose has the surface; None where that is too little."""
+        """What a frame shows where a pose has the surface; None with too few pixels on it."""
         silhouette = self._render(se3.orthonormalised(T))
         image, own = silhouette.inside(frame.depth_m)
         depth_m, z, hit = frame.depth_m[image], silhouette.depth_m[own], silhouette.hit[own]

@@ -1,4 +1,4 @@
-"""An object's poses on the surface that they fuse: each frame refined, and found again from its neighbours."""
+"""Each frame's pose refined on the surface fused from all, and lost ones found from their neighbours."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from p2p_lib.offline.evidence import STEP_M, Evidence
 from p2p_lib.offline.finished import Finished
 from p2p_lib.offline.sight import Found, Sight, off_surface
 
-#: A point is taken as a keypoint of a pose within this, m.
+#: A point within this distance of its place by a pose is a keypoint of the pose, m.
 _NEAR_M = 0.02
-#: A fit is as good as usual within three standard deviations and so much more.
+#: A fit is as good as usual up to so many standard deviations above the median cost, and this.
 _SIGMAS, _SLACK = 3.0, 0.02
 
 
@@ -40,8 +40,8 @@ def fused(made: Finished, name: str, T: np.ndarray, rows: np.ndarray, config: Co
 class SurfacePoses:
     """Poses T (n, 4, 4) of an object, NaN where there is none, their covariance (n, 6, 6) and cost (n,) on a volume.
 
-    points, seen  of the object (N, 3), and where they are seen, in the order of frames
-    limit         what a pose costs at most that fits as well as the others do
+    points, seen  points of the object (N, 3) and their sightings, in the order of frames
+    limit         the largest cost of a pose that fits as well as the others do
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class SurfacePoses:
         self._camera, self._config = camera, config
 
     def refine(self, start: np.ndarray, sure: np.ndarray, bar: Any) -> None:
-        """Refine each pose, from where it is and from ``start`` (n, 4, 4); ``sure`` rows tell what a good one costs."""
+        """Refine each pose from itself and from ``start`` (n, 4, 4); ``sure`` rows set the limit of costs."""
         for k in range(len(self.T)):
             if np.isfinite(self.T[k, 0, 0]):
                 self.T[k], self.covariance[k], self.cost[k] = self._best_of(k, [self.T[k], start[k]])
@@ -87,7 +87,7 @@ class SurfacePoses:
                     T[k], self.covariance[k], cost[k] = found
 
     def cost_at(self, k: int, T: np.ndarray) -> float:
-        """How far off, 0 to 2, at a pose of the k-th frame: its cloud from the surface, points from where seen."""
+        """The cost, 0 to 2, of a pose of the k-th frame: distance of its cloud and of its keypoints from the map."""
         met = self._points_in(k)
         off = off_surface(self._volume, T, self._evidence.clouds[k])
         apart = np.linalg.norm(se3.transform(se3.inverse(T), met.p_cam) - met.p_obj, axis=1) / (5 * met.sigma_m)

@@ -1,7 +1,7 @@
-"""The texture of a model: baked from the sharpest views all around, each texel most by those that show it best.
+"""The texture of a model: each texel the mean of sharp views all around, weighted by how well they show it.
 
-The exposure of the views is evened out first: a gain per view and channel, by what several of them show. What no view
-shows keeps the surface's own colour.
+The exposure of the views is evened out first: a gain per view and channel, from points that several of them show. What
+no view shows keeps the surface's own colour.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from p2p_lib.offline.finished import Finished, Renderer, evenly
 
 #: Views that a texture is baked from, at most.
 VIEWS = 48
-#: Of the frames with a trusted pose every so many-th is kept out of the texture, to be compared with.
+#: One in so many frames with a trusted pose is held out of the texture, to measure its error.
 HELD_OUT_EVERY = 10
-#: A surface counts as the one that a pixel shows where it is no farther behind what was rendered, and off what was
-#: measured, than this, m.
+#: A pixel shows a surface point that is at most so far behind the rendered depth, if that is at most so far off the
+#: measured one, m.
 _BEHIND_M, _MEASURED_M = 0.004, 0.015
 #: Texels seen more obliquely than this cosine are not taken from a view.
 _FACING = 0.25
-#: Pixels at a mask's border that may be of something else.
+#: Pixels along a mask's border that may belong to something else.
 _BORDER_PX = 3
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An image that shows an object: rgb (H, W, 3) float32, shows (H, W) bool where it can be believed, and how sharp.
+    """An image of an object: rgb (H, W, 3) float32, ``shows`` (H, W) bool where it reliably shows it, and sharpness.
 
     depth_m (H, W) of the surface as rendered, infinite where it is not met.
     """
@@ -59,7 +59,7 @@ def view_of(made: Finished, name: str, row: int, render: Renderer) -> View:
 
 
 def chosen_rows(made: Finished, name: str, rows: np.ndarray, render: Renderer, count: int = VIEWS) -> list[View]:
-    """Of the frames ``rows`` the sharpest from each of ``count`` directions that lie far apart."""
+    """Of the frames ``rows`` the sharpest of up to four near each of ``count`` directions that lie far apart."""
     T_obj_cam = se3.inverse(made.run.objects[name].T_cam_obj[rows])
     way = T_obj_cam[:, :3, 3] / np.linalg.norm(T_obj_cam[:, :3, 3], axis=1, keepdims=True)
     seeds, far = [0], np.linalg.norm(way - way[0], axis=1)
@@ -95,13 +95,13 @@ def sampled(view: View, camera: Camera, p_obj: np.ndarray, normal: np.ndarray):
 
 
 def lookup(image: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
-    """(N, 3) of an image (H, W, 3) between its pixels at (N, 2), in parts: OpenCV's images have few columns."""
+    """(N, 3) an image (H, W, 3) interpolated at (N, 2), in parts, since OpenCV limits the columns of an image."""
     parts = np.array_split(uv_px.astype(np.float32), -(-len(uv_px) // 30_000) or 1)
     return np.concatenate([cv2.remap(image, p[None, :, 0], p[None, :, 1], cv2.INTER_LINEAR)[0] for p in parts])
 
 
 def evened(views: list[View], camera: Camera, p_obj: np.ndarray, normal: np.ndarray) -> list[View]:
-    """The views with gains that make what several of them show of surface points (N, 3) the same, on average 1."""
+    """The views with gains, on average 1, that make their colours of common surface points (N, 3) agree."""
     value = np.full((len(views), len(p_obj), 3), np.nan)
     for of, view in zip(value, views):
         rows, colour, _ = sampled(view, camera, p_obj, normal)
@@ -120,7 +120,7 @@ def evened(views: list[View], camera: Camera, p_obj: np.ndarray, normal: np.ndar
 
 
 def baked(views: Iterable[View], camera: Camera, p_obj: np.ndarray, normal: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(N, 3) uint8 of surface points (N, 3): the mean of the views by how well each shows it, else its ``own`` colour.
+    """(N, 3) uint8 of surface points (N, 3): the mean of views, weighted by how well each shows it, else ``own``.
 
     A mean, not the best view: its pose is off by a pixel or two, and so is that of the next image.
     """
@@ -136,7 +136,7 @@ def baked(views: Iterable[View], camera: Camera, p_obj: np.ndarray, normal: np.n
 
 
 def colour_error(view: View, rendered: np.ndarray, shown: np.ndarray) -> float:
-    """Mean absolute difference, of 255, of a rendered image (H, W, 3) where it is ``shown`` (H, W), at one exposure."""
+    """Mean absolute difference (0 to 255) of a rendered image (H, W, 3) where it is ``shown`` (H, W), gains evened."""
     use = view.shows & shown
     if use.sum() < 50:
         return float("nan")
