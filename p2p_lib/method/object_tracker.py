@@ -198,7 +198,7 @@ class ObjectTracker:
     # -- between the steps ---------------------------------------------------------------------
 
     def adopt(self) -> None:
-        """Take in what the graph found since the frame before; called before the frame is observed."""
+        """Take in what the graph has solved since the frame before; called before the frame is observed."""
         T_cam_obj = self.model.adopt()
         if T_cam_obj is not None:
             self.life = self.life.corrected(T_cam_obj)
