@@ -24,7 +24,7 @@ from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError
 from p2p_lib.core.findings import Finding, Level
 from p2p_lib.core.options import lengths_m
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.types import Frame
+from p2p_lib.core.types import Frame, evenly
 from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.image_sequence import WRITE_K, paired_images
@@ -104,7 +104,7 @@ def check_folder(
         own = isinstance(sequence, str | Path) and format in (None, "folder")
         return (_files(Path(str(sequence)).expanduser()) if own else []) or [_unreadable("files", error)]
     sequence, frames, masks, wrong = opened, [], [], []
-    for i in np.unique(np.linspace(0, len(sequence) - 1, FRAMES).astype(int)).tolist():
+    for i in evenly(np.arange(len(sequence)), FRAMES).tolist():
         try:
             frames.append(sequence.frame(i))
             masks.append(sequence.masks(i) or {})

@@ -8,6 +8,9 @@ from functools import reduce
 import cv2
 import numpy as np
 
+#: The direction of an outline is that from so many of its pixels before to so many behind.
+_ALONG = 3
+
 
 def in_image(uv_px: np.ndarray, shape: tuple[int, int], margin_px: float = 0.0) -> np.ndarray:
     """(...,) bool: which of the pixels (..., 2) an image of shape (H, W) holds; NaN is outside.
@@ -38,6 +41,23 @@ def bounds(mask: np.ndarray, margin_px: int = 0) -> tuple[slice, slice]:
     spans = ((top, height, mask.shape[0]), (left, width, mask.shape[1]))
     rows, columns = (slice(max(at - margin_px, 0), min(at + size + margin_px, end)) for at, size, end in spans)
     return rows, columns
+
+
+def outline_px(mask: np.ndarray, beside_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(N, 2) each: the pixels along the outline of a mask's (H, W) largest part, and what is beside, inside and out.
+
+    beside_px  how far beside, across the outline. N is 0 for an empty mask.
+    """
+    cut = bounds(mask, 1)
+    found, _ = cv2.findContours(mask[cut].astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not found:
+        return (np.zeros((0, 2)),) * 3
+    uv_px = max(found, key=len)[:, 0] + np.array([cut[1].start, cut[0].start])
+    along = np.roll(uv_px, -_ALONG, 0) - np.roll(uv_px, _ALONG, 0)
+    across = along[:, ::-1] * [1, -1] * beside_px / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1)
+    u, v = nearest_px(uv_px + across, mask.shape)
+    inwards = np.where(mask[v, u][:, None], across, -across)
+    return uv_px, uv_px + inwards, uv_px - inwards
 
 
 def either(masks: Iterable[np.ndarray | None]) -> np.ndarray:

@@ -147,6 +147,11 @@ class Rows:
         return type(self)(*(c if about else c.select(rows) if isinstance(c, Rows) else c[rows] for c, about in columns))
 
 
+def evenly(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most ``most`` of the rows (n, ...), evenly spread; of several the first and the last are among them."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), max(most, 0))).astype(int)]
+
+
 def joined(parts: Sequence[Arrays], join: Callable[..., np.ndarray] = np.concatenate) -> Arrays:
     """Values of one dataclass that holds arrays (or such dataclasses again), one after the other."""
     columns = (([getattr(part, f.name) for part in parts], f.metadata) for f in fields(parts[0]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.types import evenly
 from p2p_lib.evaluation import metrics
 
 
@@ -34,7 +35,7 @@ def align_all(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
     values, vectors = np.linalg.eigh(homogeneous.T @ homogeneous / len(points))
     L = vectors * np.sqrt(np.maximum(values, 0))
-    tried = Y[np.unique(np.linspace(0, len(Y) - 1, 400).astype(int))]  # of long runs 400 evenly spread ones
+    tried = evenly(Y, 400)  # of long runs 400 evenly spread ones
     best = tried[np.argmin([_cost(_distances(X, Y, L)) for X in tried])]
     distances = _distances(best, Y, L)
     for _ in range(200):

@@ -17,6 +17,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.raycasting import cast, ray_scene
+from p2p_lib.core.types import evenly
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints
 from p2p_lib.datasets.mask_log import CELL_PX, CELLS, ObjectMasks
 from p2p_lib.datasets.models import load_mesh
@@ -59,7 +60,7 @@ def surface_in_view(
         scene, shape = ray_scene(*load_mesh(mesh)), (sequence.camera.height, sequence.camera.width)
     except MissingBackend:  # the other evidence is enough for a summary
         return fit
-    for row in np.unique(np.linspace(0, len(obj) - 1, looks).astype(int)):
+    for row in evenly(np.arange(len(obj)), looks):
         if not obj.has_pose[row]:
             continue
         index = int(obj.frame_index[row])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from p2p_lib.core.image import bounds, in_image, nearest_px
+from p2p_lib.core.image import in_image, nearest_px, outline_px
 from p2p_lib.core.types import SPARSE, Frame
 
 #: Keypoints nearer to each other say little of the size, m; so many are needed.
@@ -20,8 +20,6 @@ _SAME_GREY = 12
 _LOOKS_THE_SAME = 0.2
 #: Depth is compared this many px to either side of the outline, at this many places at least; a step is larger, m.
 _BESIDE_PX, _OUTLINE, _DEPTH_STEP_M = 4, 20, 0.02
-#: The outline's direction is taken between the pixels this many before and after.
-_ALONG = 3
 
 
 def size_ratio(p_obj: np.ndarray, p_cam: np.ndarray, noise_m: np.ndarray) -> tuple[float, float] | None:
@@ -59,16 +57,9 @@ def outline_share(frame: Frame, mask: np.ndarray, own: bool = False) -> float | 
     Of the longest contour; None where too little is measured on both sides. At the image's border there is no step.
     With ``own`` only steps with the mask on the nearer side count: at others something in front ends.
     """
-    cut = bounds(mask, 1)
-    found, _ = cv2.findContours(mask[cut].astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if not found:
-        return None
-    uv_px = max(found, key=len)[:, 0] + np.array([cut[1].start, cut[0].start])
-    along = np.roll(uv_px, -_ALONG, 0) - np.roll(uv_px, _ALONG, 0)
-    across = along[:, ::-1] * [1, -1] * _BESIDE_PX / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1)
-    sides = uv_px + across, uv_px - across
-    inside = in_image(sides[0], mask.shape) & in_image(sides[1], mask.shape)
-    z = [frame.depth_m[nearest_px(at, mask.shape)[::-1]] for at in sides]
-    beyond_m = np.where(mask[nearest_px(sides[0], mask.shape)[::-1]], z[1] - z[0], z[0] - z[1])
-    steps = (inside & ((beyond_m if own else np.abs(beyond_m)) > _DEPTH_STEP_M))[~inside | (z[0] > 0) & (z[1] > 0)]
+    _, inner, outer = outline_px(mask, _BESIDE_PX)
+    inside = in_image(inner, mask.shape) & in_image(outer, mask.shape)
+    own_m, other_m = (frame.depth_m[nearest_px(at, mask.shape)[::-1]] for at in (inner, outer))
+    beyond_m = other_m - own_m
+    steps = (inside & ((beyond_m if own else np.abs(beyond_m)) > _DEPTH_STEP_M))[~inside | (own_m > 0) & (other_m > 0)]
     return float(steps.mean()) if len(steps) >= _OUTLINE else None

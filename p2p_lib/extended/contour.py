@@ -8,20 +8,20 @@ only where the surface leaves free where the object is.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.image import bounds, in_image, nearest_px
-from p2p_lib.core.types import Frame
-from p2p_lib.method.refinement import Keypoints
+from p2p_lib.core.config import RefinementConfig
+from p2p_lib.core.image import in_image, nearest_px, outline_px
+from p2p_lib.core.types import Frame, evenly
+from p2p_lib.method.refinement import Keypoints, Refinement, refine
+from p2p_lib.method.tsdf import TsdfVolume
 
 #: Points that an object's contour is known by at most, and the fewest that say anything.
 _POINTS, _FEWEST = 120, 24
-#: The direction of a contour is that from so many of its pixels before to so many behind; depth is compared so many
-#: pixels to either side, and what is so much nearer outside hides the object: it ends there, not the object. m
-_ALONG, _BESIDE_PX, _NEARER_M = 3, 4, 0.02
+#: Depth is compared so many pixels to either side of a contour. What is so much nearer outside, m, hides the object.
+_BESIDE_PX, _NEARER_M = 4, 0.02
 #: Something is flat whose points scatter about a plane by less, m. A plane carries a contour where the line of sight is
 #: this near to its normal, as a cosine: else where it ends is not known well.
 _FLAT_M, _FACING = 0.005, 0.5
@@ -39,18 +39,10 @@ def contour_px(frame: Frame, mask: np.ndarray) -> np.ndarray:
 
     Not at the image's border, nor where something nearer begins.
     """
-    cut = bounds(mask, 1)
-    found, _ = cv2.findContours(mask[cut].astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if not found:
-        return np.zeros((0, 2))
-    uv_px = max(found, key=len)[:, 0] + np.array([cut[1].start, cut[0].start])
-    along = np.roll(uv_px, -_ALONG, 0) - np.roll(uv_px, _ALONG, 0)
-    across = along[:, ::-1] * [1, -1] * _BESIDE_PX / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1)
-    u, v = nearest_px(uv_px + across, mask.shape)
-    inwards = np.where(mask[v, u][:, None], across, -across)
-    (u, v), (u_out, v_out) = (nearest_px(at, mask.shape) for at in (uv_px + inwards, uv_px - inwards))
+    uv_px, inner, outer = outline_px(mask, _BESIDE_PX)
+    (u, v), (u_out, v_out) = (nearest_px(at, mask.shape) for at in (inner, outer))
     own_m, beyond_m = frame.depth_m[v, u], frame.depth_m[v_out, u_out]
-    ends = mask[v, u] & (own_m > 0) & in_image(uv_px - inwards, mask.shape)
+    ends = mask[v, u] & (own_m > 0) & in_image(outer, mask.shape)
     ends &= (beyond_m == 0) | (beyond_m > own_m - _NEARER_M)
     return uv_px[ends].astype(float)
 
@@ -68,8 +60,8 @@ def on_plane(uv_px: np.ndarray, cloud: np.ndarray, camera: Camera) -> np.ndarray
         return None
     if abs(normal @ middle) < _FACING * np.linalg.norm(middle):
         return None
-    rows = np.unique(np.linspace(0, len(uv_px) - 1, min(len(uv_px), _POINTS)).astype(int))
-    rays = camera.unproject(uv_px[rows], np.ones(len(rows)))
+    uv_px = evenly(uv_px, _POINTS)
+    rays = camera.unproject(uv_px, np.ones(len(uv_px)))
     return rays * (middle @ normal / (rays @ normal))[:, None]
 
 
@@ -88,6 +80,16 @@ class ContourFit:
         z = p_cam[near, 2]
         sigma_m = z / self._camera.fx * np.sqrt(max(near.sum() / _INDEPENDENT, 1.0))
         return Keypoints(self._p_obj[rows[near]], self._camera.unproject(self._seen_px[nearest[near]], z), sigma_m)
+
+    def refined(
+        self, found: Refinement, cloud: np.ndarray, surface: TsdfVolume, config: RefinementConfig
+    ) -> Refinement:
+        """A pose laid on the contour that is seen and, by points (N, 3), on the surface; ``found`` if little shows."""
+        for reach_px in REACH_PX:
+            if (pairs := self.pairs(found.T_cam_obj, reach_px)) is None:
+                break
+            found = refine(found.T_cam_obj, cloud, surface, config, keypoints=pairs)
+        return found
 
     def share(self, T_cam_obj: np.ndarray) -> float:
         """How much of either contour is on the other one under a pose: of a part one does not know which it is."""

@@ -14,7 +14,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.types import DOUBTED, Status
 from p2p_lib.extended.agreement import scene_ratio, size_ratio
 from p2p_lib.extended.confidence import Belief, may_slide
-from p2p_lib.extended.contour import REACH_PX, ContourFit, on_plane
+from p2p_lib.extended.contour import ContourFit, on_plane
 from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Evidence, Judgement, judge, off_size
 from p2p_lib.extended.graph import explained
 from p2p_lib.extended.image_search import laid_on
@@ -22,7 +22,7 @@ from p2p_lib.extended.lifecycle import TELLING, Lifecycle, same_place
 from p2p_lib.extended.motion import motion_weight
 from p2p_lib.extended.shape_search import ShapeSearch
 from p2p_lib.extended.sight import Sight, cut_off, empty
-from p2p_lib.method import refinement, registration
+from p2p_lib.method import registration
 from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
 from p2p_lib.method.policy import Admission, Candidate, Policy, Verdict
 from p2p_lib.method.refinement import Refinement as Refinement  # the type of an inherited field
@@ -170,12 +170,7 @@ class OurPolicy(Policy):
         found = super().refined(obs, known, T_cam_obj, agrees)
         held = known.life.unconfirmed or (agrees is not None and agrees.sum() >= FIXED_BY)
         fit = None if held else self._contour(obs, known, found)
-        for reach_px in () if fit is None else REACH_PX:
-            if (pairs := fit.pairs(found.T_cam_obj, reach_px)) is None:
-                break
-            surface, cfg = known.model.surface, self.config.refinement
-            found = refinement.refine(found.T_cam_obj, obs.cloud, surface, cfg, keypoints=pairs)
-        return found
+        return found if fit is None else fit.refined(found, obs.cloud, known.model.surface, self.config.refinement)
 
     def _contour(self, obs: Sight, known: Known, refined: Refinement) -> ContourFit | None:
         """The contour that something flat is known by beside the one that is seen; None where there is none."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from p2p_lib.core.types import evenly
 from p2p_lib.method.keyframe_views import KeyframeViews
 
 
@@ -26,7 +27,7 @@ class AccumulatedViews(KeyframeViews):
 
     def some(self, most: int) -> np.ndarray:
         """(M, 4, 4) of the views, evenly chosen where there are more than ``most``."""
-        return self.T_cam_obj[np.unique(np.linspace(0, len(self) - 1, min(len(self), most)).astype(int))]
+        return evenly(self.T_cam_obj, most)
 
     def add(self, T_cam_obj: np.ndarray) -> None:
         """Add a view; its accumulated rotation is that of the nearest view plus the turn from it."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.packages import needed_for
-from p2p_lib.core.types import status_word
+from p2p_lib.core.types import evenly, status_word
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.figures import style
 from p2p_lib.figures.playback import CLOUD_MAX_M, Playback
@@ -49,7 +49,7 @@ def scene_page(playback: Playback, moments: int = MOMENTS, points: int = POINTS)
             scene = _Scene(server, playback, points)
             recording = server.get_scene_serializer()
             # Points, image and objects are all of the same frame: what is left out is left out of all.
-            rows = np.unique(np.linspace(0, len(playback) - 1, min(moments, len(playback))).astype(int))
+            rows = evenly(np.arange(len(playback)), moments)
             ends_s = [*playback.times_s[rows[1:]], playback.times_s[-1] + 1 / 30]
             for before, i, end_s in zip([None, *rows], rows, ends_s):
                 scene.show(int(i), before)

@@ -20,6 +20,7 @@ from p2p_lib.core import observability, se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import compiled
 from p2p_lib.core.config import RefinementConfig
+from p2p_lib.core.types import evenly
 
 if TYPE_CHECKING:
     from p2p_lib.method.tsdf import TsdfVolume
@@ -378,10 +379,7 @@ def surface_distances(volume: TsdfVolume, p_cam: np.ndarray, T_cam_obj: np.ndarr
 
 def _usable(p_cam: np.ndarray, max_points: int) -> np.ndarray:
     p_cam = np.asarray(p_cam, float).reshape(-1, 3)
-    p_cam = p_cam[np.isfinite(p_cam).all(-1)]
-    if len(p_cam) <= max_points:
-        return p_cam
-    return p_cam[np.linspace(0, len(p_cam) - 1, max_points).astype(int)]
+    return evenly(p_cam[np.isfinite(p_cam).all(-1)], max_points)
 
 
 def _usable_keypoints(keypoints: Keypoints | None, config: RefinementConfig) -> Keypoints | None:

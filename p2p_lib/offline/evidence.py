@@ -16,12 +16,13 @@ from scipy.sparse.csgraph import connected_components
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.depth import depth_noise_m, in_range, lift, off_edges
+from p2p_lib.core.types import evenly
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.offline import loops
 from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
-from p2p_lib.offline.finished import Finished, evenly
+from p2p_lib.offline.finished import Finished
 
 #: Keyframes that are compared with each other, and poses that are adjusted together.
 KEYFRAMES, TOGETHER = 60, 200

@@ -111,11 +111,6 @@ class Finished:
         return {name: of & kept for name, of in sure.items()}
 
 
-def evenly(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most ``most`` of the rows (n, ...), evenly spread; of several the first and the last are among them."""
-    return rows[np.linspace(0, len(rows) - 1, min(len(rows), max(most, 0))).astype(int)]
-
-
 @dataclass(frozen=True, eq=False)
 class Silhouette:
     """A surface as a camera sees it: a cut of an image that may reach beyond its borders.

@@ -17,8 +17,7 @@ from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import depth_noise_m, lift, off_edges
 from p2p_lib.core.image import bounds, nearest_px
 from p2p_lib.core.robust import fit_rigid, residual_m
-from p2p_lib.core.types import Frame
-from p2p_lib.offline.finished import evenly
+from p2p_lib.core.types import Frame, evenly
 
 #: A match is nearer than this share of the next best, and a tie has at least so many matches that move rigidly.
 _RATIO, MIN_MATCHES = 0.8, 9

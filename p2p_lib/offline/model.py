@@ -21,10 +21,10 @@ from p2p_lib.core.files import replace_text, replacing
 from p2p_lib.core.image import nearest_px
 from p2p_lib.core.native import load_open3d
 from p2p_lib.core.progress import progress_bar
-from p2p_lib.core.types import DOUBTED
+from p2p_lib.core.types import DOUBTED, evenly
 from p2p_lib.datasets.images import save_png
 from p2p_lib.offline import texture
-from p2p_lib.offline.finished import Finished, Renderer, evenly, new_folder
+from p2p_lib.offline.finished import Finished, Renderer, new_folder
 
 NAME = "textured_simple"
 #: Components with less of the largest one's area are left out.

@@ -27,11 +27,11 @@ from p2p_lib.core.errors import MissingData
 from p2p_lib.core.files import load_arrays, replace_text, replacing, writing_alone
 from p2p_lib.core.mesh import save
 from p2p_lib.core.progress import progress_bar
-from p2p_lib.core.types import DOUBTED, WITH_POSE, Status
+from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, tum_line
 from p2p_lib.offline.evidence import Evidence, VideoPoses, gather
-from p2p_lib.offline.finished import Finished, evenly
+from p2p_lib.offline.finished import Finished
 from p2p_lib.offline.sight import Sight
 from p2p_lib.offline.surface import SurfacePoses, fused
 

@@ -9,12 +9,12 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.depth import depth_noise_m
-from p2p_lib.core.types import Frame
+from p2p_lib.core.types import Frame, evenly
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.method.refinement import refine
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.offline.dataset import agreement, visible
-from p2p_lib.offline.finished import Finished, Renderer, evenly
+from p2p_lib.offline.finished import Finished, Renderer
 
 #: Distances from the surface are cut at this, m.
 _FAR_M = 0.01

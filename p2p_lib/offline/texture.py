@@ -15,7 +15,8 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.image import nearest_px
-from p2p_lib.offline.finished import Finished, Renderer, evenly
+from p2p_lib.core.types import evenly
+from p2p_lib.offline.finished import Finished, Renderer
 
 #: Views that a texture is baked from, at most.
 VIEWS = 48

@@ -12,9 +12,9 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.native import load_open3d
 from p2p_lib.core.raycasting import SurfaceDistance
+from p2p_lib.core.types import evenly
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh
 from p2p_lib.offline import model, texture
-from p2p_lib.offline.finished import evenly
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
 
@@ -107,8 +107,7 @@ def test_of_one_direction_the_sharpest_frame_is_taken(monkeypatch):
     T[20:] = T[20:] @ se3.exp(np.array([0, 1.0, 0, 0, 0, 0]))  # seen from two sides
     made = SimpleNamespace(run=SimpleNamespace(objects={"box": SimpleNamespace(T_cam_obj=T)}))
     nothing = np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), bool), np.zeros((1, 1), np.float32)
-    shown = lambda made, name, row, render: texture.View(row, T[row], *nothing, sharpness[row])  # noqa: E731
-    monkeypatch.setattr(texture, "view_of", shown)
+    monkeypatch.setattr(texture, "view_of", lambda *of: texture.View(of[2], T[of[2]], *nothing, sharpness[of[2]]))
     chosen = [view.frame for view in texture.chosen_rows(made, "box", np.arange(40), None)]
     looked_at = [evenly(np.arange(20), 4), evenly(np.arange(20, 40), 4)]
     assert chosen == [rows[sharpness[rows].argmax()] for rows in looked_at]

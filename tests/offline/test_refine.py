@@ -238,11 +238,11 @@ def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what, 
         rgb = middle + 3 * (rgb - middle)
     if what == "pattern":  # the same colours elsewhere, beside a frame in whose light they are far off as well
         look = sight._look
-        in_that_light = lambda frame, *how, **more: (  # noqa: E731
-            look(frame, *how, **more)._replace(off=3 * sight._usual, alike=0.9)
-            if frame.index == k - 1
-            else look(frame, *how, **more)
-        )
+
+        def in_that_light(frame, *how, **more):
+            found = look(frame, *how, **more)
+            return found._replace(off=3 * sight._usual, alike=0.9) if frame.index == k - 1 else found
+
         monkeypatch.setattr(sight, "_look", in_that_light)
         v, u = np.nonzero(mask)
         rgb[v, u] = rgb[v, u][np.random.default_rng(0).permutation(len(v))]
