@@ -54,7 +54,7 @@ MECHANISMS = {
     # Inside: gates.
     "return_gate": "A return needs many agreeing points, or shape and colour.",
     "surface_gate": "A pose without agreeing points needs a surface that fits.",
-    "sliding_gate": "Of something flat, whose surface leaves free where it is, points have to agree with a pose.",
+    "sliding_gate": "Of something flat, whose surface leaves it free, points or its contour have to agree with a pose.",
     "contour": "What is flat and plain is held by where its mask ends.",
     "rest": "What lay still in the scene is not back elsewhere unless its points say so.",
     "size": "Nothing is learnt where depth shows the object and the scene in another size.",
