@@ -224,7 +224,7 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     objects = _chosen(list(dict.fromkeys([*objects, *memories])), options.objects)
     memories = {name: memory for name, memory in memories.items() if name in objects}
     if both := [p.name for p in prompts if p.name in memories]:
-        raise BadInput(f"memory of {both[0]!r}", "a prompt of it, too", "one of them", "Leave the prompt out.")
+        raise BadInput(f"memory of {both[0]!r}", "a prompt of it, too", "a memory or a prompt", "Leave the prompt out.")
     if not told and all(sequence.masks(i) is None for i in frames):
         fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
         fix = "Leave --masks out: the prompts start the objects." if prompts else fix
@@ -243,7 +243,7 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     for i, said in by_frame.items() if masks.every_mask else ():
         if both := [p.name for p in said if p.name in (sequence.masks(i) or {})]:
             fix = "Leave --masks out to start from the prompts, or take the mask of that frame away."
-            raise BadInput(f"prompt of {both[0]!r}", f"a mask in frame {i} too", "one of them", fix)
+            raise BadInput(f"prompt of {both[0]!r}", f"a mask in frame {i}, too", "a mask or a prompt", fix)
     return _Job(source, config, sequence, frames, objects, masks, by_frame, memories)
 
 
@@ -255,7 +255,7 @@ def _doubt_scale(job: _Job) -> None:
     except P2PError:
         return  # said when the run comes to that frame, with the poses before it kept
     if text := moving_scale(pairs):
-        doubt("depth", text, f"Nothing rigid does that: is each image scaled by itself? See p2p check {job.source}")
+        doubt("depth", text, f"Is each image scaled separately? See p2p check {job.source}")
 
 
 def _frame_range(count: int, start: int, stop: int | None) -> range:
@@ -315,7 +315,7 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None
         say(f"{writer.path} holds {writer.earlier}, which is finished.")
     elif writer.resumed:
         kept = "its frames" if writer.redo_from is None else f"its frames before {writer.redo_from}"
-        say(f"{writer.path} holds {writer.earlier}; {kept} are tracked again and compared, then it goes on.")
+        say(f"{writer.path} holds {writer.earlier}; {kept} are tracked again and compared before it goes on.")
     elif writer.earlier:
         say(f"{writer.path} held {writer.earlier}, which this one replaces.")
 
@@ -358,7 +358,7 @@ def _estimates(
                 frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
             except P2PError as unreadable:
                 if left_out is None or i in job.prompts:
-                    raise advised(unreadable, "A prompt is made on it." if i in job.prompts else SKIP_BAD) from None
+                    raise advised(unreadable, "A prompt needs this frame." if i in job.prompts else SKIP_BAD) from None
                 left_out[str(i)] = str(unreadable)
                 continue
             for prompt in job.prompts.get(i, ()):
@@ -400,7 +400,7 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
         why = Counter(status_text(*said).partition(" since ")[0] for said in zip(obj.status[lost], obj.reason[lost]))
-        most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
+        most = f"; otherwise mostly {why.most_common(1)[0][0]}" if why else ""
         doubted = int(obj.doubted.sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""
         lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}")
@@ -416,14 +416,14 @@ def _advice(run: Run, job: _Job) -> str:
         return ""
     why = " ".join(reasons.values())
     if set(reasons) <= set(job.memories):
-        fix = "is it in view, and seen from a side that was learnt? Else click on it"
+        fix = "show a side that was learnt, or click on it"
     elif "pixels with depth" in why:
-        fix = "its depth is missing or out of range, or in another unit (--depth-scale)"
+        fix = "its depth is missing, out of range or in another unit (--depth-scale)"
     elif "not seen yet" in why and not job.masks.every_mask:
-        fix = "click in the middle of it, elsewhere"
+        fix = "click on another place, near its centre"
     elif "not seen yet" in why:
-        fix = "its masks are empty or too small: draw it, or use p2p click"
+        fix = "its masks are empty or too small: draw them anew, or use p2p click"
     else:
-        fix = "see what is wrong with the data"
+        fix = "look for faults in the data"
     first = next(iter(reasons.values()))
     return f"{', '.join(reasons)} never had a pose ({first}); {fix}. Next: p2p check {job.source}"

@@ -109,7 +109,7 @@ class Objects(ABC):
         check_prompt(prompt, self.camera)
         check_apart((other for other in self._said.values() if other.name != name), prompt)
         if name not in known and not prompt.starts:
-            what = "an empty mask" if prompt.mask is not None else "clicks beside it alone"
+            what = "an empty mask" if prompt.mask is not None else "negative clicks alone"
             raise BadInput(f"object {name!r}", what, "a click on it, a box or at least one pixel of its mask")
         with self.alone():
             if name not in self.objects:
@@ -158,7 +158,7 @@ class Objects(ABC):
         self.refused |= refused
         for name, error in refused.items():
             if name in self.segmenter.names:  # its estimates go on and cannot say so
-                doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is not used. {error.fix}")
+                doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is ignored. {error.fix}")
         return given, said
 
     def explained(self, estimate: PoseEstimate, mask_given: bool) -> PoseEstimate:

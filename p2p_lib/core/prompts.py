@@ -53,7 +53,7 @@ class Prompt:
         if not len(self.points_px) and not len(self.negative_px) and self.box_px is None and self.mask is None:
             raise BadInput(f"clicks on {self.name!r}", "none", "at least one [x, y] in pixels, a box or a mask")
         if self.mask is not None and (len(self.points_px) or len(self.negative_px) or self.box_px is not None):
-            raise BadInput(f"object {self.name!r}", "a mask and clicks", "one of them", "A mask says it all.")
+            raise BadInput(f"object {self.name!r}", "a mask and clicks", "one of them", "A mask needs no clicks.")
 
     @property
     def starts(self) -> bool:
@@ -85,7 +85,7 @@ def check_prompt(prompt: Prompt, camera: Camera) -> None:
             fix = "Draw the object alone; is the mask inverted?"
             raise BadInput(f"mask of {name!r}", "the whole image", "the object's pixels", fix)
     if _meet(prompt.points_px, prompt.negative_px):
-        raise BadInput(f"clicks on {name!r}", "a click that is also one beside it", "one or the other")
+        raise BadInput(f"clicks on {name!r}", "a positive and a negative click on one pixel", "one or the other")
 
 
 def check_mask(name: str, mask: np.ndarray | None, camera: Camera) -> None:
@@ -109,7 +109,7 @@ def check_depth(prompt: Prompt, frame: Frame) -> None:
     at = prompt.points_px
     if len(at) and not np.isfinite(depths_at(at, frame)).any():
         got = f"{_pixel(at[0])} has no depth in frame {frame.index}"
-        raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel with a depth measurement", "Click beside the hole.")
+        raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel with a depth measurement", "Click next to the hole.")
     if prompt.box_px is not None and not len(prompt.points_px) and not len(points_in_box(prompt.box_px, frame)):
         got = f"no depth inside it in frame {frame.index}"
         raise BadInput(f"box around {prompt.name!r}", got, "measured pixels in its middle", "Click on the object.")

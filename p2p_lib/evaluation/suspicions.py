@@ -102,54 +102,54 @@ def _known(key: str) -> Callable[[Evidence], np.ndarray]:
 
 
 _RULES = (
-    _Rule("lost", "no pose where its mask is", 0.1, lambda e: ~e.has_pose, lambda e: e.seen),
-    _Rule("doubted", "poses doubted", 0.5, lambda e: e.confidence <= DOUBTED, lambda e: e.has_pose),
+    _Rule("lost", "no pose although the mask is visible", 0.1, lambda e: ~e.has_pose, lambda e: e.seen),
+    _Rule("doubted", f"confidence at most {DOUBTED:g}", 0.5, lambda e: e.confidence <= DOUBTED, lambda e: e.has_pose),
     _Rule(
         "maps",
-        "poses in a map that never met the one that is kept",
+        "poses in a second map that was never merged",
         0.05,
         lambda e: e.elsewhere,
         lambda e: e.has_pose | e.elsewhere,
     ),
     _Rule(
         "no keypoints",
-        f"a pose and a mask, and fewer than {FEW} of its own keypoints in view",
+        f"a pose and a mask, but fewer than {FEW} visible keypoints",
         0.3,
         lambda e: e.keypoints < FEW,
         lambda e: e.carried & np.isfinite(e.keypoints),
     ),
     _Rule(
         "outside",
-        "its own keypoints are seen outside its mask",
+        "most keypoints lie outside the mask",
         0.05,
         lambda e: e.inside < 0.5,
         lambda e: e.seen & np.isfinite(e.inside) & (e.keypoints >= FEW),
     ),
     _Rule(
         "keypoints off",
-        f"keypoints more than {OFF_PX:g} px from where the pose puts them",
+        f"median reprojection error of the keypoints above {OFF_PX:g} px",
         0.25,
         lambda e: e.off_px > OFF_PX,
         _known("off_px"),
     ),
-    _Rule("jumps", "poses jump, what is seen does not", 0.02, lambda e: e.jump_px > JUMP_PX, _known("jump_px")),
+    _Rule("jumps", "the pose jumps, the keypoints do not", 0.02, lambda e: e.jump_px > JUMP_PX, _known("jump_px")),
     _Rule(
         "silhouette",
-        "the reconstructed surface does not cover the mask, or covers more",
+        f"silhouette and mask overlap by less than {OVERLAP:g} (IoU)",
         0.2,
         lambda e: e.overlap < OVERLAP,
         _known("overlap"),
     ),
     _Rule(
         "seen through",
-        "depth is measured behind the reconstructed surface",
+        "depth shows empty space where the surface should be",
         0.5,
         lambda e: e.through > THROUGH,
         _known("through"),
     ),
     _Rule(
         "grown",
-        f"the mask holds something {GROWN:g} times as long as it mostly does",
+        f"the mask spans more than {GROWN:g} times the object's usual length",
         0.05,
         lambda e: e.size_m > GROWN * median_of_known(e.size_m[e.seen]),
         lambda e: e.seen & np.isfinite(e.size_m),
@@ -161,7 +161,7 @@ def suspicions(e: Evidence) -> tuple[Suspicion, ...]:
     """Everything that speaks against an object's part of a run; none: nothing that a run keeps does."""
     found = [Suspicion("start", text) for text in e.told]
     if e.apart > APART:
-        found.append(Suspicion("start", f"{100 * e.apart:.0f} % of its first mask lies apart: two objects?"))
+        found.append(Suspicion("start", f"{100 * e.apart:.0f} % of the first mask is apart: two objects?"))
     found += [s for s in (_absent(e), _size(e)) if s is not None]
     for rule in _RULES:
         count = rule.count(e)
@@ -181,14 +181,14 @@ def median_of_known(values: np.ndarray) -> float:
 def _absent(e: Evidence) -> Suspicion | None:
     """Away at the end, or for most of the run: a run cannot tell what is out of view from what it does not find."""
     if not e.has_pose.any():
-        return _suspicion("absent", "never a pose", e, ~e.has_pose)
+        return _suspicion("absent", "no pose in any frame", e, ~e.has_pose)
     away = ~e.seen & ~e.has_pose
     back = np.flatnonzero(~away)[-1] + 1
     last = np.arange(len(away)) >= back
     if last.sum() > max(_GONE_FRAMES, _GONE_SHARE * len(away)):
-        return _suspicion("absent", "not found again; is it out of view to the end?", e, last)
+        return _suspicion("absent", "not found again before the end: is it out of view?", e, last)
     if away.mean() > _AWAY_SHARE:
-        return _suspicion("absent", f"away ({100 * away.mean():.0f} %); is it out of view there?", e, away)
+        return _suspicion("absent", f"no mask and no pose ({100 * away.mean():.0f} %): is it out of view?", e, away)
     return None
 
 
@@ -197,7 +197,7 @@ def _size(e: Evidence) -> Suspicion | None:
     if not known.any() or SHORTEST_M <= (size_m := float(np.median(e.size_m[known]))) <= LONGEST_M:
         return None
     than = f"longer than {100 * LONGEST_M:g}" if size_m > LONGEST_M else f"shorter than {100 * SHORTEST_M:g}"
-    text = f"its mask holds something {100 * size_m:.0f} cm long, {than} cm: more than it, or depth in another unit?"
+    text = f"the mask spans {100 * size_m:.0f} cm, {than} cm: does it hold other things, or is the depth unit wrong?"
     return _suspicion("size", text, e, known & ((e.size_m > LONGEST_M) | (e.size_m < SHORTEST_M)), known)
 
 

@@ -78,8 +78,9 @@ def judge(life: Lifecycle, evidence: Evidence, on: Container[str], config: Lifec
         if name in on and (reason := contradiction(life, evidence)):
             return Judgement(True, Status.DEGRADED, reason, doubted=True)
     if evidence.support < config.return_inliers:
+        few = f"only {evidence.support} points agree with the pose, fewer than {config.return_inliers}"
         proven = "return_gate" not in on or evidence.sighting is None or _sighted(life, evidence)
-        return Judgement(True, Status.DEGRADED, f"only {evidence.support} points agree", proven=proven)
+        return Judgement(True, Status.DEGRADED, few, proven=proven)
     return Judgement(True, Status.RECOVERED if life.returning else Status.TRACKED)
 
 
@@ -91,13 +92,13 @@ def _few_points_on_return(life: Lifecycle, evidence: Evidence, config: Lifecycle
     on_its_way = evidence.carried and (evidence.surface_share or 0.0) >= config.surface_only_share
     found = _sighted(life, evidence) or on_its_way
     few = life.unconfirmed and evidence.support < config.return_inliers and not found
-    return f"only {evidence.support} points agree on a return" if few else ""
+    return f"only {evidence.support} points agree with the pose of a return" if few else ""
 
 
 def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
     off = (evidence.surface_share or 0.0) < config.surface_only_share
     nothing = not evidence.support and off and not _sighted(life, evidence)
-    return "too few points, and the surface does not fit either" if nothing else ""
+    return "no points agree with the pose, and its surface does not fit the depth" if nothing else ""
 
 
 def _few_points_on_flat(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
@@ -105,27 +106,27 @@ def _few_points_on_flat(life: Lifecycle, evidence: Evidence, config: LifecycleCo
     points = evidence.support >= FIXED_BY or (evidence.sighting or 0.0) >= SIGHTED
     fixed = points or evidence.contour >= _CONTOUR
     free = evidence.slides and not fixed
-    return f"only {evidence.support} points agree, and the surface leaves free where it is" if free else ""
+    return f"only {evidence.support} points agree with the pose, and a flat surface does not fix it" if free else ""
 
 
 def _few_points_elsewhere(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
     """What lay still does not move while nobody sees it, unless its own points say so."""
     elsewhere = life.unconfirmed and evidence.support < config.return_inliers and evidence.rests is False
-    return f"only {evidence.support} points agree, and it lay still elsewhere" if elsewhere else ""
+    return f"only {evidence.support} points agree with the pose, and the object rested elsewhere" if elsewhere else ""
 
 
 def _mask_off_steps(life: Lifecycle, evidence: Evidence) -> str:
     off = evidence.outline < OUTLINE and life.doubted_frames < _LONGEST_DOUBT
-    return "its mask does not end where its depth does any more" if off else ""
+    return "the outline of the mask no longer follows depth edges" if off else ""
 
 
 def _another_size(life: Lifecycle, evidence: Evidence) -> str:
     ratio, sigma = evidence.size or (1.0, 0.0)
-    return f"its depth shows it {ratio:.2f} times as large as before" if off_size(ratio, sigma) else ""
+    return f"depth shows the object {ratio:.2f} times as large as its map" if off_size(ratio, sigma) else ""
 
 
 def _same_image(life: Lifecycle, evidence: Evidence) -> str:
-    return "the camera gives the same image again and again" if evidence.still else ""
+    return "the camera repeats the same image" if evidence.still else ""
 
 
 def off_size(ratio: float, sigma: float = 0.0) -> bool:

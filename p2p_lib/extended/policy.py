@@ -234,7 +234,7 @@ class OurPolicy(Policy):
         verdict = super().start(known, points)
         if verdict.accepted or known.model.surface is None or "motion_prior" not in self.on:
             return verdict
-        return Verdict(True, Status.DEGRADED, f"only {points} points")
+        return Verdict(True, Status.DEGRADED, verdict.reason)
 
     def judge(self, obs: Sight, known: Known, best: Proposal) -> Judgement:
         """Whether the pose stands, by its evidence and by the consistency of depth and masks."""

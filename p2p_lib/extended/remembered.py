@@ -218,7 +218,7 @@ class Remembered(TwoMaps):
         """The object's pose at a frame; once it is followed, landmarks that have come into view are added."""
         given = obs.mask is not None and obs.given
         if not given and not (self._claimed and (obs.mask is not None or self.life.T_cam_obj is not None)):
-            return self.own.absent(obs, Verdict(False, Status.INITIALISING, "remembered, and not found yet"))
+            return self.own.absent(obs, Verdict(False, Status.INITIALISING, "known from memory, not found yet"))
         followed = int(np.isin(self.map.keys, self._key)[obs.seen].sum())
         step = super().step(obs)
         if step.estimate.T_cam_obj is not None:

@@ -234,18 +234,16 @@ class TwoMaps:
         own, new = self.own, copy(self.own)
         new.known = Known(new.new_model(), self.policy.life, own.known.map_id + 1)
         step, trusted = new.begin(obs), self.policy.trusted
-        few = keep and step.estimate.status is Status.DEGRADED
-        if few or step.estimate.T_cam_obj is None:
-            reason = f"{step.estimate.reason} to start from" if few else step.estimate.reason
+        if (keep and step.estimate.status is Status.DEGRADED) or step.estimate.T_cam_obj is None:
             self.policy.trusted = trusted
-            return own.absent(obs, Verdict(False, Status.LOST, reason))
+            return own.absent(obs, Verdict(False, Status.LOST, step.estimate.reason))
         gone = self.other if keep else own
         if keep:
             self.other = _lost(own)
         self.own, self._relation = new, Relation()
         if step.estimate.status is not Status.DEGRADED:
             new.life = replace(new.life, status=Status.RECOVERED)
-            again = replace(step.estimate, status=Status.RECOVERED, reason="a new map: the old one stays lost")
+            again = replace(step.estimate, status=Status.RECOVERED, reason="new map: the object stayed lost in the old")
             step = replace(step, estimate=again)
         forgotten = NO_IDS if gone is None else gone.map.ids[gone.map.ids >= 0]
         return replace(step, requests=replace(step.requests, drop=forgotten))
@@ -294,7 +292,7 @@ class TwoMaps:
         self.model.join(gone.model, T_obj_other)
         self.life = replace(self.life, seen_m2=max(self.life.seen_m2, gone.life.seen_m2))
         both = replace(best, hypothesis=agreeing_together(best.hypothesis, known.hypothesis))
-        maps = f"maps {self.known.map_id} and {gone.map_id} are one"
+        maps = f"maps {self.known.map_id} and {gone.map_id} were joined"
         verdict = Judgement(True, Status.RECOVERED, maps, joins=True)
         step = self.own.accept(seen_together(obs, obs.other), both, verdict, due=True)
         return replace(step, estimate=replace(step.estimate, joined=(gone.map_id, T_obj_other)))

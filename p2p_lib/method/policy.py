@@ -153,13 +153,14 @@ class Policy:
     def start(self, known: Known, points: int) -> Verdict:
         """Whether a map may begin with this number of ``points``."""
         enough = points >= self.config.registration.min_inliers
-        return Verdict(enough, Status.TRACKED, "" if enough else f"only {points} points to start from")
+        return Verdict(enough, Status.TRACKED, "" if enough else f"only {points} points to start a map")
 
     def judge(self, obs: Observation, known: Known, best: Candidate) -> Verdict:
         """Every pose stands; few points degrade it."""
         support = best.hypothesis.support
         if support < self.config.lifecycle.return_inliers:
-            return Verdict(True, Status.DEGRADED, f"only {support} points agree")
+            few = f"only {support} points agree with the pose, fewer than {self.config.lifecycle.return_inliers}"
+            return Verdict(True, Status.DEGRADED, few)
         return Verdict(True, Status.RECOVERED if known.life.returning else Status.TRACKED)
 
     def admit(self, obs: Observation, known: Known, best: Candidate, verdict: Verdict) -> Admission:

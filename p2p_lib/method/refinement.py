@@ -159,7 +159,7 @@ class _Problem:
         # Wide at first: far from the solution, the few points that hold a direction look like outliers.
         at = self.surface(T, self.volume.tau_m / 2)
         if at is None:
-            return Refinement(T, reason="the cloud lies beyond the surface's truncation")
+            return Refinement(T, reason="the depth points lie beyond the truncation distance")
         while tries < self.config.iterations and not converged:
             tries += 1
             step = self.clipped(self.step(*self.joint(at), damping))
@@ -276,7 +276,7 @@ class _Problem:
             at.eigenvalues,
             at.directions.T,
             observability.rotations_in(loose).T @ to_origin.T * self.radius,
-            f"the shape leaves {loose.shape[1]} of 6 directions free" if loose.size else "",
+            f"the shape leaves {loose.shape[1]} of 6 degrees of freedom unconstrained" if loose.size else "",
         )
 
 

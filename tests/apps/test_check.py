@@ -254,7 +254,7 @@ def click(u, v):
 
 def test_a_click_on_the_background_is_worth_a_look(good):
     finding = found(good, "box: clicks", **click(230, 240))
-    assert finding.level is Level.LOOK and "flat in what is around it, as a table or a wall is" in finding.text
+    assert finding.level is Level.LOOK and "lie in the plane around them, like a table or a wall" in finding.text
 
 
 def test_clicks_all_over_the_background_are_worth_a_look(good):
@@ -269,7 +269,7 @@ def test_clicks_of_two_objects_on_one_body_are_worth_a_look(good):
     (box,) = prompts_in({"box": open_sequence(good).masks(0)["box"]})
     twice = [box, Prompt("lid", 0, np.add(box.points_px, [15, 10]))]
     finding = found(good, "lid: clicks", prompts=twice)
-    assert finding.level is Level.LOOK and "most of 'box' belongs to what is clicked" in finding.text
+    assert finding.level is Level.LOOK and "selects most of 'box', too" in finding.text
 
 
 def test_a_click_that_segments_nothing_is_said_once(good, recwarn):

@@ -401,7 +401,7 @@ def test_a_torn_frame_is_left_out_too_but_not_one_that_a_prompt_is_made_on(seque
     assert re.search("6 of 8 frames.*; 2 left out", capsys.readouterr().out)
     (sequence / "depth/0001.png").write_bytes(b"torn")
     assert run(sequence, tmp_path / "other", *clicks) == 2
-    assert "0001.png" in (err := capsys.readouterr().err) and "A prompt is made on it." in err
+    assert "0001.png" in (err := capsys.readouterr().err) and "A prompt needs this frame." in err
 
 
 def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, capsys):

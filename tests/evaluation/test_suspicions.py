@@ -68,10 +68,10 @@ def gone(rows: np.ndarray) -> Evidence:
     ("rows", "says"),
     [
         ((ROWS > 30) & (ROWS < 70), ""),
-        ((ROWS > 30) & (ROWS < 90), "away (59 %); is it out of view there?: frames 41 to 99"),
+        ((ROWS > 30) & (ROWS < 90), "no mask and no pose (59 %): is it out of view?: frames 41 to 99"),
         (ROWS >= 85, ""),
-        (ROWS >= 60, "not found again; is it out of view to the end?: frames 70 to 109"),
-        (ROWS >= 0, "never a pose: frames 10 to 109"),
+        (ROWS >= 60, "not found again before the end: is it out of view?: frames 70 to 109"),
+        (ROWS >= 0, "no pose in any frame: frames 10 to 109"),
     ],
 )
 def test_what_is_away_may_be_lost(rows, says):
@@ -81,7 +81,7 @@ def test_what_is_away_may_be_lost(rows, says):
 
 def test_how_it_started():
     found = suspicions(replace(spotless(), told=("clicks on 'cup': flat",), apart=0.4))
-    assert [s.rule for s in found] == ["start", "start"] and "40 % of its first mask lies apart" in found[1].text
+    assert [s.rule for s in found] == ["start", "start"] and "40 % of the first mask is apart" in found[1].text
 
 
 def test_stretches_are_named_across_frames_that_do_not_count():

@@ -680,7 +680,7 @@ def test_the_covariance_of_refinement_goes_before_that_of_the_keypoints():
 def test_an_object_with_next_to_no_texture_starts_on_its_surface():
     lump, points_alone = Lump(), Lump(**NO_SURFACE)
     lump.tracker.own.detector = points_alone.tracker.own.detector = Pair()
-    assert points_alone.see(START).estimate.reason == "only 2 points to start from"
+    assert points_alone.see(START).estimate.reason == "only 2 points to start a map"
     assert lump.see(START).estimate.status is Status.DEGRADED
     lump.see(turned(3))
     assert lump.off(turned(3))[0] < 1
@@ -718,7 +718,8 @@ def test_a_map_of_a_sliver_is_founded_anew_where_the_object_stays_lost_in_plain_
     founded = steps[first]
     assert [step.estimate.status for step in steps[:first]] == [Status.LOST] * first
     assert (
-        founded.estimate.status is Status.RECOVERED and founded.estimate.reason == "a new map: the old one stays lost"
+        founded.estimate.status is Status.RECOVERED
+        and founded.estimate.reason == "new map: the object stayed lost in the old"
     )
     assert len(founded.requests.drop) and not np.isin(founded.requests.drop, lump.tracker.map.ids).any()
     assert {step.estimate.status for step in steps[first + 1 :]} == {Status.TRACKED}
@@ -791,8 +792,8 @@ def dilated(mask: np.ndarray) -> np.ndarray:
     [
         ({"depth": lambda depth_m: 1.2 * depth_m}, "1.20 times as large"),
         ({"depth": lambda depth_m: depth_m + np.float32(0.1)}, "times as large"),
-        ({"mask": dilated}, "does not end where its depth does"),
-        ({"depth": lambda depth_m: np.roll(depth_m, 20, 1)}, "does not end where its depth does"),
+        ({"mask": dilated}, "no longer follows depth edges"),
+        ({"depth": lambda depth_m: np.roll(depth_m, 20, 1)}, "no longer follows depth edges"),
     ],
 )
 def test_nothing_is_learnt_from_what_contradicts_itself(fault, word):
@@ -814,7 +815,7 @@ def test_an_outline_that_never_told_where_the_object_ends_does_not_now(share, do
     lump = before_a_wall()
     vars(lump.tracker.policy.trusted)["outline_share"] = share  # as it was in the newest frame that was not doubted
     estimate = doubtful(lump, mask=dilated).estimate
-    assert ("does not end where its depth does" in estimate.reason) == doubted != estimate.keyframe
+    assert ("no longer follows depth edges" in estimate.reason) == doubted != estimate.keyframe
 
 
 @pytest.mark.parametrize(("settings", "fault"), [({}, {}), ({"method__mechanisms": UNGATED}, {"mask": dilated})])
@@ -859,7 +860,7 @@ def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_bo
         deg += 4
         met.append(lump.see(about(deg)))
     joined = met[-1].estimate
-    assert joined.map_id == 0 and joined.status is Status.RECOVERED and "0 and 1 are one" in joined.reason
+    assert joined.map_id == 0 and joined.status is Status.RECOVERED and "0 and 1 were joined" in joined.reason
     assert [step.estimate.map_id for step in met] == [1] * (len(met) - 1) + [0]
     # What was said in the second map is right in the first one's frame, by the relation that is told.
     gone, T_obj_joined = joined.joined
@@ -908,7 +909,7 @@ def test_where_the_first_map_fits_again_and_the_second_does_not_the_first_one_go
 
 def test_no_second_map_is_begun_on_few_points():
     lump, _, steps = turned_over(Pair())
-    assert lump.tracker.other is None and steps[-1].estimate.reason == "only 2 points to start from"
+    assert lump.tracker.other is None and steps[-1].estimate.reason == "only 2 points to start a map"
 
 
 def test_no_second_map_is_begun_while_the_object_still_comes_into_view():
