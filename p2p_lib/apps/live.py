@@ -31,7 +31,7 @@ from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
 from p2p_lib.keeper import Keeper, noted
-from p2p_lib.run import recall, told
+from p2p_lib.run import described, recall
 
 #: Made-up images that are tracked before a camera starts.
 _WARM_FRAMES = 4
@@ -197,7 +197,7 @@ def _kept(
     sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
     objects = tuple(dict.fromkeys([*(prompt.name for prompt in prompts), *memories]))
     writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, if_exists=if_exists)
-    writer.info |= told(method, options, prompts)
+    writer.info |= described(method, options, prompts)
     keeper, stopped = Keeper(writer, method, options.save_masks, prompts), None
 
     def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:

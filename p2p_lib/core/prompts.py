@@ -125,11 +125,11 @@ def check_not_on(prompt: Prompt, other: Prompt, frame_index: int) -> None:
 def given_masks(
     frame: Frame,
     masks: Mapping[str, np.ndarray | None],
-    said: Mapping[str, Prompt],
+    prompts: Mapping[str, Prompt],
     objects: Iterable[str],
     camera: Camera,
 ) -> tuple[dict[str, np.ndarray | None], dict[str, BadInput]]:
-    """Every object's mask in a frame, by ``masks`` and what is ``said`` of it; None for one that nobody gives.
+    """Every object's mask in a frame, by ``masks`` and ``prompts``; None for one that nobody gives.
 
     Also why what is said of some objects does not fit this frame: it is not used. Raises :class:`BadInput` for a frame
     of another size and masks of unknown objects.
@@ -150,17 +150,17 @@ def given_masks(
         if prompt.mask is not None and prompt.mask.all():
             doubt(f"mask of {name!r}", f"the whole image in frame {frame.index}", "Is it inverted?")
     refused = {}
-    for name, prompt in said.items():
+    for name, prompt in prompts.items():
         try:
-            _check_said(prompt, frame, given)
+            _check_clicks(prompt, frame, given)
         except BadInput as error:
             refused[name] = error
-    given = {name: p for name, p in said.items() if p.mask is not None and name not in refused} | given
+    given = {name: p for name, p in prompts.items() if p.mask is not None and name not in refused} | given
     return {name: given[name].mask if name in given else None for name in objects}, refused
 
 
-def _check_said(prompt: Prompt, frame: Frame, given: Mapping[str, Prompt]) -> None:
-    """Refuse what is said of an object in a frame where depth or the masks given with it say otherwise."""
+def _check_clicks(prompt: Prompt, frame: Frame, given: Mapping[str, Prompt]) -> None:
+    """Refuse a prompt that depth or the masks given with its frame contradict."""
     check_depth(prompt, frame)
     for other in given.values():
         check_not_on(prompt, other, frame.index)

@@ -24,7 +24,7 @@ from p2p_lib.datasets.models import load_mesh
 from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
-from p2p_lib.evaluation.suspicions import FEW, Evidence
+from p2p_lib.evaluation.suspicions import FEW, RunEvidence
 
 #: As near to the surface is on it; so much before it is something else that hides it.
 ON_M, BEFORE_M = 0.005, 0.01
@@ -81,7 +81,7 @@ def gathered(
     keypoints: ObjectKeypoints | None,
     fit: SurfaceFit,
     told: tuple[str, ...],
-) -> Evidence:
+) -> RunEvidence:
     """All that is known of one object, frame by frame.
 
     every  the same object with the poses of all its maps
@@ -100,7 +100,7 @@ def gathered(
     elsewhere = every.has_pose & ~obj.has_pose
     said = obj.frame_index, obj.has_pose, elsewhere, obj.confidence
     seen, inside, off_px, jump_px = of_points
-    return Evidence(*said, px, size_m, seen, inside, off_px, jump_px, fit.overlap, fit.through, told, apart)
+    return RunEvidence(*said, px, size_m, seen, inside, off_px, jump_px, fit.overlap, fit.through, told, apart)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:

@@ -36,7 +36,7 @@ _NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class RunEvidence:
     """What speaks for and against one object in the n frames of a run; NaN where nothing is known.
 
     frame_index   (n,)
@@ -93,11 +93,11 @@ class _Rule:
     name: str
     text: str
     limit: float
-    against: Callable[[Evidence], np.ndarray]
-    count: Callable[[Evidence], np.ndarray]
+    against: Callable[[RunEvidence], np.ndarray]
+    count: Callable[[RunEvidence], np.ndarray]
 
 
-def _known(key: str) -> Callable[[Evidence], np.ndarray]:
+def _known(key: str) -> Callable[[RunEvidence], np.ndarray]:
     return lambda e: np.isfinite(getattr(e, key))
 
 
@@ -157,7 +157,7 @@ _RULES = (
 )
 
 
-def suspicions(e: Evidence) -> tuple[Suspicion, ...]:
+def suspicions(e: RunEvidence) -> tuple[Suspicion, ...]:
     """Everything that speaks against an object's part of a run; none: nothing that a run keeps does."""
     found = [Suspicion("start", text) for text in e.told]
     if e.apart > APART:
@@ -178,7 +178,7 @@ def median_of_known(values: np.ndarray) -> float:
     return float(np.median(known)) if len(known) else float("nan")
 
 
-def _absent(e: Evidence) -> Suspicion | None:
+def _absent(e: RunEvidence) -> Suspicion | None:
     """Away at the end, or for most of the run: a run cannot tell what is out of view from what it does not find."""
     if not e.has_pose.any():
         return _suspicion("absent", "no pose in any frame", e, ~e.has_pose)
@@ -192,7 +192,7 @@ def _absent(e: Evidence) -> Suspicion | None:
     return None
 
 
-def _size(e: Evidence) -> Suspicion | None:
+def _size(e: RunEvidence) -> Suspicion | None:
     known = e.seen & np.isfinite(e.size_m)
     if not known.any() or SHORTEST_M <= (size_m := float(np.median(e.size_m[known]))) <= LONGEST_M:
         return None
@@ -201,7 +201,7 @@ def _size(e: Evidence) -> Suspicion | None:
     return _suspicion("size", text, e, known & ((e.size_m > LONGEST_M) | (e.size_m < SHORTEST_M)), known)
 
 
-def _suspicion(rule: str, text: str, e: Evidence, wrong: np.ndarray, count: np.ndarray | None = None) -> Suspicion:
+def _suspicion(rule: str, text: str, e: RunEvidence, wrong: np.ndarray, count: np.ndarray | None = None) -> Suspicion:
     """One of frames ``wrong`` (n,) bool; those between two of them that do not ``count`` are named with them."""
     at = np.flatnonzero(wrong if count is None else count)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong[at], [False]]).astype(int)))

@@ -79,14 +79,14 @@ def chosen(config: Config) -> frozenset[str]:
     >>> sorted(chosen(preset()) - chosen(some)), chosen(preset("paper"))
     (['outline', 'size'], frozenset())
     """
-    said = config.method.mechanisms.strip()
-    if said in (ALL, NONE):
-        return frozenset(MECHANISMS if said == ALL else ())
-    names = {name.strip() for name in said.removeprefix(ALL_BUT).split(",")}
+    spec = config.method.mechanisms.strip()
+    if spec in (ALL, NONE):
+        return frozenset(MECHANISMS if spec == ALL else ())
+    names = {name.strip() for name in spec.removeprefix(ALL_BUT).split(",")}
     for name in sorted(names - set(MECHANISMS)):
         expected = f"all, none, or names, or all but names, of {', '.join(MECHANISMS)}"
         raise BadInput("config method.mechanisms", repr(name), expected, did_you_mean(name, MECHANISMS))
-    return frozenset(set(MECHANISMS) - names if said.startswith(ALL_BUT) else names)
+    return frozenset(set(MECHANISMS) - names if spec.startswith(ALL_BUT) else names)
 
 
 class Point2Pose(pipeline.Point2Pose):
@@ -126,7 +126,7 @@ class Point2Pose(pipeline.Point2Pose):
             self._turn = turn
 
     def add_object(
-        self, name: str, *said: Any, memory: ObjectMemory | None = None, frozen: bool = False, **more: Any
+        self, name: str, *prompt: Any, memory: ObjectMemory | None = None, frozen: bool = False, **more: Any
     ) -> None:
         """As in :class:`p2p_lib.core.objects.Objects`, or an object that is known from a memory.
 
@@ -137,10 +137,10 @@ class Point2Pose(pipeline.Point2Pose):
         Raises :class:`BadInput` for a memory together with clicks or masks, and with preset ``paper``.
         """
         if memory is None:
-            super().add_object(name, *said, **more)
+            super().add_object(name, *prompt, **more)
             return
-        if said or more or name in self.objects:
-            got = "clicks or a mask, too" if said or more else f"{name!r}, which is in use"
+        if prompt or more or name in self.objects:
+            got = "clicks or a mask, too" if prompt or more else f"{name!r}, which is in use"
             raise BadInput("add_object with a memory", got, "a new name and the memory alone")
         if not chosen(self.config):
             raise BadInput("add_object with a memory", "mechanisms none", "preset default: the paper has no memory")
@@ -167,8 +167,8 @@ class Point2Pose(pipeline.Point2Pose):
         """
         about, learnt = read_memories(path, _SAVED, _SAVED_BY)
         try:
-            said = {name: about[name] for name in ("tracker", "detector", "segmenter")} | parts
-            loaded = cls(camera or Camera(**about["camera"]), from_dict(about["config"], str(path)), **said)
+            named = {name: about[name] for name in ("tracker", "detector", "segmenter")} | parts
+            loaded = cls(camera or Camera(**about["camera"]), from_dict(about["config"], str(path)), **named)
             for name, frozen in about["objects"].items():
                 loaded.add_object(name, memory=learnt.get(name), frozen=frozen)
         except (KeyError, TypeError, AttributeError) as error:

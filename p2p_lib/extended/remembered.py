@@ -25,7 +25,7 @@ from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.agreement import outline_share
 from p2p_lib.extended.image_search import ImageSearch, Sighting, laid_at
 from p2p_lib.extended.lifecycle import CONFIRM_FRAMES
-from p2p_lib.extended.sight import Sight
+from p2p_lib.extended.observation import OurObservation
 from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method.object_model import Known, Requests
 from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
@@ -95,16 +95,16 @@ class Remembered(TwoMaps):
     @property
     def recalls(self) -> bool:
         """Whether it is to be looked for by its landmarks."""
-        return not self.life.has_pose or (self._bare and not self._sure)
+        return not self.life.has_pose or (self._bare and not self._confirmed)
 
     @property
-    def _sure(self) -> bool:
+    def _confirmed(self) -> bool:
         return self._borne_out >= CONFIRM_FRAMES
 
     @property
     def forsaken(self) -> bool:
         """Whether it was claimed to be there, and neither points nor landmarks have confirmed that."""
-        return self._claimed and not self._sure and self._in_vain >= _PATIENCE
+        return self._claimed and not self._confirmed and self._in_vain >= _PATIENCE
 
     def withdraw(self) -> Requests:
         """Withdraw the claim, with everything learnt since."""
@@ -214,7 +214,7 @@ class Remembered(TwoMaps):
 
     # -- the step ------------------------------------------------------------------------------
 
-    def step(self, obs: Sight) -> ObjectStep:
+    def step(self, obs: OurObservation) -> ObjectStep:
         """The object's pose at a frame; once it is followed, landmarks that have come into view are added."""
         given = obs.mask is not None and obs.given
         if not given and not (self._claimed and (obs.mask is not None or self.life.T_cam_obj is not None)):
@@ -224,7 +224,7 @@ class Remembered(TwoMaps):
         if step.estimate.T_cam_obj is not None:
             self._claimed, self._bare = True, step.estimate.inliers < _BARE
             self._borne_out += step.estimate.inliers >= self.config.lifecycle.return_inliers
-            self.policy.frozen = self.frozen or not self._sure
+            self.policy.frozen = self.frozen or not self._confirmed
         self._since += 1
         due = self._since >= _EVERY and step.estimate.T_cam_obj is not None and self.known.map_id == 0
         if not due or followed >= _ENOUGH or step.estimate.status is Status.DEGRADED or obs.mask is None:
@@ -232,7 +232,7 @@ class Remembered(TwoMaps):
         self._since = 0
         return replace(step, requests=self._with_more(step.requests, obs, step.estimate.T_cam_obj))
 
-    def _with_more(self, requests: Requests, obs: Sight, T_cam_obj: np.ndarray) -> Requests:
+    def _with_more(self, requests: Requests, obs: OurObservation, T_cam_obj: np.ndarray) -> Requests:
         """Requests with landmarks that are seen under a pose, and are not followed yet."""
         absent = np.flatnonzero(~np.isin(self._key, self.map.keys))
         p_obj, descriptors = self._memory.p_obj[absent], self._memory.descriptors[absent]
@@ -243,11 +243,11 @@ class Remembered(TwoMaps):
         add_px, keys = np.concatenate([requests.add_px, seen.uv_px]), np.concatenate([requests.keys, keys])
         return replace(requests, add_px=add_px, keys=keys)
 
-    def _outgrown(self, obs: Sight) -> bool:
+    def _outgrown(self, obs: OurObservation) -> bool:
         """A memory is never founded anew."""
         return False
 
-    def _turned_over(self, obs: Sight) -> bool:
+    def _turned_over(self, obs: OurObservation) -> bool:
         """No second map where the map does not grow."""
         return not self.policy.frozen and super()._turned_over(obs)
 

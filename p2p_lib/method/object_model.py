@@ -47,21 +47,21 @@ class Requests:
 class ObjectModel:
     """Keypoints, surface and graph of one object; rows of observations are rows of ``map``.
 
-    Mapping, the graph's solution and the fusion of views, runs in the background by the executor ``beside``; reading
+    Mapping, the graph's solution and the fusion of views, runs in the background by ``executor``; reading
     surface or graph waits for it. :meth:`adopt` waits, too, and takes the solution into the map in the next frame:
     results do not depend on threads or timing.
     """
 
     make_graph, make_views = ObjectGraph, KeyframeViews
 
-    def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch, beside: Executor):
+    def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch, executor: Executor):
         self.config = config
         self.map = KeypointMap(config.keypoint_map)
         self._surface = _volume(config) if config.method.surface else None
         self._graph = self.make_graph(config.factor_graph) if config.method.graph else None
         self.views = self.make_views()
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
-        self._observer, self._stopwatch, self._beside = observer, stopwatch, beside
+        self._observer, self._stopwatch, self._executor = observer, stopwatch, executor
         self._mapping: Future | None = None  # the newest background job; each waits for the one before
         self._solved: Future[GraphResult | None] | None = None  # the graph's newest solution, to be adopted
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
@@ -93,7 +93,7 @@ class ObjectModel:
                 before.result()
             return work(*args)
 
-        self._mapping = self._beside.submit(after)
+        self._mapping = self._executor.submit(after)
         return self._mapping
 
     def _settle(self) -> None:

@@ -176,11 +176,11 @@ class _Problem:
 
     # -- the two kinds of residual -----------------------------------------------------------------
 
-    def surface(self, T: np.ndarray, widest_m: float = 0.0, beside: _Linear | None = None) -> _Linear | None:
+    def surface(self, T: np.ndarray, widest_m: float = 0.0, nearby: _Linear | None = None) -> _Linear | None:
         """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points can be used.
 
         Trims outliers by the MAD, but nothing within ``widest_m`` nor within Huber's threshold. The eigenvectors are
-        those of ``beside``, a pose nearby, where it is given: they hardly change.
+        those of ``nearby``, another pose, where it is given: they hardly change.
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj)
@@ -192,7 +192,7 @@ class _Problem:
         if len(used) < MIN_POINTS:
             return None
         distance = np.where(valid, np.abs(value), np.inf)
-        held = (beside.eigenvalues, beside.directions) if beside else self.eigen(used, J)
+        held = (nearby.eigenvalues, nearby.directions) if nearby else self.eigen(used, J)
         return _Linear(T, distance, H, g, *held, cut, used, J, rms, sigma)
 
     def eigen(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -308,9 +308,9 @@ def _linearised(p_obj, centre, radius, value, gradient, valid, floor_m, reach_m,
     H, g = np.zeros((6, 6)), np.zeros(6)
     if len(near) < MIN_POINTS:
         return near, np.zeros((0, 6)), H, g, 0.0, 0.0, 0.0
-    middle = _upper_median(value[near])
-    sigma = max(_MAD_TO_SIGMA * _upper_median(np.abs(value[near] - middle)), floor_m)
-    cut = max(abs(middle) + _MAD_TRIM * sigma, least_m)
+    median = _upper_median(value[near])
+    sigma = max(_MAD_TO_SIGMA * _upper_median(np.abs(value[near] - median)), floor_m)
+    cut = max(abs(median) + _MAD_TRIM * sigma, least_m)
     used = near[np.abs(value[near]) <= cut]
     J, squares = surface_jacobian((p_obj[used] - centre) / radius, gradient[used]), 0.0
     for n in range(len(used)):

@@ -33,7 +33,7 @@ STEP_M = 0.02
 
 
 @dataclass(eq=False)
-class Evidence:
+class VideoEvidence:
     """What the n frames of a run show of an object.
 
     clouds   (n,) each (P, 3) float32, points of its surface in the camera frame
@@ -55,10 +55,10 @@ class Evidence:
         return np.array(self.mask_px) >= MIN_VISIBLE_PX
 
 
-def gather(made: Finished, names: list[str], config: Config, bar: Any) -> dict[str, Evidence]:
+def gather(made: Finished, names: list[str], config: Config, bar: Any) -> dict[str, VideoEvidence]:
     """Object to what the video shows of it."""
     logs, frames, camera = load_keypoints(made.run.path), made.frames, made.sequence.camera
-    found = {name: Evidence() for name in names}
+    found = {name: VideoEvidence() for name in names}
     wanted = evenly(np.arange(len(frames)), KEYFRAMES)
     for k, i in enumerate(frames.tolist()):
         frame, masks = made.sequence.frame(i), made.masks(i)
@@ -82,7 +82,7 @@ def gather(made: Finished, names: list[str], config: Config, bar: Any) -> dict[s
 class VideoPoses:
     """An object's poses by all its tracks and features."""
 
-    def __init__(self, made: Finished, obj: ObjectRun, config: Config, evidence: Evidence):
+    def __init__(self, made: Finished, obj: ObjectRun, config: Config, evidence: VideoEvidence):
         self.obj, self.camera, self.config, self.seed = obj, made.sequence.camera, config, made.run.info["seed"]
         self.key, self.views, self.tracks = np.array(evidence.key, int), evidence.views, evidence.tracks
 

@@ -16,9 +16,9 @@ from p2p_lib.datasets.runs import NO_COVARIANCE, NO_POSE
 from p2p_lib.method.refinement import Keypoints, refine
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.offline.adjustment import Sightings
-from p2p_lib.offline.evidence import STEP_M, Evidence
+from p2p_lib.offline.evidence import STEP_M, VideoEvidence
 from p2p_lib.offline.finished import Finished
-from p2p_lib.offline.sight import Found, Sight, off_surface
+from p2p_lib.offline.surface_check import Found, SurfaceCheck, off_surface
 
 #: A point within this distance of its place by a pose is a keypoint of the pose, m.
 _NEAR_M = 0.02
@@ -49,7 +49,7 @@ class SurfacePoses:
         T: np.ndarray,
         points: np.ndarray,
         seen: Sightings,
-        evidence: Evidence,
+        evidence: VideoEvidence,
         volume: TsdfVolume,
         camera: Camera,
         config: Config,
@@ -68,7 +68,7 @@ class SurfacePoses:
         cost = self.cost[sure]
         self.limit = np.median(cost) + _SIGMAS * median_abs_deviation(cost, scale="normal") + _SLACK
 
-    def ask_neighbours(self, sight: Sight | None) -> None:
+    def ask_neighbours(self, check: SurfaceCheck | None) -> None:
         """Try frames that do not fit from their neighbours, from the end backwards, then from the start forwards."""
         T, cost, shown = self.T, self.cost, self._evidence.shown
         for step in (-1, 1):
@@ -82,7 +82,7 @@ class SurfacePoses:
                 if shown[k]:
                     found = self._best_of(k, [T[k - step], on])
                 else:
-                    found = sight.found(k, [on, T[k - step]], k - step, T[k - step]) if sight else None
+                    found = check.found(k, [on, T[k - step]], k - step, T[k - step]) if check else None
                 if found is not None and found.cost < cost[k]:
                     T[k], self.covariance[k], cost[k] = found
 

@@ -5,21 +5,21 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from p2p_lib.evaluation.suspicions import Evidence, suspicions
+from p2p_lib.evaluation.suspicions import RunEvidence, suspicions
 
 N = 100
 ROWS = np.arange(N)
 
 
-def spotless() -> Evidence:
+def spotless() -> RunEvidence:
     full = np.ones(N)
     numbers = {"mask_px": 5000, "size_m": 0.15, "keypoints": 40, "inside": 1, "off_px": 0.5, "jump_px": 0.2}
     numbers |= {"overlap": 0.9, "through": 0.01, "confidence": 0.9}
     numbers = {key: value * full for key, value in numbers.items()}
-    return Evidence(frame_index=10 + ROWS, has_pose=full > 0, elsewhere=full < 0, **numbers)
+    return RunEvidence(frame_index=10 + ROWS, has_pose=full > 0, elsewhere=full < 0, **numbers)
 
 
-def with_some(e: Evidence, share: float, **wrong: float) -> Evidence:
+def with_some(e: RunEvidence, share: float, **wrong: float) -> RunEvidence:
     """The same with these values in a share of the frames, the 21st and those after it."""
     at = (ROWS >= 20) & (ROWS < 20 + round(share * N))
     return replace(e, **{key: np.where(at, value, getattr(e, key)) for key, value in wrong.items()})
@@ -59,7 +59,7 @@ def test_maps_that_never_met():
     assert "maps" not in {s.rule for s in suspicions(with_some(spotless(), 0.04, has_pose=False, elsewhere=True))}
 
 
-def gone(rows: np.ndarray) -> Evidence:
+def gone(rows: np.ndarray) -> RunEvidence:
     e = spotless()
     return replace(e, has_pose=e.has_pose & ~rows, mask_px=np.where(rows, 0, e.mask_px))
 
@@ -93,7 +93,7 @@ def test_stretches_are_named_across_frames_that_do_not_count():
 
 
 def test_what_is_not_known_is_not_held_against_anybody():
-    unknown = {f.name for f in fields(Evidence)} - {
+    unknown = {f.name for f in fields(RunEvidence)} - {
         "frame_index",
         "has_pose",
         "elsewhere",

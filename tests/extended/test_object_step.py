@@ -17,9 +17,9 @@ from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.extended.confidence import Belief
 from p2p_lib.extended.default import chosen, object_tracker
 from p2p_lib.extended.image_search import ImageSearch
+from p2p_lib.extended.observation import area_m2, expected_px
 from p2p_lib.extended.outlook import Outlook
 from p2p_lib.extended.policy import OurPolicy, Proposal
-from p2p_lib.extended.sight import area_m2, expected_px
 from p2p_lib.method import refinement
 from p2p_lib.method.object_tracker import ObjectStep
 from p2p_lib.method.registration import Hypothesis
@@ -157,7 +157,7 @@ class Later(Executor):
 def test_it_does_not_matter_when_mapping_is_done():
     """A keyframe in every third frame, which the graph moves: the poses are the same to the last bit."""
     at_once, late = (Lump(keypoint_map__keyframe_angle_deg=5.0) for _ in range(2))
-    late.tracker.model._beside = Later()
+    late.tracker.model._executor = Later()
     for deg in range(0, 40, 2):
         one, other = at_once.see(turned(deg)).estimate, late.see(turned(deg)).estimate
         assert np.array_equal(one.T_cam_obj, other.T_cam_obj) and one.keyframe == other.keyframe

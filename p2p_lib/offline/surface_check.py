@@ -50,7 +50,7 @@ def off_surface(volume: TsdfVolume, T_cam_obj: np.ndarray, cloud: np.ndarray) ->
     return np.where(valid, np.minimum(np.abs(distance_m), _FAR_M), _FAR_M) / _FAR_M
 
 
-class Sight:
+class SurfaceCheck:
     """Looks at one object's surface, which has faces, in the frames of a run.
 
     sure  rows of frames with a certain pose in T (n, 4, 4): they say how its colours usually look
