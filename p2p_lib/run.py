@@ -182,8 +182,8 @@ def export_run(
     path = run.info.get("path")
     sequence = sequences.open_sequence(path, run.info["format"]) if path and Path(path).is_dir() else None
     frames = model_frames(run) if in_model else None
-    sure = {name: obj.of_confidence(min_confidence) for name, obj in run.objects.items()}
-    return export(replace(run, objects=sure), out, format, frames, sequence)
+    confident = {name: obj.of_confidence(min_confidence) for name, obj in run.objects.items()}
+    return export(replace(run, objects=confident), out, format, frames, sequence)
 
 
 @dataclass(frozen=True, eq=False)

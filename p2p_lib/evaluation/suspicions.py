@@ -47,7 +47,7 @@ class RunEvidence:
     off_px        (n,) median distance of these from where the pose puts them
     jump_px       (n,) how differently from what was seen the poses moved them since the frame before
     overlap       (n,) of silhouette and mask, through (n,) the share of the surface behind which depth was measured
-    told          what was doubted when the run was made, in words
+    doubts        what was doubted when the run was made, in words
     apart         the share of the first mask that is apart from its largest part
     """
 
@@ -63,7 +63,7 @@ class RunEvidence:
     jump_px: np.ndarray
     overlap: np.ndarray
     through: np.ndarray
-    told: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     apart: float = 0.0
 
     @property
@@ -159,7 +159,7 @@ _RULES = (
 
 def suspicions(e: RunEvidence) -> tuple[Suspicion, ...]:
     """Everything that speaks against an object's part of a run; none: nothing that a run keeps does."""
-    found = [Suspicion("start", text) for text in e.told]
+    found = [Suspicion("start", text) for text in e.doubts]
     if e.apart > APART:
         found.append(Suspicion("start", f"{100 * e.apart:.0f} % of the first mask is apart: two objects?"))
     found += [s for s in (_absent(e), _size(e)) if s is not None]

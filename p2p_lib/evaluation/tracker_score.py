@@ -144,7 +144,7 @@ def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, sea
         cpu_ms[i] = 1e3 * (time.process_time() - start)
         if tracks is not None and answered >= first:
             rows = np.flatnonzero(np.isin(ids, tracks.ids))
-            told = tracks.select(ids[rows])
-            uv[answered, rows], visible[answered, rows] = told.uv_px, told.visible
-            uncertainty[answered, rows] = told.uncertainty
+            answer = tracks.select(ids[rows])
+            uv[answered, rows], visible[answered, rows] = answer.uv_px, answer.visible
+            uncertainty[answered, rows] = answer.uncertainty
     return TrackRun(uv, visible, uncertainty, cpu_ms)

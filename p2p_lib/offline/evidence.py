@@ -125,8 +125,8 @@ class VideoPoses:
             point = np.concatenate([point, len(known) + label[used]])
             points = np.concatenate([points, np.concatenate([view.p_cam for view in self.views])[used]])
         z = points[:, 2]
-        sure = information(points, z / self.camera.fx, depth_noise_m(z, self.config.depth))
-        return Sightings(pose, point, points, sure)
+        weights = information(points, z / self.camera.fx, depth_noise_m(z, self.config.depth))
+        return Sightings(pose, point, points, weights)
 
     def adjusted(self, T: np.ndarray, found: Sightings) -> tuple[np.ndarray, np.ndarray, Sightings]:
         """Adjusted poses, points (N, 3) and their sightings, in the order of frames.

@@ -99,16 +99,16 @@ class Finished:
     def trusted(self, min_confidence: float = DOUBTED) -> dict[str, np.ndarray]:
         """Object to (n,) bool: its poses that are labels, by :data:`RULE`; unseen objects must have no pose at all."""
         objects = {name: self.run.objects[name] for name in self.tracked}
-        sure = {name: obj.has_pose & (obj.confidence > min_confidence) for name, obj in objects.items()}
+        confident = {name: obj.has_pose & (obj.confidence > min_confidence) for name, obj in objects.items()}
         unseen = {name: np.ones(len(obj), bool) for name, obj in objects.items()}
         for k, frame in enumerate(self.frames):
-            if all(of[k] for of in sure.values()):
+            if all(of[k] for of in confident.values()):
                 continue
             for name, mask in self.masks(int(frame)).items():
                 if name in unseen:
                     unseen[name][k] = not mask.any()
-        kept = np.logical_and.reduce([sure[name] | (unseen[name] & ~objects[name].has_pose) for name in objects])
-        return {name: of & kept for name, of in sure.items()}
+        kept = np.logical_and.reduce([confident[name] | (unseen[name] & ~objects[name].has_pose) for name in objects])
+        return {name: of & kept for name, of in confident.items()}
 
 
 @dataclass(frozen=True, eq=False)

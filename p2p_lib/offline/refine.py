@@ -71,9 +71,9 @@ def refine_run(folder: str | Path, progress: bool = False) -> list[str]:
             evidence = gather(made, todo, config, bar) if todo else {}
             for name in todo:
                 _part(made, name, config, evidence.pop(name), parts, bar)
-        told = _write(made, parts, stamp)
+        summary = _write(made, parts, stamp)
         shutil.rmtree(parts)
-    return told
+    return summary
 
 
 def _stamp(folder: Path) -> str:
@@ -90,12 +90,12 @@ def _part(made: Finished, name: str, config: Config, evidence: VideoEvidence, pa
     start, strong = video.tied()
     T, points, seen = video.adjusted(start, video.sightings(strong))
     posed = np.isfinite(T[:, 0, 0])
-    sure = np.flatnonzero(posed & (obj.confidence > DOUBTED))
-    sure = sure if len(sure) else np.flatnonzero(posed)
-    volume = fused(made, name, T, evenly(sure, FUSED), config, voxel_m)
+    confident = np.flatnonzero(posed & (obj.confidence > DOUBTED))
+    confident = confident if len(confident) else np.flatnonzero(posed)
+    volume = fused(made, name, T, evenly(confident, FUSED), config, voxel_m)
     poses = SurfacePoses(T, points, seen, evidence, volume, made.sequence.camera, config)
-    poses.refine(start, sure, bar)
-    check = SurfaceCheck(made, name, config, volume, poses.T, sure) if len(volume.mesh().faces) else None
+    poses.refine(start, confident, bar)
+    check = SurfaceCheck(made, name, config, volume, poses.T, confident) if len(volume.mesh().faces) else None
     poses.ask_neighbours(check)
     columns, fits = _columns(obj, poses, evidence, check)
     last = evenly(np.flatnonzero(fits & evidence.shown), FUSED_LAST)
@@ -175,7 +175,7 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
     shutil.rmtree(new, ignore_errors=True)
     (new / "poses").mkdir(parents=True)
     arrays: dict[str, np.ndarray] = {}
-    told, disagrees = [], {}
+    summary, disagrees = [], {}
     for name, obj in made.run.objects.items():
         part = load_arrays(parts / f"{name}.npz")
         offline = _merged(obj, part) if part else obj
@@ -187,7 +187,7 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
         disagrees[name] = [int(obj.frame_index[k]) for k in off]
         more, less = int((has & ~obj.has_pose).sum()), int((~has & obj.has_pose).sum())
         line = f"{name}: a pose in {int(has.sum())} of {len(obj)} frames ({more} more, {less} fewer than causally)"
-        told.append(
+        summary.append(
             line + f", {len(off)} of them more than three sigmas from the causal one" + in_ranges(disagrees[name])
         )
     with replacing(new / "poses.npz") as file:
@@ -201,7 +201,7 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
     replace_text(new / "run.json", json.dumps(made.run.info | about, indent=1, ensure_ascii=False) + "\n")
     shutil.rmtree(made.run.path / OFFLINE, ignore_errors=True)
     new.rename(made.run.path / OFFLINE)
-    return told
+    return summary
 
 
 def in_ranges(frames: list[int]) -> str:

@@ -59,13 +59,13 @@ class SurfacePoses:
         self._points, self._seen, self._evidence, self._volume = points, seen, evidence, volume
         self._camera, self._config = camera, config
 
-    def refine(self, start: np.ndarray, sure: np.ndarray, bar: Any) -> None:
-        """Refine each pose from itself and from ``start`` (n, 4, 4); ``sure`` rows set the limit of costs."""
+    def refine(self, start: np.ndarray, confident: np.ndarray, bar: Any) -> None:
+        """Refine each pose from itself and from ``start`` (n, 4, 4); ``confident`` rows set the limit of costs."""
         for k in range(len(self.T)):
             if np.isfinite(self.T[k, 0, 0]):
                 self.T[k], self.covariance[k], self.cost[k] = self._best_of(k, [self.T[k], start[k]])
             bar.update()
-        cost = self.cost[sure]
+        cost = self.cost[confident]
         self.limit = np.median(cost) + _SIGMAS * median_abs_deviation(cost, scale="normal") + _SLACK
 
     def ask_neighbours(self, check: SurfaceCheck | None) -> None:

@@ -53,29 +53,31 @@ def off_surface(volume: TsdfVolume, T_cam_obj: np.ndarray, cloud: np.ndarray) ->
 class SurfaceCheck:
     """Looks at one object's surface, which has faces, in the frames of a run.
 
-    sure  rows of frames with a certain pose in T (n, 4, 4): they say how its colours usually look
+    confident  rows of frames with a certain pose in T (n, 4, 4): they say how its colours usually look
     """
 
-    def __init__(self, made: Finished, name: str, config: Config, volume: TsdfVolume, T: np.ndarray, sure: np.ndarray):
+    def __init__(
+        self, made: Finished, name: str, config: Config, volume: TsdfVolume, T: np.ndarray, confident: np.ndarray
+    ):
         self._made, self._name, self._config, self._volume = made, name, config, volume
         mesh: Any = volume.mesh()  # its colours are those of vertices
         colours = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float)
         self._colours = colours[mesh.faces].mean(1)
         self._render = Renderer(mesh.vertices, mesh.faces, made.sequence.camera)
-        looks = (self._look(self._frame(k), T[k]) for k in evenly(sure, _CALIBRATED))
+        looks = (self._look(self._frame(k), T[k]) for k in evenly(confident, _CALIBRATED))
         usual = [look.off for look in looks if look]
         self._usual = float(np.median(usual)) if usual else 0.0
 
     def _frame(self, k: int) -> Frame:
         return self._made.sequence.frame(int(self._made.frames[k]))
 
-    def found(self, k: int, candidates: list[np.ndarray], beside: int, T_beside: np.ndarray) -> Found | None:
+    def found(self, k: int, candidates: list[np.ndarray], neighbour: int, T_neighbour: np.ndarray) -> Found | None:
         """The best pose of the k-th frame; None where the surface is not seen from any of these.
 
-        beside  a frame next to it with its pose, in the same light
+        neighbour  a frame next to it with its pose, in the same light
         """
         frame, best = self._frame(k), None
-        known = self._look(self._frame(beside), T_beside)
+        known = self._look(self._frame(neighbour), T_neighbour)
         usual, alike = (max(self._usual, known.off), known.alike) if known else (self._usual, 1.0)
         for T in candidates:
             covariance = None

@@ -80,7 +80,7 @@ def test_what_is_away_may_be_lost(rows, says):
 
 
 def test_how_it_started():
-    found = suspicions(replace(spotless(), told=("clicks on 'cup': flat",), apart=0.4))
+    found = suspicions(replace(spotless(), doubts=("clicks on 'cup': flat",), apart=0.4))
     assert [s.rule for s in found] == ["start", "start"] and "40 % of the first mask is apart" in found[1].text
 
 
