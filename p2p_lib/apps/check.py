@@ -140,8 +140,8 @@ def check_folder(
             findings.append(_size(name, sizes_m[name], frame, mask, sequence.camera))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         findings.append(_range(name, frame, mask, config, scale))
-        said = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
-        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in said]
+        warned = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
+        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in warned]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
     return findings
 
@@ -298,8 +298,8 @@ def _units(median_m: float, scale: float) -> str:
     """The units of the field that bring a depth to where things stand before a camera, likeliest first, in words."""
     fits = [(unit, what, median_m * unit / scale) for unit, what in UNITS_M.items() if not np.isclose(unit, scale)]
     fits = [(unit, what, m) for unit, what, m in fits if _STANDS_M[0] <= m <= _STANDS_M[1]][:3]
-    said = [f"{unit:g} ({what}) would make it {m:.2g} m" for unit, what, m in fits]
-    return f"A unit of {', of '.join(said)}" if said else ""
+    units = [f"{unit:g} ({what}) would make it {m:.2g} m" for unit, what, m in fits]
+    return f"A unit of {', of '.join(units)}" if units else ""
 
 
 def _registered(frames: list[Frame]) -> Finding:

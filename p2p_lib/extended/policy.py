@@ -100,9 +100,7 @@ class OurPolicy(Policy):
         self.frozen = False  # whether the map does not grow
         # The last pose, and where the object lies that had it, by the scene as seen last.
         self._lies: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
-        self.trusted: OurObservation | None = (
-            None  # the newest frame without a doubt; None if the object was hidden since
-        )
+        self.trusted: OurObservation | None = None  # the newest frame without a doubt; None if hidden since
 
     # -- propose -------------------------------------------------------------------------------
 
@@ -248,9 +246,9 @@ class OurPolicy(Policy):
         slides = "sliding_gate" in self.on and may_slide(best.refined, self.config.refinement.min_eigenvalue)
         fit = self._contour(obs, known, best.refined)
         rests = self._rests(obs, known, best) if "rest" in self.on else None
-        also = {"size": size, "outline": outline, "still": obs.still, "carried": carried, "slides": slides}
-        also["contour"] = 0.0 if fit is None else fit.share(best.T_cam_obj)
-        evidence = replace(best.evidence, rests=rests, **also)
+        terms = {"size": size, "outline": outline, "still": obs.still, "carried": carried, "slides": slides}
+        terms["contour"] = 0.0 if fit is None else fit.share(best.T_cam_obj)
+        evidence = replace(best.evidence, rests=rests, **terms)
         return judge(known.life, evidence, self.on, self.config.lifecycle)
 
     def judge_other(self, obs: OurObservation, known: Known, best: Proposal) -> Judgement:

@@ -54,7 +54,7 @@ _BARE, _PATIENCE = 4, 5
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Recognition:
     """Where a remembered object is in an image: its ``mask`` (H, W) bool, what shows of it, and landmarks there.
 
     rows  (M,) of the landmarks in the memory, seen at uv_px (M, 2)
@@ -116,7 +116,7 @@ class Remembered(TwoMaps):
         """The memory that this map began with; None for a later map."""
         return self._memory if map_id == 0 else None
 
-    def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
+    def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Recognition | None:
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool.
 
         It counts as found where one of the last looks found it, too, or where its pose has it; in a mask, at once.
@@ -139,7 +139,7 @@ class Remembered(TwoMaps):
         moved_m = se3.transform(T_cam_obj, p_obj).mean(0) - se3.transform(other, p_obj).mean(0)
         return bool(np.linalg.norm(moved_m) < np.ptp(p_obj, 0).max() / 2 + _FASTEST_M_S * after_s)
 
-    def _look(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
+    def _look(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Recognition | None:
         """Where it may be in one frame."""
         memory, best = self._memory, None
         search = ImageSearch(frame, self.observer.camera, self.config.depth)
@@ -162,7 +162,7 @@ class Remembered(TwoMaps):
         if best is None:
             return None
         _, where, sighting, seen = best
-        return Found(where, sighting, seen.rows, seen.uv_px)
+        return Recognition(where, sighting, seen.rows, seen.uv_px)
 
     def _sightings(
         self, frame: Frame, search: ImageSearch, mask: np.ndarray | None, taken: np.ndarray | None
@@ -260,7 +260,7 @@ def _certain(landmarks: float, share: float, outline: Callable[[], float | None]
     return landmarks >= 1 and share >= _SHARE and (outline() or 0.0) >= _OUTLINE
 
 
-def follow(obj: Remembered, found: Found, tracker: PointTracker, tracks: Tracks) -> Tracks:
+def follow(obj: Remembered, found: Recognition, tracker: PointTracker, tracks: Tracks) -> Tracks:
     """Have the tracker follow the landmarks found; returns all objects' tracks in this frame, with these."""
     keys, ids = obj.taken_in(found.rows), tracker.add(found.uv_px)
     obj.map.assign(keys, ids)

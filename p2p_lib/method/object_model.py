@@ -84,7 +84,7 @@ class ObjectModel:
         self._settle()
         return self._graph
 
-    def _beside_after(self, work: Callable[..., object], *args: object) -> Future:
+    def _submit(self, work: Callable[..., object], *args: object) -> Future:
         """Run ``work`` in the background, after all earlier jobs: mapping is sequential."""
         before = self._mapping
 
@@ -180,7 +180,7 @@ class ObjectModel:
         self.views.add(T_cam_obj)
         self._since_keyframe = 0
         gone, drop = self.map.retire()
-        self._solved = self._beside_after(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone)
+        self._solved = self._submit(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone)
         return Requests(drop=drop, add_px=uv_px, keys=keys)
 
     def _map_keyframe(
@@ -222,7 +222,7 @@ class ObjectModel:
     def settle_surface(self) -> None:
         """Re-integrate the keyframe that the graph has moved farthest: one a frame, so that no frame waits long."""
         if self._surface is not None and self._corrected:
-            self._beside_after(self._follow_graph)
+            self._submit(self._follow_graph)
 
     def _follow_graph(self) -> None:
         if not self._surface.move(self._corrected, limit=1):

@@ -21,7 +21,7 @@ from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.offline import loops
-from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
+from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished
 
 #: Keyframes that are compared with each other, and poses that are adjusted together.
@@ -110,7 +110,7 @@ class VideoPoses:
         strength = loops.rated(T_a_b, max(agree, 1), self.views[a], self.views[b], self.camera)
         return a, b, T_a_b, max(strength, _LEAST)
 
-    def sightings(self, strong: list[loops.Tie]) -> Sightings:
+    def sightings(self, strong: list[loops.Tie]) -> PointObservations:
         """The sightings of tracks and of features matched by ties; ``pose`` is the frame's row."""
         ids, points = (np.concatenate(part) for part in zip(*self.tracks))
         pose = np.repeat(np.arange(len(self.tracks)), [len(of) for of, _ in self.tracks])
@@ -126,9 +126,9 @@ class VideoPoses:
             points = np.concatenate([points, np.concatenate([view.p_cam for view in self.views])[used]])
         z = points[:, 2]
         weights = information(points, z / self.camera.fx, depth_noise_m(z, self.config.depth))
-        return Sightings(pose, point, points, weights)
+        return PointObservations(pose, point, points, weights)
 
-    def adjusted(self, T: np.ndarray, found: Sightings) -> tuple[np.ndarray, np.ndarray, Sightings]:
+    def adjusted(self, T: np.ndarray, found: PointObservations) -> tuple[np.ndarray, np.ndarray, PointObservations]:
         """Adjusted poses, points (N, 3) and their sightings, in the order of frames.
 
         Keyframes and some others are adjusted together; the other frames are located by the points of these.

@@ -19,10 +19,10 @@ from p2p_lib.datasets.models import MESHES, find_models, load_mesh, read_mesh
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.offline import evidence, loops
 from p2p_lib.offline import refine as offline
-from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
+from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished
 from p2p_lib.offline.surface import SurfacePoses, fused
-from p2p_lib.offline.surface_check import Found, SurfaceCheck
+from p2p_lib.offline.surface_check import FittedPose, SurfaceCheck
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 CAMERA = Camera(500, 500, 159.5, 119.5, 320, 240)
@@ -37,7 +37,7 @@ def scene():
     pose, point = (x.ravel() for x in np.meshgrid(np.arange(20), np.arange(40), indexing="ij"))
     p_cam = se3.transform(T[pose], p[point][:, None])[:, 0] + rng.normal(scale=0.002, size=(800, 3))
     noise_m = np.full(800, 0.002)
-    return T, p, Sightings(pose, point, p_cam, information(p_cam, noise_m, noise_m)), rng
+    return T, p, PointObservations(pose, point, p_cam, information(p_cam, noise_m, noise_m)), rng
 
 
 def off(T, T_true):
@@ -156,7 +156,7 @@ def test_poses_that_fill_the_masks_better_stay(made, tracked, monkeypatch):
 
     def beside(*args):
         T, covariance, cost = best_of(*args)
-        return Found(se3.exp(np.array([0, 0, 0, *rng.uniform(-0.01, 0.01, 2), 0])) @ T, covariance, cost)
+        return FittedPose(se3.exp(np.array([0, 0, 0, *rng.uniform(-0.01, 0.01, 2), 0])) @ T, covariance, cost)
 
     monkeypatch.setattr(SurfacePoses, "_best_of", beside)
     offline.refine_run(tracked)
@@ -288,7 +288,7 @@ def test_what_ties_matched_is_adjusted_as_one_point():
 
 def test_a_neighbour_helps_where_it_fits_better_with_a_mask_or_by_sight():
     """Frame 1 has no mask, frame 3 has one, in which nothing fits better than what is there."""
-    better, worse = (Found(np.full((4, 4), k), np.eye(6), cost) for k, cost in ((5.0, 0.2), (6.0, 0.95)))
+    better, worse = (FittedPose(np.full((4, 4), k), np.eye(6), cost) for k, cost in ((5.0, 0.2), (6.0, 0.95)))
     poses = SimpleNamespace(
         T=np.tile(np.eye(4), (5, 1, 1)),
         covariance=np.tile(np.eye(6), (5, 1, 1)),
