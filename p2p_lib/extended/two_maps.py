@@ -152,8 +152,8 @@ class TwoMaps:
     ) -> OurObservation:
         """What a frame shows of the object, by its mask (H, W) bool, None where unknown, and all objects' tracks."""
         obs = self.own.observe(frame, mask, tracks)
-        sight = OurObservation(obs.frame, obs.mask, obs.tracks, obs.p_cam, obs.cloud, sighting, given)
-        return self._with_other(sight, tracks)
+        ours = OurObservation(obs.frame, obs.mask, obs.tracks, obs.p_cam, obs.cloud, sighting, given)
+        return self._with_other(ours, tracks)
 
     def seen_anew(self, obs: OurObservation, tracks: Tracks) -> OurObservation:
         """The observation again, with all objects' newest tracks."""

@@ -157,10 +157,9 @@ class Policy:
 
     def judge(self, obs: Observation, known: Known, best: Candidate) -> Verdict:
         """Every pose stands; few points degrade it."""
-        support = best.hypothesis.support
-        if support < self.config.lifecycle.return_inliers:
-            few = f"only {support} points agree with the pose, fewer than {self.config.lifecycle.return_inliers}"
-            return Verdict(True, Status.DEGRADED, few)
+        support, enough = best.hypothesis.support, self.config.lifecycle.return_inliers
+        if support < enough:
+            return Verdict(True, Status.DEGRADED, f"only {support} points agree with the pose, fewer than {enough}")
         return Verdict(True, Status.RECOVERED if known.life.returning else Status.TRACKED)
 
     def admit(self, obs: Observation, known: Known, best: Candidate, verdict: Verdict) -> Admission:

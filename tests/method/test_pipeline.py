@@ -699,7 +699,7 @@ def test_a_late_object_is_clicked_while_another_has_masks():
     assert {str(e.status) for e in estimates.values()} == {"tracked"}
     assert iou(method.masks["right"], masks["right"]) > 0.85
     method.correct("right", clicks=clicks_on(film()[14][1]["right"]))
-    with pytest.warns(Doubt, match="correction of 'right': mask of 'right': a mask and clicks in frame 14. It is not"):
+    with pytest.warns(Doubt, match="correction of 'right': mask of 'right': a mask and clicks in frame 14. It is"):
         estimates = method.step(film()[14][0], film()[14][1])
     assert {str(e.status) for e in estimates.values()} == {"tracked"}
     np.testing.assert_array_equal(method.masks["right"], film()[14][1]["right"])
@@ -837,7 +837,7 @@ def test_a_correction_without_depth_is_doubted_and_changes_nothing():
         expected = alone.step(frame)
         if k == 3:
             method.correct("left", clicks=at)
-            with pytest.warns(Doubt, match=r"correction of 'left'.* has no depth in frame 3. It is not used"):
+            with pytest.warns(Doubt, match=r"correction of 'left'.* has no depth in frame 3. It is ignored"):
                 estimates = method.step(frame)
         else:
             estimates = method.step(frame)
