@@ -1,4 +1,4 @@
-"""What somebody says of an object in one frame: clicks on it, clicks beside it, a box around it, its mask."""
+"""Prompts: what is given of an object in one frame, as positive and negative clicks, a box or a mask."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Prompt:
             raise BadInput("prompt", f"the name {self.name!r}", "a word")
         if isinstance(self.frame, bool) or not isinstance(self.frame, int | np.integer) or self.frame < 0:
             raise BadInput(f"prompt of {self.name!r}", f"frame {self.frame!r}", "a whole number from 0")
-        for key, what in (("points_px", "clicks on"), ("negative_px", "clicks beside")):
+        for key, what in (("points_px", "clicks on"), ("negative_px", "negative clicks of")):
             object.__setattr__(self, key, _pixels(f"{what} {self.name!r}", getattr(self, key)))
         if self.box_px is not None:
             object.__setattr__(self, "box_px", _box(f"box around {self.name!r}", self.box_px))
@@ -71,7 +71,7 @@ class Prompt:
 def check_prompt(prompt: Prompt, camera: Camera) -> None:
     """Refuse what does not lie in the image; :class:`BadInput` names the object, the frame's size and what to do."""
     name, size = prompt.name, f"{camera.width}x{camera.height}"
-    for what, at in (("clicks on", prompt.points_px), ("clicks beside", prompt.negative_px)):
+    for what, at in (("clicks on", prompt.points_px), ("negative clicks of", prompt.negative_px)):
         outside = ~camera.inside(at, -0.5)
         if outside.any():
             raise BadInput(f"{what} {name!r}", _pixel(at[outside][0]), f"pixels within {size}")
@@ -112,7 +112,7 @@ def check_depth(prompt: Prompt, frame: Frame) -> None:
         raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel with a depth measurement", "Click next to the hole.")
     if prompt.box_px is not None and not len(prompt.points_px) and not len(points_in_box(prompt.box_px, frame)):
         got = f"no depth inside it in frame {frame.index}"
-        raise BadInput(f"box around {prompt.name!r}", got, "measured pixels in its middle", "Click on the object.")
+        raise BadInput(f"box around {prompt.name!r}", got, "measured pixels near its centre", "Click on the object.")
 
 
 def check_not_on(prompt: Prompt, other: Prompt, frame_index: int) -> None:

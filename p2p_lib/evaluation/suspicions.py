@@ -102,7 +102,7 @@ def _known(key: str) -> Callable[[RunEvidence], np.ndarray]:
 
 
 _RULES = (
-    _Rule("lost", "no pose although the mask is visible", 0.1, lambda e: ~e.has_pose, lambda e: e.seen),
+    _Rule("lost", "a mask, but no pose", 0.1, lambda e: ~e.has_pose, lambda e: e.seen),
     _Rule("doubted", f"confidence at most {DOUBTED:g}", 0.5, lambda e: e.confidence <= DOUBTED, lambda e: e.has_pose),
     _Rule(
         "maps",
@@ -113,7 +113,7 @@ _RULES = (
     ),
     _Rule(
         "no keypoints",
-        f"a pose and a mask, but fewer than {FEW} visible keypoints",
+        f"a mask and a pose, but fewer than {FEW} visible keypoints",
         0.3,
         lambda e: e.keypoints < FEW,
         lambda e: e.carried & np.isfinite(e.keypoints),

@@ -45,7 +45,7 @@ MECHANISMS = {
     "outgrown": "A map of a sliver, or one that was never followed, is replaced when its object stays lost.",
     "second_map": "A second map is started when an object shows an unknown side.",
     # Inside: policy, motion.
-    "motion_prior": "The last pose and constant velocity propose poses, which the surface alone may confirm.",
+    "motion_prior": "The last pose and constant velocity propose poses; without points the surface tracks them.",
     "motion_weight": "A hypothesis needs more support the farther it is from the predicted motion.",
     "motion_over_gaps": "The motion of an absent object is extrapolated for a while.",
     "moving_points": "A point becomes a keypoint only if it moves with the object.",
