@@ -48,9 +48,7 @@ class Objects(ABC):
             raise BadInput("tracker", "a call after close()", "an open tracker", "Make a new one, or reset() this one.")
         if not self._turn.acquire(blocking=False):
             fix = "Put a lock around its calls, or give each thread a tracker of its own."
-            raise BadInput(
-                "tracker", "a call from a second thread during one from another", "one thread at a time", fix
-            )
+            raise BadInput("tracker", "a call from a second thread meanwhile", "one thread at a time", fix)
         try:
             yield
         finally:
