@@ -98,7 +98,7 @@ def test_what_is_not_known_is_not_held_against_anybody():
         "has_pose",
         "elsewhere",
         "confidence",
-        "told",
+        "doubts",
         "apart",
     }
     assert suspicions(replace(spotless(), **{key: np.full(N, np.nan) for key in unknown})) == ()
