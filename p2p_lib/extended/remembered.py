@@ -24,10 +24,9 @@ from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.agreement import outline_share
 from p2p_lib.extended.image_search import ImageSearch, Sighting, laid_at
-from p2p_lib.extended.lifecycle import CONFIRM_FRAMES
 from p2p_lib.extended.observation import OurObservation
 from p2p_lib.extended.two_maps import TwoMaps
-from p2p_lib.method.object_model import Known, Requests
+from p2p_lib.method.object_model import CONFIRM_FRAMES, Known, Requests
 from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
 from p2p_lib.method.policy import Verdict
 from p2p_lib.method.refinement import surface_distance

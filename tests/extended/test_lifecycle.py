@@ -9,7 +9,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import LifecycleConfig
 from p2p_lib.core.types import WITH_POSE, Status
 from p2p_lib.extended.gates import DOUBTS, GATES, SIGHTED, Judgement, PoseEvidence, judge
-from p2p_lib.extended.lifecycle import CLEAR, CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES, TELLING, Lifecycle
+from p2p_lib.extended.lifecycle import CLEAR, TELLING, Lifecycle
+from p2p_lib.method.object_model import CONFIRM_FRAMES, CONFIRM_LONGER
 
 CFG = LifecycleConfig()
 ALL = (*GATES, *DOUBTS)
@@ -97,14 +98,14 @@ def test_what_the_surface_alone_says_proves_nothing_where_the_image_says_otherwi
     life = away.with_verdict(pose(3), 3.0, unproven)
     for k in range(4):
         life = life.with_verdict(pose(4 + k), 4.0 + k, unproven)
-    assert life.confirming == CONFIRM_SIGHTED_FRAMES and life.lost_frames == away.lost_frames + 5
+    assert life.confirming == CONFIRM_LONGER and life.lost_frames == away.lost_frames + 5
     proven = life.with_verdict(pose(9), 9.0, DEGRADED)
-    assert proven.confirming == CONFIRM_SIGHTED_FRAMES - 1 and not proven.lost_frames
+    assert proven.confirming == CONFIRM_LONGER - 1 and not proven.lost_frames
 
 
 def test_a_return_whose_turn_is_clear_is_confirmed_as_soon_as_one_by_points():
     away = lived(GOOD, Status.LOST)[-1]
-    assert away.with_verdict(pose(3), 3.0, DEGRADED, 0.9 * CLEAR).confirming == CONFIRM_SIGHTED_FRAMES
+    assert away.with_verdict(pose(3), 3.0, DEGRADED, 0.9 * CLEAR).confirming == CONFIRM_LONGER
     assert away.with_verdict(pose(3), 3.0, DEGRADED, CLEAR).confirming == CONFIRM_FRAMES
 
 

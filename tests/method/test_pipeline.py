@@ -16,7 +16,7 @@ from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.extended.default import Point2Pose
-from p2p_lib.extended.lifecycle import CONFIRM_FRAMES
+from p2p_lib.method.object_model import CONFIRM_FRAMES
 from p2p_lib.synthetic import shapes
 from p2p_lib.synthetic.noise import Sensor, measured_colour, measured_depth
 from p2p_lib.synthetic.render import render
