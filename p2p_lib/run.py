@@ -326,8 +326,15 @@ def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Calla
     warm_up(say if progress else lambda line: None)
     with noted(keeper.doubts), progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
         bar.set_postfix_str("first masks")  # which SAM 2 takes seconds for
+        left_out = writer.info["left_out"]
+
+        def leave_out(index: int, unreadable: P2PError) -> None:
+            left_out[str(index)] = str(unreadable)
+            bar.set_description_str(f"{job.sequence.name}, {len(left_out)} left out", refresh=False)
+            bar.update()
+
         try:
-            for frame, estimates in _estimates(method, job, writer.info["left_out"] if skip_bad else None):
+            for frame, estimates in _estimates(method, job, leave_out if skip_bad else None):
                 if (started := keeper.add(frame, estimates)) and progress:
                     bar.clear()
                     say(f"First masks of {', '.join(started)} in frame {frame.index}: {keeper.first_masks.path}")
@@ -345,11 +352,11 @@ def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Calla
 
 
 def _estimates(
-    method: Point2Pose, job: _Job, left_out: dict[str, str] | None
+    method: Point2Pose, job: _Job, leave_out: Callable[[int, P2PError], None] | None
 ) -> Iterator[tuple[Frame, dict[str, PoseEstimate]]]:
     """Every frame with its estimates, which a late 2D tracker gives some frames later.
 
-    left_out  gets the frames that cannot be read, with the reason; None: they end the run
+    leave_out  is told the frames that cannot be read, with the reason; None: they end the run
     """
 
     def steps() -> Iterator[dict[str, PoseEstimate]]:
@@ -357,9 +364,9 @@ def _estimates(
             try:
                 frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
             except P2PError as unreadable:
-                if left_out is None or i in job.prompts:
+                if leave_out is None or i in job.prompts:
                     raise advised(unreadable, "A prompt needs this frame." if i in job.prompts else SKIP_BAD) from None
-                left_out[str(i)] = str(unreadable)
+                leave_out(i, unreadable)
                 continue
             for prompt in job.prompts.get(i, ()):
                 method.tell(prompt)

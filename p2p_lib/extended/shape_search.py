@@ -33,7 +33,7 @@ class ShapeSearch:
 
     def knows(self, known: Known) -> bool:
         """Whether there is a surface to search with."""
-        return self._on and known.model.has_surface and len(self.sample(known.model)) > 0
+        return self._on and known.model.seen_surface is not None and len(self.sample(known.model)) > 0
 
     def sample(self, model: ObjectModel) -> SurfaceSample:
         """Points of the surface, sampled when first asked for after a keyframe."""

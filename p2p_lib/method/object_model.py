@@ -118,9 +118,9 @@ class ObjectModel:
         return result.T_cam_obj[-1]
 
     @property
-    def has_surface(self) -> bool:
-        """Whether depth can be compared with a surface."""
-        return self.surface is not None and not self.surface.empty
+    def seen_surface(self) -> TsdfVolume | None:
+        """The surface, for depth to be compared with; None while nothing of it has been seen."""
+        return None if self.surface is None or self.surface.empty else self.surface
 
     def noise_m(self, p_cam: np.ndarray) -> np.ndarray | None:
         """(N,) standard deviation of measured points by the sensor's model; None where one noise is assumed for all."""
@@ -225,7 +225,7 @@ class ObjectModel:
             self._submit(self._follow_graph)
 
     def _follow_graph(self) -> None:
-        if not self._surface.move(self._corrected, limit=1):
+        if self._surface is not None and not self._surface.move(self._corrected, limit=1):
             self._corrected = {}
 
 
@@ -271,7 +271,7 @@ class Life:
 
     def moved_from_last(self, T_cam_obj: np.ndarray) -> tuple[float, float] | None:
         """Metres and degrees from the pose of the frame before to another (4, 4); None after a gap."""
-        if not self.has_pose:
+        if not self.has_pose or self.T_cam_obj is None:
             return None
         moved_m = np.linalg.norm(T_cam_obj[:3, 3] - self.T_cam_obj[:3, 3])
         return float(moved_m), float(np.degrees(se3.angle_rad(se3.inverse(self.T_cam_obj) @ T_cam_obj)))

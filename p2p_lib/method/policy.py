@@ -124,8 +124,8 @@ class Policy:
         """The candidate to go on with, and why; ``weight`` (H,) factors of their support."""
         with self.stopwatch("selection"):
             poses, distance_m = [c.T_cam_obj for c in candidates], None
-            if len(poses) > 1 and known.model.has_surface and len(obs.cloud):
-                distance_m = refinement.surface_distances(known.model.surface, obs.cloud, np.stack(poses))
+            if len(poses) > 1 and len(obs.cloud) and (surface := known.model.seen_surface) is not None:
+                distance_m = refinement.surface_distances(surface, obs.cloud, np.stack(poses))
             hypotheses = [c.hypothesis for c in candidates]
             row, reason = selection.select(hypotheses, distance_m, self.config.selection, weight)
             return (None if row is None else candidates[row]), reason
@@ -141,12 +141,12 @@ class Policy:
     ) -> Refinement:
         """The pose refined on the surface, with the keypoints ``agrees`` (N,) bool where the configuration says so."""
         cfg, keypoints = self.config.refinement, None
-        if cfg.residuals == "none" or not known.model.has_surface or not len(obs.cloud):
+        if cfg.residuals == "none" or not len(obs.cloud) or (surface := known.model.seen_surface) is None:
             return Refinement(T_cam_obj, reason="no surface")
         if agrees is not None and cfg.residuals == "surface_and_keypoints":
             p_cam = obs.p_cam[agrees]
             keypoints = Keypoints(known.map.p_obj[agrees], p_cam, self.observer.noise_m(p_cam))
-        return refinement.refine(T_cam_obj, obs.cloud, known.model.surface, cfg, keypoints=keypoints)
+        return refinement.refine(T_cam_obj, obs.cloud, surface, cfg, keypoints=keypoints)
 
     # -- judge, admit, request -----------------------------------------------------------------
 
@@ -168,7 +168,7 @@ class Policy:
 
     def covariance(self, obs: Observation, known: Known, best: Candidate) -> np.ndarray:
         """(6, 6) of the pose relative to the map: from the refinement, else from the keypoints alone."""
-        if best.refined.covariance is not None:
+        if best.refined is not None and best.refined.covariance is not None:
             return best.refined.covariance
         noise_m = self.observer.noise_m(obs.p_cam)
         return registration.covariance(best.hypothesis, known.map.p_obj, obs.p_cam, noise_m)

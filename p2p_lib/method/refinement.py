@@ -157,9 +157,10 @@ class _Problem:
     def solve(self, T: np.ndarray) -> Refinement:
         damping, converged, tries = _DAMPING, False, 0
         # Wide at first: far from the solution, the few points that hold a direction look like outliers.
-        at = self.surface(T, self.volume.tau_m / 2)
-        if at is None:
+        begun = self.surface(T, self.volume.tau_m / 2)
+        if begun is None:
             return Refinement(T, reason="the depth points lie beyond the truncation distance")
+        at = begun
         while tries < self.config.iterations and not converged:
             tries += 1
             step = self.clipped(self.step(*self.joint(at), damping))
@@ -167,7 +168,7 @@ class _Problem:
             new = self.surface(self.moved(at.T, step), self.volume.tau_m / 2 ** (tries + 1), nearby)
             gain = self.cost(at, at) - self.cost(new, at) if new is not None else -np.inf
             converged = abs(gain) < _TOLERANCE
-            if gain > 0:
+            if new is not None and gain > 0:
                 at, damping = new, damping / _DAMPING_FACTOR
             else:
                 damping = max(damping, 1e-4) * _DAMPING_FACTOR**2
@@ -202,9 +203,8 @@ class _Problem:
         first, second = pairs = row.take(self.pairs)
         return observability.eigen(J, pairs[:, (first >= 0) & (second >= 0)])
 
-    def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def keypoint_system(self, k: Keypoints, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of T^-1 p_cam - p_obj in standard deviations, in the variables of :meth:`surface`."""
-        k = self.keypoints
         return _keypoint_system(se3.inverse(T), k.p_obj, k.p_cam, k.sigma_m, self.centre, self.radius)
 
     # -- solving -------------------------------------------------------------------------------
@@ -215,7 +215,7 @@ class _Problem:
         P, information = held @ held.T, self.effective_information(at)
         H, g = information * P @ at.H @ P, information * P @ at.g
         if self.keypoints is not None:
-            H_k, g_k = self.keypoint_system(at.T)
+            H_k, g_k = self.keypoint_system(self.keypoints, at.T)
             H, g = H + H_k, g + g_k
         return H, g
 

@@ -37,7 +37,7 @@ def select(
     if len(hypotheses) == 1:
         return 0, "the only hypothesis"
     best, scores = _best(hypotheses, weight), _scores(distance_m)
-    if scores is None:
+    if distance_m is None or scores is None:
         return best, "most inliers; there is no surface to compare with"
     nearest = int(np.argmin(scores))
     if config.rule == "support":

@@ -362,10 +362,12 @@ def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(seque
     (sequence / "depth/0002.png").unlink()
     assert run(sequence, tmp_path / "run") == 2
     assert "0002.png is missing. p2p run --skip-bad goes on" in capsys.readouterr().err
-    assert run(sequence, tmp_path / "run", "--skip-bad", "--save-masks") == 0
-    assert re.search(
-        r"7 of 8 frames.*; 1 left out, which cannot be read, the first: .*0002\.png", capsys.readouterr().out
-    )
+    loud = [word for word in POINTS_ALONE if word != "--quiet"]
+    words = [str(sequence), "--out", str(tmp_path / "run"), *loud, "--skip-bad", "--save-masks"]
+    assert cli.main(["run", *words]) == 0
+    said = capsys.readouterr()
+    assert re.search(r"7 of 8 frames.*; 1 left out, which cannot be read, the first: .*0002\.png", said.out)
+    assert re.search(r", 1 left out: 100%.* 8/8 ", said.err)
     kept = load_run(tmp_path / "run")
     assert (
         kept.objects["object"].frame_index.tolist() == [0, 1, 3, 4, 5, 6, 7] and kept.objects["object"].has_pose.all()

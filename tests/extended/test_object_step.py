@@ -599,7 +599,7 @@ def test_the_surface_follows_what_the_graph_finds():
     lump, moved = settled(begun(), [5, 12]), []
     lump.tracker.model.surface.move = lambda poses, limit: moved.append((set(poses), limit)) or []
     lump.see(turned(13))
-    assert lump.tracker.model.has_surface, "which waits for it"
+    assert lump.tracker.model.seen_surface is not None, "which waits for it"
     assert moved and moved[0][0] == set(lump.tracker.model.graph.keys) and moved[0][1] == 1
     assert not lump.tracker.model._corrected, "nothing is left to move"
 
