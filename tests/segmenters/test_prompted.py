@@ -87,6 +87,15 @@ def test_clicks_close_together_select_all_of_a_cover(seed):
     assert iou(segmenter().segment(frame, [clicks]) == 1, cover) > 0.9
 
 
+def test_a_click_on_one_of_two_stickers_alike_selects_that_one():
+    """What is as flat as the table, and of one colour, is told apart by the table between alone."""
+    one, other = rectangle(120, 90, 150, 120), rectangle(156, 90, 186, 120)
+    frame = on_a_table(one | other, (150, 40, 40), np.ones(one.shape), 0)
+    with pytest.warns(Doubt, match="flat in what is around it"):
+        found = segmenter().segment(frame, [Prompt("sticker", points_px=[[135, 105]])]) == 1
+    assert iou(found, one) > 0.95
+
+
 @pytest.mark.parametrize(
     ("ties", "chosen"),
     [((0.44, 0.45, 0.42), 1.0), ((0.44, 0.45, 0.3), 2.5), ((0.3, 0.45, 0.42), 1.0), ((0.2, 0.45, 0.42), 0.4)],
