@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 #: Of objects, in the order in which a sequence names them.
-OBJECTS = ("#0072B2", "#E69F00", "#CC79A7", "#56B4E9", "#882255", "#6B4E23", "#222222")
+OBJECTS = ("#0072B2", "#E69F00", "#00CCAA", "#EE0066", "#6B4E23", "#CC88EE", "#440088", "#222222")
 
 
 def object_colours(names: Iterable[str]) -> dict[str, str]:
-    """Object to its colour ``#RRGGBB``, by its place in the sequence; beyond seven objects they come round again."""
+    """Object to its colour ``#RRGGBB``, by its place in the sequence; beyond eight objects they come round again."""
     return {name: OBJECTS[k % len(OBJECTS)] for k, name in enumerate(names)}
 
 

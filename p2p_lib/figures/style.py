@@ -1,7 +1,7 @@
 """One place for colours and type: what is an object's colour, what is a status's, and how a plot looks.
 
-The colours are those of Okabe and Ito (2008), told apart by the colour-blind, and three darker ones. Green, yellow and
-vermillion are kept for statuses, whose strips are hatched besides, so that they survive a black-and-white printer.
+Eight objects differ for the colour-blind, too. Green, yellow and vermillion of Okabe and Ito (2008) are kept for
+statuses, whose strips are hatched besides, so that they survive a black-and-white printer.
 """
 
 from __future__ import annotations

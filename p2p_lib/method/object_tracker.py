@@ -50,13 +50,13 @@ class ObjectTracker:
         detector: Detector,
         rng: np.random.Generator,
         stopwatch: Stopwatch,
-        beside: Executor,
+        executor: Executor,
         policy: Callable[..., Policy] = Policy,
         model: Callable[..., ObjectModel] = ObjectModel,
     ):
         self.name, self.config, self.detector = name, config, detector
         self.observer = Observer(camera, config.depth, config.refinement.max_points if config.method.surface else 0)
-        self.new_model = partial(model, config, self.observer, stopwatch, beside)
+        self.new_model = partial(model, config, self.observer, stopwatch, executor)
         self.policy = policy(self.observer, config, rng, stopwatch)
         self.known = Known(self.new_model(), self.policy.life)
         self._stopwatch = stopwatch
@@ -126,12 +126,12 @@ class ObjectTracker:
         if keyframe:
             rows = admission.rows(obs, model)
             rated = admission.covariance, admission.confidence
-            asked = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), rows, *rated)
-            requests = replace(asked, reject=requests.reject)
-        covariance, sure = admission.rated(model)
-        self.life = self.policy.followed(obs, self.known, best, admission, sure)
+            added = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), rows, *rated)
+            requests = replace(added, reject=requests.reject)
+        covariance, confidence = admission.rated(model)
+        self.life = self.policy.followed(obs, self.known, best, admission, confidence)
         support = best.hypothesis.support
-        pose = {"confidence": sure, "covariance": covariance, "inliers": support, "keyframe": keyframe}
+        pose = {"confidence": confidence, "covariance": covariance, "inliers": support, "keyframe": keyframe}
         return ObjectStep(self._estimate(obs, admission.verdict, **pose), requests)
 
     def absent(self, obs: Observation, verdict: Verdict) -> ObjectStep:
@@ -166,6 +166,7 @@ class ObjectTracker:
 
     def _sample(self, obs: Observation) -> tuple[np.ndarray, np.ndarray]:
         """New points chosen by the sampling objective: uv_px (M, 2) and p_cam (M, 3)."""
+        assert obs.mask is not None  # nobody asks for points where no mask is known
         with self._stopwatch("sampling"):
             cfg = self.config.sampling
             depth = self.config.depth
@@ -206,7 +207,7 @@ class ObjectTracker:
     def awaited(self, mask: np.ndarray | None) -> bool:
         """Whether the object had no pose in the frame before and its mask says that it is back."""
         away = not self.model.empty and not self.life.has_pose
-        return away and mask is not None and np.count_nonzero(mask) >= self.config.lifecycle.min_mask_px
+        return away and mask is not None and int(np.count_nonzero(mask)) >= self.config.lifecycle.min_mask_px
 
     def hint(self, obs: Observation) -> Hint:
         """Where the object should be by its tracks and its model, for the segmenter; ``obs`` has no mask yet."""
@@ -222,12 +223,12 @@ class ObjectTracker:
         """Whether most keypoints of an absent object lie outside the image where it is expected."""
         T_cam_obj = self.policy.expected(obs, self.known)
         inside = () if T_cam_obj is None else self.observer.in_image(T_cam_obj, self.map.p_obj)
-        return len(inside) > 0 and np.mean(inside) < 0.5
+        return len(inside) > 0 and bool(np.mean(inside) < 0.5)
 
 
 def hint_at(frame: Frame, known: Known, observer: Observer, uv_px: np.ndarray, T_cam_obj: np.ndarray) -> Hint:
     """The hint of a pose: points uv_px (K, 2) that agree with it, and the measured pixels' distances to the surface."""
-    distance_m, model = None, known.model
-    if model.has_surface:
-        distance_m = surface_distance(model.surface, frame.depth_m, observer.camera, T_cam_obj)
+    distance_m, surface = None, known.model.seen_surface
+    if surface is not None:
+        distance_m = surface_distance(surface, frame.depth_m, observer.camera, T_cam_obj)
     return Hint(uv_px, distance_m, T_cam_obj)

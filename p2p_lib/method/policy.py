@@ -98,9 +98,9 @@ class Policy:
         """(N,) bool each: the points to register, and all that are certain enough for it."""
         certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)
         use = certain & known.map.promoted
-        return (use if use.sum() >= self.few_keypoints(known) else certain), certain
+        return (use if use.sum() >= self.min_keypoints(known) else certain), certain
 
-    def few_keypoints(self, known: Known) -> int:
+    def min_keypoints(self, known: Known) -> int:
         """With fewer visible keypoints than this, pending points help to register (the release's number)."""
         return 12
 
@@ -124,8 +124,8 @@ class Policy:
         """The candidate to go on with, and why; ``weight`` (H,) factors of their support."""
         with self.stopwatch("selection"):
             poses, distance_m = [c.T_cam_obj for c in candidates], None
-            if len(poses) > 1 and known.model.has_surface and len(obs.cloud):
-                distance_m = refinement.surface_distances(known.model.surface, obs.cloud, np.stack(poses))
+            if len(poses) > 1 and len(obs.cloud) and (surface := known.model.seen_surface) is not None:
+                distance_m = refinement.surface_distances(surface, obs.cloud, np.stack(poses))
             hypotheses = [c.hypothesis for c in candidates]
             row, reason = selection.select(hypotheses, distance_m, self.config.selection, weight)
             return (None if row is None else candidates[row]), reason
@@ -141,25 +141,25 @@ class Policy:
     ) -> Refinement:
         """The pose refined on the surface, with the keypoints ``agrees`` (N,) bool where the configuration says so."""
         cfg, keypoints = self.config.refinement, None
-        if cfg.residuals == "none" or not known.model.has_surface or not len(obs.cloud):
+        if cfg.residuals == "none" or not len(obs.cloud) or (surface := known.model.seen_surface) is None:
             return Refinement(T_cam_obj, reason="no surface")
         if agrees is not None and cfg.residuals == "surface_and_keypoints":
             p_cam = obs.p_cam[agrees]
             keypoints = Keypoints(known.map.p_obj[agrees], p_cam, self.observer.noise_m(p_cam))
-        return refinement.refine(T_cam_obj, obs.cloud, known.model.surface, cfg, keypoints=keypoints)
+        return refinement.refine(T_cam_obj, obs.cloud, surface, cfg, keypoints=keypoints)
 
     # -- judge, admit, request -----------------------------------------------------------------
 
     def start(self, known: Known, points: int) -> Verdict:
         """Whether a map may begin with this number of ``points``."""
         enough = points >= self.config.registration.min_inliers
-        return Verdict(enough, Status.TRACKED, "" if enough else f"only {points} points to start from")
+        return Verdict(enough, Status.TRACKED, "" if enough else f"only {points} points to start a map")
 
     def judge(self, obs: Observation, known: Known, best: Candidate) -> Verdict:
         """Every pose stands; few points degrade it."""
-        support = best.hypothesis.support
-        if support < self.config.lifecycle.return_inliers:
-            return Verdict(True, Status.DEGRADED, f"only {support} points agree")
+        support, enough = best.hypothesis.support, self.config.lifecycle.return_inliers
+        if support < enough:
+            return Verdict(True, Status.DEGRADED, f"only {support} points agree with the pose, fewer than {enough}")
         return Verdict(True, Status.RECOVERED if known.life.returning else Status.TRACKED)
 
     def admit(self, obs: Observation, known: Known, best: Candidate, verdict: Verdict) -> Admission:
@@ -168,7 +168,7 @@ class Policy:
 
     def covariance(self, obs: Observation, known: Known, best: Candidate) -> np.ndarray:
         """(6, 6) of the pose relative to the map: from the refinement, else from the keypoints alone."""
-        if best.refined.covariance is not None:
+        if best.refined is not None and best.refined.covariance is not None:
             return best.refined.covariance
         noise_m = self.observer.noise_m(obs.p_cam)
         return registration.covariance(best.hypothesis, known.map.p_obj, obs.p_cam, noise_m)
@@ -183,8 +183,10 @@ class Policy:
         """The life of a map after its first frame."""
         return replace(self.life, status=verdict.status, T_cam_obj=T_cam_obj, seen_s=obs.frame.time_s)
 
-    def followed(self, obs: Observation, known: Known, best: Candidate, admission: Admission, sure: float) -> Life:
-        """The life after a frame with a pose, which is reported with the confidence ``sure``."""
+    def followed(
+        self, obs: Observation, known: Known, best: Candidate, admission: Admission, confidence: float
+    ) -> Life:
+        """The life after a frame with a pose that is reported with this confidence."""
         return known.life.with_pose(best.T_cam_obj, obs.frame.time_s, admission.verdict.status)
 
     def missed(self, obs: Observation, known: Known, verdict: Verdict) -> Life:

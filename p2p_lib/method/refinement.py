@@ -157,9 +157,10 @@ class _Problem:
     def solve(self, T: np.ndarray) -> Refinement:
         damping, converged, tries = _DAMPING, False, 0
         # Wide at first: far from the solution, the few points that hold a direction look like outliers.
-        at = self.surface(T, self.volume.tau_m / 2)
-        if at is None:
-            return Refinement(T, reason="the cloud lies beyond the surface's truncation")
+        begun = self.surface(T, self.volume.tau_m / 2)
+        if begun is None:
+            return Refinement(T, reason="the depth points lie beyond the truncation distance")
+        at = begun
         while tries < self.config.iterations and not converged:
             tries += 1
             step = self.clipped(self.step(*self.joint(at), damping))
@@ -167,7 +168,7 @@ class _Problem:
             new = self.surface(self.moved(at.T, step), self.volume.tau_m / 2 ** (tries + 1), nearby)
             gain = self.cost(at, at) - self.cost(new, at) if new is not None else -np.inf
             converged = abs(gain) < _TOLERANCE
-            if gain > 0:
+            if new is not None and gain > 0:
                 at, damping = new, damping / _DAMPING_FACTOR
             else:
                 damping = max(damping, 1e-4) * _DAMPING_FACTOR**2
@@ -176,11 +177,11 @@ class _Problem:
 
     # -- the two kinds of residual -----------------------------------------------------------------
 
-    def surface(self, T: np.ndarray, widest_m: float = 0.0, beside: _Linear | None = None) -> _Linear | None:
+    def surface(self, T: np.ndarray, widest_m: float = 0.0, nearby: _Linear | None = None) -> _Linear | None:
         """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points can be used.
 
         Trims outliers by the MAD, but nothing within ``widest_m`` nor within Huber's threshold. The eigenvectors are
-        those of ``beside``, a pose nearby, where it is given: they hardly change.
+        those of ``nearby``, another pose, where it is given: they hardly change.
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj)
@@ -192,7 +193,7 @@ class _Problem:
         if len(used) < MIN_POINTS:
             return None
         distance = np.where(valid, np.abs(value), np.inf)
-        held = (beside.eigenvalues, beside.directions) if beside else self.eigen(used, J)
+        held = (nearby.eigenvalues, nearby.directions) if nearby else self.eigen(used, J)
         return _Linear(T, distance, H, g, *held, cut, used, J, rms, sigma)
 
     def eigen(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -202,9 +203,8 @@ class _Problem:
         first, second = pairs = row.take(self.pairs)
         return observability.eigen(J, pairs[:, (first >= 0) & (second >= 0)])
 
-    def keypoint_system(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def keypoint_system(self, k: Keypoints, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of T^-1 p_cam - p_obj in standard deviations, in the variables of :meth:`surface`."""
-        k = self.keypoints
         return _keypoint_system(se3.inverse(T), k.p_obj, k.p_cam, k.sigma_m, self.centre, self.radius)
 
     # -- solving -------------------------------------------------------------------------------
@@ -215,7 +215,7 @@ class _Problem:
         P, information = held @ held.T, self.effective_information(at)
         H, g = information * P @ at.H @ P, information * P @ at.g
         if self.keypoints is not None:
-            H_k, g_k = self.keypoint_system(at.T)
+            H_k, g_k = self.keypoint_system(self.keypoints, at.T)
             H, g = H + H_k, g + g_k
         return H, g
 
@@ -276,7 +276,7 @@ class _Problem:
             at.eigenvalues,
             at.directions.T,
             observability.rotations_in(loose).T @ to_origin.T * self.radius,
-            f"the shape leaves {loose.shape[1]} of 6 directions free" if loose.size else "",
+            f"the shape leaves {loose.shape[1]} of 6 degrees of freedom unconstrained" if loose.size else "",
         )
 
 
@@ -308,9 +308,9 @@ def _linearised(p_obj, centre, radius, value, gradient, valid, floor_m, reach_m,
     H, g = np.zeros((6, 6)), np.zeros(6)
     if len(near) < MIN_POINTS:
         return near, np.zeros((0, 6)), H, g, 0.0, 0.0, 0.0
-    middle = _upper_median(value[near])
-    sigma = max(_MAD_TO_SIGMA * _upper_median(np.abs(value[near] - middle)), floor_m)
-    cut = max(abs(middle) + _MAD_TRIM * sigma, least_m)
+    median = _upper_median(value[near])
+    sigma = max(_MAD_TO_SIGMA * _upper_median(np.abs(value[near] - median)), floor_m)
+    cut = max(abs(median) + _MAD_TRIM * sigma, least_m)
     used = near[np.abs(value[near]) <= cut]
     J, squares = surface_jacobian((p_obj[used] - centre) / radius, gradient[used]), 0.0
     for n in range(len(used)):

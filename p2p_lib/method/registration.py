@@ -136,8 +136,8 @@ class _Matches:
         return cls(p_obj, p_cam, limit, weight), usable
 
 
-def _determined(inertia_m2: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
-    return inertia_m2 > (limit_m / 3 / _DETERMINED_RAD) ** 2
+def _determined(inertia_m2: np.ndarray | float, limit_m: float) -> bool:
+    return bool(inertia_m2 > (limit_m / 3 / _DETERMINED_RAD) ** 2)
 
 
 def _sequential(matches: _Matches, config: RegistrationConfig, rng: np.random.Generator) -> list[Hypothesis]:
@@ -172,7 +172,7 @@ def _refit(
     if fit is None:
         return None
     hypothesis = Hypothesis(fit.T_a_b, fit.inliers, fit.residual_m, origin)
-    return hypothesis, bool(_determined(fit.inertia_m2, m.limit_m[fit.inliers].mean()))
+    return hypothesis, _determined(fit.inertia_m2, m.limit_m[fit.inliers].mean())
 
 
 def _from_priors(matches: _Matches, priors: Mapping[str, np.ndarray], config: RegistrationConfig) -> list[Hypothesis]:

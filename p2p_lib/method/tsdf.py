@@ -89,7 +89,7 @@ class TsdfVolume:
         if np.prod(shape) > config.max_voxels:
             raise BadInput("tsdf shape", "x".join(map(str, shape)), f"at most {config.max_voxels} voxels")
         self.views: dict[int, View] = {}  # observations of keyframes, oldest first, that are kept for re-integration
-        self._total = 0  # of all weights
+        self._total = 0.0  # of all weights
         self.lo = np.zeros(3, int)
         self._grid = CpuGrid(shape) if device == "cpu" else TorchGrid(shape, device)
 

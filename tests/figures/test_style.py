@@ -36,9 +36,9 @@ def apart(colours, seer):
 
 @pytest.mark.parametrize("seer", SEEN_BY)
 def test_objects_differ_for_everybody(seer):
-    # 10 is about ten just noticeable differences.
-    close = {pair: d for pair, d in apart(style.OBJECTS, seer).items() if d < 10}
-    assert not close
+    # 14 is about fourteen just noticeable differences; two blues of 22 are still taken for one another.
+    close = {pair: d for pair, d in apart(style.OBJECTS, seer).items() if d < (24 if seer == "normal" else 14)}
+    assert len(style.OBJECTS) >= 8 and not close
 
 
 @pytest.mark.parametrize("seer", SEEN_BY)

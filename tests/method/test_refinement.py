@@ -113,7 +113,7 @@ def test_keypoint_system_equals_the_numerical_derivatives_of_its_cost():
     cloud = se3.transform(T, rng.uniform(-0.05, 0.05, (50, 3)))
     keypoints = Keypoints(p_obj, p_cam, rng.uniform(0.01, 0.02, 12))
     problem = refinement._Problem.about(T, cloud, Exact(LUMP), CONFIG, keypoints)
-    H, g = problem.keypoint_system(T)
+    H, g = problem.keypoint_system(problem.keypoints, T)
 
     def residual(step):
         q = se3.transform(se3.inverse(problem.moved(T, step)), p_cam)

@@ -19,10 +19,10 @@ from p2p_lib.datasets.models import MESHES, find_models, load_mesh, read_mesh
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.offline import evidence, loops
 from p2p_lib.offline import refine as offline
-from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
+from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished
-from p2p_lib.offline.sight import Found, Sight
 from p2p_lib.offline.surface import SurfacePoses, fused
+from p2p_lib.offline.surface_check import FittedPose, SurfaceCheck
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 CAMERA = Camera(500, 500, 159.5, 119.5, 320, 240)
@@ -37,7 +37,7 @@ def scene():
     pose, point = (x.ravel() for x in np.meshgrid(np.arange(20), np.arange(40), indexing="ij"))
     p_cam = se3.transform(T[pose], p[point][:, None])[:, 0] + rng.normal(scale=0.002, size=(800, 3))
     noise_m = np.full(800, 0.002)
-    return T, p, Sightings(pose, point, p_cam, information(p_cam, noise_m, noise_m)), rng
+    return T, p, PointObservations(pose, point, p_cam, information(p_cam, noise_m, noise_m)), rng
 
 
 def off(T, T_true):
@@ -156,7 +156,7 @@ def test_poses_that_fill_the_masks_better_stay(made, tracked, monkeypatch):
 
     def beside(*args):
         T, covariance, cost = best_of(*args)
-        return Found(se3.exp(np.array([0, 0, 0, *rng.uniform(-0.01, 0.01, 2), 0])) @ T, covariance, cost)
+        return FittedPose(se3.exp(np.array([0, 0, 0, *rng.uniform(-0.01, 0.01, 2), 0])) @ T, covariance, cost)
 
     monkeypatch.setattr(SurfacePoses, "_best_of", beside)
     offline.refine_run(tracked)
@@ -212,7 +212,7 @@ def test_frames_keep_the_causal_object_frame_and_what_does_not_fit_has_no_pose(m
     T = np.where(has[:, None, None], obj.T_cam_obj, np.eye(4)) @ moved
     cost = np.where(has, 0.2, 0.9)
     poses = SimpleNamespace(T=T, covariance=np.tile(np.eye(6), (n, 1, 1)), cost=cost, limit=0.5)
-    columns, fits = offline._columns(obj, poses, evidence.Evidence(mask_px=[0] * n), None)
+    columns, fits = offline._columns(obj, poses, evidence.VideoEvidence(mask_px=[0] * n), None)
     np.testing.assert_allclose(columns["T_cam_obj"][has], obj.T_cam_obj[has], atol=1e-9)
     assert np.isnan(columns["T_cam_obj"][~has]).all() and (columns["confidence"][~has] == 0).all()
     assert (fits == has).all()
@@ -226,7 +226,7 @@ def test_frames_keep_the_causal_object_frame_and_what_does_not_fit_has_no_pose(m
 def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what, monkeypatch):
     of, T, config = Finished(made.run, made.sequence), made.run.objects["can"].T_cam_obj, preset()
     rows = np.arange(0, 12)
-    sight = Sight(of, "can", config, fused(of, "can", T, rows, config, 0.004), T, rows)
+    check = SurfaceCheck(of, "can", config, fused(of, "can", T, rows, config, 0.004), T, rows)
     frame, k = made.sequence.frame(6), 6
     mask = made.sequence.masks(6)["can"]
     depth_m, rgb = frame.depth_m.copy(), frame.rgb.astype(float)
@@ -237,18 +237,18 @@ def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what, 
     if what == "colours":  # as it was, but three times as strong
         rgb = middle + 3 * (rgb - middle)
     if what == "pattern":  # the same colours elsewhere, beside a frame in whose light they are far off as well
-        look = sight._look
+        look = check._look
 
         def in_that_light(frame, *how, **more):
             found = look(frame, *how, **more)
-            return found._replace(off=3 * sight._usual, alike=0.9) if frame.index == k - 1 else found
+            return found._replace(off=3 * check._usual, alike=0.9) if frame.index == k - 1 else found
 
-        monkeypatch.setattr(sight, "_look", in_that_light)
+        monkeypatch.setattr(check, "_look", in_that_light)
         v, u = np.nonzero(mask)
         rgb[v, u] = rgb[v, u][np.random.default_rng(0).permutation(len(v))]
     seen = replace(frame, depth_m=depth_m, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
-    sight._frame = lambda row: seen if row == k else made.sequence.frame(row)
-    found = sight.found(k, [T[k] @ se3.exp(np.array([0, 0, 0, 0.002, 0.001, 0]))], k - 1, T[k - 1])
+    check._frame = lambda row: seen if row == k else made.sequence.frame(row)
+    found = check.found(k, [T[k] @ se3.exp(np.array([0, 0, 0, 0.002, 0.001, 0]))], k - 1, T[k - 1])
     assert (found is not None) == (what == "as it is")
     assert found is None or np.linalg.norm((found.T_cam_obj - T[k])[:3, 3]) < 0.003
 
@@ -276,7 +276,7 @@ def test_what_ties_matched_is_adjusted_as_one_point():
     away = np.array([0, 0, 0.5])
     views = [loops.Features(away + rng.normal(0, 0.02, (n, 3)), np.zeros((n, 128)), *[None] * 2) for n in (6, 5)]
     tracks = [(np.array([7, 8]), views[0].p_cam[:2]), (np.array([8, 9]), views[1].p_cam[:2])]
-    told = evidence.Evidence(tracks=tracks, key=[0, 1], views=views)
+    told = evidence.VideoEvidence(tracks=tracks, key=[0, 1], views=views)
     made = SimpleNamespace(sequence=SimpleNamespace(camera=CAMERA), run=SimpleNamespace(info={"seed": 0}))
     video = evidence.VideoPoses(made, SimpleNamespace(T_cam_obj=T), preset(), told)
     tie = loops.Tie(0, 1, np.eye(4), np.array([5, 1, 0]), np.array([2, 4, 3]), 9.0)
@@ -288,7 +288,7 @@ def test_what_ties_matched_is_adjusted_as_one_point():
 
 def test_a_neighbour_helps_where_it_fits_better_with_a_mask_or_by_sight():
     """Frame 1 has no mask, frame 3 has one, in which nothing fits better than what is there."""
-    better, worse = (Found(np.full((4, 4), k), np.eye(6), cost) for k, cost in ((5.0, 0.2), (6.0, 0.95)))
+    better, worse = (FittedPose(np.full((4, 4), k), np.eye(6), cost) for k, cost in ((5.0, 0.2), (6.0, 0.95)))
     poses = SimpleNamespace(
         T=np.tile(np.eye(4), (5, 1, 1)),
         covariance=np.tile(np.eye(6), (5, 1, 1)),

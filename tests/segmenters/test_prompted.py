@@ -135,9 +135,8 @@ def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, 
         doubt_start(Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))), mask, others)
     assert bool(caught) == said
     if said:
-        found = re.search(
-            r"3600 pixels; 6600 have as good an outline. See where \((\d+), (\d+)\)", str(caught[0].message)
-        )
+        text = r"3600 pixels selected; a mask of 6600 fits as well. If pixel \((\d+), (\d+)\)"
+        found = re.search(text, str(caught[0].message))
         assert RIGHT[int(found[2]), int(found[1])]
 
 
@@ -252,10 +251,10 @@ def test_a_refused_prompt_changes_nothing():
 @pytest.mark.parametrize(
     ("prompts", "said"),
     [
-        ([Prompt("a", points_px=[[30, 40]])], "clicks on 'a' in frame 0: .* flat in what is around it"),
+        ([Prompt("a", points_px=[[30, 40]])], "clicks on 'a' in frame 0: .* lie in the plane around them"),
         (
             [Prompt("a", points_px=[[100, 90]]), Prompt("b", points_px=[[140, 130]])],
-            "clicks on 'b' in frame 0: most of 'a' belongs to what is clicked. If both are one body",
+            "clicks on 'b' in frame 0: the prompt selects most of 'a', too. If they are one object",
         ),
         ([Prompt("left", points_px=[[100, 90]]), Prompt("right", points_px=[[175, 110]])], None),
         ([Prompt("left", box_px=(90, 80, 150, 140))], None),
@@ -275,5 +274,5 @@ def test_nothing_found_is_said():
     frame = picture()
     speck = np.zeros_like(frame.depth_m)
     speck[108:111, 173:176] = frame.depth_m[108:111, 173:176]
-    with pytest.warns(Doubt, match="clicks on 'right' in frame 0: no object is found there"):
+    with pytest.warns(Doubt, match="clicks on 'right' in frame 0: no object was found there"):
         segmenter().segment(Frame(0, 0.0, frame.rgb, speck), [Prompt("right", points_px=[[174, 109]])])
