@@ -114,11 +114,11 @@ def test_what_stands_still_does_not_hold_back_what_moves_slowly():
     p, segments = started(UV, image())
     segments.remember(p, image(), None)
     (segment,) = segments.segments
-    own, moved_m = segment.sight.corners, np.array([0.008, 0.006, 0])
+    own, moved_m = segment.last_view.corners, np.array([0.008, 0.006, 0])
     moves = np.arange(len(own.uv_px)) % 5 > 1
     found = replace(own, p_cam=own.p_cam + moves[:, None] * moved_m)
-    match = wide_baseline.matched(segment.sight, found, CFG, np.random.default_rng(0))
-    assert np.abs((match.T_cam_seg - segment.sight.T_cam_seg)[:3, 3] - moved_m).max() < 0.001
+    match = wide_baseline.matched(segment.last_view, found, CFG, np.random.default_rng(0))
+    assert np.abs((match.T_cam_seg - segment.last_view.T_cam_seg)[:3, 3] - moved_m).max() < 0.001
 
 
 def test_what_matches_alone_carry_is_soon_not_seen():
