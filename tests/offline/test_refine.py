@@ -98,6 +98,43 @@ def test_what_shines_and_stands_still_ties_nothing():
     assert tie.strength < 5 < loops.rated(T @ se3.inverse(turned), 12, *views, CAMERA)
 
 
+def disc(radius_m: float) -> loops.Features:
+    """A disc half a metre away before a wall, seen from in front."""
+    p = CAMERA.rays.reshape(-1, 3) * 0.5
+    on = np.linalg.norm(p[:, :2], axis=1) < radius_m
+    depth_m = np.where(on, 0.5, 1.0).reshape(240, 320).astype(np.float32)
+    return loops.Features(np.zeros((0, 3)), np.zeros((0, 128)), p[on][::7], depth_m)
+
+
+def test_depth_contradicts_a_tie_whichever_of_its_views_shows_more():
+    """Points of the larger disc would float before the wall beside the smaller one; not the other way round."""
+    small, large = disc(0.03), disc(0.06)
+    for pair in ((small, large), (large, small)):
+        assert loops.rated(np.eye(4), 100, *pair, CAMERA) < 1
+    assert loops.rated(np.eye(4), 100, small, small, CAMERA) == 100
+
+
+def test_features_match_that_are_each_others_nearest_and_like_no_other():
+    rng = np.random.default_rng(0)
+    own = rng.random((4, 128))
+    one, other = np.abs(own + rng.normal(0, 0.02, (2, *own.shape)))
+    a, b = np.stack([own[0], own[1], one[1], own[2]]), np.stack([one[0], other[0], own[1], own[3], own[2]])
+    views = [
+        loops.Features(np.zeros((len(d), 3)), 512 * d / np.linalg.norm(d, axis=1, keepdims=True), *[None] * 2)
+        for d in (a, b)
+    ]
+    np.testing.assert_array_equal(loops.matched(*views), [[1, 3], [2, 4]])
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_ties_of_a_pair_the_stronger_counts_and_no_pose_is_needed_where_they_are(order):
+    T = se3.exp(np.random.default_rng(5).normal(size=(3, 6)))
+    known = T.copy()
+    known[1] = np.nan
+    pairs = [(0, 1, T[0] @ se3.inverse(T[1]), 30.0), (0, 1, np.eye(4), 2.0), (1, 2, T[1] @ se3.inverse(T[2]), 20.0)]
+    np.testing.assert_allclose(loops.along_ties(known, pairs[::order]), T, atol=1e-9)
+
+
 def test_poses_follow_the_strongest_ties():
     T = se3.exp(np.random.default_rng(5).normal(size=(5, 6)))
     slipped = T.copy()
