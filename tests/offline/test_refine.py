@@ -126,6 +126,14 @@ def test_features_match_that_are_each_others_nearest_and_like_no_other():
     np.testing.assert_array_equal(loops.matched(*views), [[1, 3], [2, 4]])
 
 
+def test_matches_that_do_not_move_rigidly_are_no_tie():
+    turned, rng = se3.from_rt(np.eye(3), np.array([0, 0, 0.5])), np.random.default_rng(0)
+    one, other = (view(turned @ se3.exp(rng.normal(0, 0.1, 6)), np.zeros((0, 3))) for _ in range(2))
+    assert len(loops.ties([one, other], CAMERA, rng)) == 1
+    crossed = replace(other, p_cam=rng.permutation(other.p_cam))
+    assert not loops.ties([one, crossed], CAMERA, rng)
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_of_two_ties_of_a_pair_the_stronger_counts_and_no_pose_is_needed_where_they_are(order):
     T = se3.exp(np.random.default_rng(5).normal(size=(3, 6)))
@@ -337,6 +345,23 @@ def test_a_neighbour_helps_where_it_fits_better_with_a_mask_or_by_sight():
     SurfacePoses.ask_neighbours(poses, SimpleNamespace(found=lambda *of: better))
     assert (poses.T[1] == 5).all() and poses.cost[1] == 0.2
     assert (poses.T[3] == np.eye(4)).all() and poses.cost[3] == 0.9
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_a_frame_that_does_not_fit_is_tried_where_its_neighbours_motion_leads(step):
+    even = np.stack([se3.exp(np.array([0, 0, 0.1 * k, 0.02 * k, 0, 0])) for k in range(4)])[::step]
+    lost = 3 if step == 1 else 0
+    tried = []
+    poses = SimpleNamespace(
+        T=even.copy(),
+        covariance=np.tile(np.eye(6), (4, 1, 1)),
+        cost=np.where(np.arange(4) == lost, 0.9, 0.1),
+        limit=0.5,
+        _evidence=SimpleNamespace(shown=np.ones(4, bool)),
+        _best_of=lambda k, candidates: tried.extend(candidates) or FittedPose(candidates[0], np.eye(6), 1.0),
+    )
+    SurfacePoses.ask_neighbours(poses, None)
+    assert any(np.allclose(T, even[lost], atol=1e-9) for T in tried)
 
 
 def test_features_keep_away_from_the_border_of_the_mask():
