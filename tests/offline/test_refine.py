@@ -98,6 +98,51 @@ def test_what_shines_and_stands_still_ties_nothing():
     assert tie.strength < 5 < loops.rated(T @ se3.inverse(turned), 12, *views, CAMERA)
 
 
+def disc(radius_m: float) -> loops.Features:
+    """A disc half a metre away before a wall, seen from in front."""
+    p = CAMERA.rays.reshape(-1, 3) * 0.5
+    on = np.linalg.norm(p[:, :2], axis=1) < radius_m
+    depth_m = np.where(on, 0.5, 1.0).reshape(240, 320).astype(np.float32)
+    return loops.Features(np.zeros((0, 3)), np.zeros((0, 128)), p[on][::7], depth_m)
+
+
+def test_depth_contradicts_a_tie_whichever_of_its_views_shows_more():
+    """Points of the larger disc would float before the wall beside the smaller one; not the other way round."""
+    small, large = disc(0.03), disc(0.06)
+    for pair in ((small, large), (large, small)):
+        assert loops.rated(np.eye(4), 100, *pair, CAMERA) < 1
+    assert loops.rated(np.eye(4), 100, small, small, CAMERA) == 100
+
+
+def test_features_match_that_are_each_others_nearest_and_like_no_other():
+    rng = np.random.default_rng(0)
+    own = rng.random((4, 128))
+    one, other = np.abs(own + rng.normal(0, 0.02, (2, *own.shape)))
+    a, b = np.stack([own[0], own[1], one[1], own[2]]), np.stack([one[0], other[0], own[1], own[3], own[2]])
+    views = [
+        loops.Features(np.zeros((len(d), 3)), 512 * d / np.linalg.norm(d, axis=1, keepdims=True), *[None] * 2)
+        for d in (a, b)
+    ]
+    np.testing.assert_array_equal(loops.matched(*views), [[1, 3], [2, 4]])
+
+
+def test_matches_that_do_not_move_rigidly_are_no_tie():
+    turned, rng = se3.from_rt(np.eye(3), np.array([0, 0, 0.5])), np.random.default_rng(0)
+    one, other = (view(turned @ se3.exp(rng.normal(0, 0.1, 6)), np.zeros((0, 3))) for _ in range(2))
+    assert len(loops.ties([one, other], CAMERA, rng)) == 1
+    crossed = replace(other, p_cam=rng.permutation(other.p_cam))
+    assert not loops.ties([one, crossed], CAMERA, rng)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_ties_of_a_pair_the_stronger_counts_and_no_pose_is_needed_where_they_are(order):
+    T = se3.exp(np.random.default_rng(5).normal(size=(3, 6)))
+    known = T.copy()
+    known[1] = np.nan
+    pairs = [(0, 1, T[0] @ se3.inverse(T[1]), 30.0), (0, 1, np.eye(4), 2.0), (1, 2, T[1] @ se3.inverse(T[2]), 20.0)]
+    np.testing.assert_allclose(loops.along_ties(known, pairs[::order]), T, atol=1e-9)
+
+
 def test_poses_follow_the_strongest_ties():
     T = se3.exp(np.random.default_rng(5).normal(size=(5, 6)))
     slipped = T.copy()
@@ -300,6 +345,23 @@ def test_a_neighbour_helps_where_it_fits_better_with_a_mask_or_by_sight():
     SurfacePoses.ask_neighbours(poses, SimpleNamespace(found=lambda *of: better))
     assert (poses.T[1] == 5).all() and poses.cost[1] == 0.2
     assert (poses.T[3] == np.eye(4)).all() and poses.cost[3] == 0.9
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_a_frame_that_does_not_fit_is_tried_where_its_neighbours_motion_leads(step):
+    even = np.stack([se3.exp(np.array([0, 0, 0.1 * k, 0.02 * k, 0, 0])) for k in range(4)])[::step]
+    lost = 3 if step == 1 else 0
+    tried = []
+    poses = SimpleNamespace(
+        T=even.copy(),
+        covariance=np.tile(np.eye(6), (4, 1, 1)),
+        cost=np.where(np.arange(4) == lost, 0.9, 0.1),
+        limit=0.5,
+        _evidence=SimpleNamespace(shown=np.ones(4, bool)),
+        _best_of=lambda k, candidates: tried.extend(candidates) or FittedPose(candidates[0], np.eye(6), 1.0),
+    )
+    SurfacePoses.ask_neighbours(poses, None)
+    assert any(np.allclose(T, even[lost], atol=1e-9) for T in tried)
 
 
 def test_features_keep_away_from_the_border_of_the_mask():

@@ -91,7 +91,7 @@ def test_a_click_on_one_of_two_stickers_alike_selects_that_one():
     """What is as flat as the table, and of one colour, is told apart by the table between alone."""
     one, other = rectangle(120, 90, 150, 120), rectangle(156, 90, 186, 120)
     frame = on_a_table(one | other, (150, 40, 40), np.ones(one.shape), 0)
-    with pytest.warns(Doubt, match="flat in what is around it"):
+    with pytest.warns(Doubt, match="lie in the plane around them"):
         found = segmenter().segment(frame, [Prompt("sticker", points_px=[[135, 105]])]) == 1
     assert iou(found, one) > 0.95
 

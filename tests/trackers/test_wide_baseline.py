@@ -109,6 +109,18 @@ def test_another_texture_is_no_match():
     assert wide_baseline.matched(segment.last_view, here, CFG, np.random.default_rng(0)) is None
 
 
+def test_what_stands_still_does_not_hold_back_what_moves_slowly():
+    """Two fifths of the corners are of shine and shadow, which stay where they are while the rest moves by 1 cm."""
+    p, segments = started(UV, image())
+    segments.remember(p, image(), None)
+    (segment,) = segments.segments
+    own, moved_m = segment.last_view.corners, np.array([0.008, 0.006, 0])
+    moves = np.arange(len(own.uv_px)) % 5 > 1
+    found = replace(own, p_cam=own.p_cam + moves[:, None] * moved_m)
+    match = wide_baseline.matched(segment.last_view, found, CFG, np.random.default_rng(0))
+    assert np.abs((match.T_cam_seg - segment.last_view.T_cam_seg)[:3, 3] - moved_m).max() < 0.001
+
+
 def test_what_matches_alone_carry_is_soon_not_seen():
     """From match to match errors add up: an image that shows the points in no way they are known by carries them on."""
     tracker = BuiltinTracker(replace(CFG, return_ncc=1.0, min_ncc=1.0, coast_frames=0, textureless_contrast=1e3))
