@@ -182,8 +182,8 @@ def export_run(
     path = run.info.get("path")
     sequence = sequences.open_sequence(path, run.info["format"]) if path and Path(path).is_dir() else None
     frames = model_frames(run) if in_model else None
-    sure = {name: obj.of_confidence(min_confidence) for name, obj in run.objects.items()}
-    return export(replace(run, objects=sure), out, format, frames, sequence)
+    confident = {name: obj.of_confidence(min_confidence) for name, obj in run.objects.items()}
+    return export(replace(run, objects=confident), out, format, frames, sequence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +207,7 @@ class _Job:
 
 
 def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> _Job:
-    """Whatever can be wrong with the options is said here, before anything is tracked."""
+    """Check the options, before anything is tracked."""
     config, prompts, source = options.config(), options.prompts, str(sequence)
     if options.depth_scale is not None:
         source += f" --depth-scale {options.depth_scale:g}"
@@ -219,18 +219,18 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     how = options.format, options.depth_scale, config.seed
     sequence = sequences.open_sequence(sequence, *how, masks=masks.folder, gaps=options.skip_bad)
     frames = _frame_range(len(sequence), options.start, options.stop)
-    told = masks.name == "clicks" and bool(prompts or memories)  # all that is known of the objects
-    objects = [p.name for p in prompts] if told else sequence.objects
+    prompted = masks.name == "clicks" and bool(prompts or memories)  # all that is known of the objects
+    objects = [p.name for p in prompts] if prompted else sequence.objects
     objects = _chosen(list(dict.fromkeys([*objects, *memories])), options.objects)
     memories = {name: memory for name, memory in memories.items() if name in objects}
     if both := [p.name for p in prompts if p.name in memories]:
-        raise BadInput(f"memory of {both[0]!r}", "a prompt of it, too", "one of them", "Leave the prompt out.")
-    if not told and all(sequence.masks(i) is None for i in frames):
+        raise BadInput(f"memory of {both[0]!r}", "a prompt of it, too", "a memory or a prompt", "Leave the prompt out.")
+    if not prompted and all(sequence.masks(i) is None for i in frames):
         fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
         fix = "Leave --masks out: the prompts start the objects." if prompts else fix
         expected = "masks of the first image at least, or clicks"
         raise BadInput("masks", f"none in frames {frames[0]} to {frames[-1]} of {sequence.name}", expected, fix)
-    if not told and not masks.every_mask:
+    if not prompted and not masks.every_mask:
         rng, clicks = np.random.default_rng([config.seed, 2]), CLICKS if masks.name == "clicks" else 0
         unknown = tuple(name for name in objects if name not in memories)
         drawn = first_prompts(sequence, frames, unknown, config.lifecycle.min_mask_px, clicks, rng)
@@ -240,10 +240,10 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
         prompts += drawn
     started = objects if masks.every_mask else tuple(memories)
     by_frame = prompts_by_frame([p for p in prompts if p.name in objects], frames, sequence.camera, started)
-    for i, said in by_frame.items() if masks.every_mask else ():
-        if both := [p.name for p in said if p.name in (sequence.masks(i) or {})]:
+    for i, of_frame in by_frame.items() if masks.every_mask else ():
+        if both := [p.name for p in of_frame if p.name in (sequence.masks(i) or {})]:
             fix = "Leave --masks out to start from the prompts, or take the mask of that frame away."
-            raise BadInput(f"prompt of {both[0]!r}", f"a mask in frame {i} too", "one of them", fix)
+            raise BadInput(f"prompt of {both[0]!r}", f"a mask in frame {i}, too", "a mask or a prompt", fix)
     return _Job(source, config, sequence, frames, objects, masks, by_frame, memories)
 
 
@@ -255,7 +255,7 @@ def _doubt_scale(job: _Job) -> None:
     except P2PError:
         return  # said when the run comes to that frame, with the poses before it kept
     if text := moving_scale(pairs):
-        doubt("depth", text, f"Nothing rigid does that: is each image scaled by itself? See p2p check {job.source}")
+        doubt("depth", text, f"Is each image scaled separately? See p2p check {job.source}")
 
 
 def _frame_range(count: int, start: int, stop: int | None) -> range:
@@ -300,11 +300,11 @@ def _writer(
         redo_from,
     )
     writer.info["left_out"] = {}
-    writer.info |= told(method, options, [prompt for of_frame in job.prompts.values() for prompt in of_frame])
+    writer.info |= described(method, options, [prompt for of_frame in job.prompts.values() for prompt in of_frame])
     return writer
 
 
-def told(method: Point2Pose, options: RunOptions, prompts: Iterable[Prompt]) -> dict[str, Any]:
+def described(method: Point2Pose, options: RunOptions, prompts: Iterable[Prompt]) -> dict[str, Any]:
     """What ``run.json`` says of the parts and words with which a run was made."""
     parts = {"detector": method.detector.name, "segmenter": method.segmenter.name}
     return {**parts, "prompts": [prompt.as_dict() for prompt in prompts], "options": options.as_dict()}
@@ -315,7 +315,7 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None
         say(f"{writer.path} holds {writer.earlier}, which is finished.")
     elif writer.resumed:
         kept = "its frames" if writer.redo_from is None else f"its frames before {writer.redo_from}"
-        say(f"{writer.path} holds {writer.earlier}; {kept} are tracked again and compared, then it goes on.")
+        say(f"{writer.path} holds {writer.earlier}; {kept} are tracked again and compared before it goes on.")
     elif writer.earlier:
         say(f"{writer.path} held {writer.earlier}, which this one replaces.")
 
@@ -365,7 +365,7 @@ def _estimates(
                 frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
             except P2PError as unreadable:
                 if leave_out is None or i in job.prompts:
-                    raise advised(unreadable, "A prompt is made on it." if i in job.prompts else SKIP_BAD) from None
+                    raise advised(unreadable, "A prompt needs this frame." if i in job.prompts else SKIP_BAD) from None
                 leave_out(i, unreadable)
                 continue
             for prompt in job.prompts.get(i, ()):
@@ -393,8 +393,8 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
     tracked = any(obj.has_pose.any() for obj in done.objects.values())
     advice = "" if interrupted else _advice(done, job)
     look_at = [f"{name}: {text}" for name, of in (done.info.get("look_at") or {}).items() for text in of]
-    told = summary(done, len(job.frames)), interrupted, advice, tracked, tuple(look_at)
-    return RunResult(out, evaluation, not_scored, *told)
+    lines = summary(done, len(job.frames))
+    return RunResult(out, evaluation, not_scored, lines, interrupted, advice, tracked, tuple(look_at))
 
 
 def summary(run: Run, wanted: int) -> tuple[str, ...]:
@@ -406,8 +406,8 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
         lines[0] += f"; {len(left_out)} left out, which cannot be read, the first: {next(iter(left_out.values()))}"
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
-        why = Counter(status_text(*said).partition(" since ")[0] for said in zip(obj.status[lost], obj.reason[lost]))
-        most = f"; without one mostly {why.most_common(1)[0][0]}" if why else ""
+        why = Counter(status_text(*one).partition(" since ")[0] for one in zip(obj.status[lost], obj.reason[lost]))
+        most = f"; otherwise mostly {why.most_common(1)[0][0]}" if why else ""
         doubted = int(obj.doubted.sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""
         lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}")
@@ -423,14 +423,14 @@ def _advice(run: Run, job: _Job) -> str:
         return ""
     why = " ".join(reasons.values())
     if set(reasons) <= set(job.memories):
-        fix = "is it in view, and seen from a side that was learnt? Else click on it"
+        fix = "show a side that was learnt, or click on it"
     elif "pixels with depth" in why:
-        fix = "its depth is missing or out of range, or in another unit (--depth-scale)"
+        fix = "its depth is missing, out of range or in another unit (--depth-scale)"
     elif "not seen yet" in why and not job.masks.every_mask:
-        fix = "click in the middle of it, elsewhere"
+        fix = "click on another place, near its centre"
     elif "not seen yet" in why:
-        fix = "its masks are empty or too small: draw it, or use p2p click"
+        fix = "its masks are empty or too small: draw them anew, or use p2p click"
     else:
-        fix = "see what is wrong with the data"
+        fix = "look for faults in the data"
     first = next(iter(reasons.values()))
     return f"{', '.join(reasons)} never had a pose ({first}); {fix}. Next: p2p check {job.source}"

@@ -19,8 +19,10 @@ mutants = load_mutants()
 MECHANISMS = mutants.read_mechanisms([])
 
 
-def test_names_are_distinct():
-    assert len({entry["name"] for entry in MECHANISMS}) == len(MECHANISMS)
+def test_a_name_that_is_there_twice_is_refused(tmp_path):
+    (tmp_path / "twice.toml").write_text('[[mechanism]]\nname = "sight"\n' * 2)
+    with pytest.raises(mutants.DoesNotFit, match="two mechanisms 'sight'"):
+        mutants.read_mechanisms([], tmp_path / "twice.toml")
 
 
 @pytest.mark.parametrize("entry", MECHANISMS, ids=lambda entry: entry["name"])

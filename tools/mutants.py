@@ -31,8 +31,12 @@ class DoesNotFit(Exception):
 
 
 def read_mechanisms(names: list[str], path: Path = MECHANISMS) -> list[dict[str, str]]:
-    """The entries of these names, all where there are none; :class:`DoesNotFit` for a name that is not there."""
-    known = {entry["name"]: entry for entry in tomllib.loads(path.read_text(encoding="utf-8"))["mechanism"]}
+    """The entries of these names, all where there are none; :class:`DoesNotFit` for a name that is not there once."""
+    entries = tomllib.loads(path.read_text(encoding="utf-8"))["mechanism"]
+    known = {entry["name"]: entry for entry in entries}
+    if len(known) < len(entries):
+        twice = next(entry["name"] for entry in entries if known[entry["name"]] is not entry)
+        raise DoesNotFit(f"{path.name} has two mechanisms {twice!r}")
     if unknown := [name for name in names if name not in known]:
         raise DoesNotFit(f"{path.name} has no mechanism {unknown[0]!r}")
     return [known[name] for name in names or known]

@@ -28,7 +28,7 @@ from p2p_lib.figures.final_tables import paper_table
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.provenance import Saved, save_table
-from p2p_lib.figures.scenes import Scene, beside
+from p2p_lib.figures.scenes import Scene, side_by_side
 from p2p_lib.synthetic.shapes import load_mesh
 from studies import SHIPPED
 
@@ -150,7 +150,7 @@ def recovery_strip(benchmark: Benchmark, count: int = 4, width_px: int = 300) ->
     """Occlusion and recovery: a line for each method, the same moments below each other."""
     ran = {job.method.name for job, outcome in benchmark.results if outcome.objects}
     scenes = {name: scene_of(benchmark, name) for name in benchmark.methods if name in ran}
-    return beside(scenes, count, width_px)
+    return side_by_side(scenes, count, width_px)
 
 
 def reconstruction_sheet(benchmark: Benchmark, method: str) -> np.ndarray:

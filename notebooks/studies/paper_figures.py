@@ -27,7 +27,7 @@ from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.figures import mesh_view, overlay, style
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.provenance import Saved, save_figure
-from p2p_lib.figures.scenes import Scene, beside
+from p2p_lib.figures.scenes import Scene, side_by_side
 from studies import CLONE
 from studies.final_figures import rate_figure, scene_of
 from studies.pipeline_diagram import pipeline_diagram
@@ -94,11 +94,11 @@ def return_beside(runs: Benchmark, poses: Path | None = None) -> np.ndarray:
         ours = scene_of(runs, _OURS, _HIDDEN)
         rival = imported(poses, ours.sequence)
         scenes = {"ours": ours, poses.stem: Scene(ours.sequence, rival, evaluate(rival))}
-        return _marked(beside(scenes, 4, axes=True), _OTHER)
+        return _marked(side_by_side(scenes, 4, axes=True), _OTHER)
     scenes = {words: scene_of(runs, method, _HIDDEN) for words, method in _TWO_BY_TWO.items()}
     event = evaluate(next(iter(scenes.values())).run).objects["box"].returns[0]
     shown = [event.hidden_frame - 15, (event.hidden_frame + event.return_frame) // 2, event.return_frame + 10]
-    return _marked(beside(scenes, shown, 240, across=2), _OTHER)
+    return _marked(side_by_side(scenes, shown, 240, across=2), _OTHER)
 
 
 def imported(poses: Path, video: Sequence) -> Run:

@@ -140,8 +140,8 @@ def check_folder(
             findings.append(_size(name, sizes_m[name], frame, mask, sequence.camera))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         findings.append(_range(name, frame, mask, config, scale))
-        said = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
-        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in said]
+        warned = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
+        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in warned]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
     return findings
 
@@ -189,7 +189,7 @@ def _files(folder: Path) -> list[Finding]:
     K = "a 3x3 camera matrix in pixels"
     look("cam_K.txt", _PUT["K"], lambda: Camera.from_K(images.read_numbers(folder / "cam_K.txt", K), 1, 1, "cam_K.txt"))
     for path in (path for path in (folder / "times.txt", folder / "depth_scale.txt") if path.exists()):
-        look(path.name, "It is optional: mend it or take it away.", partial(images.read_numbers, path, "numbers"))
+        look(path.name, "It is optional: correct it or remove it.", partial(images.read_numbers, path, "numbers"))
     return wrong
 
 
@@ -247,7 +247,7 @@ def _times(sequence: Sequence) -> Finding:
 def _scale(pairs: list[tuple[Frame, Frame]]) -> Finding:
     """Whether depth has one unit throughout."""
     if text := moving_scale(pairs):
-        fix = "Nothing rigid does that: take what a depth camera measured, in one unit, not scaled image by image."
+        fix = "Take depth as the camera measured it, in one unit, not scaled image by image."
         return Finding("scale", Level.WRONG, text, fix)
     return Finding("scale", Level.OK, "depth keeps its scale from image to image")
 
@@ -283,7 +283,7 @@ def _depth(frames: list[Frame], scale: float) -> Finding:
         clipped = float((every_m == every_m.max()).mean())
         if median_m > FARTHEST_M and clipped > CLIPPED_SHARE:
             text = f"{text}; {100 * clipped:.0f} % of them are cut off at {every_m.max():.3g} m, the most that fits"
-            fix = "No scale brings back what was cut off: export the depth again, as 16-bit millimetres."
+            fix = "Export the depth again, as 16-bit millimetres: no scale restores what was cut off."
             return Finding("depth", Level.WRONG, text, fix)
         fix = "Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1)."
         fix += f" {guess}." if (guess := _units(median_m, scale)) else ""
@@ -298,8 +298,8 @@ def _units(median_m: float, scale: float) -> str:
     """The units of the field that bring a depth to where things stand before a camera, likeliest first, in words."""
     fits = [(unit, what, median_m * unit / scale) for unit, what in UNITS_M.items() if not np.isclose(unit, scale)]
     fits = [(unit, what, m) for unit, what, m in fits if _STANDS_M[0] <= m <= _STANDS_M[1]][:3]
-    said = [f"{unit:g} ({what}) would make it {m:.2g} m" for unit, what, m in fits]
-    return f"A unit of {', of '.join(said)}" if said else ""
+    units = [f"{unit:g} ({what}) would make it {m:.2g} m" for unit, what, m in fits]
+    return f"A unit of {', of '.join(units)}" if units else ""
 
 
 def _registered(frames: list[Frame]) -> Finding:
@@ -313,7 +313,7 @@ def _registered(frames: list[Frame]) -> Finding:
     where = f"shifted by ({round(found.du_px):+d}, {round(found.dv_px):+d}) px"
     size = f"{found.scale:.2f} times as large and " if abs(found.scale - 1) > 0.03 else ""
     fix = "Register depth to colour when recording (`align` in the camera's software; p2p convert does for RealSense)."
-    text = f"depth lies beside colour: {size}{where}, its edges would fit {found.gain:.1f} times as well"
+    text = f"depth is offset from colour: {size}{where}, its edges would fit {found.gain:.1f} times as well"
     return Finding(name, Level.WRONG, text, fix)
 
 
@@ -331,7 +331,7 @@ def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) ->
     count, needed = int(mask.sum()), config.lifecycle.min_mask_px
     what = f"only {count} pixels were segmented" if count else "nothing was segmented"
     text = f"{what} at the clicks on it in frame {frame.index}; {needed} pixels are needed"
-    return Finding(f"{name}: mask", Level.WRONG, text, "Click elsewhere, in the middle of the object: p2p click.")
+    return Finding(f"{name}: mask", Level.WRONG, text, "Click again, near the centre of the object: p2p click.")
 
 
 def _distance_m(frame: Frame, mask: np.ndarray) -> float:
@@ -388,7 +388,7 @@ def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Fin
     large, deep_m = mask.mean(), far_m - near_m  # without its outermost pixels
     if large > LARGE_SHARE or deep_m > DEEP_SHARE * away_m:
         text = f"it covers {100 * large:.0f} % of the image, over {deep_m:.2f} m of depth; {text}"
-        fix = "Is it the object, or the table or wall? If it is not, click in its middle, or draw it tighter."
+        fix = "If this is a table or a wall, click near the centre of the object, or draw the mask tighter."
         return Finding(f"{name}: mask", Level.LOOK, text, fix)
     return Finding(f"{name}: mask", Level.OK, text)
 

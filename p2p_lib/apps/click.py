@@ -120,15 +120,15 @@ class Clicker(AbstractContextManager):
             warnings.simplefilter("always", Doubt)
             made = clicked_masks(self.sequence, [prompt for prompt in prompts if prompt.starts])
         found |= {name: mask for name, (_, mask) in made.items()}
-        said = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
-        return {"masks": {name: run_lengths(mask)["counts"] for name, mask in found.items()}, "doubts": said}
+        texts = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
+        return {"masks": {name: run_lengths(mask)["counts"] for name, mask in found.items()}, "doubts": texts}
 
     def checked(self, content: object, started: Iterable[str] = ()) -> tuple[Prompt, ...]:
         """The prompts that the page sends; objects that are ``started`` may be corrected alone."""
         prompts = parse_prompts(content)
         by_frame = prompts_by_frame(prompts, range(len(self.sequence)), self.sequence.camera, started)
-        for i, said in by_frame.items():
-            for prompt in said:
+        for i, of_frame in by_frame.items():
+            for prompt in of_frame:
                 check_depth(prompt, self.sequence.frame(i))
         return prompts
 
@@ -161,10 +161,10 @@ def clicked_masks(sequence: Sequence, prompts: Iterable[Prompt], config: Config 
     """Each object's first mask, as the built-in segmenter cuts it out of the frame that its first prompt is of."""
     config = config or preset()
     found: FirstMasks = {}
-    for i, said in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
+    for i, of_frame in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
         frame = sequence.frame(i)
         segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation)
-        labels = segmenter.segment(frame, [prompt for prompt in said if prompt.name not in found])
+        labels = segmenter.segment(frame, [prompt for prompt in of_frame if prompt.name not in found])
         found |= {name: (frame, labels == label) for label, name in enumerate(segmenter.names, 1)}
     return found
 

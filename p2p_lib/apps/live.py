@@ -32,7 +32,7 @@ from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
 from p2p_lib.keeper import Keeper, noted
-from p2p_lib.run import recall, told
+from p2p_lib.run import described, recall
 
 #: Made-up images that are tracked before a camera starts.
 _WARM_FRAMES = 4
@@ -113,7 +113,7 @@ def track_live(
     named = options.tracker if isinstance(options.tracker, str) else ""
     if named.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
-    said = list(prompts)
+    every_prompt = list(prompts)
     with ExitStack() as kept:
         listeners: list[Listener] = [_each(on_estimate)]
         if page is not None:
@@ -121,7 +121,7 @@ def track_live(
         if overlay is not None:
             listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
         if out is not None:
-            listeners.append(kept.enter_context(_kept(out, camera, method, options, said, memories, if_exists)))
+            listeners.append(kept.enter_context(_kept(out, camera, method, options, every_prompt, memories, if_exists)))
 
         def tell(estimates: dict[str, PoseEstimate]) -> None:
             if (of := method.frame) is not None:
@@ -134,7 +134,7 @@ def track_live(
         while frame is not None and (frame is first or options.stop is None or frame.index < options.stop):
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))
-            said += words.tell(method, frame.index) if words else []
+            every_prompt += words.tell(method, frame.index) if words else []
             tell(method.step(frame))
             if frame is not first:  # which may be long ago
                 count.count(frame)
@@ -202,7 +202,7 @@ def _kept(
     sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
     objects = tuple(dict.fromkeys([*(prompt.name for prompt in prompts), *memories]))
     writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, if_exists=if_exists)
-    writer.info |= told(method, options, prompts)
+    writer.info |= described(method, options, prompts)
     keeper, stopped = Keeper(writer, method, options.save_masks, prompts), None
 
     def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
@@ -237,11 +237,11 @@ def click_first(
 
 def text_line(estimate: PoseEstimate) -> str:
     """An estimate as a line for people: time, object, status; its place in the camera's frame, or why it has none."""
-    said = f"{estimate.time_s:.2f} s  {estimate.object}: "
+    head = f"{estimate.time_s:.2f} s  {estimate.object}: "
     if estimate.T_cam_obj is None:
-        return said + status_text(estimate.status, estimate.reason)
+        return head + status_text(estimate.status, estimate.reason)
     x, y, z = estimate.T_cam_obj[:3, 3]
-    return f"{said}{estimate.status}  {x:.3f} {y:.3f} {z:.3f} m  confidence {estimate.confidence:.2f}"
+    return f"{head}{estimate.status}  {x:.3f} {y:.3f} {z:.3f} m  confidence {estimate.confidence:.2f}"
 
 
 def json_line(estimate: PoseEstimate) -> str:

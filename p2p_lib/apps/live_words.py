@@ -30,7 +30,7 @@ class Words:
     """
 
     def __init__(self, lines: Iterable[str] | None, say: Callable[[str], object]):
-        self._said: deque[tuple[str, Prompt | None]] = deque()
+        self._pending: deque[tuple[str, Prompt | None]] = deque()
         self._say = say
         if lines is not None:
             threading.Thread(target=lambda: deque(map(self.hear, lines), 0), daemon=True).start()
@@ -38,15 +38,15 @@ class Words:
     def hear(self, line: str) -> None:
         """Take in one line; what does not fit is said."""
         try:
-            self._said.extend(_parsed(line) if line.strip() else ())
+            self._pending.extend(_parsed(line) if line.strip() else ())
         except BadInput as error:
             self._say(str(error))
 
     def tell(self, method: Point2Pose, frame_index: int) -> list[Prompt]:
         """Tell a tracker what was said since, before its next frame; the prompts that it took."""
         taken = []
-        while self._said:
-            name, prompt = self._said.popleft()
+        while self._pending:
+            name, prompt = self._pending.popleft()
             try:
                 if prompt is None:
                     method.remove_object(name)
@@ -62,15 +62,15 @@ class Words:
 def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
     """Object and prompt of each thing that a line says; no prompt: it is to be removed."""
     try:
-        said = json.loads(line)
+        message = json.loads(line)
     except ValueError as error:
         raise BadInput("line", f"{line.strip()[:60]} ({in_a_line(error)})", _FORM) from None
-    if isinstance(said, dict) and said.keys() == {"remove"} and isinstance(said["remove"], str):
-        return [(said["remove"], None)]
-    if isinstance(said, dict) and "objects" in said:
-        prompts = parse_prompts(said)
-    elif isinstance(said, dict) and {"name"} < said.keys() <= KEYS:
-        prompts = parse_prompts({"objects": [said]})
+    if isinstance(message, dict) and message.keys() == {"remove"} and isinstance(message["remove"], str):
+        return [(message["remove"], None)]
+    if isinstance(message, dict) and "objects" in message:
+        prompts = parse_prompts(message)
+    elif isinstance(message, dict) and {"name"} < message.keys() <= KEYS:
+        prompts = parse_prompts({"objects": [message]})
     else:
         raise BadInput("line", line.strip()[:60], _FORM)
     return [(prompt.name, prompt) for prompt in prompts]

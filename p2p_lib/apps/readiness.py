@@ -25,11 +25,11 @@ def readiness(name: str) -> str:
     alike: dict[str, list[str]] = defaultdict(list)
     for method, reasons in found.items():
         ready = sum(not reason for reason in reasons.values())
-        said = f"{ready} of {len(reasons)} sequences"
+        count = f"{ready} of {len(reasons)} sequences"
         if why := list(dict.fromkeys(reason for reason in reasons.values() if reason)):
-            said += f"; else: {why[0]}" + f" ({len(why) - 1} more likewise)" * (len(why) > 1)
-        alike[said].append(method)
-    return "\n".join([*lines, *(f"  {'; '.join(methods)}: {said}" for said, methods in alike.items())])
+            count += f"; else: {why[0]}" + f" ({len(why) - 1} more likewise)" * (len(why) > 1)
+        alike[count].append(method)
+    return "\n".join([*lines, *(f"  {'; '.join(methods)}: {count}" for count, methods in alike.items())])
 
 
 def overview() -> str:

@@ -197,13 +197,13 @@ def _run(
                     save_outcome(out, outcome)
                 found[job.key] = outcome
                 failed = sum(o.status == "failed" for o in found.values())
-                said = f"{job.method.name} on {job.sequence.name}" + f", {failed} failed" * bool(failed)
-                bar.set_postfix_str(said, refresh=False)
+                label = f"{job.method.name} on {job.sequence.name}" + f", {failed} failed" * bool(failed)
+                bar.set_postfix_str(label, refresh=False)
                 bar.update()
                 if not bar.disable and not sys.stderr.isatty() and len(found) < total:
                     # Into a file: such runs take hours, and somebody wants to know.
                     left_s = bar.format_dict["elapsed"] / len(found) * (total - len(found))
-                    sys.stderr.write(f"{len(found)} of {total} runs, about {left_s / 60:.0f} min left: {said}\n")
+                    sys.stderr.write(f"{len(found)} of {total} runs, about {left_s / 60:.0f} min left: {label}\n")
         except KeyboardInterrupt:
             pass
         finally:

@@ -184,8 +184,8 @@ def _columns(file: Path) -> dict[str, dict[str, str]]:
     """Sequence, object and its column, as the file says; none where there is no file."""
     expected = 'a table [SEQUENCE] each, with a line OBJECT = "COLUMN" for each object'
     try:
-        said = read_toml(file, expected) if file.is_file() else {}
-        return TypeAdapter(dict[str, dict[str, str]]).validate_python(said)
+        content = read_toml(file, expected) if file.is_file() else {}
+        return TypeAdapter(dict[str, dict[str, str]]).validate_python(content)
     except ValidationError as error:
         raise BadInput(str(file), first_fault(error), expected) from None
 

@@ -77,8 +77,8 @@ class PlannedFault(Strict):
     @property
     def shown(self) -> str:
         """What tables call it."""
-        said = "" if self.when == "for a while" else self.when
-        return ", ".join(filter(None, (self.name, "" if self.severity is None else f"{self.severity:g}", said)))
+        period = "" if self.when == "for a while" else self.when
+        return ", ".join(filter(None, (self.name, "" if self.severity is None else f"{self.severity:g}", period)))
 
 
 class PlannedSequence(Strict):

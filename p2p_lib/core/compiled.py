@@ -33,7 +33,7 @@ LOOPS = (
     "p2p_lib.extended.image_search",
     "p2p_lib.core.robust",
 )
-LOOPS_BESIDE = ("p2p_lib.trackers.builtin.rigid_motion", "p2p_lib.method.refinement")
+LOOPS_IN_BACKGROUND = ("p2p_lib.trackers.builtin.rigid_motion", "p2p_lib.method.refinement")
 _waiting: dict[str, list[Callable]] = {}
 _arguments: dict[tuple[str, str], tuple[str, ...]] = {}  # (module, function) to the types it is called with
 _warm: set[str] = set()
@@ -75,18 +75,18 @@ def warm_up(say: Callable[[str], object] = lambda line: None) -> float:
     say  told a line before anything is compiled; nothing where it is only loaded
     """
     start_s = monotonic()
-    beside: subprocess.Popen | None = None
+    child: subprocess.Popen | None = None
     try:
-        for module in (name for name in (*LOOPS, *LOOPS_BESIDE) if name not in _warm):
-            if module == LOOPS_BESIDE[0] and beside is not None:
-                beside.wait()  # what it has compiled is loaded; what it has not is compiled here
+        for module in (name for name in (*LOOPS, *LOOPS_IN_BACKGROUND) if name not in _warm):
+            if module == LOOPS_IN_BACKGROUND[0] and child is not None:
+                child.wait()  # what it has compiled is loaded; what it has not is compiled here
             if _ready(module) and module == LOOPS[0]:
                 say("Compiling inner loops, once on this machine: 10 to 25 s.")
-                beside = _compiling_beside() if len(os.sched_getaffinity(0)) > 1 else None
+                child = _compile_in_background() if len(os.sched_getaffinity(0)) > 1 else None
     finally:
-        if beside is not None:
-            beside.kill()
-            beside.wait()
+        if child is not None:
+            child.kill()
+            child.wait()
     return monotonic() - start_s
 
 
@@ -105,10 +105,10 @@ def _ready(module: str) -> int:
     return missed
 
 
-def _compiling_beside() -> subprocess.Popen | None:
-    """Another process that compiles :data:`LOOPS_BESIDE`, for numba compiles one function of a process at a time."""
+def _compile_in_background() -> subprocess.Popen | None:
+    """A process that compiles :data:`LOOPS_IN_BACKGROUND`: numba compiles one function of a process at a time."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from p2p_lib.core import compiled as c\n"
-    code += "for module in c.LOOPS_BESIDE: c._ready(module)"
+    code += "for module in c.LOOPS_IN_BACKGROUND: c._ready(module)"
     quiet = subprocess.DEVNULL
     try:
         return subprocess.Popen([sys.executable, "-c", code], stdin=quiet, stdout=quiet, stderr=quiet)

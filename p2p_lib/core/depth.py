@@ -124,16 +124,16 @@ def _plane_depths(depth_m: np.ndarray, uv_px: np.ndarray, min_m: float, max_m: f
         if not (0 <= u <= width - 1 and 0 <= v <= height - 1):  # NaN is outside as well
             continue
         column, line = int(np.rint(u)), int(np.rint(v))
-        middle = depth_m[line, column]
-        if not min_m <= middle <= max_m:
+        centre_m = depth_m[line, column]
+        if not min_m <= centre_m <= max_m:
             continue
         # Sums over the readings on its surface: of their offsets from the middle, of their depths from the middle's.
         n, x, y, xx, yy, xy, d, xd, yd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(max(line - 1, 0), min(line + 2, height)):
             for i in range(max(column - 1, 0), min(column + 2, width)):
                 z = depth_m[j, i]
-                if min_m <= z <= max_m and abs(z - middle) <= edge_m:
-                    a, b, c = float(i - column), float(j - line), float(z) - float(middle)
+                if min_m <= z <= max_m and abs(z - centre_m) <= edge_m:
+                    a, b, c = float(i - column), float(j - line), float(z) - float(centre_m)
                     n, x, y, xx, yy, xy = n + 1, x + a, y + b, xx + a * a, yy + b * b, xy + a * b
                     d, xd, yd = d + c, xd + a * c, yd + b * c
         d, x, y = d / n, x / n, y / n
@@ -141,5 +141,5 @@ def _plane_depths(depth_m: np.ndarray, uv_px: np.ndarray, min_m: float, max_m: f
         xd, yd = xd - n * x * d, yd - n * y * d
         determinant = xx * yy - xy * xy
         along_x, along_y = (yy * xd - xy * yd) / determinant, (xx * yd - xy * xd) / determinant
-        out[row] = middle + d + along_x * (u - column - x) + along_y * (v - line - y)
+        out[row] = centre_m + d + along_x * (u - column - x) + along_y * (v - line - y)
     return out

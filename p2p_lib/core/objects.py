@@ -1,4 +1,4 @@
-"""Objects come and go: who is followed, and what is said of them before a frame."""
+"""Objects come and go: which are followed, and the prompts for the next frame."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Objects(ABC):
         self.camera = camera
         self.objects: dict[str, Any] = {}
         self.refused: dict[str, BadInput] = {}
-        self._said: dict[str, Prompt] = {}  # in the frame to come
+        self._prompts: dict[str, Prompt] = {}  # in the frame to come
         self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
         self._turn, self.closed = RLock(), False
         self._predictor = Predictor()
@@ -48,9 +48,7 @@ class Objects(ABC):
             raise BadInput("tracker", "a call after close()", "an open tracker", "Make a new one, or reset() this one.")
         if not self._turn.acquire(blocking=False):
             fix = "Put a lock around its calls, or give each thread a tracker of its own."
-            raise BadInput(
-                "tracker", "a call from a second thread during one from another", "one thread at a time", fix
-            )
+            raise BadInput("tracker", "a call from a second thread meanwhile", "one thread at a time", fix)
         try:
             yield
         finally:
@@ -97,24 +95,24 @@ class Objects(ABC):
         else:
             self.tell(_prompt(name, mask=mask, clicks=clicks, negative=negative, box=box))
 
-    def correct(self, name: str, **said: ArrayLike | None) -> None:
+    def correct(self, name: str, **arguments: ArrayLike | None) -> None:
         """Mend an object's mask in the next frame; arguments as of :meth:`add_object`. The last correction counts."""
         if name not in self.objects:
             raise BadInput("correct", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        self.tell(_prompt(name, **said))
+        self.tell(_prompt(name, **arguments))
 
     def tell(self, prompt: Prompt) -> None:
-        """What is said of an object in the next frame, whichever that is: starts the object, or corrects its mask."""
+        """A prompt for the next frame, whichever that is: it starts its object, or corrects its mask."""
         name, known = prompt.name, self.segmenter.names
         check_prompt(prompt, self.camera)
-        check_apart((other for other in self._said.values() if other.name != name), prompt)
+        check_apart((other for other in self._prompts.values() if other.name != name), prompt)
         if name not in known and not prompt.starts:
-            what = "an empty mask" if prompt.mask is not None else "clicks beside it alone"
+            what = "an empty mask" if prompt.mask is not None else "negative clicks alone"
             raise BadInput(f"object {name!r}", what, "a click on it, a box or at least one pixel of its mask")
         with self.alone():
             if name not in self.objects:
                 self.begin(name)
-            self._said[name] = prompt
+            self._prompts[name] = prompt
             self.refused.pop(name, None)
 
     def remove_object(self, name: str) -> None:
@@ -124,7 +122,7 @@ class Objects(ABC):
         with self.alone():
             if len(ids := self.objects.pop(name).ids):
                 self.tracker.drop(ids)
-            for kept in (self._said, self.refused, self._without):
+            for kept in (self._prompts, self.refused, self._without):
                 kept.pop(name, None)
             self._predictor.forget(name)
             if name in self.segmenter.names:
@@ -143,23 +141,23 @@ class Objects(ABC):
                 raise BadInput("predict", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
             return self._predictor.predict(name, time_s)
 
-    def take_said(
+    def take_prompts(
         self, frame: Frame, masks: Mapping[str, np.ndarray | None]
     ) -> tuple[dict[str, np.ndarray | None], dict[str, Prompt]]:
-        """Every object's mask in this frame, None for one to be found, and what is said of objects in it.
+        """Every object's mask in this frame, None for one to be found, and the prompts for this frame.
 
-        What was said until now belongs to this frame: what does not fit it is ``refused``, and stops nobody.
+        Every prompt since the last frame belongs to this one; one that does not fit it is ``refused``.
         """
-        given, refused = given_masks(frame, masks, self._said, self.objects, self.camera)
+        given, refused = given_masks(frame, masks, self._prompts, self.objects, self.camera)
         self._cameras.append((frame.time_s, frame.T_world_cam))
         while len(self._cameras) > self.tracker.latency_frames + 1:
             self._cameras.popleft()
-        said, self._said = {name: p for name, p in self._said.items() if name not in refused}, {}
+        prompts, self._prompts = {name: p for name, p in self._prompts.items() if name not in refused}, {}
         self.refused |= refused
         for name, error in refused.items():
             if name in self.segmenter.names:  # its estimates go on and cannot say so
-                doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is not used. {error.fix}")
-        return given, said
+                doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is ignored. {error.fix}")
+        return given, prompts
 
     def explained(self, estimate: PoseEstimate, mask_given: bool) -> PoseEstimate:
         """An estimate that says what is known: of an object that has not started, what was wrong with its prompt.
@@ -185,10 +183,10 @@ class Objects(ABC):
         return replace(estimate, reason=f"{known}{NOT_FOUND} since frame {since}")
 
 
-def _prompt(name: str, **said: ArrayLike | None) -> Prompt:
+def _prompt(name: str, **arguments: ArrayLike | None) -> Prompt:
     """The prompt of the arguments of :meth:`Point2Pose.add_object`; TypeError for any other."""
     field = {"mask": "mask", "clicks": "points_px", "negative": "negative_px", "box": "box_px"}
-    if unknown := sorted(set(said) - set(field)):
+    if unknown := sorted(set(arguments) - set(field)):
         raise TypeError(f"unknown argument {unknown[0]!r}, expected some of {', '.join(field)}")
-    values: dict[str, Any] = {field[key]: value for key, value in said.items() if value is not None}
+    values: dict[str, Any] = {field[key]: value for key, value in arguments.items() if value is not None}
     return Prompt(name, **values)

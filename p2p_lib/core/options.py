@@ -76,9 +76,9 @@ _MEMORY = _typed(
     action="append",
     metavar="FILE",
 )
-_FROZEN = _typed("what --memory brings stays as it is: its maps do not grow", action="store_true")
+_FROZEN = _typed("keep the maps of --memory as they are: nothing is added", action="store_true")
 _SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")
-_SKIP_BAD = _typed("leave frames out whose images are missing or cannot be read, and count them", action="store_true")
+_SKIP_BAD = _typed("skip frames whose images are missing or unreadable, and count them", action="store_true")
 _FORMAT = _typed(
     "layout: ho3d, bop, tum, open3d, ycbmultitrack, ycbineoat, folder (default: recognised), or a package.module:load"
 )
@@ -94,7 +94,7 @@ _MODELS = _typed(
     metavar="NAME=PATH",
 )
 _SIZES = _typed(
-    "how long objects are, cm: what was measured is compared with it",
+    "known lengths of objects, cm, to compare with the measured ones",
     flag="--size",
     read=partial(pairs, option="--size", form="NAME=CM"),
     nargs="+",

@@ -15,8 +15,8 @@ PAPER_REPORTED = "paper_reported.json"
 
 def manifest_dir() -> Path:
     """``data_manifests/`` of the checkout; where there is none, the copy that the wheel installs."""
-    beside = PROJECT / "data_manifests"
-    return beside if beside.is_dir() else Path(sysconfig.get_path("data")) / "share" / "p2p_lib" / "data_manifests"
+    local = PROJECT / "data_manifests"
+    return local if local.is_dir() else Path(sysconfig.get_path("data")) / "share" / "p2p_lib" / "data_manifests"
 
 
 def cache_dir() -> Path:

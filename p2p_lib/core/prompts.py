@@ -1,4 +1,4 @@
-"""What somebody says of an object in one frame: clicks on it, clicks beside it, a box around it, its mask."""
+"""Prompts: what is given of an object in one frame, as positive and negative clicks, a box or a mask."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Prompt:
             raise BadInput("prompt", f"the name {self.name!r}", "a word")
         if isinstance(self.frame, bool) or not isinstance(self.frame, int | np.integer) or self.frame < 0:
             raise BadInput(f"prompt of {self.name!r}", f"frame {self.frame!r}", "a whole number from 0")
-        for key, what in (("points_px", "clicks on"), ("negative_px", "clicks beside")):
+        for key, what in (("points_px", "clicks on"), ("negative_px", "negative clicks of")):
             object.__setattr__(self, key, _pixels(f"{what} {self.name!r}", getattr(self, key)))
         if self.box_px is not None:
             object.__setattr__(self, "box_px", _box(f"box around {self.name!r}", self.box_px))
@@ -53,7 +53,7 @@ class Prompt:
         if not len(self.points_px) and not len(self.negative_px) and self.box_px is None and self.mask is None:
             raise BadInput(f"clicks on {self.name!r}", "none", "at least one [x, y] in pixels, a box or a mask")
         if self.mask is not None and (len(self.points_px) or len(self.negative_px) or self.box_px is not None):
-            raise BadInput(f"object {self.name!r}", "a mask and clicks", "one of them", "A mask says it all.")
+            raise BadInput(f"object {self.name!r}", "a mask and clicks", "one of them", "A mask needs no clicks.")
 
     @property
     def starts(self) -> bool:
@@ -71,7 +71,7 @@ class Prompt:
 def check_prompt(prompt: Prompt, camera: Camera) -> None:
     """Refuse what does not lie in the image; :class:`BadInput` names the object, the frame's size and what to do."""
     name, size = prompt.name, f"{camera.width}x{camera.height}"
-    for what, at in (("clicks on", prompt.points_px), ("clicks beside", prompt.negative_px)):
+    for what, at in (("clicks on", prompt.points_px), ("negative clicks of", prompt.negative_px)):
         outside = ~camera.inside(at, -0.5)
         if outside.any():
             raise BadInput(f"{what} {name!r}", _pixel(at[outside][0]), f"pixels within {size}")
@@ -85,7 +85,7 @@ def check_prompt(prompt: Prompt, camera: Camera) -> None:
             fix = "Draw the object alone; is the mask inverted?"
             raise BadInput(f"mask of {name!r}", "the whole image", "the object's pixels", fix)
     if _meet(prompt.points_px, prompt.negative_px):
-        raise BadInput(f"clicks on {name!r}", "a click that is also one beside it", "one or the other")
+        raise BadInput(f"clicks on {name!r}", "a positive and a negative click on one pixel", "one or the other")
 
 
 def check_mask(name: str, mask: np.ndarray | None, camera: Camera) -> None:
@@ -109,10 +109,10 @@ def check_depth(prompt: Prompt, frame: Frame) -> None:
     at = prompt.points_px
     if len(at) and not np.isfinite(depths_at(at, frame)).any():
         got = f"{_pixel(at[0])} has no depth in frame {frame.index}"
-        raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel with a depth measurement", "Click beside the hole.")
+        raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel with a depth measurement", "Click next to the hole.")
     if prompt.box_px is not None and not len(prompt.points_px) and not len(points_in_box(prompt.box_px, frame)):
         got = f"no depth inside it in frame {frame.index}"
-        raise BadInput(f"box around {prompt.name!r}", got, "measured pixels in its middle", "Click on the object.")
+        raise BadInput(f"box around {prompt.name!r}", got, "measured pixels near its centre", "Click on the object.")
 
 
 def check_not_on(prompt: Prompt, other: Prompt, frame_index: int) -> None:
@@ -125,11 +125,11 @@ def check_not_on(prompt: Prompt, other: Prompt, frame_index: int) -> None:
 def given_masks(
     frame: Frame,
     masks: Mapping[str, np.ndarray | None],
-    said: Mapping[str, Prompt],
+    prompts: Mapping[str, Prompt],
     objects: Iterable[str],
     camera: Camera,
 ) -> tuple[dict[str, np.ndarray | None], dict[str, BadInput]]:
-    """Every object's mask in a frame, by ``masks`` and what is ``said`` of it; None for one that nobody gives.
+    """Every object's mask in a frame, by ``masks`` and ``prompts``; None for one that nobody gives.
 
     Also why what is said of some objects does not fit this frame: it is not used. Raises :class:`BadInput` for a frame
     of another size and masks of unknown objects.
@@ -150,17 +150,17 @@ def given_masks(
         if prompt.mask is not None and prompt.mask.all():
             doubt(f"mask of {name!r}", f"the whole image in frame {frame.index}", "Is it inverted?")
     refused = {}
-    for name, prompt in said.items():
+    for name, prompt in prompts.items():
         try:
-            _check_said(prompt, frame, given)
+            _check_clicks(prompt, frame, given)
         except BadInput as error:
             refused[name] = error
-    given = {name: p for name, p in said.items() if p.mask is not None and name not in refused} | given
+    given = {name: p for name, p in prompts.items() if p.mask is not None and name not in refused} | given
     return {name: given[name].mask if name in given else None for name in objects}, refused
 
 
-def _check_said(prompt: Prompt, frame: Frame, given: Mapping[str, Prompt]) -> None:
-    """Refuse what is said of an object in a frame where depth or the masks given with it say otherwise."""
+def _check_clicks(prompt: Prompt, frame: Frame, given: Mapping[str, Prompt]) -> None:
+    """Refuse a prompt that depth or the masks given with its frame contradict."""
     check_depth(prompt, frame)
     for other in given.values():
         check_not_on(prompt, other, frame.index)

@@ -131,10 +131,10 @@ def interpolate(T_a_b: np.ndarray, T_a_c: np.ndarray, s: float | np.ndarray) -> 
 
 def median(T: np.ndarray) -> np.ndarray:
     """The (4, 4) in the middle of (n, 4, 4), of which a few may be wild: the medians of the tangents there are 0."""
-    middle = T[len(T) // 2]
+    centre = T[len(T) // 2]
     for _ in range(20):
-        middle = middle @ exp(np.median(log(inverse(middle) @ T), axis=0))
-    return middle
+        centre = centre @ exp(np.median(log(inverse(centre) @ T), axis=0))
+    return centre
 
 
 def orthonormalised(T: np.ndarray) -> np.ndarray:

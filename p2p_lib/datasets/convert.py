@@ -82,8 +82,8 @@ class AzureKinectRecording:
             self._reader = open3d.io.AzureKinectMKVReader()
         except RuntimeError as error:
             fix = "Install Microsoft's libk4arecord 1.4, or export the recording as color/ and depth/ where it is."
-            said = " ".join(str(error).split())[-80:]
-            raise MissingBackend("Azure Kinect recordings", f"its library is not there ({said})", fix) from None
+            reason = " ".join(str(error).split())[-80:]
+            raise MissingBackend("Azure Kinect recordings", f"its library is not there ({reason})", fix) from None
         if not self._reader.open(str(path)):
             raise BadInput(str(path), "what is no recording of an Azure Kinect", "one that k4arecorder has made")
         lens = self._reader.get_metadata().intrinsics

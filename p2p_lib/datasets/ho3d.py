@@ -39,8 +39,8 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     camera = camera_for(rgb[0], first["camMat"], f"{meta_files[0]}: camMat")
     files = ImageSequence(folder, rgb, depth, camera, images.frame_times(folder, rgb))
     at = images.full(folder)
-    beside = [at.parents[1] / str(where) / at.name for where in ([masks] if masks else MASKS)]
-    files = files.with_masks(next((where for where in beside if where.is_dir()), masks), objects=(OBJECT,))
+    folders = [at.parents[1] / str(where) / at.name for where in ([masks] if masks else MASKS)]
+    files = files.with_masks(next((where for where in folders if where.is_dir()), masks), objects=(OBJECT,))
 
     def read_truth() -> dict[str, ObjectTruth]:
         poses = [read_pose(path, read_meta(path), camera) for path in meta_files]
@@ -95,5 +95,5 @@ def _models(folder: Path, meta: dict) -> tuple[Path, ...]:
     own, known = folder / "models" / OBJECT, meta.get("objName")
     if not isinstance(known, str) or not re.fullmatch(r"[\w-]+", known):
         return (own,)
-    beside = images.full(folder).parents[1] / "models" / known
-    return own, beside / "textured_simple.obj", beside
+    models = images.full(folder).parents[1] / "models" / known
+    return own, models / "textured_simple.obj", models

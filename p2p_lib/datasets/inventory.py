@@ -123,14 +123,14 @@ def _fetch_one(file: RemoteFile, record: _Record, progress: bool) -> str:
     unpacked = record.unpacked(file)
     record.keep(file, digest, unpacked)
     unknown = f"no checksum is published: sha256 {digest} is what came, and is checked from now on"
-    said = "checked" if expected else unknown
+    state = "checked" if expected else unknown
     if file.unpack_to is not None and unpacked is None:
         into = record.folder / file.unpack_to
         with progress_bar(f"unpacking {file.path}", unit="B", unit_scale=True, shown=progress) as bar:
             unpacked = unpack(path, into, bar.update)
         record.keep(file, digest, unpacked)
-        said += f", {len(unpacked)} files unpacked into {into}"
-    return f"{file.path}: {tqdm.format_sizeof(path.stat().st_size, 'B')}, {said}"
+        state += f", {len(unpacked)} files unpacked into {into}"
+    return f"{file.path}: {tqdm.format_sizeof(path.stat().st_size, 'B')}, {state}"
 
 
 def require(of: Manifest) -> list[Path]:

@@ -86,7 +86,7 @@ class PaperReported(Strict):
 
     def statement(self, key: str, of: str = "") -> Statement:
         """The number of the text with this key (and of this method)."""
-        found = [said for said in self.text if said.key == key and of in ("", said.of)]
+        found = [passage for passage in self.text if passage.key == key and of in ("", passage.of)]
         if len(found) != 1:
             raise BadInput("number", f"{key} {of}".strip(), "one of " + ", ".join(f"{s.key} {s.of}" for s in self.text))
         return found[0]

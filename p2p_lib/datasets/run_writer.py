@@ -245,7 +245,7 @@ class RunWriter:
         theirs["objects"] = theirs["objects"][: len(mine["objects"])]  # others may have come later
         if (start := self.redo_from) is not None:
             for info in (mine, theirs):
-                info["prompts"] = [said for said in info.get("prompts") or [] if said["frame"] < start]
+                info["prompts"] = [prompt for prompt in info.get("prompts") or [] if prompt["frame"] < start]
                 info["options"] = {**(info.get("options") or {}), "prompts": None}
             theirs["objects"] = mine["objects"]  # their poses tell
             fix = "Say --from FRAME of the first change." if mine["prompts"] != theirs["prompts"] else fix

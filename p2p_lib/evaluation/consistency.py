@@ -89,12 +89,12 @@ class Consistency:
 
     def as_table(self) -> str:
         """The same for people, with what each number says."""
-        told = [f"{head}: {says}" for head, says in HEADS.values()]
+        legend = [f"{head}: {says}" for head, says in HEADS.values()]
         hz = [f"{self.hz:.1f} Hz"] if self.hz is not None else []
         ran = ", ".join(f"{key} {self.info.get(key)}" for key in WHAT_RAN)
         without = f"Not scored: {self.not_scored}.\nWithout a model" if self.not_scored else "Without truth"
         title = f"{without}: how well the run agrees with what the camera saw (- where nothing was kept to tell)"
-        return "\n".join([title, tables.as_text(self.as_frame()), *self.look_at(), *told, SCALE, *hz, ran])
+        return "\n".join([title, tables.as_text(self.as_frame()), *self.look_at(), *legend, SCALE, *hz, ran])
 
     def verdict(self, name: str) -> str:
         """In a word: ``good``, or ``look`` at the film before an object's poses are believed."""
@@ -122,8 +122,8 @@ def consistency(
     for name, obj in run.objects.items():
         mesh = run.path / "meshes" / f"{name}.ply"
         fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks)
-        told = tuple(text for text in run.info.get("doubts") or () if _is_about(text, name))
-        evidence = gathered(obj, every.objects[name], sequence, masks.get(name), keypoints.get(name), fit, told)
+        doubts = tuple(text for text in run.info.get("doubts") or () if _is_about(text, name))
+        evidence = gathered(obj, every.objects[name], sequence, masks.get(name), keypoints.get(name), fit, doubts)
         off = (Suspicion("known size", sizes[name]),) if name in sizes else ()
         found[name] = off + suspicions(evidence)
         numbers = dict.fromkeys(HEADS, float("nan")) | {"pose": 100 * float(obj.has_pose.mean())}

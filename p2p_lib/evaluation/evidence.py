@@ -24,7 +24,7 @@ from p2p_lib.datasets.models import load_mesh
 from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
-from p2p_lib.evaluation.suspicions import FEW, Evidence
+from p2p_lib.evaluation.suspicions import FEW, RunEvidence
 
 #: As near to the surface is on it; so much before it is something else that hides it.
 ON_M, BEFORE_M = 0.005, 0.01
@@ -80,12 +80,12 @@ def gathered(
     masks: ObjectMasks | None,
     keypoints: ObjectKeypoints | None,
     fit: SurfaceFit,
-    told: tuple[str, ...],
-) -> Evidence:
+    doubts: tuple[str, ...],
+) -> RunEvidence:
     """All that is known of one object, frame by frame.
 
-    every  the same object with the poses of all its maps
-    told   what was doubted of it when the run was made
+    every   the same object with the poses of all its maps
+    doubts  what was doubted of it when the run was made
     """
     n = len(obj)
     px, size_m, apart = np.full(n, np.nan), np.full(n, np.nan), 0.0
@@ -98,9 +98,9 @@ def gathered(
     if keypoints is not None and sequence is not None:
         of_points = _of_keypoints(obj, keypoints, masks, sequence.camera)
     elsewhere = every.has_pose & ~obj.has_pose
-    said = obj.frame_index, obj.has_pose, elsewhere, obj.confidence
+    of_poses = obj.frame_index, obj.has_pose, elsewhere, obj.confidence
     seen, inside, off_px, jump_px = of_points
-    return Evidence(*said, px, size_m, seen, inside, off_px, jump_px, fit.overlap, fit.through, told, apart)
+    return RunEvidence(*of_poses, px, size_m, seen, inside, off_px, jump_px, fit.overlap, fit.through, doubts, apart)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:
@@ -140,7 +140,7 @@ def _placed(
 
 def _of_keypoints(obj: ObjectRun, points: ObjectKeypoints, masks: ObjectMasks | None, camera: Camera) -> np.ndarray:
     """(4, n): keypoints seen, the share of them in the mask, how far off they are, and how differently they move."""
-    count, inside, off_px, jump_px = told = np.full((4, len(obj)), np.nan)
+    count, inside, off_px, jump_px = columns = np.full((4, len(obj)), np.nan)
     before: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     for row, index in enumerate(obj.frame_index.tolist()):
         uv_px = points.uv_px[points.at(index)].astype(float)
@@ -155,7 +155,7 @@ def _of_keypoints(obj: ObjectRun, points: ObjectKeypoints, masks: ObjectMasks | 
             apart_px = (now[2][b] - before[2][a]) - (now[1][b] - before[1][a])
             jump_px[row] = np.median(np.linalg.norm(apart_px, axis=1)) if len(a) >= FEW else np.nan
         before = now
-    return told
+    return columns
 
 
 def _inside(uv_px: np.ndarray, masks: ObjectMasks, index: int, shape: tuple[int, int]) -> float:

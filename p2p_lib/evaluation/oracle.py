@@ -50,11 +50,11 @@ class OracleTracker(PointTracker):
         """Where truth has the points in the next frame, spoiled as configured."""
         self._ids.check_started()
         self._frame, cfg = frame, self.config
-        sight = self._scene.see(frame, self._points)
+        true = self._scene.see(frame, self._points)
         span, since = divmod(frame.index, cfg.lasting_frames)
         part = since / cfg.lasting_frames
-        visible = sight.visible & (self._drawn(_DROPOUT, span, "random") >= cfg.dropout)
-        uv = sight.uv_px + cfg.noise_px * self._drawn(_NOISE, frame.index, "standard_normal", 2)
+        visible = true.visible & (self._drawn(_DROPOUT, span, "random") >= cfg.dropout)
+        uv = true.uv_px + cfg.noise_px * self._drawn(_NOISE, frame.index, "standard_normal", 2)
         ends = (self._drawn(_SLIDE, span + k, "standard_normal", 2) for k in (0, 1))
         uv += cfg.slide_px * sum(np.sqrt(weight) * end for weight, end in zip((1 - part, part), ends, strict=True))
         stray = self._drawn(_OUTLIER, span, "random") < cfg.outliers

@@ -47,10 +47,10 @@ def tapvid(
     """
     off = (uv_px - uv_true) * (RASTER_PX / np.array(shape[::-1], float))
     off_sq = np.where(np.isfinite(off).all(-1), (off**2).sum(-1), np.inf)[scored]
-    truly, said = visible_true[scored], visible[scored]
+    truly, predicted = visible_true[scored], visible[scored]
     near = off_sq < np.square(THRESHOLDS_PX, dtype=float)[:, None]
-    hits = (near & truly & said).sum(1)
-    false = (said & ~(near & truly)).sum(1)
+    hits = (near & truly & predicted).sum(1)
+    false = (predicted & ~(near & truly)).sum(1)
     with np.errstate(invalid="ignore"):
         within = (near & truly).sum(1) / truly.sum()
         jaccard = hits / (truly.sum() + false)
@@ -58,7 +58,7 @@ def tapvid(
     return {
         "aj": float(jaccard.mean()),
         "delta_avg": float(within.mean()),
-        "oa": float((truly == said).mean()) if truly.size else float("nan"),
+        "oa": float((truly == predicted).mean()) if truly.size else float("nan"),
         "jaccard": dict(zip(names, jaccard.tolist(), strict=True)),
         "within": dict(zip(names, within.tolist(), strict=True)),
     }
@@ -79,9 +79,9 @@ def outcomes(
 ) -> np.ndarray:
     """(T, N) uint8 of :class:`Outcome`; pixels are those of the image as it is."""
     near = visible_true & (np.linalg.norm(uv_px - uv_true, axis=-1) < FOUND_PX)
-    said = np.where(near, Outcome.RIGHT, Outcome.WRONG)
+    outcome = np.where(near, Outcome.RIGHT, Outcome.WRONG)
     silent = np.where(visible_true, Outcome.MISSED, Outcome.HIDDEN)
-    return np.where(scored, np.where(visible, said, silent), Outcome.NOT_ASKED).astype(np.uint8)
+    return np.where(scored, np.where(visible, outcome, silent), Outcome.NOT_ASKED).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,7 @@ _NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class RunEvidence:
     """What speaks for and against one object in the n frames of a run; NaN where nothing is known.
 
     frame_index   (n,)
@@ -47,7 +47,7 @@ class Evidence:
     off_px        (n,) median distance of these from where the pose puts them
     jump_px       (n,) how differently from what was seen the poses moved them since the frame before
     overlap       (n,) of silhouette and mask, through (n,) the share of the surface behind which depth was measured
-    told          what was doubted when the run was made, in words
+    doubts        what was doubted when the run was made, in words
     apart         the share of the first mask that is apart from its largest part
     """
 
@@ -63,7 +63,7 @@ class Evidence:
     jump_px: np.ndarray
     overlap: np.ndarray
     through: np.ndarray
-    told: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     apart: float = 0.0
 
     @property
@@ -93,63 +93,63 @@ class _Rule:
     name: str
     text: str
     limit: float
-    against: Callable[[Evidence], np.ndarray]
-    count: Callable[[Evidence], np.ndarray]
+    against: Callable[[RunEvidence], np.ndarray]
+    count: Callable[[RunEvidence], np.ndarray]
 
 
-def _known(key: str) -> Callable[[Evidence], np.ndarray]:
+def _known(key: str) -> Callable[[RunEvidence], np.ndarray]:
     return lambda e: np.isfinite(getattr(e, key))
 
 
 _RULES = (
-    _Rule("lost", "no pose where its mask is", 0.1, lambda e: ~e.has_pose, lambda e: e.seen),
-    _Rule("doubted", "poses doubted", 0.5, lambda e: e.confidence <= DOUBTED, lambda e: e.has_pose),
+    _Rule("lost", "a mask, but no pose", 0.1, lambda e: ~e.has_pose, lambda e: e.seen),
+    _Rule("doubted", f"confidence at most {DOUBTED:g}", 0.5, lambda e: e.confidence <= DOUBTED, lambda e: e.has_pose),
     _Rule(
         "maps",
-        "poses in a map that never met the one that is kept",
+        "poses in a second map that was never merged",
         0.05,
         lambda e: e.elsewhere,
         lambda e: e.has_pose | e.elsewhere,
     ),
     _Rule(
         "no keypoints",
-        f"a pose and a mask, and fewer than {FEW} of its own keypoints in view",
+        f"a mask and a pose, but fewer than {FEW} visible keypoints",
         0.3,
         lambda e: e.keypoints < FEW,
         lambda e: e.carried & np.isfinite(e.keypoints),
     ),
     _Rule(
         "outside",
-        "its own keypoints are seen outside its mask",
+        "most keypoints lie outside the mask",
         0.05,
         lambda e: e.inside < 0.5,
         lambda e: e.seen & np.isfinite(e.inside) & (e.keypoints >= FEW),
     ),
     _Rule(
         "keypoints off",
-        f"keypoints more than {OFF_PX:g} px from where the pose puts them",
+        f"median reprojection error of the keypoints above {OFF_PX:g} px",
         0.25,
         lambda e: e.off_px > OFF_PX,
         _known("off_px"),
     ),
-    _Rule("jumps", "poses jump, what is seen does not", 0.02, lambda e: e.jump_px > JUMP_PX, _known("jump_px")),
+    _Rule("jumps", "the pose jumps, the keypoints do not", 0.02, lambda e: e.jump_px > JUMP_PX, _known("jump_px")),
     _Rule(
         "silhouette",
-        "the reconstructed surface does not cover the mask, or covers more",
+        f"silhouette and mask overlap by less than {OVERLAP:g} (IoU)",
         0.2,
         lambda e: e.overlap < OVERLAP,
         _known("overlap"),
     ),
     _Rule(
         "seen through",
-        "depth is measured behind the reconstructed surface",
+        "depth shows empty space where the surface should be",
         0.5,
         lambda e: e.through > THROUGH,
         _known("through"),
     ),
     _Rule(
         "grown",
-        f"the mask holds something {GROWN:g} times as long as it mostly does",
+        f"the mask spans more than {GROWN:g} times the object's usual length",
         0.05,
         lambda e: e.size_m > GROWN * median_of_known(e.size_m[e.seen]),
         lambda e: e.seen & np.isfinite(e.size_m),
@@ -157,11 +157,11 @@ _RULES = (
 )
 
 
-def suspicions(e: Evidence) -> tuple[Suspicion, ...]:
+def suspicions(e: RunEvidence) -> tuple[Suspicion, ...]:
     """Everything that speaks against an object's part of a run; none: nothing that a run keeps does."""
-    found = [Suspicion("start", text) for text in e.told]
+    found = [Suspicion("start", text) for text in e.doubts]
     if e.apart > APART:
-        found.append(Suspicion("start", f"{100 * e.apart:.0f} % of its first mask lies apart: two objects?"))
+        found.append(Suspicion("start", f"{100 * e.apart:.0f} % of the first mask is apart: two objects?"))
     found += [s for s in (_absent(e), _size(e)) if s is not None]
     for rule in _RULES:
         count = rule.count(e)
@@ -178,30 +178,30 @@ def median_of_known(values: np.ndarray) -> float:
     return float(np.median(known)) if len(known) else float("nan")
 
 
-def _absent(e: Evidence) -> Suspicion | None:
+def _absent(e: RunEvidence) -> Suspicion | None:
     """Away at the end, or for most of the run: a run cannot tell what is out of view from what it does not find."""
     if not e.has_pose.any():
-        return _suspicion("absent", "never a pose", e, ~e.has_pose)
+        return _suspicion("absent", "no pose in any frame", e, ~e.has_pose)
     away = ~e.seen & ~e.has_pose
     back = np.flatnonzero(~away)[-1] + 1
     last = np.arange(len(away)) >= back
     if last.sum() > max(_GONE_FRAMES, _GONE_SHARE * len(away)):
-        return _suspicion("absent", "not found again; is it out of view to the end?", e, last)
+        return _suspicion("absent", "not found again before the end: is it out of view?", e, last)
     if away.mean() > _AWAY_SHARE:
-        return _suspicion("absent", f"away ({100 * away.mean():.0f} %); is it out of view there?", e, away)
+        return _suspicion("absent", f"no mask and no pose ({100 * away.mean():.0f} %): is it out of view?", e, away)
     return None
 
 
-def _size(e: Evidence) -> Suspicion | None:
+def _size(e: RunEvidence) -> Suspicion | None:
     known = e.seen & np.isfinite(e.size_m)
     if not known.any() or SHORTEST_M <= (size_m := float(np.median(e.size_m[known]))) <= LONGEST_M:
         return None
     than = f"longer than {100 * LONGEST_M:g}" if size_m > LONGEST_M else f"shorter than {100 * SHORTEST_M:g}"
-    text = f"its mask holds something {100 * size_m:.0f} cm long, {than} cm: more than it, or depth in another unit?"
+    text = f"the mask spans {100 * size_m:.0f} cm, {than} cm: does it hold other things, or is the depth unit wrong?"
     return _suspicion("size", text, e, known & ((e.size_m > LONGEST_M) | (e.size_m < SHORTEST_M)), known)
 
 
-def _suspicion(rule: str, text: str, e: Evidence, wrong: np.ndarray, count: np.ndarray | None = None) -> Suspicion:
+def _suspicion(rule: str, text: str, e: RunEvidence, wrong: np.ndarray, count: np.ndarray | None = None) -> Suspicion:
     """One of frames ``wrong`` (n,) bool; those between two of them that do not ``count`` are named with them."""
     at = np.flatnonzero(wrong if count is None else count)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong[at], [False]]).astype(int)))

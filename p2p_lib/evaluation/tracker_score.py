@@ -16,7 +16,7 @@ from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.point_tracks import after_query, redetection_shares, redetections, tapvid
-from p2p_lib.evaluation.true_tracks import Queries, Sight, TrueScene, draw_queries, true_tracks
+from p2p_lib.evaluation.true_tracks import Queries, TrueScene, TrueTracks, draw_queries, true_tracks
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -42,7 +42,7 @@ class TrackerScore:
 
     tapvid: dict[str, Any]
     redetections: DataFrame
-    truth: Sight
+    truth: TrueTracks
     run: TrackRun
     queries: Queries
     info: dict[str, Any]
@@ -75,7 +75,7 @@ class TrackTask:
     sequence: Sequence
     scene: TrueScene
     queries: Queries
-    truth: Sight
+    truth: TrueTracks
     seed: int
 
     @classmethod
@@ -144,7 +144,7 @@ def run_tracker(tracker: PointTracker, sequence: Sequence, queries: Queries, sea
         cpu_ms[i] = 1e3 * (time.process_time() - start)
         if tracks is not None and answered >= first:
             rows = np.flatnonzero(np.isin(ids, tracks.ids))
-            told = tracks.select(ids[rows])
-            uv[answered, rows], visible[answered, rows] = told.uv_px, told.visible
-            uncertainty[answered, rows] = told.uncertainty
+            answer = tracks.select(ids[rows])
+            uv[answered, rows], visible[answered, rows] = answer.uv_px, answer.visible
+            uncertainty[answered, rows] = answer.uncertainty
     return TrackRun(uv, visible, uncertainty, cpu_ms)

@@ -47,7 +47,7 @@ NO_POINTS = SurfacePoints(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class TrueTracks:
     """Surface points as truth has them, in one frame (N, ...) or in all frames of a sequence (T, N, ...).
 
     uv_px    (..., 2) NaN where the object's pose is not known
@@ -111,10 +111,10 @@ class TrueScene:
                 p_model[rows], normal[rows] = self._lift_by_depth(frame, uv_px[rows], T_cam_model)
         return SurfacePoints(np.asarray(object, np.int64), p_model, normal)
 
-    def see(self, frame: Frame, points: SurfacePoints) -> Sight:
+    def see(self, frame: Frame, points: SurfacePoints) -> TrueTracks:
         """Where the points are in this frame and which of them are visible."""
         n = len(points)
-        sight = Sight(np.full((n, 2), np.nan), np.zeros(n, bool), np.zeros(n, bool), np.full((n, 3), np.nan))
+        true = TrueTracks(np.full((n, 2), np.nan), np.zeros(n, bool), np.zeros(n, bool), np.full((n, 3), np.nan))
         masks = self.masks(frame.index)
         for k, name in enumerate(self.objects):
             rows = np.flatnonzero(points.object == k)
@@ -124,13 +124,13 @@ class TrueScene:
             T_cam_model = truth.T_cam_model[frame.index]
             posed = bool(np.isfinite(T_cam_model).all() and truth.labelled[frame.index])
             # Without a valid pose an object is certainly invisible only where its mask is there and empty.
-            sight.known[rows] = posed or (mask is not None and not mask.any())
+            true.known[rows] = posed or (mask is not None and not mask.any())
             if np.isfinite(T_cam_model).all():
-                sight.uv_px[rows], visible, sight.view[rows] = self._look(
+                true.uv_px[rows], visible, true.view[rows] = self._look(
                     frame, name, mask, T_cam_model, points.select(rows)
                 )
-                sight.visible[rows] = visible & posed
-        return sight
+                true.visible[rows] = visible & posed
+        return true
 
     def _look(
         self, frame: Frame, name: str, mask: np.ndarray | None, T_cam_model: np.ndarray, points: SurfacePoints
@@ -207,7 +207,7 @@ def draw_queries(scene: TrueScene, rng: np.random.Generator, count: int = 256, a
     return joined(drawn)
 
 
-def true_tracks(scene: TrueScene, points: SurfacePoints) -> Sight:
+def true_tracks(scene: TrueScene, points: SurfacePoints) -> TrueTracks:
     """The true tracks of surface points over the whole sequence."""
     return joined([scene.see(scene.sequence.frame(i), points) for i in range(len(scene.sequence))], np.stack)
 

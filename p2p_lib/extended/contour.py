@@ -54,15 +54,15 @@ def on_plane(uv_px: np.ndarray, cloud: np.ndarray, camera: Camera) -> np.ndarray
     """
     if min(len(uv_px), len(cloud)) < _FEWEST:
         return None
-    middle = cloud.mean(0)
-    normal = np.linalg.svd(cloud - middle, full_matrices=False)[2][2]
-    if np.median(np.abs((cloud - middle) @ normal)) > _FLAT_M:
+    centre = cloud.mean(0)
+    normal = np.linalg.svd(cloud - centre, full_matrices=False)[2][2]
+    if np.median(np.abs((cloud - centre) @ normal)) > _FLAT_M:
         return None
-    if abs(normal @ middle) < _FACING * np.linalg.norm(middle):
+    if abs(normal @ centre) < _FACING * np.linalg.norm(centre):
         return None
     uv_px = evenly(uv_px, _POINTS)
     rays = camera.unproject(uv_px, np.ones(len(uv_px)))
-    return rays * (middle @ normal / (rays @ normal))[:, None]
+    return rays * (centre @ normal / (rays @ normal))[:, None]
 
 
 class ContourFit:

@@ -34,37 +34,37 @@ from p2p_lib.method.object_tracker import ObjectTracker
 #: Name to what it does.
 MECHANISMS = {
     # Before a frame: frame_guard.
-    "moments": "Depth counts as missing where it is not of the moment of its colour.",
+    "moments": "Depth is ignored while depth and colour are of different moments.",
     # Around track and segment: reacquisition, outlook.
-    "scene": "The static scene says how the camera moved, and so where an object is that was left lying.",
-    "shape_search": "An absent object is looked for by the shape and colour of its surface.",
-    "redetection": "Where few keypoints are seen, a pose says where the tracker has to look for the others.",
+    "scene": "Camera motion, from the static scene, tells where an object at rest is.",
+    "shape_search": "Absent objects are searched for by the shape and colour of their surface.",
+    "redetection": "Where few keypoints are visible, the pose predicts where the tracker finds the others.",
     "rejection": "Tracks that contradict their object's pose or mask are rejected.",
     # Around an object: two_maps.
-    "growing": "No map is begun of an object that still comes into view.",
-    "outgrown": "A map of a sliver, or of what never was followed, is founded anew where its object stays lost.",
-    "second_map": "A second map is begun of an object that shows a side that nobody knows.",
+    "growing": "No map is started while its object is still coming into view.",
+    "outgrown": "A map of a sliver, or one that was never followed, is replaced when its object stays lost.",
+    "second_map": "A second map is started when an object shows an unknown side.",
     # Inside: policy, motion.
-    "motion_prior": "The last pose and even motion propose poses, and the surface alone may follow them.",
-    "motion_weight": "A hypothesis needs more support the farther it is from the motion so far.",
-    "motion_over_gaps": "For a while after its last pose an object is expected where its motion leads.",
+    "motion_prior": "The last pose and constant velocity propose poses; without points the surface tracks them.",
+    "motion_weight": "A hypothesis needs more support the farther it is from the predicted motion.",
+    "motion_over_gaps": "The motion of an absent object is extrapolated for a while.",
     "moving_points": "A point becomes a keypoint only if it moves with the object.",
-    "pending_points": "While an object is followed, points that are no keypoints yet help to register it.",
-    "turns": "The pose of a return is compared with other turns that look alike.",
+    "pending_points": "While an object is followed, pending points help to register it.",
+    "turns": "The pose of a return is compared with other rotations that look alike.",
     # Inside: gates.
-    "return_gate": "A return needs many agreeing points, or shape and colour.",
-    "surface_gate": "A pose without agreeing points needs a surface that fits.",
-    "sliding_gate": "Of something flat, whose surface leaves it free, points or its contour have to agree with a pose.",
-    "contour": "What is flat and plain is held by where its mask ends.",
-    "rest": "What lay still in the scene is not back elsewhere unless its points say so.",
-    "size": "Nothing is learnt where depth shows the object and the scene in another size.",
-    "outline": "Nothing is learnt where the mask does not end where depth has steps.",
-    "still": "Nothing is learnt while the camera gives the same image again and again.",
+    "return_gate": "A return needs many agreeing points, or a match of shape and colour.",
+    "surface_gate": "A pose without agreeing points needs a surface that fits the depth.",
+    "sliding_gate": "A flat object, whose surface can slide, needs agreeing points or a matching contour.",
+    "contour": "A flat object without texture is registered by the contour of its mask.",
+    "rest": "An object left at rest is accepted elsewhere only if enough points agree.",
+    "size": "Nothing is learnt while depth shows the object and the scene at another size.",
+    "outline": "Nothing is learnt while the outline of the mask does not follow depth edges.",
+    "still": "Nothing is learnt while the camera repeats the same image.",
     # Inside: confidence, graph.
-    "confidence": "Each pose gets a confidence, which weighs the points that it places.",
-    "texture": "A turn that shape leaves free has to be constrained by texture.",
-    "sure_keyframes": "A pose that is hardly believed, or a return to be confirmed, makes no keyframe.",
-    "stray_points": "A point that is seen far from where the pose has it stays out of the graph.",
+    "confidence": "Each pose gets a confidence, which weights the points that it places.",
+    "texture": "A rotation that shape does not constrain has to be constrained by texture.",
+    "sure_keyframes": "Poses of low confidence and unconfirmed returns make no keyframes.",
+    "stray_points": "A point observed far from its predicted place stays out of the graph.",
 }
 #: A file of :meth:`Point2Pose.save`: its kind, and what that is to people.
 _SAVED, _SAVED_BY = "p2p tracker", "a tracker as Point2Pose.save writes it"
@@ -79,14 +79,14 @@ def chosen(config: Config) -> frozenset[str]:
     >>> sorted(chosen(preset()) - chosen(some)), chosen(preset("paper"))
     (['outline', 'size'], frozenset())
     """
-    said = config.method.mechanisms.strip()
-    if said in (ALL, NONE):
-        return frozenset(MECHANISMS if said == ALL else ())
-    names = {name.strip() for name in said.removeprefix(ALL_BUT).split(",")}
+    spec = config.method.mechanisms.strip()
+    if spec in (ALL, NONE):
+        return frozenset(MECHANISMS if spec == ALL else ())
+    names = {name.strip() for name in spec.removeprefix(ALL_BUT).split(",")}
     for name in sorted(names - set(MECHANISMS)):
         expected = f"all, none, or names, or all but names, of {', '.join(MECHANISMS)}"
         raise BadInput("config method.mechanisms", repr(name), expected, did_you_mean(name, MECHANISMS))
-    return frozenset(set(MECHANISMS) - names if said.startswith(ALL_BUT) else names)
+    return frozenset(set(MECHANISMS) - names if spec.startswith(ALL_BUT) else names)
 
 
 class Point2Pose(pipeline.Point2Pose):
@@ -126,7 +126,7 @@ class Point2Pose(pipeline.Point2Pose):
             self._turn = turn
 
     def add_object(
-        self, name: str, *said: Any, memory: ObjectMemory | None = None, frozen: bool = False, **more: Any
+        self, name: str, *prompt: Any, memory: ObjectMemory | None = None, frozen: bool = False, **more: Any
     ) -> None:
         """As in :class:`p2p_lib.core.objects.Objects`, or an object that is known from a memory.
 
@@ -137,10 +137,10 @@ class Point2Pose(pipeline.Point2Pose):
         Raises :class:`BadInput` for a memory together with clicks or masks, and with preset ``paper``.
         """
         if memory is None:
-            super().add_object(name, *said, **more)
+            super().add_object(name, *prompt, **more)
             return
-        if said or more or name in self.objects:
-            got = "clicks or a mask, too" if said or more else f"{name!r}, which is in use"
+        if prompt or more or name in self.objects:
+            got = "clicks or a mask, too" if prompt or more else f"{name!r}, which is in use"
             raise BadInput("add_object with a memory", got, "a new name and the memory alone")
         if not chosen(self.config):
             raise BadInput("add_object with a memory", "mechanisms none", "preset default: the paper has no memory")
@@ -167,8 +167,8 @@ class Point2Pose(pipeline.Point2Pose):
         """
         about, learnt = read_memories(path, _SAVED, _SAVED_BY)
         try:
-            said = {name: about[name] for name in ("tracker", "detector", "segmenter")} | parts
-            loaded = cls(camera or Camera(**about["camera"]), from_dict(about["config"], str(path)), **said)
+            named = {name: about[name] for name in ("tracker", "detector", "segmenter")} | parts
+            loaded = cls(camera or Camera(**about["camera"]), from_dict(about["config"], str(path)), **named)
             for name, frozen in about["objects"].items():
                 loaded.add_object(name, memory=learnt.get(name), frozen=frozen)
         except (KeyError, TypeError, AttributeError) as error:

@@ -44,8 +44,8 @@ class FrameGuard:
     def _check_time(self, frame: Frame) -> None:
         """Warn, once, of frames whose time does not increase."""
         if self._time_s is not None and frame.time_s <= self._time_s:
-            got = f"{frame.time_s:.6f} s after {self._time_s:.6f} s"
-            doubt(f"time of frame {frame.index}", got, "It did not go on: give frames as they were taken.")
+            got = f"{frame.time_s:.6f} s, not later than the frame before ({self._time_s:.6f} s)"
+            doubt(f"time of frame {frame.index}", got, "Give frames in the order in which they were taken.")
             self._time_s = None
         elif self._time_s is not None:
             self._time_s = frame.time_s
@@ -53,8 +53,8 @@ class FrameGuard:
 
 def _without_depth(frame: Frame) -> Frame:
     """The frame without its depth, which is not of the moment of its colour: points can wait for depth."""
-    got = "one is the same image again and again while the other goes on"
-    doubt("depth and colour", got, "Until both go on, depth counts as missing.")
+    got = "one repeats the same image while the other changes"
+    doubt("depth and colour", got, "Depth is ignored until both change.")
     return replace(frame, depth_m=np.zeros_like(frame.depth_m))
 
 

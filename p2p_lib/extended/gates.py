@@ -26,7 +26,7 @@ FIXED_BY, _CONTOUR = 3, 0.7
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PoseEvidence:
     """What speaks for the pose of a frame.
 
     support        keypoints that agree with it
@@ -69,7 +69,7 @@ class Judgement(Verdict):
     joins: bool = False
 
 
-def judge(life: Lifecycle, evidence: Evidence, on: Container[str], config: LifecycleConfig) -> Judgement:
+def judge(life: Lifecycle, evidence: PoseEvidence, on: Container[str], config: LifecycleConfig) -> Judgement:
     """The verdict on a pose: refused by the first gate ``on`` with a reason, else accepted, perhaps with a doubt."""
     for name, gate in GATES.items():
         if name in on and (reason := gate(life, evidence, config)):
@@ -78,54 +78,55 @@ def judge(life: Lifecycle, evidence: Evidence, on: Container[str], config: Lifec
         if name in on and (reason := contradiction(life, evidence)):
             return Judgement(True, Status.DEGRADED, reason, doubted=True)
     if evidence.support < config.return_inliers:
+        few = f"only {evidence.support} points agree with the pose, fewer than {config.return_inliers}"
         proven = "return_gate" not in on or evidence.sighting is None or _sighted(life, evidence)
-        return Judgement(True, Status.DEGRADED, f"only {evidence.support} points agree", proven=proven)
+        return Judgement(True, Status.DEGRADED, few, proven=proven)
     return Judgement(True, Status.RECOVERED if life.returning else Status.TRACKED)
 
 
-def _sighted(life: Lifecycle, evidence: Evidence) -> bool:
+def _sighted(life: Lifecycle, evidence: PoseEvidence) -> bool:
     return (evidence.sighting or 0.0) >= (SIGHTED_STILL if life.has_pose else SIGHTED)
 
 
-def _few_points_on_return(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+def _few_points_on_return(life: Lifecycle, evidence: PoseEvidence, config: LifecycleConfig) -> str:
     on_its_way = evidence.carried and (evidence.surface_share or 0.0) >= config.surface_only_share
     found = _sighted(life, evidence) or on_its_way
     few = life.unconfirmed and evidence.support < config.return_inliers and not found
-    return f"only {evidence.support} points agree on a return" if few else ""
+    return f"only {evidence.support} points agree with the pose of a return" if few else ""
 
 
-def _no_points_and_off_surface(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+def _no_points_and_off_surface(life: Lifecycle, evidence: PoseEvidence, config: LifecycleConfig) -> str:
     off = (evidence.surface_share or 0.0) < config.surface_only_share
     nothing = not evidence.support and off and not _sighted(life, evidence)
-    return "too few points, and the surface does not fit either" if nothing else ""
+    return "no points agree with the pose, and its surface does not fit the depth" if nothing else ""
 
 
-def _few_points_on_flat(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+def _few_points_on_flat(life: Lifecycle, evidence: PoseEvidence, config: LifecycleConfig) -> str:
     """What is flat lies on a table as well as on itself: its own points, or where it ends, have to say where."""
     points = evidence.support >= FIXED_BY or (evidence.sighting or 0.0) >= SIGHTED
     fixed = points or evidence.contour >= _CONTOUR
     free = evidence.slides and not fixed
-    return f"only {evidence.support} points agree, and the surface leaves free where it is" if free else ""
+    return f"only {evidence.support} points agree with the pose, and a flat surface does not fix it" if free else ""
 
 
-def _few_points_elsewhere(life: Lifecycle, evidence: Evidence, config: LifecycleConfig) -> str:
+def _few_points_elsewhere(life: Lifecycle, evidence: PoseEvidence, config: LifecycleConfig) -> str:
     """What lay still does not move while nobody sees it, unless its own points say so."""
     elsewhere = life.unconfirmed and evidence.support < config.return_inliers and evidence.rests is False
-    return f"only {evidence.support} points agree, and it lay still elsewhere" if elsewhere else ""
+    return f"only {evidence.support} points agree with the pose, and the object rested elsewhere" if elsewhere else ""
 
 
-def _mask_off_steps(life: Lifecycle, evidence: Evidence) -> str:
+def _mask_off_steps(life: Lifecycle, evidence: PoseEvidence) -> str:
     off = evidence.outline < OUTLINE and life.doubted_frames < _LONGEST_DOUBT
-    return "its mask does not end where its depth does any more" if off else ""
+    return "the outline of the mask no longer follows depth edges" if off else ""
 
 
-def _another_size(life: Lifecycle, evidence: Evidence) -> str:
+def _another_size(life: Lifecycle, evidence: PoseEvidence) -> str:
     ratio, sigma = evidence.size or (1.0, 0.0)
-    return f"its depth shows it {ratio:.2f} times as large as before" if off_size(ratio, sigma) else ""
+    return f"depth shows the object {ratio:.2f} times as large as its map" if off_size(ratio, sigma) else ""
 
 
-def _same_image(life: Lifecycle, evidence: Evidence) -> str:
-    return "the camera gives the same image again and again" if evidence.still else ""
+def _same_image(life: Lifecycle, evidence: PoseEvidence) -> str:
+    return "the camera repeats the same image" if evidence.still else ""
 
 
 def off_size(ratio: float, sigma: float = 0.0) -> bool:
@@ -134,14 +135,14 @@ def off_size(ratio: float, sigma: float = 0.0) -> bool:
 
 
 #: Every reason to doubt a pose that no gate refuses: state and evidence to words, or "".
-DOUBTS: dict[str, Callable[[Lifecycle, Evidence], str]] = {
+DOUBTS: dict[str, Callable[[Lifecycle, PoseEvidence], str]] = {
     "size": _another_size,
     "outline": _mask_off_steps,
     "still": _same_image,
 }
 
 #: Every reason to refuse a pose, in this order: state, evidence and bounds to words, or "".
-GATES: dict[str, Callable[[Lifecycle, Evidence, LifecycleConfig], str]] = {
+GATES: dict[str, Callable[[Lifecycle, PoseEvidence, LifecycleConfig], str]] = {
     "return_gate": _few_points_on_return,
     "surface_gate": _no_points_and_off_surface,
     "sliding_gate": _few_points_on_flat,

@@ -343,8 +343,8 @@ def laid_at(turns: np.ndarray, p_cam: np.ndarray, sample: SurfaceSample) -> np.n
     poses = np.repeat(turns, len(p_cam), 0)
     for k, T in enumerate(turns):
         facing = ((sample.n_obj @ T[:3, :3].T) * se3.transform(T, sample.p_obj)).sum(1) < 0
-        middle = sample.p_obj[facing if facing.any() else slice(None)].mean(0)
-        poses[k * len(p_cam) : (k + 1) * len(p_cam), :3, 3] = p_cam - T[:3, :3] @ middle
+        centre = sample.p_obj[facing if facing.any() else slice(None)].mean(0)
+        poses[k * len(p_cam) : (k + 1) * len(p_cam), :3, 3] = p_cam - T[:3, :3] @ centre
     return poses
 
 

@@ -13,13 +13,11 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.types import Status
 from p2p_lib.extended.motion import Motion
-from p2p_lib.method.object_model import Life
+from p2p_lib.method.object_model import CONFIRM_FRAMES, CONFIRM_LONGER, Life
 
 if TYPE_CHECKING:
     from p2p_lib.extended.gates import Judgement
 
-#: A return has to be confirmed for the first number of frames, for the second where few points agree.
-CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES = 5, 15
 #: A time between two frames is a pause if it is longer than this, s, and than so many times the one before.
 _PAUSE_S, _PAUSE = 0.25, 5
 #: The motion so far is that of poses with more confidence than this.
@@ -144,7 +142,7 @@ class Lifecycle(Life):
     ) -> Lifecycle:
         """The state after a frame with an accepted pose, and that pose's lead over other turns."""
         clear = verdict.status is not Status.DEGRADED or (lead is not None and lead >= CLEAR)
-        longest = CONFIRM_FRAMES if clear else CONFIRM_SIGHTED_FRAMES
+        longest = CONFIRM_FRAMES if clear else CONFIRM_LONGER
         return replace(
             self,
             status=verdict.status,

@@ -51,7 +51,7 @@ class JoinableModel(ObjectModel):
         self.map.add(keys, p_obj, True)
         self.map.confidence[-len(keys) :] = confidence
         if self._graph is not None:
-            self._beside_after(self._graph.remember, keys, p_obj)
+            self._submit(self._graph.remember, keys, p_obj)
         return keys
 
     def join(self, other: JoinableModel, T_obj_other: np.ndarray) -> None:
@@ -64,7 +64,7 @@ class JoinableModel(ObjectModel):
         if self.graph is not None:
             self.graph.join(other.graph, T_obj_other, self._next_key)
         if self.surface is not None:
-            self._beside_after(self._surface.join, other.surface, T_obj_other, vertices)
+            self._submit(self._surface.join, other.surface, T_obj_other, vertices)
         for T_cam_obj in other.views.T_cam_obj @ se3.inverse(T_obj_other):
             self.views.add(T_cam_obj)
         self._next_key += other._next_key

@@ -14,8 +14,8 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
+from p2p_lib.extended.observation import OurObservation, expected_px
 from p2p_lib.extended.policy import OurPolicy
-from p2p_lib.extended.sight import Sight, expected_px
 from p2p_lib.method.object_model import Known, Requests
 from p2p_lib.method.object_tracker import hint_at
 
@@ -36,7 +36,7 @@ class Outlook:
         """Whether an object that has been seen is absent, or back by shape and colour alone."""
         return not self.known.model.empty and self.known.life.sought
 
-    def misplaced(self, obs: Sight, within: np.ndarray | None) -> Requests:
+    def misplaced(self, obs: OurObservation, within: np.ndarray | None) -> Requests:
         """Requests to reject an absent object's tracks that are elsewhere, perhaps on a look-alike.
 
         within  (H, W) bool, where they may be; None: anywhere
@@ -45,7 +45,7 @@ class Outlook:
             return Requests()
         return Requests(reject=self.known.map.ids[obs.tracks.visible & ~in_mask(obs.tracks.uv_px, within)])
 
-    def expected_px(self, obs: Sight) -> np.ndarray | None:
+    def expected_px(self, obs: OurObservation) -> np.ndarray | None:
         """(N, 2) where keypoints should show under the best hypothesis, NaN where not: for guided re-detection.
 
         None where enough are seen, or no hypothesis. A few points that agree predict all the others, which the
@@ -60,18 +60,18 @@ class Outlook:
         best = max(self.policy.propose(obs, known), key=lambda h: h.support, default=None)
         return None if best is None else self.points_px(obs, best.T_cam_obj)
 
-    def points_px(self, obs: Sight, T_cam_obj: np.ndarray) -> np.ndarray:
+    def points_px(self, obs: OurObservation, T_cam_obj: np.ndarray) -> np.ndarray:
         """(N, 2) where keypoints should show under a pose; NaN where not."""
         keypoints = np.where(self.known.map.promoted[:, None], self.known.map.p_obj, np.nan)
         return expected_px(self.policy.observer, obs, T_cam_obj, keypoints)
 
-    def sighted(self, obs: Sight) -> Sighting | None:
+    def sighted(self, obs: OurObservation) -> Sighting | None:
         """Where a sought object shows by shape and colour."""
         if not (self.sought and self.policy.shape.knows(self.known)) or self.policy.hidden(obs):
             return None
         return self.policy.shape.sighted(obs, self.known, self.policy.carried(self.known, obs.frame.time_s))
 
-    def hint(self, obs: Sight) -> tuple[Hint, Requests]:
+    def hint(self, obs: OurObservation) -> tuple[Hint, Requests]:
         """Where the object should be by its tracks and its model, for the segmenter; and the tracks to reject.
 
         While the object is away, points that do not agree on a pose are on something else.
@@ -109,8 +109,8 @@ class Outlook:
         if not (self.sought and self.policy.carried(self.known, time_s)):
             return None
         motion = self.known.life.motion
-        middle = se3.transform(motion.at(time_s), self.known.map.p_obj.mean(0, keepdims=True))[0]
-        return np.append(middle, motion.reach_m(time_s))
+        centre = se3.transform(motion.at(time_s), self.known.map.p_obj.mean(0, keepdims=True))[0]
+        return np.append(centre, motion.reach_m(time_s))
 
     def _inside(self, T_cam_obj: np.ndarray) -> np.ndarray:
         """(N,) bool: whether a pose projects the keypoints into the image, hidden or not."""

@@ -15,13 +15,13 @@ from p2p_lib.core.types import DOUBTED, Status
 from p2p_lib.extended.agreement import scene_ratio, size_ratio
 from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.contour import ContourFit, on_plane
-from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Evidence, Judgement, judge, off_size
+from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Judgement, PoseEvidence, judge, off_size
 from p2p_lib.extended.graph import explained
 from p2p_lib.extended.image_search import laid_on
 from p2p_lib.extended.lifecycle import TELLING, Lifecycle, same_place
 from p2p_lib.extended.motion import motion_weight
+from p2p_lib.extended.observation import OurObservation, cut_off, empty
 from p2p_lib.extended.shape_search import ShapeSearch
-from p2p_lib.extended.sight import Sight, cut_off, empty
 from p2p_lib.method import registration
 from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
 from p2p_lib.method.policy import Admission, Candidate, Policy, Verdict
@@ -51,10 +51,10 @@ class Proposal(Candidate):
     lead: float | None = None
 
     @property
-    def evidence(self) -> Evidence:
+    def evidence(self) -> PoseEvidence:
         """What speaks for it."""
         share = self.refined.inliers if self.refined.refined else None
-        return Evidence(self.hypothesis.support, share, self.sighting, self.lead)
+        return PoseEvidence(self.hypothesis.support, share, self.sighting, self.lead)
 
     def agreement(self, keypoints: np.ndarray) -> float:
         """Of the keypoints seen (N,) bool, the share that agrees less the share that does not."""
@@ -78,7 +78,7 @@ class BelievedAdmission(Admission):
     most: float = 1.0
     stray_sigma: np.ndarray | None = None
 
-    def rows(self, obs: Sight, model: ObjectModel) -> np.ndarray:
+    def rows(self, obs: OurObservation, model: ObjectModel) -> np.ndarray:
         """As in the paper, without stray points."""
         rows = super().rows(obs, model)
         if self.stray_sigma is None:
@@ -100,11 +100,11 @@ class OurPolicy(Policy):
         self.frozen = False  # whether the map does not grow
         # The last pose, and where the object lies that had it, by the scene as seen last.
         self._lies: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
-        self.trusted: Sight | None = None  # the newest frame without a doubt; None if the object was hidden since
+        self.trusted: OurObservation | None = None  # the newest frame without a doubt; None if hidden since
 
     # -- propose -------------------------------------------------------------------------------
 
-    def propose(self, obs: Sight, known: Known) -> list[Hypothesis]:
+    def propose(self, obs: OurObservation, known: Known) -> list[Hypothesis]:
         """Candidate poses from the visible keypoints and from priors: the last poses, a sighting."""
         cfg = self.config.registration
         with self.stopwatch("registration"):
@@ -122,13 +122,13 @@ class OurPolicy(Policy):
                 found += self._along_surface(obs, known, p_cam, priors)
             return found or self._surface_only(known, priors)
 
-    def few_keypoints(self, known: Known) -> int:
+    def min_keypoints(self, known: Known) -> int:
         """While an object is followed, more: a fast turn leaves pending points where keypoints are few."""
         if "pending_points" in self.on and not known.life.unconfirmed:
             return self.config.keypoint_map.keyframe_min_points
-        return super().few_keypoints(known)
+        return super().min_keypoints(known)
 
-    def _motion_priors(self, obs: Sight, known: Known) -> dict[str, np.ndarray]:
+    def _motion_priors(self, obs: OurObservation, known: Known) -> dict[str, np.ndarray]:
         """Where the object is by its motion: name to T_cam_obj (4, 4)."""
         priors = known.life.motion_priors() if "motion_prior" in self.on else {}
         return priors or self._carried_on(obs, known)
@@ -138,7 +138,7 @@ class OurPolicy(Policy):
         motion = known.life.motion
         return "motion_over_gaps" in self.on and motion is not None and motion.holds(time_s)
 
-    def _carried_on(self, obs: Sight, known: Known) -> dict[str, np.ndarray]:
+    def _carried_on(self, obs: OurObservation, known: Known) -> dict[str, np.ndarray]:
         """Where an absent object is if its motion went on, and that turn placed on its measured depth."""
         motion, time_s = known.life.motion, obs.frame.time_s
         if not (self.carried(known, time_s) and len(obs.cloud) and self.shape.knows(known)):
@@ -149,7 +149,7 @@ class OurPolicy(Policy):
         return {"motion": T_cam_obj} | ({"motion, on its depth": on_depth} if near else {})
 
     def _along_surface(
-        self, obs: Sight, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray]
+        self, obs: OurObservation, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray]
     ) -> list[Hypothesis]:
         """The hypothesis that is refit from the pose that the surface alone leads to; or none."""
         start = self.refined(obs, known, list(priors.values())[-1])
@@ -165,14 +165,16 @@ class OurPolicy(Policy):
 
     # -- choose --------------------------------------------------------------------------------
 
-    def refined(self, obs: Sight, known: Known, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None) -> Refinement:
+    def refined(
+        self, obs: OurObservation, known: Known, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None
+    ) -> Refinement:
         """As in the paper; something flat that no points hold is held by where it ends, while it is followed."""
         found = super().refined(obs, known, T_cam_obj, agrees)
         held = known.life.unconfirmed or (agrees is not None and agrees.sum() >= FIXED_BY)
         fit = None if held else self._contour(obs, known, found)
         return found if fit is None else fit.refined(found, obs.cloud, known.model.surface, self.config.refinement)
 
-    def _contour(self, obs: Sight, known: Known, refined: Refinement) -> ContourFit | None:
+    def _contour(self, obs: OurObservation, known: Known, refined: Refinement) -> ContourFit | None:
         """The contour that something flat is known by beside the one that is seen; None where there is none."""
         if not self._flat(refined) or known.life.contour is None:
             return None
@@ -182,7 +184,7 @@ class OurPolicy(Policy):
         """Whether the contour has a say: where the surface leaves free to all sides where the object is."""
         return "contour" in self.on and may_slide(refined, self.config.refinement.min_eigenvalue, 2)
 
-    def choose(self, obs: Sight, known: Known, hypotheses: list[Hypothesis]) -> tuple[Proposal | None, str]:
+    def choose(self, obs: OurObservation, known: Known, hypotheses: list[Hypothesis]) -> tuple[Proposal | None, str]:
         """The best of some hypotheses, refined, and why. The paper selects one and refines that; ours refines all."""
         candidates = [Proposal(hypothesis) for hypothesis in hypotheses]
         if self.config.selection.rule == "support":
@@ -192,7 +194,7 @@ class OurPolicy(Policy):
             return None, reason
         return self._compared(obs, known, best if best.refined else self.refine(obs, known, best)), reason
 
-    def _best(self, obs: Sight, known: Known, candidates: list[Proposal]) -> tuple[Proposal | None, str]:
+    def _best(self, obs: OurObservation, known: Known, candidates: list[Proposal]) -> tuple[Proposal | None, str]:
         """The candidate to go on with, and why."""
         few = max((c.hypothesis.support for c in candidates), default=0) < self.config.lifecycle.return_inliers
         if few and any((c.sighting or 0.0) > 0 for c in candidates):
@@ -202,14 +204,14 @@ class OurPolicy(Policy):
             weight = motion_weight([c.T_cam_obj for c in candidates], list(known.life.motion_priors().values()))
         return self.select(obs, known, candidates, weight)
 
-    def _look_again(self, obs: Sight, known: Known, candidates: list[Proposal]) -> list[Proposal]:
+    def _look_again(self, obs: OurObservation, known: Known, candidates: list[Proposal]) -> list[Proposal]:
         """Candidates for a return, with how much of the surface shows in the image under each."""
         if not (known.life.unconfirmed and self.shape.knows(known)):
             return candidates
         found = self.shape.at(obs, known, [c.T_cam_obj for c in candidates])
         return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
 
-    def _compared(self, obs: Sight, known: Known, best: Proposal) -> Proposal:
+    def _compared(self, obs: OurObservation, known: Known, best: Proposal) -> Proposal:
         """The pose of a return with its lead over the best other turn, or that turn if much more of the surface shows.
 
         Repeated now and then until the lead is telling. Where no other turn is known, the keypoints' agreement leads.
@@ -234,9 +236,9 @@ class OurPolicy(Policy):
         verdict = super().start(known, points)
         if verdict.accepted or known.model.surface is None or "motion_prior" not in self.on:
             return verdict
-        return Verdict(True, Status.DEGRADED, f"only {points} points")
+        return Verdict(True, Status.DEGRADED, verdict.reason)
 
-    def judge(self, obs: Sight, known: Known, best: Proposal) -> Judgement:
+    def judge(self, obs: OurObservation, known: Known, best: Proposal) -> Judgement:
         """Whether the pose stands, by its evidence and by the consistency of depth and masks."""
         size = self._size(obs, known, best) if "size" in self.on else None
         outline = self.outline(obs) if "outline" in self.on else 1.0
@@ -244,16 +246,16 @@ class OurPolicy(Policy):
         slides = "sliding_gate" in self.on and may_slide(best.refined, self.config.refinement.min_eigenvalue)
         fit = self._contour(obs, known, best.refined)
         rests = self._rests(obs, known, best) if "rest" in self.on else None
-        told = {"size": size, "outline": outline, "still": obs.still, "carried": carried, "slides": slides}
-        told["contour"] = 0.0 if fit is None else fit.share(best.T_cam_obj)
-        evidence = replace(best.evidence, rests=rests, **told)
+        terms = {"size": size, "outline": outline, "still": obs.still, "carried": carried, "slides": slides}
+        terms["contour"] = 0.0 if fit is None else fit.share(best.T_cam_obj)
+        evidence = replace(best.evidence, rests=rests, **terms)
         return judge(known.life, evidence, self.on, self.config.lifecycle)
 
-    def judge_other(self, obs: Sight, known: Known, best: Proposal) -> Judgement:
+    def judge_other(self, obs: OurObservation, known: Known, best: Proposal) -> Judgement:
         """The same in the other map, by the pose's own evidence alone."""
         return judge(known.life, replace(best.evidence, still=obs.still), self.on, self.config.lifecycle)
 
-    def _rests(self, obs: Sight, known: Known, best: Proposal) -> bool | None:
+    def _rests(self, obs: OurObservation, known: Known, best: Proposal) -> bool | None:
         """Whether an object that lay still is where the scene has it; None if unknown, or the place is seen empty."""
         place = known.life.scene_prior(obs.frame.T_world_cam).get("scene") if known.life.lay_still else None
         if place is None:
@@ -261,12 +263,12 @@ class OurPolicy(Policy):
         near = same_place(place, best.T_cam_obj)
         return near or (None if empty(self.observer, obs.frame, place, known.map.p_obj) else False)
 
-    def _before(self, obs: Sight) -> Sight | None:
+    def _before(self, obs: OurObservation) -> OurObservation | None:
         """The newest frame without a doubt; None unless both it and this one have a mask."""
         before = self.trusted
         return None if obs.mask is None or before is None or before.mask is None else before
 
-    def _size(self, obs: Sight, known: Known, best: Proposal) -> tuple[float, float] | None:
+    def _size(self, obs: OurObservation, known: Known, best: Proposal) -> tuple[float, float] | None:
         """The size ratio and its deviation, if the scene beside the object has changed its depth, too; else None.
 
         Points that slide over an object change only the object's size.
@@ -280,7 +282,7 @@ class OurPolicy(Policy):
         p_cam = obs.p_cam[sized]
         return size_ratio(known.map.p_obj[sized], p_cam, self.observer.noise_m(p_cam))
 
-    def outline(self, obs: Sight) -> float:
+    def outline(self, obs: OurObservation) -> float:
         """Share of the mask's outline along depth steps, relative to that in the newest frame without a doubt."""
         before = self._before(obs)
         then, now = None if before is None else before.outline_share, obs.outline_share
@@ -288,7 +290,7 @@ class OurPolicy(Policy):
 
     # -- admit and request ---------------------------------------------------------------------
 
-    def admit(self, obs: Sight, known: Known, best: Proposal, verdict: Judgement) -> BelievedAdmission:
+    def admit(self, obs: OurObservation, known: Known, best: Proposal, verdict: Judgement) -> BelievedAdmission:
         """Nothing is learnt from a doubted pose, and one of little confidence makes no keyframe."""
         belief = Belief.of(obs, best, known, self, "texture" in self.on) if "confidence" in self.on else None
         life = known.life.with_verdict(best.T_cam_obj, obs.frame.time_s, verdict, best.lead)
@@ -311,7 +313,7 @@ class OurPolicy(Policy):
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNCONSTRAINED)
         return BelievedAdmission(verdict, best.hypothesis.inliers, belief.of_frame, confidence, **kept)
 
-    def request(self, obs: Sight, known: Known, best: Proposal, admission: Admission) -> Requests:
+    def request(self, obs: OurObservation, known: Known, best: Proposal, admission: Admission) -> Requests:
         """Tracks of keypoints that contradict the pose are rejected, if the frame is learnt from."""
         if "rejection" not in self.on or not admission.learns:
             return Requests()
@@ -319,14 +321,14 @@ class OurPolicy(Policy):
 
     # -- the object's life ---------------------------------------------------------------------
 
-    def begun(self, obs: Sight, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
+    def begun(self, obs: OurObservation, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
         """As in the paper, with its place in the scene; the frame becomes the trusted one."""
         self.trusted = obs
         life = super().begun(obs, T_cam_obj, verdict).placed(obs.frame.T_world_cam)
         return self._outlined(life, obs, T_cam_obj) if "contour" in self.on else life
 
     def followed(
-        self, obs: Sight, known: Known, best: Proposal, admission: BelievedAdmission, sure: float
+        self, obs: OurObservation, known: Known, best: Proposal, admission: BelievedAdmission, confidence: float
     ) -> Lifecycle:
         """A frame that is learnt from updates its place in the scene and its motion, too."""
         life = admission.life
@@ -335,14 +337,14 @@ class OurPolicy(Policy):
         certain = best.hypothesis.support >= self.config.lifecycle.return_inliers
         if (certain or life.contour is None) and self._flat(best.refined):
             life = self._outlined(life, obs, best.T_cam_obj)
-        return life.placed(obs.frame.T_world_cam).moved(sure)
+        return life.placed(obs.frame.T_world_cam).moved(confidence)
 
-    def _outlined(self, life: Lifecycle, obs: Sight, T_cam_obj: np.ndarray) -> Lifecycle:
+    def _outlined(self, life: Lifecycle, obs: OurObservation, T_cam_obj: np.ndarray) -> Lifecycle:
         """The life with the contour that is seen under a pose, where that can be known."""
         p_cam = on_plane(obs.contour_px, obs.cloud, self.observer.camera)
         return life if p_cam is None else replace(life, contour=se3.transform(se3.inverse(T_cam_obj), p_cam))
 
-    def expected(self, obs: Sight, known: Known) -> np.ndarray | None:
+    def expected(self, obs: OurObservation, known: Known) -> np.ndarray | None:
         """Where it was left in the static scene, by the newest frame that located the camera; else as in the paper."""
         last = super().expected(obs, known)
         if known.life.lay_still and (prior := known.life.scene_prior(obs.frame.T_world_cam)):
@@ -350,7 +352,7 @@ class OurPolicy(Policy):
         since, lies = self._lies
         return lies if since is last and since is not None else last
 
-    def missed(self, obs: Sight, known: Known, verdict: Verdict) -> Lifecycle:
+    def missed(self, obs: OurObservation, known: Known, verdict: Verdict) -> Lifecycle:
         """After a frame in which the object was hidden, later ones are not compared with those before."""
         self.trusted = self.trusted if verdict.status is Status.LOST else None
         return known.life.without_pose(verdict.status, obs.mask_px, self.carried(known, obs.frame.time_s))

@@ -17,11 +17,11 @@ from p2p_lib.core.image import either
 from p2p_lib.core.interfaces import Hint, LazyHints
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
+from p2p_lib.extended.observation import OurObservation
 from p2p_lib.extended.remembered import Remembered, follow
 from p2p_lib.extended.scene import Scene
-from p2p_lib.extended.sight import Sight
 from p2p_lib.extended.two_maps import TwoMaps
-from p2p_lib.method.frontend import Asked, Frontend, Masks
+from p2p_lib.method.frontend import FrameInputs, Frontend, Masks
 from p2p_lib.method.object_model import Requests
 
 #: The camera is located every so many frames: while all objects have poses; while one is away.
@@ -40,11 +40,11 @@ class Reacquisition(Frontend):
         self._sightings: Mapping[str, Sighting] = {}
         self._turn = 0  # counts frames: which remembered object is searched for
 
-    def track(self, asked: Asked) -> Asked | None:
+    def track(self, inputs: FrameInputs) -> FrameInputs | None:
         """As in the paper; the camera is located meanwhile."""
         answers = len(self.waiting) >= self.tracker.latency_frames
-        locating = self._locate((self.waiting[0] if self.waiting else asked).frame) if answers else None
-        tracked = super().track(asked)
+        locating = self._locate((self.waiting[0] if self.waiting else inputs).frame) if answers else None
+        tracked = super().track(inputs)
         if locating is None or tracked is None:
             return tracked
         with self.stopwatch("scene"):
@@ -59,33 +59,33 @@ class Reacquisition(Frontend):
             return None
         self._unlocated = 0
         known = [mask for mask in self.masks.values() if mask is not None]
-        return self.beside.submit(self.scene.locate, frame, either(known) if known else None)
+        return self.executor.submit(self.scene.locate, frame, either(known) if known else None)
 
-    def segment(self, asked: Asked) -> None:
+    def segment(self, inputs: FrameInputs) -> None:
         """As in the paper, after the search for sought objects."""
-        self._sightings = self._sighted(asked.frame, asked.masks)
-        super().segment(self._recalled(asked))
+        self._sightings = self._sighted(inputs.frame, inputs.masks)
+        super().segment(self._recalled(inputs))
 
-    def _recalled(self, asked: Asked) -> Asked:
+    def _recalled(self, inputs: FrameInputs) -> FrameInputs:
         """With the mask of a remembered object, if it is found: one of them is looked for in each frame."""
         sought = [n for n, obj in sorted(self.objects.items()) if isinstance(obj, Remembered) and obj.recalls]
-        sought = [name for name in sought if name in asked.masks and name not in asked.said]
+        sought = [name for name in sought if name in inputs.masks and name not in inputs.prompts]
         if not sought:
-            return asked
+            return inputs
         self._turn += 1
         name = sought[self._turn % len(sought)]
         others = [mask for other, mask in self.masks.items() if other != name and mask is not None]
         with self.stopwatch("search"):
-            found = self.objects[name].find(asked.frame, asked.masks[name], either(others) if others else None)
+            found = self.objects[name].find(inputs.frame, inputs.masks[name], either(others) if others else None)
         if self.objects[name].forsaken:
             self.apply({name: self.objects[name].withdraw()})
             if name in self.segmenter.names:
                 self.segmenter.remove(name)
         if found is None:
-            return asked
+            return inputs
         self.tracks = follow(self.objects[name], found, self.tracker, self.tracks)
         self._sightings = {**self._sightings, name: found.sighting}
-        return replace(asked, masks=asked.masks | {name: found.mask})
+        return replace(inputs, masks=inputs.masks | {name: found.mask})
 
     def _sighted(self, frame: Frame, masks: Masks) -> dict[str, Sighting]:
         """Sought objects that show by shape and colour; the tracker looks for their points there."""
@@ -107,19 +107,19 @@ class Reacquisition(Frontend):
     def _hint(self, obj: TwoMaps, frame: Frame, sighting: Sighting | None) -> tuple[Hint, Requests]:
         return obj.outlook.hint(obj.observe(frame, None, self.tracks, sighting))
 
-    def observe(self, asked: Asked) -> Mapping[str, Sight]:
+    def observe(self, inputs: FrameInputs) -> Mapping[str, OurObservation]:
         """What the frame shows of every object, after misplaced tracks are rejected and missing points looked for."""
         seen = {
             name: self.objects[name].observe(
-                asked.frame, mask, self.tracks, self._sightings.get(name), asked.masks[name] is not None
+                inputs.frame, mask, self.tracks, self._sightings.get(name), inputs.masks[name] is not None
             )
             for name, mask in self.masks.items()
         }
         if "rejection" in self.on:
-            self.apply(self._misplaced(seen, asked.masks))
+            self.apply(self._misplaced(seen, inputs.masks))
         return seen | self._redetect(seen) if "redetection" in self.on else seen
 
-    def _misplaced(self, seen: Mapping[str, Sight], given: Masks) -> dict[str, Requests]:
+    def _misplaced(self, seen: Mapping[str, OurObservation], given: Masks) -> dict[str, Requests]:
         """Tracks of absent objects that are on something else.
 
         An empty mask by the segmenter rejects only tracks on other objects: it was made by means of these tracks.
@@ -129,7 +129,7 @@ class Reacquisition(Frontend):
         within = {name: elsewhere if name in nowhere else obs.mask for name, obs in seen.items()}
         return {name: self.objects[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
-    def _redetect(self, seen: Mapping[str, Sight]) -> dict[str, Sight]:
+    def _redetect(self, seen: Mapping[str, OurObservation]) -> dict[str, OurObservation]:
         """Guided re-detection: the tracker looks for points where objects expect them; the new observations."""
         looked = {name: self.objects[name].outlook.expected_px(obs) for name, obs in seen.items()}
         expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}

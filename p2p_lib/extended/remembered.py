@@ -24,10 +24,9 @@ from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.agreement import outline_share
 from p2p_lib.extended.image_search import ImageSearch, Sighting, laid_at
-from p2p_lib.extended.lifecycle import CONFIRM_FRAMES
-from p2p_lib.extended.sight import Sight
+from p2p_lib.extended.observation import OurObservation
 from p2p_lib.extended.two_maps import TwoMaps
-from p2p_lib.method.object_model import Known, Requests
+from p2p_lib.method.object_model import CONFIRM_FRAMES, Known, Requests
 from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
 from p2p_lib.method.policy import Verdict
 from p2p_lib.method.refinement import surface_distance
@@ -54,7 +53,7 @@ _BARE, _PATIENCE = 4, 5
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Recognition:
     """Where a remembered object is in an image: its ``mask`` (H, W) bool, what shows of it, and landmarks there.
 
     rows  (M,) of the landmarks in the memory, seen at uv_px (M, 2)
@@ -95,16 +94,16 @@ class Remembered(TwoMaps):
     @property
     def recalls(self) -> bool:
         """Whether it is to be looked for by its landmarks."""
-        return not self.life.has_pose or (self._bare and not self._sure)
+        return not self.life.has_pose or (self._bare and not self._confirmed)
 
     @property
-    def _sure(self) -> bool:
+    def _confirmed(self) -> bool:
         return self._borne_out >= CONFIRM_FRAMES
 
     @property
     def forsaken(self) -> bool:
         """Whether it was claimed to be there, and neither points nor landmarks have confirmed that."""
-        return self._claimed and not self._sure and self._in_vain >= _PATIENCE
+        return self._claimed and not self._confirmed and self._in_vain >= _PATIENCE
 
     def withdraw(self) -> Requests:
         """Withdraw the claim, with everything learnt since."""
@@ -116,7 +115,7 @@ class Remembered(TwoMaps):
         """The memory that this map began with; None for a later map."""
         return self._memory if map_id == 0 else None
 
-    def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
+    def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Recognition | None:
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool.
 
         It counts as found where one of the last looks found it, too, or where its pose has it; in a mask, at once.
@@ -139,7 +138,7 @@ class Remembered(TwoMaps):
         moved_m = se3.transform(T_cam_obj, p_obj).mean(0) - se3.transform(other, p_obj).mean(0)
         return bool(np.linalg.norm(moved_m) < np.ptp(p_obj, 0).max() / 2 + _FASTEST_M_S * after_s)
 
-    def _look(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Found | None:
+    def _look(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Recognition | None:
         """Where it may be in one frame."""
         memory, best = self._memory, None
         search = ImageSearch(frame, self.observer.camera, self.config.depth)
@@ -162,7 +161,7 @@ class Remembered(TwoMaps):
         if best is None:
             return None
         _, where, sighting, seen = best
-        return Found(where, sighting, seen.rows, seen.uv_px)
+        return Recognition(where, sighting, seen.rows, seen.uv_px)
 
     def _sightings(
         self, frame: Frame, search: ImageSearch, mask: np.ndarray | None, taken: np.ndarray | None
@@ -214,17 +213,17 @@ class Remembered(TwoMaps):
 
     # -- the step ------------------------------------------------------------------------------
 
-    def step(self, obs: Sight) -> ObjectStep:
+    def step(self, obs: OurObservation) -> ObjectStep:
         """The object's pose at a frame; once it is followed, landmarks that have come into view are added."""
         given = obs.mask is not None and obs.given
         if not given and not (self._claimed and (obs.mask is not None or self.life.T_cam_obj is not None)):
-            return self.own.absent(obs, Verdict(False, Status.INITIALISING, "remembered, and not found yet"))
+            return self.own.absent(obs, Verdict(False, Status.INITIALISING, "known from memory, not found yet"))
         followed = int(np.isin(self.map.keys, self._key)[obs.seen].sum())
         step = super().step(obs)
         if step.estimate.T_cam_obj is not None:
             self._claimed, self._bare = True, step.estimate.inliers < _BARE
             self._borne_out += step.estimate.inliers >= self.config.lifecycle.return_inliers
-            self.policy.frozen = self.frozen or not self._sure
+            self.policy.frozen = self.frozen or not self._confirmed
         self._since += 1
         due = self._since >= _EVERY and step.estimate.T_cam_obj is not None and self.known.map_id == 0
         if not due or followed >= _ENOUGH or step.estimate.status is Status.DEGRADED or obs.mask is None:
@@ -232,7 +231,7 @@ class Remembered(TwoMaps):
         self._since = 0
         return replace(step, requests=self._with_more(step.requests, obs, step.estimate.T_cam_obj))
 
-    def _with_more(self, requests: Requests, obs: Sight, T_cam_obj: np.ndarray) -> Requests:
+    def _with_more(self, requests: Requests, obs: OurObservation, T_cam_obj: np.ndarray) -> Requests:
         """Requests with landmarks that are seen under a pose, and are not followed yet."""
         absent = np.flatnonzero(~np.isin(self._key, self.map.keys))
         p_obj, descriptors = self._memory.p_obj[absent], self._memory.descriptors[absent]
@@ -243,11 +242,11 @@ class Remembered(TwoMaps):
         add_px, keys = np.concatenate([requests.add_px, seen.uv_px]), np.concatenate([requests.keys, keys])
         return replace(requests, add_px=add_px, keys=keys)
 
-    def _outgrown(self, obs: Sight) -> bool:
+    def _outgrown(self, obs: OurObservation) -> bool:
         """A memory is never founded anew."""
         return False
 
-    def _turned_over(self, obs: Sight) -> bool:
+    def _turned_over(self, obs: OurObservation) -> bool:
         """No second map where the map does not grow."""
         return not self.policy.frozen and super()._turned_over(obs)
 
@@ -260,7 +259,7 @@ def _certain(landmarks: float, share: float, outline: Callable[[], float | None]
     return landmarks >= 1 and share >= _SHARE and (outline() or 0.0) >= _OUTLINE
 
 
-def follow(obj: Remembered, found: Found, tracker: PointTracker, tracks: Tracks) -> Tracks:
+def follow(obj: Remembered, found: Recognition, tracker: PointTracker, tracks: Tracks) -> Tracks:
     """Have the tracker follow the landmarks found; returns all objects' tracks in this frame, with these."""
     keys, ids = obj.taken_in(found.rows), tracker.add(found.uv_px)
     obj.map.assign(keys, ids)

@@ -51,8 +51,8 @@ def memory_of(name: str, known: Known, made_of: dict[str, Any], before: ObjectMe
 def _landmarks(known: Known, surface: TsdfVolume) -> tuple[np.ndarray, ...]:
     """p_obj (L, 3), descriptors, confidence (L,) and keypoint (L,) of what the kept views show."""
     points = known.map
-    own, sure = points.p_obj[points.promoted], points.confidence[points.promoted]
-    middling = float(np.median(sure)) if len(sure) else 0.0
+    own, own_confidence = points.p_obj[points.promoted], points.confidence[points.promoted]
+    middling = float(np.median(own_confidence)) if len(own_confidence) else 0.0
     found: list[tuple[np.ndarray, ...]] = []
     for view in surface.views.values():
         (height, width), (left, top), lens = view.inside.shape, view.corner, view.camera
@@ -71,7 +71,7 @@ def _landmarks(known: Known, surface: TsdfVolume) -> tuple[np.ndarray, ...]:
         rows = shown[which[is_point]]
         p_obj[is_point] = own[rows]
         confidence = np.full(len(p_obj), middling)
-        confidence[is_point] = sure[rows]
+        confidence[is_point] = own_confidence[rows]
         found.append((p_obj, descriptors, confidence, is_point))
     if not found:
         return np.zeros((0, 3)), np.zeros((0, 1, 1), np.uint8), np.zeros(0), np.zeros(0, bool)

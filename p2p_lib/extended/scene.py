@@ -101,8 +101,8 @@ class Scene:
         away = self._away(self._T_world_cam)
         nearest = np.argsort(away, kind="stable")
         oldest = np.flatnonzero(away < _OVERLAPS)
-        turn = self._turn % int(np.ceil(len(away) / _NEAR))
-        chosen = nearest[turn * _NEAR : (turn + 1) * _NEAR]
+        turn = self._turn % (1 + int(np.ceil(max(len(away) - 2, 0) / _NEAR)))
+        chosen = nearest[2 + (turn - 1) * _NEAR : 2 + turn * _NEAR]
         if not turn:
             chosen = np.unique(np.concatenate([nearest[:2], oldest[:3]]))
         pairs = [self._matched(self._views[k], seen) for k in chosen]

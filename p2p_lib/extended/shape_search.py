@@ -14,7 +14,7 @@ from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.gates import SIGHTED
 from p2p_lib.extended.image_search import ImageSearch, Sighting, SurfaceSample
-from p2p_lib.extended.sight import Sight, cut_off
+from p2p_lib.extended.observation import OurObservation, cut_off
 from p2p_lib.method.object_model import Known, ObjectModel
 from p2p_lib.method.observation import Observer
 from p2p_lib.method.refinement import surface_distances
@@ -43,12 +43,12 @@ class ShapeSearch:
             self._samples[model] = model.revision, sample
         return sample
 
-    def at(self, obs: Sight, known: Known, poses: list[np.ndarray]) -> list[Sighting | None]:
+    def at(self, obs: OurObservation, known: Known, poses: list[np.ndarray]) -> list[Sighting | None]:
         """What of the surface shows under each of some poses; None where too little would show."""
         search = self._search(obs.frame)
         return [search.at(T_cam_obj, self.sample(known.model)) for T_cam_obj in poses]
 
-    def sighted(self, obs: Sight, known: Known, carried: bool) -> Sighting | None:
+    def sighted(self, obs: OurObservation, known: Known, carried: bool) -> Sighting | None:
         """Where a sought object shows: near its place by scene, motion or the frame before, or in its mask."""
         life, model, time_s = known.life, known.model, obs.frame.time_s
         proposed = [*life.scene_prior(obs.frame.T_world_cam).values()]
@@ -63,14 +63,14 @@ class ShapeSearch:
             best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
             return best if best is not None and best.share >= SIGHTED else None
 
-    def otherwise(self, obs: Sight, known: Known, T_cam_obj: np.ndarray) -> tuple[Sighting | None, ...]:
+    def otherwise(self, obs: OurObservation, known: Known, T_cam_obj: np.ndarray) -> tuple[Sighting | None, ...]:
         """What shows under a pose, and the best that is turned otherwise; None where it cannot be said."""
         with self._stopwatch("search"):
             search, sample = self._search(obs.frame), self.sample(known.model)
             views = known.model.views.some(_TURNS)
             return search.at(T_cam_obj, sample), search.otherwise(T_cam_obj, views, obs.cloud, sample)
 
-    def _turned(self, obs: Sight, known: Known, search: ImageSearch) -> Sighting | None:
+    def _turned(self, obs: OurObservation, known: Known, search: ImageSearch) -> Sighting | None:
         """Where a lost object shows in its mask, in a turn of one of its keyframes, if enough depth fits."""
         found = search.turned(known.model.views.some(_TURNS), obs.cloud, self.sample(known.model))
         if found is None:

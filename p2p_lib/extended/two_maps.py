@@ -17,9 +17,9 @@ from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.gates import OUTLINE, Judgement
 from p2p_lib.extended.image_search import Sighting
 from p2p_lib.extended.lifecycle import Lifecycle
+from p2p_lib.extended.observation import OurObservation, area_m2, cut_off, with_tracks
 from p2p_lib.extended.outlook import Outlook
 from p2p_lib.extended.policy import OurPolicy, Proposal
-from p2p_lib.extended.sight import Sight, area_m2, cut_off, with_tracks
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.object_model import NO_IDS, Known, ObjectModel
 from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
@@ -50,8 +50,8 @@ class Relation:
     def with_frame(self, T_obj_other: np.ndarray, p_other: np.ndarray) -> Relation:
         """With one more frame's (4, 4); one that disagrees with the last, at the points p_other, starts anew."""
         if len(self.T_obj_other):
-            last, middle = self.T_obj_other[-1], p_other.mean(0, keepdims=True)
-            moved_m = np.linalg.norm(se3.transform(T_obj_other, middle) - se3.transform(last, middle))
+            last, centre = self.T_obj_other[-1], p_other.mean(0, keepdims=True)
+            moved_m = np.linalg.norm(se3.transform(T_obj_other, centre) - se3.transform(last, centre))
             if moved_m < _ALIKE_M and se3.angle_rad(se3.inverse(last) @ T_obj_other) < _ALIKE_RAD:
                 return Relation(np.concatenate([self.T_obj_other, T_obj_other[None]]))
         return Relation(T_obj_other[None])
@@ -68,7 +68,7 @@ class Relation:
         return first @ se3.exp(se3.log(se3.inverse(first) @ self.T_obj_other).mean(0))
 
 
-def seen_together(own: Sight, other: Sight) -> Sight:
+def seen_together(own: OurObservation, other: OurObservation) -> OurObservation:
     """The observation of a map that has taken in another: its own points, then the other's."""
     p_cam = np.concatenate([own.p_cam, other.p_cam])
     return replace(own, tracks=joined([own.tracks, other.tracks]), p_cam=p_cam, other=None)
@@ -149,17 +149,17 @@ class TwoMaps:
         tracks: Tracks,
         sighting: Sighting | None = None,
         given: bool = True,
-    ) -> Sight:
+    ) -> OurObservation:
         """What a frame shows of the object, by its mask (H, W) bool, None where unknown, and all objects' tracks."""
         obs = self.own.observe(frame, mask, tracks)
-        sight = Sight(obs.frame, obs.mask, obs.tracks, obs.p_cam, obs.cloud, sighting, given)
-        return self._with_other(sight, tracks)
+        ours = OurObservation(obs.frame, obs.mask, obs.tracks, obs.p_cam, obs.cloud, sighting, given)
+        return self._with_other(ours, tracks)
 
-    def seen_anew(self, obs: Sight, tracks: Tracks) -> Sight:
+    def seen_anew(self, obs: OurObservation, tracks: Tracks) -> OurObservation:
         """The observation again, with all objects' newest tracks."""
         return self._with_other(with_tracks(self.observer, obs, tracks.select(self.map.ids)), tracks)
 
-    def _with_other(self, obs: Sight, tracks: Tracks) -> Sight:
+    def _with_other(self, obs: OurObservation, tracks: Tracks) -> OurObservation:
         if self.other is None:
             return obs
         same = replace(obs, sighting=None, other=None)
@@ -167,14 +167,14 @@ class TwoMaps:
 
     # -- the step ------------------------------------------------------------------------------
 
-    def step(self, obs: Sight) -> ObjectStep:
+    def step(self, obs: OurObservation) -> ObjectStep:
         """The object's pose at a frame, by the map that knows it."""
         step = self._step(obs)
         if step.estimate.keyframe:
             self.life = replace(self.life, seen_m2=max(self.life.seen_m2, area_m2(self.observer, obs)))
         return step
 
-    def _step(self, obs: Sight) -> ObjectStep:
+    def _step(self, obs: OurObservation) -> ObjectStep:
         own = self.own
         if own.policy.hidden(obs) or (own.model.empty and not self._still_growing(obs)):
             return own.step(obs)
@@ -188,17 +188,17 @@ class TwoMaps:
         if best is not None and verdict.accepted:
             return self._accept(obs, best, verdict)
         if (outgrown := self._outgrown(obs)) or self._turned_over(obs):
-            return self._begin_anew(obs, keep=not outgrown)
+            return self._begin_anew(obs, outgrown)
         return own.absent(obs, verdict)
 
-    def _accept(self, obs: Sight, best: Proposal, verdict: Judgement) -> ObjectStep:
+    def _accept(self, obs: OurObservation, best: Proposal, verdict: Judgement) -> ObjectStep:
         if not verdict.doubted:
             self.policy.trusted = obs
         return self.own.accept(obs, best, verdict)
 
     # -- a new map -----------------------------------------------------------------------------
 
-    def _still_growing(self, obs: Sight) -> bool:
+    def _still_growing(self, obs: OurObservation) -> bool:
         """Whether the object is still coming into view.
 
         Points on its first sliver would all be at its rim; or a side that its map knows may be about to return.
@@ -206,20 +206,20 @@ class TwoMaps:
         before, now = self.life.start_px, obs.mask_px
         return "growing" in self._on and now is not None and before is not None and now > _GROWTH * before
 
-    def _outgrown(self, obs: Sight) -> bool:
+    def _outgrown(self, obs: OurObservation) -> bool:
         """Whether a lost object shows much more than its keyframes ever did, or was never followed."""
         if "outgrown" not in self._on or self.life.lost_frames < _PATIENCE or obs.mask is None:
             return False
         more = area_m2(self.observer, obs) > _OUTGROWN * self.life.seen_m2
         return not self.life.followed or (more and self.policy.outline(obs) >= OUTLINE)
 
-    def _turned_over(self, obs: Sight) -> bool:
+    def _turned_over(self, obs: OurObservation) -> bool:
         """Whether a known object stays lost in plain view: it shows a side that its map does not have.
 
         Its mask must be given, or it must have been in sight since: what the segmenter takes for an object that was
         hidden, and that agrees with nothing known of it, may be something else.
         """
-        room = self.other is None or _first_view_alone(self.other.known)
+        room = self.other is None or _first_view_alone(self.other.known) or _first_view_alone(self.known)
         known = "second_map" in self._on and room and self.life.lost_frames >= _STAYS_LOST
         of_it = obs.given or self.life.in_sight
         if not known or obs.mask is None or not of_it or cut_off(self.observer, obs):
@@ -227,32 +227,34 @@ class TwoMaps:
         plain = area_m2(self.observer, obs) >= _IN_PLAIN_VIEW * self.life.seen_m2
         return plain and self.policy.outline(obs) >= OUTLINE
 
-    def _begin_anew(self, obs: Sight, keep: bool) -> ObjectStep:
-        """Begin a new map; with ``keep`` the one so far becomes the other one, else it is dropped."""
+    def _begin_anew(self, obs: OurObservation, outgrown: bool) -> ObjectStep:
+        """Begin a new map. The one so far becomes the other one.
+
+        It is dropped where it is ``outgrown`` or, with another one there, knows one view alone.
+        """
         if self._still_growing(obs):
             return self.own.absent(obs, Verdict(False, Status.LOST, _STILL_GROWING))
         own, new = self.own, copy(self.own)
         new.known = Known(new.new_model(), self.policy.life, own.known.map_id + 1)
         step, trusted = new.begin(obs), self.policy.trusted
-        few = keep and step.estimate.status is Status.DEGRADED
-        if few or step.estimate.T_cam_obj is None:
-            reason = f"{step.estimate.reason} to start from" if few else step.estimate.reason
+        if (not outgrown and step.estimate.status is Status.DEGRADED) or step.estimate.T_cam_obj is None:
             self.policy.trusted = trusted
-            return own.absent(obs, Verdict(False, Status.LOST, reason))
+            return own.absent(obs, Verdict(False, Status.LOST, step.estimate.reason))
+        keep = not outgrown and (self.other is None or not _first_view_alone(own.known))
         gone = self.other if keep else own
         if keep:
             self.other = _lost(own)
         self.own, self._relation = new, Relation()
         if step.estimate.status is not Status.DEGRADED:
             new.life = replace(new.life, status=Status.RECOVERED)
-            again = replace(step.estimate, status=Status.RECOVERED, reason="a new map: the old one stays lost")
+            again = replace(step.estimate, status=Status.RECOVERED, reason="new map: the object stayed lost in the old")
             step = replace(step, estimate=again)
         forgotten = NO_IDS if gone is None else gone.map.ids[gone.map.ids >= 0]
         return replace(step, requests=replace(step.requests, drop=forgotten))
 
     # -- two maps ------------------------------------------------------------------------------
 
-    def _by_other(self, obs: Sight, best: Proposal | None, verdict: Verdict) -> ObjectStep | None:
+    def _by_other(self, obs: OurObservation, best: Proposal | None, verdict: Verdict) -> ObjectStep | None:
         """The step by the other map, if it alone finds the object, or by the joined maps; else None."""
         other = self.other
         known = None if other is None or obs.other is None else self._known_again(obs.other, other.known)
@@ -266,7 +268,7 @@ class TwoMaps:
         self._relation = self._relation.with_frame(T_obj_other, other.map.p_obj)
         return self._joined(obs, best, known[0]) if self._relation.certain else None
 
-    def _known_again(self, obs: Sight, other: Known) -> tuple[Proposal, Judgement] | None:
+    def _known_again(self, obs: OurObservation, other: Known) -> tuple[Proposal, Judgement] | None:
         """The pose by the other map, where points and surface say that it is this object; else None."""
         cfg = self.config.lifecycle
         found = [h for h in self.policy.propose(obs, other) if h.support >= cfg.return_inliers]
@@ -278,12 +280,12 @@ class TwoMaps:
         fits = verdict.accepted and (share is None or share >= cfg.surface_only_share)
         return (best, verdict) if fits else None
 
-    def _exchanged(self, obs: Sight) -> Sight:
+    def _exchanged(self, obs: OurObservation) -> OurObservation:
         """Exchange the two maps; returns the observation of the one to go on in."""
         self.own, self.other, self._relation = self.other, _lost(self.own), Relation()
         return replace(obs.other, other=replace(obs, other=None))
 
-    def _joined(self, obs: Sight, best: Proposal, known: Proposal) -> ObjectStep:
+    def _joined(self, obs: OurObservation, best: Proposal, known: Proposal) -> ObjectStep:
         """Join two maps that fit this frame, in the frame of the older; a keyframe ties the points of both."""
         T_obj_other = self._relation.mean
         if self.other.known.map_id < self.known.map_id:
@@ -294,7 +296,7 @@ class TwoMaps:
         self.model.join(gone.model, T_obj_other)
         self.life = replace(self.life, seen_m2=max(self.life.seen_m2, gone.life.seen_m2))
         both = replace(best, hypothesis=agreeing_together(best.hypothesis, known.hypothesis))
-        maps = f"maps {self.known.map_id} and {gone.map_id} are one"
+        maps = f"maps {self.known.map_id} and {gone.map_id} were joined"
         verdict = Judgement(True, Status.RECOVERED, maps, joins=True)
         step = self.own.accept(seen_together(obs, obs.other), both, verdict, due=True)
         return replace(step, estimate=replace(step.estimate, joined=(gone.map_id, T_obj_other)))

@@ -160,8 +160,8 @@ def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method:
             ran, recreated = cells[column].text != "-", job.sequence.name.startswith(SYNTHETIC)
             whole |= {column} if ran and not part else set()
             same |= {column} if ran and not part and not recreated else set()
-            said = part or ("re-created, not the paper's files" if recreated and ran else "")
-            cells[column] = replace(cells[column], note=cells[column].note or said)
+            note = part or ("re-created, not the paper's files" if recreated and ran else "")
+            cells[column] = replace(cells[column], note=cells[column].note or note)
     cells["Mean"] = numbers.cell(method.name, METRICS[metric][0], MEAN, "", form)
     if len(whole) < len(columns):
         values = [float(cells[column].text.partition(" ")[0]) for column in whole if cells[column].text != FAIL]

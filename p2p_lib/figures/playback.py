@@ -67,8 +67,8 @@ class Playback:
     @cached_property
     def objects(self) -> dict[str, ObjectRun]:
         """What is drawn: poses as they were said, in maps that were given up since as well."""
-        said = load_run(self.run.path, every_map=True).objects
-        return {name: obj.in_joined_maps() for name, obj in said.items()}
+        objects = load_run(self.run.path, every_map=True).objects
+        return {name: obj.in_joined_maps() for name, obj in objects.items()}
 
     def of_kept_map(self, name: str) -> np.ndarray:
         """(n,) bool: rows whose pose is in the frame of the surface and the keypoints in the folder."""

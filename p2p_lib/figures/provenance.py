@@ -149,8 +149,8 @@ def describe(source: Any) -> dict[str, Any]:
         return {"evaluation": _what_ran(source.info), "align": source.align}
     if isinstance(source, Benchmark):
         keys = sorted({outcome.key for _, outcome in source.results if outcome.status == "done"})
-        said = {"benchmark": source.plan.name, "profile": source.profile, "plan": _plan_digest(source.plan)}
-        return {**said, "cpu_min": round(source.cpu_min, 1), "runs": keys}
+        source_info = {"benchmark": source.plan.name, "profile": source.profile, "plan": _plan_digest(source.plan)}
+        return {**source_info, "cpu_min": round(source.cpu_min, 1), "runs": keys}
     if isinstance(source, str | Path):
         return {"file": Path(source).name, "sha256": _sha256(Path(source))}
     if hasattr(source, "frame") and hasattr(source, "camera"):

@@ -207,7 +207,7 @@ class Scene:
         return Label(text, self.colours[name], (*uv.min(0), *uv.max(0)))
 
 
-def beside(
+def side_by_side(
     scenes: Mapping[str, Scene], shown: int | Sequence[int], width_px: int = 300, axes: bool = False, across: int = 1
 ) -> np.ndarray:
     """The same frames of each method under its name, one method a line, or ``across`` of them.

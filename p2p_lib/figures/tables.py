@@ -135,14 +135,14 @@ class Table:
         if groups and len(self.heads) > _MARKDOWN_COLUMNS:
             columns = [[*range(groups[0]), *range(a, b)] for a, b in pairwise(np.cumsum(groups).tolist())]
         table = "\n".join(as_markdown(whole.iloc[:, list(at)], self.words) for at in columns)
-        said = "".join(f"{line}  \n" for line in self._said("({}) "))
-        return f"**{self.title}**\n\n{table}\n" + said.replace("$", r"\$")  # else it is an equation
+        notes = "".join(f"{line}  \n" for line in self._lettered_notes("({}) "))
+        return f"**{self.title}**\n\n{table}\n" + notes.replace("$", r"\$")  # else it is an equation
 
     def html(self) -> str:
         """For notebooks: small, with the groups in a line of their own, so that all columns fit on a page."""
         table = as_html(self._frame(_HTML), self.words, self.rules, escape=False)
-        said = "<br>\n".join(map(html.escape, self._said("({}) "))).replace("$", "<span>$</span>")
-        return f'<p><b>{html.escape(self.title)}</b></p>\n{table}\n<p style="font-size: 11px">{said}</p>\n'
+        notes = "<br>\n".join(map(html.escape, self._lettered_notes("({}) "))).replace("$", "<span>$</span>")
+        return f'<p><b>{html.escape(self.title)}</b></p>\n{table}\n<p style="font-size: 11px">{notes}</p>\n'
 
     def latex(self) -> str:
         """For papers; needs the package booktabs."""
@@ -151,8 +151,8 @@ class Table:
         sides = "l" * self.words + "c" * (len(self.heads) - self.words)
         style = {"column_format": f"@{{}}{sides}@{{}}", "multicol_align": "c", "position_float": "centering"}
         lines = table.style.hide(axis="index").to_latex(hrules=True, caption=_LATEX.escape(self.title), **style)
-        said = " ".join(self._said(r"\textsuperscript{{{}}}~", _LATEX.escape))
-        return lines.replace(r"\end{table}", rf"\par\footnotesize {said}" + "\n" + r"\end{table}")
+        notes = " ".join(self._lettered_notes(r"\textsuperscript{{{}}}~", _LATEX.escape))
+        return lines.replace(r"\end{table}", rf"\par\footnotesize {notes}" + "\n" + r"\end{table}")
 
     def csv(self) -> str:
         """Values alone, and a column that says why some are missing."""
@@ -177,7 +177,7 @@ class Table:
         pairs = zip(groups or [""] * len(self.heads), self.heads, strict=True)
         return DataFrame(cells, columns=[f"{group}{between}{head}" if group else head for group, head in pairs])
 
-    def _said(self, letter: str, escape: Callable[[str], str] = str) -> list[str]:
+    def _lettered_notes(self, letter: str, escape: Callable[[str], str] = str) -> list[str]:
         """What stands below the table: its notes with their letters, then those of the whole."""
         noted = [letter.format(name) + escape(note) + "." for note, name in self.letters().items()]
         return [*noted, *(escape(note) + "." for note in self.notes)]

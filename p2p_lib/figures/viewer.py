@@ -95,9 +95,9 @@ class _Scene:
         server.scene.set_up_direction("-y")
         objects = playback.objects.values()
         places = np.concatenate([obj.T_cam_obj[obj.has_pose, :3, 3] for obj in objects])
-        middle = np.median(places, 0) if len(places) else np.array([0.0, 0.0, 0.7])
-        server.initial_camera.position = tuple(middle + middle[2] * np.array([0.35, -0.5, -1.0]))
-        server.initial_camera.look_at = tuple(middle)
+        centre = np.median(places, 0) if len(places) else np.array([0.0, 0.0, 0.7])
+        server.initial_camera.position = tuple(centre + centre[2] * np.array([0.35, -0.5, -1.0]))
+        server.initial_camera.look_at = tuple(centre)
         self._camera: Any = None
         if playback.sequence is not None:
             camera = playback.sequence.camera

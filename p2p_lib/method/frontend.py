@@ -26,12 +26,12 @@ NOTHING_TRACKED = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, bo
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class FrameInputs:
     """A frame, the masks given with it (None: to be segmented) and the prompts for it, by object."""
 
     frame: Frame
     masks: Masks
-    said: dict[str, Prompt]
+    prompts: dict[str, Prompt]
 
 
 @dataclass(eq=False)
@@ -43,16 +43,16 @@ class Frontend:
     segmenter: Segmenter
     objects: dict[str, ObjectTracker]
     stopwatch: Stopwatch
-    beside: Executor
+    executor: Executor
     tracks: Tracks = NOTHING_TRACKED
     masks: Masks = field(default_factory=dict)
-    waiting: deque[Asked] = field(default_factory=deque)  # frames without an answer of the tracker yet
+    waiting: deque[FrameInputs] = field(default_factory=deque)  # frames without an answer of the tracker yet
     _streaming: bool = False
 
-    def track(self, asked: Asked) -> Asked | None:
+    def track(self, inputs: FrameInputs) -> FrameInputs | None:
         """Follow all points into a frame; returns the frame of the tracks, None while a late tracker has none."""
-        self.waiting.append(asked)
-        tracks = self._tracked(asked.frame, asked.masks)
+        self.waiting.append(inputs)
+        tracks = self._tracked(inputs.frame, inputs.masks)
         if len(self.waiting) <= self.tracker.latency_frames:
             return None
         for obj in self.objects.values():
@@ -73,18 +73,18 @@ class Frontend:
             urgent = any(obj.awaited(masks[name]) for name, obj in self.objects.items())
             return self.tracker.track(frame, search, urgent)
 
-    def segment(self, asked: Asked) -> None:
+    def segment(self, inputs: FrameInputs) -> None:
         """Every object's mask: the one given, else the segmenter's, which learns from those that are given."""
-        frame = asked.frame
+        frame = inputs.frame
         # With a late tracker objects may have come or gone since. Sorted: the caller's order must not matter.
-        self.masks = masks = {name: mask for name, mask in sorted(asked.masks.items()) if name in self.objects}
-        said = {name: prompt for name, prompt in sorted(asked.said.items()) if name in masks}
-        said |= {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items() if mask is not None}
-        if not self.segmenter.names and not said:
+        self.masks = masks = {name: mask for name, mask in sorted(inputs.masks.items()) if name in self.objects}
+        prompts = {name: prompt for name, prompt in sorted(inputs.prompts.items()) if name in masks}
+        prompts |= {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items() if mask is not None}
+        if not self.segmenter.names and not prompts:
             return
         with self.stopwatch("segmentation"):
             sought = [name for name in self.segmenter.names if name in masks and masks[name] is None]
-            labels = self.segmenter.segment(frame, said.values(), self.hints(frame, sought))
+            labels = self.segmenter.segment(frame, prompts.values(), self.hints(frame, sought))
             label_of = {name: label for label, name in enumerate(self.segmenter.names, 1)}
             looked_after = [name for name, mask in masks.items() if mask is None and name in label_of]
             self.masks = masks | {name: labels == label_of[name] for name in looked_after}
@@ -94,9 +94,9 @@ class Frontend:
         objects = self.objects
         return LazyHints(sought, lambda name: objects[name].hint(objects[name].observe(frame, None, self.tracks)))
 
-    def observe(self, asked: Asked) -> Mapping[str, Observation]:
+    def observe(self, inputs: FrameInputs) -> Mapping[str, Observation]:
         """What the frame shows of every object."""
-        return {name: self.objects[name].observe(asked.frame, mask, self.tracks) for name, mask in self.masks.items()}
+        return {name: self.objects[name].observe(inputs.frame, mask, self.tracks) for name, mask in self.masks.items()}
 
     def apply(self, requests: Mapping[str, Requests]) -> None:
         """Pass all objects' requests to the shared tracker, after all steps: the order of objects does not matter."""

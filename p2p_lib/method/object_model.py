@@ -47,21 +47,21 @@ class Requests:
 class ObjectModel:
     """Keypoints, surface and graph of one object; rows of observations are rows of ``map``.
 
-    Mapping, the graph's solution and the fusion of views, runs in the background by the executor ``beside``; reading
+    Mapping, the graph's solution and the fusion of views, runs in the background by ``executor``; reading
     surface or graph waits for it. :meth:`adopt` waits, too, and takes the solution into the map in the next frame:
     results do not depend on threads or timing.
     """
 
     make_graph, make_views = ObjectGraph, KeyframeViews
 
-    def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch, beside: Executor):
+    def __init__(self, config: Config, observer: Observer, stopwatch: Stopwatch, executor: Executor):
         self.config = config
         self.map = KeypointMap(config.keypoint_map)
         self._surface = _volume(config) if config.method.surface else None
         self._graph = self.make_graph(config.factor_graph) if config.method.graph else None
         self.views = self.make_views()
         self.covariance = np.zeros((6, 6))  # of the newest keyframe, by the graph
-        self._observer, self._stopwatch, self._beside = observer, stopwatch, beside
+        self._observer, self._stopwatch, self._executor = observer, stopwatch, executor
         self._mapping: Future | None = None  # the newest background job; each waits for the one before
         self._solved: Future[GraphResult | None] | None = None  # the graph's newest solution, to be adopted
         self._corrected: dict[int, np.ndarray] = {}  # keyframe poses that the surface has yet to follow
@@ -84,7 +84,7 @@ class ObjectModel:
         self._settle()
         return self._graph
 
-    def _beside_after(self, work: Callable[..., object], *args: object) -> Future:
+    def _submit(self, work: Callable[..., object], *args: object) -> Future:
         """Run ``work`` in the background, after all earlier jobs: mapping is sequential."""
         before = self._mapping
 
@@ -93,7 +93,7 @@ class ObjectModel:
                 before.result()
             return work(*args)
 
-        self._mapping = self._beside.submit(after)
+        self._mapping = self._executor.submit(after)
         return self._mapping
 
     def _settle(self) -> None:
@@ -180,7 +180,7 @@ class ObjectModel:
         self.views.add(T_cam_obj)
         self._since_keyframe = 0
         gone, drop = self.map.retire()
-        self._solved = self._beside_after(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone)
+        self._solved = self._submit(self._map_keyframe, obs, T_cam_obj, *seen, covariance, gone)
         return Requests(drop=drop, add_px=uv_px, keys=keys)
 
     def _map_keyframe(
@@ -222,7 +222,7 @@ class ObjectModel:
     def settle_surface(self) -> None:
         """Re-integrate the keyframe that the graph has moved farthest: one a frame, so that no frame waits long."""
         if self._surface is not None and self._corrected:
-            self._beside_after(self._follow_graph)
+            self._submit(self._follow_graph)
 
     def _follow_graph(self) -> None:
         if self._surface is not None and not self._surface.move(self._corrected, limit=1):

@@ -50,13 +50,13 @@ class ObjectTracker:
         detector: Detector,
         rng: np.random.Generator,
         stopwatch: Stopwatch,
-        beside: Executor,
+        executor: Executor,
         policy: Callable[..., Policy] = Policy,
         model: Callable[..., ObjectModel] = ObjectModel,
     ):
         self.name, self.config, self.detector = name, config, detector
         self.observer = Observer(camera, config.depth, config.refinement.max_points if config.method.surface else 0)
-        self.new_model = partial(model, config, self.observer, stopwatch, beside)
+        self.new_model = partial(model, config, self.observer, stopwatch, executor)
         self.policy = policy(self.observer, config, rng, stopwatch)
         self.known = Known(self.new_model(), self.policy.life)
         self._stopwatch = stopwatch
@@ -126,12 +126,12 @@ class ObjectTracker:
         if keyframe:
             rows = admission.rows(obs, model)
             rated = admission.covariance, admission.confidence
-            asked = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), rows, *rated)
-            requests = replace(asked, reject=requests.reject)
-        covariance, sure = admission.rated(model)
-        self.life = self.policy.followed(obs, self.known, best, admission, sure)
+            added = model.insert_keyframe(obs, T_cam_obj, *self._sample(obs), rows, *rated)
+            requests = replace(added, reject=requests.reject)
+        covariance, confidence = admission.rated(model)
+        self.life = self.policy.followed(obs, self.known, best, admission, confidence)
         support = best.hypothesis.support
-        pose = {"confidence": sure, "covariance": covariance, "inliers": support, "keyframe": keyframe}
+        pose = {"confidence": confidence, "covariance": covariance, "inliers": support, "keyframe": keyframe}
         return ObjectStep(self._estimate(obs, admission.verdict, **pose), requests)
 
     def absent(self, obs: Observation, verdict: Verdict) -> ObjectStep:

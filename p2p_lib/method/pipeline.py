@@ -27,7 +27,7 @@ from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.objects import Objects
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
-from p2p_lib.method.frontend import Asked, Frontend, Masks
+from p2p_lib.method.frontend import FrameInputs, Frontend, Masks
 from p2p_lib.method.object_tracker import ObjectTracker
 
 _LOG = logging.getLogger("p2p_lib")
@@ -76,8 +76,8 @@ class Point2Pose(Objects):
         segmenter = backends.make_segmenter(segmenter, camera, self.config.segmentation)
         self.frame: Frame | None = None
         self.stopwatch = Stopwatch()
-        self._beside = ThreadPoolExecutor(2, "p2p")
-        self.front = self._parts.front(camera, tracker, segmenter, self.objects, self.stopwatch, self._beside)
+        self._executor = ThreadPoolExecutor(2, "p2p")
+        self.front = self._parts.front(camera, tracker, segmenter, self.objects, self.stopwatch, self._executor)
         self._status: dict[str, Status] = {}
 
     @property
@@ -113,7 +113,7 @@ class Point2Pose(Objects):
         and ``self.tracks`` are the masks, given or segmented, and all objects' 2D tracks in it.
         """
         with self.alone(), self.stopwatch.frame(), uninterrupted():
-            tracked = self.front.track(self._asked(frame, masks or {}))
+            tracked = self.front.track(self._inputs(frame, masks or {}))
             self.frame = None if tracked is None else tracked.frame
             if tracked is None:
                 return {}
@@ -126,10 +126,10 @@ class Point2Pose(Objects):
         self._log(estimates)
         return estimates
 
-    def _asked(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> Asked:
+    def _inputs(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> FrameInputs:
         """The frame, every object's checked mask (None: the segmenter has to find it) and the prompts for it."""
-        given, said = self.take_said(frame, masks)
-        return Asked(self._parts.before(frame) if self._parts.before else frame, given, said)
+        given, prompts = self.take_prompts(frame, masks)
+        return FrameInputs(self._parts.before(frame) if self._parts.before else frame, given, prompts)
 
     def finish(self) -> Iterator[dict[str, PoseEstimate]]:
         """After the last frame: the estimates still owed by a tracker that answers late, oldest first."""
@@ -144,7 +144,7 @@ class Point2Pose(Objects):
     def begin(self, name: str) -> None:
         """Start an object of which nothing is known."""
         rng = np.random.default_rng([self.config.seed, *name.encode()])
-        made_of = self.camera, self.config, self.detector, rng, self.stopwatch, self._beside
+        made_of = self.camera, self.config, self.detector, rng, self.stopwatch, self._executor
         self.objects[name] = self._parts.object(name, *made_of)
 
     def _log(self, estimates: Mapping[str, PoseEstimate]) -> None:
@@ -160,7 +160,7 @@ class Point2Pose(Objects):
     def close(self) -> None:
         """End the threads once their work is done; afterwards nothing can be tracked."""
         self.closed = True
-        self._beside.shutdown()
+        self._executor.shutdown()
 
     def __enter__(self) -> Self:
         return self

@@ -98,9 +98,9 @@ class Policy:
         """(N,) bool each: the points to register, and all that are certain enough for it."""
         certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)
         use = certain & known.map.promoted
-        return (use if use.sum() >= self.few_keypoints(known) else certain), certain
+        return (use if use.sum() >= self.min_keypoints(known) else certain), certain
 
-    def few_keypoints(self, known: Known) -> int:
+    def min_keypoints(self, known: Known) -> int:
         """With fewer visible keypoints than this, pending points help to register (the release's number)."""
         return 12
 
@@ -153,13 +153,13 @@ class Policy:
     def start(self, known: Known, points: int) -> Verdict:
         """Whether a map may begin with this number of ``points``."""
         enough = points >= self.config.registration.min_inliers
-        return Verdict(enough, Status.TRACKED, "" if enough else f"only {points} points to start from")
+        return Verdict(enough, Status.TRACKED, "" if enough else f"only {points} points to start a map")
 
     def judge(self, obs: Observation, known: Known, best: Candidate) -> Verdict:
         """Every pose stands; few points degrade it."""
-        support = best.hypothesis.support
-        if support < self.config.lifecycle.return_inliers:
-            return Verdict(True, Status.DEGRADED, f"only {support} points agree")
+        support, enough = best.hypothesis.support, self.config.lifecycle.return_inliers
+        if support < enough:
+            return Verdict(True, Status.DEGRADED, f"only {support} points agree with the pose, fewer than {enough}")
         return Verdict(True, Status.RECOVERED if known.life.returning else Status.TRACKED)
 
     def admit(self, obs: Observation, known: Known, best: Candidate, verdict: Verdict) -> Admission:
@@ -183,8 +183,10 @@ class Policy:
         """The life of a map after its first frame."""
         return replace(self.life, status=verdict.status, T_cam_obj=T_cam_obj, seen_s=obs.frame.time_s)
 
-    def followed(self, obs: Observation, known: Known, best: Candidate, admission: Admission, sure: float) -> Life:
-        """The life after a frame with a pose, which is reported with the confidence ``sure``."""
+    def followed(
+        self, obs: Observation, known: Known, best: Candidate, admission: Admission, confidence: float
+    ) -> Life:
+        """The life after a frame with a pose that is reported with this confidence."""
         return known.life.with_pose(best.T_cam_obj, obs.frame.time_s, admission.verdict.status)
 
     def missed(self, obs: Observation, known: Known, verdict: Verdict) -> Life:

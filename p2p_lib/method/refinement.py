@@ -159,7 +159,7 @@ class _Problem:
         # Wide at first: far from the solution, the few points that hold a direction look like outliers.
         begun = self.surface(T, self.volume.tau_m / 2)
         if begun is None:
-            return Refinement(T, reason="the cloud lies beyond the surface's truncation")
+            return Refinement(T, reason="the depth points lie beyond the truncation distance")
         at = begun
         while tries < self.config.iterations and not converged:
             tries += 1
@@ -177,11 +177,11 @@ class _Problem:
 
     # -- the two kinds of residual -----------------------------------------------------------------
 
-    def surface(self, T: np.ndarray, widest_m: float = 0.0, beside: _Linear | None = None) -> _Linear | None:
+    def surface(self, T: np.ndarray, widest_m: float = 0.0, nearby: _Linear | None = None) -> _Linear | None:
         """Robust normal equations of Phi(T^-1 p) in metres; None where fewer than ten points can be used.
 
         Trims outliers by the MAD, but nothing within ``widest_m`` nor within Huber's threshold. The eigenvectors are
-        those of ``beside``, a pose nearby, where it is given: they hardly change.
+        those of ``nearby``, another pose, where it is given: they hardly change.
         """
         p_obj = se3.transform(se3.inverse(T), self.p_cam)
         value, gradient, valid = self.volume.query_with_gradient(p_obj)
@@ -193,7 +193,7 @@ class _Problem:
         if len(used) < MIN_POINTS:
             return None
         distance = np.where(valid, np.abs(value), np.inf)
-        held = (beside.eigenvalues, beside.directions) if beside else self.eigen(used, J)
+        held = (nearby.eigenvalues, nearby.directions) if nearby else self.eigen(used, J)
         return _Linear(T, distance, H, g, *held, cut, used, J, rms, sigma)
 
     def eigen(self, used: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -276,7 +276,7 @@ class _Problem:
             at.eigenvalues,
             at.directions.T,
             observability.rotations_in(loose).T @ to_origin.T * self.radius,
-            f"the shape leaves {loose.shape[1]} of 6 directions free" if loose.size else "",
+            f"the shape leaves {loose.shape[1]} of 6 degrees of freedom unconstrained" if loose.size else "",
         )
 
 
@@ -308,9 +308,9 @@ def _linearised(p_obj, centre, radius, value, gradient, valid, floor_m, reach_m,
     H, g = np.zeros((6, 6)), np.zeros(6)
     if len(near) < MIN_POINTS:
         return near, np.zeros((0, 6)), H, g, 0.0, 0.0, 0.0
-    middle = _upper_median(value[near])
-    sigma = max(_MAD_TO_SIGMA * _upper_median(np.abs(value[near] - middle)), floor_m)
-    cut = max(abs(middle) + _MAD_TRIM * sigma, least_m)
+    median = _upper_median(value[near])
+    sigma = max(_MAD_TO_SIGMA * _upper_median(np.abs(value[near] - median)), floor_m)
+    cut = max(abs(median) + _MAD_TRIM * sigma, least_m)
     used = near[np.abs(value[near]) <= cut]
     J, squares = surface_jacobian((p_obj[used] - centre) / radius, gradient[used]), 0.0
     for n in range(len(used)):

@@ -38,14 +38,14 @@ def select(
         return 0, "the only hypothesis"
     best, scores = _best(hypotheses, weight), _scores(distance_m)
     if distance_m is None or scores is None:
-        return best, "most inliers, there is no surface yet"
+        return best, "most inliers; there is no surface to compare with"
     nearest = int(np.argmin(scores))
     if config.rule == "support":
         nearer = distance_m[best] - distance_m[nearest]
         chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
         preferred = scores[best] - scores[nearest] > max(chance, _MARGIN_M) and scores[nearest] < _FITS_M
         if not preferred:
-            return best, "most inliers, the surface does not tell the hypotheses apart"
+            return best, "most inliers; the hypotheses fit the surface equally well"
     return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
 
 

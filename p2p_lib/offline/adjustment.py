@@ -21,7 +21,7 @@ _ITERATIONS, _TOLERANCE = 15, 2e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class PointObservations:
     """M sightings: rows (M,) of pose and of point, measured p_cam (M, 3), and information (M, 3, 3)."""
 
     pose: np.ndarray
@@ -29,9 +29,9 @@ class Sightings:
     p_cam: np.ndarray
     information: np.ndarray
 
-    def select(self, rows: np.ndarray) -> Sightings:
+    def select(self, rows: np.ndarray) -> PointObservations:
         """The sightings at these rows, or under a mask (M,) bool."""
-        return Sightings(self.pose[rows], self.point[rows], self.p_cam[rows], self.information[rows])
+        return PointObservations(self.pose[rows], self.point[rows], self.p_cam[rows], self.information[rows])
 
 
 def information(p_cam: np.ndarray, lateral_m: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
@@ -41,7 +41,7 @@ def information(p_cam: np.ndarray, lateral_m: np.ndarray, depth_m: np.ndarray) -
     return (np.eye(3) - along) / lateral_m[:, None, None] ** 2 + along / depth_m[:, None, None] ** 2
 
 
-def placed(T_cam_obj: np.ndarray, seen: Sightings, count: int) -> np.ndarray:
+def placed(T_cam_obj: np.ndarray, seen: PointObservations, count: int) -> np.ndarray:
     """(count, 3) points in the object frame, the median of each one's sightings at these poses; NaN without any."""
     p_obj = se3.transform(se3.inverse(T_cam_obj[seen.pose]), seen.p_cam[:, None])[:, 0]
     order = np.argsort(seen.point, kind="stable")
@@ -52,7 +52,7 @@ def placed(T_cam_obj: np.ndarray, seen: Sightings, count: int) -> np.ndarray:
     return points
 
 
-def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> tuple[np.ndarray, np.ndarray]:
+def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: PointObservations) -> tuple[np.ndarray, np.ndarray]:
     """Poses (K, 4, 4) and points (N, 3) adjusted from these; each must have a sighting at least."""
     T, p = np.array(T_cam_obj, float), np.array(p_obj, float)
     K, N = len(T), len(p)
@@ -84,7 +84,7 @@ def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> tuple[n
     return se3.orthonormalised(T), p
 
 
-def locate(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> np.ndarray:
+def locate(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: PointObservations) -> np.ndarray:
     """Each pose (K, 4, 4) adjusted by itself to fixed points (N, 3); one with few sightings hardly moves."""
     T, K = np.array(T_cam_obj, float), len(T_cam_obj)
     weak = np.diag(np.repeat([0.5, 0.1], 3) ** -2.0)
@@ -99,7 +99,7 @@ def locate(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: Sightings) -> np.ndar
     return se3.orthonormalised(T)
 
 
-def _linear(T: np.ndarray, p: np.ndarray, seen: Sightings, wide: float):
+def _linear(T: np.ndarray, p: np.ndarray, seen: PointObservations, wide: float):
     """In the object's axes: weighted information (M, 3, 3), residual (M, 3), its derivative (M, 3, 6)."""
     R, points = T[seen.pose, :3, :3], p[seen.point]
     e = points - np.einsum("mji,mj->mi", R, seen.p_cam - T[seen.pose, :3, 3])

@@ -77,12 +77,12 @@ class _Labels:
     @cached_property
     def truth(self) -> dict[str, ObjectTruth]:
         """Poses that are trusted."""
-        told = {}
+        truth = {}
         for name, trusted in self.made.trusted(self.min_confidence).items():
             poses, obj = np.full((len(self.made.sequence), 4, 4), np.nan), self.made.run.objects[name]
             poses[obj.frame_index[trusted]] = obj.T_cam_obj[trusted]
-            told[name] = ObjectTruth(poses, np.isfinite(poses).all((1, 2)))
-        return told
+            truth[name] = ObjectTruth(poses, np.isfinite(poses).all((1, 2)))
+        return truth
 
     @property
     def frames(self) -> np.ndarray:
@@ -116,9 +116,9 @@ class _Labels:
         for name, silhouette in silhouettes.items():
             fits = agreement(silhouette, shown[name], frame.depth_m, given.get(name))
             obj = self.made.run.objects[name]
-            sure = obj.confidence[np.searchsorted(obj.frame_index, i)]
+            confidence = obj.confidence[np.searchsorted(obj.frame_index, i)]
             share = np.count_nonzero(shown[name]) / max(whole[name].px, 1)
-            self.rows.append((i, name, self.objects.index(name) + 1, sure, share, *fits))
+            self.rows.append((i, name, self.objects.index(name) + 1, confidence, share, *fits))
         return whole
 
 
@@ -138,8 +138,8 @@ def write_bop(folder: str | Path, out: str | Path, min_confidence: float = DOUBT
             obj_ids = write_scene(there / SCENE, labels, kept, labels.outlines)  # type: ignore[arg-type]
         write_models(there / "models", {obj_ids[n]: made.run.path / "meshes" / f"{n}.ply" for n in labels.objects})
         camera = labels.camera
-        told = {key: getattr(camera, key) for key in ("cx", "cy", "fx", "fy", "width", "height")}
-        replace_text(there / "camera.json", json.dumps(told | {"depth_scale": 1.0}, indent=1) + "\n")
+        intrinsics = {key: getattr(camera, key) for key in ("cx", "cy", "fx", "fy", "width", "height")}
+        replace_text(there / "camera.json", json.dumps(intrinsics | {"depth_scale": 1.0}, indent=1) + "\n")
         replace_text(there / "labels.csv", _csv(labels.rows))
         about = {"rule": RULE.format(min_confidence), "min_confidence": min_confidence, "visible_m": VISIBLE_M}
         about |= {"run": made.about, "objects": obj_ids}
@@ -164,7 +164,7 @@ def write_foundationpose(
     ``rgb/`` and ``depth/`` (millimetres) from its first trusted frame on, ``masks/`` of that frame, ``cam_K.txt`` and
     ``mesh/``: the files of ``meshes`` (object to a folder of them).
     """
-    made, told = Finished.of(folder), []
+    made, lines = Finished.of(folder), []
     first = {}
     for name, trusted in made.trusted(min_confidence).items():
         masks = ((int(i), made.masks(int(i)).get(name)) for i in made.frames[trusted])
@@ -183,5 +183,5 @@ def write_foundationpose(
             images.save_png(at / "masks" / f"{start:06d}.png", mask)
             np.savetxt(at / "cam_K.txt", made.sequence.camera.K, fmt="%.9g")
             shutil.copytree(meshes[name], at / "mesh")
-            told.append(f"{name}: {len(numbers)} images from frame {start} on")
-    return "; ".join(told)
+            lines.append(f"{name}: {len(numbers)} images from frame {start} on")
+    return "; ".join(lines)

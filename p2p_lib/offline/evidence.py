@@ -21,7 +21,7 @@ from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.offline import loops
-from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
+from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished
 
 #: Keyframes that are compared with each other, and poses that are adjusted together.
@@ -33,7 +33,7 @@ STEP_M = 0.02
 
 
 @dataclass(eq=False)
-class Evidence:
+class VideoEvidence:
     """What the n frames of a run show of an object.
 
     clouds   (n,) each (P, 3) float32, points of its surface in the camera frame
@@ -55,10 +55,10 @@ class Evidence:
         return np.array(self.mask_px) >= MIN_VISIBLE_PX
 
 
-def gather(made: Finished, names: list[str], config: Config, bar: Any) -> dict[str, Evidence]:
+def gather(made: Finished, names: list[str], config: Config, bar: Any) -> dict[str, VideoEvidence]:
     """Object to what the video shows of it."""
     logs, frames, camera = load_keypoints(made.run.path), made.frames, made.sequence.camera
-    found = {name: Evidence() for name in names}
+    found = {name: VideoEvidence() for name in names}
     wanted = evenly(np.arange(len(frames)), KEYFRAMES)
     for k, i in enumerate(frames.tolist()):
         frame, masks = made.sequence.frame(i), made.masks(i)
@@ -82,7 +82,7 @@ def gather(made: Finished, names: list[str], config: Config, bar: Any) -> dict[s
 class VideoPoses:
     """An object's poses by all its tracks and features."""
 
-    def __init__(self, made: Finished, obj: ObjectRun, config: Config, evidence: Evidence):
+    def __init__(self, made: Finished, obj: ObjectRun, config: Config, evidence: VideoEvidence):
         self.obj, self.camera, self.config, self.seed = obj, made.sequence.camera, config, made.run.info["seed"]
         self.key, self.views, self.tracks = np.array(evidence.key, int), evidence.views, evidence.tracks
 
@@ -110,7 +110,7 @@ class VideoPoses:
         strength = loops.rated(T_a_b, max(agree, 1), self.views[a], self.views[b], self.camera)
         return a, b, T_a_b, max(strength, _LEAST)
 
-    def sightings(self, strong: list[loops.Tie]) -> Sightings:
+    def sightings(self, strong: list[loops.Tie]) -> PointObservations:
         """The sightings of tracks and of features matched by ties; ``pose`` is the frame's row."""
         ids, points = (np.concatenate(part) for part in zip(*self.tracks))
         pose = np.repeat(np.arange(len(self.tracks)), [len(of) for of, _ in self.tracks])
@@ -125,10 +125,10 @@ class VideoPoses:
             point = np.concatenate([point, len(known) + label[used]])
             points = np.concatenate([points, np.concatenate([view.p_cam for view in self.views])[used]])
         z = points[:, 2]
-        sure = information(points, z / self.camera.fx, depth_noise_m(z, self.config.depth))
-        return Sightings(pose, point, points, sure)
+        weights = information(points, z / self.camera.fx, depth_noise_m(z, self.config.depth))
+        return PointObservations(pose, point, points, weights)
 
-    def adjusted(self, T: np.ndarray, found: Sightings) -> tuple[np.ndarray, np.ndarray, Sightings]:
+    def adjusted(self, T: np.ndarray, found: PointObservations) -> tuple[np.ndarray, np.ndarray, PointObservations]:
         """Adjusted poses, points (N, 3) and their sightings, in the order of frames.
 
         Keyframes and some others are adjusted together; the other frames are located by the points of these.

@@ -25,8 +25,8 @@ from p2p_lib.datasets.sequence import Sequence, reopen
 
 #: The one rule of what is labelled; ``{0}`` is the least confidence.
 RULE = (
-    "An image is labelled where every object of the run either has a pose of confidence above {0:g} or is not seen:"
-    " no pixel of it in the masks that the run used."
+    "An image is labelled where every object of the run either has a pose of confidence above {0:g}, or has neither"
+    " a pose nor a pixel in the masks that the run used."
 )
 
 
@@ -97,18 +97,18 @@ class Finished:
         return read_mesh(path)
 
     def trusted(self, min_confidence: float = DOUBTED) -> dict[str, np.ndarray]:
-        """Object to (n,) bool: its poses that are labels, by :data:`RULE`; unseen objects must have no pose at all."""
+        """Object to (n,) bool: its poses that are labels, by :data:`RULE`."""
         objects = {name: self.run.objects[name] for name in self.tracked}
-        sure = {name: obj.has_pose & (obj.confidence > min_confidence) for name, obj in objects.items()}
+        confident = {name: obj.has_pose & (obj.confidence > min_confidence) for name, obj in objects.items()}
         unseen = {name: np.ones(len(obj), bool) for name, obj in objects.items()}
         for k, frame in enumerate(self.frames):
-            if all(of[k] for of in sure.values()):
+            if all(of[k] for of in confident.values()):
                 continue
             for name, mask in self.masks(int(frame)).items():
                 if name in unseen:
                     unseen[name][k] = not mask.any()
-        kept = np.logical_and.reduce([sure[name] | (unseen[name] & ~objects[name].has_pose) for name in objects])
-        return {name: of & kept for name, of in sure.items()}
+        kept = np.logical_and.reduce([confident[name] | (unseen[name] & ~objects[name].has_pose) for name in objects])
+        return {name: of & kept for name, of in confident.items()}
 
 
 @dataclass(frozen=True, eq=False)

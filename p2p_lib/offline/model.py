@@ -76,13 +76,13 @@ def write_models(
     if faces < 100:
         raise BadInput("faces", faces, "at least 100")
     open3d = load_open3d()
-    made, told = Finished.of(folder), []
+    made, lines = Finished.of(folder), []
     quiet = open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error)
     with quiet, new_folder(out) as there, progress_bar("models", len(made.tracked), "object", progress) as bar:
         for name in made.tracked:
-            told.append(_write_model(made, name, there / name, faces, min_confidence))
+            lines.append(_write_model(made, name, there / name, faces, min_confidence))
             bar.update()
-    return "; ".join(told)
+    return "; ".join(lines)
 
 
 def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidence: float) -> str:
@@ -113,16 +113,16 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
 def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[str, float]) -> dict[str, Any]:
     mesh, shape = textured.shape.mesh, textured.shape
     frame = "the object frame of the run's poses: p_cam = T_cam_obj p_obj, OpenCV's camera axes"
-    told = {
+    record = {
         "object": name,
         "units": "m",
         "frame": frame,
         "faces": len(shape.faces),
         "watertight": bool(mesh.is_watertight),
     }
-    told |= {"guessed_share": float(mesh.area_faces[shape.guessed].sum() / mesh.area), "views": views}
-    told |= {"size_m": np.ptp(shape.vertices, axis=0).round(5).tolist(), "colour_error_of_255": off}
-    return told | {"run": made.about}
+    record |= {"guessed_share": float(mesh.area_faces[shape.guessed].sum() / mesh.area), "views": views}
+    record |= {"size_m": np.ptp(shape.vertices, axis=0).round(5).tolist(), "colour_error_of_255": off}
+    return record | {"run": made.about}
 
 
 # --- shape ---------------------------------------------------------------------------------------

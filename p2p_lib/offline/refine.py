@@ -2,7 +2,7 @@
 
 For each object: what the whole video shows of it, and the poses that fit all of it best (``evidence.py``). A surface is
 fused at these poses, and each frame is refined on it from its tied and its adjusted pose and, where that fits badly,
-from its neighbours' poses, backwards and then forwards; the best is kept (``surface.py``, ``sight.py``). A frame
+from its neighbours' poses, back and forth; the best is kept (``surface.py``, ``surface_check.py``). A frame
 without a pose gets one that fits as well as the others do. Causal poses at which the surface fits the masks better are
 kept. The surface is fused anew with half the voxel size.
 
@@ -30,10 +30,10 @@ from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, tum_line
-from p2p_lib.offline.evidence import Evidence, VideoPoses, gather
+from p2p_lib.offline.evidence import VideoEvidence, VideoPoses, gather
 from p2p_lib.offline.finished import Finished
-from p2p_lib.offline.sight import Sight
 from p2p_lib.offline.surface import SurfacePoses, fused
+from p2p_lib.offline.surface_check import SurfaceCheck
 
 _PARTS = ".offline.partial"
 #: Views fused while refining and at the end.
@@ -71,9 +71,9 @@ def refine_run(folder: str | Path, progress: bool = False) -> list[str]:
             evidence = gather(made, todo, config, bar) if todo else {}
             for name in todo:
                 _part(made, name, config, evidence.pop(name), parts, bar)
-        told = _write(made, parts, stamp)
+        summary = _write(made, parts, stamp)
         shutil.rmtree(parts)
-    return told
+    return summary
 
 
 def _stamp(folder: Path) -> str:
@@ -83,21 +83,21 @@ def _stamp(folder: Path) -> str:
 # --- one object ----------------------------------------------------------------------------------
 
 
-def _part(made: Finished, name: str, config: Config, evidence: Evidence, parts: Path, bar: Any) -> None:
+def _part(made: Finished, name: str, config: Config, evidence: VideoEvidence, parts: Path, bar: Any) -> None:
     """Refine an object, and keep its poses and its surface in the folder ``parts``."""
     obj, voxel_m = made.run.objects[name], config.tsdf.voxel_m
     video = VideoPoses(made, obj, config, evidence)
     start, strong = video.tied()
     T, points, seen = video.adjusted(start, video.sightings(strong))
     posed = np.isfinite(T[:, 0, 0])
-    sure = np.flatnonzero(posed & (obj.confidence > DOUBTED))
-    sure = sure if len(sure) else np.flatnonzero(posed)
-    volume = fused(made, name, T, evenly(sure, FUSED), config, voxel_m)
+    confident = np.flatnonzero(posed & (obj.confidence > DOUBTED))
+    confident = confident if len(confident) else np.flatnonzero(posed)
+    volume = fused(made, name, T, evenly(confident, FUSED), config, voxel_m)
     poses = SurfacePoses(T, points, seen, evidence, volume, made.sequence.camera, config)
-    poses.refine(start, sure, bar)
-    sight = Sight(made, name, config, volume, poses.T, sure) if len(volume.mesh().faces) else None
-    poses.ask_neighbours(sight)
-    columns, fits = _columns(obj, poses, evidence, sight)
+    poses.refine(start, confident, bar)
+    check = SurfaceCheck(made, name, config, volume, poses.T, confident) if len(volume.mesh().faces) else None
+    poses.ask_neighbours(check)
+    columns, fits = _columns(obj, poses, evidence, check)
     last = evenly(np.flatnonzero(fits & evidence.shown), FUSED_LAST)
     if len((mesh := fused(made, name, columns["T_cam_obj"], last, config, voxel_m / 2).mesh()).faces):
         save(mesh, parts / "meshes" / f"{name}.ply")
@@ -107,7 +107,7 @@ def _part(made: Finished, name: str, config: Config, evidence: Evidence, parts: 
 
 
 def _columns(
-    obj: ObjectRun, poses: SurfacePoses, evidence: Evidence, sight: Sight | None
+    obj: ObjectRun, poses: SurfacePoses, evidence: VideoEvidence, check: SurfaceCheck | None
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Columns of a run, in the causal object frame, and (n,) bool which poses fit; better causal poses are kept."""
     fits, T, covariance = poses.cost <= poses.limit, poses.T.copy(), poses.covariance.copy()
@@ -118,7 +118,7 @@ def _columns(
     both = has & obj.has_pose & (obj.confidence > DOUBTED)
     T_new_old = se3.median(se3.inverse(T[both]) @ obj.T_cam_obj[both]) if both.any() else np.eye(4)
     causal = obj.T_cam_obj @ se3.inverse(T_new_old)
-    stays = _stays(T, causal, evidence, sight)
+    stays = _stays(T, causal, evidence, check)
     for k in np.flatnonzero(stays):
         stays[k] = poses.cost_at(int(k), causal[k]) <= _GROSS * poses.limit
     A = se3.adjoint(se3.inverse(T_new_old))
@@ -129,7 +129,7 @@ def _columns(
     return {"T_cam_obj": T, "covariance": covariance, "confidence": confidence}, has & fits
 
 
-def _stays(T: np.ndarray, causal: np.ndarray, evidence: Evidence, sight: Sight | None) -> np.ndarray:
+def _stays(T: np.ndarray, causal: np.ndarray, evidence: VideoEvidence, check: SurfaceCheck | None) -> np.ndarray:
     """(n,) bool: where the surface at the causal pose (n, 4, 4) fits the mask better than at the new one T.
 
     The new poses fit the surface anyway, which was fused at them; masks are independent. One mask says little: the mean
@@ -137,9 +137,9 @@ def _stays(T: np.ndarray, causal: np.ndarray, evidence: Evidence, sight: Sight |
     """
     has = np.isfinite(T[:, 0, 0]) & np.isfinite(causal[:, 0, 0])
     rows = np.flatnonzero(has & evidence.shown)[::_JUDGED_EVERY]
-    if not len(rows) or sight is None:
+    if not len(rows) or check is None:
         return np.zeros(len(T), bool)
-    better = [sight.overlap(k, causal[k]) - sight.overlap(k, T[k]) for k in rows.tolist()]
+    better = [check.overlap(k, causal[k]) - check.overlap(k, T[k]) for k in rows.tolist()]
     mean = uniform_filter1d(np.array(better), min(_JUDGED, len(rows)), mode="nearest")
     nearest = np.abs(np.arange(len(T))[:, None] - rows).argmin(1)
     return has & (mean[nearest] > 0)
@@ -175,7 +175,7 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
     shutil.rmtree(new, ignore_errors=True)
     (new / "poses").mkdir(parents=True)
     arrays: dict[str, np.ndarray] = {}
-    told, disagrees = [], {}
+    summary, disagrees = [], {}
     for name, obj in made.run.objects.items():
         part = load_arrays(parts / f"{name}.npz")
         offline = _merged(obj, part) if part else obj
@@ -187,7 +187,7 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
         disagrees[name] = [int(obj.frame_index[k]) for k in off]
         more, less = int((has & ~obj.has_pose).sum()), int((~has & obj.has_pose).sum())
         line = f"{name}: a pose in {int(has.sum())} of {len(obj)} frames ({more} more, {less} fewer than causally)"
-        told.append(
+        summary.append(
             line + f", {len(off)} of them more than three sigmas from the causal one" + in_ranges(disagrees[name])
         )
     with replacing(new / "poses.npz") as file:
@@ -201,7 +201,7 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
     replace_text(new / "run.json", json.dumps(made.run.info | about, indent=1, ensure_ascii=False) + "\n")
     shutil.rmtree(made.run.path / OFFLINE, ignore_errors=True)
     new.rename(made.run.path / OFFLINE)
-    return told
+    return summary
 
 
 def in_ranges(frames: list[int]) -> str:

@@ -15,10 +15,10 @@ from p2p_lib.core.depth import depth_noise_m, in_range, off_edges
 from p2p_lib.datasets.runs import NO_COVARIANCE, NO_POSE
 from p2p_lib.method.refinement import Keypoints, refine
 from p2p_lib.method.tsdf import TsdfVolume
-from p2p_lib.offline.adjustment import Sightings
-from p2p_lib.offline.evidence import STEP_M, Evidence
+from p2p_lib.offline.adjustment import PointObservations
+from p2p_lib.offline.evidence import STEP_M, VideoEvidence
 from p2p_lib.offline.finished import Finished
-from p2p_lib.offline.sight import Found, Sight, off_surface
+from p2p_lib.offline.surface_check import FittedPose, SurfaceCheck, off_surface
 
 #: A point within this distance of its place by a pose is a keypoint of the pose, m.
 _NEAR_M = 0.02
@@ -48,8 +48,8 @@ class SurfacePoses:
         self,
         T: np.ndarray,
         points: np.ndarray,
-        seen: Sightings,
-        evidence: Evidence,
+        seen: PointObservations,
+        evidence: VideoEvidence,
         volume: TsdfVolume,
         camera: Camera,
         config: Config,
@@ -59,16 +59,16 @@ class SurfacePoses:
         self._points, self._seen, self._evidence, self._volume = points, seen, evidence, volume
         self._camera, self._config = camera, config
 
-    def refine(self, start: np.ndarray, sure: np.ndarray, bar: Any) -> None:
-        """Refine each pose from itself and from ``start`` (n, 4, 4); ``sure`` rows set the limit of costs."""
+    def refine(self, start: np.ndarray, confident: np.ndarray, bar: Any) -> None:
+        """Refine each pose from itself and from ``start`` (n, 4, 4); ``confident`` rows set the limit of costs."""
         for k in range(len(self.T)):
             if np.isfinite(self.T[k, 0, 0]):
                 self.T[k], self.covariance[k], self.cost[k] = self._best_of(k, [self.T[k], start[k]])
             bar.update()
-        cost = self.cost[sure]
+        cost = self.cost[confident]
         self.limit = np.median(cost) + _SIGMAS * median_abs_deviation(cost, scale="normal") + _SLACK
 
-    def ask_neighbours(self, sight: Sight | None) -> None:
+    def ask_neighbours(self, check: SurfaceCheck | None) -> None:
         """Try frames that do not fit from their neighbours, from the end backwards, then from the start forwards."""
         T, cost, shown = self.T, self.cost, self._evidence.shown
         for step in (-1, 1):
@@ -78,11 +78,11 @@ class SurfacePoses:
                 two = 0 <= k - 2 * step < len(T) and cost[k - 2 * step] <= self.limit
                 before = T[k - 2 * step] if two else T[k - step]
                 on = T[k - step] @ se3.inverse(before) @ T[k - step]  # goes on as it moved, else stays
-                found: Found | None
+                found: FittedPose | None
                 if shown[k]:
                     found = self._best_of(k, [T[k - step], on])
                 else:
-                    found = sight.found(k, [on, T[k - step]], k - step, T[k - step]) if sight else None
+                    found = check.found(k, [on, T[k - step]], k - step, T[k - step]) if check else None
                 if found is not None and found.cost < cost[k]:
                     T[k], self.covariance[k], cost[k] = found
 
@@ -94,17 +94,17 @@ class SurfacePoses:
         parts = [float(part.mean()) for part in (off, np.minimum(apart, 1)) if len(part)]
         return 2 * sum(parts) / len(parts) if parts else 2.0
 
-    def _best_of(self, k: int, candidates: list[np.ndarray]) -> Found:
+    def _best_of(self, k: int, candidates: list[np.ndarray]) -> FittedPose:
         """The pose of the k-th frame that fits surface and points best."""
         met, cloud = self._points_in(k), self._evidence.clouds[k].astype(float)
-        best = Found(NO_POSE, NO_COVARIANCE, np.inf)
+        best = FittedPose(NO_POSE, NO_COVARIANCE, np.inf)
         for T in candidates:
             near = np.linalg.norm(se3.transform(se3.inverse(T), met.p_cam) - met.p_obj, axis=1) < _NEAR_M
             keypoints = Keypoints(met.p_obj[near], met.p_cam[near], met.sigma_m[near]) if near.any() else None
             found = refine(T, cloud, self._volume, self._config.refinement, keypoints=keypoints)
             if (cost := self.cost_at(k, found.T_cam_obj)) < best.cost:
                 covariance = NO_COVARIANCE if found.covariance is None else found.covariance
-                best = Found(found.T_cam_obj, covariance, cost)
+                best = FittedPose(found.T_cam_obj, covariance, cost)
         return best
 
     def _points_in(self, k: int) -> Keypoints:

@@ -30,10 +30,10 @@ def _with_sam2(camera: Camera, config: SegmentationConfig, every: int | None, at
     """Beside the tracking the network leaves half of the cores alone, unless it is told otherwise."""
     from p2p_lib.segmenters.sam2 import Sam2Refiner, shared_network
 
-    beside = config.sam2_every == 0
-    threads = config.sam2_threads or (max(1, (os.cpu_count() or 2) // 2) if beside else 0)
+    background = config.sam2_every == 0
+    threads = config.sam2_threads or (max(1, (os.cpu_count() or 2) // 2) if background else 0)
     network = shared_network(threads, at_once)
-    return BuiltinSegmenter(camera, config, Sam2Refiner(network, camera, config, every, beside))
+    return BuiltinSegmenter(camera, config, Sam2Refiner(network, camera, config, every, background))
 
 
 def _available() -> bool:

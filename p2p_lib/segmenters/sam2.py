@@ -85,9 +85,9 @@ class Question:
 
     @classmethod
     def of_prompt(cls, prompt: Prompt, found: np.ndarray, others_px: np.ndarray) -> Question:
-        """Of what somebody says, beside the mask (H, W) bool that the built-in segmenter made of it."""
+        """Of a prompt and the mask (H, W) bool that the built-in segmenter made of it."""
         own_px = prompt.points_px
-        if not len(own_px) and prompt.box_px is None:  # clicks beside it alone: the rest of it stays
+        if not len(own_px) and prompt.box_px is None:  # negative clicks alone: the rest of it stays
             own_px = _spread(_middle(found), _MIDDLE)
         asked = replace(prompt, points_px=own_px) if len(own_px) else prompt
         return cls(asked, own_px, np.concatenate([prompt.negative_px, others_px]))
@@ -168,10 +168,10 @@ class _Answer:
 class Sam2Refiner:
     """Mends the masks of a segmenter in some frames.
 
-    network  gives the network when it is needed first
-    every    followed objects are asked for in every so many frames; None: never, only what prompts say is
-    beside   it works beside the tracking, and followed objects are asked for whenever it is ready; only for the first
-             frame, before which nothing is followed, it is waited for
+    network     gives the network when it is needed first
+    every       followed objects are asked for in every so many frames; None: never, only what prompts say is
+    background  it works beside the tracking, and followed objects are asked for whenever it is ready; only for the
+                first frame, before which nothing is followed, it is waited for
     """
 
     def __init__(
@@ -180,11 +180,11 @@ class Sam2Refiner:
         camera: Camera,
         config: SegmentationConfig,
         every: int | None = None,
-        beside: bool = False,
+        background: bool = False,
     ):
         self.name = "builtin+sam2" if every is None else "sam2"
         self._network, self._camera, self._config, self._every = network, camera, config, every
-        self._beside = ThreadPoolExecutor(1, "sam2") if beside else None
+        self._executor = ThreadPoolExecutor(1, "sam2") if background else None
         self._working: _Working | None = None
         self._answered: dict[str, _Answered] = {}
         self._frames = 0
@@ -201,8 +201,8 @@ class Sam2Refiner:
         prompts  those of this frame that are no masks
         found    every object that the segmenter located, to its mask (H, W) bool, which may be empty
         """
-        beside = self._beside if self._frames else None  # the first image waits
-        due = self._every is not None and (beside is not None or self._frames % self._every == 0)
+        executor = self._executor if self._frames else None  # the first image waits
+        due = self._every is not None and (executor is not None or self._frames % self._every == 0)
         self._frames += 1
         if any(name in self._answered for name in prompts):
             self._working = None  # what is thought of it is wrong, as the answer to come may be
@@ -210,11 +210,11 @@ class Sam2Refiner:
         arrived = self._arrived(frame, found, hints)
         if self._working is None and (questions := self._questions(frame, prompts, found, hints, due)):
             T_cam_obj = {name: hints.get(name, _NO_HINT).T_cam_obj for name in questions}
-            if beside is None:
+            if executor is None:
                 answers = _answers(self._network, frame, questions)
                 self._keep(frame, answers, T_cam_obj)
                 return {name: answer.mask for name, answer in answers.items()}
-            self._working = _Working(frame, beside.submit(_answers, self._network, frame, questions), T_cam_obj)
+            self._working = _Working(frame, executor.submit(_answers, self._network, frame, questions), T_cam_obj)
         return arrived
 
     def _place(self, frame: Frame, hints: Mapping[str, Hint]) -> None:

@@ -125,13 +125,13 @@ class Sam2Image:
         if mask is not None:
             share = cv2.resize(mask.astype(np.float32), (MASK_SIDE, MASK_SIDE), interpolation=cv2.INTER_AREA)
             before = _SURE * (2 * share - 1)
-        said = {
+        inputs = {
             "point_coords": to_raster(at, features.shape, SIDE).astype(np.float32)[None],
             "point_labels": np.array(kinds, np.float32)[None],
             "mask_input": before[None, None],
             "has_mask_input": np.array([mask is not None], np.float32),
         }
-        logits, score = self._decoder.run(None, features.arrays | said)
+        logits, score = self._decoder.run(None, features.arrays | inputs)
         return MaskCandidates(logits[0], score[0], features.shape)
 
 

@@ -89,18 +89,18 @@ class Sam2VideoSegmenter:
         """One frame in, one label image out; where two objects claim a pixel the likelier one has it."""
         import torch
 
-        said = {prompt.name: prompt for prompt in prompts}
-        for prompt in (p for p in said.values() if p.mask is None):
+        prompt_of = {prompt.name: prompt for prompt in prompts}
+        for prompt in (p for p in prompt_of.values() if p.mask is None):
             check_prompt(prompt, self._camera)
             check_depth(prompt, frame)
-        masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
-        for name in said:
+        masks = {name: prompt.mask for name, prompt in prompt_of.items() if prompt.mask is not None}
+        for name in prompt_of:
             self._sessions.setdefault(name, None)
         self._given |= {name: (frame, mask) for name, mask in masks.items() if mask.any()}
         with torch.inference_mode():
             for name in self._given.keys() - masks.keys():
                 self._restart(name, *self._given.pop(name))
-            self._click([prompt for prompt in said.values() if prompt.mask is None])
+            self._click([prompt for prompt in prompt_of.values() if prompt.mask is None])
             known = [name for name, session in self._sessions.items() if session is not None]
             labels = self._labels(frame, [name for name in known if name not in masks])
         self._at += 1
@@ -191,9 +191,9 @@ class Sam2VideoSegmenter:
         import torch
 
         session.cache.cache_vision_features(at, features or self._features(pixels))
-        told = self._model(inference_session=session, frame=pixels, frame_idx=at)
+        output = self._model(inference_session=session, frame=pixels, frame_idx=at)
         self._trim(session, at)
-        return torch.where(told.object_score_logits.view(-1, 1, 1, 1) > 0, told.pred_masks, _ABSENT)
+        return torch.where(output.object_score_logits.view(-1, 1, 1, 1) > 0, output.pred_masks, _ABSENT)
 
     def _pixels(self, rgb: np.ndarray) -> torch.Tensor:
         """(1, 3, S, S) as the network wants it."""

@@ -191,11 +191,11 @@ def _panned(rng: np.random.Generator, way: float) -> np.ndarray:
     places = [before, before + 8, before, before, after, after, after - 8, after]
     place = through([0, 50, 95, 118, 178, 200, 250, 299], places, frames, 4)
     pan = through([0, 95, 132, 164, 201, 299], [0, 0, _AWAY_PAN, _AWAY_PAN, 0, 0], frames, 3)
-    middle, height = np.array([0.0, 0.0, 0.04]), np.radians(_AWAY_HEIGHT)
+    centre, height = np.array([0.0, 0.0, 0.04]), np.radians(_AWAY_HEIGHT)
     about = np.radians(way * place)
     level = np.stack([np.sin(about), -np.cos(about), np.zeros(_FRAMES)], 1)
-    eyes = middle + _AWAY_M * (np.cos(height) * level + [0, 0, np.sin(height)])
-    T = np.stack([look_at(eye, middle) for eye in eyes])
+    eyes = centre + _AWAY_M * (np.cos(height) * level + [0, 0, np.sin(height)])
+    T = np.stack([look_at(eye, centre) for eye in eyes])
     T[:, :3, :3] = se3.exp(np.radians(way * pan)[:, None] * np.array([0, 0, 1.0, 0, 0, 0]))[:, :3, :3] @ T[:, :3, :3]
     return T @ wander(rng, _FRAMES, 0.008, 1.5, 45)
 
@@ -215,10 +215,10 @@ def half_hidden_start(seed: int, models: str = "") -> Scenario:
     time, way = np.arange(_FRAMES) / _FRAMES, rng.choice([-1.0, 1.0])
     bodies = []
     for name, mesh, ahead in zip(names, meshes, (np.pi / 2, -np.pi / 2), strict=True):
-        middle = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
+        centre = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
         end_on = np.pi / 2 * (np.ptp(mesh.vertices, 0)[:2].argmax() == 0)
         yaw = end_on * (ahead > 0) + rng.uniform(-0.4, 0.4) - way * 2 * np.pi * time
-        own = turned(wander(rng, _FRAMES, 0.006, 8.0, 200), yaw, np.zeros(3)) @ se3.from_rt(np.eye(3), -middle)
+        own = turned(wander(rng, _FRAMES, 0.006, 8.0, 200), yaw, np.zeros(3)) @ se3.from_rt(np.eye(3), -centre)
         bodies.append((name, mesh, ahead, own))
 
     def scenario(start_rad: float) -> Scenario:
@@ -232,8 +232,8 @@ def half_hidden_start(seed: int, models: str = "") -> Scenario:
 
     walls, (low, high) = room(rng), (0.0, np.pi / 3)
     for _ in range(6):
-        middle = (low + high) / 2
-        low, high = (low, middle) if _first_share(scenario(middle)) > share else (middle, high)
+        midpoint = (low + high) / 2
+        low, high = (low, midpoint) if _first_share(scenario(midpoint)) > share else (midpoint, high)
     return scenario(high)
 
 

@@ -192,11 +192,11 @@ class _Film:
     def _grasp(self) -> np.ndarray | None:
         """T_thing_hand of an open hand whose palm is at the thing or a little off, from where the arm is."""
         rng = self.rng
-        middle = self.thing[:3, :3] @ self.pivot + self.thing[:3, 3]
-        forward = (middle + rng.uniform(-0.02, 0.02, 3) - self.elbow) * [1, 1, rng.uniform(0.2, 1)]
+        centre = self.thing[:3, :3] @ self.pivot + self.thing[:3, 3]
+        forward = (centre + rng.uniform(-0.02, 0.02, 3) - self.elbow) * [1, 1, rng.uniform(0.2, 1)]
         forward = se3.exp(np.r_[0, 0, rng.uniform(-0.7, 0.7), 0, 0, 0])[:3, :3] @ forward
         R = _facing(forward, rng.normal((0, 0, -1.2)))
-        aim = middle - R[:, 2] * rng.uniform(0.015, 0.055) + R[:, 0] * rng.uniform(-0.025, 0.025)
+        aim = centre - R[:, 2] * rng.uniform(0.015, 0.055) + R[:, 0] * rng.uniform(-0.025, 0.025)
         back = np.linspace(0.16, 0.0, 33)
         T = np.repeat(se3.from_rt(R, aim)[None], len(back), 0)
         T[:, :3, 3] += back[:, None] * R[:, 1]

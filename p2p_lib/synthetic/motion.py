@@ -89,5 +89,5 @@ def carried(T0: np.ndarray, T1: np.ndarray, frames: int, pivot: np.ndarray) -> n
 def spun(T: np.ndarray, deg: float, axis: np.ndarray, pivot: np.ndarray) -> np.ndarray:
     """A pose turned about an axis (any length) in the world through the model's point ``pivot``."""
     R = se3.exp(np.r_[np.radians(deg) * axis / np.linalg.norm(axis), 0, 0, 0])[:3, :3]
-    middle = T[:3, :3] @ pivot + T[:3, 3]
-    return se3.from_rt(R @ T[:3, :3], middle + R @ (T[:3, 3] - middle))
+    centre = T[:3, :3] @ pivot + T[:3, 3]
+    return se3.from_rt(R @ T[:3, :3], centre + R @ (T[:3, 3] - centre))

@@ -56,8 +56,8 @@ def paper_sequence(seed: int, frames: int = FRAMES, models: str = "", *, parts: 
     for model, motion in parts.items():
         mesh = shapes.load_mesh(Path(models) / model / "textured.obj") if models else STAND_INS[model](rng)
         T = {"circular": _circular, "linear": _linear}[motion](rng, frames, reach[motion])
-        middle = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
-        bodies.append(Body(model, mesh, T @ se3.from_rt(np.eye(3), -middle)))
+        centre = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
+        bodies.append(Body(model, mesh, T @ se3.from_rt(np.eye(3), -centre)))
     T_world_cam = standing(np.array([0.0, -0.52, 0.34]), np.array([0.0, 0.02, 0.14]), frames)
     kind = "YCB models" if models else "procedural stand-ins of about the YCB models' sizes"
     return Scenario(CAMERA, T_world_cam, tuple(bodies), room(rng), objects=kind)

@@ -21,21 +21,21 @@ def resting(mesh: Mesh) -> np.ndarray:
     hull = ConvexHull(mesh.vertices)
     corners, outline = mesh.vertices[hull.simplices], mesh.vertices[hull.vertices]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    middle = area @ corners.mean(1) / area.sum()
+    centre = area @ corners.mean(1) / area.sum()
     down = np.zeros((0, 3))
     for normal in hull.equations[np.argsort(-area), :3]:
-        if (down @ normal < np.cos(np.radians(_ALIKE_DEG))).all() and _stands(outline, middle, normal):
+        if (down @ normal < np.cos(np.radians(_ALIKE_DEG))).all() and _stands(outline, centre, normal):
             down = np.vstack([down, normal])
     x = np.where(np.abs(down[:, :1]) < 0.8, [[1.0, 0, 0]], [[0, 1.0, 0]])
     x -= np.sum(x * down, -1, keepdims=True) * down
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     R = np.stack([x, np.cross(-down, x), -down], 1)
-    t = -(R @ middle)
+    t = -(R @ centre)
     t[:, 2] = -(outline @ R[:, 2].T).min(0)
     return se3.from_rt(R, t)
 
 
-def _stands(outline: np.ndarray, middle: np.ndarray, down: np.ndarray) -> bool:
+def _stands(outline: np.ndarray, centre: np.ndarray, down: np.ndarray) -> bool:
     """Whether a thing with these outermost points (N, 3) stays as it is when its lowest ones are on a table."""
     from scipy.spatial import Delaunay, QhullError
 
@@ -43,6 +43,6 @@ def _stands(outline: np.ndarray, middle: np.ndarray, down: np.ndarray) -> bool:
     base = outline[depth > depth.max() - _FLAT_M]
     level = np.linalg.svd(np.eye(3) - np.outer(down, down))[0][:, :2]
     try:
-        return bool(Delaunay(base @ level).find_simplex(middle @ level) >= 0)
+        return bool(Delaunay(base @ level).find_simplex(centre @ level) >= 0)
     except (QhullError, ValueError):  # a point or a line
         return False

@@ -43,8 +43,8 @@ def darkness(points: np.ndarray, bodies: Sequence[tuple[Mesh, np.ndarray]], ligh
     for lost_k, (a, b) in zip(lost, _DISC * _LAMP_RAD, strict=True):
         way = towards + a * side + b * np.cross(towards, side)
         for mesh, T in bodies:
-            middle, radius = mesh.ball
-            off = se3.transform(T, middle[None]) - points
+            centre, radius = mesh.ball
+            off = se3.transform(T, centre[None]) - points
             along = off @ way / (way @ way)
             near = ~lost_k & (along > 0) & (along < _REACH_M)
             near[near] = np.linalg.norm(off[near] - along[near, None] * way, axis=1) < radius

@@ -70,8 +70,8 @@ class Mesh:
     @cached_property
     def ball(self) -> tuple[np.ndarray, float]:
         """Middle (3,) and radius of a ball around it."""
-        middle = (self.vertices.max(0) + self.vertices.min(0)) / 2
-        return middle, float(np.linalg.norm(self.vertices - middle, axis=1).max())
+        centre = (self.vertices.max(0) + self.vertices.min(0)) / 2
+        return centre, float(np.linalg.norm(self.vertices - centre, axis=1).max())
 
     @cached_property
     def ray_scene(self) -> Any:

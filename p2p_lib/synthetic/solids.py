@@ -156,8 +156,8 @@ def _stamp(rng: np.random.Generator, page: np.ndarray, at: tuple[int, int], radi
     for share in (0.92, 0.70):
         cv2.circle(page, at, int(share * radius), dark, 3, cv2.LINE_AA)
     for turn in rng.uniform(0, 360, 7):
-        middle = at[0] + int(0.35 * radius * np.cos(turn)), at[1] + int(0.35 * radius * np.sin(turn))
-        cv2.ellipse(page, middle, (radius // 4, radius // 9), turn, 0, 360, dark, 2, cv2.LINE_AA)
+        centre = at[0] + int(0.35 * radius * np.cos(turn)), at[1] + int(0.35 * radius * np.sin(turn))
+        cv2.ellipse(page, centre, (radius // 4, radius // 9), turn, 0, 360, dark, 2, cv2.LINE_AA)
     cv2.putText(page, "KILN", (at[0] - radius // 2, at[1] + radius // 5), 4, radius / 60, dark, 3, cv2.LINE_AA)
 
 

@@ -75,8 +75,8 @@ class CoTrackerRollout:
         if answered < 0:
             q = self._queries.shape[1]
             return np.full((q, 2), np.nan), np.zeros(q, bool), np.ones(q)
-        xy, visible, sure = (told[answered - self._first] for told in self._told)
-        return xy / self._scale, visible * sure > _VISIBLE, 1 - sure
+        xy, visible, confidence = (answer[answered - self._first] for answer in self._answers)
+        return xy / self._scale, visible * confidence > _VISIBLE, 1 - confidence
 
     def _take(self, rgb: np.ndarray) -> None:
         self._images.append(self._resized(rgb))
@@ -100,7 +100,7 @@ class CoTrackerRollout:
             model.init_video_online_processing()
             vars(model).update(self._state)
             video = torch.stack(list(self._images))[None]
-            told = model(video=video, queries=self._queries, iters=_ITERATIONS, is_online=True)[:3]
+            answer = model(video=video, queries=self._queries, iters=_ITERATIONS, is_online=True)[:3]
         self._state = {key: value for key, value in vars(model).items() if key.startswith("online_")}
-        self._told = tuple(part[0, -window:].double().cpu().numpy() for part in told)
+        self._answers = tuple(part[0, -window:].double().cpu().numpy() for part in answer)
         self._first = self._taken - window  # the frame, counted from the queries', that its first row is of

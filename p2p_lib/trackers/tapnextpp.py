@@ -66,10 +66,10 @@ class TapNextRollout:
     def step(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions (Q, 2) in pixels, visible (Q,), uncertainty (Q,) in the next image."""
         yx, logits, visible, self._state = self._forward(rgb, state=self._state)
-        yx, logits, visible = (told[0, 0, : self._count].double() for told in (yx, logits, visible))
-        sure = _mass_near(yx[:, 0], logits[:, :SIZE_PX]) * _mass_near(yx[:, 1], logits[:, SIZE_PX:])
+        yx, logits, visible = (part[0, 0, : self._count].double() for part in (yx, logits, visible))
+        confidence = _mass_near(yx[:, 0], logits[:, :SIZE_PX]) * _mass_near(yx[:, 1], logits[:, SIZE_PX:])
         uv = from_raster(yx.flip(-1).cpu().numpy(), rgb.shape[:2], SIZE_PX)
-        return uv, (visible[:, 0] > 0).cpu().numpy(), 1 - sure.cpu().numpy()
+        return uv, (visible[:, 0] > 0).cpu().numpy(), 1 - confidence.cpu().numpy()
 
     def _forward(self, rgb: np.ndarray, **given: Any) -> tuple:
         import torch

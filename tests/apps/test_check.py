@@ -55,7 +55,7 @@ EXPECTED = {
         r"^\d{3} m in the middle",
         r"--depth-scale .*\. A unit of 0\.001 \(millimetres\)",
     ),
-    "a moving scale": ("scale", Level.WRONG, r"all depth changes by \d+ % from frame \d to \d", "a depth camera"),
+    "a moving scale": ("scale", Level.WRONG, r"all depth changes by \d+ % from frame \d to \d", "as the camera"),
     "ten times as far": ("box: depth", Level.WRONG, r"6\.\d+ m away.*0\.1 to 2\.5 m count", "the depth scale is wrong"),
     "depth not registered": ("registration", Level.WRONG, r"0\.7\d times as large", "Register depth to colour"),
     "depth shifted": ("registration", Level.WRONG, r"shifted by \(\+1[6-9]|\(\+20, [+-]0\) px", "Register depth"),
@@ -254,14 +254,14 @@ def click(u, v):
 
 def test_a_click_on_the_background_is_worth_a_look(good):
     finding = found(good, "box: clicks", **click(230, 240))
-    assert finding.level is Level.LOOK and "flat in what is around it, as a table or a wall is" in finding.text
+    assert finding.level is Level.LOOK and "lie in the plane around them, like a table or a wall" in finding.text
 
 
 def test_clicks_all_over_the_background_are_worth_a_look(good):
     clicks = {"prompts": [Prompt("box", 0, np.array([[100.0, 400], [500, 420], [320, 320]]))]}
     finding = found(good, "box: mask", **clicks)
     assert finding.level is Level.LOOK and re.match(r"it covers \d+ % of the image, over 0\.\d+ m", finding.text)
-    assert "table or wall" in finding.fix
+    assert "table or a wall" in finding.fix
 
 
 def test_clicks_of_two_objects_on_one_body_are_worth_a_look(good):
@@ -269,7 +269,7 @@ def test_clicks_of_two_objects_on_one_body_are_worth_a_look(good):
     (box,) = prompts_in({"box": open_sequence(good).masks(0)["box"]})
     twice = [box, Prompt("lid", 0, np.add(box.points_px, [15, 10]))]
     finding = found(good, "lid: clicks", prompts=twice)
-    assert finding.level is Level.LOOK and "most of 'box' belongs to what is clicked" in finding.text
+    assert finding.level is Level.LOOK and "selects most of 'box', too" in finding.text
 
 
 def test_a_click_that_segments_nothing_is_said_once(good, recwarn):
@@ -278,7 +278,7 @@ def test_a_click_that_segments_nothing_is_said_once(good, recwarn):
         "box: mask",
         Level.WRONG,
     ) and "were segmented at the clicks on it" in wrong.text
-    assert "Click elsewhere" in wrong.fix and not len(recwarn)
+    assert "Click again" in wrong.fix and not len(recwarn)
 
 
 def scaled_depth(folder, factor):
@@ -313,7 +313,7 @@ def test_a_known_size_tells_what_nothing_else_does(good):
 
 def test_depth_that_was_cut_off_must_be_exported_again(good, tmp_path):
     (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), 1000)))
-    assert wrong.name == "depth" and "cut off at 65.5 m" in wrong.text and "export the depth again" in wrong.fix
+    assert wrong.name == "depth" and "cut off at 65.5 m" in wrong.text and "Export the depth again" in wrong.fix
 
 
 def test_an_image_that_ends_too_early_is_found_wherever_it_is(good, tmp_path, monkeypatch):

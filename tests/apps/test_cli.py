@@ -231,7 +231,7 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
         assert run(sequence, out, *words) == 130  # where there is nothing yet it begins
     capsys.readouterr()
     assert run(sequence, out, *words) == 0
-    assert "(5 frames" in (err := capsys.readouterr().err) and "then it goes on" in err
+    assert "(5 frames" in (err := capsys.readouterr().err) and "before it goes on" in err
     now, whole = load_run(out), load_run(done)
     np.testing.assert_array_equal(now.objects["object"].T_cam_obj, whole.objects["object"].T_cam_obj)
     with np.load(out / "keypoints.npz") as mine, np.load(done / "keypoints.npz") as theirs:
@@ -403,7 +403,7 @@ def test_a_torn_frame_is_left_out_too_but_not_one_that_a_prompt_is_made_on(seque
     assert re.search("6 of 8 frames.*; 2 left out", capsys.readouterr().out)
     (sequence / "depth/0001.png").write_bytes(b"torn")
     assert run(sequence, tmp_path / "other", *clicks) == 2
-    assert "0001.png" in (err := capsys.readouterr().err) and "A prompt is made on it." in err
+    assert "0001.png" in (err := capsys.readouterr().err) and "A prompt needs this frame." in err
 
 
 def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, capsys):
@@ -867,7 +867,7 @@ def test_what_is_suspicious_is_said_at_the_end_kept_and_said_again(sequence, tmp
 BAD_CLICKS = {
     "no file": (["--prompts", "{seq}/none.json"], ["none.json", "p2p click SEQ --out"]),
     "no JSON": (["--prompts", "{seq}/cam_K.txt"], ["cam_K.txt", "unreadable JSON"]),
-    "both": ([("object", 0, ON_BOARD), "--masks", "dataset"], ["prompt of 'object': got a mask in frame 0 too"]),
+    "both": ([("object", 0, ON_BOARD), "--masks", "dataset"], ["prompt of 'object': got a mask in frame 0, too"]),
     "outside": ([("object", 0, [[W, 10]])], ["clicks on 'object'", "(160, 10)", "160x120"]),
     "late and outside": ([("object", 5, [[3, -9]])], ["clicks on 'object'", "(3, -9)"]),
     "same click": ([("a", 0, ON_BOARD), ("b", 0, ON_BOARD[:1])], ["clicks on 'b'", "also one of 'a'"]),

@@ -41,7 +41,7 @@ def test_one_that_is_not_there_is_no_fault_of_the_data(learnt, tmp_path, capsys)
     words = ["--start", "170", "--stop", "174", "--memory", str(tmp_path / "cup.npz"), "--out", str(tmp_path / "out")]
     assert main([*CROSSING, *words]) == 2
     out, err = capsys.readouterr()
-    assert "cup never had a pose" in err and "is it in view, and seen from a side that was learnt?" in err
+    assert "cup never had a pose" in err and "show a side that was learnt, or click on it" in err
     assert "not scored, the sequence has no truth of cup, only of box, can." in out
 
 

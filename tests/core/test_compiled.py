@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from p2p_lib.core.compiled import LOOPS, LOOPS_BESIDE, uninterrupted
+from p2p_lib.core.compiled import LOOPS, LOOPS_IN_BACKGROUND, uninterrupted
 from p2p_lib.core.paths import PROJECT
 
 FILE = '''
@@ -148,4 +148,4 @@ def test_every_file_with_compiled_functions_is_warmed_up():
     have = {
         str(p.relative_to(PROJECT).with_suffix("")).replace("/", ".") for p in files if "\n@compiled" in p.read_text()
     }
-    assert have == {*LOOPS, *LOOPS_BESIDE}
+    assert have == {*LOOPS, *LOOPS_IN_BACKGROUND}

@@ -56,7 +56,7 @@ def test_a_good_run_is_called_good_and_one_put_off_is_not(made, run):
     off = consistency(put_off(run, (0, np.radians(10), 0, 0.02, 0, 0)), made.sequence)
     for name in run.objects:
         assert off.verdict(name) == "look"
-        assert any("keypoints more than 3 px" in line for line in off.look_at() if line.startswith(f"look at {name}"))
+        assert any("above 3 px" in line for line in off.look_at() if line.startswith(f"look at {name}"))
         told = off.as_dict()["objects"][name]
         assert told["verdict"] == "look" and all(found["text"] and found["frames"] for found in told["look_at"])
     assert all(line in off.as_table() for line in off.look_at())

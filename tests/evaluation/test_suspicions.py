@@ -5,21 +5,21 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from p2p_lib.evaluation.suspicions import Evidence, suspicions
+from p2p_lib.evaluation.suspicions import RunEvidence, suspicions
 
 N = 100
 ROWS = np.arange(N)
 
 
-def spotless() -> Evidence:
+def spotless() -> RunEvidence:
     full = np.ones(N)
     numbers = {"mask_px": 5000, "size_m": 0.15, "keypoints": 40, "inside": 1, "off_px": 0.5, "jump_px": 0.2}
     numbers |= {"overlap": 0.9, "through": 0.01, "confidence": 0.9}
     numbers = {key: value * full for key, value in numbers.items()}
-    return Evidence(frame_index=10 + ROWS, has_pose=full > 0, elsewhere=full < 0, **numbers)
+    return RunEvidence(frame_index=10 + ROWS, has_pose=full > 0, elsewhere=full < 0, **numbers)
 
 
-def with_some(e: Evidence, share: float, **wrong: float) -> Evidence:
+def with_some(e: RunEvidence, share: float, **wrong: float) -> RunEvidence:
     """The same with these values in a share of the frames, the 21st and those after it."""
     at = (ROWS >= 20) & (ROWS < 20 + round(share * N))
     return replace(e, **{key: np.where(at, value, getattr(e, key)) for key, value in wrong.items()})
@@ -59,7 +59,7 @@ def test_maps_that_never_met():
     assert "maps" not in {s.rule for s in suspicions(with_some(spotless(), 0.04, has_pose=False, elsewhere=True))}
 
 
-def gone(rows: np.ndarray) -> Evidence:
+def gone(rows: np.ndarray) -> RunEvidence:
     e = spotless()
     return replace(e, has_pose=e.has_pose & ~rows, mask_px=np.where(rows, 0, e.mask_px))
 
@@ -68,10 +68,10 @@ def gone(rows: np.ndarray) -> Evidence:
     ("rows", "says"),
     [
         ((ROWS > 30) & (ROWS < 70), ""),
-        ((ROWS > 30) & (ROWS < 90), "away (59 %); is it out of view there?: frames 41 to 99"),
+        ((ROWS > 30) & (ROWS < 90), "no mask and no pose (59 %): is it out of view?: frames 41 to 99"),
         (ROWS >= 85, ""),
-        (ROWS >= 60, "not found again; is it out of view to the end?: frames 70 to 109"),
-        (ROWS >= 0, "never a pose: frames 10 to 109"),
+        (ROWS >= 60, "not found again before the end: is it out of view?: frames 70 to 109"),
+        (ROWS >= 0, "no pose in any frame: frames 10 to 109"),
     ],
 )
 def test_what_is_away_may_be_lost(rows, says):
@@ -80,8 +80,8 @@ def test_what_is_away_may_be_lost(rows, says):
 
 
 def test_how_it_started():
-    found = suspicions(replace(spotless(), told=("clicks on 'cup': flat",), apart=0.4))
-    assert [s.rule for s in found] == ["start", "start"] and "40 % of its first mask lies apart" in found[1].text
+    found = suspicions(replace(spotless(), doubts=("clicks on 'cup': flat",), apart=0.4))
+    assert [s.rule for s in found] == ["start", "start"] and "40 % of the first mask is apart" in found[1].text
 
 
 def test_stretches_are_named_across_frames_that_do_not_count():
@@ -93,12 +93,12 @@ def test_stretches_are_named_across_frames_that_do_not_count():
 
 
 def test_what_is_not_known_is_not_held_against_anybody():
-    unknown = {f.name for f in fields(Evidence)} - {
+    unknown = {f.name for f in fields(RunEvidence)} - {
         "frame_index",
         "has_pose",
         "elsewhere",
         "confidence",
-        "told",
+        "doubts",
         "apart",
     }
     assert suspicions(replace(spotless(), **{key: np.full(N, np.nan) for key in unknown})) == ()

@@ -67,6 +67,31 @@ def test_a_plain_plate_is_followed_by_where_it_ends(mechanisms):
     assert (lost == 0 and max(off_m) < 0.008) == (mechanisms == "all"), (lost, max(off_m))
 
 
+@pytest.mark.parametrize(
+    ("hidden", "points", "length"),
+    [("half", 30, 2), ("half", 5, 1), ("all round", 5, 2)],
+    ids=["renewed", "few points renew nothing", "learnt late"],
+)
+def test_a_contour_hidden_at_first_is_learnt_later(hidden, points, length):
+    """Enough points to be sure of the pose replace what is known; where nothing is, a few will do."""
+    method = Point2Pose(CAMERA, preset().with_values({"sampling.points": points}))
+    grains, lengths = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8), []
+    for k in range(2):
+        truth = moved(0.01 * k, 0, 0)
+        frame, mask = plate(truth, k)
+        print_ = cv2.GaussianBlur(np.roll(grains, 5 * k, 1), (0, 0), 1.5)
+        frame = replace(frame, rgb=np.where(mask[..., None], print_, frame.rgb))
+        if not k:
+            beside = np.arange(320) > np.median(np.nonzero(mask)[1]) if hidden == "half" else ~mask
+            hides = np.broadcast_to(beside, mask.shape)
+            frame.depth_m[hides], mask[hides] = 0.3, False
+            method.add_object("plate", mask=mask)
+        T_plate_obj = se3.inverse(truth) @ method.step(frame, {"plate": mask})["plate"].T_cam_obj
+        contour = method.objects["plate"].life.contour
+        lengths.append(0 if contour is None else np.ptp(se3.transform(T_plate_obj, contour)[:, 0]) / SIDES_M[0])
+    np.testing.assert_allclose(lengths, [hidden == "half", length], atol=0.1)
+
+
 def test_what_points_hold_is_not_moved_by_its_contour():
     grains = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
     poses = []
@@ -134,6 +159,17 @@ def test_a_contour_is_laid_on_the_one_that_is_seen():
     np.testing.assert_allclose(pairs.p_cam[:, 2], p_cam[:, 2], atol=1e-9)
     assert fit().pairs(moved(0.02, 0.02, 0), REACH_PX[-1]) is None
     assert fit().share(START) > 0.95 and fit().share(moved(0.006, 0.004, 0)) < 0.7
+
+
+def test_what_something_nearer_hides_of_a_contour_is_laid_on_nothing():
+    """Where a board hides the corner of a plate, the plate's mask ends near by, but the plate does not."""
+    frame, mask = plate(START)
+    edge = round(np.quantile(np.nonzero(mask)[1], 0.9))
+    depth_m, rest = frame.depth_m.copy(), mask.copy()
+    depth_m[:, edge:], rest[:, edge:] = 0.3, False
+    hidden = Frame(0, 0.0, frame.rgb, depth_m)
+    pairs = ContourFit(known(START), contour_px(hidden, rest), hidden, CAMERA).pairs(START, REACH_PX[0])
+    assert CAMERA.project(se3.transform(START, pairs.p_obj))[:, 0].max() < edge
 
 
 @pytest.mark.parametrize("what", ["half", "more", "nothing"])

@@ -97,6 +97,37 @@ def test_what_hides_it_says_little():
     assert search(replace(frame, depth_m=np.full_like(depth, 0.4))).at(PLACE, sample) is None
 
 
+def card(thickness_m: float = 0.0) -> tuple[Frame, SurfaceSample]:
+    """A card at 60 cm that faces the camera, and points on its front, and on its back if it has a thickness."""
+    frame, half = ball_in_front_of_a_wall(centre=np.array([0.0, 0, -9.0])), round(CAMERA.fx * RADIUS_M / 0.6)
+    on = np.s_[120 - half : 121 + half, 160 - half : 161 + half]
+    frame.rgb[on], frame.depth_m[on] = BLUE, 0.6
+    side = np.linspace(-RADIUS_M, RADIUS_M, 12)
+    front, normal = np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3), np.tile([0.0, 0, -1], (144, 1))
+    back = front + np.array([0, 0, thickness_m])
+    p_obj, n_obj = np.concatenate([front, back]), np.concatenate([normal, -normal])
+    faces = slice(None) if thickness_m else slice(144)
+    return frame, SurfaceSample(p_obj[faces], n_obj[faces], sample_of_the_ball().lab[:288][faces])
+
+
+def test_a_third_of_what_would_show_is_the_least():
+    """Something flat faces the camera with all its points: a fourth of them is many, and little of it."""
+    frame, sample = card()
+    T_cam_obj = se3.from_rt(np.eye(3), np.array([0, 0, 0.6]))
+    for hidden, known in ((0.6, True), (0.75, False)):
+        depth_m = frame.depth_m.copy()
+        depth_m[:, : round(160 + (2 * hidden - 1) * CAMERA.fx * RADIUS_M / 0.6)] = 0.4
+        assert (search(replace(frame, depth_m=depth_m)).at(T_cam_obj, sample) is not None) == known
+
+
+def test_what_faces_away_is_not_laid_on_what_is_seen():
+    """The back of something thin is as near to what is measured as its front."""
+    frame, sample = card(thickness_m=0.012)
+    for off_m in (-0.006, 0.0, 0.006):
+        found = search(frame).about(se3.from_rt(np.eye(3), np.array([0, 0, 0.6 + off_m])), sample)
+        assert abs(found.T_cam_obj[2, 3] - 0.6) < 0.001
+
+
 def test_outside_the_image_nothing_is_known():
     assert search(ball_in_front_of_a_wall()).about(moved(2.0, 0, 0), sample_of_the_ball()) is None
 

@@ -8,25 +8,26 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.config import LifecycleConfig
 from p2p_lib.core.types import WITH_POSE, Status
-from p2p_lib.extended.gates import DOUBTS, GATES, SIGHTED, Evidence, Judgement, judge
-from p2p_lib.extended.lifecycle import CLEAR, CONFIRM_FRAMES, CONFIRM_SIGHTED_FRAMES, TELLING, Lifecycle
+from p2p_lib.extended.gates import DOUBTS, GATES, SIGHTED, Judgement, PoseEvidence, judge
+from p2p_lib.extended.lifecycle import CLEAR, TELLING, Lifecycle
+from p2p_lib.method.object_model import CONFIRM_FRAMES, CONFIRM_LONGER
 
 CFG = LifecycleConfig()
 ALL = (*GATES, *DOUBTS)
 TRACKED, RECOVERED, DEGRADED = (Judgement(True, s) for s in (Status.TRACKED, Status.RECOVERED, Status.DEGRADED))
-GOOD = Evidence(support=30, surface_share=0.9)
+GOOD = PoseEvidence(support=30, surface_share=0.9)
 
 
 def pose(k: float) -> np.ndarray:
     return se3.exp(np.array([0.02 * k, 0, 0.01 * k, 0.001 * k, 0, 0.6]))
 
 
-def lived(*steps: Evidence | Status) -> list[Lifecycle]:
+def lived(*steps: PoseEvidence | Status) -> list[Lifecycle]:
     """Started at pose 0, then judged with all gates, frame by frame; a status stands for a frame without a pose."""
     lives = [Lifecycle(Status.TRACKED, pose(0), 0.0)]
     for k, step in enumerate(steps, 1):
         life = lives[-1]
-        if isinstance(step, Evidence):
+        if isinstance(step, PoseEvidence):
             verdict = judge(life, step, ALL, CFG)
             life = life.with_verdict(pose(k), k, verdict) if verdict.accepted else life.without_pose(verdict.status)
         else:
@@ -40,7 +41,7 @@ def test_it_is_a_value():
     with pytest.raises(dataclasses.FrozenInstanceError):
         life.status = Status.TRACKED
     before = lived(GOOD)[-1]
-    judge(before, Evidence(0, None), ALL, CFG)
+    judge(before, PoseEvidence(0, None), ALL, CFG)
     before.without_pose(Status.LOST)
     assert before.has_pose and before.status is Status.TRACKED
 
@@ -72,7 +73,7 @@ def test_only_sure_poses_say_how_it_moves():
 def test_for_a_while_the_surface_stands_for_points_where_the_motion_leads():
     away = lived(GOOD)[-1].moved(0.9).without_pose(Status.OCCLUDED)
     assert away.motion.holds(away.seen_s + 1) and not away.motion.holds(away.seen_s + 2)
-    fits = Evidence(0, 0.61, carried=True)
+    fits = PoseEvidence(0, 0.61, carried=True)
     assert judge(away, fits, ALL, CFG).accepted and judge(away, fits, ALL, CFG).status is Status.DEGRADED
     assert not judge(away, dataclasses.replace(fits, surface_share=0.59), ALL, CFG).accepted
     assert not judge(away, dataclasses.replace(fits, surface_share=0.59, support=3), ALL, CFG).accepted
@@ -91,20 +92,20 @@ def test_it_is_in_sight_until_it_is_hidden():
 def test_what_the_surface_alone_says_proves_nothing_where_the_image_says_otherwise():
     """Frames in which it is not proven confirm no return, and it counts as lost in them."""
     away = lived(GOOD, Status.LOST)[-1].moved(0.9)
-    unproven = judge(away, Evidence(0, 0.9, sighting=0.1, carried=True), ALL, CFG)
+    unproven = judge(away, PoseEvidence(0, 0.9, sighting=0.1, carried=True), ALL, CFG)
     assert unproven.accepted and not unproven.proven
-    assert judge(away, Evidence(0, 0.9, carried=True), ALL, CFG).proven, "too little shows to say"
+    assert judge(away, PoseEvidence(0, 0.9, carried=True), ALL, CFG).proven, "too little shows to say"
     life = away.with_verdict(pose(3), 3.0, unproven)
     for k in range(4):
         life = life.with_verdict(pose(4 + k), 4.0 + k, unproven)
-    assert life.confirming == CONFIRM_SIGHTED_FRAMES and life.lost_frames == away.lost_frames + 5
+    assert life.confirming == CONFIRM_LONGER and life.lost_frames == away.lost_frames + 5
     proven = life.with_verdict(pose(9), 9.0, DEGRADED)
-    assert proven.confirming == CONFIRM_SIGHTED_FRAMES - 1 and not proven.lost_frames
+    assert proven.confirming == CONFIRM_LONGER - 1 and not proven.lost_frames
 
 
 def test_a_return_whose_turn_is_clear_is_confirmed_as_soon_as_one_by_points():
     away = lived(GOOD, Status.LOST)[-1]
-    assert away.with_verdict(pose(3), 3.0, DEGRADED, 0.9 * CLEAR).confirming == CONFIRM_SIGHTED_FRAMES
+    assert away.with_verdict(pose(3), 3.0, DEGRADED, 0.9 * CLEAR).confirming == CONFIRM_LONGER
     assert away.with_verdict(pose(3), 3.0, DEGRADED, CLEAR).confirming == CONFIRM_FRAMES
 
 
@@ -117,17 +118,17 @@ def test_moves_are_told_from_the_frame_before():
 
 
 def test_few_points_are_degraded_while_tracked_and_no_return():
-    few = Evidence(CFG.return_inliers - 1, 0.9)
+    few = PoseEvidence(CFG.return_inliers - 1, 0.9)
     assert lived(few)[-1].status is Status.DEGRADED
     verdict = judge(lived(Status.OCCLUDED)[-1], few, ALL, CFG)
-    assert not verdict.accepted and verdict.status is Status.LOST and "agree on a return" in verdict.reason
+    assert not verdict.accepted and verdict.status is Status.LOST and "the pose of a return" in verdict.reason
     assert judge(lived(Status.OCCLUDED)[-1], few, (), CFG).accepted, "the paper has no gates"
     assert judge(lived(Status.OCCLUDED)[-1], GOOD, ALL, CFG).accepted
 
 
 @pytest.mark.parametrize(("share", "accepted"), [(0.61, True), (0.59, False), (None, False)])
 def test_without_points_the_surface_has_to_fit(share, accepted):
-    verdict = judge(lived(GOOD)[-1], Evidence(0, share), ALL, CFG)
+    verdict = judge(lived(GOOD)[-1], PoseEvidence(0, share), ALL, CFG)
     assert verdict.accepted == accepted
     assert verdict.status is (Status.DEGRADED if accepted else Status.LOST) and verdict.reason
 
@@ -139,7 +140,7 @@ def test_a_return_is_recovered_until_it_is_confirmed():
 
 
 def test_a_return_that_is_not_confirmed_is_taken_back():
-    lives = lived(GOOD, Status.OCCLUDED, GOOD, GOOD, Evidence(3, 0.9))
+    lives = lived(GOOD, Status.OCCLUDED, GOOD, GOOD, PoseEvidence(3, 0.9))
     assert [life.status in WITH_POSE for life in lives] == [True, True, False, True, True, False]
     np.testing.assert_array_equal(lives[-1].T_cam_obj, pose(1))
     confirmed = lived(GOOD, Status.OCCLUDED, *[GOOD] * (CONFIRM_FRAMES + 1), Status.LOST)[-1]
@@ -222,7 +223,7 @@ def test_a_return_has_a_place_once_it_is_confirmed():
 
 
 def test_shape_and_colour_stand_for_points_at_a_return():
-    few, away = Evidence(support=0, surface_share=0.2, sighting=SIGHTED), lived(GOOD, Status.LOST)[-1]
+    few, away = PoseEvidence(support=0, surface_share=0.2, sighting=SIGHTED), lived(GOOD, Status.LOST)[-1]
     assert judge(away, few, ALL, CFG).accepted
     less = dataclasses.replace(few, sighting=0.9 * SIGHTED)
     assert not judge(away, less, ALL, CFG).accepted

@@ -17,9 +17,9 @@ from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.extended.confidence import Belief
 from p2p_lib.extended.default import chosen, object_tracker
 from p2p_lib.extended.image_search import ImageSearch
+from p2p_lib.extended.observation import area_m2, expected_px
 from p2p_lib.extended.outlook import Outlook
 from p2p_lib.extended.policy import OurPolicy, Proposal
-from p2p_lib.extended.sight import area_m2, expected_px
 from p2p_lib.method import refinement
 from p2p_lib.method.object_tracker import ObjectStep
 from p2p_lib.method.registration import Hypothesis
@@ -157,7 +157,7 @@ class Later(Executor):
 def test_it_does_not_matter_when_mapping_is_done():
     """A keyframe in every third frame, which the graph moves: the poses are the same to the last bit."""
     at_once, late = (Lump(keypoint_map__keyframe_angle_deg=5.0) for _ in range(2))
-    late.tracker.model._beside = Later()
+    late.tracker.model._executor = Later()
     for deg in range(0, 40, 2):
         one, other = at_once.see(turned(deg)).estimate, late.see(turned(deg)).estimate
         assert np.array_equal(one.T_cam_obj, other.T_cam_obj) and one.keyframe == other.keyframe
@@ -680,7 +680,7 @@ def test_the_covariance_of_refinement_goes_before_that_of_the_keypoints():
 def test_an_object_with_next_to_no_texture_starts_on_its_surface():
     lump, points_alone = Lump(), Lump(**NO_SURFACE)
     lump.tracker.own.detector = points_alone.tracker.own.detector = Pair()
-    assert points_alone.see(START).estimate.reason == "only 2 points to start from"
+    assert points_alone.see(START).estimate.reason == "only 2 points to start a map"
     assert lump.see(START).estimate.status is Status.DEGRADED
     lump.see(turned(3))
     assert lump.off(turned(3))[0] < 1
@@ -718,7 +718,8 @@ def test_a_map_of_a_sliver_is_founded_anew_where_the_object_stays_lost_in_plain_
     founded = steps[first]
     assert [step.estimate.status for step in steps[:first]] == [Status.LOST] * first
     assert (
-        founded.estimate.status is Status.RECOVERED and founded.estimate.reason == "a new map: the old one stays lost"
+        founded.estimate.status is Status.RECOVERED
+        and founded.estimate.reason == "new map: the object stayed lost in the old"
     )
     assert len(founded.requests.drop) and not np.isin(founded.requests.drop, lump.tracker.map.ids).any()
     assert {step.estimate.status for step in steps[first + 1 :]} == {Status.TRACKED}
@@ -791,8 +792,8 @@ def dilated(mask: np.ndarray) -> np.ndarray:
     [
         ({"depth": lambda depth_m: 1.2 * depth_m}, "1.20 times as large"),
         ({"depth": lambda depth_m: depth_m + np.float32(0.1)}, "times as large"),
-        ({"mask": dilated}, "does not end where its depth does"),
-        ({"depth": lambda depth_m: np.roll(depth_m, 20, 1)}, "does not end where its depth does"),
+        ({"mask": dilated}, "no longer follows depth edges"),
+        ({"depth": lambda depth_m: np.roll(depth_m, 20, 1)}, "no longer follows depth edges"),
     ],
 )
 def test_nothing_is_learnt_from_what_contradicts_itself(fault, word):
@@ -814,7 +815,7 @@ def test_an_outline_that_never_told_where_the_object_ends_does_not_now(share, do
     lump = before_a_wall()
     vars(lump.tracker.policy.trusted)["outline_share"] = share  # as it was in the newest frame that was not doubted
     estimate = doubtful(lump, mask=dilated).estimate
-    assert ("does not end where its depth does" in estimate.reason) == doubted != estimate.keyframe
+    assert ("no longer follows depth edges" in estimate.reason) == doubted != estimate.keyframe
 
 
 @pytest.mark.parametrize(("settings", "fault"), [({}, {}), ({"method__mechanisms": UNGATED}, {"mask": dilated})])
@@ -859,7 +860,7 @@ def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_bo
         deg += 4
         met.append(lump.see(about(deg)))
     joined = met[-1].estimate
-    assert joined.map_id == 0 and joined.status is Status.RECOVERED and "0 and 1 are one" in joined.reason
+    assert joined.map_id == 0 and joined.status is Status.RECOVERED and "0 and 1 were joined" in joined.reason
     assert [step.estimate.map_id for step in met] == [1] * (len(met) - 1) + [0]
     # What was said in the second map is right in the first one's frame, by the relation that is told.
     gone, T_obj_joined = joined.joined
@@ -880,17 +881,22 @@ def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_bo
     assert valid.mean() > 0.9 and np.median(np.abs(distance_m[valid])) < 0.002
 
 
+@pytest.mark.parametrize("which", [0, 1])
 @pytest.mark.parametrize(("sure", "views", "room"), [(False, 1, True), (False, 2, False), (True, 1, False)])
-def test_a_map_aside_makes_room_where_it_knows_one_view_alone(sure, views, room):
+def test_a_map_that_knows_one_view_alone_makes_room_for_another(sure, views, room, which):
     lump, old, _ = turned_over()
-    gone, second = lump.tracker.other, lump.tracker.map.ids.copy()
-    gone.model.views.T_cam_obj = np.repeat(START[None], views, 0)
-    gone.life = gone.life if sure else replace(gone.life, motion=None)
+    maps, ids = [lump.tracker.other, lump.tracker.own], [old, lump.tracker.map.ids.copy()]
+    for k, tracker in enumerate(maps):
+        tracker.model.views.T_cam_obj = np.repeat(START[None], views if k == which else 2, 0)
+    motion = maps[0].life.motion
+    for k, tracker in enumerate(maps):
+        tracker.life = replace(tracker.life, motion=motion if sure or k != which else None)
     lump.steps += [lump.steps[-1]] * 60
     steps = [lump.see(about(270), unseen) for _ in range(16)]
     begun = [step for step in steps if step.estimate.map_id == 2]
-    assert bool(begun) == room and (not room or set(begun[0].requests.drop) == set(old[old >= 0]))
-    assert set(second) <= set(lump.tracker.ids)
+    gone, kept = ids[which], ids[1 - which]
+    assert bool(begun) == room and (not room or set(begun[0].requests.drop) == set(gone[gone >= 0]))
+    assert set(kept) <= set(lump.tracker.ids)
 
 
 def test_where_the_first_map_fits_again_and_the_second_does_not_the_first_one_goes_on():
@@ -908,7 +914,7 @@ def test_where_the_first_map_fits_again_and_the_second_does_not_the_first_one_go
 
 def test_no_second_map_is_begun_on_few_points():
     lump, _, steps = turned_over(Pair())
-    assert lump.tracker.other is None and steps[-1].estimate.reason == "only 2 points to start from"
+    assert lump.tracker.other is None and steps[-1].estimate.reason == "only 2 points to start a map"
 
 
 def test_no_second_map_is_begun_while_the_object_still_comes_into_view():

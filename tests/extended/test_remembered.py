@@ -220,7 +220,7 @@ def test_what_is_not_there_is_not_found(learnt):
     for i in range(0, 60, 6):
         estimate = method.step(other.frame(i))["box"]
         assert estimate.status is Status.INITIALISING and estimate.T_cam_obj is None
-        assert estimate.reason == "remembered, and not found yet"
+        assert estimate.reason == "known from memory, not found yet"
 
 
 def lead_astray(obj, monkeypatch):

@@ -64,6 +64,17 @@ def test_it_is_found_again_after_a_gap_with_nothing_to_see():
     assert known and known[0] < 0.03
 
 
+def test_while_the_camera_is_lost_every_view_is_tried(monkeypatch):
+    tracked, tried = scene(), []
+    for k in range(11):
+        tracked.locate(wall_seen_from(moved(0.3 * k), k), None)
+    nothing = np.zeros((0, 3)), np.zeros((0, 3))
+    monkeypatch.setattr(tracked, "_matched", lambda view, seen: tried.append(view) or nothing)
+    for _ in range(3):
+        assert tracked.locate(wall_seen_from(moved(0)), None) is None
+    assert len(tracked._views) == 11 and {id(view) for view in tried} == {id(view) for view in tracked._views}
+
+
 def test_objects_are_no_part_of_it():
     """A board with most of the corners moves against the wall: the camera stands still."""
     board = np.zeros((240, 320), bool)

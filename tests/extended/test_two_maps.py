@@ -1,5 +1,7 @@
 """Two maps of one object that become one, part by part: against one that was made in one frame from the start."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -104,6 +106,7 @@ def test_joined_keypoints_keep_what_they_have_been_through():
 def test_a_life_told_in_another_frame_is_the_same():
     T = se3.exp(np.random.default_rng(0).normal(0, 0.3, (2, 6)))
     life = Lifecycle("tracked", T[0], 0.0).placed(np.eye(4)).with_verdict(T[1], 0.03, Judgement(True, "tracked"))
+    life = replace(life, contour=np.random.default_rng(1).normal(0, 0.1, (30, 3)))
     T_other = T @ T_FIRST_SECOND
     other = (
         Lifecycle("tracked", T_other[0], 0.0)
@@ -115,4 +118,6 @@ def test_a_life_told_in_another_frame_is_the_same():
         np.testing.assert_allclose(getattr(moved, name), getattr(other, name), atol=1e-12)
     np.testing.assert_allclose(moved.moved(0.9).motion.T_cam_obj, other.T_cam_obj, atol=1e-12)
     np.testing.assert_allclose(life.moved(0.9).in_frame(T_FIRST_SECOND).motion.T_cam_obj, other.T_cam_obj, atol=1e-12)
+    in_camera = [se3.transform(told.T_cam_obj, told.contour) for told in (life, moved)]
+    np.testing.assert_allclose(*in_camera, atol=1e-12)
     assert moved.T_left is None and pytest.approx(moved.seen_s) == other.seen_s

@@ -16,7 +16,7 @@ from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import gaps
-from p2p_lib.figures.scenes import Scene, beside, draw_live
+from p2p_lib.figures.scenes import Scene, draw_live, side_by_side
 from p2p_lib.figures.viewer import scene_page
 from tests.figures.test_viewer import told, unpacked
 
@@ -127,13 +127,13 @@ def test_stories_and_images_have_their_sizes(scene):
 def test_methods_stand_beside_each_other_at_the_same_frames(scene):
     """A line each, or two by two; each image is the scene's own, with its method's name in the corner."""
     scenes, shown = {name: Scene(scene.sequence, scene.run) for name in "abcd"}, [2, 5]
-    lines, pairs = (beside(scenes, shown, 200, across=across) for across in (1, 2))
+    lines, pairs = (side_by_side(scenes, shown, 200, across=across) for across in (1, 2))
     high, gap = (lines.shape[0] + 4) // 4 - 4, 4
     assert lines.shape[:2] == (4 * high + 3 * gap, 2 * 200 + gap)
     assert pairs.shape[:2] == (2 * high + gap, 4 * 200 + 3 * gap)
     third = scenes["c"].draw(scene.row(5), scenes["a"].region(), 200, axes=False, trail=0, note="c")
     np.testing.assert_array_equal(pairs[high + gap :, 200 + gap : 400 + gap], third)
-    assert beside(scenes, 3, 200).shape[1] == 3 * 200 + 2 * gap, "or moments of the first"
+    assert side_by_side(scenes, 3, 200).shape[1] == 3 * 200 + 2 * gap, "or moments of the first"
 
 
 def test_a_run_on_other_data_is_refused(made):

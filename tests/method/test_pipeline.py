@@ -16,7 +16,7 @@ from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.extended.default import Point2Pose
-from p2p_lib.extended.lifecycle import CONFIRM_FRAMES
+from p2p_lib.method.object_model import CONFIRM_FRAMES
 from p2p_lib.synthetic import shapes
 from p2p_lib.synthetic.noise import Sensor, measured_colour, measured_depth
 from p2p_lib.synthetic.render import render
@@ -197,7 +197,8 @@ def test_time_that_runs_backwards_is_said_once_and_statuses_are_logged(caplog):
         estimates = track(frames, names=("left",))
     about_time = [str(of.message) for of in said if "time of frame" in str(of.message)]
     assert about_time == [
-        "time of frame 1: 0.033333 s after 0.066667 s. It did not go on: give frames as they were taken."
+        "time of frame 1: 0.033333 s, not later than the frame before (0.066667 s). "
+        "Give frames in the order in which they were taken."
     ]
     first = estimates[0]["left"].status
     assert caplog.messages[0].startswith(f"frame 0: left is {first}")
@@ -491,7 +492,7 @@ def test_depth_may_fail_for_a_while():
 def test_depth_and_colour_of_different_moments_are_no_measurement(half):
     standing = {half: getattr(film()[9][0], half)}
     frames = [(replace(f, **standing) if f.index in range(10, 16) else f, masks) for f, masks in film()[:20]]
-    with pytest.warns(Doubt, match="the same image again"):
+    with pytest.warns(Doubt, match="repeats the same image"):
         estimates = track(frames)
     # A camera may deliver one more seldom than the other: for less than a tenth of a second it serves.
     assert [e["left"].T_cam_obj is not None for e in estimates] == [True] * 12 + [False] * 4 + [True] * 4
@@ -698,7 +699,7 @@ def test_a_late_object_is_clicked_while_another_has_masks():
     assert {str(e.status) for e in estimates.values()} == {"tracked"}
     assert iou(method.masks["right"], masks["right"]) > 0.85
     method.correct("right", clicks=clicks_on(film()[14][1]["right"]))
-    with pytest.warns(Doubt, match="correction of 'right': mask of 'right': a mask and clicks in frame 14. It is not"):
+    with pytest.warns(Doubt, match="correction of 'right': mask of 'right': a mask and clicks in frame 14. It is"):
         estimates = method.step(film()[14][0], film()[14][1])
     assert {str(e.status) for e in estimates.values()} == {"tracked"}
     np.testing.assert_array_equal(method.masks["right"], film()[14][1]["right"])
@@ -730,10 +731,10 @@ def test_clicks_that_do_not_fit_are_refused_and_leave_no_object_behind():
         method.add_object("cup", mask=np.ones((300, 400), bool))
     with pytest.raises(BadInput, match=r"box around 'cup': got \[500.0, .*, expected a box within 400x300"):
         method.add_object("cup", box=(500, 10, 600, 90))
-    with pytest.raises(BadInput, match="clicks on 'cup': got a click that is also one beside it"):
+    with pytest.raises(BadInput, match="clicks on 'cup': got a positive and a negative click on one pixel"):
         method.add_object("cup", clicks=[[5, 5], [9, 9]], negative=[[9, 9]])
     for beside_alone in ({"negative": [[9, 9]]}, {"mask": np.zeros((300, 400), bool)}):
-        with pytest.raises(BadInput, match=r"object 'left': got (clicks beside it alone|an empty mask)"):
+        with pytest.raises(BadInput, match=r"object 'left': got (negative clicks alone|an empty mask)"):
             method.correct("left", **beside_alone)  # it has not started yet
     with pytest.raises(BadInput, match="correct: got 'cup', expected one of left"):
         method.correct("cup", clicks=good)
@@ -836,7 +837,7 @@ def test_a_correction_without_depth_is_doubted_and_changes_nothing():
         expected = alone.step(frame)
         if k == 3:
             method.correct("left", clicks=at)
-            with pytest.warns(Doubt, match=r"correction of 'left'.* has no depth in frame 3. It is not used"):
+            with pytest.warns(Doubt, match=r"correction of 'left'.* has no depth in frame 3. It is ignored"):
                 estimates = method.step(frame)
         else:
             estimates = method.step(frame)

@@ -290,7 +290,7 @@ def test_mug_ours_is_right_and_a_single_hypothesis_fails(config) -> None:
         off = se3.log(se3.inverse(mug.truth) @ chosen.T_cam_obj)
         nees.append(off @ np.linalg.solve(cov, off))
         row, reason = select(hypotheses, None, rule)
-        assert reason == "most inliers, there is no surface yet"
+        assert reason == "most inliers; there is no surface to compare with"
         most_inliers.append(error_deg_m(hypotheses[row].T_cam_obj, mug.truth)[0])
         single = generate(mug.p_obj, mug.p_cam, replace(config, method="svd"), np.random.default_rng(seed))
         assert [h.origin for h in single] == ["svd"]

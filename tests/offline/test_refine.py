@@ -19,10 +19,10 @@ from p2p_lib.datasets.models import MESHES, find_models, load_mesh, read_mesh
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.offline import evidence, loops
 from p2p_lib.offline import refine as offline
-from p2p_lib.offline.adjustment import Sightings, adjust, information, locate, placed
+from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished
-from p2p_lib.offline.sight import Found, Sight
 from p2p_lib.offline.surface import SurfacePoses, fused
+from p2p_lib.offline.surface_check import FittedPose, SurfaceCheck
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 CAMERA = Camera(500, 500, 159.5, 119.5, 320, 240)
@@ -37,7 +37,7 @@ def scene():
     pose, point = (x.ravel() for x in np.meshgrid(np.arange(20), np.arange(40), indexing="ij"))
     p_cam = se3.transform(T[pose], p[point][:, None])[:, 0] + rng.normal(scale=0.002, size=(800, 3))
     noise_m = np.full(800, 0.002)
-    return T, p, Sightings(pose, point, p_cam, information(p_cam, noise_m, noise_m)), rng
+    return T, p, PointObservations(pose, point, p_cam, information(p_cam, noise_m, noise_m)), rng
 
 
 def off(T, T_true):
@@ -98,6 +98,51 @@ def test_what_shines_and_stands_still_ties_nothing():
     assert tie.strength < 5 < loops.rated(T @ se3.inverse(turned), 12, *views, CAMERA)
 
 
+def disc(radius_m: float) -> loops.Features:
+    """A disc half a metre away before a wall, seen from in front."""
+    p = CAMERA.rays.reshape(-1, 3) * 0.5
+    on = np.linalg.norm(p[:, :2], axis=1) < radius_m
+    depth_m = np.where(on, 0.5, 1.0).reshape(240, 320).astype(np.float32)
+    return loops.Features(np.zeros((0, 3)), np.zeros((0, 128)), p[on][::7], depth_m)
+
+
+def test_depth_contradicts_a_tie_whichever_of_its_views_shows_more():
+    """Points of the larger disc would float before the wall beside the smaller one; not the other way round."""
+    small, large = disc(0.03), disc(0.06)
+    for pair in ((small, large), (large, small)):
+        assert loops.rated(np.eye(4), 100, *pair, CAMERA) < 1
+    assert loops.rated(np.eye(4), 100, small, small, CAMERA) == 100
+
+
+def test_features_match_that_are_each_others_nearest_and_like_no_other():
+    rng = np.random.default_rng(0)
+    own = rng.random((4, 128))
+    one, other = np.abs(own + rng.normal(0, 0.02, (2, *own.shape)))
+    a, b = np.stack([own[0], own[1], one[1], own[2]]), np.stack([one[0], other[0], own[1], own[3], own[2]])
+    views = [
+        loops.Features(np.zeros((len(d), 3)), 512 * d / np.linalg.norm(d, axis=1, keepdims=True), *[None] * 2)
+        for d in (a, b)
+    ]
+    np.testing.assert_array_equal(loops.matched(*views), [[1, 3], [2, 4]])
+
+
+def test_matches_that_do_not_move_rigidly_are_no_tie():
+    turned, rng = se3.from_rt(np.eye(3), np.array([0, 0, 0.5])), np.random.default_rng(0)
+    one, other = (view(turned @ se3.exp(rng.normal(0, 0.1, 6)), np.zeros((0, 3))) for _ in range(2))
+    assert len(loops.ties([one, other], CAMERA, rng)) == 1
+    crossed = replace(other, p_cam=rng.permutation(other.p_cam))
+    assert not loops.ties([one, crossed], CAMERA, rng)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_ties_of_a_pair_the_stronger_counts_and_no_pose_is_needed_where_they_are(order):
+    T = se3.exp(np.random.default_rng(5).normal(size=(3, 6)))
+    known = T.copy()
+    known[1] = np.nan
+    pairs = [(0, 1, T[0] @ se3.inverse(T[1]), 30.0), (0, 1, np.eye(4), 2.0), (1, 2, T[1] @ se3.inverse(T[2]), 20.0)]
+    np.testing.assert_allclose(loops.along_ties(known, pairs[::order]), T, atol=1e-9)
+
+
 def test_poses_follow_the_strongest_ties():
     T = se3.exp(np.random.default_rng(5).normal(size=(5, 6)))
     slipped = T.copy()
@@ -156,7 +201,7 @@ def test_poses_that_fill_the_masks_better_stay(made, tracked, monkeypatch):
 
     def beside(*args):
         T, covariance, cost = best_of(*args)
-        return Found(se3.exp(np.array([0, 0, 0, *rng.uniform(-0.01, 0.01, 2), 0])) @ T, covariance, cost)
+        return FittedPose(se3.exp(np.array([0, 0, 0, *rng.uniform(-0.01, 0.01, 2), 0])) @ T, covariance, cost)
 
     monkeypatch.setattr(SurfacePoses, "_best_of", beside)
     offline.refine_run(tracked)
@@ -212,7 +257,7 @@ def test_frames_keep_the_causal_object_frame_and_what_does_not_fit_has_no_pose(m
     T = np.where(has[:, None, None], obj.T_cam_obj, np.eye(4)) @ moved
     cost = np.where(has, 0.2, 0.9)
     poses = SimpleNamespace(T=T, covariance=np.tile(np.eye(6), (n, 1, 1)), cost=cost, limit=0.5)
-    columns, fits = offline._columns(obj, poses, evidence.Evidence(mask_px=[0] * n), None)
+    columns, fits = offline._columns(obj, poses, evidence.VideoEvidence(mask_px=[0] * n), None)
     np.testing.assert_allclose(columns["T_cam_obj"][has], obj.T_cam_obj[has], atol=1e-9)
     assert np.isnan(columns["T_cam_obj"][~has]).all() and (columns["confidence"][~has] == 0).all()
     assert (fits == has).all()
@@ -226,7 +271,7 @@ def test_frames_keep_the_causal_object_frame_and_what_does_not_fit_has_no_pose(m
 def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what, monkeypatch):
     of, T, config = Finished(made.run, made.sequence), made.run.objects["can"].T_cam_obj, preset()
     rows = np.arange(0, 12)
-    sight = Sight(of, "can", config, fused(of, "can", T, rows, config, 0.004), T, rows)
+    check = SurfaceCheck(of, "can", config, fused(of, "can", T, rows, config, 0.004), T, rows)
     frame, k = made.sequence.frame(6), 6
     mask = made.sequence.masks(6)["can"]
     depth_m, rgb = frame.depth_m.copy(), frame.rgb.astype(float)
@@ -237,18 +282,18 @@ def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what, 
     if what == "colours":  # as it was, but three times as strong
         rgb = middle + 3 * (rgb - middle)
     if what == "pattern":  # the same colours elsewhere, beside a frame in whose light they are far off as well
-        look = sight._look
+        look = check._look
 
         def in_that_light(frame, *how, **more):
             found = look(frame, *how, **more)
-            return found._replace(off=3 * sight._usual, alike=0.9) if frame.index == k - 1 else found
+            return found._replace(off=3 * check._usual, alike=0.9) if frame.index == k - 1 else found
 
-        monkeypatch.setattr(sight, "_look", in_that_light)
+        monkeypatch.setattr(check, "_look", in_that_light)
         v, u = np.nonzero(mask)
         rgb[v, u] = rgb[v, u][np.random.default_rng(0).permutation(len(v))]
     seen = replace(frame, depth_m=depth_m, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
-    sight._frame = lambda row: seen if row == k else made.sequence.frame(row)
-    found = sight.found(k, [T[k] @ se3.exp(np.array([0, 0, 0, 0.002, 0.001, 0]))], k - 1, T[k - 1])
+    check._frame = lambda row: seen if row == k else made.sequence.frame(row)
+    found = check.found(k, [T[k] @ se3.exp(np.array([0, 0, 0, 0.002, 0.001, 0]))], k - 1, T[k - 1])
     assert (found is not None) == (what == "as it is")
     assert found is None or np.linalg.norm((found.T_cam_obj - T[k])[:3, 3]) < 0.003
 
@@ -276,7 +321,7 @@ def test_what_ties_matched_is_adjusted_as_one_point():
     away = np.array([0, 0, 0.5])
     views = [loops.Features(away + rng.normal(0, 0.02, (n, 3)), np.zeros((n, 128)), *[None] * 2) for n in (6, 5)]
     tracks = [(np.array([7, 8]), views[0].p_cam[:2]), (np.array([8, 9]), views[1].p_cam[:2])]
-    told = evidence.Evidence(tracks=tracks, key=[0, 1], views=views)
+    told = evidence.VideoEvidence(tracks=tracks, key=[0, 1], views=views)
     made = SimpleNamespace(sequence=SimpleNamespace(camera=CAMERA), run=SimpleNamespace(info={"seed": 0}))
     video = evidence.VideoPoses(made, SimpleNamespace(T_cam_obj=T), preset(), told)
     tie = loops.Tie(0, 1, np.eye(4), np.array([5, 1, 0]), np.array([2, 4, 3]), 9.0)
@@ -288,7 +333,7 @@ def test_what_ties_matched_is_adjusted_as_one_point():
 
 def test_a_neighbour_helps_where_it_fits_better_with_a_mask_or_by_sight():
     """Frame 1 has no mask, frame 3 has one, in which nothing fits better than what is there."""
-    better, worse = (Found(np.full((4, 4), k), np.eye(6), cost) for k, cost in ((5.0, 0.2), (6.0, 0.95)))
+    better, worse = (FittedPose(np.full((4, 4), k), np.eye(6), cost) for k, cost in ((5.0, 0.2), (6.0, 0.95)))
     poses = SimpleNamespace(
         T=np.tile(np.eye(4), (5, 1, 1)),
         covariance=np.tile(np.eye(6), (5, 1, 1)),
@@ -300,6 +345,23 @@ def test_a_neighbour_helps_where_it_fits_better_with_a_mask_or_by_sight():
     SurfacePoses.ask_neighbours(poses, SimpleNamespace(found=lambda *of: better))
     assert (poses.T[1] == 5).all() and poses.cost[1] == 0.2
     assert (poses.T[3] == np.eye(4)).all() and poses.cost[3] == 0.9
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_a_frame_that_does_not_fit_is_tried_where_its_neighbours_motion_leads(step):
+    even = np.stack([se3.exp(np.array([0, 0, 0.1 * k, 0.02 * k, 0, 0])) for k in range(4)])[::step]
+    lost = 3 if step == 1 else 0
+    tried = []
+    poses = SimpleNamespace(
+        T=even.copy(),
+        covariance=np.tile(np.eye(6), (4, 1, 1)),
+        cost=np.where(np.arange(4) == lost, 0.9, 0.1),
+        limit=0.5,
+        _evidence=SimpleNamespace(shown=np.ones(4, bool)),
+        _best_of=lambda k, candidates: tried.extend(candidates) or FittedPose(candidates[0], np.eye(6), 1.0),
+    )
+    SurfacePoses.ask_neighbours(poses, None)
+    assert any(np.allclose(T, even[lost], atol=1e-9) for T in tried)
 
 
 def test_features_keep_away_from_the_border_of_the_mask():

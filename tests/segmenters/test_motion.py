@@ -82,6 +82,13 @@ def test_a_part_that_moves_along_is_told_from_a_neighbour_that_stays():
     assert scene_stays(patch, motions)
 
 
+def test_of_its_past_the_first_frame_and_six_recent_ones_are_kept():
+    past = Past()
+    for k in range(12):
+        past = past.with_frame(scene(5 * k, 0.0), left(0.01 * k))
+    assert [then.index for then, _ in past.seen] == [0, 30, 35, 40, 45, 50, 55]
+
+
 def test_what_may_as_well_have_stood_still_is_no_part():
     """A plain board beside the plate is in most of its pixels the same, whether it moved along or not."""
     board, moved_m = np.zeros((240, 320), bool), 0.02

@@ -87,6 +87,15 @@ def test_clicks_close_together_select_all_of_a_cover(seed):
     assert iou(segmenter().segment(frame, [clicks]) == 1, cover) > 0.9
 
 
+def test_a_click_on_one_of_two_stickers_alike_selects_that_one():
+    """What is as flat as the table, and of one colour, is told apart by the table between alone."""
+    one, other = rectangle(120, 90, 150, 120), rectangle(156, 90, 186, 120)
+    frame = on_a_table(one | other, (150, 40, 40), np.ones(one.shape), 0)
+    with pytest.warns(Doubt, match="lie in the plane around them"):
+        found = segmenter().segment(frame, [Prompt("sticker", points_px=[[135, 105]])]) == 1
+    assert iou(found, one) > 0.95
+
+
 @pytest.mark.parametrize(
     ("ties", "chosen"),
     [((0.44, 0.45, 0.42), 1.0), ((0.44, 0.45, 0.3), 2.5), ((0.3, 0.45, 0.42), 1.0), ((0.2, 0.45, 0.42), 0.4)],
@@ -126,9 +135,8 @@ def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, 
         doubt_start(Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))), mask, others)
     assert bool(caught) == said
     if said:
-        found = re.search(
-            r"3600 pixels; 6600 have as good an outline. See where \((\d+), (\d+)\)", str(caught[0].message)
-        )
+        text = r"3600 pixels selected; a mask of 6600 fits as well. If pixel \((\d+), (\d+)\)"
+        found = re.search(text, str(caught[0].message))
         assert RIGHT[int(found[2]), int(found[1])]
 
 
@@ -243,10 +251,10 @@ def test_a_refused_prompt_changes_nothing():
 @pytest.mark.parametrize(
     ("prompts", "said"),
     [
-        ([Prompt("a", points_px=[[30, 40]])], "clicks on 'a' in frame 0: .* flat in what is around it"),
+        ([Prompt("a", points_px=[[30, 40]])], "clicks on 'a' in frame 0: .* lie in the plane around them"),
         (
             [Prompt("a", points_px=[[100, 90]]), Prompt("b", points_px=[[140, 130]])],
-            "clicks on 'b' in frame 0: most of 'a' belongs to what is clicked. If both are one body",
+            "clicks on 'b' in frame 0: the prompt selects most of 'a', too. If they are one object",
         ),
         ([Prompt("left", points_px=[[100, 90]]), Prompt("right", points_px=[[175, 110]])], None),
         ([Prompt("left", box_px=(90, 80, 150, 140))], None),
@@ -266,5 +274,5 @@ def test_nothing_found_is_said():
     frame = picture()
     speck = np.zeros_like(frame.depth_m)
     speck[108:111, 173:176] = frame.depth_m[108:111, 173:176]
-    with pytest.warns(Doubt, match="clicks on 'right' in frame 0: no object is found there"):
+    with pytest.warns(Doubt, match="clicks on 'right' in frame 0: no object was found there"):
         segmenter().segment(Frame(0, 0.0, frame.rgb, speck), [Prompt("right", points_px=[[174, 109]])])

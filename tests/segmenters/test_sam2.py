@@ -233,7 +233,7 @@ def test_doubts_are_about_the_mask_that_is_used(network):
         warnings.simplefilter("always", Doubt)
         labels = segmenter(network).segment(flat, [Prompt("red", points_px=AT_RED)])
     assert iou(labels == 1, mask_of(RED_PX)) > 0.95
-    assert len(said) == 1 and f"{(labels == 1).sum()} pixels, flat" in str(said[0].message)
+    assert len(said) == 1 and f"{(labels == 1).sum()} pixels selected lie" in str(said[0].message)
 
 
 def test_beside_the_tracking_an_answer_arrives_later_where_the_object_is_then(network):
@@ -241,7 +241,7 @@ def test_beside_the_tracking_an_answer_arrives_later_where_the_object_is_then(ne
     from threading import Event
 
     go, T_obj = Event(), np.eye(4)
-    of = Sam2Refiner(lambda: (go.wait(10), network)[1], CAMERA, preset().segmentation, every=1, beside=True)
+    of = Sam2Refiner(lambda: (go.wait(10), network)[1], CAMERA, preset().segmentation, every=1, background=True)
     go.set()
     first = of.refine(frame_of(), {"red": prompts()[0]}, {"red": mask_of(RED_PX)}, {})
     assert iou(first["red"], mask_of(RED_PX)) > 0.95  # nothing is followed yet: it is waited for

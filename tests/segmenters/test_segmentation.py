@@ -412,6 +412,17 @@ def test_an_object_leaves_the_picture():
     assert not found.any()
 
 
+@pytest.mark.parametrize(("seen", "pixels"), [(8, 40), (7, 0)])
+def test_a_few_pixels_of_an_object_are_none(seen, pixels):
+    """A strip that leaves the picture, 5 pixels wide."""
+    follow, masks = segmenter(), [card((x, 100), (40, 5)) for x in (0, seen - 40)]
+    for k, mask in enumerate(masks):
+        frame = picture(k, [])
+        frame.rgb[mask], frame.depth_m[mask] = (200, 40, 30), CARD_M
+        found = follow.segment(frame, [Prompt("strip", 0, mask=masks[0])] if not k else ())
+    assert np.count_nonzero(found) == pixels
+
+
 def test_strictly_causal():
     """Every label image is the same, bit for bit, whatever comes after."""
     short, long = segmenter(), segmenter()
@@ -589,6 +600,15 @@ def test_a_mask_that_loses_the_points_which_were_on_it_is_found_anew_at_them(hel
         hints = sure(card=at) if held or at == now else {}
         found = follow.segment(picture(k, [(at, 1)]), () if k else on(card=was), hints) == 1
     assert (iou(found, card(now)) > 0.85) == held
+
+
+def test_points_on_its_double_do_not_move_a_mask_that_they_were_on_before():
+    """Once they are lost, they may be found again on what looks the same, and stay there."""
+    follow, at, double = segmenter(), (60, 80), (170, 100)
+    for k in range(12):
+        hints = sure(card=at) if k < 3 else sure(card=double) if k > 5 else {}
+        found = follow.segment(picture(k, [(at, 1), (double, 1)]), () if k else on(card=at), hints) == 1
+        assert iou(found, card(at)) > 0.85
 
 
 @pytest.mark.parametrize("told", [True, False])

@@ -8,6 +8,7 @@ from p2p_lib.core.types import joined
 from p2p_lib.trackers.builtin import motion_segments
 from p2p_lib.trackers.builtin.landmarks import Corners
 from p2p_lib.trackers.builtin.tracked_points import Points
+from p2p_lib.trackers.builtin.wide_baseline import Matched
 from tests.trackers.made_up import CAMERA, DEPTH_M, grid, image, shifted, started
 
 PX_M = DEPTH_M / CAMERA.fx  # one pixel on the plane
@@ -86,6 +87,55 @@ def test_points_that_leave_together_stay_verified_and_then_are_a_segment():
     p.uv[part] += [0, 9]
     segments.fit(p, image())
     assert len(segments.segments) == 2 and set(p.segment[part]) == {1} and not p.leaving.any()
+
+
+@pytest.mark.parametrize(("count", "leave"), [(7, False), (8, True)])
+def test_a_few_points_do_not_leave_together(count, leave):
+    p, segments = started(LEFT, image())
+    p.uv[:count] += [0, 7]
+    segments.fit(p, image())
+    assert (p.verified[:count] == leave).all() and (p.leaving[:count] == leave).all()
+
+
+def test_points_that_leave_one_by_one_are_no_segment():
+    p, segments = started(LEFT, image())
+    p.uv[:8] += np.random.default_rng(0).permutation(8)[:, None] * [0, 11] + [0, 20]
+    segments.fit(p, image())
+    assert not p.verified[:8].any() and len(segments.segments) == 1
+
+
+def half_lost(monkeypatch, shift_px: float, pairs: int) -> tuple[Points, motion_segments.MotionSegments]:
+    """Eight of 24 points are followed, where they were; so many corners of the frame before match, moved."""
+    p, segments = started(RIGHT, image())
+    segments.remember(p, image(), None)
+    p.verified[8:] = False
+    T_cam_seg = segments.segments[0].fit.T_cam_seg.copy()
+    T_cam_seg[0, 3] += shift_px * PX_M
+    own, found = slice(8, 8 + pairs), segments.segments[0].last_view.corners
+    match = Matched(T_cam_seg, p.p_seg[own], RIGHT[own] + [shift_px, 0], np.full(pairs, DEPTH_M), found)
+    monkeypatch.setattr(motion_segments, "matched", lambda *_: match)
+    return p, segments
+
+
+@pytest.mark.parametrize(
+    ("state", "pairs", "matched"),
+    [({}, 12, True), ({}, 8, False), ({"hidden_for": 5}, 12, False), ({"rejected_for": 2}, 12, False)],
+    ids=["lost", "no more agree", "lost for long", "rejected"],
+)
+def test_a_segment_is_matched_that_was_just_lost(monkeypatch, state, pairs, matched):
+    p, segments = half_lost(monkeypatch, 0, pairs)
+    for name, frames in state.items():
+        setattr(segments.segments[0], name, frames)
+    segments.fit(p, image())
+    assert (segments.segments[0].matched is not None) == matched
+
+
+def test_what_is_left_behind_by_a_match_does_not_leave_as_a_segment(monkeypatch):
+    """The points that seem to be followed stand still on something else."""
+    p, segments = half_lost(monkeypatch, 30, 12)
+    segments.fit(p, image())
+    (segment,) = segments.segments
+    assert segment.fit.T_cam_seg[0, 3] == pytest.approx(30 * PX_M, abs=1e-3) and not p.verified.any()
 
 
 def test_points_that_come_back_are_not_leaving_any_more():

@@ -71,7 +71,7 @@ def test_corners_of_an_outline_do_not_count():
     search[60:180, 90:230] = True
     p, segments = started(UV, now)
     segments.remember(p, now, search)
-    (then,) = (segment.sight for segment in segments.segments)
+    (then,) = (segment.last_view for segment in segments.segments)
     found, _ = wide_baseline.corners_of([then], now, search)
     for at in (found.uv_px, then.corners.uv_px):
         assert len(at) and (np.abs(at - [159.5, 119.5]) < [67, 57]).all()
@@ -84,7 +84,7 @@ def test_what_is_before_it_is_not_of_it():
     p.visible[(np.abs(p.uv - [160, 120]) < 25).all(1)] = False
     depth[95:145, 135:185] -= 0.04
     segments.remember(p, image(depth_m=depth), None)
-    (then,) = (segment.sight for segment in segments.segments)
+    (then,) = (segment.last_view for segment in segments.segments)
     at = then.corners.p_cam
     assert len(at) > 20 and at[:, 2].min() > DEPTH_M - 0.01
 
@@ -92,7 +92,7 @@ def test_what_is_before_it_is_not_of_it():
 def test_it_is_searched_for_where_depth_and_colour_fit():
     p, segments = started(UV, image())
     segments.remember(p, image(), None)
-    (then,) = (segment.sight for segment in segments.segments)
+    (then,) = (segment.last_view for segment in segments.segments)
     red, depth = texture().copy(), np.full(SHAPE, DEPTH_M, np.float32)
     red[:, :120, 1] //= 3
     depth[:, 200:] += 0.2
@@ -106,7 +106,19 @@ def test_another_texture_is_no_match():
     segments.remember(p, image(), None)
     (segment,) = segments.segments
     here = corners(image(texture(5)), None, wide_baseline.CORNERS)
-    assert wide_baseline.matched(segment.sight, here, CFG, np.random.default_rng(0)) is None
+    assert wide_baseline.matched(segment.last_view, here, CFG, np.random.default_rng(0)) is None
+
+
+def test_what_stands_still_does_not_hold_back_what_moves_slowly():
+    """Two fifths of the corners are of shine and shadow, which stay where they are while the rest moves by 1 cm."""
+    p, segments = started(UV, image())
+    segments.remember(p, image(), None)
+    (segment,) = segments.segments
+    own, moved_m = segment.last_view.corners, np.array([0.008, 0.006, 0])
+    moves = np.arange(len(own.uv_px)) % 5 > 1
+    found = replace(own, p_cam=own.p_cam + moves[:, None] * moved_m)
+    match = wide_baseline.matched(segment.last_view, found, CFG, np.random.default_rng(0))
+    assert np.abs((match.T_cam_seg - segment.last_view.T_cam_seg)[:3, 3] - moved_m).max() < 0.001
 
 
 def test_what_matches_alone_carry_is_soon_not_seen():

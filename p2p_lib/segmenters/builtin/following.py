@@ -48,9 +48,9 @@ def predict(view: View, target: Target) -> Prediction:
     """Move the mask of an object that was seen a frame ago by the optical flow."""
     frame, cfg, seen = view.frame, view.config, target.seen
     assert seen is not None and target.size_m is not None and view.previous is not None  # a frame ago
-    px_m = view.focal_px / seen.z_m
+    px_per_m = view.focal_px / seen.z_m
     # Room for its full size, also where only a part of it showed.
-    half = np.maximum(target.size_m / 2, target.room_m) * px_m * (1 + cfg.margin) + ROOM_PX
+    half = np.maximum(target.size_m / 2, target.room_m) * px_per_m * (1 + cfg.margin) + ROOM_PX
     patch = Patch.of(frame, around(seen.centre_px, half, frame.shape), view.camera, cfg)
     before = Patch.like(view.previous, patch.box, patch.cell_px, view.camera)
     image = np.zeros(frame.shape, np.float32)
@@ -88,14 +88,14 @@ def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Cla
     log_odds[jumped] -= cfg.geometry_weight
     log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
     x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
-    beside = dilated((x > 0.5) & (patch.depth_m > 0), 1)
-    x = np.where((patch.depth_m > 0) | (prior > 0.5) | beside, x, 0)
+    adjacent = dilated((x > 0.5) & (patch.depth_m > 0), 1)
+    x = np.where((patch.depth_m > 0) | (prior > 0.5) | adjacent, x, 0)
     claim = patch.box, patch.up(x)
     if predicted.left and not (x > 0.5).any():
         return None
     # Exposure changes colours: points that agree overrule them.
-    told = target.confident and holds(claim, hint.uv_px)
-    return claim if told or not strange(patch, x > 0.5, target.colours) else None
+    confirmed = target.confident and holds(claim, hint.uv_px)
+    return claim if confirmed or not strange(patch, x > 0.5, target.colours) else None
 
 
 def holds(claim: tuple[Box, np.ndarray], uv_px: np.ndarray) -> bool:
@@ -107,8 +107,8 @@ def holds(claim: tuple[Box, np.ndarray], uv_px: np.ndarray) -> bool:
 def with_room(view: View, target: Target, hint: Hint) -> Target:
     """The target with room for parts that move with it, which may reach farther than what it has shown so far."""
     assert target.seen is not None and hint.T_cam_obj is not None  # it was seen a frame ago, and points agree
-    cfg, px_m = view.config, view.focal_px / target.seen.z_m
-    patch = Patch.of(view.frame, around(hint.uv_px.mean(0), cfg.reach_m * px_m, view.frame.shape), view.camera, cfg)
+    cfg, px_per_m = view.config, view.focal_px / target.seen.z_m
+    patch = Patch.of(view.frame, around(hint.uv_px.mean(0), cfg.reach_m * px_per_m, view.frame.shape), view.camera, cfg)
     motions = target.past.motions(view.frame, hint.T_cam_obj)
     if motions is None or not scene_stays(patch, motions):
         return target
@@ -117,4 +117,4 @@ def with_room(view: View, target: Target, hint: Hint) -> Target:
     if not component.any():
         return target
     away_px = np.abs(patch.ends_px(component) - target.seen.centre_px).max(0)
-    return replace(target, room_m=away_px / px_m)
+    return replace(target, room_m=away_px / px_per_m)

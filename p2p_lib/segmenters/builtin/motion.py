@@ -110,14 +110,14 @@ def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, mot
     """
     size = np.bincount(part.ravel())
     count = len(size)
-    beside = np.zeros(count, bool)
-    beside[part[dilated(component, _NEAR) & ~component]] = True
-    beside[part[component]] = False
-    beside &= size >= _FEWEST
-    beside[0] = False
+    adjacent = np.zeros(count, bool)
+    adjacent[part[dilated(component, _NEAR) & ~component]] = True
+    adjacent[part[component]] = False
+    adjacent &= size >= _FEWEST
+    adjacent[0] = False
     at_border = np.bincount(part[patch.border()], minlength=count) / patch.border().sum()
-    beside &= at_border < _AT_THE_BORDER
-    v, u = np.nonzero(beside[part])
+    adjacent &= at_border < _AT_THE_BORDER
+    v, u = np.nonzero(adjacent[part])
     if not len(v) or not scene_stays(patch, motions):
         return np.zeros(patch.shape, bool)
     p_cam, rgb = patch.points()[v, u], patch.rgb[v, u]
@@ -125,4 +125,4 @@ def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, mot
     stayed, _ = agrees(p_cam, rgb, patch.camera, motions.recent[0], np.eye(4))
     _, absent = agrees(p_cam, rgb, patch.camera, *motions.first)
     moved, stayed, absent = (np.bincount(part[v, u], w, count) / np.maximum(size, 1) for w in (moved, stayed, absent))
-    return (beside & (moved > _AGREES) & (stayed < _UNDECIDED) & (absent < _ABSENT))[part]
+    return (adjacent & (moved > _AGREES) & (stayed < _UNDECIDED) & (absent < _ABSENT))[part]

@@ -136,17 +136,17 @@ class Cutter:
         """Cut anew, from the clicks that correct a mask (H, W) bool, and from what is right about the mask.
 
         known_px  (K, 2) pixels that are probably on the object, as is the mask's middle. Of both are used those nearer
-                  to a click on the object than to one beside it; with clicks beside it alone, the third that is
+                  to a positive click than to a negative one; with negative clicks alone, the third that is
                   farthest from them
         """
         inner = cv2.distanceTransform(np.pad(was, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
         v, u = np.nonzero(inner >= inner.max() / 2)
         right_px = np.concatenate([known_px, np.stack([u, v], -1)[:: max(1, len(u) // _MIDDLE)]])
-        on, beside = (
+        positive, negative = (
             np.linalg.norm(right_px[:, None] - at, axis=-1).min(1, initial=np.inf)
             for at in (self.prompt.points_px, self.prompt.negative_px)
         )
-        right_px = right_px[beside >= (on if np.isfinite(on).all() else np.quantile(beside, 2 / 3))]
+        right_px = right_px[negative >= (positive if np.isfinite(positive).all() else np.quantile(negative, 2 / 3))]
         points_px = np.concatenate([self.prompt.points_px, right_px])
         return replace(self, prompt=replace(self.prompt, points_px=points_px)).start()
 

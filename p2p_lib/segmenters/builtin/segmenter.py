@@ -79,23 +79,23 @@ class BuiltinSegmenter:
         hints: Mapping[str, Hint] | None = None,
     ) -> np.ndarray:
         """One frame in, one (H, W) label image out; a pixel that two objects claim goes to the likelier one."""
-        said, hints = {prompt.name: prompt for prompt in prompts}, hints or {}
-        _check(frame, said, self.camera)
+        prompt_of, hints = {prompt.name: prompt for prompt in prompts}, hints or {}
+        _check(frame, prompt_of, self.camera)
         self._frames += 1
         view = View(frame, self._previous, self.camera, self.config)
-        cutters = {name: _cutter(view, prompt, said) for name, prompt in said.items() if prompt.mask is None}
+        cutters = {name: _cutter(view, prompt, prompt_of) for name, prompt in prompt_of.items() if prompt.mask is None}
         new = [name for name in cutters if name not in self._targets]
-        masks = {name: prompt.mask for name, prompt in said.items() if prompt.mask is not None}
+        masks = {name: prompt.mask for name, prompt in prompt_of.items() if prompt.mask is not None}
         due, claims = self._due(), {}
         taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
-        for name in self._absent_last(said, hints, due):
+        for name in self._absent_last(prompt_of, hints, due):
             if name in masks:
                 self._targets[name] = self._targets.get(name, Target()).with_given(frame, masks[name])
             else:
                 asked = cutters.get(name), hints, taken, name in due
                 self._targets[name], claims[name] = self._locate(view, name, *asked)
                 _mark(taken, claims[name])
-        claims |= self._refined(frame, said, claims, hints)
+        claims |= self._refined(frame, prompt_of, claims, hints)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
         self._doubt_starts(labels, [cutters[name] for name in new])
@@ -106,13 +106,13 @@ class BuiltinSegmenter:
         """The objects whose turn it is to be cut out anew."""
         return {name for turn, name in enumerate(self._targets) if (self._frames - turn) % _TURNS == 0}
 
-    def _absent_last(self, said: Mapping[str, Prompt], hints: Mapping[str, Hint], due: set[str]) -> list[str]:
+    def _absent_last(self, prompt_of: Mapping[str, Prompt], hints: Mapping[str, Hint], due: set[str]) -> list[str]:
         """The order in which objects are located: absent ones last, so that none is found on an object in view."""
-        names = dict.fromkeys([*self._targets, *said])
+        names = dict.fromkeys([*self._targets, *prompt_of])
         absent = {}
         for name in names:
             target = self._targets.get(name, Target())
-            given = (name in said and said[name].mask is not None) or target.given is not None
+            given = (name in prompt_of and prompt_of[name].mask is not None) or target.given is not None
             cuts = self._cuts(target, name in due)
             absent[name] = not given and (target.seen is None or (cuts and hints.get(name, _NO_HINT).sighted))
         return sorted(names, key=absent.__getitem__)
@@ -173,7 +173,7 @@ class BuiltinSegmenter:
         return target, claim
 
     def _refined(
-        self, frame: Frame, said: Mapping[str, Prompt], claims: Mapping[str, Claim], hints: Mapping[str, Hint]
+        self, frame: Frame, prompt_of: Mapping[str, Prompt], claims: Mapping[str, Claim], hints: Mapping[str, Hint]
     ) -> dict[str, Claim]:
         """The refiner's claims, of the objects whose masks it replaces."""
         if self._refiner is None:
@@ -181,7 +181,7 @@ class BuiltinSegmenter:
         masks = {name: np.zeros(frame.shape, bool) for name in claims}
         for name, claim in claims.items():
             _mark(masks[name], claim)
-        prompts = {name: prompt for name, prompt in said.items() if prompt.mask is None}
+        prompts = {name: prompt for name, prompt in prompt_of.items() if prompt.mask is None}
         refined, whole = self._refiner.refine(frame, prompts, masks, hints), Box(0, 0, *frame.shape[::-1])
         return {name: (whole, mask.astype(np.float32)) for name, mask in refined.items()}
 
@@ -222,15 +222,15 @@ class BuiltinSegmenter:
             doubt_start(cutter, labels == label_of[name], others)
 
 
-def _cutter(view: View, prompt: Prompt, said: Mapping[str, Prompt]) -> Cutter:
-    """The cutter of a prompt's object; the clicks on other objects in ``said`` count as background."""
-    others_px = np.concatenate([NO_PX, *(p.points_px for name, p in said.items() if name != prompt.name)])
+def _cutter(view: View, prompt: Prompt, prompt_of: Mapping[str, Prompt]) -> Cutter:
+    """The cutter of a prompt's object; the clicks on other objects in ``prompt_of`` count as background."""
+    others_px = np.concatenate([NO_PX, *(p.points_px for name, p in prompt_of.items() if name != prompt.name)])
     return Cutter(view.frame, view.camera, view.config, prompt, others_px)
 
 
-def _check(frame: Frame, said: Mapping[str, Prompt], camera: Camera) -> None:
+def _check(frame: Frame, prompt_of: Mapping[str, Prompt], camera: Camera) -> None:
     """Refuse clicks and boxes outside the image or without depth, before anything changes."""
-    for prompt in (p for p in said.values() if p.mask is None):
+    for prompt in (p for p in prompt_of.values() if p.mask is None):
         check_prompt(prompt, camera)
         check_depth(prompt, frame)
 

@@ -31,24 +31,24 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
     frame, name = cutter.frame, cutter.prompt.name
     who = f"{'clicks on' if len(cutter.prompt.points_px) else 'box around'} {name!r} in frame {frame.index}"
     if not mask.any():
-        fix = "Click in its middle, on parts that look different, or draw a box."
-        return doubt(who, "no object is found there", fix)
+        fix = "Click near its centre and on parts of other colours, or draw a box."
+        return doubt(who, "no object was found there", fix)
     rows, columns = bounds(mask)
     corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
     patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)
     inside = (patch.down(mask.astype(np.float32)) > 0.5) & (patch.depth_m > 0)
     if _flat(patch, inside):
-        got = f"{np.count_nonzero(mask)} pixels, flat in what is around it, as a table or a wall is"
-        fix = "If it is not the object, click in the object's middle; else see that depth is in metres."
+        got = f"the {np.count_nonzero(mask)} pixels selected lie in the plane around them, like a table or a wall"
+        fix = "If this is not the object, click near its centre; if it is, check that depth is in metres."
         return doubt(who, got, fix)
     if one_body := _one_body(cutter, patch, inside, others):
-        fix = "If both are one body, leave one out; else give each clicks beside it (negative), on the other."
+        fix = "If they are one object, leave one out; else give each a negative click on the other."
         for other in one_body:
-            doubt(who, f"most of {other!r} belongs to what is clicked", fix)
+            doubt(who, f"the prompt selects most of {other!r}, too", fix)
     elif (another := _as_good(cutter, mask, others)) is not None:
         pixels, (u, v) = another
-        got = f"{np.count_nonzero(mask)} pixels; {pixels} have as good an outline"
-        doubt(who, got, f"See where ({u}, {v}) belongs: click there, too, or beside the object (negative).")
+        got = f"{np.count_nonzero(mask)} pixels selected; a mask of {pixels} fits as well"
+        doubt(who, got, f"If pixel ({u}, {v}) is on the object, click on it, too; else give a negative click on it.")
     return None
 
 

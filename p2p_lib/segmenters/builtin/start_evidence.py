@@ -68,8 +68,8 @@ class Clicked:
 
     def prior_beside(self, connected: np.ndarray) -> np.ndarray:
         """(h, w) log-odds by distance from the clicks; never against pixels whose ``connected`` (h, w) is positive."""
-        beside = np.clip(_BESIDE - _PER_EXTENT * self.extents, np.where(connected > 0, 0, _FAR), None)
-        return np.where(self.hull, _BETWEEN, beside).astype(np.float32)
+        outside = np.clip(_BESIDE - _PER_EXTENT * self.extents, np.where(connected > 0, 0, _FAR), None)
+        return np.where(self.hull, _BETWEEN, outside).astype(np.float32)
 
     @property
     def near(self) -> np.ndarray:

@@ -19,7 +19,7 @@ from p2p_lib.trackers.builtin.landmarks import Landmarks, corners
 from p2p_lib.trackers.builtin.rigid_motion import PoseFit, Prediction, fit_pose, pose_distance_m, predict
 from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, planes_at
 from p2p_lib.trackers.builtin.tracked_points import Points
-from p2p_lib.trackers.builtin.wide_baseline import Matched, Sight, corners_of, matched
+from p2p_lib.trackers.builtin.wide_baseline import Matched, SegmentView, corners_of, matched
 
 #: Covariance of a pose that matches have proposed: rad, m.
 _PROPOSED_COV = np.diag(np.repeat([0.05, 0.004], 3) ** 2)
@@ -47,7 +47,7 @@ class MotionSegment:
     hidden_for    frames since the pose was known
     rejected      (M, 3) points in the camera's frame where it was found wrongly: a look-alike may be there
     rejected_for  frames for which it is not searched for around them
-    sight         the newest frame in which it had a pose; None before it has points enough to be searched for
+    last_view     the newest frame in which it had a pose; None before it has points enough to be searched for
     matched       what corners of that frame have been matched with in the newest one; None where nothing
     """
 
@@ -57,7 +57,7 @@ class MotionSegment:
     rejected: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     rejected_for: int = 0
     landmarks: Landmarks = field(default_factory=Landmarks)
-    sight: Sight | None = None
+    last_view: SegmentView | None = None
     matched: Matched | None = None
 
     @property
@@ -113,7 +113,7 @@ class MotionSegments:
             if (own & wrong).sum() > 0.5 * own.sum():
                 segment.rejected = se3.transform(segment.fit.T_cam_seg, p.p_seg[own & wrong])
                 segment.rejected_for = self.config.reject_frames
-                segment.hidden_for, segment.sight = self.config.linger_frames + 1, None
+                segment.hidden_for, segment.last_view = self.config.linger_frames + 1, None
 
     def fit(self, p: Points, now: Image, search: np.ndarray | None = None) -> None:
         """Fit poses to the points that were followed; where too few agree, to the corners of the frame before, too.
@@ -180,12 +180,12 @@ class MotionSegments:
         """Look for corners of segments on which too few points were followed; kept where more of them agree."""
         agreeing = [0 if fit is None else np.count_nonzero(fit.agrees) for fit in fits]
         lost = [
-            (segment, count, segment.sight)
+            (segment, count, segment.last_view)
             for segment, count in zip(self.segments, agreeing, strict=True)
-            if segment.sight is not None
+            if segment.last_view is not None
             and segment.hidden_for < self.config.linger_frames
             and not segment.rejected_for
-            and count < _FOLLOWED * len(segment.sight.uv_px)
+            and count < _FOLLOWED * len(segment.last_view.uv_px)
         ]
         if not lost:
             return
@@ -200,7 +200,7 @@ class MotionSegments:
             own = p.visible & (p.segment == s)
             if segment.posed and np.count_nonzero(own) >= 2 * self.config.segment_min_points:
                 found = None if segment.matched is None else segment.matched.found
-                segment.sight = Sight(now, p.uv[own], segment.fit.T_cam_seg, search, found)
+                segment.last_view = SegmentView(now, p.uv[own], segment.fit.T_cam_seg, search, found)
 
     def _split(self, p: Points, strays: np.ndarray, now: Image) -> None:
         """Points that leave their segment together stay verified, and are a new segment once they are far enough.

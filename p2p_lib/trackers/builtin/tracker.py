@@ -166,5 +166,5 @@ class BuiltinTracker:
         p.cov[rows] = np.where(seen[:, None, None], (_EYE - gain) @ cov, predicted.cov_px2 + unseen_px**2 * _EYE)
         p.warp[rows[~seen]] = predicted.warp[~seen]
         p.verified[rows] = seen & exposed
-        sure = (predicted.sigma_px < cfg.max_predicted_sigma_px) & (chained <= cfg.linger_frames)
-        p.visible[rows] = exposed & (seen | sure)
+        reliable = (predicted.sigma_px < cfg.max_predicted_sigma_px) & (chained <= cfg.linger_frames)
+        p.visible[rows] = exposed & (seen | reliable)

@@ -45,7 +45,7 @@ def inner(region: np.ndarray) -> np.ndarray:
 
 
 @dataclass(eq=False)
-class Sight:
+class SegmentView:
     """A segment where it was last seen: the image, its visible points uv_px (N, 2), its pose T_cam_seg.
 
     search  (H, W) bool: where the objects were in that frame; None where nobody knows
@@ -124,22 +124,22 @@ class Matched:
         return len(self.p_seg)
 
 
-def corners_of(sights: Sequence[Sight], now: Image, search: np.ndarray | None) -> tuple[Corners, list[np.ndarray]]:
+def corners_of(views: Sequence[SegmentView], now: Image, search: np.ndarray | None) -> tuple[Corners, list[np.ndarray]]:
     """The corners of a later frame wherever segments can be, and the region (H, W) of each.
 
     They are as dense as on the segments, as far as the bound allows. ``search`` (H, W) says where objects are.
     """
-    regions = [then.region(now) for then in sights]
+    regions = [then.region(now) for then in views]
     if search is not None:
         inside = inner(search)
         regions = [region & inside for region in regions]
     anywhere = np.logical_or.reduce(regions)
-    segment_px = float(np.mean([np.count_nonzero(then.own) for then in sights]))
+    segment_px = float(np.mean([np.count_nonzero(then.own) for then in views]))
     limit = CORNERS * int(np.count_nonzero(anywhere)) / max(segment_px, 1)
     return corners(now, anywhere, int(np.clip(limit, CORNERS, _MOST))), regions
 
 
-def matched(then: Sight, found: Corners, cfg: TrackingConfig, rng: np.random.Generator) -> Matched | None:
+def matched(then: SegmentView, found: Corners, cfg: TrackingConfig, rng: np.random.Generator) -> Matched | None:
     """The segment's pose among the corners ``found`` in a later frame; None where too few of its own agree on one."""
     own = then.corners
     if min(len(own.uv_px), len(found.uv_px)) < _AGREEING:

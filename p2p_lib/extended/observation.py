@@ -26,7 +26,7 @@ _EMPTY_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Sight(Observation):
+class OurObservation(Observation):
     """What one frame shows of one object.
 
     sighting  where an absent object was found by shape and colour; None where it was not
@@ -36,7 +36,7 @@ class Sight(Observation):
 
     sighting: Sighting | None = None
     given: bool = True
-    other: Sight | None = None
+    other: OurObservation | None = None
 
     @cached_property
     def contour_px(self) -> np.ndarray:
@@ -54,7 +54,7 @@ class Sight(Observation):
         return None if self.mask is None else outline_share(self.frame, self.mask)
 
 
-def with_tracks(observer: Observer, obs: Sight, tracks: Tracks) -> Sight:
+def with_tracks(observer: Observer, obs: OurObservation, tracks: Tracks) -> OurObservation:
     """The observation with these tracks of the object's points instead of its own."""
     return replace(obs, tracks=tracks, p_cam=observer.lifted(obs.frame, obs.mask, tracks))
 

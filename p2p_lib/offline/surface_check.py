@@ -27,7 +27,7 @@ _BEHIND, _OTHER_COLOURS, _LESS_ALIKE, _CALIBRATED = 0.15, 1.4, 0.6, 12
 _GAINS = 0.7, 1.4
 
 
-class Found(NamedTuple):
+class FittedPose(NamedTuple):
     """A pose (4, 4) of a frame, its covariance (6, 6), and its cost."""
 
     T_cam_obj: np.ndarray
@@ -50,32 +50,32 @@ def off_surface(volume: TsdfVolume, T_cam_obj: np.ndarray, cloud: np.ndarray) ->
     return np.where(valid, np.minimum(np.abs(distance_m), _FAR_M), _FAR_M) / _FAR_M
 
 
-class Sight:
+class SurfaceCheck:
     """Looks at one object's surface, which has faces, in the frames of a run.
 
-    sure  rows of frames with a certain pose in T (n, 4, 4): they say how its colours usually look
+    rows  of frames with a certain pose in T (n, 4, 4): they say how its colours usually look
     """
 
-    def __init__(self, made: Finished, name: str, config: Config, volume: TsdfVolume, T: np.ndarray, sure: np.ndarray):
+    def __init__(self, made: Finished, name: str, config: Config, volume: TsdfVolume, T: np.ndarray, rows: np.ndarray):
         self._made, self._name, self._config, self._volume = made, name, config, volume
         mesh: Any = volume.mesh()  # its colours are those of vertices
         colours = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float)
         self._colours = colours[mesh.faces].mean(1)
         self._render = Renderer(mesh.vertices, mesh.faces, made.sequence.camera)
-        looks = (self._look(self._frame(k), T[k]) for k in evenly(sure, _CALIBRATED))
+        looks = (self._look(self._frame(k), T[k]) for k in evenly(rows, _CALIBRATED))
         usual = [look.off for look in looks if look]
         self._usual = float(np.median(usual)) if usual else 0.0
 
     def _frame(self, k: int) -> Frame:
         return self._made.sequence.frame(int(self._made.frames[k]))
 
-    def found(self, k: int, candidates: list[np.ndarray], beside: int, T_beside: np.ndarray) -> Found | None:
+    def found(self, k: int, candidates: list[np.ndarray], near: int, T_near: np.ndarray) -> FittedPose | None:
         """The best pose of the k-th frame; None where the surface is not seen from any of these.
 
-        beside  a frame next to it with its pose, in the same light
+        near  a frame next to it with its pose, in the same light
         """
         frame, best = self._frame(k), None
-        known = self._look(self._frame(beside), T_beside)
+        known = self._look(self._frame(near), T_near)
         usual, alike = (max(self._usual, known.off), known.alike) if known else (self._usual, 1.0)
         for T in candidates:
             covariance = None
@@ -91,7 +91,7 @@ class Sight:
                 continue
             cost = float(off_surface(self._volume, T, look.cloud).mean())
             if covariance is not None and (best is None or cost < best.cost):
-                best = Found(T, covariance, cost)
+                best = FittedPose(T, covariance, cost)
         return best
 
     def overlap(self, k: int, T: np.ndarray) -> float:
