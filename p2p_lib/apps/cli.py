@@ -9,7 +9,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -126,6 +126,7 @@ def _run(a: argparse.Namespace) -> int:
     ),
     arg("--to", metavar="URL", help="send the lines to tcp://HOST:PORT or udp://HOST:PORT, not to standard output"),
     arg("--listen", action="store_true", help="lines of JSON on standard input add, correct and remove objects"),
+    arg("--click", action="store_true", help="a page on the newest image adds, corrects and removes objects"),
     arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
     _FORCE,
     _OVERLAY,
@@ -133,6 +134,7 @@ def _run(a: argparse.Namespace) -> int:
 )
 def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
+    from p2p_lib.apps.live_click import LiveClicker
     from p2p_lib.apps.live_words import Outlet, Words
     from p2p_lib.datasets.cameras import open_camera
     from p2p_lib.datasets.prompts import load_prompts
@@ -149,12 +151,18 @@ def _live(a: argparse.Namespace) -> None:
     prompts = load_prompts(a.prompts) if a.prompts else ()
     camera = open_camera(a.camera, a.rate)
     try:
-        if not (prompts or options.memory or a.listen):
+        if not (prompts or options.memory or a.listen or a.click):
             prompts, first = click_first(camera, warn, not a.no_browser)
         line = text_line if a.out is not None and sys.stdout.isatty() else json_line
-        with Outlet(a.to, warn) if a.to else nullcontext() as outlet:
-            send = outlet.send if outlet else partial(print, flush=True)
-            keep["words"] = Words(sys.stdin, lambda error: warn(f"p2p live: {error}")) if a.listen else None
+        with ExitStack() as opened:
+            send = opened.enter_context(Outlet(a.to, warn)).send if a.to else partial(print, flush=True)
+            if a.listen or a.click:
+                said = Words(sys.stdin if a.listen else None, lambda error: warn(f"p2p live: {error}"))
+                keep["words"] = said
+            if a.click:
+                page = keep["page"] = opened.enter_context(LiveClicker(camera, said))
+                warn(f"Click in your browser at {page.url}")
+                _ = a.no_browser or open_page(page.url)
             track_live(camera, prompts, lambda estimate: send(line(estimate)), options, first=first, **keep)
     except KeyboardInterrupt:
         pass  # how one stops a camera

@@ -25,6 +25,7 @@ import numpy as np
 
 from p2p_lib.apps.command_line import open_page
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, make_segmenter
+from p2p_lib.core.colours import OBJECTS
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.files import parse_json
@@ -94,11 +95,16 @@ class Clicker(AbstractContextManager):
             "height": self.sequence.camera.height,
             "names": list(self.run.objects if self.run else self.sequence.objects),
             "run": self.run is not None,
+            "colours": OBJECTS,
             "objects": [_plain(prompt) for prompt in self.prompts],
         }
 
     def _image_png(self, i: int) -> bytes:
         return cv2.imencode(".png", cv2.cvtColor(self.sequence.frame(i).rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+    def kept_masks(self, i: int) -> dict[str, np.ndarray]:
+        """The masks (H, W) bool of a frame that are known without clicks: the run's."""
+        return self.run.masks(self.sequence, i) if self.run else {}
 
     def masks(self, content: object) -> dict[str, Any]:
         """What the prompts of a frame, as the page sends them, make of it, and what is doubtful about them.
@@ -109,7 +115,7 @@ class Clicker(AbstractContextManager):
         frame, prompts = given.get("frame"), parse_prompts(given) if given.get("objects") else ()
         if not isinstance(frame, int) or not 0 <= frame < len(self.sequence):
             raise BadInput("frame", repr(frame), f"a number from 0 to {len(self.sequence) - 1}")
-        found = self.run.masks(self.sequence, frame) if self.run else {}
+        found = self.kept_masks(frame)
         with self._segmenting, warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", Doubt)
             made = clicked_masks(self.sequence, [prompt for prompt in prompts if prompt.starts])
@@ -117,16 +123,21 @@ class Clicker(AbstractContextManager):
         texts = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
         return {"masks": {name: run_lengths(mask)["counts"] for name, mask in found.items()}, "doubts": texts}
 
+    def checked(self, content: object, started: Iterable[str] = ()) -> tuple[Prompt, ...]:
+        """The prompts that the page sends; objects that are ``started`` may be corrected alone."""
+        prompts = parse_prompts(content)
+        by_frame = prompts_by_frame(prompts, range(len(self.sequence)), self.sequence.camera, started)
+        for i, of_frame in by_frame.items():
+            for prompt in of_frame:
+                check_depth(prompt, self.sequence.frame(i))
+        return prompts
+
     def save(self, content: object) -> None:
         """Check prompts as the page sends them, and write the file; :class:`BadInput` says what does not fit.
 
         ``finish`` beside the objects ends the waiting for the page, which otherwise goes on.
         """
-        prompts = parse_prompts(content)
-        by_frame = prompts_by_frame(prompts, range(len(self.sequence)), self.sequence.camera)
-        for i, of_frame in by_frame.items():
-            for prompt in of_frame:
-                check_depth(prompt, self.sequence.frame(i))
+        prompts = self.checked(content)
         save_prompts(self.path, prompts)
         self.prompts = prompts
         if isinstance(content, dict) and content.get("finish"):

@@ -17,6 +17,7 @@ from time import monotonic
 import numpy as np
 
 from p2p_lib.apps.click import Clicker, wait_for_clicks
+from p2p_lib.apps.live_click import LiveClicker
 from p2p_lib.apps.live_words import Words
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.compiled import warm_up
@@ -75,6 +76,7 @@ def track_live(
     backlog: int = DEFAULT_BACKLOG,
     say: Callable[[str], object] = lambda line: None,
     words: Words | None = None,
+    page: LiveClicker | None = None,
 ) -> LiveCount:
     """Follow the objects of the prompts until the camera ends; every estimate goes to ``on_estimate`` at once.
 
@@ -89,6 +91,7 @@ def track_live(
     backlog  how many images may wait while one takes long, before the oldest is dropped; with 0 the newest one wins
     say      told what it waits for before the first image
     words    says of objects what comes in meanwhile; there need be no prompts then
+    page     shows every frame that was tracked
 
     Closes the camera at the end, whatever ends it. Raises :class:`BadInput` for clicks that do not fit.
     """
@@ -113,6 +116,8 @@ def track_live(
     every_prompt = list(prompts)
     with ExitStack() as kept:
         listeners: list[Listener] = [_each(on_estimate)]
+        if page is not None:
+            listeners.append(lambda frame, estimates: page.see(frame, method.masks))
         if overlay is not None:
             listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
         if out is not None:

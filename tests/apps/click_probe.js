@@ -63,6 +63,8 @@ const steps = {
   remove: (k) => own(k, 4),
   undo: () => elements.undo.onclick(),
   save: () => elements.save.onclick(),
+  add: (name) => { document.getElementById("name").value = name; elements.add.onsubmit({ preventDefault() {} }); },
+  wait: () => new Promise((done) => setTimeout(done, 200)), // until a live page has asked for the newest image
 };
 (async () => {
   (0, eval)(script.replace('"use strict";', ""));
@@ -71,8 +73,9 @@ const steps = {
     await steps[name](...how);
     await new Promise((done) => setTimeout(done, 5));
   }
-  await elements.finish.onclick();
+  if (!given.session.live) await elements.finish.onclick();
   const rows = elements.objects.children.map((row) => row.children[1].textContent);
-  console.log(JSON.stringify({ sent, rows, message: elements.message.textContent,
-    doubts: elements.doubts.textContent, asked, tinted: drawn.filter(([what]) => what === "rect").map(([, ...box]) => box) }));
+  const seen = JSON.stringify({ sent, rows, message: elements.message.textContent,
+    doubts: elements.doubts.textContent, asked, tinted: drawn.filter(([what]) => what === "rect").map(([, ...box]) => box) });
+  process.stdout.write(`${seen}\n`, () => process.exit(0)); // a live page never ends by itself
 })();

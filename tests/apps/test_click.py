@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.apps.click import PAGE, Clicker, first_change
+from p2p_lib.core.colours import OBJECTS
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets.prompts import load_prompts, parse_prompts, run_lengths, save_prompts
@@ -81,6 +82,7 @@ def test_a_whole_visit(sequence, out):
         assert (status, kind) == (200, "application/json")
         assert (session["frames"], session["width"], session["height"], session["first"]) == (3, W, H, 1)
         assert session["names"] == ["object"] and session["objects"] == []
+        assert session["colours"] == list(OBJECTS), "as everywhere else"
         for k in range(3):
             status, png, kind = get(f"{clicker.url}frame/{k}")
             shown = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)

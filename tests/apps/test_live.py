@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import av
@@ -19,6 +20,7 @@ import pytest
 
 from p2p_lib.apps import cli
 from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
+from p2p_lib.apps.live_click import LiveClicker
 from p2p_lib.apps.live_words import Outlet, Words
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
@@ -38,6 +40,7 @@ from p2p_lib.figures.film import write_film
 from p2p_lib.run import run
 from p2p_lib.trackers.lk import LkTracker
 from tests.apps.test_cli import POINTS_ALONE
+from tests.apps.test_click import visit
 from tests.fixtures.sliding_board import H, K, W, write_sequence
 
 FRAMES = 20  # then the board jumps back
@@ -440,8 +443,37 @@ class Lines:
         return iter(self.typed.get, None)
 
 
-def test_objects_are_added_corrected_and_removed_while_it_runs(scripted, folder, tmp_path):
-    sequence, lines, got, errors = open_sequence(folder), Lines(), [], []
+def followed_in_step(folder: Path, before, **how) -> list[PoseEstimate]:
+    """The estimates of a live run that is given each frame when the one before was tracked, after ``before(index)``."""
+    sequence, got = open_sequence(folder), []
+    step = Point2Pose.step
+
+    class InStep(Scripted):
+        def read(self):
+            k = self.next
+            self.next += 1
+            while k > 0 and self.done.get(timeout=20) != k - 1:
+                pass
+            before(k)
+            return sequence.frame(k) if k < 14 else None
+
+    camera = InStep(sequence.camera)
+    camera.next, camera.done = 0, queue.Queue()
+
+    def stepped(self, frame, masks=None):
+        estimates = step(self, frame, masks)
+        camera.done.put(frame.index)
+        return estimates
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Point2Pose, "step", stepped)
+        patch.setattr("p2p_lib.apps.live._warm_up", lambda method: None)
+        track_live(camera, (), got.append, RunOptions(settings=SETTINGS), backlog=20, **how)
+    return got
+
+
+def test_objects_are_added_corrected_and_removed_while_it_runs(folder, tmp_path):
+    lines, errors = Lines(), []
     words = Words(lines, errors.append)
     #: Before which frame what is typed.
     script = {
@@ -458,34 +490,74 @@ def test_objects_are_added_corrected_and_removed_while_it_runs(scripted, folder,
                 time.sleep(0.001)
             time.sleep(0.02)
 
-    class Told(Scripted):
-        def read(self):
-            k = self.next
-            self.next += 1
-            while k > 0 and self.done.get(timeout=20) != k - 1:
-                pass
-            type_for(k)
-            return sequence.frame(k) if k < 14 else None
-
-    camera = Told(sequence.camera)
-    camera.next, camera.done = 0, queue.Queue()
-    step = Point2Pose.step
-
-    def stepped(self, frame, masks=None):
-        estimates = step(self, frame, masks)
-        camera.done.put(frame.index)
-        return estimates
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Point2Pose, "step", stepped)
-        patch.setattr("p2p_lib.apps.live._warm_up", lambda method: None)
-        options = RunOptions(settings=SETTINGS)
-        track_live(camera, (), got.append, options, words=words, out=tmp_path / "run", backlog=20)
+    got = followed_in_step(folder, type_for, words=words, out=tmp_path / "run")
     seen = {name: [e.frame_index for e in got if e.object == name] for name in ("board", "again")}
     assert seen == {"board": list(range(2, 8)), "again": list(range(10, 14))} and not errors
     assert all(e.T_cam_obj is not None for e in got)
     info = load_run(tmp_path / "run").info
     assert [(p["name"], p["frame"]) for p in info["prompts"]] == [("board", 2), ("board", 5), ("again", 10)]
+
+
+def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
+    """The page shows the frame that was tracked last; what is sent from there is of the next one."""
+    sequence, errors = open_sequence(folder), []
+    words = Words(None, errors.append)
+    answers = {}
+
+    def ask(where, content=None):
+        data = None if content is None else json.dumps(content).encode()
+        try:
+            with urlopen(Request(page.url + where, data, {"Content-Type": "application/json"}), timeout=20) as answer:
+                return answer.status, answer.read()
+        except HTTPError as error:
+            return error.code, error.read()
+
+    def clicked(name, frame, **what):
+        return {"objects": [{"name": name, "frame": frame, **what}], "finish": False}
+
+    def click_for(k):
+        session = json.loads(ask("session")[1])
+        if k == 0:
+            assert ask("frame/0")[0] == 500 and session["first"] == 0, "there is none yet"
+            return
+        assert (session["first"], session["live"]) == (k - 1, True)
+        answers[k] = session["names"]
+        if k in (2, 3):
+            image = cv2.imdecode(np.frombuffer(ask(f"frame/{k - 1}")[1], np.uint8), cv2.IMREAD_COLOR)
+            np.testing.assert_array_equal(image[..., ::-1], sequence.frame(k - 1).rgb)
+        if k == 2:
+            start = clicked("board", 1, points=[[64, 52]])
+            assert "board" in json.loads(ask("masks", start | {"frame": 1})[1])["masks"], "shown before it is sent"
+            status, why = ask("prompts", clicked("board", 1, points=[[W, 5]]))
+            assert status == 400 and b"expected pixels within" in why
+            assert ask("prompts", clicked("board", 1, negative=[[64, 52]]))[0] == 400, "nothing is there to correct"
+            assert ask("prompts", start)[0] == 200
+        if k == 5:
+            (counts,) = json.loads(ask("masks", {"objects": [], "frame": 4})[1])["masks"].values()
+            assert sum(counts[1::2]) > 500, "what is tracked is shown"
+            assert ask("prompts", clicked("board", 4, negative=[[5, 5]]))[0] == 200
+        if k == 8:
+            assert ask("prompts", {"remove": "board"})[0] == 200
+
+    with LiveClicker(Scripted(sequence.camera), words) as page:
+        got = followed_in_step(folder, click_for, words=words, page=page, out=tmp_path / "run")
+    assert [e.frame_index for e in got] == list(range(2, 8)) and not errors
+    assert answers == {k: ["board"] if 3 <= k <= 8 else [] for k in range(1, 15)}
+    prompts = load_run(tmp_path / "run").info["prompts"]
+    assert [(p["frame"], p.get("negative")) for p in prompts] == [(2, None), (5, [[5, 5]])]
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
+def test_the_live_page_sends_clicks_and_forgets_them(scripted):
+    page = LiveClicker(scripted, Words(None, print))
+    with page:
+        page.see(picture(7), {"board": np.eye(H, W, dtype=bool)})
+        session = page.session()
+    seen = visit(session, ["add", "cup"], ["press", 50, 20], ["wait"], ["save"])
+    assert seen["sent"] == {"objects": [{"name": "cup", "frame": 7, "points": [[50, 20]]}], "finish": False}
+    assert (seen["message"], seen["rows"]) == ("Sent.", ["board", "cup: frame 7"]), "it stood meanwhile"
+    seen = visit(session, ["add", "cup"], ["press", 50, 20], ["save"], ["wait"], ["wait"], ["remove", 0])
+    assert (seen["sent"], seen["rows"]) == ({"remove": "board"}, ["board"]), "what is tracked"
 
 
 def test_words_that_do_not_fit_are_said_and_change_nothing():
@@ -603,6 +675,9 @@ def test_a_camera_of_somebody_elses_is_closed_once_and_what_it_gives_is_checked(
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     assert cli.main(["live", "--camera", "odd_cameras:Ends", "--listen", *WORDS]) == 0
     assert sys.modules["odd_cameras"].closed == ["ends"]
+    capsys.readouterr()
+    assert cli.main(["live", "--camera", "odd_cameras:Ends", "--click", "--no-browser", *WORDS]) == 0
+    assert re.search(r"Click in your browser at http://127\.0\.0\.1:\d+/", capsys.readouterr().err)
     for name, said in (
         ("Pair", "camera odd_cameras:Pair: read(): got tuple, expected a p2p_lib.Frame, or None at the end"),
         ("Breaks", "camera odd_cameras:Breaks: Breaks.read raised OSError: unplugged ("),

@@ -1,0 +1,60 @@
+"""The click page on a camera's newest image: ``p2p live --click``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from p2p_lib.apps.click import Clicker
+from p2p_lib.apps.live_words import Words
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.cameras import LiveCamera, Stream
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown(Stream):
+    """The image that the page shows, under the number that the camera gave it."""
+
+    def __len__(self) -> int:
+        return 1 if self.kept is None else self.kept.index + 1
+
+
+class LiveClicker(Clicker):
+    """A page that shows what was tracked last; what is sent there is heard as a line of JSON would be.
+
+    words  says it to the tracker, for its next frame
+    """
+
+    def __init__(self, camera: LiveCamera, words: Words, port: int = 0):
+        self._words = words
+        self._newest: tuple[Frame | None, dict[str, np.ndarray]] = (None, {})
+        self._masks: dict[str, np.ndarray] = {}
+        self._names: tuple[str, ...] = ()
+        super().__init__(_Shown(camera.name, camera.camera), "", port=port)
+
+    def see(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> None:
+        """What is shown next: a frame with the masks (H, W) bool of all objects, None where unknown."""
+        self._names = tuple(masks)
+        self._newest = frame, {name: mask for name, mask in masks.items() if mask is not None}
+
+    def session(self) -> dict[str, Any]:
+        """The newest image is the one shown from now on: the page does not ask while somebody clicks on it."""
+        frame, self._masks = self._newest
+        self.sequence = replace(self.sequence, kept=frame)  # type: ignore[type-var]  # it is a _Shown
+        newest = {"first": len(self.sequence) - 1, "names": list(self._names), "run": True, "live": True}
+        return super().session() | newest
+
+    def kept_masks(self, i: int) -> dict[str, np.ndarray]:
+        """Those of the image that is shown."""
+        return dict(self._masks)
+
+    def save(self, content: object) -> None:
+        """Check prompts as the page sends them, or take ``{"remove": name}``, and have the tracker told."""
+        if isinstance(content, dict) and content.keys() != {"remove"}:
+            self.checked(content, self._names)
+            content = {"objects": content["objects"]}
+        self._words.hear(json.dumps(content))
