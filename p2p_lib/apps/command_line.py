@@ -13,7 +13,7 @@ import traceback
 import warnings
 import webbrowser
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,9 +21,19 @@ from shlex import quote
 from typing import Any
 
 from p2p_lib import __version__
-from p2p_lib.core.errors import Doubt, P2PError, did_you_mean
+from p2p_lib.core.backends import DETECTORS, SEGMENTERS, TRACKERS
+from p2p_lib.core.errors import Doubt, P2PError, did_you_mean, in_a_line
 from p2p_lib.core.options import RunOptions, add_options
+from p2p_lib.core.plugins import is_place, offered
 
+#: Options that name parts: their kind, and the names that are ours.
+_PARTS = {
+    "tracker": ("tracker", TRACKERS),
+    "detector": ("detector", DETECTORS),
+    "masks": ("segmenter", SEGMENTERS),
+    "camera": ("camera", ()),
+    "format": ("dataset", ()),
+}
 EXIT_INTERRUPTED = 128  # and the signal's number: 130 for Ctrl-C, 143 for SIGTERM
 
 Argument = Callable[[argparse.ArgumentParser], Any]
@@ -83,11 +93,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (P2PError, OSError) as error:  # OSError: a full disk, a folder that may not be written
+    except Exception as error:
+        said = _said_of(error, arguments)
+        if said is None:  # a mistake of ours
+            raise
         if arguments.debug:
             traceback.print_exc()
         else:
-            warn(f"p2p {arguments.name}: {error}")
+            warn(f"p2p {arguments.name}: {said}")
         return P2PError.exit_code
     except KeyboardInterrupt:
         warn(f"p2p {arguments.name}: interrupted")
@@ -98,6 +111,35 @@ def main(argv: Sequence[str] | None = None) -> int:
                 warn(f"p2p {arguments.name}: {count - 1} more like: {doubt}")
         if in_main:
             signal.signal(signal.SIGTERM, before)
+
+
+def _said_of(error: Exception, arguments: argparse.Namespace) -> str | None:
+    """What went wrong that a user can mend, in a line; None where that is nothing of theirs."""
+    if isinstance(error, P2PError):
+        return str(error)
+    ran = [(f.f_globals.get("__name__"), f.f_code, line) for f, line in traceback.walk_tb(error.__traceback__)]
+    entered = {code.co_qualname.partition(".")[0] for _, code, _ in ran}
+    for option, place in sorted(_others_parts(arguments), key=lambda part: part[1].partition(":")[2] not in entered):
+        package, name = re.split("[.:]", place)[0], place.partition(":")[2]
+        theirs = [(code, line) for module, code, line in ran if str(module).partition(".")[0] == package]
+        called = theirs[0][0].co_qualname if theirs else name
+        # Called with what it does not take, it is not entered at all.
+        if theirs or (isinstance(error, TypeError) and str(error).startswith(f"{name}.")):
+            where = f" ({theirs[-1][0].co_filename}:{theirs[-1][1]})" if theirs else ""
+            said = f"{type(error).__name__}: {in_a_line(error)}"
+            return f"{option} {place}: {called} raised {said}{where}. --debug shows the traceback."
+    return str(error) if isinstance(error, OSError) else None  # a full disk, a folder that may not be written
+
+
+def _others_parts(arguments: argparse.Namespace) -> Iterator[tuple[str, str]]:
+    """The options that name a part of somebody else's, each with its ``package.module:Class``."""
+    for option, (kind, ours) in _PARTS.items():
+        name = getattr(arguments, option, None)
+        if isinstance(name, str) and name not in ours:
+            if is_place(name):
+                yield option, name
+            elif (point := offered(kind).get(name)) is not None:
+                yield option, point.value
 
 
 def parser() -> argparse.ArgumentParser:

@@ -106,8 +106,8 @@ def merge_keyframes(keyframes: dict[int, Keyframe], most: int) -> None:
         R = np.array([keyframes[key].T_obj_cam[:3, :3] for key in keys])
         # tr(R_kept^T R_gone) grows as the angle between the two falls.
         similarity = np.einsum("kij,gij->kg", R, R[1:-1])
-        gone = np.arange(similarity.shape[1])
-        similarity[gone + 1, gone] = -np.inf
+        own = np.arange(similarity.shape[1])
+        similarity[own + 1, own] = -np.inf
         kept, gone = np.unravel_index(np.argmax(similarity), similarity.shape)
         _merge(keyframes[keys[kept]], keyframes[keys[gone + 1]])
         remove(keyframes, keys[gone + 1])

@@ -8,7 +8,7 @@ which counts less.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -72,7 +72,8 @@ class SurfaceSample(Rows):
     def of(cls, mesh: trimesh.Trimesh) -> SurfaceSample:
         """A random sample of a mesh's vertices, always the same."""
         at = np.sort(np.random.default_rng(0).permutation(len(mesh.vertices))[:_POINTS])
-        rgb = np.asarray(mesh.visual.vertex_colors)[at, :3] if len(at) else np.zeros((0, 3), np.uint8)
+        visual: Any = mesh.visual  # Trimesh's types know of textures besides
+        rgb = np.asarray(visual.vertex_colors)[at, :3] if len(at) else np.zeros((0, 3), np.uint8)
         lab = cv2.cvtColor(np.ascontiguousarray(rgb)[None], cv2.COLOR_RGB2LAB)[0] if len(at) else rgb
         return cls(np.asarray(mesh.vertices)[at], np.asarray(mesh.vertex_normals)[at], lab.astype(np.float32))
 
@@ -126,7 +127,7 @@ class ImageSearch:
         """
         known = np.zeros((256 // _BIN,) * 2, np.uint8)
         known[tuple((sample.lab[:, 1:] // _BIN).astype(int).T)] = 1
-        known = cv2.dilate(known, np.ones((3, 3), np.uint8))
+        known = cv2.dilate(known, np.ones((3, 3), np.uint8)).astype(np.uint8)
         top, left = rng.integers(0, _LATTICE_PX, 2)
         every = np.s_[top::_LATTICE_PX, left::_LATTICE_PX]
         a, b = np.moveaxis(self._lab[every][..., 1:] // _BIN, -1, 0).astype(int)
@@ -149,7 +150,8 @@ class ImageSearch:
         """The best distinct ones of many poses (H, 4, 4), aligned and polished."""
         if len(sample) < _FEWEST or not len(poses):
             return []
-        share, best = self._roughly(poses, sample), []
+        share = self._roughly(poses, sample)
+        best: list[int] = []
         for k in np.argsort(-share)[:_RANKED]:
             apart_m = np.linalg.norm(poses[best, :3, 3] - poses[k, :3, 3], axis=1)
             turned = se3.angle_rad(se3.inverse(poses[best]) @ poses[k])

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -91,17 +91,18 @@ class Lifecycle(Life):
 
     def scene_prior(self, T_world_cam: np.ndarray | None) -> dict[str, np.ndarray]:
         """T_cam_obj of a sought object if it has lain still, by name; empty where unknown."""
-        known = T_world_cam is not None and self.T_world_obj is not None
-        if not known or (self.has_pose and not self.sought):
+        if T_world_cam is None or self.T_world_obj is None or (self.has_pose and not self.sought):
             return {}
         return {"scene": se3.orthonormalised(se3.inverse(T_world_cam) @ self.T_world_obj)}
 
     def in_frame(self, T_old_new: np.ndarray) -> Lifecycle:
         """The same in a new object frame, which T_old_new (4, 4) maps to the present one."""
-        poses = {name: getattr(self, name) for name in ("T_cam_obj", "T_previous", "T_left", "T_world_obj")}
+        poses: dict[str, np.ndarray | None] = {
+            name: getattr(self, name) for name in ("T_cam_obj", "T_previous", "T_left", "T_world_obj")
+        }
         motion = self.motion and self.motion.in_frame(T_old_new)
         contour = None if self.contour is None else se3.transform(se3.inverse(T_old_new), self.contour)
-        moved = {n: None if T is None else T @ T_old_new for n, T in poses.items()}
+        moved: dict[str, Any] = {n: None if T is None else T @ T_old_new for n, T in poses.items()}
         return replace(self, motion=motion, contour=contour, **moved)
 
     def placed(self, T_world_cam: np.ndarray | None) -> Lifecycle:
@@ -109,7 +110,9 @@ class Lifecycle(Life):
 
         A degraded pose, as of a sliver at the image's border, does not replace a known place.
         """
-        if T_world_cam is None or self.confirming or (self.status is Status.DEGRADED and self.T_world_obj is not None):
+        if T_world_cam is None or self.T_cam_obj is None or self.confirming:
+            return self
+        if self.status is Status.DEGRADED and self.T_world_obj is not None:
             return self
         T_world_obj = T_world_cam @ self.T_cam_obj
         again = self.T_world_obj is not None and same_place(self.T_world_obj, T_world_obj)
@@ -122,16 +125,16 @@ class Lifecycle(Life):
 
     def moved(self, confidence: float) -> Lifecycle:
         """The state with its motion updated by the newest pose, if that is confident."""
-        if confidence <= _CONFIDENT:
+        if confidence <= _CONFIDENT or self.T_cam_obj is None:
             return self
-        known = self.motion is not None and self.motion.time_s < self.seen_s
-        go_on = self.motion.followed_by if known else Motion
+        before = self.motion
+        go_on = before.followed_by if before is not None and before.time_s < self.seen_s else Motion
         return replace(self, motion=go_on(self.T_cam_obj, self.seen_s))
 
     def corrected(self, T_cam_obj: np.ndarray) -> Lifecycle:
         """With the newest pose replaced by the graph's, from which the next frame starts."""
         lies = self.T_world_obj
-        lies = None if lies is None else lies @ se3.inverse(self.T_cam_obj) @ T_cam_obj
+        lies = None if lies is None or self.T_cam_obj is None else lies @ se3.inverse(self.T_cam_obj) @ T_cam_obj
         return replace(self, T_cam_obj=T_cam_obj, T_world_obj=lies)
 
     def with_verdict(
@@ -161,7 +164,7 @@ class Lifecycle(Life):
 
         A return that was not confirmed is taken back.
         """
-        taken_back = {"T_cam_obj": self.T_left, "confirming": 0} if self.confirming else {}
+        taken_back: dict[str, Any] = {"T_cam_obj": self.T_left, "confirming": 0} if self.confirming else {}
         lost = status is Status.LOST
         in_sight = lost and (self.in_sight or carried)
         lost_frames = self.lost_frames + lost

@@ -328,11 +328,11 @@ class OurPolicy(Policy):
         return self._outlined(life, obs, T_cam_obj) if "contour" in self.on else life
 
     def followed(
-        self, obs: OurObservation, known: Known, best: Proposal, admission: BelievedAdmission, confidence: float
+        self, obs: OurObservation, known: Known, best: Proposal, admitted: BelievedAdmission, confidence: float
     ) -> Lifecycle:
         """A frame that is learnt from updates its place in the scene and its motion, too."""
-        life = admission.life
-        if not admission.learns:
+        life = admitted.life
+        if not admitted.learns:
             return life
         certain = best.hypothesis.support >= self.config.lifecycle.return_inliers
         if (certain or life.contour is None) and self._flat(best.refined):

@@ -43,7 +43,7 @@ def memory_of(name: str, known: Known, made_of: dict[str, Any], before: ObjectMe
     p_obj, descriptors, confidence, keypoint = (np.concatenate(of) for of in zip(*columns, strict=True))
     rng = np.random.default_rng(0)
     kept = np.sort(np.argsort(~keypoint + rng.random(len(p_obj)))[:_LANDMARKS])  # keypoints first
-    landmarks = [column[kept] for column in (p_obj, descriptors, confidence, keypoint)]
+    landmarks = p_obj[kept], descriptors[kept], confidence[kept], keypoint[kept]
     rest = known.model.views.T_cam_obj, known.model.covariance, np.array(getattr(known.life, "seen_m2", 0.0))
     return ObjectMemory(name, *landmarks, *rest, _surface_memory(surface), made_of)
 

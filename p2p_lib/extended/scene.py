@@ -51,7 +51,7 @@ class Scene:
     def __init__(self, camera: Camera, config: DepthConfig, rng: np.random.Generator):
         self._camera, self._config, self._rng = camera, config, rng
         # As many matches as with the default pyramid, in half the time.
-        self._orb = cv2.ORB_create(_CORNERS, scaleFactor=1.4, nlevels=4)
+        self._orb = cv2.ORB.create(_CORNERS, scaleFactor=1.4, nlevels=4)
         self._views: list[_View] = []
         self._T_world_cam = np.eye(4)
         self._turn = 0  # of the views that are tried while the camera is lost
@@ -82,7 +82,7 @@ class Scene:
             grown = cv2.dilate(occupied.astype(np.uint8), np.ones((2 * _ROOM_PX + 1,) * 2, np.uint8))
             free = 255 * (1 - grown)
         found, descriptors = self._orb.detectAndCompute(gray, free)
-        uv_px = cv2.KeyPoint_convert(found) if found else np.zeros((0, 2), np.float32)
+        uv_px = np.asarray(cv2.KeyPoint.convert(found)) if found else np.zeros((0, 2), np.float32)
         u, v = nearest_px(uv_px, gray.shape)
         z = frame.depth_m[v, u].astype(float)
         measured = (z > self._config.min_m) & (z < _MAX_M)
@@ -144,7 +144,7 @@ def two_nearest(descriptors, others):
                 x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
                 x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
                 x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-                bits += np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+                bits += np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))  # type: ignore[assignment]  # compiled
             if bits < distance[m]:
                 nearest[m], distance[m], second[m] = n, bits, distance[m]
             elif bits < second[m]:

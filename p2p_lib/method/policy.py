@@ -183,11 +183,9 @@ class Policy:
         """The life of a map after its first frame."""
         return replace(self.life, status=verdict.status, T_cam_obj=T_cam_obj, seen_s=obs.frame.time_s)
 
-    def followed(
-        self, obs: Observation, known: Known, best: Candidate, admission: Admission, confidence: float
-    ) -> Life:
+    def followed(self, obs: Observation, known: Known, best: Candidate, admitted: Admission, confidence: float) -> Life:
         """The life after a frame with a pose that is reported with this confidence."""
-        return known.life.with_pose(best.T_cam_obj, obs.frame.time_s, admission.verdict.status)
+        return known.life.with_pose(best.T_cam_obj, obs.frame.time_s, admitted.verdict.status)
 
     def missed(self, obs: Observation, known: Known, verdict: Verdict) -> Life:
         """The life after a frame without a pose."""

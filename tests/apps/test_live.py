@@ -592,6 +592,8 @@ def test_a_camera_of_somebody_elses_is_closed_once_and_what_it_gives_is_checked(
         "    def close(self): closed.append(self.name)\n"
         "class Pair(Ends):\n"
         "    def read(self): return ('rgb', 'depth')\n"
+        "class Breaks(Ends):\n"
+        "    def read(self): raise OSError('unplugged')\n"
         "class Nameless(Ends):\n"
         "    name = None\n"
         "class Matrix(Ends):\n"
@@ -603,6 +605,7 @@ def test_a_camera_of_somebody_elses_is_closed_once_and_what_it_gives_is_checked(
     assert sys.modules["odd_cameras"].closed == ["ends"]
     for name, said in (
         ("Pair", "camera odd_cameras:Pair: read(): got tuple, expected a p2p_lib.Frame, or None at the end"),
+        ("Breaks", "camera odd_cameras:Breaks: Breaks.read raised OSError: unplugged ("),
         ("Nameless", "camera odd_cameras:Nameless: name: got None"),
         ("Matrix", "camera odd_cameras:Matrix: camera: got list, expected a p2p_lib.Camera"),
     ):

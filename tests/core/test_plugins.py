@@ -1,5 +1,6 @@
 """Parts of other people: by their place or by the name that an installed package offers; what is wrong is one line."""
 
+import re
 import shutil
 import sys
 
@@ -43,6 +44,32 @@ def load(folder, masks):
 load.patterns = ("gt_mask.marked/",)
 
 def nothing(folder, masks): ...
+
+def fail():
+    raise ValueError("no luck\\ntoday")
+
+class Unlucky(LkTracker):
+    name = "unlucky"
+    def track(self, frame, search=None, urgent=False):
+        return fail()
+
+class Narrow(LkTracker):
+    name = "narrow"
+    def track(self, frame):
+        return super().track(frame)
+
+class Blind(UniformDetector):
+    name = "blind"
+    def detect(self, frame, mask):
+        return open("/nowhere/weights")
+
+class Torn(BuiltinSegmenter):
+    name = "torn"
+    def segment(self, *said):
+        return {}["labels"]
+
+def unread(folder, masks):
+    return fail()
 """
 OFFERED = """
 [p2p_lib.trackers]
@@ -125,6 +152,44 @@ def test_what_cannot_be_had_is_said_in_one_line(theirs, sequence):
         open_sequence("nowhere", format="marks")
     with pytest.raises(BadInput, match=r"their_parts:nothing: .* gives: got NoneType, expected an ImageSequence"):
         open_sequence(sequence, format="their_parts:nothing")
+
+
+@pytest.mark.parametrize(
+    ("option", "part", "said"),
+    [
+        ("tracker", "Unlucky", r"Unlucky.track raised ValueError: no luck today \(\S+their_parts.py:(\d+)\)"),
+        (
+            "tracker",
+            "Narrow",
+            r"Narrow raised TypeError: Narrow.track\(\) takes 2 positional arguments but 4 were given",
+        ),
+        ("detector", "Blind", r"Blind.detect raised FileNotFoundError: .*weights' \(\S+their_parts.py:(\d+)\)"),
+        ("masks", "Torn", r"Torn.segment raised KeyError: 'labels' \(\S+their_parts.py:(\d+)\)"),
+        ("format", "unread", r"unread raised ValueError: no luck today \(\S+their_parts.py:(\d+)\)"),
+    ],
+)
+def test_what_a_part_raises_is_said_with_its_place(theirs, sequence, tmp_path, capsys, option, part, said):
+    (tmp_path / "prompts.json").write_text('{"objects": [{"name": "object", "frame": 0, "points": [[60, 50]]}]}')
+    words = ["run", str(sequence), f"--{option}=their_parts:{part}", "--prompts", str(tmp_path / "prompts.json")]
+    words += ["--out", str(tmp_path / "run"), *POINTS_ALONE]
+    words += ["--tracker=their_parts:Mine"] if option != "tracker" else []
+    assert cli.main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    found = re.fullmatch(rf"p2p run: {option} their_parts:{part}: {said}. --debug shows the traceback.", line)
+    assert found, line
+    if found.groups():
+        source = CODE.replace("\\\\", "\\").splitlines()[int(found[1]) - 1]
+        assert "raise ValueError" in source or "nowhere" in source or "labels" in source
+    assert cli.main([*words, "--debug", "--force"]) == 2 and "Traceback" in capsys.readouterr().err
+
+
+def test_a_mistake_of_ours_is_none_of_theirs(theirs, sequence, tmp_path, monkeypatch):
+    def broken(*of, **more):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("p2p_lib.run.run", broken)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["run", str(sequence), "--tracker=their_parts:Mine", "--out", str(tmp_path / "run")])
 
 
 def test_a_folder_of_masks_is_no_segmenter(theirs):

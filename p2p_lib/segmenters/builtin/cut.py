@@ -5,6 +5,8 @@ Log-odds of different evidence add up; they are positive for the object.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -38,6 +40,8 @@ _STANDS_OUT = 2.0
 _PLANE_SLACK_M = 0.003
 #: Least side of an image whose optical flow is taken, px.
 _SMALLEST_FLOW = 32
+#: What OpenCV's type stubs do not know to be optional.
+_NOTHING: Any = None
 
 
 def max_plane_height_m(sigma_m: np.ndarray | float) -> np.ndarray | float:
@@ -139,8 +143,8 @@ def warped(was: np.ndarray, before: Patch, patch: Patch) -> tuple[np.ndarray, np
     """The mask ``was`` (h, w) in [0, 1] and the depth of the patch before, warped to this one by optical flow."""
     v, u = np.mgrid[: patch.shape[0], : patch.shape[1]]
     at = _flow(patch.gray, before.gray) + np.stack([u, v], -1).astype(np.float32)
-    mask = cv2.remap(was.astype(np.float32), at, None, cv2.INTER_LINEAR, borderValue=0)
-    return mask, cv2.remap(before.depth_m, at, None, cv2.INTER_NEAREST, borderValue=0)
+    mask = cv2.remap(was.astype(np.float32), at, _NOTHING, cv2.INTER_LINEAR, borderValue=0)
+    return mask, cv2.remap(before.depth_m, at, _NOTHING, cv2.INTER_NEAREST, borderValue=0)
 
 
 def _flow(gray: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -151,5 +155,5 @@ def _flow(gray: np.ndarray, before: np.ndarray) -> np.ndarray:
     """
     h, w = gray.shape
     side = max(h, w, _SMALLEST_FLOW)
-    square = [cv2.copyMakeBorder(g, 0, side - h, 0, side - w, cv2.BORDER_REPLICATE) for g in (gray, before)]
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(*square, None)[:h, :w]
+    now, then = (cv2.copyMakeBorder(g, 0, side - h, 0, side - w, cv2.BORDER_REPLICATE) for g in (gray, before))
+    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(now, then, _NOTHING)[:h, :w]

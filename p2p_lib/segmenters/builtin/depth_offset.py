@@ -44,7 +44,7 @@ def with_depth_moved(frame: Frame, offset_px: tuple[int, int]) -> Frame:
     """A frame with its depth moved by (x, y) pixels; what moves in from outside the image is unmeasured."""
     if offset_px == (0, 0):
         return frame
-    moved = np.float32([[1, 0, offset_px[0]], [0, 1, offset_px[1]]])
+    moved = np.array([[1, 0, offset_px[0]], [0, 1, offset_px[1]]], np.float32)
     depth_m = cv2.warpAffine(frame.depth_m, moved, frame.shape[::-1], flags=cv2.INTER_NEAREST)
     return replace(frame, depth_m=depth_m)
 

@@ -33,10 +33,10 @@ _LEAP_M = 0.15
 def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
     """Find a target where enough of its points are back or it is expected, outside ``taken`` (H, W) bool."""
     frame, cfg, uv_px = view.frame, view.config, hint.uv_px[~in_mask(hint.uv_px, taken)]
-    if target.colours is None:
+    if target.colours is None or target.size_m is None:
         return None
     expected = len(uv_px) < cfg.find_points and hint.place is not None
-    if expected:
+    if expected and hint.place is not None:
         uv_px = _coloured_px(view, target, hint.place, taken)
     if len(uv_px) < cfg.find_points:
         return None
@@ -59,7 +59,7 @@ def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
 
 def near_last(view: View, target: Target, hint: Hint) -> Hint:
     """A hint that expects the object where it was seen last, unless the hint itself says where it is."""
-    if hint.place is not None or len(hint.uv_px) >= view.config.find_points:
+    if hint.place is not None or len(hint.uv_px) >= view.config.find_points or target.seen is None:
         return hint
     centre_m = view.camera.unproject(target.seen.centre_px[None], np.array([target.seen.z_m]))[0]
     return replace(hint, place=np.append(centre_m, _LEAP_M))
@@ -67,6 +67,7 @@ def near_last(view: View, target: Target, hint: Hint) -> Hint:
 
 def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarray) -> np.ndarray:
     """(N, 2) pixels near the place of a hint that show the object's colours; none where its surroundings do too."""
+    assert target.colours is not None and target.size_m is not None  # else nobody looks for it
     frame, centre_m, within_m = view.frame, place[:3], target.size_m.max() / 2 + place[3]
     (centre_px,) = view.camera.project(centre_m[None])
     if not view.camera.inside(centre_px, -0.5):

@@ -47,6 +47,7 @@ class Prediction:
 def predict(view: View, target: Target) -> Prediction:
     """Move the mask of an object that was seen a frame ago by the optical flow."""
     frame, cfg, seen = view.frame, view.config, target.seen
+    assert seen is not None and target.size_m is not None and view.previous is not None  # a frame ago
     px_per_m = view.focal_px / seen.z_m
     # Room for its full size, also where only a part of it showed.
     half = np.maximum(target.size_m / 2, target.room_m) * px_per_m * (1 + cfg.margin) + ROOM_PX
@@ -63,7 +64,7 @@ def predict(view: View, target: Target) -> Prediction:
     changed = abs(area - np.count_nonzero(was > 0.5)) > _MAX_AREA_CHANGE * area
     doubtful = changed or np.count_nonzero(jumped) > _MAX_JUMPED * area or blind > _MAX_UNMEASURED * area
     left = np.count_nonzero(jumped & (patch.depth_m > z_before)) > area / 2
-    return Prediction(patch, prior, jumped, shown, left, doubtful)
+    return Prediction(patch, prior, jumped, shown, bool(left), bool(doubtful))
 
 
 def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Claim:
@@ -72,11 +73,13 @@ def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Cla
     None if it has left: what shows there lies behind it, or has the surroundings' colours without its points.
     """
     cfg, patch, prior, jumped = view.config, predicted.patch, predicted.prior, predicted.jumped
+    assert target.seen is not None and target.colours is not None  # a frame ago
     core = (prior > 0.8) & ~(jumped | predicted.shown)
     if not (core & (patch.depth_m > 0)).any():
         core |= predicted.shown & (np.abs(patch.depth_m - target.seen.z_m) < _REAPPEARS_WITHIN_M)
     plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2))
-    motions = target.past.motions(view.frame, hint.T_cam_obj) if target.confident else None
+    T_cam_obj = hint.T_cam_obj if target.confident else None
+    motions = None if T_cam_obj is None else target.past.motions(view.frame, T_cam_obj)
     log_odds, component = by_geometry(patch, core, plane, cfg, motions)
     stays = cfg.prior_weight * np.where(jumped | predicted.shown, 0, 2 * prior - 1)
     stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours shall count as much
@@ -103,6 +106,7 @@ def holds(claim: tuple[Box, np.ndarray], uv_px: np.ndarray) -> bool:
 
 def with_room(view: View, target: Target, hint: Hint) -> Target:
     """The target with room for parts that move with it, which may reach farther than what it has shown so far."""
+    assert target.seen is not None and hint.T_cam_obj is not None  # it was seen a frame ago, and points agree
     cfg, px_per_m = view.config, view.focal_px / target.seen.z_m
     patch = Patch.of(view.frame, around(hint.uv_px.mean(0), cfg.reach_m * px_per_m, view.frame.shape), view.camera, cfg)
     motions = target.past.motions(view.frame, hint.T_cam_obj)

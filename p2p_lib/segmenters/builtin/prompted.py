@@ -97,7 +97,9 @@ class Cutter:
     def cuts(self) -> list[Cut]:
         """From clicks or a box, at several scales, the least doubtful first."""
         cfg, frame, around_px = self.config, self.frame, self.prompt.box_px
-        clicks = self.prompt.points_px if len(self.prompt.points_px) else points_in_box(around_px, frame)
+        clicks = self.prompt.points_px
+        if not len(clicks) and around_px is not None:
+            clicks = points_in_box(around_px, frame)
         z_m = float(np.nanmedian(depths_at(clicks, frame)))
         if around_px is None:
             reach_px = cfg.reach_m * np.array([self.camera.fx, self.camera.fy]) / z_m
@@ -168,6 +170,7 @@ class Cutter:
             x = cut(patch, log_odds, start=x, seeds=seeds, background=barred & ~seeds, sharp=True)
             x = keep_seeded_components(x, seeds)
             own, other = np.maximum(2 * x - 1, 0) + clicked.hull / 2, np.maximum(1 - 2 * x, 0)
+        assert x is not None  # there are rounds
         return x
 
     @property

@@ -7,6 +7,9 @@ pixel, and prefers large edge weights, ends at the object: the minimum of a quad
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 #: Least edge weight, across the strongest contrast: no pixel is cut off completely.
@@ -28,7 +31,7 @@ def edge_weights(colour: np.ndarray, depth_m: np.ndarray, step_m: np.ndarray) ->
     across = colour[:, 1:] - colour[:, :-1], colour[1:] - colour[:-1]
     contrast = [np.einsum("ijk,ijk->ij", d, d) for d in across]
     mean = sum(c.sum() for c in contrast) / max(sum(c.size for c in contrast), 1)
-    pairs = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
+    pairs: Sequence[tuple[Any, Any]] = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
     measured, weights = depth_m > 0, []
     for (a, b), c in zip(pairs, contrast, strict=True):
         jump = np.where(measured[a] & measured[b], (depth_m[a] - depth_m[b]) / np.maximum(step_m[a], step_m[b]), 0)

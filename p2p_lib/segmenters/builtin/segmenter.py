@@ -168,8 +168,9 @@ class BuiltinSegmenter:
                 target = replace(target, confident=False)
         if claim is None:  # too fast for the flow: look near its last place
             return target, find(view, target, near_last(view, target, hint), taken)
-        past = target.past.with_frame(view.frame, hint.T_cam_obj) if due else target.past
-        return replace(target, past=past), claim
+        if due and hint.T_cam_obj is not None:
+            target = replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj))
+        return target, claim
 
     def _refined(
         self, frame: Frame, prompt_of: Mapping[str, Prompt], claims: Mapping[str, Claim], hints: Mapping[str, Hint]
@@ -194,16 +195,16 @@ class BuiltinSegmenter:
         frame, cfg = view.frame, view.config
         labels, best = np.zeros(frame.shape, np.int32), np.zeros(frame.shape, np.float32)
         for label, name in enumerate(self._targets, 1):
-            if claims.get(name) is not None:
-                box, x = claims[name]
+            if (claim := claims.get(name)) is not None:
+                box, x = claim
                 part, likeliest = labels[box.slices], best[box.slices]
                 wins = x > np.maximum(likeliest, 0.5)
                 part[wins], likeliest[wins] = label, x[wins]
         for label, (name, target) in enumerate(self._targets.items(), 1):
-            if claims.get(name) is None:
+            if (claim := claims.get(name)) is None:
                 self._targets[name] = replace(target, seen=None) if name in claims else target
                 continue
-            box = claims[name][0]
+            box, _ = claim
             part = labels[box.slices]
             mask = part == label
             seen = seen_in(frame, mask, box, cfg.min_px, None if target.seen is None else target.seen.z_m)

@@ -85,7 +85,7 @@ def _as_good(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray])
         if cut.doubtful < _AS_GOOD * cutter.cuts[0].doubtful and 0 < _OTHER_SIZE * small < large:
             apart = cv2.distanceTransform((another ^ mask).astype(np.uint8), cv2.DIST_L2, 3)
             v, u = np.unravel_index(apart.argmax(), apart.shape)
-            return np.count_nonzero(another), (int(u), int(v))
+            return int(np.count_nonzero(another)), (int(u), int(v))
     return None
 
 

@@ -72,7 +72,7 @@ class Target:
         size_m = np.array(seen.mask.shape[::-1]) * seen.z_m / focal_px
         some = np.s_[:: 1 + max(seen.mask.shape) // config.side_px,] * 2
         colours = histogram(colour_codes(frame.rgb[seen.box.slices][some][seen.mask[some]]))
-        if self.colours is None:
+        if self.colours is None or self.size_m is None:
             return replace(self, seen=seen, colours=colours, size_m=size_m)
         rate = config.colour_rate
         colours = (1 - rate) * self.colours + rate * colours

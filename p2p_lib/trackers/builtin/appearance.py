@@ -32,7 +32,7 @@ _SETTLED = 0.005
 #: Ratio of areas beyond which an alignment has diverged.
 _MAX_AREA_CHANGE = 5.0
 #: Damping of an affine and of a translational step, in units of the normalised patch.
-_DAMP = np.diag(np.float32([1e-4] * 2 + [0.05] * 4))
+_DAMP = np.diag(np.array([1e-4] * 2 + [0.05] * 4, np.float32))
 
 
 @dataclass(eq=False)
@@ -171,12 +171,12 @@ def _aligned(image, pixels, solver, rows, uv, A, iterations):
                 seen[p] = upper * (one - b) + lower * b
             for p in range(len(seen)):  # a loop of its own: the one above is done for several pixels at once
                 mean += seen[p] * _SQUARE[p]
-            mean = np.float32(mean)
+            mean = np.float32(mean)  # type: ignore[assignment]  # compiled
             for p in range(len(seen)):
                 seen[p] = (seen[p] - mean) * _ROOT[p]
                 slope_x += seen[p] * _RAMPS[0, p]
                 slope_y += seen[p] * _RAMPS[1, p]
-            slope_x, slope_y = np.float32(slope_x), np.float32(slope_y)
+            slope_x, slope_y = np.float32(slope_x), np.float32(slope_y)  # type: ignore[assignment]  # compiled
             for p in range(len(seen)):
                 seen[p] -= slope_x * _RAMPS[0, p] + slope_y * _RAMPS[1, p]
                 squared += seen[p] * seen[p]

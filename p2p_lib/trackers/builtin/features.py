@@ -62,7 +62,7 @@ def detect(gray: np.ndarray, region: np.ndarray | None, limit: int) -> np.ndarra
     corners = cv2.goodFeaturesToTrack(level, limit, 0.005, 4 - step + 1, mask=inside, blockSize=7 - 2 * step)
     if corners is None:
         return np.zeros((0, 2), np.float32)
-    return step * corners.reshape(-1, 2) + np.float32([columns.start, rows.start])
+    return step * corners.reshape(-1, 2).astype(np.float32) + np.array([columns.start, rows.start], np.float32)
 
 
 def describe(gray: np.ndarray, uv_px: np.ndarray, step_px: Sequence[np.ndarray]) -> np.ndarray:
@@ -128,7 +128,9 @@ def match(wanted: np.ndarray, found: np.ndarray, uv_px: np.ndarray, ratio: float
     from scipy.spatial.distance import cdist
 
     similarity = wanted @ found.T
-    rows, best, similarities = np.arange(len(wanted)), [], []
+    rows = np.arange(len(wanted))
+    best: list[np.ndarray] = []
+    similarities: list[np.ndarray] = []
     same = cdist(uv_px, uv_px, "chebyshev") <= _SAME_PX
     for place in range(_PLACES + 1):
         if place:

@@ -73,8 +73,9 @@ def flow(before: Image, after: Image, uv_px: np.ndarray, window_px: int) -> tupl
     x1, y1 = np.minimum(np.ceil(uv_px.max(0)).astype(int) + reach, [w, h])
     if min(x1 - x0, y1 - y0) < reach:
         x0, y0, x1, y1 = 0, 0, w, h
-    part, origin = np.s_[y0:y1, x0:x1], np.float32([x0, y0])
+    part, origin = np.s_[y0:y1, x0:x1], np.array([x0, y0], np.float32)
+    there, window = np.empty_like(uv_px), (window_px, window_px)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        before.gray[part], after.gray[part], uv_px - origin, None, winSize=(window_px, window_px), maxLevel=_LEVELS
+        before.gray[part], after.gray[part], uv_px - origin, there, winSize=window, maxLevel=_LEVELS
     )
     return moved + origin, found[:, 0] > 0

@@ -59,7 +59,7 @@ class ImageOnlyTracker(BuiltinTracker):
         """Follow all live queries into the next frame."""
         return super().track(_without_depth(frame), search, urgent)
 
-    def _find_predicted(self, search: np.ndarray | None) -> None:
+    def _find_predicted(self, search: np.ndarray | None, fewest: float = 0) -> None:
         """There are no predictions: points that were lost are sought among the corners of the whole image."""
         p, cfg, now = self._points, self.config, self._now
         lost = np.flatnonzero(~p.verified & (p.contrast >= cfg.textureless_contrast))

@@ -102,6 +102,6 @@ def _region_around(uv_px: np.ndarray, now: Image, reach_m: float) -> np.ndarray:
     z = now.depth_at(uv_px)
     reach_px = int(now.camera.fx * reach_m / max(np.median(z[z > 0]), reach_m)) if (z > 0).any() else 0
     region = np.zeros(now.gray.shape, np.uint8)
-    u, v = nearest_px(uv_px, region.shape)
+    u, v = nearest_px(uv_px, now.gray.shape)
     region[v, u] = 1
     return cv2.dilate(region, np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)) > 0

@@ -172,7 +172,8 @@ class MotionSegments:
         fewest = max(self.config.segment_min_points, fewest)
         if len(seen[0]) < fewest:
             return None
-        fit = fit_pose(start, *seen, now.camera)
+        p_seg, map_cov, uv_px, cov_px2, z_m = seen
+        fit = fit_pose(start, p_seg, map_cov, uv_px, cov_px2, z_m, now.camera)
         return replace(fit, agrees=fit.agrees[: len(at)]) if fit.agrees.sum() >= fewest else None
 
     def _match(self, fits: list[PoseFit | None], now: Image, search: np.ndarray | None) -> None:

@@ -97,7 +97,7 @@ class Recogniser:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rows among ``some`` landmarks, and the corners that look like them."""
         if not len(found) or not len(some):
-            return np.zeros((2, 0), int)
+            return np.zeros(0, int), np.zeros(0, int)
         which, corner = np.unique(alike(descriptors[some].astype(np.float32) / _SCALE, found, ratio), axis=1)
         return some[which], corner
 

@@ -39,7 +39,8 @@ class BuiltinTracker:
         """Begin a stream at this frame; without a camera, one with a common field of view is assumed."""
         h, w = frame.shape
         self._ids.start()
-        self._frames, self._search = 0, None
+        self._frames = 0
+        self._search: np.ndarray | None = None
         self._points = Points.new(np.zeros((0, 2)), self.config.templates)
         self._segments = MotionSegments(self.config)
         self._camera = camera or Camera(0.95 * w, 0.95 * w, (w - 1) / 2, (h - 1) / 2, w, h)
@@ -74,7 +75,7 @@ class BuiltinTracker:
         # Their last position is wrong: no place to search first.
         p.hidden_for[wrong] = self.config.linger_frames + 1
 
-    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks:
+    def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Guided re-detection: search for lost segments where the caller expects their points in the newest frame.
 
         ids, uv_px  (N,), (N, 2): points of one rigid object, the visible ones too, for they fix its rotation.

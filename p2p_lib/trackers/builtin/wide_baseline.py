@@ -101,7 +101,7 @@ class SegmentView:
         own = cv2.resize(self.own.astype(np.uint8), self.image.chroma.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
         known = np.zeros((256 // _BIN,) * 2, np.uint8)
         known[tuple((self.image.chroma[own] // _BIN).astype(int).T)] = 1
-        known = cv2.dilate(known, np.ones((3, 3), np.uint8))
+        known = cv2.dilate(known, np.ones((3, 3), np.uint8)).astype(np.uint8)
         a, b = (now.chroma // _BIN).astype(int).transpose(2, 0, 1)
         near = cv2.dilate(known[a, b], np.ones((3, 3), np.uint8))
         return cv2.resize(near, now.gray.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
@@ -134,8 +134,8 @@ def corners_of(views: Sequence[SegmentView], now: Image, search: np.ndarray | No
         inside = inner(search)
         regions = [region & inside for region in regions]
     anywhere = np.logical_or.reduce(regions)
-    segment_px = np.mean([np.count_nonzero(then.own) for then in views])
-    limit = CORNERS * np.count_nonzero(anywhere) / max(segment_px, 1)
+    segment_px = float(np.mean([np.count_nonzero(then.own) for then in views]))
+    limit = CORNERS * int(np.count_nonzero(anywhere)) / max(segment_px, 1)
     return corners(now, anywhere, int(np.clip(limit, CORNERS, _MOST))), regions
 
 
