@@ -17,7 +17,8 @@ from p2p_lib.core.types import Frame
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, read_mesh
 from p2p_lib.datasets.runs import load_run
-from p2p_lib.offline import evidence, loops
+from p2p_lib.method.refinement import Keypoints
+from p2p_lib.offline import evidence, loops, surface
 from p2p_lib.offline import refine as offline
 from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished
@@ -267,7 +268,7 @@ def test_frames_keep_the_causal_object_frame_and_what_does_not_fit_has_no_pose(m
     assert (refined.status[4:8] == obj.status[4:8]).all()
 
 
-@pytest.mark.parametrize("what", ["as it is", "behind", "colours", "pattern"])
+@pytest.mark.parametrize("what", ["as it is", "darker", "behind", "colours", "pattern"])
 def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what, monkeypatch):
     of, T, config = Finished(made.run, made.sequence), made.run.objects["can"].T_cam_obj, preset()
     rows = np.arange(0, 12)
@@ -276,6 +277,8 @@ def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what, 
     mask = made.sequence.masks(6)["can"]
     depth_m, rgb = frame.depth_m.copy(), frame.rgb.astype(float)
     middle = rgb[mask].mean(0)
+    if what == "darker":  # by another exposure than in the frame before
+        rgb *= 0.6
     if what == "behind":  # through half of it one sees what stands behind
         v, u = np.nonzero(mask)
         depth_m[v[u > np.median(u)], u[u > np.median(u)]] += 0.05
@@ -294,7 +297,7 @@ def test_an_object_is_found_without_a_mask_where_it_looks_as_it_did(made, what, 
     seen = replace(frame, depth_m=depth_m, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
     check._frame = lambda row: seen if row == k else made.sequence.frame(row)
     found = check.found(k, [T[k] @ se3.exp(np.array([0, 0, 0, 0.002, 0.001, 0]))], k - 1, T[k - 1])
-    assert (found is not None) == (what == "as it is")
+    assert (found is not None) == (what in ("as it is", "darker"))
     assert found is None or np.linalg.norm((found.T_cam_obj - T[k])[:3, 3]) < 0.003
 
 
@@ -331,6 +334,30 @@ def test_what_ties_matched_is_adjusted_as_one_point():
         assert len(found.p_cam) == 4 + 6 * bool(strong)
 
 
+def test_ties_that_depth_contradicts_do_not_count():
+    T = se3.from_rt(np.eye(3), np.array([0, 0, 0.5]))
+    T = np.stack([T, T @ se3.exp(np.array([0, 0, np.radians(40), 0, 0, 0]))])
+    shine = T[0, :3, 3] + np.random.default_rng(2).normal(scale=0.02, size=(25, 3))
+    nothing = np.zeros(0, int), np.zeros((0, 3))
+    made = SimpleNamespace(sequence=SimpleNamespace(camera=CAMERA), run=SimpleNamespace(info={"seed": 0}))
+    for still, count in ((shine, 0), (np.zeros((0, 3)), 1)):
+        told = evidence.VideoEvidence(tracks=[nothing] * 2, key=[0, 1], views=[view(T_k, still) for T_k in T])
+        poses, strong = evidence.VideoPoses(made, SimpleNamespace(T_cam_obj=T), preset(), told).tied()
+        assert len(strong) == count
+        assert np.degrees(se3.angle_rad(se3.inverse(poses[0]) @ poses[1])) == pytest.approx(40, abs=0.5)
+
+
+def test_a_point_that_one_frame_alone_shows_is_not_adjusted():
+    rng, T = np.random.default_rng(0), np.tile(se3.from_rt(np.eye(3), np.array([0, 0, 0.5])), (3, 1, 1))
+    p_cam = np.array([0, 0, 0.5]) + rng.normal(0, 0.02, (9, 3))
+    tracks = [(np.arange(8), p_cam[:8]), (np.arange(8), p_cam[:8]), (np.arange(1, 9), p_cam[1:])]
+    told = evidence.VideoEvidence(tracks=tracks)
+    made = SimpleNamespace(sequence=SimpleNamespace(camera=CAMERA), run=SimpleNamespace(info={"seed": 0}))
+    video = evidence.VideoPoses(made, SimpleNamespace(T_cam_obj=T), preset(), told)
+    _, points, seen = video.adjusted(T, video.sightings([]))
+    assert len(points) == 8 and len(seen.pose) == 23
+
+
 def test_a_neighbour_helps_where_it_fits_better_with_a_mask_or_by_sight():
     """Frame 1 has no mask, frame 3 has one, in which nothing fits better than what is there."""
     better, worse = (FittedPose(np.full((4, 4), k), np.eye(6), cost) for k, cost in ((5.0, 0.2), (6.0, 0.95)))
@@ -345,6 +372,24 @@ def test_a_neighbour_helps_where_it_fits_better_with_a_mask_or_by_sight():
     SurfacePoses.ask_neighbours(poses, SimpleNamespace(found=lambda *of: better))
     assert (poses.T[1] == 5).all() and poses.cost[1] == 0.2
     assert (poses.T[3] == np.eye(4)).all() and poses.cost[3] == 0.9
+
+
+def test_points_that_slid_away_hold_no_pose(monkeypatch):
+    p_obj = np.random.default_rng(0).normal(0, 0.02, (5, 3))
+    p_cam, told = p_obj + np.array([0, 0, 0.5]), []
+    p_cam[2, 0] += 0.03
+    T_cam_obj = se3.from_rt(np.eye(3), np.array([0, 0, 0.5]))
+    poses = SimpleNamespace(
+        _points_in=lambda k: Keypoints(p_obj, p_cam, np.full(5, 0.002)),
+        _evidence=SimpleNamespace(clouds=[p_cam]),
+        _volume=None,
+        _config=preset(),
+        cost_at=lambda *of: 0.1,
+    )
+    refined = SimpleNamespace(T_cam_obj=T_cam_obj, covariance=None)
+    monkeypatch.setattr(surface, "refine", lambda *of, keypoints: told.append(keypoints) or refined)
+    SurfacePoses._best_of(poses, 0, [T_cam_obj])
+    np.testing.assert_array_equal(told[0].p_obj, np.delete(p_obj, 2, axis=0))
 
 
 @pytest.mark.parametrize("step", [1, -1])

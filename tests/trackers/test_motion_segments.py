@@ -105,7 +105,7 @@ def test_points_that_leave_one_by_one_are_no_segment():
 
 
 def half_lost(monkeypatch, shift_px: float, pairs: int) -> tuple[Points, motion_segments.MotionSegments]:
-    """Eight of 24 points are followed, where they were; so many corners of the frame before match, moved."""
+    """Eight of 25 points are followed, where they were; so many corners of the frame before match, moved."""
     p, segments = started(RIGHT, image())
     segments.remember(p, image(), None)
     p.verified[8:] = False
@@ -146,6 +146,13 @@ def test_points_that_come_back_are_not_leaving_any_more():
     p.uv[:10] -= [0, 7]
     segments.fit(p, image())
     assert not p.leaving.any() and p.verified.all()
+
+
+@pytest.mark.parametrize(("wrong", "posed"), [(12, True), (13, False)])
+def test_a_segment_is_rejected_with_most_of_its_points(wrong, posed):
+    p, segments = started(RIGHT, image())
+    segments.invalidate(p, np.arange(len(RIGHT)) < wrong)
+    assert segments.segments[0].posed == posed
 
 
 def test_a_rejected_segment_is_not_searched_for_where_it_was(monkeypatch):
