@@ -1,6 +1,7 @@
 """Two maps of one object that become one, part by part: against one that was made in one frame from the start."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from p2p_lib.core.config import preset
 from p2p_lib.extended.gates import Judgement
 from p2p_lib.extended.graph import BoundedGraph
 from p2p_lib.extended.lifecycle import Lifecycle
-from p2p_lib.extended.two_maps import Relation
+from p2p_lib.extended.policy import Proposal
+from p2p_lib.extended.two_maps import Relation, TwoMaps
 from p2p_lib.method.keypoint_map import KeypointMap
+from p2p_lib.method.registration import Hypothesis
 from tests.method.analytic_scene import LUMP, around
 from tests.method.test_factor_graph import ALL, Turntable
 from tests.method.test_tsdf import fused
@@ -101,6 +104,36 @@ def test_joined_keypoints_keep_what_they_have_been_through():
         promoted = first.observe(moved, np.zeros(9), stable=True)
     np.testing.assert_array_equal(promoted, [5, 6, 7, 8])
     np.testing.assert_allclose(first.p_obj[5:], se3.transform(T_FIRST_SECOND, p), atol=1e-12)
+
+
+def proposed(inliers: int) -> Proposal:
+    """A pose with which so many of thirty keypoints agree."""
+    agree = np.arange(30) < inliers
+    hypothesis = Hypothesis(np.eye(4), agree, np.where(agree, 0.0, np.inf), "ransac 1")
+    return Proposal(hypothesis, SimpleNamespace(refined=False, T_cam_obj=np.eye(4)))  # no surface has been asked
+
+
+@pytest.mark.parametrize("doubted", [True, False])
+def test_a_doubted_pose_says_nothing_of_where_maps_lie_to_each_other(doubted):
+    other = SimpleNamespace(known=None, map=SimpleNamespace(p_obj=np.zeros((1, 3))))
+    met = proposed(20), Judgement(True, "tracked")
+    both = SimpleNamespace(other=other, _relation=Relation(), _known_again=lambda *of: met)
+    seen = SimpleNamespace(other=SimpleNamespace())
+    assert TwoMaps._by_other(both, seen, proposed(20), Judgement(True, "tracked", doubted=doubted)) is None
+    assert len(both._relation.T_obj_other) == (not doubted)
+
+
+@pytest.mark.parametrize(("inliers", "known"), [(12, False), (20, True)])
+def test_a_map_that_most_of_its_points_contradict_does_not_know_the_object_again(inliers, known):
+    """What is alike in some places has points enough for a pose, and more that are elsewhere."""
+    policy = SimpleNamespace(
+        propose=lambda *of: [proposed(inliers).hypothesis],
+        choose=lambda obs, other, found: (proposed(inliers), ""),
+        judge_other=lambda *of: Judgement(True, "tracked"),
+    )
+    both = SimpleNamespace(config=preset(), policy=policy)
+    other = SimpleNamespace(keypoints=lambda obs: np.ones(30, bool))
+    assert (TwoMaps._known_again(both, None, other) is not None) == known
 
 
 def test_a_life_told_in_another_frame_is_the_same():

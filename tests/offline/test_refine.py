@@ -417,3 +417,13 @@ def test_features_keep_away_from_the_border_of_the_mask():
     found = printed(rgb, mask)
     u, v = CAMERA.project(found.p_cam).T
     assert len(u) > 40 and ((u > 141) & (u < 198) & (v > 101) & (v < 148)).all()
+
+
+def test_features_keep_away_from_steps_of_depth():
+    """There one sees what is behind a handle, or through it."""
+    rgb = cv2.resize(np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8), (320, 240))
+    mask, depth_m = np.zeros((240, 320), bool), np.full((240, 320), 0.5, np.float32)
+    mask[60:190, 60:260], depth_m[:, ::20] = True, 0.55
+    found = loops.features(Frame(0, 0.0, rgb, depth_m), mask, CAMERA, preset().depth)
+    column = np.rint(CAMERA.project(found.p_cam)[:, 0]) % 20
+    assert len(column) > 100 and ((column > 1) & (column < 19)).all()
