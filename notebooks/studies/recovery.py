@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 from pandas import DataFrame, Series
 
 from p2p_lib.core import se3
+from p2p_lib.core.types import Status
 from p2p_lib.datasets.runs import ObjectRun, Run
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M, Judged, reliability, right_poses
-from p2p_lib.evaluation.point_tracks import Outcome
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import MAX_ADDS_M, RecoveryEvent, recovered_within
 from p2p_lib.figures import overlay, style
@@ -160,7 +160,7 @@ def confidence_over_time(run: Run, evaluation: Evaluation) -> Figure:
         wrong = ~right & obj.has_pose
         axis.plot(obj.time_s, np.where(obj.has_pose, obj.confidence, np.nan), color=colour, lw=0.8)
         axis.plot(obj.time_s[right], obj.confidence[right], ".", color=colour, ms=4)
-        axis.plot(obj.time_s[wrong], obj.confidence[wrong], "x", color=style.OUTCOMES[Outcome.WRONG], ms=4)
+        axis.plot(obj.time_s[wrong], obj.confidence[wrong], "x", color=style.STATUS[Status.LOST][0], ms=4)
         axis.set(ylim=(-0.03, 1.05), ylabel=name)
     axes[0].set_title(f"Confidence, {run.info['sequence']}; crosses: the pose is not within {_RIGHT}")
     axes[-1].set_xlabel("time [s]")

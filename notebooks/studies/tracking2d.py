@@ -13,17 +13,19 @@ from pandas import DataFrame
 
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.types import Status
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.point_tracks import FOUND_PX, Outcome, Reliability, after_query, outcomes, reliability
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels, status_intervals
 
+#: Colour and words of what came of asking for a point: right is the quiet one, wrong the colour of lost.
 _OUTCOMES = {
-    Outcome.RIGHT: f"found within {FOUND_PX:.0f} px",
-    Outcome.MISSED: "visible, but called hidden",
-    Outcome.WRONG: "called visible where it is not",
-    Outcome.HIDDEN: "hidden, and known to be",
+    Outcome.RIGHT: ("#CFCFCF", f"found within {FOUND_PX:.0f} px"),
+    Outcome.MISSED: ("#222222", "visible, but called hidden"),
+    Outcome.WRONG: (style.STATUS[Status.LOST][0], "called visible where it is not"),
+    Outcome.HIDDEN: ("#FFFFFF", "hidden, and known to be"),
 }
 _MIN_ABSENCE = 15  # frames
 
@@ -100,9 +102,9 @@ class TrackScene:
         for name, points in self._points.items():
             right, missed, wrong = (points & (came == k) for k in (Outcome.RIGHT, Outcome.MISSED, Outcome.WRONG))
             image = overlay.draw_trail(image, path_px[:, right].swapaxes(0, 1), self._colours[name], 1)
-            image = overlay.draw_points(image, true_px[index, missed], style.OUTCOMES[Outcome.MISSED], 0.7)
+            image = overlay.draw_points(image, true_px[index, missed], _OUTCOMES[Outcome.MISSED][0], 0.7)
             image = overlay.draw_points(image, uv_px[index, right], self._colours[name], 2.5)
-            image = overlay.draw_points(image, uv_px[index, wrong], style.OUTCOMES[Outcome.WRONG], 4, filled=False)
+            image = overlay.draw_points(image, uv_px[index, wrong], _OUTCOMES[Outcome.WRONG][0], 4, filled=False)
         kinds = (Outcome.RIGHT, Outcome.WRONG, Outcome.MISSED)
         counts = ", ".join(f"{(came == k).sum()} {k.name.lower()}" for k in kinds)
         return overlay.draw_caption(image, f"{frame.time_s:.2f} s: {counts}")
@@ -154,7 +156,7 @@ def outcome_bands(scores: Mapping[str, TrackerScore], times_s: np.ndarray) -> Fi
 
     Lines are sorted by object, then by query frame; a point has the same line in all panels.
     """
-    colours = ListedColormap(["#F3F3F3", *(style.OUTCOMES[k] for k in sorted(style.OUTCOMES))])
+    colours = ListedColormap(["#F3F3F3", *(_OUTCOMES[k][0] for k in sorted(_OUTCOMES))])
     figure, axes = panels(len(scores), (WIDTH_IN, 1.0 + 1.7 * len(scores)))
     for axis, (label, score) in zip(axes, scores.items(), strict=True):
         order = np.lexsort([score.queries.frame, score.queries.points.object])
@@ -165,7 +167,7 @@ def outcome_bands(scores: Mapping[str, TrackerScore], times_s: np.ndarray) -> Fi
         axis.grid(visible=False)
     axes[-1].set_xlabel("time [s]", loc="left")
     edge = {"edgecolor": "#333333", "linewidth": 0.3}
-    patches = [Patch(facecolor=style.OUTCOMES[k], label=words, **edge) for k, words in _OUTCOMES.items()]
+    patches = [Patch(facecolor=fill, label=words, **edge) for fill, words in _OUTCOMES.values()]
     figure.legend(handles=patches, loc="outside lower right", ncols=2, fontsize=8)
     return figure
 

@@ -246,10 +246,9 @@ def _times(sequence: Sequence) -> Finding:
 
 def _scale(pairs: list[tuple[Frame, Frame]]) -> Finding:
     """Whether depth has one unit throughout."""
-    if text := moving_scale(pairs):
-        fix = "Take depth as the camera measured it, in one unit, not scaled image by image."
-        return Finding("scale", Level.WRONG, text, fix)
-    return Finding("scale", Level.OK, "depth keeps its scale from image to image")
+    moves = moving_scale(pairs)
+    fix = "Take depth as the camera measured it, in one unit, not scaled image by image."
+    return Finding.whether(not moves, "scale", moves or "depth keeps its scale from image to image", fix)
 
 
 def _truth(sequence: Sequence) -> Finding:

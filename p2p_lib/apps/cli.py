@@ -135,7 +135,7 @@ def _run(a: argparse.Namespace) -> int:
 def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
     from p2p_lib.apps.live_click import LiveClicker
-    from p2p_lib.apps.live_words import Outlet, Words
+    from p2p_lib.apps.live_words import Words, outlet
     from p2p_lib.datasets.cameras import open_camera
     from p2p_lib.datasets.prompts import load_prompts
     from p2p_lib.datasets.run_writer import look_into
@@ -155,7 +155,7 @@ def _live(a: argparse.Namespace) -> None:
             prompts, first = click_first(camera, warn, not a.no_browser)
         line = text_line if a.out is not None and sys.stdout.isatty() else json_line
         with ExitStack() as opened:
-            send = opened.enter_context(Outlet(a.to, warn)).send if a.to else partial(print, flush=True)
+            send = opened.enter_context(outlet(a.to, warn)) if a.to else partial(print, flush=True)
             if a.listen or a.click:
                 said = Words(sys.stdin if a.listen else None, lambda error: warn(f"p2p live: {error}"))
                 keep["words"] = said

@@ -115,7 +115,7 @@ def track_live(
         _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
     every_prompt = list(prompts)
     with ExitStack() as kept:
-        listeners: list[Listener] = [_each(on_estimate)]
+        listeners: list[Listener] = []
         if page is not None:
             listeners.append(lambda frame, estimates: page.see(frame, method.masks))
         if overlay is not None:
@@ -125,6 +125,8 @@ def track_live(
 
         def tell(estimates: dict[str, PoseEstimate]) -> None:
             if (of := method.frame) is not None:
+                for estimate in estimates.values():
+                    on_estimate(estimate)
                 for listen in listeners:
                     listen(of, estimates)
 
@@ -163,16 +165,6 @@ def _warm_up(method: Point2Pose) -> None:
 
 
 Listener = Callable[[Frame, dict[str, PoseEstimate]], object]
-
-
-def _each(on_estimate: Callable[[PoseEstimate], None]) -> Listener:
-    """One that hears of each object by itself."""
-
-    def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
-        for estimate in estimates.values():
-            on_estimate(estimate)
-
-    return listen
 
 
 def _filmed(film: Film, name: str, method: Point2Pose, first: Frame | None) -> Listener:

@@ -6,8 +6,8 @@ import json
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from urllib.parse import urlsplit
 
@@ -76,40 +76,26 @@ def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
     return [(prompt.name, prompt) for prompt in prompts]
 
 
-class Outlet:
-    """Sends lines to ``tcp://HOST:PORT`` or, one a datagram, to ``udp://HOST:PORT``; a context manager.
+@contextmanager
+def outlet(to: str, say: Callable[[str], object]) -> Iterator[Callable[[str], None]]:
+    """What sends lines to ``tcp://HOST:PORT`` or, one a datagram, to ``udp://HOST:PORT``.
 
     A reader that goes away, or takes no line for half a second, is given up, which is said once: tracking goes on.
     """
+    with _connected(to) as reader:
 
-    def __init__(self, to: str, say: Callable[[str], object]):
-        self._to, self._say = to, say
-        self._socket: socket.socket | None = _connected(to)
+        def send(line: str) -> None:
+            if reader.fileno() < 0:  # given up
+                return
+            try:
+                reader.sendall(f"{line}\n".encode())
+            except OSError as error:
+                if reader.type == socket.SOCK_DGRAM and not isinstance(error, TimeoutError):
+                    return  # nobody listens yet, or any more: datagrams are for whoever is there
+                say(f"{to} takes no more lines ({in_a_line(error)}); tracking goes on.")
+                reader.close()
 
-    def send(self, line: str) -> None:
-        """One more line."""
-        if self._socket is None:
-            return
-        try:
-            self._socket.sendall(f"{line}\n".encode())
-        except OSError as error:
-            if self._socket.type == socket.SOCK_DGRAM and not isinstance(error, TimeoutError):
-                return  # nobody listens yet, or any more: datagrams are for whoever is there
-            self._say(f"{self._to} takes no more lines ({in_a_line(error)}); tracking goes on.")
-            self.close()
-
-    def close(self) -> None:
-        """Send no more."""
-        if self._socket is not None:
-            with suppress(OSError):
-                self._socket.close()
-        self._socket = None
-
-    def __enter__(self) -> Outlet:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        yield send
 
 
 def _connected(to: str) -> socket.socket:

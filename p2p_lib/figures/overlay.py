@@ -258,15 +258,13 @@ def region_around(
 
 def montage(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
     """Images of one size, row by row, with white between them."""
+    from skimage.util import montage as sheet
+
     if not len(images) or len({image.shape for image in images}) != 1:
         raise BadInput("montage", sorted({image.shape for image in images}), "images of one size")
-    h, w, _ = images[0].shape
     rows = -(-len(images) // columns)
-    sheet = np.full((rows * (h + _GAP_PX) - _GAP_PX, columns * (w + _GAP_PX) - _GAP_PX, 3), 255, np.uint8)
-    for k, image in enumerate(images):
-        top, left = k // columns * (h + _GAP_PX), k % columns * (w + _GAP_PX)
-        sheet[top : top + h, left : left + w] = image
-    return sheet
+    how = {"grid_shape": (rows, columns), "padding_width": _GAP_PX, "channel_axis": -1}
+    return sheet(np.stack(images), fill=[255, 255, 255], **how)[_GAP_PX:-_GAP_PX, _GAP_PX:-_GAP_PX]
 
 
 def _front_edges(T_cam_box: np.ndarray, size_m: np.ndarray) -> np.ndarray:

@@ -124,7 +124,7 @@ class Scene:
         if not words:
             return image
         caption = f"{self.sequence.name}  {frame.time_s - first.time_s[0]:.2f} s"
-        return overlay.draw_labels(image, [label for label in labels if label is not None], caption)
+        return overlay.draw_labels(image, labels, caption)
 
     def story(self, count: int = 6, columns: int = 3, width_px: int = 360) -> np.ndarray:
         """One sheet of ``count`` frames that tell what happened, cut to where the objects are."""

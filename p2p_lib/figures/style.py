@@ -14,7 +14,6 @@ from p2p_lib.core.colours import object_colours as object_colours
 from p2p_lib.core.colours import rgb as rgb
 from p2p_lib.core.packages import needed_for
 from p2p_lib.core.types import Status
-from p2p_lib.evaluation.point_tracks import Outcome
 
 #: Statuses: fill and hatch. Tracked is the quiet one.
 STATUS: dict[str, tuple[str, str]] = {
@@ -24,13 +23,6 @@ STATUS: dict[str, tuple[str, str]] = {
     Status.OCCLUDED: ("#6F6F6F", "////"),
     Status.LOST: ("#D55E00", "xxxx"),
     Status.RECOVERED: ("#009E73", ""),
-}
-#: What came of asking for a 2D point: right is the quiet one, wrong the colour of lost.
-OUTCOMES: dict[Outcome, str] = {
-    Outcome.HIDDEN: "#FFFFFF",
-    Outcome.RIGHT: "#CFCFCF",
-    Outcome.MISSED: "#222222",
-    Outcome.WRONG: "#D55E00",
 }
 #: Methods, or anything else that is compared side by side, in that order: none is an object's or a status's colour.
 METHODS = ("#5511DD", "#557711", "#AA99CC", "#114411", "#BB8888", "#885566", "#44BB11")

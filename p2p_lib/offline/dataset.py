@@ -6,19 +6,16 @@ measured depth is more than 15 mm before it; where nothing was measured it count
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import replace_text
 from p2p_lib.core.progress import progress_bar
@@ -57,52 +54,30 @@ def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, ma
     return float(iou), float(1000 * np.quantile(off_m, 0.9)) if len(off_m) else np.nan
 
 
-@dataclass(eq=False)
 class _Labels:
     """The run as a sequence with its trusted poses as truth; ``rows`` say how well each label fits."""
 
-    made: Finished
-    min_confidence: float
-    rows: list[tuple] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.objects, self.camera = self.made.tracked, self.made.sequence.camera
-        surfaces = {name: self.made.surface(name) for name in self.objects}
-        self._render = {name: Renderer(mesh.vertices, mesh.faces, self.camera) for name, mesh in surfaces.items()}
-        self._seen: tuple[int, Frame, dict[str, Silhouette]] | None = None
-
-    camera: Camera = field(init=False)
-    objects: tuple[str, ...] = field(init=False)
-
-    @cached_property
-    def truth(self) -> dict[str, ObjectTruth]:
-        """Poses that are trusted."""
-        truth = {}
-        for name, trusted in self.made.trusted(self.min_confidence).items():
-            poses, obj = np.full((len(self.made.sequence), 4, 4), np.nan), self.made.run.objects[name]
+    def __init__(self, made: Finished, min_confidence: float):
+        self.made, self.objects, self.camera = made, made.tracked, made.sequence.camera
+        self.rows: list[tuple] = []
+        self.truth: dict[str, ObjectTruth] = {}
+        for name, trusted in made.trusted(min_confidence).items():
+            poses, obj = np.full((len(made.sequence), 4, 4), np.nan), made.run.objects[name]
             poses[obj.frame_index[trusted]] = obj.T_cam_obj[trusted]
-            truth[name] = ObjectTruth(poses, np.isfinite(poses).all((1, 2)))
-        return truth
+            self.truth[name] = ObjectTruth(poses, np.isfinite(poses).all((1, 2)))
+        self.frames = np.flatnonzero(np.logical_or.reduce([of.labelled for of in self.truth.values()]))
+        surfaces = {name: made.surface(name) for name in self.objects}
+        self._render = {name: Renderer(mesh.vertices, mesh.faces, self.camera) for name, mesh in surfaces.items()}
+        self._rendered = lru_cache(maxsize=1)(self._render_all)
 
-    @property
-    def frames(self) -> np.ndarray:
-        """Those with a label."""
-        return np.flatnonzero(np.logical_or.reduce([of.labelled for of in self.truth.values()]))
-
-    def __len__(self) -> int:
-        return len(self.made.sequence)
+    def _render_all(self, i: int) -> tuple[Frame, dict[str, Silhouette]]:
+        """The image, and each labelled object in it as if nothing hid it."""
+        poses = {name: of.T_cam_model[i] for name, of in self.truth.items() if of.labelled[i]}
+        return self.made.sequence.frame(i), {name: self._render[name](T) for name, T in poses.items()}
 
     def frame(self, i: int) -> Frame:
         """The image."""
         return self._rendered(i)[0]
-
-    def _rendered(self, i: int) -> tuple[Frame, dict[str, Silhouette]]:
-        """The image, and each labelled object in it as if nothing hid it; the last one is cached."""
-        if self._seen is None or self._seen[0] != i:
-            poses = {name: of.T_cam_model[i] for name, of in self.truth.items() if of.labelled[i]}
-            frame = self.made.sequence.frame(i)
-            self._seen = i, frame, {name: self._render[name](T) for name, T in poses.items()}
-        return self._seen[1:]
 
     def masks(self, i: int) -> dict[str, np.ndarray]:
         """What shows of each object."""
@@ -129,6 +104,8 @@ def write_bop(folder: str | Path, out: str | Path, min_confidence: float = DOUBT
     ``labels.csv`` says of each label how well it fits, ``labels.json`` by what rule frames were left out and which
     number is which object. Raises :class:`BadInput` where no frame has a label.
     """
+    from pandas import DataFrame
+
     labels = _Labels(made := Finished.of(folder), min_confidence)
     if not len(labels.frames):
         fix = "Lower --min-confidence, or look at what was wrong: p2p eval RUN."
@@ -140,20 +117,13 @@ def write_bop(folder: str | Path, out: str | Path, min_confidence: float = DOUBT
         camera = labels.camera
         intrinsics = {key: getattr(camera, key) for key in ("cx", "cy", "fx", "fy", "width", "height")}
         replace_text(there / "camera.json", json.dumps(intrinsics | {"depth_scale": 1.0}, indent=1) + "\n")
-        replace_text(there / "labels.csv", _csv(labels.rows))
+        how: Any = {"index": False, "lineterminator": "\n", "float_format": "%.4f", "na_rep": "nan"}
+        replace_text(there / "labels.csv", DataFrame(labels.rows, columns=list(COLUMNS)).to_csv(**how))
         about = {"rule": RULE.format(min_confidence), "min_confidence": min_confidence, "visible_m": VISIBLE_M}
         about |= {"run": made.about, "objects": obj_ids}
         about |= {"frames": len(made.frames), "labelled": len(labels.frames)}
         replace_text(there / "labels.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
     return f"{len(labels.rows)} labels in {len(labels.frames)} of {len(made.frames)} images"
-
-
-def _csv(rows: list[tuple]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows((*row[:3], *(f"{x:.4f}" for x in row[3:])) for row in rows)
-    return text.getvalue()
 
 
 def write_foundationpose(

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
@@ -170,9 +172,6 @@ def along_ties(T_cam_obj: np.ndarray, pairs: list[tuple[int, int, np.ndarray, fl
 
     The keyframe with the strongest ties keeps its pose, and so do those that no tie connects with it.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
-
     K, T = len(T_cam_obj), np.array(T_cam_obj, float)
     best: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
     for a, b, T_a_b, strength in pairs:

@@ -59,12 +59,12 @@ def view_of(made: Finished, name: str, row: int, render: Renderer) -> View:
     return View(i, T, frame.rgb.astype(np.float32), shows, depth_m, sharp)
 
 
-def chosen_rows(made: Finished, name: str, rows: np.ndarray, render: Renderer, count: int = VIEWS) -> list[View]:
-    """Of the frames ``rows`` the sharpest of up to four near each of ``count`` directions that lie far apart."""
+def chosen_rows(made: Finished, name: str, rows: np.ndarray, render: Renderer) -> list[View]:
+    """Of the frames ``rows`` the sharpest of up to four near each of :data:`VIEWS` directions that lie far apart."""
     T_obj_cam = se3.inverse(made.run.objects[name].T_cam_obj[rows])
     way = T_obj_cam[:, :3, 3] / np.linalg.norm(T_obj_cam[:, :3, 3], axis=1, keepdims=True)
     seeds, far = [0], np.linalg.norm(way - way[0], axis=1)
-    while len(seeds) < min(count, len(rows)) and far.max() > 1e-3:
+    while len(seeds) < min(VIEWS, len(rows)) and far.max() > 1e-3:
         seeds.append(int(far.argmax()))
         far = np.minimum(far, np.linalg.norm(way - way[seeds[-1]], axis=1))
     nearest = np.linalg.norm(way[:, None] - way[seeds][None], axis=-1).argmin(1)

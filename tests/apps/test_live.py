@@ -21,7 +21,7 @@ import pytest
 from p2p_lib.apps import cli
 from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
 from p2p_lib.apps.live_click import LiveClicker
-from p2p_lib.apps.live_words import Outlet, Words
+from p2p_lib.apps.live_words import Words, outlet
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import preset
@@ -620,10 +620,10 @@ def test_lines_go_to_a_socket(kind, folder, tmp_path, capsys):
 def test_a_reader_that_goes_away_ends_nothing(capsys):
     said = []
     with socket.create_server(("127.0.0.1", 0)) as server:
-        with Outlet(f"tcp://127.0.0.1:{server.getsockname()[1]}", said.append) as outlet:
+        with outlet(f"tcp://127.0.0.1:{server.getsockname()[1]}", said.append) as send:
             server.accept()[0].close()
             for _ in range(20):
-                outlet.send("x" * 10_000)
+                send("x" * 10_000)
                 time.sleep(0.01)
     assert len(said) == 1 and "tracking goes on" in said[0]
 
