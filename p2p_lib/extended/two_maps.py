@@ -188,7 +188,7 @@ class TwoMaps:
         if best is not None and verdict.accepted:
             return self._accept(obs, best, verdict)
         if (outgrown := self._outgrown(obs)) or self._turned_over(obs):
-            return self._begin_anew(obs, outgrown)
+            return self._begin_anew(obs, keep=not outgrown)
         return own.absent(obs, verdict)
 
     def _accept(self, obs: OurObservation, best: Proposal, verdict: Judgement) -> ObjectStep:
@@ -219,7 +219,7 @@ class TwoMaps:
         Its mask must be given, or it must have been in sight since: what the segmenter takes for an object that was
         hidden, and that agrees with nothing known of it, may be something else.
         """
-        room = self.other is None or _first_view_alone(self.other.known) or _first_view_alone(self.known)
+        room = self.other is None or _first_view_alone(self.other.known)
         known = "second_map" in self._on and room and self.life.lost_frames >= _STAYS_LOST
         of_it = obs.given or self.life.in_sight
         if not known or obs.mask is None or not of_it or cut_off(self.observer, obs):
@@ -227,20 +227,16 @@ class TwoMaps:
         plain = area_m2(self.observer, obs) >= _IN_PLAIN_VIEW * self.life.seen_m2
         return plain and self.policy.outline(obs) >= OUTLINE
 
-    def _begin_anew(self, obs: OurObservation, outgrown: bool) -> ObjectStep:
-        """Begin a new map. The one so far becomes the other one.
-
-        It is dropped where it is ``outgrown`` or, with another one there, knows one view alone.
-        """
+    def _begin_anew(self, obs: OurObservation, keep: bool) -> ObjectStep:
+        """Begin a new map; with ``keep`` the one so far becomes the other one, else it is dropped."""
         if self._still_growing(obs):
             return self.own.absent(obs, Verdict(False, Status.LOST, _STILL_GROWING))
         own, new = self.own, copy(self.own)
         new.known = Known(new.new_model(), self.policy.life, own.known.map_id + 1)
         step, trusted = new.begin(obs), self.policy.trusted
-        if (not outgrown and step.estimate.status is Status.DEGRADED) or step.estimate.T_cam_obj is None:
+        if (keep and step.estimate.status is Status.DEGRADED) or step.estimate.T_cam_obj is None:
             self.policy.trusted = trusted
             return own.absent(obs, Verdict(False, Status.LOST, step.estimate.reason))
-        keep = not outgrown and (self.other is None or not _first_view_alone(own.known))
         gone = self.other if keep else own
         if keep:
             self.other = _lost(own)
