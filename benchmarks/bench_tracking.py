@@ -176,7 +176,7 @@ def plot(label: str, settings: Mapping[object, Compared]):
     most = [*shares][:SHOWN]
     shares["others"] = shares.drop(columns=most).sum(axis=1)
     floor = np.zeros(len(shares))
-    for colour, stage in zip(style.OBJECTS, [*most, "others"], strict=True):
+    for colour, stage in zip(style.OBJECTS, [*most, "others"], strict=False):
         right.bar(names, shares[stage], 0.6, floor, color=colour, label=stage)
         floor += shares[stage].to_numpy()
     right.axhline(1, color=style.NEUTRAL[0], linewidth=0.8)
