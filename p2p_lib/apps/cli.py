@@ -133,6 +133,7 @@ def _run(a: argparse.Namespace) -> int:
     NO_BROWSER,
 )
 def _live(a: argparse.Namespace) -> None:
+    from p2p_lib.apps.click import invite
     from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
     from p2p_lib.apps.live_click import LiveClicker
     from p2p_lib.apps.live_words import Words, outlet
@@ -157,12 +158,10 @@ def _live(a: argparse.Namespace) -> None:
         with ExitStack() as opened:
             send = opened.enter_context(outlet(a.to, warn)) if a.to else partial(print, flush=True)
             if a.listen or a.click:
-                said = Words(sys.stdin if a.listen else None, lambda error: warn(f"p2p live: {error}"))
-                keep["words"] = said
+                keep["words"] = words = Words(sys.stdin if a.listen else None, lambda error: warn(f"p2p live: {error}"))
             if a.click:
-                page = keep["page"] = opened.enter_context(LiveClicker(camera, said))
-                warn(f"Click in your browser at {page.url}")
-                _ = a.no_browser or open_page(page.url)
+                keep["page"] = page = opened.enter_context(LiveClicker(camera, words))
+                invite(page, warn, not a.no_browser)
             track_live(camera, prompts, lambda estimate: send(line(estimate)), options, first=first, **keep)
     except KeyboardInterrupt:
         pass  # how one stops a camera

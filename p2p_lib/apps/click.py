@@ -177,6 +177,13 @@ def check_writable(path: Path) -> None:
         raise BadInput(f"--out {path}", what, "a file in a folder that can be written")
 
 
+def invite(clicker: Clicker, say: Callable[[str], object], open_browser: bool, more: str = "") -> None:
+    """Say where the page is, and open it where there is a desktop."""
+    say(f"Click in your browser at {clicker.url}{more}")
+    if open_browser:
+        open_page(clicker.url)
+
+
 def wait_for_clicks(clicker: Clicker, say: Callable[[str], object], open_browser: bool = True) -> tuple[Prompt, ...]:
     """What the page saves: says where the page is, opens it where there is a desktop, waits, closes.
 
@@ -184,9 +191,7 @@ def wait_for_clicks(clicker: Clicker, say: Callable[[str], object], open_browser
     """
     before = clicker.prompts
     with clicker:
-        say(f"Click in your browser at {clicker.url} and press Save and finish there; Ctrl-C here ends it, too.")
-        if open_browser:
-            open_page(clicker.url)
+        invite(clicker, say, open_browser, " and press Save and finish there; Ctrl-C here ends it, too.")
         try:
             clicker.wait()
         except KeyboardInterrupt:

@@ -94,13 +94,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
-        said = _said_of(error, arguments)
-        if said is None:  # a mistake of ours
+        message = _in_words(error, arguments)
+        if message is None:  # a mistake of ours
             raise
         if arguments.debug:
             traceback.print_exc()
         else:
-            warn(f"p2p {arguments.name}: {said}")
+            warn(f"p2p {arguments.name}: {message}")
         return P2PError.exit_code
     except KeyboardInterrupt:
         warn(f"p2p {arguments.name}: interrupted")
@@ -113,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             signal.signal(signal.SIGTERM, before)
 
 
-def _said_of(error: Exception, arguments: argparse.Namespace) -> str | None:
+def _in_words(error: Exception, arguments: argparse.Namespace) -> str | None:
     """What went wrong that a user can mend, in a line; None where that is nothing of theirs."""
     if isinstance(error, P2PError):
         return str(error)
@@ -126,8 +126,8 @@ def _said_of(error: Exception, arguments: argparse.Namespace) -> str | None:
         # Called with what it does not take, it is not entered at all.
         if theirs or (isinstance(error, TypeError) and str(error).startswith(f"{name}.")):
             where = f" ({theirs[-1][0].co_filename}:{theirs[-1][1]})" if theirs else ""
-            said = f"{type(error).__name__}: {in_a_line(error)}"
-            return f"{option} {place}: {called} raised {said}{where}. --debug shows the traceback."
+            what = f"{type(error).__name__}: {in_a_line(error)}"
+            return f"{option} {place}: {called} raised {what}{where}. --debug shows the traceback."
     return str(error) if isinstance(error, OSError) else None  # a full disk, a folder that may not be written
 
 

@@ -218,7 +218,9 @@ def test_the_page_needs_nothing_from_elsewhere():
 
 
 def visit(session: dict, *steps: list) -> dict:
-    """What the page's own script makes of these steps of a user."""
+    """What the page's own script makes of these steps of a user; nothing is known without node, which runs it."""
+    if shutil.which("node") is None:
+        pytest.skip("no node to run the page's script (Debian: apt-get install nodejs)")
     given = json.dumps({"session": session, "steps": steps})
     probe = Path(__file__).with_name("click_probe.js")
     done = subprocess.run(["node", str(probe), str(PAGE)], input=given, capture_output=True, text=True, timeout=60)
@@ -226,7 +228,6 @@ def visit(session: dict, *steps: list) -> dict:
     return json.loads(done.stdout)
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
 def test_the_page_makes_prompts_of_clicks_boxes_and_later_frames(sequence, out):
     """Dots on the object and beside it, a dragged box, corrections in another frame, one click taken back."""
     save_prompts(out, [Prompt("cup", 0, [[40, 30]]), Prompt("lid", 1, mask=np.eye(H, W, dtype=bool))])
@@ -260,7 +261,6 @@ def test_the_page_makes_prompts_of_clicks_boxes_and_later_frames(sequence, out):
     np.testing.assert_array_equal(load_prompts(out)[2].mask, np.eye(H, W, dtype=bool))  # masks stay as they were
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
 def test_the_page_undoes_renames_clears_and_zooms(sequence, out):
     with Clicker(sequence, out) as clicker:
         session = clicker.session()
@@ -281,7 +281,6 @@ def test_the_page_undoes_renames_clears_and_zooms(sequence, out):
         assert visit(session, *steps, *more)["sent"]["objects"] == objects, case
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
 def test_the_page_asks_for_the_masks_of_the_frame_that_is_shown(sequence, out):
     with Clicker(sequence, out) as clicker:
         seen = visit(clicker.session(), ["press", 50, 20], ["frame", 1], ["press", 30, 30])
@@ -297,7 +296,6 @@ def disc(x: int, y: int, radius: int) -> np.ndarray:
     return (u - x) ** 2 + (v - y) ** 2 <= radius**2
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
 def test_a_brush_mends_a_mask(sequence, out):
     """It starts from the mask that is shown; what it leaves is a mask, which a click replaces and undo brings back."""
     with Clicker(sequence, out) as clicker:

@@ -547,7 +547,6 @@ def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
     assert [(p["frame"], p.get("negative")) for p in prompts] == [(2, None), (5, [[5, 5]])]
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="node is not there to run the page's script")
 def test_the_live_page_sends_clicks_and_forgets_them(scripted):
     page = LiveClicker(scripted, Words(None, print))
     with page:
