@@ -41,11 +41,13 @@ def _click(a: argparse.Namespace) -> None:
     prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)
     changed = first_change(before, prompts)
     if shown is None or changed is None:
-        print(f"{len(prompts)} prompts in {a.out}. Next: p2p run {a.sequence} --prompts {a.out} --save-masks --out DIR")
+        print(
+            f"Prompts in {a.out}: {len(prompts)}. Next: p2p run {a.sequence} --prompts {a.out} --save-masks --out DIR"
+        )
     else:
         how = f"--resume --from {changed}" if changed > shown.info["start"] else "--force"
         words = again(shown.info, a.run, prompts=str(a.out), save_masks=True)
-        print(f"{len(prompts)} prompts in {a.out}, the first new one in frame {changed}. Next: {words} {how}")
+        print(f"Prompts in {a.out}: {len(prompts)}, the first new one in frame {changed}. Next: {words} {how}")
 
 
 @command(
