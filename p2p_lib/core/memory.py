@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.files import check_arrays, file_name, load_arrays, parse_json, replacing
+from p2p_lib.core.files import check_arrays, file_name, load_arrays, parse_json, save_arrays
 
 #: Of the files that this library writes, and reads.
 VERSION = 1
@@ -127,8 +127,7 @@ def save_memories(path: str | Path, memories: Mapping[str, ObjectMemory], kind: 
     for name, memory in memories.items():
         arrays |= {f"{name}/{f.name}": getattr(memory, f.name) for f in _array_fields(ObjectMemory)}
         arrays |= {f"{name}/surface/{f.name}": getattr(memory.surface, f.name) for f in fields(SurfaceMemory)}
-    with replacing(Path(path)) as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    save_arrays(Path(path), arrays, compressed=True)
 
 
 def read_memories(path: str | Path, kind: str, expected: str) -> tuple[dict[str, Any], dict[str, ObjectMemory]]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.files import append, file_name, read_text, replace_text, replacing, writing_alone
+from p2p_lib.core.files import append, file_name, read_text, replace_text, save_arrays, writing_alone
 from p2p_lib.core.options import differing
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
@@ -150,7 +150,7 @@ class RunWriter:
             self._clear_redone(self.resumed.objects, self.redo_from)
         replace_text(self.path / "config.toml", self._config.to_toml())
         if self._points:
-            _save_arrays(self.path / "models.npz", self._points)
+            save_arrays(self.path / "models.npz", self._points)
         for name in self._estimates:
             self._write_poses(name)
         self._write_timings()
@@ -203,7 +203,7 @@ class RunWriter:
                 arrays |= {f"{name}/{column}": getattr(run, column) for column in COLUMNS}
                 if self._several_maps(name):
                     self._write_poses(name)
-            _save_arrays(self.path / "poses.npz", arrays)
+            save_arrays(self.path / "poses.npz", arrays)
         self.info |= {"frames": n, "objects": list(self._estimates)}
         self._write_info()
 
@@ -376,8 +376,3 @@ def _clear_refined(out: Path) -> None:
         for folder in (refined / "poses", refined / "meshes", refined):
             with suppress(OSError):  # something else is in it
                 folder.rmdir()
-
-
-def _save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with replacing(path) as file:
-        np.savez(file, allow_pickle=False, **arrays)

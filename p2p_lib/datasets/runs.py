@@ -12,7 +12,6 @@ It is written into a folder of its own, by one process at a time: nothing is del
                           and so are poses in maps that were given up since (``map_id`` in ``poses.npz``); poses in a
                           map that became part of the last one since are in its frame
     poses.npz             everything of every frame as it was said then, and the truth where the sequence has it
-    first_masks.png       the mask with which each object was started, to be looked at first
     meshes/<object>.ply   the reconstructed surface in the object frame, vertex colours (written at the end)
     keypoints.npz         2D tracks and keypoint maps (:mod:`p2p_lib.datasets.keypoint_log`; written at the end)
     masks.npz             every mask, coarsely (:mod:`p2p_lib.datasets.mask_log`; written at the end)

@@ -24,7 +24,7 @@ from scipy.ndimage import uniform_filter1d
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config, from_toml
 from p2p_lib.core.errors import MissingData
-from p2p_lib.core.files import load_arrays, replace_text, replacing, writing_alone
+from p2p_lib.core.files import load_arrays, replace_text, save_arrays, writing_alone
 from p2p_lib.core.mesh import save
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
@@ -102,8 +102,7 @@ def _part(made: Finished, name: str, config: Config, evidence: VideoEvidence, pa
     if len((mesh := fused(made, name, columns["T_cam_obj"], last, config, voxel_m / 2).mesh()).faces):
         save(mesh, parts / "meshes" / f"{name}.ply")
     bar.update(len(T))
-    with replacing(parts / f"{name}.npz") as file:
-        np.savez(file, allow_pickle=False, **columns)
+    save_arrays(parts / f"{name}.npz", columns)
 
 
 def _columns(
@@ -190,8 +189,7 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
         summary.append(
             line + f", {len(off)} of them more than three sigmas from the causal one" + in_ranges(disagrees[name])
         )
-    with replacing(new / "poses.npz") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    save_arrays(new / "poses.npz", arrays)
     for file_name in ("config.toml", "models.npz", "masks.npz"):
         if (made.run.path / file_name).is_file():
             shutil.copyfile(made.run.path / file_name, new / file_name)

@@ -368,7 +368,7 @@ def test_a_written_folder_reads_back(good):
 
 
 def test_a_folder_is_not_written_over(good):
-    with pytest.raises(BadInput, match="not empty"):
+    with pytest.raises(BadInput, match="what is there already"):
         own.write(open_sequence(good), good)
 
 
