@@ -381,8 +381,8 @@ def test_after_a_reset_it_is_looked_for_as_at_first(crossing, learnt):
     np.testing.assert_array_equal(told[1].T_cam_obj, told[0].T_cam_obj)
 
 
-def test_look_alikes_are_not_taken_for_each_other():
-    alike = open_sequence("synthetic/look_alikes")
+def test_look_alikes_are_not_taken_for_each_other(opening):
+    alike = opening("look_alikes", 61)
     method = Point2Pose(alike.camera)
     for name in alike.objects:
         method.add_object(name)

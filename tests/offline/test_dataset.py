@@ -13,15 +13,8 @@ from p2p_lib.apps import cli
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.models import MESHES, find_models, load_points
-from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
-
-
-@pytest.fixture
-def scene(finished, tmp_path):
-    write_product(finished, "bop-dataset", tmp_path / "set")
-    return open_sequence(tmp_path / "set/train/000001")
 
 
 def test_labels_are_the_poses_and_the_masks_are_the_true_ones(made, scene):
@@ -113,18 +106,3 @@ def test_images_that_are_gone_and_runs_without_poses_are_a_sentence_each(finishe
     np.savez(finished / "poses.npz", **arrays)
     assert cli.main(["export", str(finished), "--format", "bop-dataset", "--out", str(tmp_path / "set")]) == 2
     assert "a run without a single pose" in capsys.readouterr().err
-
-
-def test_foundationpose_folders(finished, made, tmp_path):
-    write_product(finished, "foundationpose", tmp_path / "fp", faces=500)
-    for name in made.sequence.objects:
-        folder = tmp_path / "fp" / name
-        (mask,) = (folder / "masks").iterdir()
-        rgb = sorted((folder / "rgb").iterdir())
-        assert mask.name == rgb[0].name == sorted((folder / "depth").iterdir())[0].name
-        own = made.sequence.masks(int(mask.stem))[name]
-        np.testing.assert_array_equal(cv2.imread(str(mask), -1) > 0, own)
-        depth = cv2.imread(str(folder / "depth" / mask.name), -1) / 1000
-        np.testing.assert_allclose(depth, made.sequence.frame(int(mask.stem)).depth_m, atol=0.0005)
-        np.testing.assert_allclose(np.loadtxt(folder / "cam_K.txt"), made.sequence.camera.K)
-        assert {"textured_simple.obj", "textured_simple.png"} <= {path.name for path in (folder / "mesh").iterdir()}

@@ -1,6 +1,7 @@
 """Models to take away: what they look like, opened by other libraries, and how near they are to the truth."""
 
 import json
+import shutil
 from types import SimpleNamespace
 
 import cv2
@@ -21,8 +22,6 @@ from tests.fixtures.made_run import T_OBJ_MODEL
 
 @pytest.fixture(scope="module")
 def models(made, tmp_path_factory):
-    import shutil
-
     from p2p_lib.core.mesh import save
 
     folder = tmp_path_factory.mktemp("models")
@@ -68,6 +67,29 @@ def test_obj_and_glb_show_the_same(models):
         order = np.lexsort(mesh.triangles_center.round(4).T)
         colours.append(trimesh.visual.color.uv_to_color(middle, image)[order, :3].astype(float))
     assert np.abs(colours[0] - colours[1]).mean() < 2
+
+
+def test_foundationpose_folders(finished, made, models, tmp_path, monkeypatch):
+    asked = []
+
+    def made_before(run, out, *how):
+        asked.append((run, *how))
+        shutil.copytree(models, out)
+
+    monkeypatch.setattr(model, "write_models", made_before)
+    write_product(finished, "foundationpose", tmp_path / "fp", 0.4, faces=500)
+    assert asked == [(finished, 500, 0.4, False)]
+    for name in made.sequence.objects:
+        folder = tmp_path / "fp" / name
+        (mask,) = (folder / "masks").iterdir()
+        rgb = sorted((folder / "rgb").iterdir())
+        assert mask.name == rgb[0].name == sorted((folder / "depth").iterdir())[0].name
+        own = made.sequence.masks(int(mask.stem))[name]
+        np.testing.assert_array_equal(cv2.imread(str(mask), -1) > 0, own)
+        depth = cv2.imread(str(folder / "depth" / mask.name), -1) / 1000
+        np.testing.assert_allclose(depth, made.sequence.frame(int(mask.stem)).depth_m, atol=0.0005)
+        np.testing.assert_allclose(np.loadtxt(folder / "cam_K.txt"), made.sequence.camera.K)
+        assert {"textured_simple.obj", "textured_simple.png"} <= {path.name for path in (folder / "mesh").iterdir()}
 
 
 def box(open_above=True):
