@@ -1,6 +1,6 @@
 """A CPU renderer for textured meshes: exact depth at pixel centres, prefiltered textures, Lambert shading, glaze.
 
-Open3D's ray caster says which face a pixel shows. Where on it follows in float64: with A the camera-space corners of a
+Embree says which face a pixel shows. Where on it follows in float64: with A the camera-space corners of a
 face as columns, ``A^-1 @ ray`` are the barycentric coordinates divided by the depth (Olano and Greer, 1997). They are
 affine in the pixel, so one 3x3 matrix per face gives the depth, perspective-correct texture coordinates and their
 derivatives.
