@@ -27,6 +27,12 @@ def crossing():
 
 
 @pytest.fixture(scope="module")
+def other(opening):
+    """A mug, which has nothing of what was learnt."""
+    return opening("mug", 55)
+
+
+@pytest.fixture(scope="module")
 def learnt(crossing):
     """The carton of ``crossing``, learnt in its first frames: the memory, T_obj_model, and the surface's values."""
     method = Point2Pose(crossing.camera)
@@ -213,8 +219,7 @@ def test_landmarks_lie_on_the_surface(learnt):
     assert known.mean() > 0.9 and np.median(np.abs(distance_m[known])) < 1e-4
 
 
-def test_what_is_not_there_is_not_found(learnt):
-    other = open_sequence("synthetic/mug")
+def test_what_is_not_there_is_not_found(learnt, other):
     method = Point2Pose(other.camera)
     method.add_object("box", memory=learnt.memory)
     for i in range(0, 60, 6):
@@ -282,8 +287,7 @@ def test_a_claim_that_the_surface_alone_bears_out_is_withdrawn_too(crossing, lea
     assert told[5].status is Status.INITIALISING and not len(obj.map)
 
 
-def test_a_claim_that_nothing_bears_out_is_withdrawn(crossing, learnt):
-    other = open_sequence("synthetic/mug")
+def test_a_claim_that_nothing_bears_out_is_withdrawn(crossing, learnt, other):
     method = Point2Pose(crossing.camera)
     method.add_object("box", memory=learnt.memory)
     assert followed(crossing, method, LATER[:3])[-1]["box"].T_cam_obj is not None
@@ -313,8 +317,7 @@ def test_a_frozen_map_does_not_grow(crossing, learnt):
     np.testing.assert_allclose(model.surface.values(), learnt.values, atol=1e-3)
 
 
-def test_a_mask_of_something_else_founds_no_other_map(learnt):
-    other = open_sequence("synthetic/mug")
+def test_a_mask_of_something_else_founds_no_other_map(learnt, other):
     method = Point2Pose(other.camera)
     method.add_object("box", memory=learnt.memory)
     told = [method.step(other.frame(i), {"box": other.masks(i)["mug"]})["box"] for i in range(15)]
