@@ -18,7 +18,7 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import check_arrays, file_name, load_arrays, parse_json, save_arrays
 
 #: Of the files that this library writes, and reads.
-VERSION = 1
+VERSION = 2
 _KIND = "p2p object memory"
 _EXPECTED = "a memory as p2p run writes it (maps/OBJECT.npz)"
 #: Keyframe poses were rounded to this and more.
@@ -67,7 +67,6 @@ class ObjectMemory:
     p_obj        (N, 3) its landmarks, metres
     descriptors  (N, scales, SIZE) uint8: how each looks on the surface
     confidence   (N,) of the poses that placed them
-    keypoint     (N,) bool: those that were tracked, and kept by the graph
     T_cam_obj    (V, 4, 4) poses of its keyframes: from where it was seen
     covariance   (6, 6) of the newest keyframe, right tangent of T_cam_obj
     seen_m2      the most that a keyframe showed of it, across the line of sight
@@ -79,7 +78,6 @@ class ObjectMemory:
     p_obj: np.ndarray
     descriptors: np.ndarray
     confidence: np.ndarray
-    keypoint: np.ndarray
     T_cam_obj: np.ndarray
     covariance: np.ndarray
     seen_m2: np.ndarray
@@ -96,7 +94,7 @@ class ObjectMemory:
         if self.descriptors.ndim != 3 or self.descriptors.dtype != np.uint8:
             raise BadInput("memory descriptors", f"{self.descriptors.shape}", "(N, scales, SIZE) uint8")
         shapes = {"p_obj": (n, 3), "descriptors": (n, *self.descriptors.shape[1:]), "confidence": (n,)}
-        shapes |= {"keypoint": (n,), "T_cam_obj": (v, 4, 4), "covariance": (6, 6), "seen_m2": ()}
+        shapes |= {"T_cam_obj": (v, 4, 4), "covariance": (6, 6), "seen_m2": ()}
         check_arrays(f"memory of {self.name!r}", self, shapes, finite=True)
         for T in self.T_cam_obj:
             se3.check("memory T_cam_obj", T, _POSE_TOLERANCE)

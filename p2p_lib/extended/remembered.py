@@ -54,15 +54,11 @@ _BARE, _PATIENCE = 4, 5
 
 @dataclass(frozen=True, eq=False)
 class Recognition:
-    """Where a remembered object is in an image: its ``mask`` (H, W) bool, what shows of it, and landmarks there.
-
-    rows  (M,) of the landmarks in the memory, seen at uv_px (M, 2)
-    """
+    """Where a remembered object is in an image: its ``mask`` (H, W) bool, what shows of it, and landmarks ``seen``."""
 
     mask: np.ndarray
     sighting: Sighting
-    rows: np.ndarray
-    uv_px: np.ndarray
+    seen: Any
 
 
 class Remembered(TwoMaps):
@@ -161,7 +157,7 @@ class Remembered(TwoMaps):
         if best is None:
             return None
         _, where, sighting, seen = best
-        return Recognition(where, sighting, seen.rows, seen.uv_px)
+        return Recognition(where, sighting, seen)
 
     def _sightings(
         self, frame: Frame, search: ImageSearch, mask: np.ndarray | None, taken: np.ndarray | None
@@ -204,10 +200,14 @@ class Remembered(TwoMaps):
         held = np.unique(label[v, u])
         return np.isin(label, held[held > 0])
 
-    def taken_in(self, rows: np.ndarray) -> np.ndarray:
-        """Add landmarks, by rows (M,), as keypoints of the map, again if they were lost; returns their keys."""
-        memory = self._memory
-        keys = self.model.remember(memory.p_obj[rows].astype(float), memory.confidence[rows])
+    def taken_in(self, rows: np.ndarray, seen: Any) -> np.ndarray:
+        """Add the corners at which landmarks, rows (M,), are seen as keypoints of the map; returns their keys.
+
+        A landmark tells where the object is to a few millimetres, all of them to a fraction of that. So they say where
+        the object is, and its keypoints are what is there.
+        """
+        p_obj = se3.transform(se3.inverse(seen.T_cam_obj), seen.p_cam)
+        keys = self.model.remember(p_obj, self._memory.confidence[rows])
         self._key[rows] = keys
         return keys
 
@@ -238,7 +238,7 @@ class Remembered(TwoMaps):
         seen = self._recogniser.at(obs.frame, obs.mask, T_cam_obj, p_obj, descriptors)
         if not len(seen):
             return requests
-        keys = self.taken_in(absent[seen.rows])
+        keys = self.taken_in(absent[seen.rows], seen)
         add_px, keys = np.concatenate([requests.add_px, seen.uv_px]), np.concatenate([requests.keys, keys])
         return replace(requests, add_px=add_px, keys=keys)
 
@@ -261,7 +261,7 @@ def _certain(landmarks: float, share: float, outline: Callable[[], float | None]
 
 def follow(obj: Remembered, found: Recognition, tracker: PointTracker, tracks: Tracks) -> Tracks:
     """Have the tracker follow the landmarks found; returns all objects' tracks in this frame, with these."""
-    keys, ids = obj.taken_in(found.rows), tracker.add(found.uv_px)
+    keys, ids = obj.taken_in(found.seen.rows, found.seen), tracker.add(found.seen.uv_px)
     obj.map.assign(keys, ids)
     count = len(ids)
-    return joined([tracks, Tracks(ids, found.uv_px, np.ones(count, bool), np.zeros(count))])
+    return joined([tracks, Tracks(ids, found.seen.uv_px, np.ones(count, bool), np.zeros(count))])

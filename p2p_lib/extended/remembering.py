@@ -38,21 +38,20 @@ def memory_of(name: str, known: Known, made_of: dict[str, Any], before: ObjectMe
         raise BadInput(f"memory of {name!r}", "no surface", "an object with a reconstructed surface")
     columns = [_landmarks(known, surface)]
     if before is not None:
-        columns.append((before.p_obj, before.descriptors, before.confidence, before.keypoint))
+        columns.append((before.p_obj, before.descriptors, before.confidence))
     columns = [column for column in columns if len(column[0])] or columns[:1]
-    p_obj, descriptors, confidence, keypoint = (np.concatenate(of) for of in zip(*columns, strict=True))
-    rng = np.random.default_rng(0)
-    kept = np.sort(np.argsort(~keypoint + rng.random(len(p_obj)))[:_LANDMARKS])  # keypoints first
-    landmarks = p_obj[kept], descriptors[kept], confidence[kept], keypoint[kept]
+    p_obj, descriptors, confidence = (np.concatenate(of) for of in zip(*columns, strict=True))
+    kept = np.sort(np.random.default_rng(0).permutation(len(p_obj))[:_LANDMARKS])
+    landmarks = p_obj[kept], descriptors[kept], confidence[kept]
     rest = known.model.views.T_cam_obj, known.model.covariance, np.array(getattr(known.life, "seen_m2", 0.0))
     return ObjectMemory(name, *landmarks, *rest, _surface_memory(surface), made_of)
 
 
 def _landmarks(known: Known, surface: TsdfVolume) -> tuple[np.ndarray, ...]:
-    """p_obj (L, 3), descriptors, confidence (L,) and keypoint (L,) of what the kept views show."""
+    """p_obj (L, 3), descriptors and confidence (L,) of the corners and keypoints that the kept views show."""
     points = known.map
-    own, own_confidence = points.p_obj[points.promoted], points.confidence[points.promoted]
-    middling = float(np.median(own_confidence)) if len(own_confidence) else 0.0
+    own, confidence = points.p_obj[points.promoted], points.confidence[points.promoted]
+    middling = float(np.median(confidence)) if len(confidence) else 0.0
     found: list[tuple[np.ndarray, ...]] = []
     for view in surface.views.values():
         (height, width), (left, top), lens = view.inside.shape, view.corner, view.camera
@@ -64,17 +63,11 @@ def _landmarks(known: Known, surface: TsdfVolume) -> tuple[np.ndarray, ...]:
         inside = np.flatnonzero((p_cam[:, 2] > 0) & in_image(uv_px, depth_m.shape))
         u, v = np.rint(uv_px[inside]).astype(int).T
         shown = inside[np.abs(depth_m[v, u] - p_cam[inside, 2]) < _SHOWS_M]
-        recogniser = backends.make_recogniser(camera)
-        p_cam, descriptors, which = recogniser.describe(frame, view.inside, uv_px[shown])
+        p_cam, descriptors = backends.make_recogniser(camera).describe(frame, view.inside, uv_px[shown])
         p_obj = _on_surface(surface, se3.transform(se3.inverse(view.T_cam_obj), p_cam))
-        is_point = which >= 0
-        rows = shown[which[is_point]]
-        p_obj[is_point] = own[rows]
-        confidence = np.full(len(p_obj), middling)
-        confidence[is_point] = own_confidence[rows]
-        found.append((p_obj, descriptors, confidence, is_point))
+        found.append((p_obj, descriptors, np.full(len(p_obj), middling)))
     if not found:
-        return np.zeros((0, 3)), np.zeros((0, 1, 1), np.uint8), np.zeros(0), np.zeros(0, bool)
+        return np.zeros((0, 3)), np.zeros((0, 1, 1), np.uint8), np.zeros(0)
     return tuple(np.concatenate(column) for column in zip(*found, strict=True))
 
 

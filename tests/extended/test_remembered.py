@@ -18,7 +18,7 @@ from p2p_lib.extended.image_search import ImageSearch
 from p2p_lib.extended.remembered import _certain
 from p2p_lib.trackers.builtin.recogniser import Recognised, Recogniser
 
-LEARNT, LATER = range(0, 45), range(72, 83)
+LEARNT, LATER = range(0, 45), range(74, 85)
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +169,17 @@ def test_landmarks_that_come_into_view_become_keypoints(again):
     assert (of_memory >= 0).sum() > again.keypoints
 
 
+def test_keypoints_lie_where_they_are_seen(crossing, again):
+    """A landmark looks like its corner, and is a few pixels beside it: all of them tell the pose, none its point."""
+    method, estimate = again.method, again.told[-1]["box"]
+    points = method.objects["box"].map
+    seen = dict(zip(method.tracks.ids.tolist(), method.tracks.uv_px, strict=True))
+    rows = np.flatnonzero(points.promoted & np.isin(points.ids, method.tracks.ids[method.tracks.visible]))
+    uv_px = crossing.camera.project(se3.transform(estimate.T_cam_obj, points.p_obj[rows]))
+    off_px = np.linalg.norm(uv_px - [seen[k] for k in points.ids[rows]], axis=1)
+    assert len(rows) >= 20 and np.quantile(off_px, 0.8) < 1
+
+
 def test_what_was_found_is_kept_with_what_it_began_with(learnt, again):
     kept = again.method.memory("box")
     before = {tuple(p) for p in learnt.memory.p_obj}
@@ -214,8 +225,7 @@ def test_looks_find_what_few_landmarks_show(crossing, learnt):
 
 
 def test_landmarks_lie_on_the_surface(learnt):
-    corners = learnt.memory.p_obj[~learnt.memory.keypoint]
-    distance_m, known = learnt.method.objects["box"].model.surface.query(corners)
+    distance_m, known = learnt.method.objects["box"].model.surface.query(learnt.memory.p_obj)
     assert known.mean() > 0.9 and np.median(np.abs(distance_m[known])) < 1e-4
 
 

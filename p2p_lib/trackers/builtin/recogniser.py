@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.robust import consensus
+from p2p_lib.core.robust import consensus, refit, residual_m
 from p2p_lib.core.types import SHARED, Frame, Rows
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Corners, alike, corners, described
@@ -25,8 +24,8 @@ _COMPARED, _PAIRS = 600, 400
 _RATIO, _EXPECTED_RATIO = 0.85, 0.95
 #: Descriptors are of unit length, and kept as bytes of this scale.
 _SCALE = 255.0
-#: Pairs agree within this, m.
-_AGREE_M = 0.008
+#: Pairs agree within this, m; fewer of them do not improve a pose.
+_AGREE_M, _REFIT = 0.008, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +49,16 @@ class Recogniser:
         self._rng = np.random.default_rng(0)  # part of the method: the same stream gives the same
         self._newest: tuple[Frame, Corners] | None = None  # a frame's corners serve all objects
 
-    def describe(self, frame: Frame, mask: np.ndarray, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def describe(self, frame: Frame, mask: np.ndarray, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Landmarks of an object: corners in its ``mask`` (H, W) and points at ``uv_px`` (M, 2), where there is depth.
 
-        Returns p_cam (N, 3), descriptors (N, scales, SIZE) uint8, and which (N,) of ``uv_px`` each is, -1 for corners.
+        Returns p_cam (N, 3) and descriptors (N, scales, SIZE) uint8.
         """
         now = Image.of(frame, self.camera)
-        own, (given, points) = corners(now, inner(mask), _IN_MASK), described(now, uv_px.astype(np.float32))
-        which = np.concatenate([np.full(len(own), -1), given])
+        own, (_, points) = corners(now, inner(mask), _IN_MASK), described(now, uv_px.astype(np.float32))
         descriptors = np.concatenate([own.descriptors, points.descriptors])
         as_bytes = np.rint(np.clip(descriptors, 0, 1) * _SCALE).astype(np.uint8)
-        return np.concatenate([own.p_cam, points.p_cam]), as_bytes, which
+        return np.concatenate([own.p_cam, points.p_cam]), as_bytes
 
     def pairs(self, frame: Frame, descriptors: np.ndarray) -> Recognised:
         """Some of the landmarks (N,) that look like corners anywhere in an image."""
@@ -80,11 +78,18 @@ class Recogniser:
     def at(
         self, frame: Frame, mask: np.ndarray, T_cam_obj: np.ndarray, p_obj: np.ndarray, descriptors: np.ndarray
     ) -> Recognised:
-        """The landmarks (N, 3) that are seen in a ``mask`` (H, W) where a pose has them; perhaps none."""
+        """The landmarks (N, 3) that are seen in a ``mask`` (H, W) where a pose has them; perhaps none.
+
+        Each looks like its corner, and may be a few pixels beside it: their pose is refit to them all.
+        """
         found = corners(Image.of(frame, self.camera), inner(mask), _IN_MASK)
         rows, corner = self._pairs(found, descriptors, np.arange(len(p_obj)), _EXPECTED_RATIO)
-        near = np.linalg.norm(se3.transform(T_cam_obj, p_obj[rows]) - found.p_cam[corner], axis=1) < _AGREE_M
-        return _once(Recognised(rows, found.uv_px[corner].astype(float), found.p_cam[corner]), near, T_cam_obj)
+        pairs = Recognised(rows, found.uv_px[corner].astype(float), found.p_cam[corner])
+        every, limit_m = np.ones(len(rows)), np.full(len(rows), _AGREE_M)
+        if fit := refit(T_cam_obj, p_obj[rows], pairs.p_cam, limit_m, every, _REFIT, every > 0):
+            return _once(pairs, fit.inliers, fit.T_a_b)
+        near = residual_m(T_cam_obj, p_obj[rows], pairs.p_cam) < _AGREE_M
+        return _once(pairs, near, T_cam_obj)
 
     def _corners(self, frame: Frame) -> Corners:
         if self._newest is None or self._newest[0] is not frame:
