@@ -44,7 +44,7 @@ _WANTED = {
     "greater_than": "more than {gt}",
     "less_than_equal": "at most {le}",
     "less_than": "less than {lt}",
-    "too_short": "a list of {min_length} or more",
+    "too_short": "a list of at least {min_length}",
     "too_long": "a list of at most {max_length}",
     "string_pattern_mismatch": "text of the form {pattern}",
     "string_too_short": "some text",

@@ -204,7 +204,7 @@ SMALL += '[full]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
     [
         ('name = "Ours"', 'name = "Ours"\ntraker = "lk"', r"method\.0\.traker, a key unknown .* Did you mean tracker"),
         ("seeds = [0]", "seeds = [0.5]", r"quick\.seeds\.0: 0\.5, where a whole number should be"),
-        ("seeds = [0]", "seeds = []", r"quick\.seeds: \[\], where a list of 1 or more should be"),
+        ("seeds = [0]", "seeds = []", r"quick\.seeds: \[\], where a list of at least 1 should be"),
         ('name = "a" }', 'name = "a", stop = -1 }', r"quick\.sequence\.0\.stop"),
         ("[quick]", '[[method]]\nname = "Ours"\n[quick]', "two methods have one name"),
         ("seeds = [0]", 'seeds = [0]\nmethods = ["Theirs"]', "no method is called 'Theirs'"),
