@@ -407,7 +407,8 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
         why = Counter(status_text(*one).partition(" since ")[0] for one in zip(obj.status[lost], obj.reason[lost]))
-        most = f"; otherwise mostly {why.most_common(1)[0][0]}" if why else ""
+        otherwise = "otherwise mostly" if obj.has_pose.any() else "mostly"
+        most = f"; {otherwise} {why.most_common(1)[0][0]}" if why else ""
         doubted = int(obj.doubted.sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""
         lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}")

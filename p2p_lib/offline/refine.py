@@ -7,6 +7,7 @@ without a pose gets one that fits as well as the others do. Causal poses at whic
 kept. The surface is fused anew with half the voxel size.
 
 Written to ``RUN/offline``, a run's folder of its own that says ``"offline": true``: causal results stay as they are.
+It has no ``maps/``: keypoints and keyframes, by which an object is found again, stay those of ``RUN/maps``.
 """
 
 from __future__ import annotations
@@ -66,8 +67,9 @@ def refine_run(folder: str | Path, progress: bool = False) -> list[str]:
         parts.mkdir(exist_ok=True)
         replace_text(parts / "of", stamp)
         todo = [name for name in made.tracked if not (parts / f"{name}.npz").is_file()]
-        total = len(made.frames) * (1 + 2 * len(todo)) if todo else 0
-        with progress_bar("refine", total, shown=progress) as bar:
+        passes = 1 + 2 * len(todo) if todo else 0  # over the frames: one for all objects, then two for each
+        title = f"refine, {passes} passes over {len(made.frames)} frames"
+        with progress_bar(title, passes * len(made.frames), shown=progress) as bar:
             evidence = gather(made, todo, config, bar) if todo else {}
             for name in todo:
                 _part(made, name, config, evidence.pop(name), parts, bar)

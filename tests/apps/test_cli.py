@@ -488,7 +488,7 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     assert "$P2P_DATA is not set" in first and "--quick" in first and "nothing ran" in last
     assert cli.main(["benchmark", "--list"]) == 0
     first, *table = capsys.readouterr().out.splitlines()
-    assert re.match(r"\d+ of 19 plans can run here and now in full; \d+ of \d+ methods", first)
+    assert any(re.match(r"\d+ of 19 plans can run here and now in full; \d+ of \d+ methods", line) for line in table)
     assert any(re.match(r"ycbineoat +0 of 54 +YCBInEOAT$", line) for line in table)
     assert any(re.match(r"sampling_embedded +18 of 30 ", line) for line in table)
     assert max(map(len, [first, *table])) <= 100
@@ -781,6 +781,17 @@ def test_a_run_says_how_many_poses_it_doubts(made):
         doubted = replace(made.run, objects={name: replace(obj, confidence=confidence)})
         _, line = summary(doubted, len(obj))
         assert words in line and ("doubted" in line) == (confidence is doubtful)
+
+
+def test_a_run_says_what_mostly_kept_an_object_from_a_pose(made):
+    name, obj = next(iter(made.run.objects.items()))
+    lost = replace(obj, T_cam_obj=np.where(np.arange(len(obj))[:, None, None] < 3, obj.T_cam_obj, np.nan))
+    for some, words in (
+        (lost, "; otherwise mostly "),
+        (replace(lost, T_cam_obj=0 * lost.T_cam_obj * np.nan), "; mostly "),
+    ):
+        _, line = summary(replace(made.run, objects={name: some}), len(obj))
+        assert words in line
 
 
 def test_a_folder_of_ones_own_may_have_masks_of_some_images(sequence, tmp_path, capsys):

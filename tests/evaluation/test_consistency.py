@@ -12,6 +12,7 @@ from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.mask_log import MaskLog, load_masks
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, load_points
 from p2p_lib.evaluation.consistency import HEADS, consistency
+from p2p_lib.evaluation.evidence import on_surface
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 OFF_PX = 2.0
@@ -121,7 +122,16 @@ def test_what_cannot_be_said_is_not(made, run, tmp_path):
         assert {key for key, value in numbers.items() if np.isfinite(value)} == {"pose", "doubted"}
         assert said.as_dict()["objects"][name]["mask_iou"] is None
     assert said.as_dict()["truth"] is None and said.as_dict()["not_scored"] is None
+    assert {said.verdict(name) for name in run.objects} == {"unknown"}, "where nothing was compared nothing is good"
+    assert "unknown, box: no pose was compared" in said.as_table() and "keypoints were kept" in said.as_table()
     unscored = replace(said, not_scored="no model of 'box'")
     assert unscored.as_dict()["truth"] is None and unscored.as_dict()["not_scored"] == "no model of 'box'"
     for head, says in HEADS.values():
         assert head in said.as_table() and says in said.as_table()
+
+
+def test_far_depth_is_as_near_to_the_surface_as_a_camera_measures_it():
+    """8 mm are off at arm's length and noise at 2 m, where right poses of a depth camera would be called off."""
+    for range_m, share in ((0.6, 0.0), (2.0, 1.0)):
+        surface_m = np.full((4, 4), range_m)
+        assert on_surface(surface_m, surface_m + 0.008) == on_surface(surface_m, surface_m - 0.008) == share

@@ -112,6 +112,17 @@ def test_other_files_are_refused_and_say_what_was_expected(learnt, kept, tmp_pat
         load_memory(tmp_path / "newer.npz")
 
 
+def test_a_folder_gives_all_its_memories(learnt, tmp_path):
+    """A run's folder holds other archives beside its maps."""
+    for name in ("box", "can"):
+        save_memory(tmp_path / f"maps/{name}.npz", replace(learnt.memory, name=name))
+    (tmp_path / "poses.npz").write_bytes(b"")
+    assert list(load_memories([tmp_path])) == list(load_memories([tmp_path / "maps"])) == ["box", "can"]
+    (tmp_path / "none").mkdir()
+    with pytest.raises(MissingData, match="no file in it, expected a memory"):
+        load_memories([tmp_path / "none"])
+
+
 def test_two_of_one_name_and_an_empty_map_are_refused(learnt, kept):
     with pytest.raises(BadInput, match="two of 'box'"):
         load_memories([kept, kept])

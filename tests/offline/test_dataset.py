@@ -31,6 +31,18 @@ def test_labels_are_the_poses_and_the_masks_are_the_true_ones(made, scene):
     np.testing.assert_array_equal(scene.frame(3).rgb, made.sequence.frame(numbers[3]).rgb)
 
 
+def test_what_is_left_out_and_what_is_doubtful_is_counted(made, finished, tmp_path):
+    arrays = dict(np.load(finished / "poses.npz"))
+    arrays["box/confidence"] = np.where(np.arange(len(made.sequence)) < 3, 0.4, arrays["box/confidence"])
+    np.savez(finished / "poses.npz", **arrays)
+    for least, doubtful in ((0.5, 0), (0.3, 3)):
+        said = write_product(finished, "bop-dataset", out := tmp_path / f"set{least}", least)
+        rows = list(csv.DictReader((out / "labels.csv").open()))
+        frames, n = {row["image"] for row in rows}, len(made.sequence)
+        assert said.startswith(f"{len(rows)} labels in {len(frames)} of {n} images; {n - len(frames)} left out")
+        assert f"; {doubtful} of the labels doubtful" in said
+
+
 def test_models_are_metric_whatever_the_file_says(made, scene):
     for k, (_, path) in enumerate(sorted(find_models(made.sequence, MESHES).items()), 1):
         found = load_points(find_models(scene)[f"obj_{k:06d}"])
