@@ -36,6 +36,7 @@ class Objects(ABC):
         self.objects: dict[str, Any] = {}
         self.refused: dict[str, BadInput] = {}
         self._prompts: dict[str, Prompt] = {}  # in the frame to come
+        self._next_map: dict[str, int] = {}  # by object, which no pose of its name has had yet
         self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
         self._turn, self.closed = RLock(), False
         self._predictor = Predictor()
@@ -116,7 +117,10 @@ class Objects(ABC):
             self.refused.pop(name, None)
 
     def remove_object(self, name: str) -> None:
-        """Stop following an object; its points are dropped from the tracker."""
+        """Stop following an object; its points are dropped from the tracker.
+
+        Under the same name another one may be added; its poses are in other maps (``map_id``).
+        """
         if name not in self.objects:
             raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
         with self.alone():
@@ -167,6 +171,7 @@ class Objects(ABC):
         is no world of the user's.
         """
         name = estimate.object
+        self._next_map[name] = max(self._next_map.get(name, 0), estimate.map_id + 1)
         T_world_cam = next((T for time_s, T in reversed(self._cameras) if time_s == estimate.time_s), None)
         self._predictor.add(estimate, T_world_cam)
         if estimate.T_cam_obj is not None and T_world_cam is not None:

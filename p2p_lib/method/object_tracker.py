@@ -40,6 +40,7 @@ class ObjectTracker:
 
     policy  makes what decides the open questions of a step; the paper's by default
     model   makes an empty model
+    map_id  the number of its first map
     """
 
     def __init__(
@@ -53,12 +54,13 @@ class ObjectTracker:
         executor: Executor,
         policy: Callable[..., Policy] = Policy,
         model: Callable[..., ObjectModel] = ObjectModel,
+        map_id: int = 0,
     ):
         self.name, self.config, self.detector = name, config, detector
         self.observer = Observer(camera, config.depth, config.refinement.max_points if config.method.surface else 0)
         self.new_model = partial(model, config, self.observer, stopwatch, executor)
         self.policy = policy(self.observer, config, rng, stopwatch)
-        self.known = Known(self.new_model(), self.policy.life)
+        self.known = Known(self.new_model(), self.policy.life, map_id)
         self._stopwatch = stopwatch
 
     @property

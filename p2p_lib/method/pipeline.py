@@ -145,7 +145,7 @@ class Point2Pose(Objects):
         """Start an object of which nothing is known."""
         rng = np.random.default_rng([self.config.seed, *name.encode()])
         made_of = self.camera, self.config, self.detector, rng, self.stopwatch, self._executor
-        self.objects[name] = self._parts.object(name, *made_of)
+        self.objects[name] = self._parts.object(name, *made_of, map_id=self._next_map.get(name, 0))
 
     def _log(self, estimates: Mapping[str, PoseEstimate]) -> None:
         """Log every object whose status has changed."""
