@@ -424,7 +424,7 @@ def _advice(run: Run, job: _Job) -> str:
     why = " ".join(reasons.values())
     if set(reasons) <= set(job.memories):
         fix = "show a side that was learnt, or click on it"
-    elif "pixels with depth" in why:
+    elif "depth" in why:
         fix = "its depth is missing, out of range or in another unit (--depth-scale)"
     elif "not seen yet" in why and not job.masks.every_mask:
         fix = "click on another place, near its centre"

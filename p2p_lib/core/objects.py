@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.depth import depth_trouble
 from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.prediction import Prediction, Predictor
@@ -163,10 +164,14 @@ class Objects(ABC):
                 doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is ignored. {error.fix}")
         return given, prompts
 
-    def explained(self, estimate: PoseEstimate, mask_given: bool) -> PoseEstimate:
-        """An estimate that says what is known: of an object that has not started, what was wrong with its prompt.
+    def explained(
+        self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, given: np.ndarray | None
+    ) -> PoseEstimate:
+        """An estimate that says what is known of why it is as it is, and where its object is in the world.
 
-        Where nobody gave a mask, an object without pixels may be hidden, or in view and not found; since when, is sure.
+        mask, given  (H, W) bool, that by which the object was looked for in the frame, and that which the caller gave;
+                     None where there was none
+
         Where its frame was given with a ``T_world_cam``, its pose is in the world, too; the scene that a tracker finds
         is no world of the user's.
         """
@@ -176,16 +181,28 @@ class Objects(ABC):
         self._predictor.add(estimate, T_world_cam)
         if estimate.T_cam_obj is not None and T_world_cam is not None:
             estimate = replace(estimate, T_world_obj=T_world_cam @ estimate.T_cam_obj)
-        if estimate.status == Status.INITIALISING:
-            return replace(estimate, reason=str(self.refused[name])) if name in self.refused else estimate
+        reason = self._reason(estimate, frame, mask, given is not None)
+        return replace(estimate, reason="; ".join(part for part in (reason, frame.remark) if part))
+
+    def _reason(self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, mask_given: bool) -> str:
+        """Why an estimate has its status, with what prompts, depth and earlier frames tell of it.
+
+        Of an object that has not started, what was wrong with its prompt. Where nobody gave a mask, an object without
+        pixels may be hidden, or in view and not found; since when, is sure.
+        """
+        name = estimate.object
         if estimate.T_cam_obj is not None:
             self._without.pop(name, None)
-            return estimate
-        since = self._without.setdefault(name, estimate.frame_index)
+        elif estimate.status != Status.INITIALISING:
+            self._without.setdefault(name, estimate.frame_index)
+        elif name in self.refused:
+            return str(self.refused[name])
+        if estimate.reason and (trouble := depth_trouble(frame, mask)):
+            return trouble
         if estimate.status != Status.OCCLUDED or mask_given:
-            return estimate
+            return estimate.reason
         known = f"{OUT_OF_VIEW}: " * estimate.reason.startswith(OUT_OF_VIEW)
-        return replace(estimate, reason=f"{known}{NOT_FOUND} since frame {since}")
+        return f"{known}{NOT_FOUND} since frame {self._without[name]}"
 
 
 def _prompt(name: str, **arguments: ArrayLike | None) -> Prompt:
