@@ -84,7 +84,8 @@ class Objects(ABC):
         clicks    (N, 2) pixels on it in the next frame; ``negative`` (M, 2) are not of it
         box       (4,) left, top, right, bottom: all of it is inside in the next frame
 
-        With none of them it is started by the first mask that ``step`` gets for it. Raises :class:`BadInput` for what
+        With none of them it is started by the first mask that ``step`` gets for it, or by :meth:`correct`, and its
+        estimates say until then that it waits for them. Raises :class:`BadInput` for what
         does not fit, and nothing has changed. What shows to be unusable in the next frame itself, as clicks where no
         depth was measured, is forgotten with that frame: ``refused`` and the reason of the object's estimates say why,
         until :meth:`correct` says something better.

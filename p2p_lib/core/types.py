@@ -178,6 +178,8 @@ class Status(StrEnum):
 
 #: How the reason of an occlusion begins where the object has left the image, and where nobody knows what hides it.
 OUT_OF_VIEW, NOT_FOUND = "out of view", "not found"
+#: What an object waits for that was added by its name alone.
+WAITS = ": it waits for a mask (step) or for clicks (correct)"
 
 
 def status_word(status: str, reason: str) -> str:

@@ -546,6 +546,7 @@ def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
         session = json.loads(ask("session")[1])
         if k == 0:
             assert ask("frame/0")[0] == 500 and session["first"] == 0, "there is none yet"
+            assert b"none has come" in ask("prompts", clicked("board", 0, points=[[64, 52]]))[1]
             return
         assert (session["first"], session["live"]) == (k - 1, True)
         answers[k] = session["names"]
@@ -558,6 +559,9 @@ def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
             status, why = ask("prompts", clicked("board", 1, points=[[W, 5]]))
             assert status == 400 and b"expected pixels within" in why
             assert ask("prompts", clicked("board", 1, negative=[[64, 52]]))[0] == 400, "nothing is there to correct"
+            for stale in (0, 9):
+                status, why = ask("prompts", clicked("board", stale, points=[[64, 52]]))
+                assert status == 400 and f"got frame {stale}, expected frame 1, the one that is shown" in why.decode()
             assert ask("prompts", start)[0] == 200
         if k == 5:
             (counts,) = json.loads(ask("masks", {"objects": [], "frame": 4})[1])["masks"].values()

@@ -191,6 +191,16 @@ def test_depth_in_millimetres_is_refused_and_a_far_background_doubted():
         Point2Pose(CAMERA).step(replace(frame, depth_m=depth_m))
 
 
+def test_an_object_that_was_named_alone_says_what_it_waits_for():
+    method = Point2Pose(CAMERA, quick())
+    method.add_object("left")
+    waits = "not seen yet: it waits for a mask (step) or for clicks (correct)"
+    assert method.step(film()[0][0])["left"].reason == method.step(film()[1][0])["left"].reason == waits
+    assert method.step(film()[2][0], {"left": np.zeros((300, 400), bool)})["left"].reason == "not seen yet"
+    started = [method.step(frame, {"left": masks["left"]})["left"].status for frame, masks in film()[3:5]]
+    assert started[-1] is Status.TRACKED
+
+
 @pytest.mark.parametrize("name", ["default", "paper"])
 @pytest.mark.parametrize(
     ("scale", "says"),
