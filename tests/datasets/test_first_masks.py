@@ -45,7 +45,7 @@ def test_each_object_is_drawn_in_the_frame_that_it_starts_in(tmp_path):
 
 def test_what_was_said_meanwhile_is_drawn_and_an_object_that_was_added_again(tmp_path):
     """Of several prompts the newest one, none that is yet to come."""
-    path, cup, said = tmp_path / "first.png", np.array(rgb(OBJECTS[0])), [Prompt("cup", 9, [[10, 10]])]
+    path, cup, said = tmp_path / "first.png", np.array(rgb(OBJECTS[0])), [Prompt("cup", 9, [[10, 100]])]
     firsts = FirstMasks(path, said)
     said += [Prompt("cup", 0, [[20, 40]]), Prompt("cup", 1, [[65, 65]])]
     assert firsts.add(picture(2), {"cup": square(50, 50)}) == ["cup"]
@@ -54,7 +54,7 @@ def test_what_was_said_meanwhile_is_drawn_and_an_object_that_was_added_again(tmp
     assert firsts.add(picture(3), {"cup": None}) == firsts.add(picture(4), {"cup": square(9, 9)}) == []
     assert firsts.add(picture(5), {}) == [] and firsts.add(picture(9), {"cup": square(0, 50)}) == ["cup"]
     again = read(path)[len(image) :]
-    assert (again[10, 10] == cup).all() and (again[65, 65] == GRAY).all() and (again[29, 50:80] == cup).all()
+    assert (again[100, 10] == cup).all() and (again[65, 65] == GRAY).all() and (again[29, 50:80] == cup).all()
 
 
 def test_no_object_is_smaller_by_itself_than_in_the_frame(tmp_path):
