@@ -96,6 +96,7 @@ class RunWriter:
             "masks": masks,
             "preset": config.preset,
             "seed": config.seed,
+            "scene_seed": getattr(sequence, "scene_seed", None),
             "models": {name: str(_from(sequence.path, path)) for name, path in models.items()},
             "frames": 0,
             "finished": False,
