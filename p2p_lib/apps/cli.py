@@ -14,6 +14,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from shlex import quote
 from shutil import get_terminal_size
 from textwrap import fill
 from typing import Any
@@ -58,7 +59,12 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
 @command(
     "run",
     "track the objects of a sequence and write poses, timings, scores",
-    arg("sequence", nargs="?", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA"),
+    arg(
+        "sequence",
+        nargs="?",
+        metavar="SEQ",
+        help="a folder, synthetic/NAME or NAME@SEED (bundled), or a name below $P2P_DATA",
+    ),
     arg(
         "--batch",
         type=Path,
@@ -82,6 +88,7 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     QUIET,
 )
 def _run(a: argparse.Namespace) -> int:
+    from p2p_lib.datasets.runs import read_info
     from p2p_lib.run import run
 
     if (a.sequence is None) == (a.batch is None):
@@ -110,7 +117,8 @@ def _run(a: argparse.Namespace) -> int:
     if film is not None and not result.interrupted:
         print(f"Film in {film(a.out, a.overlay)}")
     if result.interrupted:
-        raise KeyboardInterrupt
+        info = read_info(a.out)  # none where no frame was finished
+        raise KeyboardInterrupt("" if info is None else f"Go on with it: {again(info, a.out)} --resume")
     if result.advice:
         warn(f"p2p run: {result.advice}")
     return 0 if result.tracked else P2PError.exit_code
@@ -383,7 +391,11 @@ def _refine(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import OFFLINE
     from p2p_lib.offline.refine import refine_run
 
-    print("\n".join(refine_run(a.run, not a.quiet)))
+    try:
+        print("\n".join(refine_run(a.run, not a.quiet)))
+    except KeyboardInterrupt:
+        then = f"Go on: p2p refine {quote(str(a.run))}; it keeps the objects that are finished."
+        raise KeyboardInterrupt(then) from None
     print(f"Results in {a.run / OFFLINE}. Next: p2p eval {a.run / OFFLINE}")
 
 

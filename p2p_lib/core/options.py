@@ -57,7 +57,7 @@ _SET = _typed(
     action="append",
     metavar="STAGE.KEY=VALUE",
 )
-_SEED = _typed("of every random choice (default 0)", type=int, metavar="N")
+_SEED = _typed("of every random choice of the tracker (default 0); a scene's: synthetic/NAME@N", type=int, metavar="N")
 _DEVICE = _typed("where surfaces are kept and fused: cpu (default), cuda or cuda:N")
 _OWN = "or your own as package.module:Class"
 _TRACKER = _typed(f"2D point tracker: {', '.join(TRACKERS)} (default {DEFAULT_TRACKER}), {_OWN}", metavar="NAME")

@@ -22,7 +22,7 @@ from p2p_lib.datasets.keypoint_log import FILE as KEYPOINTS
 from p2p_lib.datasets.mask_log import FILE as MASK_LOG
 from p2p_lib.datasets.models import load_points
 from p2p_lib.datasets.provenance import provenance
-from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, Run, load_run, read_info, tum_line
+from p2p_lib.datasets.runs import COLUMNS, NO_POSE, NOT_FOLLOWED, OFFLINE, ObjectRun, Run, load_run, read_info, tum_line
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
 
 IfExists = Literal["refuse", "replace", "resume"]
@@ -96,6 +96,7 @@ class RunWriter:
             "masks": masks,
             "preset": config.preset,
             "seed": config.seed,
+            "scene_seed": getattr(sequence, "scene_seed", None),
             "models": {name: str(_from(sequence.path, path)) for name, path in models.items()},
             "frames": 0,
             "finished": False,
@@ -335,7 +336,7 @@ def _place(info: Mapping[str, Any]) -> str:
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:
-    return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason="not followed")
+    return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason=NOT_FOLLOWED)
 
 
 def _from(folder: Path | None, path: Path) -> Path:

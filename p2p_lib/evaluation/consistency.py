@@ -113,6 +113,8 @@ def consistency(
 ) -> Consistency:
     """What can be said of a run without truth; of its images where they can still be had.
 
+    Frames before an object was added and after it was removed count neither for nor against it.
+
     sequence  that the run was made on (default: opened as the run says)
     looks     frames of which the images are looked at, evenly spread; where there are none to be had, 0
     known_m   how long objects are known to be: what was measured is compared with it
@@ -125,11 +127,13 @@ def consistency(
     keypoints, masks, every = load_keypoints(run.path), load_masks(run.path), load_run(run.path, every_map=True)
     sizes = size_doubts(run.path, known_m or {})
     objects, found, unknown = {}, {}, {}
-    for name, obj in run.objects.items():
+    for name, whole in run.objects.items():
+        rows = whole.followed if whole.followed.any() else np.ones(len(whole), bool)
+        obj, of_every_map = whole.select(rows), every.objects[name].select(rows)
         mesh = run.path / "meshes" / f"{name}.ply"
         fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks)
         doubts = tuple(text for text in run.info.get("doubts") or () if _is_about(text, name))
-        evidence = gathered(obj, every.objects[name], sequence, masks.get(name), keypoints.get(name), fit, doubts)
+        evidence = gathered(obj, of_every_map, sequence, masks.get(name), keypoints.get(name), fit, doubts)
         off = (Suspicion("known size", sizes[name]),) if name in sizes else ()
         found[name] = off + suspicions(evidence)
         if obj.has_pose.any() and not evidence.compared:

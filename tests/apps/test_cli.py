@@ -925,7 +925,8 @@ def test_an_interruption_leaves_what_was_there(sequence, tmp_path, capsys, monke
     monkeypatch.setattr(Point2Pose, "step", interrupted)
     assert run(sequence, tmp_path / "out") == 130
     out, err = capsys.readouterr()
-    assert err == "p2p run: interrupted\n" and "p2p eval" in out
+    first, then = err.rstrip().split(". Go on with it: ")
+    assert first == "p2p run: interrupted" and "p2p eval" in out
     loaded = load_run(tmp_path / "out")
     assert loaded.objects["object"].frame_index.tolist() == list(range(5))
     assert len(loaded.timings["total_ms"]) == 5
@@ -933,6 +934,19 @@ def test_an_interruption_leaves_what_was_there(sequence, tmp_path, capsys, monke
     assert len(np.loadtxt(tmp_path / "out" / "poses" / "object.txt")) == 5
     assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["objects"]["object"]["frames"] == 5
+    monkeypatch.setattr(Point2Pose, "step", step)
+    assert cli.main([*shlex.split(then)[1:], "--quiet"]) == 0 and then.endswith(" --resume")
+    assert load_run(tmp_path / "out").info["finished"] and len(load_run(tmp_path / "out").objects["object"]) == FRAMES
+
+
+def test_an_interrupted_offline_pass_says_how_it_goes_on(tmp_path, capsys, monkeypatch):
+    def interrupted(folder, progress):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("p2p_lib.offline.refine.refine_run", interrupted)
+    assert cli.main(["refine", str(tmp_path / "a run")]) == 130
+    then = f"Go on: p2p refine '{tmp_path / 'a run'}'; it keeps the objects that are finished."
+    assert capsys.readouterr().err == f"p2p refine: interrupted. {then}\n"
 
 
 def test_an_interruption_before_the_first_frame(sequence, tmp_path, capsys, monkeypatch):

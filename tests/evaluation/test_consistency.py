@@ -11,8 +11,10 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.mask_log import MaskLog, load_masks
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, load_points
+from p2p_lib.datasets.runs import COLUMNS, NOT_FOLLOWED, load_run
 from p2p_lib.evaluation.consistency import HEADS, consistency
 from p2p_lib.evaluation.evidence import on_surface
+from p2p_lib.evaluation.protocol import evaluate
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 OFF_PX = 2.0
@@ -69,6 +71,27 @@ def test_what_was_doubted_when_it_was_made_is_to_be_looked_at(made, run):
     assert [s.text for s in found.suspicions["box"]] == doubts and [s.text for s in found.suspicions["can"]] == doubts[
         1:
     ]
+
+
+def test_a_removed_object_is_no_lost_one(made, run, tmp_path):
+    """What it was before it was removed counts, and what was before it was added does not."""
+
+    def followed(obj, rows):
+        status, reason = np.where(rows, obj.status, "initialising"), np.where(rows, obj.reason, NOT_FOLLOWED)
+        T_cam_obj = np.where(rows[:, None, None], obj.T_cam_obj, np.nan)
+        return replace(obj, status=status, reason=reason, T_cam_obj=T_cam_obj, confidence=obj.confidence * rows)
+
+    rows = np.arange(40)
+    box = followed(made.run.objects["box"], (rows > 8) & (rows < 16))
+    arrays = dict(np.load(run.path / "poses.npz")) | {f"box/{column}": getattr(box, column) for column in COLUMNS}
+    np.savez(tmp_path / "poses.npz", **arrays)
+    for file in ("run.json", "keypoints.npz", "masks.npz"):
+        (tmp_path / file).write_bytes((run.path / file).read_bytes())
+    short = load_run(tmp_path)
+    found = consistency(short, made.sequence)
+    assert found.verdict("box") == "good" and found.objects["box"]["pose_where_seen"] == 100
+    score = evaluate(replace(short, points=made.run.points)).objects["box"]
+    assert max(score.frame_index) == 15 and score.lost == min(sum(made.run.objects["box"].visible_px[:9] >= 300), 9)
 
 
 def test_a_known_size_that_does_not_fit_is_to_be_looked_at(made, run):
