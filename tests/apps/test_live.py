@@ -522,7 +522,7 @@ def test_what_was_learnt_of_an_object_is_kept_when_it_is_removed(folder, tmp_pat
     assert memory.made_of["map_id"] == 1 and len(trimesh.load(tmp_path / "run" / "meshes" / "board.ply").faces)
     assert len(load_keypoints(tmp_path / "run")["board"].ids) > 10
     found = consistency(kept)
-    assert not [text for text in found.look_at() if "found again" in text or "no pose" in text]
+    assert not [text for text in found.look_at() if "found again" in text or "no mask and no pose" in text]
 
 
 def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
