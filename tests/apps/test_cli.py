@@ -210,7 +210,7 @@ def test_a_mesh_that_cannot_be_written_is_an_error_and_no_finished_run(sequence,
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("p2p_lib.datasets.keypoint_log.save_arrays", full)
+    monkeypatch.setattr("p2p_lib.datasets.keypoint_log.save_arrays", lambda *_, **__: full())
     assert run(sequence, tmp_path / "out") == 2
     assert "No space left" in one_line(capsys)
     info = load_run(tmp_path / "out").info
