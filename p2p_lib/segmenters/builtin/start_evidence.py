@@ -16,7 +16,6 @@ from p2p_lib.segmenters.builtin.patch import (
     Patch,
     approximate_median,
     components_touching,
-    connected_components,
     dilated,
     plane_heights,
     support_plane,
@@ -34,6 +33,8 @@ _PLANE_SIGMA_M = 0.001
 _IN_PLANE, _ABOVE_PLANE = -2.0, 0.5
 #: Log-odds of what depth connects with the clicks, and of what it does not.
 _CONNECTED, _APART = 2.5, -1.5
+#: What stands on a support is linked over smaller gaps: inside and outside of a cup, parts between holes of the depth, m.
+_LINK_M = 0.03
 #: A component may cover up to this share of the patch's border by accident.
 _AT_THE_BORDER = 0.02
 #: An unmeasured pixel has this share of its nearest measured one's log-odds.
@@ -129,7 +130,7 @@ def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
     log_odds = np.zeros(patch.shape, np.float32)
     if height.flat:
         return log_odds
-    component = components_touching(connected_components(patch.smooth & (height.log_odds >= 0)), clicked.seeds)
+    component = components_touching(patch.linked(height.log_odds >= 0, _LINK_M), clicked.seeds)
     log_odds[(patch.depth_m > 0) & ~dilated(component, 1)] = _APART
     if component[patch.border()].mean() <= _AT_THE_BORDER:
         log_odds[component] = _CONNECTED
