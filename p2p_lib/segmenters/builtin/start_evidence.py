@@ -32,7 +32,9 @@ _PLANE_SIGMA_M = 0.001
 #: Log-odds of a pixel in the support plane, and most of one above it: other things stand on it, too.
 _IN_PLANE, _ABOVE_PLANE = -2.0, 0.5
 #: Log-odds of what depth connects with the clicks, and of what it does not.
-_CONNECTED, _APART = 2.5, -1.5
+_CONNECTED, _APART, _UNLIKE = 2.5, -1.5, 1.0
+#: A support looks about the same up to this, in CIELAB, and a shade on it counts this share.
+_LOOK, _SHADE = 4.0, 0.4
 #: What stands on a support is linked over smaller gaps: inside and outside of a cup, parts between holes of the depth, m.
 _LINK_M = 0.03
 #: A component may cover up to this share of the patch's border by accident.
@@ -96,6 +98,18 @@ class Height:
     flat: bool
     log_odds: np.ndarray
 
+    def unlike(self, patch: Patch) -> np.ndarray:
+        """(h, w) bool: what does not look like the support around it."""
+        if self.plane is None:
+            return np.zeros(patch.shape, bool)
+        height = plane_heights(patch, self.plane)
+        support = (patch.depth_m > 0) & (np.abs(height) < _FLAT_SIGMAS * patch.sigma_m + _FLAT_M)
+        lab = cv2.cvtColor(patch.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
+        off = _looks_m2(lab, support)
+        for _ in range(3):
+            off = _looks_m2(lab, support & (off < 9))
+        return off > 16
+
     @classmethod
     def of(cls, patch: Patch, clicked: Clicked) -> Height:
         """By the plane that holds most of what surrounds the clicks."""
@@ -110,13 +124,25 @@ class Height:
             return replace(self, flat=True, log_odds=nothing)
         height, sigma_m = plane_heights(patch, self.plane), patch.sigma_m + _PLANE_SIGMA_M
         clicks_m = approximate_median(height[at])
-        if clicks_m < _FLAT_SIGMAS * approximate_median(patch.sigma_m[at]) + _FLAT_M:
-            return replace(self, flat=clicks_m > -_FLAT_M, log_odds=nothing)
+        least_m = _FLAT_SIGMAS * approximate_median(patch.sigma_m[at]) + _FLAT_M
+        if clicks_m < least_m:
+            return replace(self, flat=clicks_m > -least_m, log_odds=nothing)
         # The peak of the noise's density, 1 / (2.5 sigma), over a uniform one up to twice the height of the clicks.
         surprise = np.log(np.maximum(2 * clicks_m / (2.5 * sigma_m), 1.05))
         log_odds = np.maximum(height, 0) ** 2 / (2 * sigma_m**2) - surprise
         log_odds = np.where(patch.depth_m > 0, np.clip(log_odds, _IN_PLANE, _ABOVE_PLANE), 0)
         return replace(self, flat=False, log_odds=log_odds.astype(np.float32))
+
+
+def _looks_m2(lab: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """(h, w) squared distance of colours (h, w, 3) from those around that are ``of`` (h, w) bool the support, in sigmas."""
+    sigma = max(lab.shape) / 5
+    weight = cv2.GaussianBlur(of.astype(np.float32), (0, 0), sigma) + 1e-4
+    mean = cv2.GaussianBlur(lab * of[..., None], (0, 0), sigma) / weight[..., None]
+    off = lab - mean
+    off[..., 0] *= np.where(off[..., 0] < 0, _SHADE, 1)
+    variance = cv2.GaussianBlur(off**2 * of[..., None], (0, 0), sigma) / weight[..., None]
+    return (off**2 / (variance + _LOOK**2)).sum(-1)
 
 
 def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndarray:
@@ -126,14 +152,20 @@ def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndar
 
 
 def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
-    """Evidence for what depth connects with the clicks above their support, if it ends within the patch."""
+    """Evidence for what is linked with the clicks and is not their support, if it ends within the patch.
+
+    What is not the support stands above it or, flat on it, does not look like it.
+    """
     log_odds = np.zeros(patch.shape, np.float32)
-    if height.flat:
-        return log_odds
-    component = components_touching(patch.linked(height.log_odds >= 0, _LINK_M), clicked.seeds)
-    log_odds[(patch.depth_m > 0) & ~dilated(component, 1)] = _APART
+    above = np.zeros(patch.shape, bool) if height.flat else height.log_odds >= 0
+    if not height.flat:
+        component = components_touching(patch.linked(above, _LINK_M), clicked.seeds)
+        log_odds[(patch.depth_m > 0) & ~dilated(component, 1)] = _APART
+        if component[patch.border()].mean() <= _AT_THE_BORDER:
+            log_odds[component] = _CONNECTED
+    component = components_touching(patch.linked(above | height.unlike(patch), _LINK_M), clicked.seeds)
     if component[patch.border()].mean() <= _AT_THE_BORDER:
-        log_odds[component] = _CONNECTED
+        log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
     return log_odds
 
 
