@@ -25,7 +25,7 @@ book: docs ## notebooks as make reproduce left them, and the API reference, as o
 	@echo "Open out/book/index.html"
 
 figures: setup ## every table and figure of the paper from the data and backends present; goes on where it was stopped
-	@.venv/bin/p2p benchmark --present --out out/benchmark --tables out/full/tables
+	-@.venv/bin/p2p benchmark --present --out out/benchmark --tables out/full/tables
 	@.venv/bin/p2p notebooks --profile full --jobs 2
 	@.venv/bin/p2p figures
 

@@ -120,7 +120,7 @@ def synthetic(out: Path, cases: int) -> list[dict]:
     rows: list[dict] = []
     for case in range(cases):
         seed, scene, other = 500 + case // 2, _SCENES[case % len(_SCENES)], 600 + case
-        learnt = tracked("synthetic/crossing", out / f"crossing_{seed}", seed=seed)
+        learnt = tracked(f"synthetic/crossing@{seed}", out / f"crossing_{seed}", seed=seed)
         folder = out / "scenes" / f"{scene}_{other}_with_{seed}"
         if not (folder / "cam_K.txt").is_file():
             write_scenario(folder, other_path("crossing", seed, scene, other), NOISE["realsense"], other)
@@ -143,7 +143,7 @@ def main() -> None:
     mustard, table, desk = (
         next(iter(data.glob(f"**/{name}")), None) for name in ("mustard0_first400", "redkitchen_table", "desk_fast")
     )
-    tracked("synthetic/crossing", out / "crossing_500", seed=500)
+    tracked("synthetic/crossing@500", out / "crossing_500", seed=500)
     other = memories(out / "crossing_500", ("box", "can"))
     bottle: list[Path] = []
     if mustard is not None:

@@ -148,7 +148,7 @@ def made(name: str, case: Case, out: Path, data: Path | None) -> Run | None:
     prompts = [Prompt("x", 0, clicks)] if clicks else None
     if not sequence.startswith(SYNTHETIC) and clicks is None and options.get("masks") != "dataset":
         prompts = path.parents[len(Path(sequence).parts) - 1] / "prompts" / f"{path.name}.json"
-    where = sequence if sequence.startswith(SYNTHETIC) else path
+    where = f"{sequence}@{options.get('seed', 0)}" if sequence.startswith(SYNTHETIC) else path  # of the run's seed
     run(where, out / name, prompts=prompts, if_exists="replace", **options)
     return load_run(out / name)
 

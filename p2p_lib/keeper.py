@@ -25,8 +25,7 @@ from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation.consistency import consistency
-from p2p_lib.extended.default import Point2Pose
-from p2p_lib.method.object_model import Known
+from p2p_lib.extended.default import Point2Pose, memory_in
 
 #: Frames whose images are looked at when a run is judged at its end; ``p2p eval`` looks at more.
 RUN_LOOKS = 30
@@ -36,10 +35,12 @@ RUN_LOOKS = 30
 class Keeper:
     """Keeps what a tracker says as a run's folder: frame by frame poses, times and masks, and its maps at the end.
 
-    masks    whether to keep the masks as images
-    prompts  what started the objects, to be drawn with their first masks
-    sizes_m  how long objects are known to be
-    doubts   what was doubted meanwhile: a list that the caller fills (:func:`noted`)
+    masks     whether to keep the masks as images
+    prompts   what started the objects, to be drawn with their first masks
+    sizes_m   how long objects are known to be
+    doubts    what was doubted meanwhile: a list that the caller fills (:func:`noted`)
+    followed  what followed each object: one tracker, and one more each time that it was added again after its removal.
+              What was removed is as it was then
     """
 
     writer: RunWriter
@@ -49,6 +50,7 @@ class Keeper:
     sizes_m: Mapping[str, float] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
     keypoints: KeypointLog = field(default_factory=KeypointLog)
+    followed: dict[str, list[Any]] = field(default_factory=dict)
 
     @cached_property
     def mask_log(self) -> MaskLog:
@@ -64,6 +66,8 @@ class Keeper:
         """The frame that has just been estimated; which objects have their first mask in it."""
         method = self.method
         for name, obj in method.objects.items():
+            if obj not in (trackers := self.followed.setdefault(name, [])):
+                trackers.append(obj)
             seen = method.tracks.visible & np.isin(method.tracks.ids, obj.model.map.ids)
             self.keypoints.add(frame.index, name, method.tracks.ids[seen], method.tracks.uv_px[seen])
         stages_ms = dict(method.stopwatch.last_ms)
@@ -77,25 +81,19 @@ class Keeper:
 
     def save_maps(self) -> None:
         """``meshes/<object>.ply`` and ``maps/<object>.npz`` of each surface in its object's frame, and the two logs."""
-        objects = self.method.objects.items()
-        kept = {name: obj.known_as(self.writer.kept_map(name)) for name, obj in objects}
-        models = {name: known.model for name, known in kept.items() if known is not None}
-        for name, model in models.items():
-            if model.surface is not None and len((mesh := model.surface.mesh()).faces):
-                save_mesh(mesh, self.writer.path / "meshes" / f"{name}.ply")
-        self._save_memories({name: known for name, known in kept.items() if known is not None})
-        maps = {name: (model.map.ids, model.map.p_obj, model.map.promoted) for name, model in models.items()}
-        self.keypoints.save(self.writer.path, maps)
-        self.mask_log.save(self.writer.path)
-
-    def _save_memories(self, kept: Mapping[str, Known]) -> None:
-        """Of the objects of which enough is known to find them again."""
-        info = self.writer.info
+        path, info, maps = self.writer.path, self.writer.info, {}
         made_of = {key: info[key] for key in ("sequence", "tracker", "start", "stop") if key in info}
-        for name, known in kept.items():
-            with suppress(BadInput):
-                memory = self.method.memory(name, known, **made_of, map_id=known.map_id)
-                save_memory(self.writer.path / "maps" / f"{name}.npz", memory)
+        for name, trackers in self.followed.items():
+            map_id = self.writer.kept_map(name)
+            for obj in (obj for obj in trackers if obj.known_as(map_id) is not None):
+                model = obj.known_as(map_id).model
+                if model.surface is not None and len((mesh := model.surface.mesh()).faces):
+                    save_mesh(mesh, path / "meshes" / f"{name}.ply")
+                with suppress(BadInput):  # too little is known to find it again
+                    save_memory(path / "maps" / f"{name}.npz", memory_in(obj, map_id, **made_of, map_id=map_id))
+                maps[name] = model.map.ids, model.map.p_obj, model.map.promoted
+        self.keypoints.save(path, maps)
+        self.mask_log.save(path)
 
     def judge(self, sequence: sequences.Sequence | None = None) -> None:
         """Have ``run.json`` say what was doubted, and what to look at before the run is believed; when all is kept.

@@ -134,7 +134,7 @@ def evaluate_tracker(
 ) -> TrackerScore:
     """Score the 2D tracker of ``options`` by itself against ``count`` true tracks; what ``p2p eval-tracks`` prints.
 
-    A synthetic sequence named is always that of seed 0; the seed given draws the queries and serves the tracker.
+    The seed given draws the queries and serves the tracker.
     """
     options = replace(options or RunOptions(), **changes)
     config = options.config()
@@ -216,7 +216,7 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
         prompts = load_prompts(prompts)
     prompts, memories = tuple(prompts or ()), load_memories(options.memory or ())
     masks = options.mask_source()
-    how = options.format, options.depth_scale, config.seed
+    how = options.format, options.depth_scale
     sequence = sequences.open_sequence(sequence, *how, masks=masks.folder, gaps=options.skip_bad)
     frames = _frame_range(len(sequence), options.start, options.stop)
     prompted = masks.name == "clicks" and bool(prompts or memories)  # all that is known of the objects
@@ -407,7 +407,8 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     for name, obj in run.objects.items():
         lost = ~obj.has_pose
         why = Counter(status_text(*one).partition(" since ")[0] for one in zip(obj.status[lost], obj.reason[lost]))
-        most = f"; otherwise mostly {why.most_common(1)[0][0]}" if why else ""
+        otherwise = "otherwise mostly" if obj.has_pose.any() else "mostly"
+        most = f"; {otherwise} {why.most_common(1)[0][0]}" if why else ""
         doubted = int(obj.doubted.sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""
         lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}")
@@ -424,7 +425,7 @@ def _advice(run: Run, job: _Job) -> str:
     why = " ".join(reasons.values())
     if set(reasons) <= set(job.memories):
         fix = "show a side that was learnt, or click on it"
-    elif "pixels with depth" in why:
+    elif "depth" in why:
         fix = "its depth is missing, out of range or in another unit (--depth-scale)"
     elif "not seen yet" in why and not job.masks.every_mask:
         fix = "click on another place, near its centre"

@@ -65,6 +65,14 @@ def tool():
     return load
 
 
+@pytest.fixture(scope="session")
+def opening(tmp_path_factory):
+    """Renders the first frames of a bundled sequence, for those who look at no others: all take half a minute."""
+    from studies.recovery import excerpt
+
+    return lambda name, frames, seed=0: excerpt(name, range(frames), seed, tmp_path_factory.mktemp(name))
+
+
 @pytest.fixture
 def ctrl_c():
     """Ctrl-C interrupts, also where a shell that runs its jobs in the background has them ignore it."""

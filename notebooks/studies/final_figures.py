@@ -23,14 +23,14 @@ from p2p_lib.datasets.models import MESHES, find_models, read_mesh
 from p2p_lib.datasets.sequence import SYNTHETIC
 from p2p_lib.evaluation.consistency import reprojected
 from p2p_lib.evaluation.protocol import evaluate
-from p2p_lib.figures import mesh_view, overlay, style
+from p2p_lib.figures import overlay, style
 from p2p_lib.figures.final_tables import paper_table
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.provenance import Saved, save_table
 from p2p_lib.figures.scenes import Scene, side_by_side
 from p2p_lib.synthetic.shapes import load_mesh
-from studies import SHIPPED
+from studies import SHIPPED, mesh_view
 
 if TYPE_CHECKING:
     from IPython.display import Markdown

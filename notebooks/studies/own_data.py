@@ -24,13 +24,13 @@ from p2p_lib.datasets.models import MESHES, find_models
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence as Recording
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.mesh_view import portrait
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, panels
 from p2p_lib.figures.provenance import Saved, save_figure
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic.shapes import load_mesh
 from studies import SHIPPED
+from studies.mesh_view import portrait
 
 #: What a fault should at most do: a share of the frames for lies, else what the column of the table is in.
 FAULT_GOALS = {"lies in it": 0.005, "lies after": 0.005, "longest": 5.0, "worst": 15.0, "mesh off (%)": 5.0}

@@ -24,11 +24,11 @@ from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import evaluate
-from p2p_lib.figures import mesh_view, overlay, style
+from p2p_lib.figures import overlay, style
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.provenance import Saved, save_figure
 from p2p_lib.figures.scenes import Scene, side_by_side
-from studies import CLONE
+from studies import CLONE, mesh_view
 from studies.final_figures import rate_figure, scene_of
 from studies.pipeline_diagram import pipeline_diagram
 

@@ -26,11 +26,12 @@ from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import MAX_ADDS_M, RecoveryEvent, recovered_within
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import Box
-from p2p_lib.figures.plots import WIDTH_IN, draw_strip, logarithmic, panels
+from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic.generate import write_scenario
 from p2p_lib.synthetic.noise import Sensor
 from p2p_lib.synthetic.scenarios import SCENARIOS
+from studies.run_plots import draw_strip
 
 _RIGHT = f"{100 * MAX_M:.0f} cm and {MAX_DEG:.0f}°"
 

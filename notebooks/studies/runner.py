@@ -1,7 +1,7 @@
 """The notebooks of the suite: list, run headless, and collect what their last cells recorded.
 
 A notebook has one cell tagged ``parameters`` (literals alone, ``PROFILE`` among them) and ends with a cell tagged
-``checks`` that calls :func:`p2p_lib.figures.claims.check` with what it claims. Whatever a run leaves behind is read
+``checks`` that calls :func:`studies.claims.check` with what it claims. Whatever a run leaves behind is read
 back from the executed notebook, so that the gallery, the tests and a later visitor see the same.
 """
 
@@ -25,8 +25,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, did_you_mean
 from p2p_lib.core.packages import needed_for
-from p2p_lib.figures.claims import CHECKS_MIME, Claim, Value
 from studies import CLONE, course, equations
+from studies.claims import CHECKS_MIME, Claim, Value
 
 if TYPE_CHECKING:
     from nbformat import NotebookNode

@@ -54,11 +54,12 @@ def tracker_table(scores: Mapping[str, TrackerScore | str]) -> DataFrame:
     """A row per tracker; one that did not run has dashes and the reason."""
     rows = []
     for label, score in scores.items():
-        row = {"tracker": label}
+        row: dict[str, Any] = {"tracker": label}
         if isinstance(score, TrackerScore):
             plain = score.as_dict()
             row |= {"AJ": plain["aj"], "delta_avg": plain["delta_avg"], "OA": plain["oa"]}
-            row["found again [%]"] = round(100 * plain["redetection"]["found_same_view"], 1)
+            found = plain["redetection"]["found_same_view"]
+            row["found again [%]"] = np.nan if found is None else round(100 * found, 1)
             row["CPU [ms/frame]"] = round(plain["cpu_ms"]["mean"], 1)
         rows.append({**row, "why not": score if isinstance(score, str) else ""})
     return DataFrame(rows).round(3)

@@ -32,6 +32,7 @@ from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
 from p2p_lib.evaluation.known_size import size_doubt
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.method.sampling import choose, usable_region
 
 #: Frames that are looked at, evenly spread.
@@ -54,6 +55,8 @@ RIM_SHARE = 0.5
 MEASURED_SHARE = 0.5
 #: What an object seldom is: so much of the image, so deep (of its distance). Good sequences: at most 0.07, 0.23.
 LARGE_SHARE, DEEP_SHARE = 0.12, 0.25
+#: Files of one fault that are named.
+_LISTED = 5
 #: Fewer points tell no pose.
 POSED = 3
 #: Fraction of depth at its largest value from which on it was cut off there.
@@ -99,31 +102,34 @@ def check_folder(
     """
     config = config or preset()
     try:
-        opened = open_sequence(sequence, format, depth_scale)
+        opened = open_sequence(sequence, format, depth_scale, gaps=True)
     except P2PError as error:
         own = isinstance(sequence, str | Path) and format in (None, "folder")
         return (_files(Path(str(sequence)).expanduser()) if own else []) or [_unreadable("files", error)]
-    sequence, frames, masks, wrong = opened, [], [], []
-    for i in evenly(np.arange(len(sequence)), FRAMES).tolist():
+    sequence, frames, masks = opened, list[Frame](), list[Mapping[str, np.ndarray]]()
+    whole, wrong = _whole(sequence)
+    for i in evenly(whole, FRAMES).tolist():
         try:
             frames.append(sequence.frame(i))
-            masks.append(sequence.masks(i) or {})
+            masks.append({})
+            masks[-1] = sequence.masks(i) or {}
         except P2PError as error:
             wrong.append(_unreadable("files", error))
-    if wrong := wrong or _cut_off(sequence):
+    if not frames:
         return wrong
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", Doubt)
         try:
             firsts = clicked_masks(sequence, prompts, config) if prompts else _first_masks(sequence, config)
         except P2PError as error:
-            return [_unreadable("clicks" if prompts else "masks", error)]
+            firsts = {}
+            wrong.append(_unreadable("clicks" if prompts else "masks", error))
     sizes_m = lengths_m(sizes, dict.fromkeys([*sequence.objects, *firsts]))
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     scale = getattr(sequence, "depth_scale", 1.0)
     depth = _depth(frames, scale)
-    findings = [Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
-    pairs = [(f, sequence.frame(f.index + 1)) for f in frames if f.index + 1 < len(sequence)]
+    findings = [*wrong, Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
+    pairs = [(f, after) for f in frames if (after := _readable(sequence, f.index + 1)) is not None]
     findings += [_times(sequence), _repeated(pairs), depth, _scale(pairs), _registered(frames)]
     if depth.level is Level.WRONG:
         return findings  # nothing that follows would mean anything
@@ -154,14 +160,31 @@ def _unreadable(name: str, error: P2PError, fix: str = "") -> Finding:
     return Finding(name, Level.WRONG, text, fix)
 
 
-def _cut_off(sequence: Sequence) -> list[Finding]:
-    """Images that end too early: of all, not only of those that are looked at."""
-    files = [*getattr(sequence, "rgb", ()), *getattr(sequence, "depth", ())]
-    found = [path for path in files if path.is_file() and images.is_cut_off(path)]
-    if not found:
-        return []
-    text = f"{len(found)} of {len(files)} images end too early, the first: {found[0]} ({found[0].stat().st_size} bytes)"
-    return [Finding("files", Level.WRONG, text, f"Copy them again. {images.SKIP_BAD}")]
+def _whole(sequence: Sequence) -> tuple[np.ndarray, list[Finding]]:
+    """Frames (K,) whose files are there to their end, of all, not only of those that are looked at; and the others."""
+    rgb, depth = getattr(sequence, "rgb", ()), getattr(sequence, "depth", ())
+    missing = [path for path in depth if not path.is_file()]
+    torn = [path for path in (*rgb, *depth) if path.is_file() and images.is_cut_off(path)]
+    found = [(missing, f"{len(missing)} of {len(depth)} depth images are missing", "Put them back.")] * bool(missing)
+    found += [(torn, f"{len(torn)} of {len(rgb) + len(depth)} images end too early", "Copy them again.")] * bool(torn)
+    lost = {*missing, *torn}
+    whole = [i for i in range(len(sequence)) if not lost or not lost & {rgb[i], depth[i]}]
+    return np.array(whole, int), [
+        Finding("files", Level.WRONG, f"{what}: {_listed(paths)}", f"{fix} {images.SKIP_BAD}")
+        for paths, what, fix in found
+    ]
+
+
+def _listed(paths: list[Path]) -> str:
+    more = len(paths) - _LISTED
+    return ", ".join(map(str, paths[:_LISTED])) + (f" and {more} more" if more > 0 else "")
+
+
+def _readable(sequence: Sequence, i: int) -> Frame | None:
+    """A frame; None where there is none, or its files cannot be read."""
+    with suppress(P2PError):
+        return sequence.frame(i) if i < len(sequence) else None
+    return None
 
 
 def _files(folder: Path) -> list[Finding]:
@@ -252,10 +275,16 @@ def _scale(pairs: list[tuple[Frame, Frame]]) -> Finding:
 
 
 def _truth(sequence: Sequence) -> Finding:
-    """Whether there is anything to score a run against."""
-    seen = [f"{name} in {np.isfinite(of.T_cam_model).all((1, 2)).sum()} images" for name, of in sequence.truth.items()]
+    """Whether there is anything to score a run against: frames with a pose, and with the object in sight."""
+    masks_px = [sequence.visible_px(i) for i in range(len(sequence))] if sequence.truth else []
+    seen = []
+    for name, of in sequence.truth.items():
+        posed = np.isfinite(of.T_cam_model).all((1, 2))
+        shown = [px is None or px.get(name, 0) >= MIN_VISIBLE_PX for px in masks_px]
+        count, said = int((posed & of.labelled & shown).sum()), f"{name} in {posed.sum()} images"
+        seen.append(said if count == posed.sum() else f"{said}, in sight in {count} of them")
     none = "none (looked for in annotated_poses/ of a folder), so that a run is not scored"
-    return Finding("truth", Level.OK, ", ".join(seen) or none)
+    return Finding("truth", Level.OK, "; ".join(seen) or none)
 
 
 def _repeated(pairs: list[tuple[Frame, Frame]]) -> Finding:
@@ -423,6 +452,8 @@ def _first_masks(sequence: Sequence, config: Config) -> FirstMasks:
         if masks is None or firsts.keys() >= set(sequence.objects):
             break
         for name in sorted(masks.keys() & set(sequence.objects) - firsts.keys()):
-            if masks[name].sum() >= config.lifecycle.min_mask_px:
-                firsts[name] = sequence.frame(i), masks[name]
+            if masks[name].sum() < config.lifecycle.min_mask_px:
+                continue
+            if (frame := _readable(sequence, i)) is not None:
+                firsts[name] = frame, masks[name]
     return firsts

@@ -12,7 +12,9 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
+from shlex import quote
 from shutil import get_terminal_size
 from textwrap import fill
 from typing import Any
@@ -41,7 +43,12 @@ _FILES = (
     "poses as bop: p2p_SEQ-test.csv; tum: OBJECT.txt; poses: annotated_poses/OBJECT/FRAME.txt, 4x4 (all in DIR);"
     " bop-dataset: labelled images, masks and models; foundationpose: images, first mask, mesh; model: textured meshes"
 )
-_OVERLAY = arg("--overlay", type=Path, metavar="FILE", help="besides a film of it: .mp4, .gif or .webp (see p2p film)")
+_OVERLAY = arg(
+    "--overlay",
+    type=Path,
+    metavar="FILE",
+    help="besides a film of it: .mp4, or a .gif or .webp at most 480 px wide (see p2p film)",
+)
 _FORCE = arg("--force", dest="if_exists", action="store_const", const="replace", help="replace an earlier run in DIR")
 _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
 
@@ -52,7 +59,12 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
 @command(
     "run",
     "track the objects of a sequence and write poses, timings, scores",
-    arg("sequence", nargs="?", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA"),
+    arg(
+        "sequence",
+        nargs="?",
+        metavar="SEQ",
+        help="a folder, synthetic/NAME or NAME@SEED (bundled), or a name below $P2P_DATA",
+    ),
     arg(
         "--batch",
         type=Path,
@@ -76,6 +88,7 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     QUIET,
 )
 def _run(a: argparse.Namespace) -> int:
+    from p2p_lib.datasets.runs import read_info
     from p2p_lib.run import run
 
     if (a.sequence is None) == (a.batch is None):
@@ -104,7 +117,8 @@ def _run(a: argparse.Namespace) -> int:
     if film is not None and not result.interrupted:
         print(f"Film in {film(a.out, a.overlay)}")
     if result.interrupted:
-        raise KeyboardInterrupt
+        info = read_info(a.out)  # none where no frame was finished
+        raise KeyboardInterrupt("" if info is None else f"Go on with it: {again(info, a.out)} --resume")
     if result.advice:
         warn(f"p2p run: {result.advice}")
     return 0 if result.tracked else P2PError.exit_code
@@ -177,7 +191,12 @@ def _live(a: argparse.Namespace) -> None:
     "eval",
     "score a run against the truth of its sequence; without any, against what the camera saw",
     arg("run", type=Path, nargs="?", metavar="DIR", help="folder written by p2p run"),
-    arg("--poses", type=Path, metavar="PATH", help="instead: any method's poses (BOP CSV, TUM, 4x4 files)"),
+    arg(
+        "--poses",
+        type=Path,
+        metavar="PATH",
+        help="instead, to score another method: its BOP CSV or TUM file, or a folder of OBJECT.txt or of 4x4 files",
+    ),
     arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
     run_options("start", "stop", "models", "sizes", format="layout of --sequence (default: recognised)"),
     JSON,
@@ -285,9 +304,11 @@ def _benchmark(a: argparse.Namespace) -> int:
     if a.list:
         wide = get_terminal_size((10_000, 24)).columns  # elsewhere than on a terminal lines stay whole
         last = "Data and weights are looked for below $P2P_DATA (see p2p data list); with --quick no plan needs any."
-        found = [readiness(plan) for plan in a.plan] or [overview(), "What a plan lacks: p2p benchmark --list PLAN"]
-        for line in "\n".join([*found, last]).splitlines():
-            print(fill(line, wide, subsequent_indent=" " * 6, break_long_words=False, break_on_hyphens=False))
+        plans = (line for plan in a.plan for line in readiness(plan).splitlines())
+        lines = plans if a.plan else chain(overview(), ["What a plan lacks: p2p benchmark --list PLAN"])
+        for line in chain(lines, [last]):
+            words = fill(line, wide, subsequent_indent=" " * 6, break_long_words=False, break_on_hyphens=False)
+            print(words, flush=True)
         return 0
     if a.stale:
         return _stale(a)
@@ -314,7 +335,11 @@ def _benchmark(a: argparse.Namespace) -> int:
             save_table(paper_table(benchmark), benchmark.plan.name, sources=[benchmark], parameters=made, to=a.tables)
     if any(benchmark.interrupted for benchmark in benchmarks):
         raise KeyboardInterrupt
-    if any(benchmark.counts()["done"] for benchmark in benchmarks):
+    ended = [benchmark.counts() for benchmark in benchmarks]
+    if failed := sum(count["failed"] for count in ended):
+        warn(f"p2p benchmark: {failed} runs failed; the tables say why. --retry tries them again.")
+        return P2PError.exit_code
+    if any(count["done"] for count in ended):
         return 0
     warn("p2p benchmark: nothing ran; the tables say why")
     return P2PError.exit_code
@@ -337,7 +362,12 @@ def _stale(a: argparse.Namespace) -> int:
     "figures",
     "draw the paper's qualitative figures and write the index of all its figures and tables",
     arg("--out", type=Path, metavar="DIR", help="runs, found again the next time (default out/benchmark)"),
-    arg("--poses", type=Path, metavar="PATH", help="a competitor's on synthetic/occlusion, drawn beside ours"),
+    arg(
+        "--poses",
+        type=Path,
+        metavar="PATH",
+        help="a competitor's on synthetic/occlusion (as of p2p eval), drawn beside ours",
+    ),
     QUIET,
 )
 def _figures(a: argparse.Namespace) -> None:
@@ -361,7 +391,11 @@ def _refine(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import OFFLINE
     from p2p_lib.offline.refine import refine_run
 
-    print("\n".join(refine_run(a.run, not a.quiet)))
+    try:
+        print("\n".join(refine_run(a.run, not a.quiet)))
+    except KeyboardInterrupt:
+        then = f"Go on: p2p refine {quote(str(a.run))}; it keeps the objects that are finished."
+        raise KeyboardInterrupt(then) from None
     print(f"Results in {a.run / OFFLINE}. Next: p2p eval {a.run / OFFLINE}")
 
 
@@ -418,7 +452,7 @@ def _view(a: argparse.Namespace) -> None:
     "write a run as a film: boxes, axes, statuses, keypoints, masks",
     _RUN,
     arg("--out", type=Path, metavar="FILE", help=".mp4, .gif or .webp (default DIR/film.mp4)"),
-    arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF)"),
+    arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF or WebP)"),
 )
 def _film(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import read_info

@@ -51,7 +51,9 @@ def run_options(*wanted: str, **helps: str) -> Argument:
 
 
 #: What several commands take.
-SEQUENCE = arg("sequence", metavar="SEQ", help="a folder, synthetic/NAME (bundled), or a name below $P2P_DATA")
+SEQUENCE = arg(
+    "sequence", metavar="SEQ", help="a folder, synthetic/NAME or NAME@SEED (bundled), or a name below $P2P_DATA"
+)
 JSON = arg("--json", action="store_true", help="JSON instead of a table")
 QUIET = arg("--quiet", action="store_true", help="no progress bar")
 NO_BROWSER = arg("--no-browser", action="store_true", help="only say where the page is")
@@ -102,8 +104,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             warn(f"p2p {arguments.name}: {message}")
         return P2PError.exit_code
-    except KeyboardInterrupt:
-        warn(f"p2p {arguments.name}: interrupted")
+    except KeyboardInterrupt as interrupt:
+        warn(f"p2p {arguments.name}: interrupted{f'. {interrupt}' if str(interrupt) else ''}")
         return EXIT_INTERRUPTED + ended_by[-1]
     finally:
         for doubt, count in doubts.items():

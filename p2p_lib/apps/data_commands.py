@@ -26,7 +26,7 @@ _POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
     arg("--run", type=Path, metavar="DIR", help="show the masks that a run kept (--save-masks), to be mended"),
     arg("--port", type=int, default=0, metavar="N", help="of the page (default: a free one)"),
     NO_BROWSER,
-    run_options("format", "depth_scale", seed="of a synthetic sequence (default 0)"),
+    run_options("format", "depth_scale"),
 )
 def _click(a: argparse.Namespace) -> None:
     from p2p_lib.apps.click import Clicker, check_writable, first_change, wait_for_clicks
@@ -34,7 +34,7 @@ def _click(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.sequence import open_sequence
 
     check_writable(a.out)
-    sequence = open_sequence(a.sequence, a.format, a.depth_scale, a.seed or 0)
+    sequence = open_sequence(a.sequence, a.format, a.depth_scale)
     shown = load_run(a.run) if a.run is not None else None
     page = Clicker(sequence, a.out, a.frame, a.port, shown)
     before = page.prompts

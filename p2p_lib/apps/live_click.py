@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,8 +11,11 @@ import numpy as np
 
 from p2p_lib.apps.click import Clicker
 from p2p_lib.apps.live_words import Words
+from p2p_lib.core.errors import BadInput
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.cameras import LiveCamera, Stream
+from p2p_lib.datasets.prompts import parse_prompts
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,7 @@ class LiveClicker(Clicker):
     def __init__(self, camera: LiveCamera, words: Words, port: int = 0):
         self._words = words
         self._newest: tuple[Frame | None, dict[str, np.ndarray]] = (None, {})
+        self._shown: Frame | None = None
         self._masks: dict[str, np.ndarray] = {}
         self._names: tuple[str, ...] = ()
         super().__init__(_Shown(camera.name, camera.camera), "", port=port)
@@ -43,14 +47,25 @@ class LiveClicker(Clicker):
 
     def session(self) -> dict[str, Any]:
         """The newest image is the one shown from now on: the page does not ask while somebody clicks on it."""
-        frame, self._masks = self._newest
-        self.sequence = replace(self.sequence, kept=frame)  # type: ignore[type-var]  # it is a _Shown
+        self._shown, self._masks = self._newest
+        self.sequence = replace(self.sequence, kept=self._shown)  # type: ignore[type-var]  # it is a _Shown
         newest = {"first": len(self.sequence) - 1, "names": list(self._names), "run": True, "live": True}
         return super().session() | newest
 
     def kept_masks(self, i: int) -> dict[str, np.ndarray]:
         """Those of the image that is shown."""
         return dict(self._masks)
+
+    def checked(self, content: object, started: Iterable[str] = ()) -> tuple[Prompt, ...]:
+        """The prompts that the page sends of the image that it shows; no other one is kept."""
+        for prompt in parse_prompts(content):
+            if self._shown is None or prompt.frame != self._shown.index:
+                expected = (
+                    f"frame {self._shown.index}, the one that is shown" if self._shown else "one, but none has come"
+                )
+                fix = "Click on the newest image. Is the page open twice?"
+                raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", expected, fix)
+        return super().checked(content, started)
 
     def save(self, content: object) -> None:
         """Check prompts as the page sends them, or take ``{"remove": name}``, and have the tracker told."""

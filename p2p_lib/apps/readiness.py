@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
 from textwrap import shorten
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import Job, jobs_of
 from p2p_lib.benchmark.plan import plan_names, read_plan
-from p2p_lib.core.tables import as_text
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.sequence import SYNTHETIC
 
@@ -32,19 +32,18 @@ def readiness(name: str) -> str:
     return "\n".join([*lines, *(f"  {'; '.join(methods)}: {count}" for count, methods in alike.items())])
 
 
-def overview() -> str:
-    """What can run here and now, in one line, then a row for each plan: how many of its methods on a sequence can."""
-    from pandas import DataFrame
-
-    rows, whole, here, every = [], 0, 0, 0
-    for name in plan_names():
+def overview() -> Iterator[str]:
+    """A row for each plan as soon as it is known, how many of its methods on a sequence can run here; then the sum."""
+    names, whole, here, every = plan_names(), 0, 0, 0
+    width = max(map(len, names))
+    yield f"{'plan':{width}}  {'can run':11}  what"
+    for name in names:
         plan = read_plan(name)
         jobs = {(job.method.name, job.sequence.name): job.reason for job in jobs_of(plan, "full")}
         ready = sum(not reason for reason in jobs.values())
         whole, here, every = whole + (ready == len(jobs)), here + ready, every + len(jobs)
-        rows.append((name, f"{ready} of {len(jobs)}", shorten(plan.title, _TITLE, placeholder=" ...")))
-    first = f"{whole} of {len(rows)} plans can run here and now in full; {here} of {every} methods on a sequence can."
-    return f"{first}\n{as_text(DataFrame(rows, columns=['plan', 'can run', 'what']))}"
+        yield f"{name:{width}}  {f'{ready} of {len(jobs)}':11}  {shorten(plan.title, _TITLE, placeholder=' ...')}"
+    yield f"{whole} of {len(names)} plans can run here and now in full; {here} of {every} methods on a sequence can."
 
 
 def present_plans() -> list[str]:

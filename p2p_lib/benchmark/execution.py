@@ -107,7 +107,8 @@ def _tracks(job: Job) -> Outcome:
     """The 2D tracker by itself, on true tracks (see :mod:`p2p_lib.evaluation.tracker_score`)."""
     plain = evaluate_tracker(open_planned(job), job.options(), preset=None).as_dict()
     found = plain["redetection"]["found"]
-    scores = {"AJ": plain["aj"], "delta_avg": plain["delta_avg"], "OA": plain["oa"], "found again": found}
+    scores = {"AJ": plain["aj"], "delta_avg": plain["delta_avg"], "OA": plain["oa"]}
+    scores["found again"] = float("nan") if found is None else found
     ran = {"tracker": plain["tracker"], "frames": plain["frames"], "preset": "default", "library": library_version()}
     times = {"tracker's processor time [ms]": plain["cpu_ms"]["mean"]}
     return Outcome(key=job.key, status="done", ran=ran, tracks=scores, times=times)

@@ -118,7 +118,7 @@ def open_planned(job: Job) -> Sequence:
         scenario = planned.name.removeprefix(SYNTHETIC)
         folder = scenario_dir(scenario, job.sequence_seed, **_synthetic(planned, method)[0])
         rendered: Any = open_sequence(folder, "ycbmultitrack", masks=masks)  # of files
-        sequence: Sequence = replace(rendered, name=planned.name)
+        sequence: Sequence = replace(rendered, name=planned.name, scene_seed=job.sequence_seed)
     else:
         sequence = open_sequence(planned.name, masks=masks)
     if (fault := planned.fault) is not None:

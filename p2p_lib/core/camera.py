@@ -49,6 +49,13 @@ class Camera:
             raise BadInput(name, " ".join(f"{x:g}" for x in K.ravel()), "fx 0 cx 0 fy cy 0 0 1 with fx, fy > 0")
         return cls(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), int(width), int(height))
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same images at another size in pixels."""
+        sx, sy = width / self.width, height / self.height
+        # Integer pixels are pixel centres: an image begins half a pixel before its first one.
+        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        return Camera(self.fx * sx, self.fy * sy, cx, cy, width, height)
+
     @property
     def K(self) -> np.ndarray:
         """(3, 3) camera matrix."""

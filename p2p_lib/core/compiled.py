@@ -47,6 +47,9 @@ def compiled(*arguments: str) -> Callable[[F], F]:
                several, none where compiled functions of its file alone call it. Others still work, and are compiled
                when they come
 
+    An array assigned to a slice (``a[:3] = b``) takes seconds to compile, for the words of the error if it does not
+    fit, and so does ``np.partition``: neither is in them.
+
     The machine code is kept beside the file, or in the user's cache folder where that cannot be written. Sums keep
     their order (no ``fastmath``): results are the same in every run.
     """
@@ -68,9 +71,9 @@ def compiled(*arguments: str) -> Callable[[F], F]:
 def warm_up(say: Callable[[str], object] = lambda line: None) -> float:
     """Compile everything that a run can meet, or load it where an earlier process did; returns the seconds it took.
 
-    Compiled code is kept for later processes (see :func:`compiled`): the first call on a machine takes 10 to 25 s, on
-    two cores at once, later ones a second. Without it a step compiles what it is the first to meet, as at an object's
-    first absence, and takes as long. Safe to call again, and in any thread.
+    Compiled code is kept for later processes (see :func:`compiled`): the first call on a machine takes 10 to 25 s on
+    two free cores, longer where other programs run; later ones a second. Without it a step compiles what it is the
+    first to meet, as at an object's first absence, and takes as long. Safe to call again, and in any thread.
 
     say  told a line before anything is compiled; nothing where it is only loaded
     """
@@ -81,7 +84,7 @@ def warm_up(say: Callable[[str], object] = lambda line: None) -> float:
             if module == LOOPS_IN_BACKGROUND[0] and child is not None:
                 child.wait()  # what it has compiled is loaded; what it has not is compiled here
             if _ready(module) and module == LOOPS[0]:
-                say("Compiling inner loops, once on this machine: 10 to 25 s.")
+                say("Compiling inner loops, once on this machine: 10 to 25 s, longer where other programs run.")
                 child = _compile_in_background() if len(os.sched_getaffinity(0)) > 1 else None
     finally:
         if child is not None:

@@ -18,6 +18,9 @@ _RIDGE = 0.5
 _FAR_M = 50.0
 #: The share of pixels among which the nearest may be wild.
 _NEAREST = 0.05
+#: A smaller share of an object's pixels with depth does not say where it is.
+_HARDLY = 0.02
+_MILLIMETRES = "is it in millimetres?"
 #: What depth cameras have about: the built-in tracker and segmenter assume it of any.
 USUAL = DepthConfig()
 
@@ -34,15 +37,35 @@ def in_range(depth_m: np.ndarray, config: DepthConfig) -> np.ndarray:
 
 def check_metres(frame: Frame) -> None:
     """Refuse depth that cannot be in metres, since nothing is near; warn of what hardly is."""
-    measured = frame.depth_m[frame.depth_m > 0]
-    if not len(measured):
+    if not frame.depth_m.any():
         return
-    near_m, middle_m = np.quantile(measured, [_NEAREST, 0.5]).tolist()
-    what, fix = f"depth of frame {frame.index}", "Is it in millimetres? Give metres (p2p: --depth-scale 0.001)."
+    near_m, middle_m = _near_and_middle_m(frame.depth_m)
+    what = f"depth of frame {frame.index}"
+    fix = f"{_MILLIMETRES.capitalize()} Give metres (p2p: --depth-scale 0.001)."
     if near_m > _FAR_M:
         raise BadInput(what, f"{near_m:.0f} m and more", f"objects nearer than {_FAR_M:g} m", fix)
     if middle_m > _FAR_M:
         doubt(what, f"{middle_m:.0f} m in the middle", fix)
+
+
+def depth_trouble(frame: Frame, mask: np.ndarray | None) -> str:
+    """Why depth does not say where an object is, in words; "" where it may.
+
+    mask  (H, W) bool: the object's pixels; None where they are unknown
+    """
+    if not frame.depth_m.any():
+        return "the frame has no depth"
+    some_m = frame.sparse["depth_m"]
+    if some_m.any() and (near_m := _near_and_middle_m(some_m)[0]) > _FAR_M:
+        return f"the depth of the frame is {near_m:.0f} m and more: {_MILLIMETRES}"
+    measured, pixels = (0, 0) if mask is None else (np.count_nonzero(frame.depth_m[mask]), np.count_nonzero(mask))
+    return f"{measured} of {pixels} mask pixels have depth" if measured < _HARDLY * pixels else ""
+
+
+def _near_and_middle_m(depth_m: np.ndarray) -> tuple[float, float]:
+    """How far the nearest of what is measured is, but for a few wild readings, and its middle."""
+    near_m, middle_m = np.quantile(depth_m[depth_m > 0], [_NEAREST, 0.5]).tolist()
+    return near_m, middle_m
 
 
 def off_edges(depth_m: np.ndarray, edge_m: float) -> np.ndarray:

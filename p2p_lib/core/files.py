@@ -182,6 +182,19 @@ def replace_text(path: Path, text: str) -> None:
         file.write(text.encode())
 
 
+def save_arrays(path: Path, arrays: Mapping[str, np.ndarray], compressed: bool = False) -> None:
+    """Write arrays by name as an ``.npz`` file by :func:`replacing`."""
+    with replacing(path) as file:
+        (np.savez_compressed if compressed else np.savez)(file, **arrays)  # type: ignore[arg-type]
+
+
+def check_new(out: str | Path) -> None:
+    """Refuse a file, and a folder that holds anything: what is written there would be mixed with it."""
+    out = Path(out)
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise BadInput(str(out), "what is there already", "a new or empty folder", "Name another one.")
+
+
 def append(path: Path, line: str) -> None:
     """Write a line at the end of a file, all of it or, where the disk is full, nothing."""
     with path.open("ab", buffering=0) as file:

@@ -46,6 +46,7 @@ def as_lines(findings: Iterable[Finding], fine: str) -> str:
     """All findings for people, and last what to mend, what to look at, or that all is ``fine``."""
     findings = list(findings)
     width = max(len(finding.name) for finding in findings)
-    wrong, look = (", ".join(f.name for f in findings if f.level is level) for level in (Level.WRONG, Level.LOOK))
+    named = {level: ", ".join(dict.fromkeys(f.name for f in findings if f.level is level)) for level in Level}
+    wrong, look = named[Level.WRONG], named[Level.LOOK]
     last = f"To mend first: {wrong}" if wrong else f"To look at before tracking: {look}" if look else fine
     return "\n".join([*(finding.line(width) for finding in findings), last])

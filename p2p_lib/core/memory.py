@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.files import check_arrays, file_name, load_arrays, parse_json, replacing
+from p2p_lib.core.files import check_arrays, file_name, load_arrays, parse_json, save_arrays
 
 #: Of the files that this library writes, and reads.
 VERSION = 2
@@ -125,8 +125,7 @@ def save_memories(path: str | Path, memories: Mapping[str, ObjectMemory], kind: 
     for name, memory in memories.items():
         arrays |= {f"{name}/{f.name}": getattr(memory, f.name) for f in _array_fields(ObjectMemory)}
         arrays |= {f"{name}/surface/{f.name}": getattr(memory.surface, f.name) for f in fields(SurfaceMemory)}
-    with replacing(Path(path)) as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    save_arrays(Path(path), arrays, compressed=True)
 
 
 def read_memories(path: str | Path, kind: str, expected: str) -> tuple[dict[str, Any], dict[str, ObjectMemory]]:
@@ -157,15 +156,28 @@ def _memory(name: str, made_of: Mapping[str, Any], arrays: Mapping[str, np.ndarr
 
 
 def load_memories(paths: Sequence[str | Path]) -> dict[str, ObjectMemory]:
-    """Object to its memory; :class:`BadInput` for two of one name, too."""
+    """Object to its memory, of files and of all those in a run's folder or in its ``maps/``.
+
+    Raises as :func:`load_memory`, and :class:`BadInput` for two of one name.
+    """
     found: dict[str, ObjectMemory] = {}
-    for path in paths:
+    for path in (file for given in paths for file in _files(Path(given))):
         memory = load_memory(path)
         if memory.name in found:
             fix = "Give one of them, or learn the objects under different names."
             raise BadInput("memory", f"two of {memory.name!r}", "one an object", fix)
         found[memory.name] = memory
     return found
+
+
+def _files(path: Path) -> list[Path]:
+    """A file itself; of a folder, the memories in it."""
+    if not path.is_dir():
+        return [path]
+    folder = path / "maps" if (path / "maps").is_dir() else path
+    if not (files := sorted(folder.glob("*.npz"))):
+        raise MissingData(str(folder), f"no file in it, expected {_EXPECTED}")
+    return files
 
 
 def _array_fields(kind: type) -> list[Any]:

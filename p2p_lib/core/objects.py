@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.depth import depth_trouble
 from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.prediction import Prediction, Predictor
@@ -36,6 +37,7 @@ class Objects(ABC):
         self.objects: dict[str, Any] = {}
         self.refused: dict[str, BadInput] = {}
         self._prompts: dict[str, Prompt] = {}  # in the frame to come
+        self._next_map: dict[str, int] = {}  # by object, which no pose of its name has had yet
         self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
         self._turn, self.closed = RLock(), False
         self._predictor = Predictor()
@@ -82,7 +84,8 @@ class Objects(ABC):
         clicks    (N, 2) pixels on it in the next frame; ``negative`` (M, 2) are not of it
         box       (4,) left, top, right, bottom: all of it is inside in the next frame
 
-        With none of them it is started by the first mask that ``step`` gets for it. Raises :class:`BadInput` for what
+        With none of them it is started by the first mask that ``step`` gets for it, or by :meth:`correct`, and its
+        estimates say until then that it waits for them. Raises :class:`BadInput` for what
         does not fit, and nothing has changed. What shows to be unusable in the next frame itself, as clicks where no
         depth was measured, is forgotten with that frame: ``refused`` and the reason of the object's estimates say why,
         until :meth:`correct` says something better.
@@ -116,7 +119,10 @@ class Objects(ABC):
             self.refused.pop(name, None)
 
     def remove_object(self, name: str) -> None:
-        """Stop following an object; its points are dropped from the tracker."""
+        """Stop following an object; its points are dropped from the tracker.
+
+        Under the same name another one may be added; its poses are in other maps (``map_id``).
+        """
         if name not in self.objects:
             raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
         with self.alone():
@@ -159,28 +165,45 @@ class Objects(ABC):
                 doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is ignored. {error.fix}")
         return given, prompts
 
-    def explained(self, estimate: PoseEstimate, mask_given: bool) -> PoseEstimate:
-        """An estimate that says what is known: of an object that has not started, what was wrong with its prompt.
+    def explained(
+        self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, given: np.ndarray | None
+    ) -> PoseEstimate:
+        """An estimate that says what is known of why it is as it is, and where its object is in the world.
 
-        Where nobody gave a mask, an object without pixels may be hidden, or in view and not found; since when, is sure.
+        mask, given  (H, W) bool, that by which the object was looked for in the frame, and that which the caller gave;
+                     None where there was none
+
         Where its frame was given with a ``T_world_cam``, its pose is in the world, too; the scene that a tracker finds
         is no world of the user's.
         """
         name = estimate.object
+        self._next_map[name] = max(self._next_map.get(name, 0), estimate.map_id + 1)
         T_world_cam = next((T for time_s, T in reversed(self._cameras) if time_s == estimate.time_s), None)
         self._predictor.add(estimate, T_world_cam)
         if estimate.T_cam_obj is not None and T_world_cam is not None:
             estimate = replace(estimate, T_world_obj=T_world_cam @ estimate.T_cam_obj)
-        if estimate.status == Status.INITIALISING:
-            return replace(estimate, reason=str(self.refused[name])) if name in self.refused else estimate
+        reason = self._reason(estimate, frame, mask, given is not None)
+        return replace(estimate, reason="; ".join(part for part in (reason, frame.remark) if part))
+
+    def _reason(self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, mask_given: bool) -> str:
+        """Why an estimate has its status, with what prompts, depth and earlier frames tell of it.
+
+        Of an object that has not started, what was wrong with its prompt. Where nobody gave a mask, an object without
+        pixels may be hidden, or in view and not found; since when, is sure.
+        """
+        name = estimate.object
         if estimate.T_cam_obj is not None:
             self._without.pop(name, None)
-            return estimate
-        since = self._without.setdefault(name, estimate.frame_index)
+        elif estimate.status != Status.INITIALISING:
+            self._without.setdefault(name, estimate.frame_index)
+        elif name in self.refused:
+            return str(self.refused[name])
+        if estimate.reason and (trouble := depth_trouble(frame, mask)):
+            return trouble
         if estimate.status != Status.OCCLUDED or mask_given:
-            return estimate
+            return estimate.reason
         known = f"{OUT_OF_VIEW}: " * estimate.reason.startswith(OUT_OF_VIEW)
-        return replace(estimate, reason=f"{known}{NOT_FOUND} since frame {since}")
+        return f"{known}{NOT_FOUND} since frame {self._without[name]}"
 
 
 def _prompt(name: str, **arguments: ArrayLike | None) -> Prompt:

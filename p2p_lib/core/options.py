@@ -57,7 +57,7 @@ _SET = _typed(
     action="append",
     metavar="STAGE.KEY=VALUE",
 )
-_SEED = _typed("of every random choice (default 0)", type=int, metavar="N")
+_SEED = _typed("of every random choice of the tracker (default 0); a scene's: synthetic/NAME@N", type=int, metavar="N")
 _DEVICE = _typed("where surfaces are kept and fused: cpu (default), cuda or cuda:N")
 _OWN = "or your own as package.module:Class"
 _TRACKER = _typed(f"2D point tracker: {', '.join(TRACKERS)} (default {DEFAULT_TRACKER}), {_OWN}", metavar="NAME")
@@ -72,9 +72,10 @@ _MASKS = _typed(
 )
 _PROMPTS = _typed("what starts objects and corrects masks (see p2p click)", type=Path, metavar="FILE")
 _MEMORY = _typed(
-    "look for an object that an earlier run learnt (its maps/OBJECT.npz); repeatable, no clicks needed",
+    "look for an object that an earlier run learnt (its maps/OBJECT.npz; a run's folder: all of them); "
+    "repeatable, no clicks needed",
     action="append",
-    metavar="FILE",
+    metavar="PATH",
 )
 _FROZEN = _typed("keep the maps of --memory as they are: nothing is added", action="store_true")
 _SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")

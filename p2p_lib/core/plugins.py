@@ -7,7 +7,10 @@ A package offers parts as entry points of the groups ``p2p_lib.trackers``, ``p2p
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -26,7 +29,13 @@ def is_place(name: str) -> bool:
 
 def offered(kind: str) -> dict[str, EntryPoint]:
     """What installed packages offer of a kind (``tracker``, ``segmenter``, ``detector``, ``dataset``), by name."""
-    return {point.name: point for point in entry_points(group=f"p2p_lib.{kind}s")}
+    return _offered(f"p2p_lib.{kind}s", tuple(sys.path))
+
+
+@cache
+def _offered(group: str, path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """By name; on one path it is read once, since the files of every installed package are opened for it."""
+    return {point.name: point for point in entry_points(group=group)}
 
 
 def knows(kind: str, name: str, known: Iterable[str]) -> bool:
@@ -45,13 +54,29 @@ def find(kind: str, name: str, known: Mapping[str, str], has: Iterable[str] = ()
     if name in known:
         return load(known[name])
     if is_place(name):
-        return _checked(kind, name, name, has)
+        with _working_folder_first():
+            return _checked(kind, name, name, has)
     points = offered(kind)
     if name not in points:
         names = [*known, *points]
         expected = f"one of {', '.join(names)}, or your own as package.module:Class"
         raise BadInput(_SAID.get(kind, kind), repr(name), expected, did_you_mean(name, names))
     return _checked(kind, name, points[name].value, has)
+
+
+@contextmanager
+def _working_folder_first() -> Iterator[None]:
+    """Where the working folder is on the path, what lies there is meant, and no installed module of the same name.
+
+    Only while a named part is imported: otherwise a file there could stand in for any library.
+    """
+    here = [""] if "" in sys.path else []
+    sys.path[:0] = here
+    try:
+        yield
+    finally:
+        if here:
+            sys.path.remove("")
 
 
 def load(where: str) -> Any:

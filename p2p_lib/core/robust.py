@@ -71,11 +71,22 @@ def _fit(p_b: np.ndarray, p_a: np.ndarray, w: np.ndarray, prior: np.ndarray, T: 
             for j in range(3):
                 H[i, j] += w[n] * (p_a[n, i] - mean_a[i]) * (p_b[n, j] - mean_b[j])
     U, s, Vt = np.linalg.svd(H)
-    proper = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    U[:, 2] *= proper
     R = U @ Vt
-    T[:3, :3], T[:3, 3], T[3, 3] = R, mean_a - R @ mean_b, 1.0
+    proper = 1.0 if _determinant(R) > 0 else -1.0
+    for i in range(3):
+        U[i, 2] *= proper
+    R = U @ Vt
+    at, T[3, 3] = mean_a - R @ mean_b, 1.0
+    for i in range(3):  # that a slice may not fit takes as long to compile as all else
+        T[i, 0], T[i, 1], T[i, 2], T[i, 3] = R[i, 0], R[i, 1], R[i, 2], at[i]
     return s[1] + proper * s[2]
+
+
+@compiled()
+def _determinant(M: np.ndarray) -> float:
+    """Of a matrix (3, 3), without the half second in which that of LAPACK is compiled."""
+    minors = M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1], M[1, 2] * M[2, 0] - M[1, 0] * M[2, 2]
+    return M[0, 0] * minors[0] + M[0, 1] * minors[1] + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])
 
 
 def residual_m(T_a_b: np.ndarray, p_b: np.ndarray, p_a: np.ndarray) -> np.ndarray:
@@ -121,7 +132,7 @@ def _ransac(p_b: np.ndarray, p_a: np.ndarray, limit_m: np.ndarray, drawn: np.nda
             relative = _residual_m(T, p_b[n], p_a[n]) / limit_m[n]
             score += 1 - relative / (count + 1) if relative <= 1 else 0.0
         if score > best_score:
-            best[:], best_score = T, score
+            best, best_score = T.copy(), score
             missed = 1 - (np.ceil(score) / count) ** size
         if s + 1 >= _SAMPLES and missed ** (s + 1) < _MISSED:
             break
@@ -196,7 +207,7 @@ def _refit(T_a_b, p_b, p_a, limit_m, weights, min_inliers, among, prior):
             w[n] = weights[n] if inliers[n] else 0.0
         if turn == _REFITS or inliers.sum() < min_inliers or (turn > 0 and (inliers == fitted).all()):
             break
-        fitted[:] = inliers
+        fitted = inliers.copy()
         inertia_m2 = _fit(p_b, p_a, w, prior, T)
     return T, inliers, residual, inertia_m2
 

@@ -77,6 +77,11 @@ class Frame:
         """(height, width) in pixels."""
         return self.depth_m.shape
 
+    @property
+    def remark(self) -> str:
+        """What whoever looked at it before found wrong with it, in words."""
+        return ""
+
     @cached_property
     def sparse(self) -> dict[str, np.ndarray]:
         """``rgb`` and ``depth_m`` at :data:`SPARSE`: copies, since a stride reads the whole image."""
@@ -173,6 +178,8 @@ class Status(StrEnum):
 
 #: How the reason of an occlusion begins where the object has left the image, and where nobody knows what hides it.
 OUT_OF_VIEW, NOT_FOUND = "out of view", "not found"
+#: What an object waits for that was added by its name alone.
+WAITS = ": it waits for a mask (step) or for clicks (correct)"
 
 
 def status_word(status: str, reason: str) -> str:
@@ -200,7 +207,7 @@ class PoseEstimate:
     T_cam_obj       (4, 4) or None. None whenever the status is not one of :data:`WITH_POSE`
     covariance      (6, 6) or None: right tangent of T_cam_obj, [rotation rad, translation m]
     confidence      in [0, 1]; 0 without a pose
-    reason          why the status is what it is, in words; empty when tracked
+    reason          why the status is what it is, in words; empty when tracked, unless something is wrong with the frame
     visible_points  the object's points that the 2D tracker saw; those that this very frame adds are not among them
     inliers         keypoints that agree on the pose; in the frame in which a map begins, those it begins with
     keyframe        whether the frame was taken into the map

@@ -11,6 +11,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.files import check_new
 from p2p_lib.core.native import load_open3d
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import Frame
@@ -38,7 +39,7 @@ def convert(
     Returns the number of frames. Raises :class:`BadInput` where ``out`` is not empty or the source does not fit,
     :class:`MissingBackend` where it takes a package that is not there.
     """
-    folder.check_new(out)
+    check_new(out)
     if not is_recording(Path(source)):
         sequence = open_sequence(source, format, depth_scale)
         folder.write(sequence, out)

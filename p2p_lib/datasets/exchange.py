@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.files import read_text, replace_text
+from p2p_lib.core.files import check_new, read_text, replace_text
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets import images
 from p2p_lib.datasets.models import load_points
@@ -79,8 +79,7 @@ def export(
 
 def _new(path: Path) -> Path:
     """The path, where nothing lies yet: a dataset's own truth has the same names."""
-    if path.is_file() or (path.is_dir() and any(path.iterdir())):
-        raise BadInput(str(path), "what is there already", "a new file or folder", "Name another folder.")
+    check_new(path)
     return path
 
 

@@ -20,27 +20,33 @@ from p2p_lib.datasets.images import save_png
 
 FILE = "first_masks.png"
 _FONT, _WHITE = cv2.FONT_HERSHEY_SIMPLEX, (255, 255, 255)
-#: Of an object by itself: its height and the most of them in a row, px, and the room around it, a share of its size.
+#: Of objects by themselves: their height at least, px, the most of them in a row, and the room around, a share of one.
 _CLOSE_PX, _ACROSS, _ROOM = 240, 4, 0.3
 #: The outline of a larger object is thicker.
 _LARGE_PX = 10_000
 
 
 class FirstMasks:
-    """Collects each object's first mask with any pixels and draws them, frame below frame."""
+    """Collects each object's first mask with any pixels and draws them, frame below frame.
+
+    prompts  what is said of objects; it may grow meanwhile. Those newest in a mask's frame are drawn with it
+    """
 
     def __init__(self, path: Path, prompts: Iterable[Prompt] = ()):
-        self.path = path
-        self._prompts, self._started, self._panels = list(prompts), [], []  # type: ignore[var-annotated]
+        self.path, self._prompts, self._followed = path, prompts, set[str]()
+        self._started, self._panels = list[str](), list[np.ndarray]()
 
     def add(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> list[str]:
         """The masks that served in a frame; which objects are new, whose picture is written then."""
-        new = {name: mask for name, mask in masks.items() if name not in self._started and mask is not None}
+        self._followed &= masks.keys()  # what was removed may be added again
+        new = {name: mask for name, mask in masks.items() if name not in self._followed and mask is not None}
         new = {name: mask for name, mask in new.items() if mask.any()}
         if new:
-            self._started += new
+            self._followed |= new.keys()
+            self._started = list(dict.fromkeys([*self._started, *new]))
             colours = object_colours(self._started)
-            prompts = [prompt for prompt in self._prompts if prompt.name in new]
+            said = sorted((p for p in self._prompts if p.frame <= frame.index), key=lambda p: p.frame)
+            prompts = [prompt for name, prompt in {p.name: p for p in said}.items() if name in new]
             self._panels.append(_panel(frame, new, prompts, colours))
             width = max(panel.shape[1] for panel in self._panels)
             sheet = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0))) for p in self._panels]
@@ -58,7 +64,9 @@ def _panel(
         thick = 1 if np.count_nonzero(mask) < _LARGE_PX else 2
         cv2.drawContours(image, outlines, -1, rgb(colours[name]), thick)
     # Enlarged before anything thick is drawn, so that it covers none of a small object.
-    parts = [_close(image, masks[name], name, prompts, colours[name]) for name in masks]
+    side_px = {name: int(np.ceil(max(_size_px(mask)) * (1 + 2 * _ROOM))) for name, mask in masks.items()}
+    height_px = max(_CLOSE_PX, *side_px.values())  # none is smaller than in the frame
+    parts = [_close(image, masks[name], name, prompts, colours[name], side_px[name], height_px) for name in masks]
     _draw_prompts(image, prompts, colours, 1.0, np.zeros(2))
     _write(image, f"first masks, frame {frame.index}")
     blank = [np.zeros_like(parts[0])] * (-len(parts) % _ACROSS if len(parts) > _ACROSS else 0)
@@ -68,16 +76,22 @@ def _panel(
     return np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in (image, *rows)])
 
 
-def _close(image: np.ndarray, mask: np.ndarray, name: str, prompts: Iterable[Prompt], colour: str) -> np.ndarray:
-    """A square around one object, enlarged, with its clicks, its name and how many pixels it has."""
+def _size_px(mask: np.ndarray) -> tuple[int, int]:
+    """Width and height of what a mask holds."""
     rows, columns = bounds(mask)
-    size = np.array([columns.stop - columns.start, rows.stop - rows.start])
-    side = int(np.ceil(size.max() * (1 + 2 * _ROOM)))
-    left, top = (np.array([columns.start, rows.start]) + (size - side) // 2).tolist()
+    return columns.stop - columns.start, rows.stop - rows.start
+
+
+def _close(
+    image: np.ndarray, mask: np.ndarray, name: str, prompts: Iterable[Prompt], colour: str, side: int, height_px: int
+) -> np.ndarray:
+    """The square of this ``side`` around one object, enlarged to a height, with its clicks, name and pixels."""
+    rows, columns = bounds(mask)
+    left, top = (np.array([columns.start, rows.start]) + (np.array(_size_px(mask)) - side) // 2).tolist()
     around = cv2.copyMakeBorder(image, side, side, side, side, cv2.BORDER_CONSTANT)  # an object at the image's edge
     part = around[top + side : top + 2 * side, left + side : left + 2 * side]
-    scale = _CLOSE_PX / side
-    part = cv2.resize(part, (_CLOSE_PX, _CLOSE_PX), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    scale = height_px / side
+    part = cv2.resize(part, (height_px, height_px), interpolation=cv2.INTER_CUBIC)
     own = [prompt for prompt in prompts if prompt.name == name]
     _draw_prompts(part, own, {name: colour}, scale, np.array([left, top]))
     _write(part, f"{name}: {np.count_nonzero(mask)} px", colour)

@@ -18,6 +18,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.files import check_new
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, image_files
@@ -61,12 +62,6 @@ def write(
             images.save_png(out / "masks" / name / f"{number:06d}.png", mask)
     write_about(out, sequence.camera, sequence.times_s[frames] - sequence.times_s[frames[0]])
     return out
-
-
-def check_new(out: str | Path) -> None:
-    """Refuse a folder that holds anything."""
-    if Path(out).is_dir() and any(Path(out).iterdir()):
-        raise BadInput(str(out), "a folder that is not empty", "a new one for the images")
 
 
 def write_images(out: str | Path, frames: Iterable[Frame], unit_m: float = images.DEPTH_SCALE) -> list[float]:

@@ -40,6 +40,7 @@ class ImageSequence:
     read_depth     reads a depth file: (H, W) in the file's unit, of which depth_scale is metres
     mask_files     what :meth:`masks` gives; ``own_masks`` the dataset's own, which scoring counts
     read_truth     called once, when truth is first asked for
+    scene_seed     of a synthetic scene; None of anything else
     """
 
     path: Path
@@ -57,6 +58,7 @@ class ImageSequence:
     own_masks: MaskFiles | None = None
     read_truth: Callable[[], dict[str, ObjectTruth]] = dict
     model_places: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
+    scene_seed: int | None = None
 
     def __len__(self) -> int:
         return len(self.rgb)

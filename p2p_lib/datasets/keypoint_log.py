@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from p2p_lib.core.files import check_arrays, load_by_object, replacing
+from p2p_lib.core.files import check_arrays, load_by_object, save_arrays
 
 FILE = "keypoints.npz"
 
@@ -63,8 +63,7 @@ class KeypointLog:
             uv_px = np.concatenate([np.zeros((0, 2), np.float32), *(uv for _, _, uv in seen)])
             values = ids.astype(np.int32), p_obj.astype(np.float32), promoted, frames, track_id, uv_px
             arrays |= {f"{name}/{f.name}": value for f, value in zip(fields(ObjectKeypoints), values, strict=True)}
-        with replacing(folder / FILE) as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        save_arrays(folder / FILE, arrays, compressed=True)
 
 
 def load_keypoints(folder: str | Path) -> dict[str, ObjectKeypoints]:

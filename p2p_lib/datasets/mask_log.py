@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.files import check_arrays, load_by_object, replacing
+from p2p_lib.core.files import check_arrays, load_by_object, save_arrays
 from p2p_lib.core.types import Frame
 
 FILE = "masks.npz"
@@ -106,8 +106,7 @@ class MaskLog:
             arrays[f"{name}/bits"] = np.concatenate([np.zeros(0, np.uint8), *columns.pop("bits")])
             kinds = {"frame_index": np.int32, "px": np.int32, "box": np.int16}
             arrays |= {f"{name}/{key}": np.array(v, kinds.get(key, np.float32)) for key, v in columns.items()}
-        with replacing(folder / FILE) as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        save_arrays(folder / FILE, arrays, compressed=True)
 
 
 def load_masks(folder: str | Path) -> dict[str, ObjectMasks]:

@@ -32,19 +32,9 @@ class Resized:
 
     @property
     def camera(self) -> Camera:
-        """The original's camera with its pixels merged; integer pixels are pixel centres."""
+        """The original's camera with its pixels merged."""
         camera = self.original.camera
-        width, height = _size((camera.height, camera.width), self.scale)
-        sx, sy = width / camera.width, height / camera.height
-        return replace(
-            camera,
-            fx=camera.fx * sx,
-            fy=camera.fy * sy,
-            cx=(camera.cx + 0.5) * sx - 0.5,
-            cy=(camera.cy + 0.5) * sy - 0.5,
-            width=width,
-            height=height,
-        )
+        return camera.resized(*_size((camera.height, camera.width), self.scale))
 
     def frame(self, i: int) -> Frame:
         """The i-th image, smaller."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.files import append, file_name, read_text, replace_text, replacing, writing_alone
+from p2p_lib.core.files import append, file_name, read_text, replace_text, save_arrays, writing_alone
 from p2p_lib.core.options import differing
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
@@ -22,7 +22,7 @@ from p2p_lib.datasets.keypoint_log import FILE as KEYPOINTS
 from p2p_lib.datasets.mask_log import FILE as MASK_LOG
 from p2p_lib.datasets.models import load_points
 from p2p_lib.datasets.provenance import provenance
-from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, Run, load_run, read_info, tum_line
+from p2p_lib.datasets.runs import COLUMNS, NO_POSE, NOT_FOLLOWED, OFFLINE, ObjectRun, Run, load_run, read_info, tum_line
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
 
 IfExists = Literal["refuse", "replace", "resume"]
@@ -96,6 +96,7 @@ class RunWriter:
             "masks": masks,
             "preset": config.preset,
             "seed": config.seed,
+            "scene_seed": getattr(sequence, "scene_seed", None),
             "models": {name: str(_from(sequence.path, path)) for name, path in models.items()},
             "frames": 0,
             "finished": False,
@@ -150,7 +151,7 @@ class RunWriter:
             self._clear_redone(self.resumed.objects, self.redo_from)
         replace_text(self.path / "config.toml", self._config.to_toml())
         if self._points:
-            _save_arrays(self.path / "models.npz", self._points)
+            save_arrays(self.path / "models.npz", self._points)
         for name in self._estimates:
             self._write_poses(name)
         self._write_timings()
@@ -203,7 +204,7 @@ class RunWriter:
                 arrays |= {f"{name}/{column}": getattr(run, column) for column in COLUMNS}
                 if self._several_maps(name):
                     self._write_poses(name)
-            _save_arrays(self.path / "poses.npz", arrays)
+            save_arrays(self.path / "poses.npz", arrays)
         self.info |= {"frames": n, "objects": list(self._estimates)}
         self._write_info()
 
@@ -335,7 +336,7 @@ def _place(info: Mapping[str, Any]) -> str:
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:
-    return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason="not followed")
+    return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason=NOT_FOLLOWED)
 
 
 def _from(folder: Path | None, path: Path) -> Path:
@@ -376,8 +377,3 @@ def _clear_refined(out: Path) -> None:
         for folder in (refined / "poses", refined / "meshes", refined):
             with suppress(OSError):  # something else is in it
                 folder.rmdir()
-
-
-def _save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with replacing(path) as file:
-        np.savez(file, allow_pickle=False, **arrays)

@@ -12,7 +12,6 @@ It is written into a folder of its own, by one process at a time: nothing is del
                           and so are poses in maps that were given up since (``map_id`` in ``poses.npz``); poses in a
                           map that became part of the last one since are in its frame
     poses.npz             everything of every frame as it was said then, and the truth where the sequence has it
-    first_masks.png       the mask with which each object was started, to be looked at first
     meshes/<object>.ply   the reconstructed surface in the object frame, vertex colours (written at the end)
     keypoints.npz         2D tracks and keypoint maps (:mod:`p2p_lib.datasets.keypoint_log`; written at the end)
     masks.npz             every mask, coarsely (:mod:`p2p_lib.datasets.mask_log`; written at the end)
@@ -34,7 +33,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import file_name, load_arrays, read_text
-from p2p_lib.core.types import DOUBTED, PoseEstimate
+from p2p_lib.core.types import DOUBTED, PoseEstimate, Status
 from p2p_lib.datasets.masks import read_labels
 from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import Sequence
@@ -42,6 +41,8 @@ from p2p_lib.datasets.sequence import Sequence
 NO_MASKS = -1  # visible_px of sequences that come without masks
 #: Where in a run's folder ``p2p refine`` puts what it makes of it.
 OFFLINE = "offline"
+#: The reason of frames before an object was added and after it was removed.
+NOT_FOLLOWED = "not followed"
 NO_POSE = np.full((4, 4), np.nan)
 NO_COVARIANCE = np.full((6, 6), np.nan)
 
@@ -120,6 +121,20 @@ class ObjectRun:
     def doubted(self) -> np.ndarray:
         """(n,) bool: a pose, of confidence :data:`~p2p_lib.core.types.DOUBTED` at most."""
         return self.has_pose & (self.confidence <= DOUBTED)
+
+    @property
+    def followed(self) -> np.ndarray:
+        """(n,) bool: it had been added, and was not removed."""
+        return (self.status != str(Status.INITIALISING)) | (self.reason != NOT_FOLLOWED)
+
+    @property
+    def removed(self) -> np.ndarray:
+        """(n,) bool: it had been followed before, and was removed."""
+        return ~self.followed & np.logical_or.accumulate(self.followed)
+
+    def select(self, rows: np.ndarray) -> ObjectRun:
+        """The same at these rows or under this mask."""
+        return ObjectRun(*(getattr(self, column)[rows] for column in COLUMNS))
 
     def of_confidence(self, least: float) -> ObjectRun:
         """The same without the poses of less confidence."""
@@ -207,9 +222,7 @@ class Run:
             fix = "Frames before it are kept."
             raise BadInput(f"{self.path}: from", f"frame {frame}", f"one from {at[0] + 1} to {at[-1]}", fix)
         kept = at < frame
-        objects = {
-            name: ObjectRun(*(getattr(obj, column)[kept] for column in COLUMNS)) for name, obj in self.objects.items()
-        }
+        objects = {name: obj.select(kept) for name, obj in self.objects.items()}
         return replace(self, objects=objects, timings={key: rows[: kept.sum()] for key, rows in self.timings.items()})
 
     def masks(self, sequence: Sequence, frame: int) -> dict[str, np.ndarray]:

@@ -126,12 +126,13 @@ def open_sequence(
     path_or_name: str | Path | Sequence,
     format: str | None = None,
     depth_scale: float | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     masks: str | Path | None = None,
     gaps: bool = False,
 ) -> Sequence:
-    """A sequence from a folder, the bundled ``synthetic/NAME``, or one below ``$P2P_DATA`` by its name alone.
+    """A sequence from a folder, a bundled one, or one below ``$P2P_DATA`` by its name alone.
 
+    Bundled are ``synthetic/NAME`` and, drawn by another seed, ``synthetic/NAME@SEED``.
     One that is open already is given back as it is.
 
     Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one; any
@@ -139,7 +140,7 @@ def open_sequence(
 
     format       one of :data:`FORMATS`, or somebody else's; by default the layout is recognised, ours before others
     depth_scale  metres per raw unit of the depth images (default: the layout's, mostly 0.001 for millimetres)
-    seed         of the generator, for ``synthetic/NAME``
+    seed         of a synthetic scene whose name has none (default 0)
     masks        another folder of masks (a name inside the sequence, or a path); by default the dataset's own
     gaps         depth images may be missing: their frames cannot be read, all others can
 
@@ -156,8 +157,10 @@ def open_sequence(
     name = str(path_or_name)
     if name.startswith(SYNTHETIC):
         render = import_module(_GENERATOR).scenario_dir
-        folder, format = render(name.removeprefix(SYNTHETIC), seed), format or "ycbmultitrack"
+        scenario, seed = _scene(name, seed)
+        folder, format = render(scenario, seed), format or "ycbmultitrack"
     else:
+        seed = None
         folder, format = _find(path_or_name, format)
         name = os.path.basename(os.path.abspath(folder))
     format = format or recognise(folder)
@@ -166,7 +169,15 @@ def open_sequence(
     if not isinstance(read, ImageSequence):
         what = f"format {format}: what load(folder, masks) gives"
         raise BadInput(what, type(read).__name__, "an ImageSequence, see CONTRIBUTING.md")
-    return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale)
+    return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale, scene_seed=seed)
+
+
+def _scene(name: str, seed: int | None) -> tuple[str, int]:
+    """The scenario and the seed of a synthetic scene's name; ``seed`` where that has none."""
+    scenario, named, number = name.removeprefix(SYNTHETIC).partition("@")
+    if named and not number.isdecimal():
+        raise BadInput(name, f"the seed {number!r}", f"{SYNTHETIC}{scenario}@SEED, a whole number from 0")
+    return scenario, int(number) if named else seed or 0
 
 
 def reopen(info: Mapping[str, Any]) -> Sequence:
@@ -176,7 +187,8 @@ def reopen(info: Mapping[str, Any]) -> Sequence:
         raise MissingData(f"images of {info['sequence']}", "it was a live camera's, of which none are kept", fix)
     asked = info.get("options") or {}
     depth_scale, gaps = asked.get("depth_scale"), bool(asked.get("skip_bad"))
-    return open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, info["seed"], gaps=gaps)
+    seed = info["seed"] if info.get("scene_seed") is None else info["scene_seed"]  # of older runs both are the same
+    return open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, seed, gaps=gaps)
 
 
 def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:

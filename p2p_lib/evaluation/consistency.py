@@ -9,7 +9,6 @@ suspicious in all this is judged by :mod:`p2p_lib.evaluation.suspicions`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +40,7 @@ HEADS = {
     "pose_where_seen": ("where seen [%]", f"the same of frames whose mask has {MIN_VISIBLE_PX} pixels: 100 is best"),
     "depth_on_surface": (
         "depth on surface [%]",
-        f"of the surface in view, where depth was measured within {1000 * ON_M:g} mm of it: 100 is best",
+        f"of the surface in view, where depth lies within {1000 * ON_M:g} mm of it, or its noise there: 100 is best",
     ),
     "mask_iou": (
         "mask IoU [%]",
@@ -61,11 +60,13 @@ class Consistency:
     """What can be said of a run without truth: per object the numbers of :data:`HEADS`, NaN where there is none.
 
     depth_on_surface, mask_iou and reprojection_px are medians over the frames that were looked at. suspicions: per
-    object, what there is to look at before the run is believed. not_scored: why there is truth and no score.
+    object, what there is to look at before the run is believed. unknown: object to why no pose of it was compared with
+    what the camera saw, of those of which none was. not_scored: why there is truth and no score.
     """
 
     objects: dict[str, dict[str, float]]
     suspicions: dict[str, tuple[Suspicion, ...]]
+    unknown: dict[str, str] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
     hz: float | None = None
     not_scored: str = ""
@@ -75,6 +76,7 @@ class Consistency:
         plain = {
             name: {key: value if np.isfinite(value) else None for key, value in numbers.items()}
             | {"verdict": self.verdict(name), "look_at": [asdict(found) for found in self.suspicions[name]]}
+            | {"unknown": self.unknown.get(name)}
             for name, numbers in self.objects.items()
         }
         ran = {key: self.info.get(key) for key in WHAT_RAN}
@@ -97,12 +99,13 @@ class Consistency:
         return "\n".join([title, tables.as_text(self.as_frame()), *self.look_at(), *legend, SCALE, *hz, ran])
 
     def verdict(self, name: str) -> str:
-        """In a word: ``good``, or ``look`` at the film before an object's poses are believed."""
-        return "look" if self.suspicions[name] else "good"
+        """In a word: ``good``, ``look`` at the film before an object's poses are believed, or ``unknown``."""
+        return "look" if self.suspicions[name] else "unknown" if name in self.unknown else "good"
 
     def look_at(self) -> list[str]:
-        """A line per object and suspicion: why, and at which frames to look."""
-        return [f"look at {name}: {found.text}" for name, of in self.suspicions.items() for found in of]
+        """A line per object and suspicion: why, and at which frames to look; and where nothing could be compared."""
+        lines = [f"look at {name}: {found.text}" for name, of in self.suspicions.items() for found in of]
+        return lines + [f"unknown, {name}: {why}" for name, why in self.unknown.items()]
 
 
 def consistency(
@@ -110,22 +113,33 @@ def consistency(
 ) -> Consistency:
     """What can be said of a run without truth; of its images where they can still be had.
 
+    Frames before an object was added and after it was removed count neither for nor against it.
+
     sequence  that the run was made on (default: opened as the run says)
     looks     frames of which the images are looked at, evenly spread; where there are none to be had, 0
     known_m   how long objects are known to be: what was measured is compared with it
     """
-    with suppress(P2PError):
+    no_images = ""
+    try:
         sequence = reopen(run.info) if sequence is None else sequence
+    except P2PError as error:
+        no_images = str(error)
     keypoints, masks, every = load_keypoints(run.path), load_masks(run.path), load_run(run.path, every_map=True)
     sizes = size_doubts(run.path, known_m or {})
-    objects, found = {}, {}
-    for name, obj in run.objects.items():
+    objects, found, unknown = {}, {}, {}
+    for name, whole in run.objects.items():
+        rows = whole.followed if whole.followed.any() else np.ones(len(whole), bool)
+        obj, of_every_map = whole.select(rows), every.objects[name].select(rows)
         mesh = run.path / "meshes" / f"{name}.ply"
         fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks)
         doubts = tuple(text for text in run.info.get("doubts") or () if _is_about(text, name))
-        evidence = gathered(obj, every.objects[name], sequence, masks.get(name), keypoints.get(name), fit, doubts)
+        evidence = gathered(obj, of_every_map, sequence, masks.get(name), keypoints.get(name), fit, doubts)
         off = (Suspicion("known size", sizes[name]),) if name in sizes else ()
         found[name] = off + suspicions(evidence)
+        if obj.has_pose.any() and not evidence.compared:
+            kept = mesh.is_file() or name in keypoints
+            why = "it is in none of the frames looked at" if kept else "neither its surface nor its keypoints were kept"
+            unknown[name] = f"no pose was compared with what the camera saw: {no_images or why}"
         numbers = dict.fromkeys(HEADS, float("nan")) | {"pose": 100 * float(obj.has_pose.mean())}
         if obj.has_pose.any():
             numbers["doubted"] = 100 * float(obj.doubted.sum() / obj.has_pose.sum())
@@ -136,7 +150,7 @@ def consistency(
         if name in keypoints and sequence is not None:
             numbers["reprojection_px"] = _reprojection_px(obj, keypoints[name], sequence.camera)
         objects[name] = numbers
-    return Consistency(objects, found, run.info, rate(run.timings)[0])
+    return Consistency(objects, found, unknown, run.info, rate(run.timings)[0])
 
 
 def surface_fit(

@@ -14,6 +14,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.raycasting import cast, ray_scene
@@ -26,7 +27,8 @@ from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.evaluation.suspicions import FEW, RunEvidence
 
-#: As near to the surface is on it; so much before it is something else that hides it.
+#: As near to the surface is on it, or as near as depth is noisy there; so much before it, or twice that, is something
+#: else that hides it.
 ON_M, BEFORE_M = 0.005, 0.01
 #: So far behind the surface, and so much of the range, nothing can be measured where the surface is.
 _BEHIND_M, _BEHIND_SHARE = 0.02, 0.01
@@ -100,7 +102,8 @@ def gathered(
     elsewhere = every.has_pose & ~obj.has_pose
     of_poses = obj.frame_index, obj.has_pose, elsewhere, obj.confidence
     seen, inside, off_px, jump_px = of_points
-    return RunEvidence(*of_poses, px, size_m, seen, inside, off_px, jump_px, fit.overlap, fit.through, doubts, apart)
+    of_surface = fit.overlap, fit.through, fit.on_surface
+    return RunEvidence(*of_poses, px, size_m, seen, inside, off_px, jump_px, *of_surface, doubts, apart)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:
@@ -113,8 +116,8 @@ def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:
 
 def on_surface(surface_m: np.ndarray, depth_m: np.ndarray) -> float:
     """The fraction of a drawn surface that nothing hides on which depth (H, W) was measured; NaN without any."""
-    behind_m = _behind_m(surface_m, depth_m)
-    return float((np.abs(behind_m) < ON_M).mean()) if len(behind_m) else float("nan")
+    behind_m, noise_m = _behind_m(surface_m, depth_m)
+    return float((np.abs(behind_m) < np.maximum(ON_M, noise_m)).mean()) if len(behind_m) else float("nan")
 
 
 def reprojected(
@@ -180,15 +183,17 @@ def _apart(masks: ObjectMasks) -> float:
     return float(1 - areas[-1] / areas.sum())
 
 
-def _behind_m(surface_m: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
-    """(K,) how far behind a drawn surface depth was measured, wherever nothing hides it."""
-    behind_m = (depth_m - surface_m)[(surface_m > 0) & (depth_m > 0)]
-    return behind_m[behind_m > -BEFORE_M]
+def _behind_m(surface_m: np.ndarray, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) how far behind a drawn surface depth was measured, wherever nothing hides it, and (K,) its noise there."""
+    both = (surface_m > 0) & (depth_m > 0)
+    behind_m, noise_m = (depth_m - surface_m)[both], depth_noise_m(surface_m[both])
+    shown = behind_m > -np.maximum(BEFORE_M, 2 * noise_m)
+    return behind_m[shown], noise_m[shown]
 
 
 def _through(surface_m: np.ndarray, depth_m: np.ndarray) -> float:
     """The share of a drawn surface that is seen through; NaN without any."""
-    behind_m = _behind_m(surface_m, depth_m)
+    behind_m, _ = _behind_m(surface_m, depth_m)
     far_m = _BEHIND_M + _BEHIND_SHARE * float(np.median(surface_m[surface_m > 0])) if len(behind_m) else 0
     return float((behind_m > far_m).mean()) if len(behind_m) else float("nan")
 

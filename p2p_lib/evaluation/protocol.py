@@ -3,7 +3,7 @@
 One rule everywhere. An object's frame is *scored* when its truth is valid there, the dataset's visibility
 labels hold and its visible mask has at least ``min_visible_px`` pixels. A scored frame without a pose is a
 failure: its error is infinite and counts as 0 in every area under a curve. Frames in which the object is
-hidden are not scored.
+hidden, or had been removed from the tracker, are not scored.
 
 The tracker's object frame is its own choice, so one rigid constant T_obj_model is free, see
 :mod:`p2p_lib.evaluation.alignment`.
@@ -154,7 +154,7 @@ def evaluate(
 def scored_frames(obj: ObjectRun, min_visible_px: int = MIN_VISIBLE_PX) -> np.ndarray:
     """(n,) bool: the rule. Where the dataset has no masks at all, truth and labels alone decide."""
     seen = (obj.visible_px >= min_visible_px) | (obj.visible_px == NO_MASKS)
-    return obj.has_truth & obj.labelled & seen
+    return obj.has_truth & obj.labelled & seen & ~obj.removed
 
 
 def score(obj: ObjectRun, scored: np.ndarray, points: np.ndarray, align: str) -> ObjectScore:

@@ -21,8 +21,9 @@ FEW = 5
 LONGEST_M, SHORTEST_M = 0.6, 0.02
 #: A pose that puts keypoints so far from where they are seen, or moves them so much otherwise than they move, px.
 OFF_PX, JUMP_PX = 3.0, 12.0
-#: A silhouette that overlaps less with the mask does not fit; a surface is seen through where so much of it is.
-OVERLAP, THROUGH = 0.5, 0.1
+#: A silhouette that overlaps less with the mask does not fit; a surface is seen through where so much of it is, and is
+#: elsewhere where depth lies on less of it.
+OVERLAP, THROUGH, ON_SURFACE = 0.5, 0.1, 0.6
 #: A mask that holds something so many times as long as usual holds something else besides.
 GROWN = 1.3
 #: Parts of a first mask that are apart, the smaller one this share of it.
@@ -47,6 +48,7 @@ class RunEvidence:
     off_px        (n,) median distance of these from where the pose puts them
     jump_px       (n,) how differently from what was seen the poses moved them since the frame before
     overlap       (n,) of silhouette and mask, through (n,) the share of the surface behind which depth was measured
+    on_surface    (n,) the share of the surface on which it was measured
     doubts        what was doubted when the run was made, in words
     apart         the share of the first mask that is apart from its largest part
     """
@@ -63,6 +65,7 @@ class RunEvidence:
     jump_px: np.ndarray
     overlap: np.ndarray
     through: np.ndarray
+    on_surface: np.ndarray
     doubts: tuple[str, ...] = ()
     apart: float = 0.0
 
@@ -75,6 +78,11 @@ class RunEvidence:
     def carried(self) -> np.ndarray:
         """(n,) bool: seen, and with a pose."""
         return self.seen & self.has_pose
+
+    @property
+    def compared(self) -> bool:
+        """Whether any pose was compared with what the camera saw: without, nothing speaks against it, nor for it."""
+        return any(np.isfinite(of).any() for of in (self.off_px, self.overlap, self.on_surface))
 
 
 @dataclass(frozen=True)
@@ -148,6 +156,13 @@ _RULES = (
         _known("through"),
     ),
     _Rule(
+        "off the surface",
+        f"depth lies on less than {100 * ON_SURFACE:.0f} % of the surface in view",
+        0.5,
+        lambda e: e.on_surface < ON_SURFACE,
+        _known("on_surface"),
+    ),
+    _Rule(
         "grown",
         f"the mask spans more than {GROWN:g} times the object's usual length",
         0.05,
@@ -194,10 +209,12 @@ def _absent(e: RunEvidence) -> Suspicion | None:
 
 def _size(e: RunEvidence) -> Suspicion | None:
     known = e.seen & np.isfinite(e.size_m)
-    if not known.any() or SHORTEST_M <= (size_m := float(np.median(e.size_m[known]))) <= LONGEST_M:
+    # To the millimetre, as it is said: what reads as a limit is within it.
+    size_m = round(median_of_known(e.size_m[known]), 3)
+    if not known.any() or SHORTEST_M <= size_m <= LONGEST_M:
         return None
     than = f"longer than {100 * LONGEST_M:g}" if size_m > LONGEST_M else f"shorter than {100 * SHORTEST_M:g}"
-    text = f"the mask spans {100 * size_m:.0f} cm, {than} cm: does it hold other things, or is the depth unit wrong?"
+    text = f"the mask spans {100 * size_m:.4g} cm, {than} cm: does it hold other things, or is the depth unit wrong?"
     return _suspicion("size", text, e, known & ((e.size_m > LONGEST_M) | (e.size_m < SHORTEST_M)), known)
 
 

@@ -48,20 +48,26 @@ class TrackerScore:
     info: dict[str, Any]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as ``p2p eval-tracks --json`` prints them; shares in [0, 1], cost in milliseconds."""
+        """Plain values, as ``p2p eval-tracks --json`` prints them; shares in [0, 1], None of nothing; milliseconds."""
         cost = self.run.cpu_ms[np.isfinite(self.run.cpu_ms)]
         cpu_ms = {"mean": float(cost.mean()), "p95": float(np.percentile(cost, 95))} if len(cost) else {}
-        return {**self.info, **self.tapvid, "redetection": redetection_shares(self.redetections), "cpu_ms": cpu_ms}
+        again = {k: v if np.isfinite(v) else None for k, v in redetection_shares(self.redetections).items()}
+        return {**self.info, **self.tapvid, "redetection": again, "cpu_ms": cpu_ms}
 
     def as_table(self) -> str:
         """The same for people."""
         plain = self.as_dict()
         again, cost = plain["redetection"], plain["cpu_ms"]
-        same = f"of the {again['returns_same_view']} within 40 degrees of a view seen: {again['found_same_view']:.3f}"
+        returns = "found again: no point returns after it was hidden"
+        if again["returns"]:
+            returns = f"found again after {again['returns']} returns: {again['found']:.3f}"
+            same = again["returns_same_view"]
+            share = f"{again['found_same_view']:.3f}" if same else "none"
+            returns += f"; of the {same} within 40 degrees of a view seen: {share}"
         lines = (
             f"{plain['tracker']} on {plain['sequence']}: {plain['queries']} queries, seed {plain['seed']}",
             f"AJ {plain['aj']:.3f}   delta_avg {plain['delta_avg']:.3f}   OA {plain['oa']:.3f}",
-            f"found again after {again['returns']} returns: {again['found']:.3f}; {same}",
+            returns,
             f"CPU per frame: mean {cost['mean']:.1f} ms, p95 {cost['p95']:.1f} ms",
             f"truth from {plain['truth']}",
         )

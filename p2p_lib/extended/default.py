@@ -28,7 +28,6 @@ from p2p_lib.extended.remembering import memory_of
 from p2p_lib.extended.scene import Scene
 from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method import pipeline
-from p2p_lib.method.object_model import Known
 from p2p_lib.method.object_tracker import ObjectTracker
 
 #: Name to what it does.
@@ -175,19 +174,24 @@ class Point2Pose(pipeline.Point2Pose):
             raise BadInput(str(path), f"a file without {error}", _SAVED_BY) from None
         return loaded
 
-    def memory(self, name: str, known: Known | None = None, **made_of: Any) -> ObjectMemory:
+    def memory(self, name: str, **made_of: Any) -> ObjectMemory:
         """What is known of an object now, to be kept by :func:`p2p_lib.core.memory.save_memory`.
 
-        known    the map to keep; None: the one in which the object is followed
         made_of  plain values that say where it comes from
 
         Raises :class:`BadInput` where too little is known to find it again.
         """
         if name not in self.objects:
             raise BadInput("memory", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        obj = self.objects[name]
-        known = known or obj.known
-        return memory_of(name, known, made_of, obj.began_with(known.map_id) if isinstance(obj, Remembered) else None)
+        return memory_in(self.objects[name], self.objects[name].known.map_id, **made_of)
+
+
+def memory_in(obj: TwoMaps | ObjectTracker, number: int, **made_of: Any) -> ObjectMemory:
+    """What an object's map of this ``number`` holds; raises as :meth:`Point2Pose.memory`."""
+    before, known = (obj.began_with(number) if isinstance(obj, Remembered) else None), obj.known_as(number)
+    if known is None:
+        raise BadInput(f"memory of {obj.name!r}", f"map {number}, which was given up", "a map that is kept")
+    return memory_of(obj.name, known, made_of, before)
 
 
 def compose(camera: Camera, config: Config) -> pipeline.Parts:
@@ -202,7 +206,7 @@ def compose(camera: Camera, config: Config) -> pipeline.Parts:
     return pipeline.Parts(FrameGuard("moments" in on), front, partial(object_tracker, on=on))
 
 
-def object_tracker(*paper: Any, on: Container[str] = frozenset(MECHANISMS)) -> TwoMaps:
-    """An object with the mechanisms that are ``on``; ``paper`` are the arguments of :class:`ObjectTracker`."""
+def object_tracker(*paper: Any, on: Container[str] = frozenset(MECHANISMS), map_id: int = 0) -> TwoMaps:
+    """An object with the mechanisms that are ``on``; the others are the arguments of :class:`ObjectTracker`."""
     own = partial(ObjectTracker, policy=partial(OurPolicy, on=on), model=JoinableModel)
-    return TwoMaps(own(*paper))
+    return TwoMaps(own(*paper, map_id=map_id))

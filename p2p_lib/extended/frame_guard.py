@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,20 @@ from p2p_lib.core.types import Frame
 _STANDS_S = 0.08
 
 
-class StillFrame(Frame):
-    """A frame of a camera that gives the same image again and again."""
+@dataclass(frozen=True, eq=False)
+class DoubtedFrame(Frame):
+    """A frame with which something is wrong: ``remark`` says what.
+
+    still  whether its camera gives the same image again and again
+    """
+
+    remark: str = ""
+    still: bool = False
+
+    @classmethod
+    def of(cls, frame: Frame, **changes: Any) -> DoubtedFrame:
+        """The frame, changed."""
+        return cls(**{f.name: getattr(frame, f.name) for f in fields(Frame)} | changes)
 
 
 class FrameGuard:
@@ -25,7 +38,7 @@ class FrameGuard:
 
     def __init__(self, moments: bool = True):
         self._moments = moments
-        self._time_s: float | None = -np.inf  # of the frame before; None once the warning is given
+        self._time_s, self._stopped, self._warned = -np.inf, False, False  # of the frame before
         self._stale = StaleFrames()
         self._newest: Frame | None = None
 
@@ -33,29 +46,32 @@ class FrameGuard:
         """The frame to go on with."""
         if frame is self._newest:  # the last one again, which ends a stream
             return frame
-        self._check_time(frame)
+        remarks, changes = [self._time_remark(frame)], {}
         self._stale = self._stale.with_frame(frame)
         half, still = self._stale.for_long(frame.time_s)
         if half and self._moments:
-            frame = _without_depth(frame)
-        self._newest = StillFrame(**{f.name: getattr(frame, f.name) for f in fields(frame)}) if still else frame
+            got, fix = "one repeats the same image while the other changes", "Depth is ignored until both change."
+            doubt("depth and colour", got, fix)
+            remarks.append(f"depth and colour: {got}")
+            changes["depth_m"] = np.zeros_like(frame.depth_m)  # not of the moment of its colour: points can wait
+        remark = "; ".join(filter(None, remarks))
+        self._newest = DoubtedFrame.of(frame, remark=remark, still=still, **changes) if remark or still else frame
         return self._newest
 
-    def _check_time(self, frame: Frame) -> None:
-        """Warn, once, of frames whose time does not increase."""
-        if self._time_s is not None and frame.time_s <= self._time_s:
-            got = f"{frame.time_s:.6f} s, not later than the frame before ({self._time_s:.6f} s)"
+    def _time_remark(self, frame: Frame) -> str:
+        """What to say of a time that goes back, or no longer on; the first is warned of, too.
+
+        Of frames that all have the same time the first one says so.
+        """
+        before_s, self._time_s = self._time_s, frame.time_s
+        stopped, self._stopped = self._stopped, frame.time_s == before_s
+        if frame.time_s > before_s or (stopped and self._stopped):
+            return ""
+        got = f"{frame.time_s:.6f} s, not later than the frame before ({before_s:.6f} s)"
+        if not self._warned:
             doubt(f"time of frame {frame.index}", got, "Give frames in the order in which they were taken.")
-            self._time_s = None
-        elif self._time_s is not None:
-            self._time_s = frame.time_s
-
-
-def _without_depth(frame: Frame) -> Frame:
-    """The frame without its depth, which is not of the moment of its colour: points can wait for depth."""
-    got = "one repeats the same image while the other changes"
-    doubt("depth and colour", got, "Depth is ignored until both change.")
-    return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+            self._warned = True
+        return f"its time is {got}"
 
 
 @dataclass(frozen=True, eq=False)

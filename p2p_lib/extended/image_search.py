@@ -243,25 +243,30 @@ def _normal_equations(T, p_obj, n_obj, depth_m, lens):
     (height, width), (fx, fy, cx, cy) = depth_m.shape, lens
     R_obj_cam = np.ascontiguousarray(T[:3, :3].T)
     p_cam, normal = p_obj @ R_obj_cam + T[:3, 3], n_obj @ R_obj_cam
-    off_m, used = np.zeros(len(p_cam)), np.zeros(len(p_cam), np.bool_)
-    for m in range(len(p_cam)):
+    centre, used, off_m = np.zeros(3), 0, np.zeros(len(p_cam))
+    for m in range(len(p_cam)):  # those that are used come to the front
         (x, y, z), (a, b, c) = p_cam[m], normal[m]
         if z <= 0 or a * x + b * y + c * z >= _FACING * np.sqrt(x * x + y * y + z * z):
             continue
         u, v = fx * x / z + cx, fy * y / z + cy
         if 0 <= u <= width - 1 and 0 <= v <= height - 1:
             measured = depth_m[int(np.rint(v)), int(np.rint(u))]
-            used[m] = measured > 0 and abs(measured - z) < 2 * _ROUGH_M
-            off_m[m] = (measured - z) / z * (a * x + b * y + c * z)  # along the ray
-    p_cam, normal, off_m = (p_cam[used], normal[used], off_m[used]) if used.any() else (p_cam, normal, off_m)
-    centre, A, right = np.zeros(3), np.zeros((6, 6)), np.zeros(6)
-    for i in range(3):
-        centre[i] = p_cam[:, i].mean()
-    if used.any():
-        J = np.hstack((np.cross(p_cam - centre, normal), normal))
-        weighted = (J / (_FINE_M**2 + off_m * off_m).reshape(-1, 1)).T
-        A, right = weighted @ J, weighted @ off_m
-    return A, right, centre
+            if measured > 0 and abs(measured - z) < 2 * _ROUGH_M:
+                off_m[used] = (measured - z) / z * (a * x + b * y + c * z)  # along the ray
+                for i in range(3):
+                    p_cam[used, i], normal[used, i] = p_cam[m, i], normal[m, i]
+                    centre[i] += p_cam[used, i]
+                used += 1
+    centre /= max(used, 1)
+    J, weighted = np.zeros((used, 6)), np.zeros((used, 6))
+    for m in range(used):
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            J[m, i] = (p_cam[m, j] - centre[j]) * normal[m, k] - (p_cam[m, k] - centre[k]) * normal[m, j]
+            J[m, 3 + i] = normal[m, i]
+        for i in range(6):
+            weighted[m, i] = J[m, i] / (_FINE_M**2 + off_m[m] * off_m[m])
+    return weighted.T @ J, weighted.T @ off_m[:used], centre
 
 
 @compiled(

@@ -13,7 +13,7 @@ from p2p_lib.core.types import Frame as Frame  # the type of an inherited field
 from p2p_lib.core.types import Tracks
 from p2p_lib.extended.agreement import outline_share
 from p2p_lib.extended.contour import contour_px
-from p2p_lib.extended.frame_guard import StillFrame
+from p2p_lib.extended.frame_guard import DoubtedFrame
 from p2p_lib.extended.image_search import Sighting
 from p2p_lib.method.observation import Observation, Observer
 
@@ -46,7 +46,7 @@ class OurObservation(Observation):
     @property
     def still(self) -> bool:
         """Whether the camera has given the same image for a while."""
-        return isinstance(self.frame, StillFrame)
+        return isinstance(self.frame, DoubtedFrame) and self.frame.still
 
     @cached_property
     def outline_share(self) -> float | None:

@@ -14,7 +14,7 @@ from functools import cache
 import numpy as np
 
 from p2p_lib.core.image import either
-from p2p_lib.core.interfaces import Hint, LazyHints
+from p2p_lib.core.interfaces import Hint, LazyHints, checked_tracks
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
 from p2p_lib.extended.observation import OurObservation
@@ -94,7 +94,9 @@ class Reacquisition(Frontend):
         seen = {name: objects[name].observe(frame, masks[name], self.tracks) for name in sought}
         looked = {name: objects[name].outlook.sighted(obs) for name, obs in seen.items()}
         found = {name: sighting for name, sighting in looked.items() if sighting is not None}
-        self._suggest({name: objects[name].outlook.points_px(seen[name], at.T_cam_obj) for name, at in found.items()})
+        self._suggest(
+            frame, {name: objects[name].outlook.points_px(seen[name], at.T_cam_obj) for name, at in found.items()}
+        )
         return found
 
     def hints(self, frame: Frame, sought: Sequence[str]) -> Mapping[str, Hint]:
@@ -117,7 +119,7 @@ class Reacquisition(Frontend):
         }
         if "rejection" in self.on:
             self.apply(self._misplaced(seen, inputs.masks))
-        return seen | self._redetect(seen) if "redetection" in self.on else seen
+        return seen | self._redetect(inputs.frame, seen) if "redetection" in self.on else seen
 
     def _misplaced(self, seen: Mapping[str, OurObservation], given: Masks) -> dict[str, Requests]:
         """Tracks of absent objects that are on something else.
@@ -129,18 +131,18 @@ class Reacquisition(Frontend):
         within = {name: elsewhere if name in nowhere else obs.mask for name, obs in seen.items()}
         return {name: self.objects[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
-    def _redetect(self, seen: Mapping[str, OurObservation]) -> dict[str, OurObservation]:
+    def _redetect(self, frame: Frame, seen: Mapping[str, OurObservation]) -> dict[str, OurObservation]:
         """Guided re-detection: the tracker looks for points where objects expect them; the new observations."""
         looked = {name: self.objects[name].outlook.expected_px(obs) for name, obs in seen.items()}
         expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}
-        self._suggest(expected)
+        self._suggest(frame, expected)
         return {name: self.objects[name].seen_anew(seen[name], self.tracks) for name in expected}
 
-    def _suggest(self, expected_px: Mapping[str, np.ndarray]) -> None:
+    def _suggest(self, frame: Frame, expected_px: Mapping[str, np.ndarray]) -> None:
         """Have the tracker look for points where their objects expect them, unless it answers late."""
         if self.tracker.latency_frames:
             return
         with self.stopwatch("tracking"):
             for name, uv_px in expected_px.items():
                 found = self.tracker.suggest(self.objects[name].map.ids, uv_px)
-                self.tracks = self.tracks if found is None else found
+                self.tracks = self.tracks if found is None else checked_tracks(self.tracker, found, frame)

@@ -71,6 +71,7 @@ class Remembered(TwoMaps):
         super().__init__(own)
         self._rng = np.random.default_rng(0)
         self._memory, self.frozen = memory, frozen
+        self._first_map = own.known.map_id
         self._recogniser = recogniser
         self._fewest = max(_FEWEST, _OF_A_VIEW * len(memory.p_obj) / min(len(memory.T_cam_obj), _VIEWS))
         self._begin()
@@ -78,7 +79,7 @@ class Remembered(TwoMaps):
     def _begin(self) -> None:
         """Reset what is known to the memory alone."""
         own, memory = self.own, self._memory
-        own.known = Known(own.new_model(), replace(self.policy.life, seen_m2=float(memory.seen_m2)))
+        own.known = Known(own.new_model(), replace(self.policy.life, seen_m2=float(memory.seen_m2)), self._first_map)
         own.model.recall(memory)
         self.other, self.policy.frozen, self.policy.trusted = None, True, None
         self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
@@ -109,7 +110,7 @@ class Remembered(TwoMaps):
 
     def began_with(self, map_id: int) -> ObjectMemory | None:
         """The memory that this map began with; None for a later map."""
-        return self._memory if map_id == 0 else None
+        return self._memory if map_id == self._first_map else None
 
     def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Recognition | None:
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool.

@@ -92,6 +92,7 @@ class TwoMaps:
         self.observer, self.config, self.name = own.observer, own.config, own.name
         self._on = self.policy.on
         self._relation = Relation()  # of the other map to this one
+        self.next_map = own.known.map_id + 1  # which no map has had yet
 
     @property
     def known(self) -> Known:
@@ -232,11 +233,12 @@ class TwoMaps:
         if self._still_growing(obs):
             return self.own.absent(obs, Verdict(False, Status.LOST, _STILL_GROWING))
         own, new = self.own, copy(self.own)
-        new.known = Known(new.new_model(), self.policy.life, own.known.map_id + 1)
+        new.known = Known(new.new_model(), self.policy.life, self.next_map)
         step, trusted = new.begin(obs), self.policy.trusted
         if (keep and step.estimate.status is Status.DEGRADED) or step.estimate.T_cam_obj is None:
             self.policy.trusted = trusted
             return own.absent(obs, Verdict(False, Status.LOST, step.estimate.reason))
+        self.next_map += 1
         gone = self.other if keep else own
         if keep:
             self.other = _lost(own)

@@ -188,7 +188,7 @@ def _part(job: Job, frames: int | None, dataset: str) -> str:
 def by_method(numbers: Numbers) -> Table:
     """A row per method, with the spread over sequences: the paper's ablations, and the comparison of trackers."""
     lines = [[Cell(method.name), *_areas(numbers, method)] for method in numbers.methods]
-    heads, groups = ["Method"], [("", 1), ("Ours", 4)]
+    heads, groups = ["Method"], [("", 1), ("Ours" if numbers.plan.paper else "measured", 4)]
     heads += [head for area in AREA_HEADS for head in (area, "std over sequences")]
     bold = [1, 3] if numbers.judges else []
     if numbers.plan.tracks:

@@ -19,7 +19,7 @@ METRICS = {
 #: Those of them that are areas under the curve, and the heads of these.
 AREA_KEYS = ("adds_auc", "add_auc")
 AREA_HEADS = [METRICS[key][1] for key in AREA_KEYS]
-_HOW = "Ours: exact area under the curve, aligned at the first scored frame, frames without a pose count as 0"
+_HOW = "exact area under the curve, aligned at the first scored frame, frames without a pose count as 0"
 _REPORTED = "(reported): as the paper prints it, on its own files, masks and machine"
 
 
@@ -73,7 +73,8 @@ class Numbers:
         seeds = ", ".join(map(str, self.seeds))
         spread = f"mean ± standard deviation over seeds {seeds}" if len(self.seeds) > 1 else f"seed {seeds} alone"
         reported = [_REPORTED] if self.plan.paper else []
-        return [f"{_HOW}; {self.scored()}; {spread}", *self.about(), *reported]
+        how = f"Ours: {_HOW}" if reported else _HOW.capitalize()
+        return [f"{how}; {self.scored()}; {spread}", *self.about(), *reported]
 
     def scored(self) -> str:
         """Which frames count."""

@@ -230,14 +230,11 @@ def zoomed(
     left, top, right, bottom = region_px
     if not (0 <= left < right <= image.shape[1] and 0 <= top < bottom <= image.shape[0]):
         raise BadInput("region_px", region_px, f"a rectangle within {image.shape[1]}x{image.shape[0]}")
-    s = width_px / (right - left)
-    height_px = round(s * (bottom - top))
-    s_v = height_px / (bottom - top)
-    how = cv2.INTER_AREA if s < 1 else cv2.INTER_CUBIC
-    part = cv2.resize(image[top:bottom, left:right], (width_px, height_px), interpolation=how)
-    # Integer pixels are pixel centres: the region's own edge lies half a pixel before its first one.
-    cx, cy = (camera.cx - left + 0.5) * s - 0.5, (camera.cy - top + 0.5) * s_v - 0.5
-    return part, replace(camera, fx=camera.fx * s, fy=camera.fy * s_v, cx=cx, cy=cy, width=width_px, height=height_px)
+    size = width_px, round(width_px / (right - left) * (bottom - top))
+    how = cv2.INTER_AREA if width_px < right - left else cv2.INTER_CUBIC
+    part = cv2.resize(image[top:bottom, left:right], size, interpolation=how)
+    region = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=right - left, height=bottom - top)
+    return part, region.resized(*size)
 
 
 def zoomed_px(uv_px: np.ndarray, camera: Camera, seen_by: Camera) -> np.ndarray:

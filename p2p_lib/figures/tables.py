@@ -1,4 +1,4 @@
-"""Returns after occlusion as a table, and tables for papers: cells with a number, its spread and its reason."""
+"""Tables for papers: cells with a number, its spread and its reason."""
 
 from __future__ import annotations
 
@@ -11,33 +11,7 @@ from itertools import pairwise
 import numpy as np
 from pandas import DataFrame, MultiIndex, Series, to_numeric
 
-from p2p_lib.core import se3
 from p2p_lib.core.tables import as_html, as_markdown
-from p2p_lib.datasets.runs import Run
-from p2p_lib.evaluation.protocol import Evaluation
-
-
-def recovery_table(run: Run, evaluation: Evaluation) -> DataFrame:
-    """A row per return after complete occlusion: when, how far the object had moved unseen, how soon it had a pose.
-
-    A good pose is one with an ADD-S of at most 2 cm; a dash where there was none before the object was hidden again.
-    """
-    rows = []
-    for name, score in evaluation.objects.items():
-        obj = run.objects[name]
-        for event in score.returns:
-            gone, back = np.searchsorted(obj.frame_index, [event.hidden_frame, event.return_frame])
-            T_before, T_after = obj.T_cam_model[gone - 1], obj.T_cam_model[back]
-            row = {
-                "object": name,
-                "hidden at [s]": obj.time_s[gone].round(2),
-                "back at [s]": obj.time_s[back].round(2),
-                "moved unseen [cm]": (100 * np.linalg.norm(T_after[:3, 3] - T_before[:3, 3])).round(1),
-                "turned unseen [°]": np.degrees(se3.angle_rad(se3.inverse(T_before) @ T_after)).round(1),
-                "frames to a good pose": event.frames_to_recovery,
-            }
-            rows.append(row)
-    return DataFrame(rows)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config
 from p2p_lib.core.interfaces import Detector, Hint
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import OUT_OF_VIEW, Frame, PoseEstimate, Status, Tracks
+from p2p_lib.core.types import OUT_OF_VIEW, WAITS, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
@@ -40,6 +40,7 @@ class ObjectTracker:
 
     policy  makes what decides the open questions of a step; the paper's by default
     model   makes an empty model
+    map_id  the number of its first map
     """
 
     def __init__(
@@ -53,12 +54,13 @@ class ObjectTracker:
         executor: Executor,
         policy: Callable[..., Policy] = Policy,
         model: Callable[..., ObjectModel] = ObjectModel,
+        map_id: int = 0,
     ):
         self.name, self.config, self.detector = name, config, detector
         self.observer = Observer(camera, config.depth, config.refinement.max_points if config.method.surface else 0)
         self.new_model = partial(model, config, self.observer, stopwatch, executor)
         self.policy = policy(self.observer, config, rng, stopwatch)
-        self.known = Known(self.new_model(), self.policy.life)
+        self.known = Known(self.new_model(), self.policy.life, map_id)
         self._stopwatch = stopwatch
 
     @property
@@ -144,7 +146,7 @@ class ObjectTracker:
     def begin(self, obs: Observation) -> ObjectStep:
         """The first frame of a map: fix the object frame and start with the first points."""
         if obs.mask_px is None or self.policy.hidden(obs):
-            return self.absent(obs, Verdict(False, Status.INITIALISING, "not seen yet"))
+            return self.absent(obs, Verdict(False, Status.INITIALISING, "not seen yet" + WAITS * (obs.mask is None)))
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < self.config.lifecycle.min_mask_px:
             return self.absent(obs, Verdict(False, Status.INITIALISING, f"only {len(v)} mask pixels with depth"))

@@ -121,8 +121,8 @@ class Point2Pose(Objects):
             seen = self.front.observe(tracked)
             steps = {name: self.objects[name].step(obs) for name, obs in seen.items()}
             self.front.apply({name: step.requests for name, step in steps.items()})
-            answers = {name: steps[name].estimate for name in self.objects if name in steps}
-            estimates = {n: self.explained(answer, tracked.masks[n] is not None) for n, answer in answers.items()}
+            said = {name: steps[name].estimate for name in self.objects if name in steps}
+            estimates = {n: self.explained(e, tracked.frame, self.masks[n], tracked.masks[n]) for n, e in said.items()}
         self._log(estimates)
         return estimates
 
@@ -145,7 +145,7 @@ class Point2Pose(Objects):
         """Start an object of which nothing is known."""
         rng = np.random.default_rng([self.config.seed, *name.encode()])
         made_of = self.camera, self.config, self.detector, rng, self.stopwatch, self._executor
-        self.objects[name] = self._parts.object(name, *made_of)
+        self.objects[name] = self._parts.object(name, *made_of, map_id=self._next_map.get(name, 0))
 
     def _log(self, estimates: Mapping[str, PoseEstimate]) -> None:
         """Log every object whose status has changed."""

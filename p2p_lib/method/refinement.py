@@ -295,7 +295,7 @@ def _huber_loss(e: np.ndarray, threshold: float, most: float) -> float:
 
 @compiled()
 def _upper_median(x: np.ndarray) -> float:
-    return np.partition(x, len(x) // 2)[len(x) // 2]
+    return np.median(np.append(x, np.inf)[: len(x) | 1])  # np.partition takes three times as long to compile
 
 
 @compiled("f8[:,::1], f8[::1], f8, f8[::1], f8[::1,:], b1[::1], f8, f8, f8, f8")

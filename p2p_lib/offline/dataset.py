@@ -23,6 +23,7 @@ from p2p_lib.core.types import DOUBTED, Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.bop import Outline, write_models, write_scene
 from p2p_lib.datasets.sequence import ObjectTruth
+from p2p_lib.evaluation.suspicions import OVERLAP
 from p2p_lib.offline.finished import RULE, Finished, Renderer, Silhouette, new_folder
 
 #: Depth up to this far before a surface does not hide it, m (the BOP toolkit's).
@@ -123,7 +124,18 @@ def write_bop(folder: str | Path, out: str | Path, min_confidence: float = DOUBT
         about |= {"run": made.about, "objects": obj_ids}
         about |= {"frames": len(made.frames), "labelled": len(labels.frames)}
         replace_text(there / "labels.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
-    return f"{len(labels.rows)} labels in {len(labels.frames)} of {len(made.frames)} images"
+    return _summary(labels, len(made.frames), min_confidence)
+
+
+def _summary(labels: _Labels, frames: int, min_confidence: float) -> str:
+    """How many labels there are, how many images have none and why, and how many labels are to be looked at."""
+    confidence, overlap = (np.array([row[COLUMNS.index(c)] for row in labels.rows]) for c in ("confidence", "mask_iou"))
+    doubtful = np.count_nonzero((confidence <= DOUBTED) | (overlap < OVERLAP))
+    lines = [f"{len(labels.rows)} labels in {len(labels.frames)} of {frames} images"]
+    if left_out := frames - len(labels.frames):
+        lines.append(f"{left_out} left out, in which an object has no pose of confidence above {min_confidence:g}")
+    why = f"confidence at most {DOUBTED:g}, or silhouette and mask overlap by less than {OVERLAP:g} (IoU)"
+    return "; ".join([*lines, f"{doubtful} of the labels doubtful ({why}): see labels.csv"])
 
 
 def write_foundationpose(

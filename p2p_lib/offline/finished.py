@@ -16,6 +16,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.files import check_new
 from p2p_lib.core.raycasting import cast, ray_scene
 from p2p_lib.core.types import DOUBTED
 from p2p_lib.datasets.mask_log import CELL_PX, load_masks
@@ -178,8 +179,7 @@ def new_folder(out: str | Path) -> Iterator[Path]:
     Raises :class:`BadInput` if ``out`` holds something already.
     """
     out = Path(out)
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise BadInput(str(out), "what is there already", "a new or empty folder", "Name another one.")
+    check_new(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     partial.mkdir()

@@ -2,7 +2,8 @@
 
 A folder per object: ``textured_simple.obj`` with ``.mtl`` and ``.png``, ``textured_simple.glb``,
 ``collision.obj`` (convex) and ``model.json``, which says what they are. All in metres, in the object frame of the
-run's poses. Faces that nobody saw are in the OBJ's group ``guessed``.
+run's poses. Faces that nobody saw are in the OBJ's group ``guessed``. ``size_m`` in ``model.json`` has the sides of the
+smallest box around the model, longest first, however the object frame lies in it.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ NAME = "textured_simple"
 _MIN_COMPONENT = 0.05
 #: A patch is open if depth this far behind it, m, was measured in at least so many views.
 _SEEN_THROUGH_M, _SEEN_THROUGH_VIEWS = 0.012, 2
+#: Parts and holes that a surface seen all around has at most, once those that nobody saw are closed.
+_PARTS, _HOLES = 1, 10
 #: Faces of a collision mesh, at most.
 _HULL_FACES = 256
 #: The edge of a texture, px, at least and at most, and the room around its charts.
@@ -107,7 +110,13 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     about = _about(made, name, textured, len(views), off) | {"collision_faces": len(hull.faces)}
     replace_text(out / "model.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
     guessed = f", {100 * about['guessed_share']:.0f} % of its area guessed" if shape.guessed.any() else ""
-    return f"{name}: {len(shape.faces)} faces, texture of {len(views)} views{guessed}"
+    line = f"{name}: {len(shape.faces)} faces, texture of {len(views)} views{guessed}"
+    parts, holes = about["parts"], about["holes"]
+    if parts <= _PARTS and holes <= _HOLES:
+        return line
+    fix = "" if made.about.get("offline") else "a model of RUN/offline (p2p refine RUN) or "
+    found = f"{parts} part{'s' * (parts > 1)}, {holes} holes"
+    return f"{line}; ragged ({found}): {fix}a video that shows each side longer and nearer has fewer"
 
 
 def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[str, float]) -> dict[str, Any]:
@@ -121,7 +130,9 @@ def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[
         "watertight": bool(mesh.is_watertight),
     }
     record |= {"guessed_share": float(mesh.area_faces[shape.guessed].sum() / mesh.area), "views": views}
-    record |= {"size_m": np.ptp(shape.vertices, axis=0).round(5).tolist(), "colour_error_of_255": off}
+    sides_m = sorted(mesh.bounding_box_oriented.primitive.extents.tolist(), reverse=True)
+    parts, holes = torn(shape)
+    record |= {"parts": parts, "holes": holes, "size_m": np.round(sides_m, 5).tolist(), "colour_error_of_255": off}
     return record | {"run": made.about}
 
 
@@ -216,6 +227,17 @@ def simplified(shape: Shape, faces: int) -> Shape:
     colours = shape.colours[cKDTree(shape.vertices).query(vertices)[1]]
     nearest = cKDTree(shape.vertices[shape.faces].mean(1)).query(vertices[made].mean(1))[1]
     return Shape(vertices, made, colours, shape.guessed[nearest])
+
+
+def torn(shape: Shape) -> tuple[int, int]:
+    """Into how many parts a shape falls, and how many holes it has: closed lines of edges of one face only."""
+    from trimesh.graph import connected_component_labels
+
+    edges = np.sort(shape.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    edges, faces = np.unique(edges, axis=0, return_counts=True)
+    return tuple(  # type: ignore[return-value]
+        len(np.unique(connected_component_labels(of, len(shape.vertices))[of])) for of in (edges, edges[faces == 1])
+    )
 
 
 def collision(shape: Shape) -> Any:

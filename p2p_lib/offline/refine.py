@@ -7,6 +7,7 @@ without a pose gets one that fits as well as the others do. Causal poses at whic
 kept. The surface is fused anew with half the voxel size.
 
 Written to ``RUN/offline``, a run's folder of its own that says ``"offline": true``: causal results stay as they are.
+It has no ``maps/``: keypoints and keyframes, by which an object is found again, stay those of ``RUN/maps``.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from scipy.ndimage import uniform_filter1d
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config, from_toml
 from p2p_lib.core.errors import MissingData
-from p2p_lib.core.files import load_arrays, replace_text, replacing, writing_alone
+from p2p_lib.core.files import load_arrays, replace_text, save_arrays, writing_alone
 from p2p_lib.core.mesh import save
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
@@ -66,8 +67,9 @@ def refine_run(folder: str | Path, progress: bool = False) -> list[str]:
         parts.mkdir(exist_ok=True)
         replace_text(parts / "of", stamp)
         todo = [name for name in made.tracked if not (parts / f"{name}.npz").is_file()]
-        total = len(made.frames) * (1 + 2 * len(todo)) if todo else 0
-        with progress_bar("refine", total, shown=progress) as bar:
+        passes = 1 + 2 * len(todo) if todo else 0  # over the frames: one for all objects, then two for each
+        title = f"refine, {passes} passes over {len(made.frames)} frames"
+        with progress_bar(title, passes * len(made.frames), shown=progress) as bar:
             evidence = gather(made, todo, config, bar) if todo else {}
             for name in todo:
                 _part(made, name, config, evidence.pop(name), parts, bar)
@@ -102,8 +104,7 @@ def _part(made: Finished, name: str, config: Config, evidence: VideoEvidence, pa
     if len((mesh := fused(made, name, columns["T_cam_obj"], last, config, voxel_m / 2).mesh()).faces):
         save(mesh, parts / "meshes" / f"{name}.ply")
     bar.update(len(T))
-    with replacing(parts / f"{name}.npz") as file:
-        np.savez(file, allow_pickle=False, **columns)
+    save_arrays(parts / f"{name}.npz", columns)
 
 
 def _columns(
@@ -190,8 +191,7 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
         summary.append(
             line + f", {len(off)} of them more than three sigmas from the causal one" + in_ranges(disagrees[name])
         )
-    with replacing(new / "poses.npz") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    save_arrays(new / "poses.npz", arrays)
     for file_name in ("config.toml", "models.npz", "masks.npz"):
         if (made.run.path / file_name).is_file():
             shutil.copyfile(made.run.path / file_name, new / file_name)

@@ -8,7 +8,6 @@ frames of 30 a second.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -209,7 +208,7 @@ def half_hidden_start(seed: int, models: str = "") -> Scenario:
     share = rng.uniform(0.12, 0.38)
     if models:
         names = "011_banana", "061_foam_brick"
-        meshes = [shapes.load_mesh(Path(models) / name / "textured.obj") for name in names]
+        meshes = [shapes.load_ycb(models, name) for name in names]
     else:
         names, meshes = ("tin", "box"), (shapes.box(rng, (0.10, 0.058, 0.035)), _carton(rng))
     time, way = np.arange(_FRAMES) / _FRAMES, rng.choice([-1.0, 1.0])

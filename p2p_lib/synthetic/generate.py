@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData, did_you_mean
+from p2p_lib.core.files import check_new
 from p2p_lib.core.paths import cache_dir
 from p2p_lib.datasets.bop import write_models, write_scene
 from p2p_lib.datasets.sequence import SYNTHETIC, open_sequence
@@ -107,8 +108,7 @@ def write_sequence(
     own, _ = _settings(name, seed, {"models": str(models)} if models else {})
     if noise not in NOISE:
         raise BadInput("noise", repr(noise), "one of " + ", ".join(NOISE))
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise BadInput(str(out), "has files in it", "a new or empty folder")
+    check_new(out)
     scenario = SCENARIOS[name](seed, **own)
     write_scenario(out, scenario, NOISE[noise], seed, f"rendering {name}")
     made = {"name": name, "seed": seed, "noise": noise, "sensor": asdict(NOISE[noise]), "objects": scenario.objects}

@@ -129,10 +129,10 @@ def closed(hand: Hand, thing: Mesh, T_thing_hand: np.ndarray) -> tuple[np.ndarra
     """Joint angles (5, 3) at which each digit first touches a thing, joint by joint from the palm; which do (5,)."""
     angles, touches = OPEN.copy(), np.zeros(5, bool)
     for j in range(3):
-        sweep = np.linspace(OPEN[:, j], _FURTHEST[:, j], 20)  # (28, 5)
+        sweep = np.linspace(OPEN[:, j], _FURTHEST[:, j], 20)  # (20, 5)
         tried = np.repeat(angles[None], len(sweep), 0)
         tried[..., j] = sweep
-        gap = _gaps(hand, thing, T_thing_hand, tried, from_joint=j)  # (28, 5)
+        gap = _gaps(hand, thing, T_thing_hand, tried, from_joint=j)  # (20, 5)
         free = np.logical_and.accumulate(gap > 0.0005, 0)
         last = np.maximum(free.sum(0) - 1, 0)
         angles[:, j] = sweep[last, np.arange(5)]
@@ -145,13 +145,8 @@ def _gaps(hand: Hand, thing: Mesh, T_thing_hand: np.ndarray, angles: np.ndarray,
     middles, radii = hand.spheres(angles)
     middles = middles[:, : 15 * _BALLS].reshape(-1, 5, 3, _BALLS, 3)[:, :, from_joint:]
     radii = radii[: 15 * _BALLS].reshape(5, 3, _BALLS)[:, from_joint:]
-    away = distance_m(thing, se3.transform(T_thing_hand, middles.reshape(-1, 3))).reshape(middles.shape[:-1])
+    away = thing.distance(se3.transform(T_thing_hand, middles.reshape(-1, 3))).reshape(middles.shape[:-1])
     return (away - radii).min((-2, -1))
-
-
-def distance_m(thing: Mesh, points: np.ndarray) -> np.ndarray:
-    """How far points (N, 3) are from a surface (N,), inside or out."""
-    return thing.distance(points)
 
 
 def _joined(limbs: list[Patch], image: np.ndarray, size: float) -> Mesh:

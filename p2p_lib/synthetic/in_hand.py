@@ -8,7 +8,6 @@ at most about half of it is covered. Between stops it moves as hands do, in as m
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -52,7 +51,7 @@ def in_hand(seed: int, thing: str = "", fps: float = FPS, turns: int = 4, models
     name = thing or choice[seed % len(choice)]
     if not models and name not in _THINGS:
         raise BadInput("in_hand thing", repr(name), "one of " + ", ".join(_THINGS))
-    mesh = shapes.load_mesh(Path(models) / name / "textured.obj") if models else _THINGS[name](rng)
+    mesh = shapes.load_ycb(models, name) if models else _THINGS[name](rng)
     film = _Film(rng, mesh, fps / FPS)
     for k in rng.permutation(turns):
         film.take(int(k % 3))
@@ -202,7 +201,7 @@ class _Film:
         T[:, :3, 3] += back[:, None] * R[:, 1]
         balls, radii = self.hand.spheres(OPEN)
         p_thing = se3.transform(se3.inverse(self.thing) @ T, balls)
-        gap = gripping.distance_m(self.mesh, p_thing.reshape(-1, 3)).reshape(len(back), -1) - radii
+        gap = self.mesh.distance(p_thing.reshape(-1, 3)).reshape(len(back), -1) - radii
         free = np.logical_and.accumulate(gap.min(1) > 0.001)
         if not free[0] or free.all():
             return None

@@ -125,8 +125,10 @@ def measured_colour(rgb: np.ndarray, sensor: Sensor, gain: float, rng: np.random
         rgb = cv2.GaussianBlur(rgb, (0, 0), sensor.psf_px)
     if sensor.read_levels or sensor.shot_levels:
         variance = sensor.read_levels**2 + sensor.shot_levels**2 * np.clip(rgb, 0, 255) / 255
-        rgb = rgb + np.sqrt(variance, dtype=np.float32) * rng.standard_normal(rgb.shape, np.float32)
-    return np.clip(np.round(rgb), 0, 255).astype(np.uint8)
+        noise = rng.standard_normal(rgb.shape, np.float32)
+        noise *= np.sqrt(variance, dtype=np.float32)
+        rgb += noise
+    return np.clip(np.round(rgb, out=rgb), 0, 255, out=rgb).astype(np.uint8)
 
 
 def measured_mask(mask: np.ndarray, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -54,7 +53,7 @@ def paper_sequence(seed: int, frames: int = FRAMES, models: str = "", *, parts: 
     reach = {"circular": 0.21, "linear": 0.04} if len(parts) > 1 else {"circular": 0.10, "linear": 0.08}
     bodies = []
     for model, motion in parts.items():
-        mesh = shapes.load_mesh(Path(models) / model / "textured.obj") if models else STAND_INS[model](rng)
+        mesh = shapes.load_ycb(models, model) if models else STAND_INS[model](rng)
         T = {"circular": _circular, "linear": _linear}[motion](rng, frames, reach[motion])
         centre = (mesh.vertices.max(0) + mesh.vertices.min(0)) / 2
         bodies.append(Body(model, mesh, T @ se3.from_rt(np.eye(3), -centre)))

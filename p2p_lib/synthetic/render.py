@@ -1,6 +1,6 @@
 """A CPU renderer for textured meshes: exact depth at pixel centres, prefiltered textures, Lambert shading, glaze.
 
-Open3D's ray caster says which face a pixel shows. Where on it follows in float64: with A the camera-space corners of a
+Embree says which face a pixel shows. Where on it follows in float64: with A the camera-space corners of a
 face as columns, ``A^-1 @ ray`` are the barycentric coordinates divided by the depth (Olano and Greer, 1997). They are
 affine in the pixel, so one 3x3 matrix per face gives the depth, perspective-correct texture coordinates and their
 derivatives.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -142,13 +143,16 @@ def _pixels_around(p_cam: np.ndarray, camera: Camera) -> np.ndarray:
 
 def _shade(seen: _Hits, camera: Camera, light: Light, T_cam_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colour (N, 3) and cosine of incidence (N,) of pixels."""
-    mesh, face, planes = seen.mesh, seen.face, seen.planes[seen.face]
+    mesh, face = seen.mesh, seen.face
     v, u = np.divmod(seen.pixel, camera.width)
-    over_z = planes[..., 0] * u[:, None] + planes[..., 1] * v[:, None] + planes[..., 2]
+    # What is of faces is worked out there and then taken: they are fewer than pixels.
+    per_u, per_v, offset = (np.ascontiguousarray(seen.planes[..., k])[face] for k in range(3))
+    over_z = per_u * u[:, None] + per_v * v[:, None] + offset
     inv_z = over_z.sum(1, keepdims=True)
     weight = over_z / inv_z
     # How the barycentric weights change from pixel to pixel, to the right and down.
-    slopes = [(planes[..., a] - weight * planes[..., a].sum(1, keepdims=True)) / inv_z for a in range(2)]
+    totals = seen.planes.sum(1)
+    slopes = [(per - weight * totals[face, a, None]) / inv_z for a, per in enumerate((per_u, per_v))]
 
     def change_per_px(of_corners: np.ndarray) -> np.ndarray:
         return np.maximum(*(np.linalg.norm(_mixed(slope, of_corners), axis=1) for slope in slopes))
@@ -156,9 +160,8 @@ def _shade(seen: _Hits, camera: Camera, light: Light, T_cam_world: np.ndarray) -
     uv, normals = mesh.uv[face], mesh.normals[face]
     texels = uv * mesh.texture.shape[1::-1]
     colour = texture.lookup(mesh.mipmap, _mixed(weight, uv), change_per_px(texels))
-    ray = camera.rays.reshape(-1, 3)[seen.pixel]
-    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-    cosine = -np.einsum("nc,nc->n", mesh.face_normals[face] @ seen.R_cam_model.T, ray)
+    ray = _directions(camera)[seen.pixel]
+    cosine = -np.einsum("nc,nc->n", (mesh.face_normals @ seen.R_cam_model.T)[face], ray)
     normal = _mixed(weight, normals) @ seen.R_cam_model.T
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     towards = T_cam_world[:3, :3] @ (np.asarray(light.towards, float) / np.linalg.norm(light.towards))
@@ -173,6 +176,13 @@ def _shade(seen: _Hits, camera: Camera, light: Light, T_cam_world: np.ndarray) -
         shown = mirrored(light.environment, away @ T_cam_world[:3, :3], spread_rad)
         colour += share[:, None].astype(np.float32) * (shown - colour)
     return colour, np.abs(cosine).astype(np.float32)
+
+
+@lru_cache(maxsize=4)
+def _directions(camera: Camera) -> np.ndarray:
+    """(H * W, 3) unit vectors along the rays of pixels."""
+    rays = camera.rays.reshape(-1, 3)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 def _mixed(weight: np.ndarray, of_corners: np.ndarray) -> np.ndarray:

@@ -116,22 +116,30 @@ def assembled(patches: Sequence[Patch], rows: Sequence[Sequence[int]] = ((0,),),
     rows    which patches' images stand side by side in each row of the texture, from the top
     ground  grey level of the texture where there is none
     """
-    sizes = [patch.image.shape[1::-1] for patch in patches]
+    page, uv = _on_one_page([(patch.image, patch.uv) for patch in patches], rows, ground)
+    flat = np.concatenate([patch.corners for patch in patches]).reshape(-1, 3)
+    _, first, index = np.unique(np.round(flat, 9), axis=0, return_index=True, return_inverse=True)
+    normals = np.concatenate([patch.normals for patch in patches])
+    return Mesh(flat[first], index.reshape(-1, 3), uv, page, normals)
+
+
+def _on_one_page(
+    images: Sequence[tuple[np.ndarray, np.ndarray]], rows: Sequence[Sequence[int]], ground: int = 128
+) -> tuple[np.ndarray, np.ndarray]:
+    """Images with coordinates (F, 3, 2) on each, in rows on one texture (H, W, 3), and all coordinates on that."""
+    sizes = [image.shape[1::-1] for image, _ in images]
     heights = [max(sizes[k][1] for k in row) for row in rows]
     W, H = max(sum(sizes[k][0] for k in row) for row in rows), sum(heights)
     page = np.full((H, W, 3), ground, np.uint8)
-    uv: list[np.ndarray] = [np.zeros(0)] * len(patches)
+    uv: list[np.ndarray] = [np.zeros(0)] * len(images)
     for row, top in zip(rows, np.cumsum([0, *heights]), strict=False):
         left = 0
         for k in row:
             w, h = sizes[k]
-            page[top : top + h, left : left + w] = patches[k].image
-            uv[k] = (patches[k].uv * [w, h] + [left, H - top - h]) / [W, H]
+            page[top : top + h, left : left + w] = images[k][0]
+            uv[k] = (images[k][1] * [w, h] + [left, H - top - h]) / [W, H]
             left += w
-    flat = np.concatenate([patch.corners for patch in patches]).reshape(-1, 3)
-    _, first, index = np.unique(np.round(flat, 9), axis=0, return_index=True, return_inverse=True)
-    normals = np.concatenate([patch.normals for patch in patches])
-    return Mesh(flat[first], index.reshape(-1, 3), np.concatenate(uv), page, normals)
+    return page, np.concatenate(uv)
 
 
 def box(rng: np.random.Generator, size_m: tuple[float, float, float], contrast: float = 1.0) -> Mesh:
@@ -206,26 +214,24 @@ def plane(image: np.ndarray, corners_m: np.ndarray) -> Mesh:
 
 def joined(parts: Sequence[tuple[Mesh, np.ndarray]]) -> Mesh:
     """One mesh of several at poses (4, 4), each in its frame; their textures stand one on the other."""
-    W, H = max(m.texture.shape[1] for m, _ in parts), sum(m.texture.shape[0] for m, _ in parts)
-    page, top, count = np.full((H, W, 3), 128, np.uint8), 0, 0
-    vertices, faces, uv, normals, mirrors = [], [], [], [], []
-    for mesh, T in parts:
-        h, w = mesh.texture.shape[:2]
-        page[top : top + h, :w] = mesh.texture
-        uv.append((mesh.uv * [w, h] + [0, H - top - h]) / [W, H])
-        vertices.append(se3.transform(T, mesh.vertices))
-        normals.append(mesh.normals @ T[:3, :3].T)
-        faces.append(mesh.faces + count)
-        mirrors.append(mesh.reflectance)
-        top, count = top + h, count + len(mesh.vertices)
-    return Mesh(
-        *(np.concatenate(a) for a in (vertices, faces, uv)), page, *(np.concatenate(a) for a in (normals, mirrors))
+    page, uv = _on_one_page([(mesh.texture, mesh.uv) for mesh, _ in parts], [[k] for k in range(len(parts))])
+    meshes = [moved(mesh, T) for mesh, T in parts]
+    before = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = np.concatenate([mesh.faces + count for mesh, count in zip(meshes, before, strict=False)])
+    vertices, normals, mirrors = (
+        np.concatenate([getattr(mesh, key) for mesh in meshes]) for key in ("vertices", "normals", "reflectance")
     )
+    return Mesh(vertices, faces, uv, page, normals, mirrors)
 
 
 def moved(mesh: Mesh, T: np.ndarray) -> Mesh:
     """The mesh with its vertices moved by T (4, 4): part of a room."""
     return replace(mesh, vertices=se3.transform(T, mesh.vertices), normals=mesh.normals @ T[:3, :3].T)
+
+
+def load_ycb(models: str | Path, name: str) -> Mesh:
+    """A model of a folder of YCB models (``NAME/textured.obj``, metres)."""
+    return load_mesh(Path(models) / name / "textured.obj")
 
 
 def load_mesh(path: str | Path) -> Mesh:

@@ -175,8 +175,9 @@ def _print_marks(rng: np.random.Generator, glaze: np.ndarray, marks: int, tall: 
         cv2.circle(glaze, (at[0] + size // 3, at[1] - size // 3), size // 6, ink, -1, cv2.LINE_AA)
 
 
-def _speckled(rng: np.random.Generator, width: int = 128, height: int = 512) -> np.ndarray:
-    """Matt clay with dark and light speckles."""
+def _speckled(rng: np.random.Generator) -> np.ndarray:
+    """Matt clay (512, 128, 3) uint8 with dark and light speckles."""
+    width, height = 128, 512
     page = np.float32([176, 150, 120]) * (1 + 0.1 * labels.smooth_noise(rng, width, height, (2, 8), 3))[..., None]
     page = np.clip(page, 0, 255).astype(np.uint8)
     for _ in range(110):

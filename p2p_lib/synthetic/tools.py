@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -36,7 +35,7 @@ def thin_tools(seed: int, tool: str = "", frames: int = 300, models: str = "") -
     meshes = {tool: MAKE[tool](rng), "can": shapes.can(rng, 0.045, 0.125)}
     if models:
         names = YCB_NAMES[tool], _CAN
-        meshes = {name: shapes.load_mesh(Path(models) / name / "textured.obj") for name in names}
+        meshes = {name: shapes.load_ycb(models, name) for name in names}
     (name, mesh), (other, can) = meshes.items()
     way, start = rng.choice([-1.0, 1.0]), rng.uniform(0, 2 * np.pi)
     share = np.arange(frames) / frames

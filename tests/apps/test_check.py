@@ -86,7 +86,9 @@ def alarms(findings):
 
 
 def test_whether_there_is_truth_is_said(good):
-    assert found("synthetic/crossing", "truth").text == "box in 300 images, can in 300 images"
+    assert found("synthetic/crossing", "truth").text == (
+        "box in 300 images, in sight in 257 of them; can in 300 images, in sight in 260 of them"
+    )
     assert found(good, "truth").text.startswith("none (looked for in annotated_poses/")
 
 
@@ -215,7 +217,8 @@ def test_what_cannot_be_read_is_a_finding(good, tmp_path, capsys):
     (folder / "depth" / "000003.png").unlink()
     assert cli.main(["check", str(folder)]) == 2
     out, err = capsys.readouterr()
-    assert "WRONG  depth/" in out and "000003.png is missing" in out and err == ""
+    assert "1 of 6 depth images are missing" in out and "000003.png" in out and "--skip-bad" in out and err == ""
+    assert "box: points" in out and "can: mask" in out, "what can be told of the other frames is"
     assert cli.main(["check", str(tmp_path / "nowhere"), "--json"]) == 2
     (listed,) = json.loads(capsys.readouterr().out)
     assert listed["name"] == "files" and listed["level"] == "WRONG" and "no such folder" in listed["text"]
@@ -322,7 +325,7 @@ def test_an_image_that_ends_too_early_is_found_wherever_it_is(good, tmp_path, mo
     torn = open_sequence(shutil.copytree(good, tmp_path / "torn")).depth[3]
     torn.write_bytes(torn.read_bytes()[:-500])
     (wrong,) = alarms(check_folder(tmp_path / "torn"))
-    assert wrong.level is Level.WRONG and wrong.text.startswith(f"1 of 12 images end too early, the first: {torn} (")
+    assert wrong.level is Level.WRONG and wrong.text == f"1 of 12 images end too early: {torn}"
     assert "--skip-bad" in wrong.fix
 
 
@@ -343,7 +346,13 @@ def test_what_is_missing_is_named(good, tmp_path):
     folder = shutil.copytree(good, tmp_path / "torn")
     for k in (1, 3):
         (folder / f"rgb/00000{k}.png").write_bytes(b"torn")
-    assert [finding.text.partition(":")[0][-10:] for finding in check_folder(folder)] == ["000001.png", "000003.png"]
+    (wrong,) = alarms(check_folder(folder))
+    assert wrong.text == f"2 of 12 images end too early: {folder}/rgb/000001.png, {folder}/rgb/000003.png"
+    for k in (1, 3):  # ends as it should, and is none
+        (folder / f"rgb/00000{k}.png").write_bytes(b"\x89PNG IEND")
+    findings = check_folder(folder)
+    assert [finding.text.partition(":")[0][-10:] for finding in alarms(findings)] == ["000001.png", "000003.png"]
+    assert as_lines(findings, "fine").endswith("To mend first: files")
 
 
 def test_lines_align_and_remedies_follow_what_they_mend(good):
@@ -368,7 +377,7 @@ def test_a_written_folder_reads_back(good):
 
 
 def test_a_folder_is_not_written_over(good):
-    with pytest.raises(BadInput, match="not empty"):
+    with pytest.raises(BadInput, match="what is there already"):
         own.write(open_sequence(good), good)
 
 

@@ -488,7 +488,7 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     assert "$P2P_DATA is not set" in first and "--quick" in first and "nothing ran" in last
     assert cli.main(["benchmark", "--list"]) == 0
     first, *table = capsys.readouterr().out.splitlines()
-    assert re.match(r"\d+ of 19 plans can run here and now in full; \d+ of \d+ methods", first)
+    assert any(re.match(r"\d+ of 19 plans can run here and now in full; \d+ of \d+ methods", line) for line in table)
     assert any(re.match(r"ycbineoat +0 of 54 +YCBInEOAT$", line) for line in table)
     assert any(re.match(r"sampling_embedded +18 of 30 ", line) for line in table)
     assert max(map(len, [first, *table])) <= 100
@@ -783,6 +783,17 @@ def test_a_run_says_how_many_poses_it_doubts(made):
         assert words in line and ("doubted" in line) == (confidence is doubtful)
 
 
+def test_a_run_says_what_mostly_kept_an_object_from_a_pose(made):
+    name, obj = next(iter(made.run.objects.items()))
+    lost = replace(obj, T_cam_obj=np.where(np.arange(len(obj))[:, None, None] < 3, obj.T_cam_obj, np.nan))
+    for some, words in (
+        (lost, "; otherwise mostly "),
+        (replace(lost, T_cam_obj=0 * lost.T_cam_obj * np.nan), "; mostly "),
+    ):
+        _, line = summary(replace(made.run, objects={name: some}), len(obj))
+        assert words in line
+
+
 def test_a_folder_of_ones_own_may_have_masks_of_some_images(sequence, tmp_path, capsys):
     """Named as their images, in a folder per object; images without one are the segmenter's."""
     own = tmp_path / "own"
@@ -914,7 +925,8 @@ def test_an_interruption_leaves_what_was_there(sequence, tmp_path, capsys, monke
     monkeypatch.setattr(Point2Pose, "step", interrupted)
     assert run(sequence, tmp_path / "out") == 130
     out, err = capsys.readouterr()
-    assert err == "p2p run: interrupted\n" and "p2p eval" in out
+    first, then = err.rstrip().split(". Go on with it: ")
+    assert first == "p2p run: interrupted" and "p2p eval" in out
     loaded = load_run(tmp_path / "out")
     assert loaded.objects["object"].frame_index.tolist() == list(range(5))
     assert len(loaded.timings["total_ms"]) == 5
@@ -922,6 +934,19 @@ def test_an_interruption_leaves_what_was_there(sequence, tmp_path, capsys, monke
     assert len(np.loadtxt(tmp_path / "out" / "poses" / "object.txt")) == 5
     assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["objects"]["object"]["frames"] == 5
+    monkeypatch.setattr(Point2Pose, "step", step)
+    assert cli.main([*shlex.split(then)[1:], "--quiet"]) == 0 and then.endswith(" --resume")
+    assert load_run(tmp_path / "out").info["finished"] and len(load_run(tmp_path / "out").objects["object"]) == FRAMES
+
+
+def test_an_interrupted_offline_pass_says_how_it_goes_on(tmp_path, capsys, monkeypatch):
+    def interrupted(folder, progress):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("p2p_lib.offline.refine.refine_run", interrupted)
+    assert cli.main(["refine", str(tmp_path / "a run")]) == 130
+    then = f"Go on: p2p refine '{tmp_path / 'a run'}'; it keeps the objects that are finished."
+    assert capsys.readouterr().err == f"p2p refine: interrupted. {then}\n"
 
 
 def test_an_interruption_before_the_first_frame(sequence, tmp_path, capsys, monkeypatch):

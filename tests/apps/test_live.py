@@ -17,6 +17,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from p2p_lib.apps import cli
 from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
@@ -26,6 +27,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.memory import load_memory
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
@@ -35,6 +37,7 @@ from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.prompts import save_prompts
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.evaluation.consistency import consistency
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import write_film
 from p2p_lib.run import run
@@ -443,7 +446,7 @@ class Lines:
         return iter(self.typed.get, None)
 
 
-def followed_in_step(folder: Path, before, **how) -> list[PoseEstimate]:
+def followed_in_step(folder: Path, before, settings=SETTINGS, **how) -> list[PoseEstimate]:
     """The estimates of a live run that is given each frame when the one before was tracked, after ``before(index)``."""
     sequence, got = open_sequence(folder), []
     step = Point2Pose.step
@@ -468,8 +471,21 @@ def followed_in_step(folder: Path, before, **how) -> list[PoseEstimate]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Point2Pose, "step", stepped)
         patch.setattr("p2p_lib.apps.live._warm_up", lambda method: None)
-        track_live(camera, (), got.append, RunOptions(settings=SETTINGS), backlog=20, **how)
+        track_live(camera, (), got.append, RunOptions(settings=settings), backlog=20, **how)
     return got
+
+
+def typed_for(script: dict[int, str], lines: Lines):
+    """Types each line before its frame."""
+
+    def type_for(k):
+        if k in script:
+            lines.typed.put(script[k])
+            while lines.typed.qsize():
+                time.sleep(0.001)
+            time.sleep(0.02)
+
+    return type_for
 
 
 def test_objects_are_added_corrected_and_removed_while_it_runs(folder, tmp_path):
@@ -483,19 +499,30 @@ def test_objects_are_added_corrected_and_removed_while_it_runs(folder, tmp_path)
         10: '{"name": "again", "box": [30, 20, 130, 110]}',
     }
 
-    def type_for(k):
-        if k in script:
-            lines.typed.put(script[k])
-            while lines.typed.qsize():
-                time.sleep(0.001)
-            time.sleep(0.02)
-
-    got = followed_in_step(folder, type_for, words=words, out=tmp_path / "run")
+    got = followed_in_step(folder, typed_for(script, lines), words=words, out=tmp_path / "run")
     seen = {name: [e.frame_index for e in got if e.object == name] for name in ("board", "again")}
     assert seen == {"board": list(range(2, 8)), "again": list(range(10, 14))} and not errors
     assert all(e.T_cam_obj is not None for e in got)
     info = load_run(tmp_path / "run").info
     assert [(p["name"], p["frame"]) for p in info["prompts"]] == [("board", 2), ("board", 5), ("again", 10)]
+
+
+def test_what_was_learnt_of_an_object_is_kept_when_it_is_removed(folder, tmp_path):
+    """As it was then; a removed object is no lost one, and one of the same name after it is another."""
+    lines, start = Lines(), '{"name": "board", "points": [[%d, 52]]}'
+    script = {0: start % 60, 2: '{"remove": "board"}', 7: start % 75, 12: '{"remove": "board"}'}
+    words = Words(lines, print)
+    got = followed_in_step(folder, typed_for(script, lines), {}, words=words, out=tmp_path / "run")
+    assert [(e.frame_index, e.map_id) for e in got] == [(0, 0), (1, 0), *((k, 1) for k in range(7, 12))]
+    kept = load_run(tmp_path / "run")
+    board = kept.objects["board"]
+    assert board.has_pose.sum() == 5, "the map with the most poses"
+    assert board.removed.tolist() == [False] * 2 + [True] * 5 + [False] * 5 + [True] * 2
+    memory = load_memory(tmp_path / "run" / "maps" / "board.npz")
+    assert memory.made_of["map_id"] == 1 and len(trimesh.load(tmp_path / "run" / "meshes" / "board.ply").faces)
+    assert len(load_keypoints(tmp_path / "run")["board"].ids) > 10
+    found = consistency(kept)
+    assert not [text for text in found.look_at() if "found again" in text or "no pose" in text]
 
 
 def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
@@ -519,6 +546,7 @@ def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
         session = json.loads(ask("session")[1])
         if k == 0:
             assert ask("frame/0")[0] == 500 and session["first"] == 0, "there is none yet"
+            assert b"none has come" in ask("prompts", clicked("board", 0, points=[[64, 52]]))[1]
             return
         assert (session["first"], session["live"]) == (k - 1, True)
         answers[k] = session["names"]
@@ -531,6 +559,9 @@ def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
             status, why = ask("prompts", clicked("board", 1, points=[[W, 5]]))
             assert status == 400 and b"expected pixels within" in why
             assert ask("prompts", clicked("board", 1, negative=[[64, 52]]))[0] == 400, "nothing is there to correct"
+            for stale in (0, 9):
+                status, why = ask("prompts", clicked("board", stale, points=[[64, 52]]))
+                assert status == 400 and f"got frame {stale}, expected frame 1, the one that is shown" in why.decode()
             assert ask("prompts", start)[0] == 200
         if k == 5:
             (counts,) = json.loads(ask("masks", {"objects": [], "frame": 4})[1])["masks"].values()

@@ -13,7 +13,7 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.figures.claims import Claim, check
+from studies.claims import Claim, check
 from studies.course import LESSONS
 from studies.runner import (
     NotebookFailed,
@@ -27,7 +27,7 @@ from studies.runner import (
 SUITE = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 MAX_CELL_LINES = 15
 PARAMETERS = "PROFILE = 'quick'\nSEED: int = 0\nSCALE = 1.0\nNAME = 'a'"
-CHECKS = """from p2p_lib.figures.claims import Claim, check
+CHECKS = """from studies.claims import Claim, check
 check(
     Claim("seed", SEED, "what is drawn"),
     Claim("scale [mm]", SCALE, "how large it is", at_least=0.5),

@@ -189,7 +189,7 @@ def test_a_killed_benchmark_resumes_to_the_identical_table(whole, plan, tmp_path
     assert (done.folder / "summary.csv").read_bytes() == (whole.folder / "summary.csv").read_bytes()
 
 
-def test_a_failing_run_is_a_row_and_the_others_go_on(slides, plan, tmp_path):
+def test_a_failing_run_is_a_row_and_the_others_go_on(slides, plan, tmp_path, capsys):
     broken = Path(shutil.copytree(slides[0], tmp_path / "broken"))
     (broken / "rgb/0004.png").write_bytes(b"no picture")
     text = plan.read_text().replace("seeds = [0, 1]", "seeds = [0]").replace(str(slides[1]), str(broken))
@@ -199,6 +199,8 @@ def test_a_failing_run_is_a_row_and_the_others_go_on(slides, plan, tmp_path):
     rows = table(done)
     failed = [row for row in rows if row["metric"] == "failed"]
     assert len(failed) == 2 and all("0004.png" in row["reason"] and row["value"] == "" for row in failed)
+    again = ["benchmark", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "out"), "--quiet"]
+    assert cli.main(again) == 2 and "2 runs failed; the tables say why" in capsys.readouterr().err
     ours = {"method": "Ours", "seed": 0}
     alone = number(rows, **EXACT, **ours, sequence=str(slides[0]))
     means = {**EXACT, **ours, "sequence": "mean over sequences"}

@@ -203,8 +203,8 @@ SMALL += '[full]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
     ("old", "new", "message"),
     [
         ('name = "Ours"', 'name = "Ours"\ntraker = "lk"', r"method\.0\.traker, a key unknown .* Did you mean tracker"),
-        ("seeds = [0]", "seeds = [0.5]", r"quick\.seeds\.0: Input should be a valid integer"),
-        ("seeds = [0]", "seeds = []", r"quick\.seeds: List should have at least 1"),
+        ("seeds = [0]", "seeds = [0.5]", r"quick\.seeds\.0: 0\.5, where a whole number should be"),
+        ("seeds = [0]", "seeds = []", r"quick\.seeds: \[\], where a list of at least 1 should be"),
         ('name = "a" }', 'name = "a", stop = -1 }', r"quick\.sequence\.0\.stop"),
         ("[quick]", '[[method]]\nname = "Ours"\n[quick]', "two methods have one name"),
         ("seeds = [0]", 'seeds = [0]\nmethods = ["Theirs"]', "no method is called 'Theirs'"),

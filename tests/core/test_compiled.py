@@ -1,5 +1,6 @@
 """Compiled functions: the same as in Python, of whatever else is compiled in their file, and wherever the file lies."""
 
+import ast
 import os
 import signal
 import subprocess
@@ -141,6 +142,35 @@ def test_once_warmed_up_nothing_is_compiled_in_any_frame(tmp_path):
     again = "import p2p_lib; said = []; p2p_lib.warm_up(said.append); print(said)"
     ran = subprocess.run([sys.executable, "-c", again], capture_output=True, text=True, env=surroundings)
     assert ran.stdout.strip() == "[]", ran.stderr
+
+
+def slow_to_compile(function: ast.FunctionDef) -> list[int]:
+    """Lines of a function that take numba seconds: an array assigned to a slice, np.partition."""
+    lines = []
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign) and not isinstance(node.value, ast.Constant):
+            targets = [e for t in node.targets for e in (t.elts if isinstance(t, ast.Tuple) else [t])]
+        else:
+            targets = [node.target] if isinstance(node, ast.AugAssign) else []
+        sliced = any(isinstance(part, ast.Slice) for t in targets for part in ast.walk(t))
+        if sliced or (isinstance(node, ast.Attribute) and node.attr == "partition"):
+            lines.append(node.lineno)
+    return lines
+
+
+def test_compiled_functions_hold_nothing_that_takes_seconds_to_compile():
+    for text, slow in (
+        ("a[:3], b = c, d", [1]),
+        ("a[:] = 1.0", []),
+        ("a[:, 2] *= b", [1]),
+        ("np.partition(a, 2)", [1]),
+    ):
+        assert slow_to_compile(ast.parse(text)) == slow
+    for path in (PROJECT / "p2p_lib").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            marks = [ast.unparse(d) for d in getattr(node, "decorator_list", ())]
+            if any(mark.startswith("compiled(") for mark in marks):
+                assert not slow_to_compile(node), f"{path}: {node.name}"
 
 
 def test_every_file_with_compiled_functions_is_warmed_up():

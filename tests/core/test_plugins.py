@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from p2p_lib.apps import cli
+from p2p_lib.core import plugins
 from p2p_lib.core.backends import make_detector, make_segmenter, make_tracker
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
@@ -127,6 +128,24 @@ def test_a_layout_of_others_is_recognised_or_named(theirs, sequence):
     assert open_sequence(sequence).format == "marked", "but for the one that takes everything"
     for name in ("marked", "their_parts:load"):
         assert open_sequence(sequence, format=name).format == name
+
+
+def test_what_lies_in_the_working_folder_is_meant_where_another_has_its_name(theirs, tmp_path, monkeypatch):
+    """As ``p2p`` is started: the folder is on the path, and last, so that none of its files stands in for a library."""
+    (tmp_path / "their_parts.py").write_text(CODE.replace('name = "mine"', 'name = "mine, changed"'))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*(place for place in sys.path if place), ""])
+    path = list(sys.path)
+    assert make_tracker("their_parts:Mine", preset().tracking).name == "mine, changed" and sys.path == path
+
+
+def test_what_is_installed_is_read_once(monkeypatch):
+    """A plan of a hundred runs asks for each of them whether its names are offered by somebody."""
+    asked = []
+    monkeypatch.setattr(plugins, "entry_points", lambda group: asked.append(group) or [])
+    plugins._offered.cache_clear()
+    assert not any(plugins.knows("tracker", "somebodys", ()) for _ in range(3)) and asked == ["p2p_lib.trackers"]
+    plugins._offered.cache_clear()
 
 
 def test_our_names_stay_ours(theirs):

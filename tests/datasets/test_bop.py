@@ -119,8 +119,8 @@ def test_without_truth_and_masks(scene):
         ("scene_camera", "[1]", r"scene_camera\.json: got the file: "),
         ("scene_camera", '{"1": {"cam_K": [1], "depth_scale": 1}}', r"scene_camera\.json: got 1\.cam_K: .*at least 9"),
         ("scene_camera", json.dumps({"1": {"cam_K": K, "depth_scale": 1}}), r"scene_camera\.json: got no image 36"),
-        ("scene_gt", '{"1": [{"cam_R_m2c": [1]}]}', r"scene_gt\.json: got 1\.0\.obj_id: Field required"),
-        ("scene_gt", '{"1": [{"obj_id": 1}]}', r"scene_gt\.json: got 1\.0\.cam_R_m2c: Field required"),
+        ("scene_gt", '{"1": [{"cam_R_m2c": [1]}]}', r"scene_gt\.json: got 1\.0\.obj_id: missing"),
+        ("scene_gt", '{"1": [{"obj_id": 1}]}', r"scene_gt\.json: got 1\.0\.cam_R_m2c: missing"),
         (
             "scene_gt",
             json.dumps({"1": [{"obj_id": 1, "cam_R_m2c": [2] * 9, "cam_t_m2c": [0, 0, 1]}]}),

@@ -159,7 +159,7 @@ def test_any_layout_becomes_a_plain_folder(make, tmp_path):
     sequence = open_sequence(tmp_path / "out")
     same(sequence, range(len(open_sequence(source))))
     assert sequence.format == "folder" and sequence.times_s[0] == 0
-    with pytest.raises(BadInput, match="a folder that is not empty"):
+    with pytest.raises(BadInput, match="what is there already"):
         convert(source, tmp_path / "out")
 
 

@@ -16,8 +16,8 @@ def picture(index: int) -> Frame:
     return Frame(index, index / 30, np.full((H, W, 3), GRAY, np.uint8), np.ones((H, W), np.float32))
 
 
-def square(top: int, left: int, size: int = 30) -> np.ndarray:
-    mask = np.zeros((H, W), bool)
+def square(top: int, left: int, size: int = 30, shape: tuple[int, int] = (H, W)) -> np.ndarray:
+    mask = np.zeros(shape, bool)
     mask[top : top + size, left : left + size] = True
     return mask
 
@@ -41,6 +41,30 @@ def test_each_object_is_drawn_in_the_frame_that_it_starts_in(tmp_path):
     both = read(path)
     np.testing.assert_array_equal(both[: len(image), : image.shape[1]], image)
     assert (both[len(image) + 30, 0:30] == box).all(), "at the image's edge"
+
+
+def test_what_was_said_meanwhile_is_drawn_and_an_object_that_was_added_again(tmp_path):
+    """Of several prompts the newest one, none that is yet to come."""
+    path, cup, said = tmp_path / "first.png", np.array(rgb(OBJECTS[0])), [Prompt("cup", 9, [[10, 100]])]
+    firsts = FirstMasks(path, said)
+    said += [Prompt("cup", 0, [[20, 40]]), Prompt("cup", 1, [[65, 65]])]
+    assert firsts.add(picture(2), {"cup": square(50, 50)}) == ["cup"]
+    image = read(path)
+    assert (image[65, 65] == cup).all() and (image[30:48, 10:48] == GRAY).all()
+    assert firsts.add(picture(3), {"cup": None}) == firsts.add(picture(4), {"cup": square(9, 9)}) == []
+    assert firsts.add(picture(5), {}) == [] and firsts.add(picture(9), {"cup": square(0, 50)}) == ["cup"]
+    again = read(path)[len(image) :]
+    assert (again[100, 10] == cup).all() and (again[65, 65] == GRAY).all() and (again[29, 50:80] == cup).all()
+
+
+def test_no_object_is_smaller_by_itself_than_in_the_frame(tmp_path):
+    mask = np.zeros((600, 800), bool)
+    mask[100:500, 100:600] = True
+    frame = Frame(0, 0.0, np.full((600, 800, 3), GRAY, np.uint8), np.ones((600, 800), np.float32))
+    FirstMasks(tmp_path / "first.png").add(frame, {"book": mask, "pin": square(10, 10, 10, mask.shape)})
+    red = (read(tmp_path / "first.png")[600:] == np.array(rgb(OBJECTS[0]))).all(-1)
+    rows, columns = np.nonzero(red[:, :800])
+    assert np.ptp(columns) >= 499 and np.ptp(rows) >= 399
 
 
 def test_eight_objects_fit(tmp_path):

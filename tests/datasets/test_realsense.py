@@ -114,7 +114,7 @@ def test_what_cannot_be_used_is_refused(tmp_path):
         convert(bag, tmp_path / "bent", progress=False)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("")
-    with pytest.raises(BadInput, match=r"full: got a folder that is not empty"):
+    with pytest.raises(BadInput, match=r"full: got what is there already"):
         convert(bag, tmp_path / "full", progress=False)
 
 

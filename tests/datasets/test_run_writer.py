@@ -76,7 +76,7 @@ def test_a_folder_that_no_run_made_is_never_touched(folder, tmp_path, if_exists)
     with pytest.raises(BadInput, match=r"mine: got a folder with cam_K\.txt, depth, masks, \.\.\., and no run"):
         writer(mine, folder, if_exists).__enter__()
     (mine / "run.json").write_text('{"objects": ["box"]}')  # somebody else's run
-    with pytest.raises(BadInput, match=r"run\.json: got sequence: Field required"):
+    with pytest.raises(BadInput, match=r"run\.json: got sequence: missing"):
         writer(mine, folder, if_exists).__enter__()
     (mine / "run.json").unlink()
     assert contents(mine) == before

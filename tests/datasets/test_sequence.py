@@ -15,8 +15,9 @@ from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
-from p2p_lib.datasets.sequence import FORMATS, ObjectTruth, open_sequence
+from p2p_lib.datasets.sequence import FORMATS, ObjectTruth, open_sequence, reopen
 from p2p_lib.evaluation.protocol import scored_frames
+from p2p_lib.run import run
 
 W, H, N = 48, 32, 4
 K = np.array([[40.0, 0, 23.5], [0, 41.0, 15.5], [0, 0, 1]])
@@ -266,6 +267,26 @@ def test_synthetic_sequences_open_by_name_with_their_seed(ycbmultitrack, monkeyp
     )
     s = open_sequence("synthetic/crossing", seed=7)
     assert (s.name, s.format, asked) == ("synthetic/crossing", "ycbmultitrack", [("crossing", 7)])
+    named = open_sequence("synthetic/crossing@3", seed=7)
+    assert (named.name, asked[1:]) == ("synthetic/crossing@3", [("crossing", 3)])
+    again = {"path": None, "format": "ycbmultitrack", "seed": 5}
+    for sequence, scene_seed in (("synthetic/crossing", 0), ("synthetic/crossing@3", 3), ("synthetic/crossing", None)):
+        reopen(again | {"sequence": sequence, "scene_seed": scene_seed})
+    assert asked[2:] == [("crossing", 0), ("crossing", 3), ("crossing", 5)], "of older runs the run's"
+    with pytest.raises(BadInput, match=r"synthetic/crossing@x: got the seed 'x', expected synthetic/crossing@SEED"):
+        open_sequence("synthetic/crossing@x")
+
+
+def test_the_seed_of_a_run_is_no_seed_of_its_scene(ycbmultitrack, monkeypatch, tmp_path):
+    asked = []
+    import p2p_lib.synthetic as synthetic
+
+    monkeypatch.setattr(synthetic, "scenario_dir", lambda name, seed: asked.append(seed) or ycbmultitrack)
+    options = {"settings": {"method.surface": False, "method.graph": False}, "stop": 1, "progress": False}
+    for sequence, name in (("synthetic/crossing", "0"), ("synthetic/crossing@3", "3")):
+        info = load_run(run(sequence, tmp_path / name, seed=5, **options).path).info
+        assert (info["seed"], info["scene_seed"], info["sequence"]) == (5, int(name), sequence)
+    assert set(asked[:1]) == {0} and asked[-1] == 3 and 5 not in asked
 
 
 def test_opening_is_light():

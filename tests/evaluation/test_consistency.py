@@ -11,7 +11,10 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.mask_log import MaskLog, load_masks
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, load_points
+from p2p_lib.datasets.runs import COLUMNS, NOT_FOLLOWED, load_run
 from p2p_lib.evaluation.consistency import HEADS, consistency
+from p2p_lib.evaluation.evidence import on_surface
+from p2p_lib.evaluation.protocol import evaluate
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 OFF_PX = 2.0
@@ -70,6 +73,27 @@ def test_what_was_doubted_when_it_was_made_is_to_be_looked_at(made, run):
     ]
 
 
+def test_a_removed_object_is_no_lost_one(made, run, tmp_path):
+    """What it was before it was removed counts, and what was before it was added does not."""
+
+    def followed(obj, rows):
+        status, reason = np.where(rows, obj.status, "initialising"), np.where(rows, obj.reason, NOT_FOLLOWED)
+        T_cam_obj = np.where(rows[:, None, None], obj.T_cam_obj, np.nan)
+        return replace(obj, status=status, reason=reason, T_cam_obj=T_cam_obj, confidence=obj.confidence * rows)
+
+    rows = np.arange(40)
+    box = followed(made.run.objects["box"], (rows > 8) & (rows < 16))
+    arrays = dict(np.load(run.path / "poses.npz")) | {f"box/{column}": getattr(box, column) for column in COLUMNS}
+    np.savez(tmp_path / "poses.npz", **arrays)
+    for file in ("run.json", "keypoints.npz", "masks.npz"):
+        (tmp_path / file).write_bytes((run.path / file).read_bytes())
+    short = load_run(tmp_path)
+    found = consistency(short, made.sequence)
+    assert found.verdict("box") == "good" and found.objects["box"]["pose_where_seen"] == 100
+    score = evaluate(replace(short, points=made.run.points)).objects["box"]
+    assert max(score.frame_index) == 15 and score.lost == min(sum(made.run.objects["box"].visible_px[:9] >= 300), 9)
+
+
 def test_a_known_size_that_does_not_fit_is_to_be_looked_at(made, run):
     length_m = float(np.nanmax(load_masks(run.path)["box"].size_m))
     assert consistency(run, made.sequence, known_m={"box": length_m}).verdict("box") == "good"
@@ -121,7 +145,16 @@ def test_what_cannot_be_said_is_not(made, run, tmp_path):
         assert {key for key, value in numbers.items() if np.isfinite(value)} == {"pose", "doubted"}
         assert said.as_dict()["objects"][name]["mask_iou"] is None
     assert said.as_dict()["truth"] is None and said.as_dict()["not_scored"] is None
+    assert {said.verdict(name) for name in run.objects} == {"unknown"}, "where nothing was compared nothing is good"
+    assert "unknown, box: no pose was compared" in said.as_table() and "keypoints were kept" in said.as_table()
     unscored = replace(said, not_scored="no model of 'box'")
     assert unscored.as_dict()["truth"] is None and unscored.as_dict()["not_scored"] == "no model of 'box'"
     for head, says in HEADS.values():
         assert head in said.as_table() and says in said.as_table()
+
+
+def test_far_depth_is_as_near_to_the_surface_as_a_camera_measures_it():
+    """8 mm are off at arm's length and noise at 2 m, where right poses of a depth camera would be called off."""
+    for range_m, share in ((0.6, 0.0), (2.0, 1.0)):
+        surface_m = np.full((4, 4), range_m)
+        assert on_surface(surface_m, surface_m + 0.008) == on_surface(surface_m, surface_m - 0.008) == share

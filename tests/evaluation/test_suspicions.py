@@ -14,7 +14,7 @@ ROWS = np.arange(N)
 def spotless() -> RunEvidence:
     full = np.ones(N)
     numbers = {"mask_px": 5000, "size_m": 0.15, "keypoints": 40, "inside": 1, "off_px": 0.5, "jump_px": 0.2}
-    numbers |= {"overlap": 0.9, "through": 0.01, "confidence": 0.9}
+    numbers |= {"overlap": 0.9, "through": 0.01, "on_surface": 0.8, "confidence": 0.9}
     numbers = {key: value * full for key, value in numbers.items()}
     return RunEvidence(frame_index=10 + ROWS, has_pose=full > 0, elsewhere=full < 0, **numbers)
 
@@ -35,6 +35,7 @@ WRONG = {
     "jumps": ({"jump_px": 20}, 0.02, 0.05),
     "silhouette": ({"overlap": 0.3}, 0.1, 0.3),
     "seen through": ({"through": 0.3}, 0.4, 0.6),
+    "off the surface": ({"on_surface": 0.5}, 0.4, 0.6),
     "grown": ({"size_m": 0.25}, 0.03, 0.1),
     "size": ({"size_m": 0.9}, 0.04, 0.6),
 }
@@ -79,6 +80,13 @@ def test_what_is_away_may_be_lost(rows, says):
     assert [s.text for s in suspicions(gone(rows)) if s.rule == "absent"] == [says] * bool(says)
 
 
+def test_a_length_does_not_read_as_the_limit_that_it_exceeds():
+    full = np.ones(N)
+    for size_m, says in ((0.0196, ""), (0.01954, ""), (0.0194, "spans 1.9 cm, shorter than 2 cm"), (0.6004, "")):
+        found = [s.text for s in suspicions(replace(spotless(), size_m=size_m * full)) if s.rule == "size"]
+        assert len(found) == bool(says) and says in "".join(found), size_m
+
+
 def test_how_it_started():
     found = suspicions(replace(spotless(), doubts=("clicks on 'cup': flat",), apart=0.4))
     assert [s.rule for s in found] == ["start", "start"] and "40 % of the first mask is apart" in found[1].text
@@ -101,4 +109,5 @@ def test_what_is_not_known_is_not_held_against_anybody():
         "doubts",
         "apart",
     }
-    assert suspicions(replace(spotless(), **{key: np.full(N, np.nan) for key in unknown})) == ()
+    nothing = replace(spotless(), **{key: np.full(N, np.nan) for key in unknown})
+    assert suspicions(nothing) == () and spotless().compared and not nothing.compared

@@ -103,6 +103,11 @@ def test_the_command_prints_one_json_object(made, capsys):
     assert plain["frames"] > 20 and cli.main([*words.split(), "--stop", "20"]) == 0
     assert json.loads(capsys.readouterr().out)["frames"] == 20
     assert set(plain["jaccard"]) == {"1_px", "2_px", "4_px", "8_px", "16_px"}
+    # Nothing is hidden so early: what is a share of nothing is no number.
+    assert cli.main([*words.split()[:-1], "--stop", "3"]) == 0 and "no point returns after" in capsys.readouterr().out
+    assert cli.main([*words.split(), "--stop", "3"]) == 0
+    again = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["redetection"]
+    assert again["returns"] == 0 and again["found"] is None
 
 
 @pytest.mark.parametrize(

@@ -869,6 +869,7 @@ def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_bo
     assert gone == 1 and np.degrees(se3.angle_rad(error)) < 1 and np.linalg.norm(error[:3, 3]) < 0.002
     model = lump.tracker.model
     assert lump.tracker.other is None and lump.tracker.life.seen_m2 >= p_second
+    assert lump.tracker.next_map == 2, "a third one is not taken for the second, whose poses are in the first now"
     assert {0} == {step.estimate.map_id for step in settled(lump, [deg + 2, deg + 4]).steps[-2:]}
     # Both sides are known now: with the points of the second map alone, and its surface.
     lump.see(about(deg), mask=np.zeros((CAMERA.height, CAMERA.width), bool))

@@ -27,6 +27,12 @@ def crossing():
 
 
 @pytest.fixture(scope="module")
+def other(opening):
+    """A mug, which has nothing of what was learnt."""
+    return opening("mug", 55)
+
+
+@pytest.fixture(scope="module")
 def learnt(crossing):
     """The carton of ``crossing``, learnt in its first frames: the memory, T_obj_model, and the surface's values."""
     method = Point2Pose(crossing.camera)
@@ -104,6 +110,17 @@ def test_other_files_are_refused_and_say_what_was_expected(learnt, kept, tmp_pat
     monkeypatch.undo()
     with pytest.raises(BadInput, match="version 99"):
         load_memory(tmp_path / "newer.npz")
+
+
+def test_a_folder_gives_all_its_memories(learnt, tmp_path):
+    """A run's folder holds other archives beside its maps."""
+    for name in ("box", "can"):
+        save_memory(tmp_path / f"maps/{name}.npz", replace(learnt.memory, name=name))
+    (tmp_path / "poses.npz").write_bytes(b"")
+    assert list(load_memories([tmp_path])) == list(load_memories([tmp_path / "maps"])) == ["box", "can"]
+    (tmp_path / "none").mkdir()
+    with pytest.raises(MissingData, match="no file in it, expected a memory"):
+        load_memories([tmp_path / "none"])
 
 
 def test_two_of_one_name_and_an_empty_map_are_refused(learnt, kept):
@@ -223,8 +240,7 @@ def test_landmarks_lie_on_the_surface(learnt):
     assert known.mean() > 0.9 and np.median(np.abs(distance_m[known])) < 1e-4
 
 
-def test_what_is_not_there_is_not_found(learnt):
-    other = open_sequence("synthetic/mug")
+def test_what_is_not_there_is_not_found(learnt, other):
     method = Point2Pose(other.camera)
     method.add_object("box", memory=learnt.memory)
     for i in range(0, 60, 6):
@@ -292,8 +308,7 @@ def test_a_claim_that_the_surface_alone_bears_out_is_withdrawn_too(crossing, lea
     assert told[5].status is Status.INITIALISING and not len(obj.map)
 
 
-def test_a_claim_that_nothing_bears_out_is_withdrawn(crossing, learnt):
-    other = open_sequence("synthetic/mug")
+def test_a_claim_that_nothing_bears_out_is_withdrawn(crossing, learnt, other):
     method = Point2Pose(crossing.camera)
     method.add_object("box", memory=learnt.memory)
     assert followed(crossing, method, LATER[:3])[-1]["box"].T_cam_obj is not None
@@ -323,8 +338,7 @@ def test_a_frozen_map_does_not_grow(crossing, learnt):
     np.testing.assert_allclose(model.surface.values(), learnt.values, atol=1e-3)
 
 
-def test_a_mask_of_something_else_founds_no_other_map(learnt):
-    other = open_sequence("synthetic/mug")
+def test_a_mask_of_something_else_founds_no_other_map(learnt, other):
     method = Point2Pose(other.camera)
     method.add_object("box", memory=learnt.memory)
     told = [method.step(other.frame(i), {"box": other.masks(i)["mug"]})["box"] for i in range(15)]
@@ -391,8 +405,8 @@ def test_after_a_reset_it_is_looked_for_as_at_first(crossing, learnt):
     np.testing.assert_array_equal(told[1].T_cam_obj, told[0].T_cam_obj)
 
 
-def test_look_alikes_are_not_taken_for_each_other():
-    alike = open_sequence("synthetic/look_alikes")
+def test_look_alikes_are_not_taken_for_each_other(opening):
+    alike = opening("look_alikes", 61)
     method = Point2Pose(alike.camera)
     for name in alike.objects:
         method.add_object(name)

@@ -11,8 +11,9 @@ from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.outcome import Outcome
 from p2p_lib.benchmark.plan import read_plan
 from p2p_lib.core.errors import BadInput
-from p2p_lib.figures import plots, provenance
+from p2p_lib.figures import provenance
 from p2p_lib.figures.provenance import save_figure, save_table, save_video
+from studies import run_plots
 
 
 @pytest.fixture
@@ -34,7 +35,7 @@ def image():
 def save_all(made):
     sources = [made.run, made.evaluation, made.sequence]
     parameters = {"PROFILE": "quick", "SEED": np.int64(3), "values": np.arange(3)}
-    save_figure(plots.error_over_time(made.run, made.evaluation), "plot", sources=sources, parameters=parameters)
+    save_figure(run_plots.error_over_time(made.run, made.evaluation), "plot", sources=sources, parameters=parameters)
     save_figure(image(), "picture", sources=sources, parameters=parameters)
     save_video([image()] * 4, "film", fps=10, sources=sources)
     save_table(made.evaluation.as_frame(), "scores", sources=sources, parameters=parameters)
@@ -138,7 +139,7 @@ def test_saving_leaves_matplotlib_as_it_was(made, folders):
 
     folders("out")
     before = dict(matplotlib.rcParams)
-    save_figure(plots.status_strip(made.run), "strip")
+    save_figure(run_plots.status_strip(made.run), "strip")
     assert dict(matplotlib.rcParams) == before
 
 

@@ -1,5 +1,6 @@
 """The whole loop on a small rendered scene whose poses are known exactly: cartons before a printed wall."""
 
+import re
 import signal
 from dataclasses import replace
 from functools import cache
@@ -190,7 +191,64 @@ def test_depth_in_millimetres_is_refused_and_a_far_background_doubted():
         Point2Pose(CAMERA).step(replace(frame, depth_m=depth_m))
 
 
-def test_time_that_runs_backwards_is_said_once_and_statuses_are_logged(caplog):
+def test_an_object_that_was_named_alone_says_what_it_waits_for():
+    method = Point2Pose(CAMERA, quick())
+    method.add_object("left")
+    waits = "not seen yet: it waits for a mask (step) or for clicks (correct)"
+    assert method.step(film()[0][0])["left"].reason == method.step(film()[1][0])["left"].reason == waits
+    assert method.step(film()[2][0], {"left": np.zeros((300, 400), bool)})["left"].reason == "not seen yet"
+    started = [method.step(frame, {"left": masks["left"]})["left"].status for frame, masks in film()[3:5]]
+    assert started[-1] is Status.TRACKED
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+@pytest.mark.parametrize(
+    ("scale", "says"),
+    [
+        (0, r"the frame has no depth"),
+        (1000, r"the depth of the frame is \d\d\d m and more: is it in millimetres\?"),
+        (None, r"0 of \d+ mask pixels have depth"),
+    ],
+)
+def test_an_estimate_says_what_is_wrong_with_the_depth_of_its_frame(name, scale, says):
+    (frame, masks), before = film()[6], film()[:6]
+    depth_m = np.where(masks["left"], 0, frame.depth_m) if scale is None else scale * frame.depth_m
+    *_, last = track([*before, (replace(frame, depth_m=depth_m), masks)], config=quick(name))
+    assert last["left"].T_cam_obj is None and re.fullmatch(says, last["left"].reason)
+    assert (last["right"].reason == "") == (scale is None), "the other one has its depth"
+
+
+def test_frames_of_one_time_say_so_once():
+    frames = [(replace(frame, time_s=min(frame.time_s, 2 / 30)), masks) for frame, masks in film()[:6]]
+    with pytest.warns(Doubt, match=r"time of frame 3"):
+        reasons = [estimate["left"].reason for estimate in track(frames, names=("left",))]
+    assert ["its time" in reason for reason in reasons] == [False, False, False, True, False, False]
+
+
+def test_tracks_that_cannot_be_used_are_refused():
+    """By whoever made them, what came, and what was expected."""
+
+    class Lost(BuiltinTracker):
+        wrong, value = "uv_px", np.nan
+
+        def track(self, *args):
+            tracks = super().track(*args)
+            getattr(tracks, self.wrong)[:3] = self.value
+            return tracks
+
+    for Lost.wrong, Lost.value, says in (
+        ("uv_px", np.nan, r"3 of \d+ visible points at no pixel, the first at \[nan, nan\], expected finite uv_px"),
+        ("uncertainty", np.nan, r"uncertainty \[nan, nan, nan.*expected numbers in \[0, 1\]"),
+    ):
+        config = quick()
+        method = Point2Pose(CAMERA, config, Lost(config.tracking, np.random.default_rng(0)))
+        method.add_object("left")
+        method.step(film()[0][0], {"left": film()[0][1]["left"]})
+        with pytest.raises(BadInput, match=rf"tracker 'builtin' \(Lost\), frame 1: got {says}"):
+            method.step(film()[1][0])
+
+
+def test_time_that_runs_backwards_is_warned_of_once_and_statuses_are_logged(caplog):
     caplog.set_level("INFO", "p2p_lib")
     frames = [film()[k] for k in (0, 1, 2, 1, 0, 3)]
     with pytest.warns(Doubt) as said:
@@ -202,6 +260,9 @@ def test_time_that_runs_backwards_is_said_once_and_statuses_are_logged(caplog):
     ]
     first = estimates[0]["left"].status
     assert caplog.messages[0].startswith(f"frame 0: left is {first}")
+    reasons = [estimate["left"].reason for estimate in estimates]
+    told = [f"its time is {k / 30:.6f} s, not later than the frame before ({(k + 1) / 30:.6f} s)" for k in (1, 0)]
+    assert [reason.partition("; ")[2] or reason for reason in reasons] == ["", "", "", *told, ""], "each in its frame"
     changes = 1 + sum(a["left"].status != b["left"].status for a, b in pairwise(estimates))
     assert len(caplog.messages) == changes and {record.name for record in caplog.records} == {"p2p_lib"}
 

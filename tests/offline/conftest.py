@@ -10,13 +10,27 @@ import trimesh
 from p2p_lib.core import se3
 from p2p_lib.core.mesh import save
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 
 @pytest.fixture
 def finished(made, tmp_path) -> Path:
     """The made run with the true models as its surfaces, in grey."""
-    folder = Path(shutil.copytree(made.run.path, tmp_path / "run"))
+    return with_surfaces(made, tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def scene(made, tmp_path_factory):
+    """What is made of it as a BOP dataset, to be read alone."""
+    folder = tmp_path_factory.mktemp("scene")
+    write_product(with_surfaces(made, folder / "run"), "bop-dataset", folder / "set")
+    return open_sequence(folder / "set/train/000001")
+
+
+def with_surfaces(made, folder: Path) -> Path:
+    shutil.copytree(made.run.path, folder)
     for name, path in find_models(made.sequence, MESHES).items():
         vertices, faces = load_mesh(path)
         surface = trimesh.Trimesh(se3.transform(T_OBJ_MODEL, vertices), faces, process=False)

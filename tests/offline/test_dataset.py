@@ -13,15 +13,8 @@ from p2p_lib.apps import cli
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.models import MESHES, find_models, load_points
-from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
-
-
-@pytest.fixture
-def scene(finished, tmp_path):
-    write_product(finished, "bop-dataset", tmp_path / "set")
-    return open_sequence(tmp_path / "set/train/000001")
 
 
 def test_labels_are_the_poses_and_the_masks_are_the_true_ones(made, scene):
@@ -36,6 +29,18 @@ def test_labels_are_the_poses_and_the_masks_are_the_true_ones(made, scene):
             shared, total = shared + np.count_nonzero(mine & own), total + np.count_nonzero(mine | own)
         assert right.sum() > 20 and shared / total > 0.97
     np.testing.assert_array_equal(scene.frame(3).rgb, made.sequence.frame(numbers[3]).rgb)
+
+
+def test_what_is_left_out_and_what_is_doubtful_is_counted(made, finished, tmp_path):
+    arrays = dict(np.load(finished / "poses.npz"))
+    arrays["box/confidence"] = np.where(np.arange(len(made.sequence)) < 3, 0.4, arrays["box/confidence"])
+    np.savez(finished / "poses.npz", **arrays)
+    for least, doubtful in ((0.5, 0), (0.3, 3)):
+        said = write_product(finished, "bop-dataset", out := tmp_path / f"set{least}", least)
+        rows = list(csv.DictReader((out / "labels.csv").open()))
+        frames, n = {row["image"] for row in rows}, len(made.sequence)
+        assert said.startswith(f"{len(rows)} labels in {len(frames)} of {n} images; {n - len(frames)} left out")
+        assert f"; {doubtful} of the labels doubtful" in said
 
 
 def test_models_are_metric_whatever_the_file_says(made, scene):
@@ -113,18 +118,3 @@ def test_images_that_are_gone_and_runs_without_poses_are_a_sentence_each(finishe
     np.savez(finished / "poses.npz", **arrays)
     assert cli.main(["export", str(finished), "--format", "bop-dataset", "--out", str(tmp_path / "set")]) == 2
     assert "a run without a single pose" in capsys.readouterr().err
-
-
-def test_foundationpose_folders(finished, made, tmp_path):
-    write_product(finished, "foundationpose", tmp_path / "fp", faces=500)
-    for name in made.sequence.objects:
-        folder = tmp_path / "fp" / name
-        (mask,) = (folder / "masks").iterdir()
-        rgb = sorted((folder / "rgb").iterdir())
-        assert mask.name == rgb[0].name == sorted((folder / "depth").iterdir())[0].name
-        own = made.sequence.masks(int(mask.stem))[name]
-        np.testing.assert_array_equal(cv2.imread(str(mask), -1) > 0, own)
-        depth = cv2.imread(str(folder / "depth" / mask.name), -1) / 1000
-        np.testing.assert_allclose(depth, made.sequence.frame(int(mask.stem)).depth_m, atol=0.0005)
-        np.testing.assert_allclose(np.loadtxt(folder / "cam_K.txt"), made.sequence.camera.K)
-        assert {"textured_simple.obj", "textured_simple.png"} <= {path.name for path in (folder / "mesh").iterdir()}

@@ -1,6 +1,7 @@
 """Models to take away: what they look like, opened by other libraries, and how near they are to the truth."""
 
 import json
+import shutil
 from types import SimpleNamespace
 
 import cv2
@@ -21,8 +22,6 @@ from tests.fixtures.made_run import T_OBJ_MODEL
 
 @pytest.fixture(scope="module")
 def models(made, tmp_path_factory):
-    import shutil
-
     from p2p_lib.core.mesh import save
 
     folder = tmp_path_factory.mktemp("models")
@@ -32,7 +31,8 @@ def models(made, tmp_path_factory):
         surface = trimesh.Trimesh(se3.transform(T_OBJ_MODEL, vertices), faces, process=False).subdivide_to_size(0.006)
         surface.visual.vertex_colors = np.full((len(surface.vertices), 3), 128, np.uint8)
         save(surface, run / "meshes" / f"{name}.ply")
-    write_product(run, "model", folder / "out", faces=3000)
+    said = write_product(run, "model", folder / "out", faces=3000)
+    assert "ragged" not in said
     return folder / "out"
 
 
@@ -49,7 +49,11 @@ def test_other_libraries_open_them_in_metres(made, models):
         assert read.has_triangle_uvs() and np.asarray(read.textures[0]).shape[0] in (512, 1024, 2048)
         hull = trimesh.load(models / name / "collision.obj")
         assert hull.is_watertight and hull.is_convex and len(hull.faces) <= 256
-        assert json.loads((models / name / "model.json").read_text())["units"] == "m"
+        about = json.loads((models / name / "model.json").read_text())
+        assert about["units"] == "m" and (about["parts"], about["holes"]) == (1, 0)
+        # Of a body however it lies in its frame: here turned and shifted.
+        sides_m = sorted(trimesh.Trimesh(true).bounding_box_oriented.primitive.extents, reverse=True)
+        np.testing.assert_allclose(about["size_m"], sides_m, atol=0.005)
 
 
 def test_the_texture_is_what_the_camera_saw(models):
@@ -68,6 +72,29 @@ def test_obj_and_glb_show_the_same(models):
         order = np.lexsort(mesh.triangles_center.round(4).T)
         colours.append(trimesh.visual.color.uv_to_color(middle, image)[order, :3].astype(float))
     assert np.abs(colours[0] - colours[1]).mean() < 2
+
+
+def test_foundationpose_folders(finished, made, models, tmp_path, monkeypatch):
+    asked = []
+
+    def made_before(run, out, *how):
+        asked.append((run, *how))
+        shutil.copytree(models, out)
+
+    monkeypatch.setattr(model, "write_models", made_before)
+    write_product(finished, "foundationpose", tmp_path / "fp", 0.4, faces=500)
+    assert asked == [(finished, 500, 0.4, False)]
+    for name in made.sequence.objects:
+        folder = tmp_path / "fp" / name
+        (mask,) = (folder / "masks").iterdir()
+        rgb = sorted((folder / "rgb").iterdir())
+        assert mask.name == rgb[0].name == sorted((folder / "depth").iterdir())[0].name
+        own = made.sequence.masks(int(mask.stem))[name]
+        np.testing.assert_array_equal(cv2.imread(str(mask), -1) > 0, own)
+        depth = cv2.imread(str(folder / "depth" / mask.name), -1) / 1000
+        np.testing.assert_allclose(depth, made.sequence.frame(int(mask.stem)).depth_m, atol=0.0005)
+        np.testing.assert_allclose(np.loadtxt(folder / "cam_K.txt"), made.sequence.camera.K)
+        assert {"textured_simple.obj", "textured_simple.png"} <= {path.name for path in (folder / "mesh").iterdir()}
 
 
 def box(open_above=True):
@@ -91,6 +118,15 @@ def test_holes_are_closed_and_marked_unless_a_camera_looked_through():
     assert (shut.vertices[shut.faces[shut.guessed]][..., 2] > 0.049).all()
     still_open = model.closed(box(), camera, into)
     assert not still_open.mesh.is_watertight and not still_open.guessed.any()
+
+
+def test_parts_and_holes_are_counted():
+    whole, opened = model.closed(box(), Camera(300, 300, 79.5, 59.5, 160, 120), []), box()
+    assert model.torn(whole) == (1, 0) and model.torn(opened) == (1, 1)
+    n = len(whole.vertices)
+    two = np.concatenate([whole.faces, n + opened.faces])
+    pair = model.Shape(np.tile(whole.vertices, (2, 1)), two, np.tile(whole.colours, (2, 1)), np.zeros(len(two), bool))
+    assert model.torn(pair) == (2, 1)
 
 
 def test_fewer_faces_keep_the_shape_and_what_is_guessed():

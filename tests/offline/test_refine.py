@@ -213,21 +213,27 @@ def test_poses_that_fill_the_masks_better_stay(made, tracked, monkeypatch):
 
 
 def test_an_interrupted_pass_goes_on(tracked, monkeypatch):
-    did, part = [], offline._part
+    did = []
 
-    def stopped(made, name, *rest):
+    def part(made, name, config, evidence, parts, bar):
         did.append(name)
         if did == ["box", "can"]:
             raise KeyboardInterrupt
-        part(made, name, *rest)
+        moved = made.run.objects[name].T_cam_obj @ se3.exp(np.full(6, 0.001 * len(did)))
+        np.savez(parts / f"{name}.npz", T_cam_obj=moved)
 
-    monkeypatch.setattr(offline, "_part", stopped)
+    monkeypatch.setattr(offline, "_part", part)
+    monkeypatch.setattr(offline, "gather", lambda made, names, *_: dict.fromkeys(names))
     with pytest.raises(KeyboardInterrupt):
         offline.refine_run(tracked)
     assert not (tracked / "offline").exists()
     offline.refine_run(tracked)
     assert did == ["box", "can", "can"] and (tracked / "offline/run.json").is_file()
     assert not (tracked / offline._PARTS).exists()
+    before, after = load_run(tracked).objects, load_run(tracked / "offline").objects
+    for name, times in {"box": 1, "can": 3}.items():
+        moved = before[name].T_cam_obj @ se3.exp(np.full(6, 0.001 * times))
+        np.testing.assert_allclose(after[name].T_cam_obj, moved, equal_nan=True)
 
 
 def test_disagreement_is_measured_by_the_causal_covariance(made):

@@ -450,9 +450,9 @@ def test_clicks_without_depth_name_the_click():
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_embedded_sequence(seed):
+def test_embedded_sequence(seed, opening):
     """The first pass of synthetic/crossing: new sides come into view, and one covers part of the other."""
-    sequence = open_sequence("synthetic/crossing", seed=seed)
+    sequence = opening("crossing", 60, seed) if seed else open_sequence("synthetic/crossing")
     new = BuiltinSegmenter(sequence.camera, CONFIG)
     rng, first, clicks = np.random.default_rng(seed), sequence.frame(0), []
     for name, mask in sequence.masks(0).items():

@@ -14,9 +14,9 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.prompts import prompts_in
 from p2p_lib.evaluation.consistency import surface_fit
-from p2p_lib.figures import mesh_view, overlay, style
+from p2p_lib.figures import overlay, style
 from p2p_lib.synthetic.render import render
-from studies import own_data
+from studies import mesh_view, own_data
 from studies.own_data import errors_against
 from studies.surface import carton
 

@@ -7,11 +7,11 @@ import pytest
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import TsdfConfig, preset
-from p2p_lib.figures.mesh_view import draw_mesh
 from p2p_lib.method.observation import sample_cloud
 from p2p_lib.synthetic.noise import PERFECT
 from p2p_lib.synthetic.scene import VGA
 from studies import surface
+from studies.mesh_view import draw_mesh
 
 trimesh = pytest.importorskip("trimesh")
 CONFIG = preset("default")

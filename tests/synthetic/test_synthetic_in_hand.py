@@ -69,7 +69,7 @@ def test_it_lies_on_the_table_or_is_held(seed):
         gaps = []
         for part in hand[:16]:  # palm and digits
             p = se3.transform(T_thing_world @ part.T_world_model[t], part.mesh.vertices)
-            gaps.append(gripping.distance_m(thing.mesh, p).min())
+            gaps.append(thing.mesh.distance(p).min())
         assert np.sum(np.array(gaps) < 0.004) >= 3  # at least three of its parts touch
         above = [se3.transform(part.T_world_model[t], part.mesh.vertices)[:, 2].min() for part in hand[:16]]
         assert min(above) > -0.015

@@ -185,9 +185,12 @@ def _aligned(image, pixels, solver, rows, uv, A, iterations):
             if turn == iterations or np.abs(step).max() < _SETTLED:
                 ncc[n] = np.dot(seen, pixels[rows[n]])
                 break
-            step[:] = np.dot(solver[rows[n]], seen - pixels[rows[n]])
+            found = np.dot(solver[rows[n]], seen - pixels[rows[n]])
+            for k in range(6):
+                step[k] = found[k]
             # The linearisation holds for a few pixels and a few tenths of scale.
-            step[:2] *= min(1.0, 3.0 / max(np.sqrt(step[0] ** 2 + step[1] ** 2), 1e-6))
+            most = min(1.0, 3.0 / max(np.sqrt(step[0] ** 2 + step[1] ** 2), 1e-6))
+            step[0], step[1] = step[0] * most, step[1] * most
             for k in range(2, 6):
                 step[k] = min(max(step[k], -0.25), 0.25)
             # A times the inverse of identity + D.

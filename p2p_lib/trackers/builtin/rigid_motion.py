@@ -82,7 +82,13 @@ def _fit_pose(R, at, arm_seg, map_cov, uv_px, cov_px2, z_m, sigma_m, fx, fy, cx,
             if step == 0:
                 cov = R @ map_cov[n] @ R.T
                 of_pixel = (P @ cov @ P.T)[:2, :2] + cov_px2[n] + _SHARED_PX**2 * np.eye(2)
-                W[n] = np.linalg.inv(of_pixel)
+                inverse = np.linalg.inv(of_pixel)
+                W[n, 0, 0], W[n, 0, 1], W[n, 1, 0], W[n, 1, 1] = (
+                    inverse[0, 0],
+                    inverse[0, 1],
+                    inverse[1, 0],
+                    inverse[1, 1],
+                )
                 z_weight[n] = 1 / (sigma_m[n] ** 2 + cov[2, 2]) if z_m[n] > 0 else 0.0
             r[n, 0], r[n, 1] = uv_px[n, 0] - fx * x / z - cx, uv_px[n, 1] - fy * y / z - cy
             r[n, 2] = z_m[n] - a[2] - at[2] if z_m[n] > 0 else 0.0
@@ -91,7 +97,7 @@ def _fit_pose(R, at, arm_seg, map_cov, uv_px, cov_px2, z_m, sigma_m, fx, fy, cx,
             for i in range(3):
                 J[n, i, 0], J[n, i, 1] = P[i, 2] * a[1] - P[i, 1] * a[2], P[i, 0] * a[2] - P[i, 2] * a[0]
                 J[n, i, 2] = P[i, 1] * a[0] - P[i, 0] * a[1]
-                J[n, i, 3:] = P[i]
+                J[n, i, 3], J[n, i, 4], J[n, i, 5] = P[i, 0], P[i, 1], P[i, 2]
         if last or step == _ITERATIONS:
             break
         # While most points are far off, as at the start, a large residual is no sign of an outlier.
@@ -99,7 +105,9 @@ def _fit_pose(R, at, arm_seg, map_cov, uv_px, cov_px2, z_m, sigma_m, fx, fy, cx,
         H, g = _PRIOR.copy(), -_PRIOR @ np.concatenate((turned, at - start))
         weight = np.zeros((3, 3))
         for n in range(count):
-            weight[:2, :2] = W[n] / (1 + chi2[n] / soft) ** 2
+            for i in range(2):
+                for j in range(2):
+                    weight[i, j] = W[n, i, j] / (1 + chi2[n] / soft) ** 2
             weight[2, 2] = z_weight[n] / (1 + chi2_z[n] / soft_z) ** 2
             JW = J[n].T @ weight
             H += JW @ J[n]

@@ -1,4 +1,4 @@
-"""What a notebook claims in its last cell: numbers, what they mean, and what they have to be."""
+"""All notebooks: what the last cell claims, numbers, what they mean, and what they have to be."""
 
 from __future__ import annotations
 

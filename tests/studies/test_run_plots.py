@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.evaluation import metrics
-from p2p_lib.figures import plots, style, tables
+from p2p_lib.evaluation.confidence import pose_error
+from p2p_lib.figures import plots, style
+from studies import run_plots
 
 
 @given(st.lists(st.sampled_from(["tracked", "occluded", "lost"]), max_size=60))
@@ -39,7 +41,7 @@ def test_waiting_for_the_first_sight_is_no_gap(made):
 
 def test_pose_error_is_what_was_put_in(made):
     obj, score = made.run.objects["box"], made.evaluation.objects["box"]
-    deg, mm = plots.pose_error(obj, score)
+    deg, mm = pose_error(obj, score)
     for i, T_error in made.wrong.items():
         if T_error is None:
             assert np.isnan(deg[i]) and np.isnan(mm[i])
@@ -53,14 +55,14 @@ def test_pose_error_is_what_was_put_in(made):
 @given(st.lists(st.floats(0, 0.3) | st.just(np.inf), min_size=1, max_size=50))
 def test_area_of_the_curve_is_the_auc(errors):
     errors = np.array(errors)
-    threshold, share = plots.accuracy_curve(errors)
+    threshold, share = run_plots.accuracy_curve(errors)
     area = (np.diff(threshold) * share[:-1]).sum() / metrics.MAX_M * 100
     assert area == pytest.approx(metrics.auc_exact(errors), abs=1e-9)
     assert (np.diff(threshold) >= 0).all() and (np.diff(share) >= 0).all() and threshold[-1] == metrics.MAX_M
 
 
 def test_error_plot_shows_the_scores(made):
-    figure = plots.error_over_time(made.run, made.evaluation)
+    figure = run_plots.error_over_time(made.run, made.evaluation)
     top = figure.axes[0]
     lines = {line.get_label(): line for line in top.get_lines()}
     for name, score in made.evaluation.objects.items():
@@ -80,7 +82,7 @@ def test_error_plot_shows_the_scores(made):
 
 
 def test_strip_has_a_bar_per_span(made):
-    axis = plots.status_strip(made.run).axes[0]
+    axis = run_plots.status_strip(made.run).axes[0]
     spans = [span for obj in made.run.objects.values() for span in plots.status_intervals(obj.status)]
     assert len(axis.patches) == len(spans)
     obj = made.run.objects["box"]
@@ -94,7 +96,7 @@ def test_strip_has_a_bar_per_span(made):
 
 
 def test_accuracy_plot_names_the_auc(made):
-    figure = plots.accuracy_threshold(made.evaluation)
+    figure = run_plots.accuracy_threshold(made.evaluation)
     for axis, key in zip(figure.axes, ("add_auc", "adds_auc")):
         said = [text.get_text() for text in axis.get_legend().get_texts()]
         scores = made.evaluation.as_dict()["objects"]
@@ -102,7 +104,7 @@ def test_accuracy_plot_names_the_auc(made):
 
 
 def test_timings_are_means_of_the_columns(made):
-    figure = plots.stage_timings(made.run)
+    figure = run_plots.stage_timings(made.run)
     axis = figure.axes[0]
     widths = {label.get_text(): bar.get_width() for label, bar in zip(axis.get_yticklabels(), axis.containers[0])}
     assert widths["tracking"] == pytest.approx(12.0)
@@ -110,13 +112,13 @@ def test_timings_are_means_of_the_columns(made):
     assert [*widths][-1] == "total" and next(iter(widths)) == "tracking"
     without = type(made.run)(**{**vars(made.run), "timings": {}})
     with pytest.raises(BadInput, match="timings"):
-        plots.stage_timings(without)
+        run_plots.stage_timings(without)
 
 
 def test_figures_are_nobodys_global_state(made):
     import matplotlib.pyplot as plt
 
-    assert isinstance(plots.status_strip(made.run), Figure)
+    assert isinstance(run_plots.status_strip(made.run), Figure)
     assert plt.get_fignums() == []
 
 
@@ -130,7 +132,7 @@ def test_score_table_has_the_numbers(made):
 
 
 def test_recovery_table_says_what_happened_unseen(made):
-    table = tables.recovery_table(made.run, made.evaluation)
+    table = run_plots.recovery_table(made.run, made.evaluation)
     for row in table.itertuples(index=False):
         name, hidden_s, back_s, moved_cm, turned_deg, frames = row
         obj = made.run.objects[name]

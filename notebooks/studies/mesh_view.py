@@ -1,4 +1,4 @@
-"""Images of reconstructed meshes: rendered with their own colours, as the synthetic bodies are."""
+"""Notebooks 00, 06, 09 and 10: reconstructed meshes, rendered with their own colours as the synthetic bodies are."""
 
 from __future__ import annotations
 
