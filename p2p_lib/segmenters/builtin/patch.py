@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,8 +27,8 @@ _SMALLEST_M2 = 1e-3
 #: The three points of each plane, by a low-discrepancy sequence (Roberts 2018).
 _STEPS = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 _TRIPLES = ((0.5 + np.arange(_PLANES) * _STEPS[:, None]) % 1 * _PLANE_POINTS).astype(int)
-#: Linked cells lie in these directions (down, right), up to so many cells apart.
-_STEPS_TO, _REACH = ((0, 1), (1, 0), (1, 1), (1, -1)), 4
+#: Cells are linked in these directions (down, right) and back, over so many cells.
+_TOWARDS, _LINK_CELLS = ((0, 1), (1, 0), (1, 1), (1, -1)), 4
 #: A support plane holds at least this share of the pixels.
 _SUPPORTS = 0.2
 
@@ -179,28 +178,28 @@ class Patch:
         return np.broadcast_to(to_one < to_other, number.size).reshape(self.shape)
 
     def linked(self, region: np.ndarray, gap_m: float) -> np.ndarray:
-        """(h, w) int: the number of each part of what is measured in a region (h, w) bool, from 1; 0 outside.
+        """(h, w) int: the number, from 1, of each part of what is measured in a region (h, w) bool; 0 elsewhere.
 
-        Cells are of one part over a gap in space up to ``gap_m``, where all between them is of the region or unmeasured.
+        Cells of one part are linked over gaps in space up to ``gap_m``: steps of depth, as at a cup's rim, and what is
+        not measured. Nothing is linked across what is measured outside the region.
         """
         from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components as graph_components
+        from scipy.sparse.csgraph import connected_components as parts_of
 
         points, measured = self.points(), self.depth_m > 0
         inside, barred = region & measured, ~region & measured
-        number, ends = np.arange(measured.size).reshape(self.shape), []
-        for step in _STEPS_TO:
-            clear = np.ones(self.shape, bool)
-            for cells in range(1, _REACH + 1):
-                one, other = _shifted(self.shape, step[0] * cells, step[1] * cells)
-                near = np.linalg.norm(points[one] - points[other], axis=-1) < gap_m
-                links = inside[one] & inside[other] & near & clear[one]
-                ends.append(np.stack([number[one][links], number[other][links]]))
+        number, links = np.arange(measured.size).reshape(self.shape), []
+        for down, right in _TOWARDS:
+            clear = inside.copy()
+            for cells in range(1, _LINK_CELLS + 1):
+                one, other = _pairs(self.shape, down * cells, right * cells)
+                near = clear[one] & inside[other]
+                near[near] = np.linalg.norm(points[one][near] - points[other][near], axis=-1) < gap_m
+                links.append(np.stack([number[one][near], number[other][near]]))
                 clear[one] &= ~barred[other]
-        starts, stops = np.concatenate(ends, 1)
-        graph = coo_array((np.ones(len(starts), bool), (starts, stops)), shape=(measured.size,) * 2)
-        part = graph_components(graph, directed=False)[1].reshape(self.shape) + 1
-        return np.where(inside, part, 0)
+        ends = np.concatenate(links, 1)
+        graph = coo_array((np.ones(ends.shape[1], bool), tuple(ends)), shape=(measured.size,) * 2)
+        return np.where(inside, parts_of(graph, directed=False)[1].reshape(self.shape) + 1, 0)
 
     def border(self) -> np.ndarray:
         """(h, w) bool: the outermost pixels."""
@@ -230,11 +229,13 @@ class Patch:
         return u + self.box.left, v + self.box.top
 
 
-def _shifted(shape: tuple[int, int], down: int, right: int) -> tuple[Any, Any]:
-    """Slices of the cells of a grid that have another one so far below and to the right, and of these others."""
-    h, w = shape
-    across = slice(max(0, -right), min(w, w - right)), slice(max(0, right), min(w, w + right))
-    return np.s_[: h - down, across[0]], np.s_[down:, across[1]]
+def _pairs(shape: tuple[int, int], down: int, right: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """To index the cells of a grid that have a neighbour so far down and to the right, and these neighbours."""
+    w = shape[1]
+    return (
+        (slice(0, max(shape[0] - down, 0)), slice(max(-right, 0), max(min(w, w - right), 0))),
+        (slice(down, None), slice(max(right, 0), max(min(w, w + right), 0))),
+    )
 
 
 def _whole_cells(box: Box, cell_px: int, shape: tuple[int, int]) -> Box:

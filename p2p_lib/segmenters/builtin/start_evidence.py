@@ -31,11 +31,14 @@ _FLAT_SIGMAS, _FLAT_M = 2.0, 0.003
 _PLANE_SIGMA_M = 0.001
 #: Log-odds of a pixel in the support plane, and most of one above it: other things stand on it, too.
 _IN_PLANE, _ABOVE_PLANE = -2.0, 0.5
-#: Log-odds of what depth connects with the clicks, and of what it does not.
+#: Log-odds of what depth connects with the clicks, of what it does not, and of what alone looks unlike the support.
 _CONNECTED, _APART, _UNLIKE = 2.5, -1.5, 1.0
-#: A support looks about the same up to this, in CIELAB, and a shade on it counts this share.
-_LOOK, _SHADE = 4.0, 0.4
-#: What stands on a support is linked over smaller gaps: inside and outside of a cup, parts between holes of the depth, m.
+#: The support's colours are those within this share of the patch's side, and vary by this much at least, in CIELAB;
+#: what is darker differs by this share: it may be a shade.
+_NEARBY, _LOOK, _SHADE = 0.2, 4.0, 0.4
+#: Standard deviations up to which a colour is the support's, and from which on another; so many times it is looked.
+_ALIKE, _OTHER, _LOOKS = 3.0, 4.0, 4
+#: What stands on a support is linked over smaller gaps, as between inside and outside of a cup, m.
 _LINK_M = 0.03
 #: A component may cover up to this share of the patch's border by accident.
 _AT_THE_BORDER = 0.02
@@ -98,18 +101,6 @@ class Height:
     flat: bool
     log_odds: np.ndarray
 
-    def unlike(self, patch: Patch) -> np.ndarray:
-        """(h, w) bool: what does not look like the support around it."""
-        if self.plane is None:
-            return np.zeros(patch.shape, bool)
-        height = plane_heights(patch, self.plane)
-        support = (patch.depth_m > 0) & (np.abs(height) < _FLAT_SIGMAS * patch.sigma_m + _FLAT_M)
-        lab = cv2.cvtColor(patch.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
-        off = _looks_m2(lab, support)
-        for _ in range(3):
-            off = _looks_m2(lab, support & (off < 9))
-        return off > 16
-
     @classmethod
     def of(cls, patch: Patch, clicked: Clicked) -> Height:
         """By the plane that holds most of what surrounds the clicks."""
@@ -134,17 +125,6 @@ class Height:
         return replace(self, flat=False, log_odds=log_odds.astype(np.float32))
 
 
-def _looks_m2(lab: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """(h, w) squared distance of colours (h, w, 3) from those around that are ``of`` (h, w) bool the support, in sigmas."""
-    sigma = max(lab.shape) / 5
-    weight = cv2.GaussianBlur(of.astype(np.float32), (0, 0), sigma) + 1e-4
-    mean = cv2.GaussianBlur(lab * of[..., None], (0, 0), sigma) / weight[..., None]
-    off = lab - mean
-    off[..., 0] *= np.where(off[..., 0] < 0, _SHADE, 1)
-    variance = cv2.GaussianBlur(off**2 * of[..., None], (0, 0), sigma) / weight[..., None]
-    return (off**2 / (variance + _LOOK**2)).sum(-1)
-
-
 def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndarray:
     """Evidence against what is farther in depth from the clicks than ``config.reach_m``."""
     far = (patch.depth_m > 0) & (np.abs(patch.depth_m - z_m) > config.reach_m)
@@ -154,19 +134,46 @@ def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndar
 def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
     """Evidence for what is linked with the clicks and is not their support, if it ends within the patch.
 
-    What is not the support stands above it or, flat on it, does not look like it.
+    What is not the support stands above it or, as the handle of a fork on a table, does not look like it.
     """
-    log_odds = np.zeros(patch.shape, np.float32)
-    above = np.zeros(patch.shape, bool) if height.flat else height.log_odds >= 0
+    log_odds, above = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     if not height.flat:
+        above = height.log_odds >= 0
         component = components_touching(patch.linked(above, _LINK_M), clicked.seeds)
         log_odds[(patch.depth_m > 0) & ~dilated(component, 1)] = _APART
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = _CONNECTED
-    component = components_touching(patch.linked(above | height.unlike(patch), _LINK_M), clicked.seeds)
-    if component[patch.border()].mean() <= _AT_THE_BORDER:
-        log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
+    if height.plane is not None:
+        component = components_touching(patch.linked(above | unlike(patch, height.plane), _LINK_M), clicked.seeds)
+        if component[patch.border()].mean() <= _AT_THE_BORDER:
+            log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
     return log_odds
+
+
+def unlike(patch: Patch, plane: np.ndarray) -> np.ndarray:
+    """(h, w) bool: what does not look like the support, a ``plane`` (4,), does around it.
+
+    A table's colour changes with the light: it is taken nearby. What lies on the table is in its plane, too: so it is
+    taken again without what is off it.
+    """
+    height, lab = plane_heights(patch, plane), cv2.cvtColor(patch.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
+    support = (patch.depth_m > 0) & (np.abs(height) < _FLAT_SIGMAS * patch.sigma_m + _FLAT_M)
+    alike, squared_off = support, np.zeros(patch.shape, np.float32)
+    for _ in range(_LOOKS):
+        squared_off = _squared_off(lab, alike)
+        alike = support & (squared_off < _ALIKE**2)
+    return squared_off > _OTHER**2
+
+
+def _squared_off(lab: np.ndarray, support: np.ndarray) -> np.ndarray:
+    """(h, w) squared distance, in standard deviations, of CIELAB colours (h, w, 3) from those of the support around."""
+    reach, weight = (0, 0), support.astype(np.float32)[..., None]
+    sigma = _NEARBY * max(support.shape)
+    shares = cv2.GaussianBlur(weight, reach, sigma)[..., None] + np.float32(1e-4)
+    off = lab - cv2.GaussianBlur(lab * weight, reach, sigma) / shares
+    off[..., 0] *= np.where(off[..., 0] < 0, _SHADE, 1)
+    variance = cv2.GaussianBlur(off**2 * weight, reach, sigma) / shares
+    return (off**2 / (variance + _LOOK**2)).sum(-1)
 
 
 def by_shares(patch: Patch, own: np.ndarray, other: np.ndarray, config: SegmentationConfig) -> np.ndarray:
