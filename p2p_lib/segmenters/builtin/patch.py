@@ -177,18 +177,17 @@ class Patch:
         )
         return np.broadcast_to(to_one < to_other, number.size).reshape(self.shape)
 
-    def linked(self, region: np.ndarray, gap_m: float) -> np.ndarray:
+    def linked(self, region: np.ndarray, barred: np.ndarray, gap_m: float) -> np.ndarray:
         """(h, w) int: the number, from 1, of each part of what is measured in a region (h, w) bool; 0 elsewhere.
 
-        Cells of one part are linked over gaps in space up to ``gap_m``: steps of depth, as at a cup's rim, and what is
-        not measured. Nothing is linked across what is measured outside the region.
+        Cells of one part are linked over gaps in space up to ``gap_m``: steps of depth, as at a cup's rim, and holes of
+        the depth. Nothing is linked across cells that are ``barred`` (h, w) bool.
         """
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components as parts_of
 
-        points, measured = self.points(), self.depth_m > 0
-        inside, barred = region & measured, ~region & measured
-        number, links = np.arange(measured.size).reshape(self.shape), []
+        points, inside = self.points(), region & (self.depth_m > 0)
+        number, links = np.arange(inside.size).reshape(self.shape), []
         for down, right in _TOWARDS:
             clear = inside.copy()
             for cells in range(1, _LINK_CELLS + 1):
@@ -198,7 +197,7 @@ class Patch:
                 links.append(np.stack([number[one][near], number[other][near]]))
                 clear[one] &= ~barred[other]
         ends = np.concatenate(links, 1)
-        graph = coo_array((np.ones(ends.shape[1], bool), tuple(ends)), shape=(measured.size,) * 2)
+        graph = coo_array((np.ones(ends.shape[1], bool), tuple(ends)), shape=(inside.size,) * 2)
         return np.where(inside, parts_of(graph, directed=False)[1].reshape(self.shape) + 1, 0)
 
     def border(self) -> np.ndarray:

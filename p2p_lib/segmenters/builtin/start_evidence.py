@@ -136,15 +136,16 @@ def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
 
     What is not the support stands above it or, as the handle of a fork on a table, does not look like it.
     """
-    log_odds, above = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
+    log_odds, measured = np.zeros(patch.shape, np.float32), patch.depth_m > 0
+    above = np.zeros(patch.shape, bool) if height.flat else height.log_odds >= 0
     if not height.flat:
-        above = height.log_odds >= 0
-        component = components_touching(patch.linked(above, _LINK_M), clicked.seeds)
-        log_odds[(patch.depth_m > 0) & ~dilated(component, 1)] = _APART
+        component = components_touching(patch.linked(above, measured & ~above, _LINK_M), clicked.seeds)
+        log_odds[measured & ~dilated(component, 1)] = _APART
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = _CONNECTED
     if height.plane is not None:
-        component = components_touching(patch.linked(above | unlike(patch, height.plane), _LINK_M), clicked.seeds)
+        other = (above & measured) | unlike(patch, height.plane)
+        component = components_touching(patch.linked(other, ~other, _LINK_M), clicked.seeds)
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
     return log_odds
