@@ -106,6 +106,37 @@ def test_height_tells_what_stands_on_a_plane_from_the_plane():
     assert (connected[22:38, 32:48] > 0).all() and (connected[:18] < 0).all()
 
 
+def test_parts_are_linked_over_holes_and_small_steps_of_depth_but_not_across_a_table():
+    depth = np.full((H, W), 1.0, np.float32)
+    region = np.zeros((H, W), bool)
+    region[10:50, 10:70] = True
+    depth[10:50, 20:23] = 0  # a hole
+    depth[10:50, 40:] -= 0.02  # a step
+    depth[10:50, 55:] -= 0.04  # a larger one
+    region[30, 10:55], depth[30, 20:23] = False, 1.0  # a strip of something else
+    part = patch_of(depth).linked(region, ~region & (depth > 0), 0.03)
+    assert (part > 0).sum() == (region & (depth > 0)).sum()
+    above, below = part[12, [12, 25, 45, 60]], part[48, [12, 25, 45, 60]]
+    for row in above, below:
+        assert row[0] == row[1] == row[2] != row[3]
+    assert above[0] != below[0] and above[3] == below[3]
+    assert len(np.unique(part[part > 0])) == 3
+
+
+def test_what_lies_on_a_table_and_looks_unlike_it_is_one_thing():
+    """The grey head of something flat is clicked, its handle is blue; the table is lit from one side."""
+    rng = np.random.default_rng(0)
+    rgb = np.tile(np.linspace(60, 230, W)[None, :, None], (H, 1, 3)) * [1.0, 0.8, 0.6]
+    rgb[26:34, 20:28], rgb[28:32, 28:60] = (150, 150, 150), (40, 60, 140)
+    rgb[34:37, 20:60] *= 0.85  # its shade
+    patch = patch_of(np.ones((H, W), np.float32))
+    patch = replace(patch, rgb=np.clip(rgb + rng.normal(0, 2, rgb.shape), 0, 255).astype(np.uint8))
+    clicked = Clicked.of(patch, np.array([[22.0, 28], [24, 30], [22, 31]]), 1.0)
+    connected = by_connection(patch, clicked, Height.of(patch, clicked))
+    assert (connected[29:31, 21:58] > 0).all()
+    assert not (connected[:24] > 0).any() and not (connected[38:] > 0).any() and (connected[35] > 0).mean() < 0.1
+
+
 @pytest.mark.parametrize("height_m", [0.0, 0.002])
 def test_what_is_flat_is_not_told_by_height(height_m):
     patch, clicked = block(height_m)

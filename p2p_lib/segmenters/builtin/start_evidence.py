@@ -16,7 +16,6 @@ from p2p_lib.segmenters.builtin.patch import (
     Patch,
     approximate_median,
     components_touching,
-    connected_components,
     dilated,
     plane_heights,
     support_plane,
@@ -32,8 +31,15 @@ _FLAT_SIGMAS, _FLAT_M = 2.0, 0.003
 _PLANE_SIGMA_M = 0.001
 #: Log-odds of a pixel in the support plane, and most of one above it: other things stand on it, too.
 _IN_PLANE, _ABOVE_PLANE = -2.0, 0.5
-#: Log-odds of what depth connects with the clicks, and of what it does not.
-_CONNECTED, _APART = 2.5, -1.5
+#: Log-odds of what depth connects with the clicks, of what it does not, and of what alone looks unlike the support.
+_CONNECTED, _APART, _UNLIKE = 2.5, -1.5, 1.0
+#: The support's colours are those within this share of the patch's side, and vary by this much at least, in CIELAB;
+#: what is darker differs by this share: it may be a shade.
+_NEARBY, _LOOK, _SHADE = 0.2, 4.0, 0.4
+#: Standard deviations up to which a colour is the support's, and from which on another; so many times it is looked.
+_ALIKE, _OTHER, _LOOKS = 3.0, 4.0, 4
+#: What stands on a support is linked over smaller gaps, as between inside and outside of a cup, m.
+_LINK_M = 0.03
 #: A component may cover up to this share of the patch's border by accident.
 _AT_THE_BORDER = 0.02
 #: An unmeasured pixel has this share of its nearest measured one's log-odds.
@@ -109,8 +115,9 @@ class Height:
             return replace(self, flat=True, log_odds=nothing)
         height, sigma_m = plane_heights(patch, self.plane), patch.sigma_m + _PLANE_SIGMA_M
         clicks_m = approximate_median(height[at])
-        if clicks_m < _FLAT_SIGMAS * approximate_median(patch.sigma_m[at]) + _FLAT_M:
-            return replace(self, flat=clicks_m > -_FLAT_M, log_odds=nothing)
+        least_m = _FLAT_SIGMAS * approximate_median(patch.sigma_m[at]) + _FLAT_M
+        if clicks_m < least_m:
+            return replace(self, flat=clicks_m > -least_m, log_odds=nothing)
         # The peak of the noise's density, 1 / (2.5 sigma), over a uniform one up to twice the height of the clicks.
         surprise = np.log(np.maximum(2 * clicks_m / (2.5 * sigma_m), 1.05))
         log_odds = np.maximum(height, 0) ** 2 / (2 * sigma_m**2) - surprise
@@ -125,15 +132,49 @@ def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndar
 
 
 def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
-    """Evidence for what depth connects with the clicks above their support, if it ends within the patch."""
-    log_odds = np.zeros(patch.shape, np.float32)
-    if height.flat:
-        return log_odds
-    component = components_touching(connected_components(patch.smooth & (height.log_odds >= 0)), clicked.seeds)
-    log_odds[(patch.depth_m > 0) & ~dilated(component, 1)] = _APART
-    if component[patch.border()].mean() <= _AT_THE_BORDER:
-        log_odds[component] = _CONNECTED
+    """Evidence for what is linked with the clicks and is not their support, if it ends within the patch.
+
+    What is not the support stands above it or, as the handle of a fork on a table, does not look like it.
+    """
+    log_odds, measured = np.zeros(patch.shape, np.float32), patch.depth_m > 0
+    above = np.zeros(patch.shape, bool) if height.flat else height.log_odds >= 0
+    if not height.flat:
+        component = components_touching(patch.linked(above, measured & ~above, _LINK_M), clicked.seeds)
+        log_odds[measured & ~dilated(component, 1)] = _APART
+        if component[patch.border()].mean() <= _AT_THE_BORDER:
+            log_odds[component] = _CONNECTED
+    if height.plane is not None:
+        other = (above & measured) | unlike(patch, height.plane)
+        component = components_touching(patch.linked(other, ~other, _LINK_M), clicked.seeds)
+        if component[patch.border()].mean() <= _AT_THE_BORDER:
+            log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
     return log_odds
+
+
+def unlike(patch: Patch, plane: np.ndarray) -> np.ndarray:
+    """(h, w) bool: what does not look like the support, a ``plane`` (4,), does around it.
+
+    A table's colour changes with the light: it is taken nearby. What lies on the table is in its plane, too: so it is
+    taken again without what is off it.
+    """
+    height, lab = plane_heights(patch, plane), cv2.cvtColor(patch.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
+    support = (patch.depth_m > 0) & (np.abs(height) < _FLAT_SIGMAS * patch.sigma_m + _FLAT_M)
+    alike, squared_off = support, np.zeros(patch.shape, np.float32)
+    for _ in range(_LOOKS):
+        squared_off = _squared_off(lab, alike)
+        alike = support & (squared_off < _ALIKE**2)
+    return squared_off > _OTHER**2
+
+
+def _squared_off(lab: np.ndarray, support: np.ndarray) -> np.ndarray:
+    """(h, w) squared distance, in standard deviations, of CIELAB colours (h, w, 3) from those of the support around."""
+    reach, weight = (0, 0), support.astype(np.float32)[..., None]
+    sigma = _NEARBY * max(support.shape)
+    shares = cv2.GaussianBlur(weight, reach, sigma)[..., None] + np.float32(1e-4)
+    off = lab - cv2.GaussianBlur(lab * weight, reach, sigma) / shares
+    off[..., 0] *= np.where(off[..., 0] < 0, _SHADE, 1)
+    variance = cv2.GaussianBlur(off**2 * weight, reach, sigma) / shares
+    return (off**2 / (variance + _LOOK**2)).sum(-1)
 
 
 def by_shares(patch: Patch, own: np.ndarray, other: np.ndarray, config: SegmentationConfig) -> np.ndarray:
