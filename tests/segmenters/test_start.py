@@ -18,6 +18,7 @@ from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.depth_offset import depth_offset_px, with_depth_moved
 from p2p_lib.segmenters.builtin.patch import Box, Patch, plane_heights, support_plane
+from p2p_lib.segmenters.builtin.prompted import Cutter
 from p2p_lib.segmenters.builtin.start_evidence import Clicked, Height, by_connection, filled, tolerant
 
 H, W = 60, 80
@@ -135,6 +136,20 @@ def test_what_lies_on_a_table_and_looks_unlike_it_is_one_thing():
     connected = by_connection(patch, clicked, Height.of(patch, clicked))
     assert (connected[29:31, 21:58] > 0).all()
     assert not (connected[:24] > 0).any() and not (connected[38:] > 0).any() and (connected[35] > 0).mean() < 0.1
+
+
+def test_what_lies_right_beside_it_is_not_linked_with_it():
+    """Two dark bars on a light table, less than a coarse cell apart; one is clicked."""
+    rgb, cells = np.full((480, 640, 3), (200, 170, 130), np.uint8), preset().segmentation
+    rgb[200:280, 300:310] = rgb[200:280, 313:323] = (40, 40, 50)
+    frame, camera = Frame(0, 0.0, rgb, np.ones((480, 640), np.float32)), Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
+    clicks_px = np.array([[304.0, 210], [305, 240], [304, 270]])
+    cutter = Cutter(frame, camera, cells, Prompt("bar", 0, points_px=clicks_px), np.zeros((0, 2)))
+    patch = Patch.of(frame, Box(120, 60, 500, 420), camera, cells)
+    height = Height.of(patch, Clicked.of(patch, clicks_px, 1.0))
+    connected = np.zeros(frame.shape, np.float32)
+    connected[patch.box.slices] = patch.up(cutter._connected(patch, clicks_px, 1.0, 1.0, height))
+    assert (connected[205:275, 303:307] > 0).all() and not (connected[205:275, 316:321] > 0).any()
 
 
 @pytest.mark.parametrize("height_m", [0.0, 0.002])
