@@ -327,7 +327,7 @@ def _benchmark(a: argparse.Namespace) -> int:
         counts = ", ".join(f"{count} {what}" for what, count in benchmark.counts().items())
         print(f"{write_table(benchmark)}\n{counts}. Tables in {benchmark.folder}\n")
         print("".join(f"{line}\n" for line in what_to_fetch(benchmark)), end="")
-        if a.tables:
+        if a.tables and not benchmark.interrupted:  # a table with holes does not replace a whole one
             done = [(job, outcome) for job, outcome in benchmark.results if outcome.status == "done"]
             made: dict[str, str | None] = {"runs": f"{len(done)} of {len(benchmark.results)}"}
             made |= {"seeds": ", ".join(map(str, sorted({job.seed for job, _ in done})))}

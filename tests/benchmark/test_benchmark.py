@@ -276,6 +276,19 @@ def test_a_run_that_is_killed_leaves_no_semaphore(tmp_path):
     assert (ran.returncode, ran.stderr) == (0, "") and (tmp_path / "held").exists()
 
 
+def test_an_interrupted_plan_replaces_no_table_that_was_made(plan, tmp_path, monkeypatch, capsys):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr("p2p_lib.benchmark.benchmark.execute", interrupted)
+    table, options = tmp_path / "tables/slides.md", ["--quick", "--out", str(tmp_path), "--quiet"]
+    table.parent.mkdir()
+    table.write_text("as it was")
+    assert cli.main(["benchmark", str(plan), *options, "--tables", str(table.parent)]) == 130
+    assert table.read_text() == "as it was" and "2 not run" in capsys.readouterr().out
+
+
 # --- on a cluster --------------------------------------------------------------------------------
 
 
