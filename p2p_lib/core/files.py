@@ -185,7 +185,7 @@ def replace_text(path: Path, text: str) -> None:
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray], compressed: bool = False) -> None:
     """Write arrays by name as an ``.npz`` file by :func:`replacing`."""
     with replacing(path) as file:
-        (np.savez_compressed if compressed else np.savez)(file, **arrays)  # type: ignore[arg-type]
+        (np.savez_compressed if compressed else np.savez)(file, allow_pickle=False, **arrays)
 
 
 def check_new(out: str | Path) -> None:

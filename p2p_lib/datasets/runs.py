@@ -127,11 +127,6 @@ class ObjectRun:
         """(n,) bool: it had been added, and was not removed."""
         return (self.status != str(Status.INITIALISING)) | (self.reason != NOT_FOLLOWED)
 
-    @property
-    def removed(self) -> np.ndarray:
-        """(n,) bool: it had been followed before, and was removed."""
-        return ~self.followed & np.logical_or.accumulate(self.followed)
-
     def select(self, rows: np.ndarray) -> ObjectRun:
         """The same at these rows or under this mask."""
         return ObjectRun(*(getattr(self, column)[rows] for column in COLUMNS))

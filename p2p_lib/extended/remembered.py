@@ -201,15 +201,15 @@ class Remembered(TwoMaps):
         held = np.unique(label[v, u])
         return np.isin(label, held[held > 0])
 
-    def taken_in(self, rows: np.ndarray, seen: Any) -> np.ndarray:
-        """Add the corners at which landmarks, rows (M,), are seen as keypoints of the map; returns their keys.
+    def taken_in(self, seen: Any) -> np.ndarray:
+        """Add the corners at which landmarks are ``seen`` as keypoints of the map; returns their keys (M,).
 
         A landmark tells where the object is to a few millimetres, all of them to a fraction of that. So they say where
         the object is, and its keypoints are what is there.
         """
         p_obj = se3.transform(se3.inverse(seen.T_cam_obj), seen.p_cam)
-        keys = self.model.remember(p_obj, self._memory.confidence[rows])
-        self._key[rows] = keys
+        keys = self.model.remember(p_obj, self._memory.confidence[seen.rows])
+        self._key[seen.rows] = keys
         return keys
 
     # -- the step ------------------------------------------------------------------------------
@@ -239,7 +239,7 @@ class Remembered(TwoMaps):
         seen = self._recogniser.at(obs.frame, obs.mask, T_cam_obj, p_obj, descriptors)
         if not len(seen):
             return requests
-        keys = self.taken_in(absent[seen.rows], seen)
+        keys = self.taken_in(replace(seen, rows=absent[seen.rows]))
         add_px, keys = np.concatenate([requests.add_px, seen.uv_px]), np.concatenate([requests.keys, keys])
         return replace(requests, add_px=add_px, keys=keys)
 
@@ -262,7 +262,7 @@ def _certain(landmarks: float, share: float, outline: Callable[[], float | None]
 
 def follow(obj: Remembered, found: Recognition, tracker: PointTracker, tracks: Tracks) -> Tracks:
     """Have the tracker follow the landmarks found; returns all objects' tracks in this frame, with these."""
-    keys, ids = obj.taken_in(found.seen.rows, found.seen), tracker.add(found.seen.uv_px)
+    keys, ids = obj.taken_in(found.seen), tracker.add(found.seen.uv_px)
     obj.map.assign(keys, ids)
     count = len(ids)
     return joined([tracks, Tracks(ids, found.seen.uv_px, np.ones(count, bool), np.zeros(count))])

@@ -517,7 +517,7 @@ def test_what_was_learnt_of_an_object_is_kept_when_it_is_removed(folder, tmp_pat
     kept = load_run(tmp_path / "run")
     board = kept.objects["board"]
     assert board.has_pose.sum() == 5, "the map with the most poses"
-    assert board.removed.tolist() == [False] * 2 + [True] * 5 + [False] * 5 + [True] * 2
+    assert board.followed.tolist() == [True] * 2 + [False] * 5 + [True] * 5 + [False] * 2
     memory = load_memory(tmp_path / "run" / "maps" / "board.npz")
     assert memory.made_of["map_id"] == 1 and len(trimesh.load(tmp_path / "run" / "meshes" / "board.ply").faces)
     assert len(load_keypoints(tmp_path / "run")["board"].ids) > 10

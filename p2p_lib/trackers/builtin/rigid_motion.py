@@ -83,12 +83,9 @@ def _fit_pose(R, at, arm_seg, map_cov, uv_px, cov_px2, z_m, sigma_m, fx, fy, cx,
                 cov = R @ map_cov[n] @ R.T
                 of_pixel = (P @ cov @ P.T)[:2, :2] + cov_px2[n] + _SHARED_PX**2 * np.eye(2)
                 inverse = np.linalg.inv(of_pixel)
-                W[n, 0, 0], W[n, 0, 1], W[n, 1, 0], W[n, 1, 1] = (
-                    inverse[0, 0],
-                    inverse[0, 1],
-                    inverse[1, 0],
-                    inverse[1, 1],
-                )
+                for i in range(2):
+                    for j in range(2):
+                        W[n, i, j] = inverse[i, j]
                 z_weight[n] = 1 / (sigma_m[n] ** 2 + cov[2, 2]) if z_m[n] > 0 else 0.0
             r[n, 0], r[n, 1] = uv_px[n, 0] - fx * x / z - cx, uv_px[n, 1] - fy * y / z - cy
             r[n, 2] = z_m[n] - a[2] - at[2] if z_m[n] > 0 else 0.0
