@@ -21,7 +21,7 @@ from p2p_lib.core.memory import ObjectMemory, load_memories
 from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate, status_text
+from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, status_text
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import moving_scale
 from p2p_lib.datasets.exchange import as_run, export, read_poses
@@ -397,6 +397,10 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
     return RunResult(out, evaluation, not_scored, lines, interrupted, advice, tracked, tuple(look_at))
 
 
+#: Why an object that was followed has no pose in its frame.
+_OTHER_MAP = "followed in another map, never joined with the one that is kept"
+
+
 def summary(run: Run, wanted: int) -> tuple[str, ...]:
     """How far the run came; per object how many frames have a pose and what mostly kept it from the others."""
     count = len(next(iter(run.objects.values())))
@@ -405,8 +409,8 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     if left_out := run.info.get("left_out"):
         lines[0] += f"; {len(left_out)} left out, which cannot be read, the first: {next(iter(left_out.values()))}"
     for name, obj in run.objects.items():
-        lost = ~obj.has_pose
-        why = Counter(status_text(*one).partition(" since ")[0] for one in zip(obj.status[lost], obj.reason[lost]))
+        without = zip(obj.status[~obj.has_pose], obj.reason[~obj.has_pose])
+        why = Counter(_OTHER_MAP if s in WITH_POSE else status_text(s, r).partition(" since ")[0] for s, r in without)
         otherwise = "otherwise mostly" if obj.has_pose.any() else "mostly"
         most = f"; {otherwise} {why.most_common(1)[0][0]}" if why else ""
         doubted = int(obj.doubted.sum())

@@ -785,10 +785,12 @@ def test_a_run_says_how_many_poses_it_doubts(made):
 
 def test_a_run_says_what_mostly_kept_an_object_from_a_pose(made):
     name, obj = next(iter(made.run.objects.items()))
-    lost = replace(obj, T_cam_obj=np.where(np.arange(len(obj))[:, None, None] < 3, obj.T_cam_obj, np.nan))
+    other = replace(obj, T_cam_obj=np.where(np.arange(len(obj))[:, None, None] < 3, obj.T_cam_obj, np.nan))
+    lost = replace(other, status=np.full(len(obj), "lost"), reason=np.full(len(obj), "no points agree"))
     for some, words in (
-        (lost, "; otherwise mostly "),
-        (replace(lost, T_cam_obj=0 * lost.T_cam_obj * np.nan), "; mostly "),
+        (other, "; otherwise mostly followed in another map, never joined with the one that is kept"),
+        (lost, "; otherwise mostly lost: no points agree"),
+        (replace(lost, T_cam_obj=np.full_like(obj.T_cam_obj, np.nan)), "; mostly lost: no points agree"),
     ):
         _, line = summary(replace(made.run, objects={name: some}), len(obj))
         assert words in line
