@@ -172,3 +172,23 @@ def test_exposure_is_evened_out():
     even = texture.evened(views, camera, p, np.tile([0, 0, -1.0], (500, 1)))
     for view in even:
         assert np.abs(view.rgb[10:-10, 10:-10] / even[1].rgb[10:-10, 10:-10] - 1).max() < 0.02
+
+
+def test_a_surface_is_cleaned_of_what_no_object_has():
+    """A ball with the steps of voxels, a speck beside it, a face without area and a third face at an edge."""
+    ball = trimesh.creation.icosphere(4, 0.05)
+    rough = np.rint(ball.vertices / 0.002) * 0.002
+    speck = trimesh.creation.icosphere(1, 0.003)
+    (a, b, c), (d, e, _) = ball.faces[0], ball.faces[len(ball.faces) // 2]
+    middle = len(rough) + len(speck.vertices)  # of an edge; the vertex after it is off the ball
+    vertices = np.concatenate([rough, speck.vertices + [0.1, 0, 0], [(rough[a] + rough[b]) / 2], [rough[d] * 1.02]])
+    split, off = [[a, middle, c], [middle, b, c], [a, b, middle]], [[d, e, middle + 1]]
+    faces = np.concatenate([ball.faces[1:], speck.faces + len(rough), split, off])
+    surface = trimesh.Trimesh(vertices, faces, process=False)
+    surface.visual.vertex_colors = np.full((len(vertices), 3), 128, np.uint8)
+    got = model.cleaned(surface)
+    assert np.linalg.norm(got.vertices, axis=1).max() < 0.06, "the speck is gone"
+    flat = trimesh.Trimesh(rough, ball.faces, process=False).area_faces < 1e-12
+    assert len(got.faces) == (~flat).sum() + 1, "of the faces that were added the two halves alone are left"
+    off_m, steps_m = (np.linalg.norm(of, axis=1) - 0.05 for of in (got.vertices, rough))
+    assert np.std(off_m) < 0.6 * np.std(steps_m) and abs(off_m.mean()) < 5e-4
