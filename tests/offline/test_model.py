@@ -181,7 +181,9 @@ def test_a_surface_is_cleaned_of_what_no_object_has():
     speck = trimesh.creation.icosphere(1, 0.003)
     (a, b, c), (d, e, _) = ball.faces[0], ball.faces[len(ball.faces) // 2]
     middle = len(rough) + len(speck.vertices)  # of an edge; the vertex after it is off the ball
-    vertices = np.concatenate([rough, speck.vertices + [0.1, 0, 0], [(rough[a] + rough[b]) / 2], [rough[d] * 1.02]])
+    vertices = np.concatenate(
+        [rough, speck.vertices + np.array([0.1, 0, 0]), [(rough[a] + rough[b]) / 2], [rough[d] * 1.02]]
+    )
     split, off = [[a, middle, c], [middle, b, c], [a, b, middle]], [[d, e, middle + 1]]
     faces = np.concatenate([ball.faces[1:], speck.faces + len(rough), split, off])
     surface = trimesh.Trimesh(vertices, faces, process=False)
