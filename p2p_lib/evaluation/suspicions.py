@@ -110,7 +110,7 @@ def _known(key: str) -> Callable[[RunEvidence], np.ndarray]:
 
 
 _RULES = (
-    _Rule("lost", "a mask, but no pose", 0.1, lambda e: ~e.has_pose, lambda e: e.seen),
+    _Rule("lost", "a mask, but no pose", 0.1, lambda e: ~(e.has_pose | e.elsewhere), lambda e: e.seen),
     _Rule("doubted", f"confidence at most {DOUBTED:g}", 0.5, lambda e: e.confidence <= DOUBTED, lambda e: e.has_pose),
     _Rule(
         "maps",
