@@ -149,7 +149,6 @@ def test_synthetic_sequences_are_rendered_and_played_as_a_camera(folder, monkeyp
     [
         ("view run --no-browser", "view"),
         ("film run --out film.mp4", "view"),
-        ("view run --rerun run.rrd", "rerun"),
         ("notebooks --only 03", "notebooks"),
         ("figures", "notebooks"),
         ("convert recording.bag --out converted", "ros"),
@@ -172,6 +171,6 @@ def test_every_extra_is_known_and_said():
     declared = set(PYPROJECT["optional-dependencies"]) - {"all", "dev"}
     assert declared == set(EXTRAS)
     (everything,) = map(Requirement, PYPROJECT["optional-dependencies"]["all"])
-    assert everything.extras == declared - {"rerun", "sam2", "sam2-video"}
+    assert everything.extras == declared - {"sam2", "sam2-video"}
     page = (PROJECT / "environment.md").read_text()
     assert not [name for name in declared if f"`{name}`" not in page]

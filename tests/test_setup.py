@@ -27,7 +27,6 @@ OURS = {"p2p_lib", "studies"}
 #: Import name to distribution, where they differ; and what comes as a part of another.
 DISTRIBUTIONS = {
     "fast_simplification": "fast-simplification",
-    "rerun": "rerun-sdk",
     "cv2": "opencv-python-headless",
     "skimage": "scikit-image",
     "PIL": "pillow",

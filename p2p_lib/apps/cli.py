@@ -431,15 +431,9 @@ def _export(a: argparse.Namespace) -> None:
     "look at a run in 3D with a time slider, in the browser",
     _RUN,
     arg("--out", type=Path, metavar="FILE", help="the page (default DIR/view.html); it needs nothing else"),
-    arg("--rerun", type=Path, metavar="FILE", help="instead: a Rerun recording, with video and tracks"),
     NO_BROWSER,
 )
 def _view(a: argparse.Namespace) -> None:
-    if a.rerun is not None:
-        from p2p_lib.figures.rerun_file import write_rerun
-
-        print(f"Written to {write_rerun(a.run, a.rerun)}. Next: rerun {a.rerun}")
-        return
     from p2p_lib.figures.viewer import write_page
 
     page = write_page(a.run, a.out)

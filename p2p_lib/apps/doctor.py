@@ -17,7 +17,7 @@ from p2p_lib.core.packages import EXTRAS, INSTALL, command, cotracker_folder, ex
 from p2p_lib.core.paths import PROJECT, cache_dir, data_dir
 
 #: Distributions whose module has another name.
-MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-image": "skimage", "rerun-sdk": "rerun"}
+MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "scikit-image": "skimage"}
 #: What no extra brings: what it serves.
 OPTIONAL = {"tapnet": "2D trackers tapir and tapnextpp", "torchvision": "2D tracker tapnextpp"}
 #: Room for the results of a clone's notebooks, and of some runs.

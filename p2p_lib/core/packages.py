@@ -28,7 +28,6 @@ EXTRAS = {
     "dask": "runs on a cluster, p2p benchmark --scheduler",
     "ros": "ROS 1 and 2 recordings, p2p convert",
     "realsense": "RealSense cameras and recordings, p2p live and p2p convert",
-    "rerun": "recordings to look at frame by frame, p2p view --rerun",
     "sam2": "SAM 2 on a CPU: masks of prompts, --masks sam2",
     "sam2-video": "segmentation by a PyTorch network with a memory: --masks sam2_video",
 }
@@ -45,7 +44,6 @@ INSTALL = {
     "transformers": extra("sam2-video"),
     "rosbags": extra("ros"),
     "pyrealsense2": extra("realsense"),
-    "rerun-sdk": extra("rerun"),
     "distributed": extra("dask"),
     "open3d": extra("open3d"),
     "torch": extra("torch"),

@@ -119,7 +119,7 @@ def test_folders_are_looked_at(monkeypatch, tmp_path):
 def test_report_for_people():
     findings = [
         Finding("torch", Level.OK, "2.13"),
-        Finding("rerun", Level.OPTIONAL, "not installed", "install rerun"),
+        Finding("dask", Level.OPTIONAL, "not installed", "install dask"),
         Finding("open3d", Level.WRONG, "ImportError", "make setup"),
     ]
     lines = as_lines(findings, "all there").splitlines()

@@ -5,7 +5,6 @@ import html
 import re
 import shutil
 import struct
-import sys
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ import trimesh
 
 from p2p_lib.apps import cli
 from p2p_lib.core import se3
-from p2p_lib.core.errors import MissingBackend
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, load_points
 from p2p_lib.datasets.runs import load_run
@@ -197,36 +195,6 @@ def test_errors_of_scored_frames_have_their_places(made, folder):
     add_m = Playback.of(folder, made.sequence).add_m("box")
     assert np.flatnonzero(add_m > 0.003).tolist() == [5, 6, 7] and np.isnan(add_m[8])
     assert add_m[6] == pytest.approx(0.02, abs=1e-6)
-
-
-# --- Rerun -----------------------------------------------------------------------------------------
-
-
-def test_without_rerun_it_says_how_to_get_it(folder, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    from p2p_lib.figures.rerun_file import write_rerun
-
-    with pytest.raises(MissingBackend, match=r"--rerun: the package rerun-sdk .*pip install .p2p_lib\[rerun\]"):
-        write_rerun(folder, folder / "x.rrd")
-
-
-def test_a_rerun_recording_is_whole(folder, made, tmp_path):
-    pytest.importorskip("rerun")
-    import subprocess
-    from pathlib import Path
-
-    from p2p_lib.figures.rerun_file import write_rerun
-
-    file = write_rerun(folder, tmp_path / "run.rrd", made.sequence)
-    program = str(Path(sys.executable).with_name("rerun"))
-    told = subprocess.run([program, "rrd", "verify", str(file)], capture_output=True, text=True)
-    assert told.returncode == 0 and "verified without error" in told.stdout + told.stderr
-    printed = subprocess.run([program, "rrd", "print", str(file)], capture_output=True, text=True).stdout
-    for entity in (
-        *("camera/picture/rgb", "camera/picture/masks", "camera/picture/tracks/box", "points", "paths/can"),
-        *("scene/box", "scene/box/surface", "scene/box/keypoints", "scene/can", "status/box", "error/can"),
-    ):
-        assert re.search(rf"/{entity}\b", printed), entity
 
 
 # --- the command -----------------------------------------------------------------------------------
