@@ -184,6 +184,22 @@ def test_two_objects_pass_and_keep_their_names():
         assert iou(found == 2, near) > 0.85 and iou(found == 1, far) > 0.75, k
 
 
+def test_objects_beside_it_say_what_is_theirs(monkeypatch):
+    """Hints cost: those of objects that are far away are not asked for."""
+    places, told = {"one": (80, 80), "two": (145, 80), "far": (230, 160)}, {}
+    hints = {name: Hint(np.array([at], float)) for name, at in places.items()}
+
+    def follow(view, target, hint, others, predicted):
+        told[tuple(hint.uv_px[0])] = [tuple(other.uv_px[0]) for other in others]
+        return predicted.claim
+
+    monkeypatch.setattr(segmenter_page, "follow", follow)
+    of = segmenter()
+    for k in range(2):
+        of.segment(picture(k, [(at, 1) for at in places.values()]), () if k else on(**places), hints)
+    assert told == {places["one"]: [places["two"]], places["two"]: [places["one"]], places["far"]: []}
+
+
 def test_what_is_covered_is_absent_whatever_covers_it():
     """A board slides over the resting card: nothing of the board is taken for it; points bring it back."""
     at = (120, 80)
@@ -594,7 +610,7 @@ def test_what_leaps_is_found_by_its_colours_near_to_where_it_was():
 @pytest.mark.parametrize("held", [True, False])
 def test_a_mask_that_loses_the_points_which_were_on_it_is_found_anew_at_them(held, monkeypatch):
     """Points that were not on it a frame ago may be on its double."""
-    monkeypatch.setattr(segmenter_page, "follow", lambda view, target, hint, predicted: predicted.claim)
+    monkeypatch.setattr(segmenter_page, "follow", lambda view, target, hint, others, predicted: predicted.claim)
     follow, was, now = segmenter(), (60, 80), (170, 100)
     for k, at in enumerate([was] * 4 + [now]):
         hints = sure(card=at) if held or at == now else {}

@@ -18,7 +18,6 @@ from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.depth_offset import depth_offset_px, with_depth_moved
 from p2p_lib.segmenters.builtin.patch import Box, Patch, plane_heights, support_plane
-from p2p_lib.segmenters.builtin.prompted import Cutter
 from p2p_lib.segmenters.builtin.start_evidence import Clicked, Height, by_connection, filled, tolerant
 
 H, W = 60, 80
@@ -107,23 +106,6 @@ def test_height_tells_what_stands_on_a_plane_from_the_plane():
     assert (connected[22:38, 32:48] > 0).all() and (connected[:18] < 0).all()
 
 
-def test_parts_are_linked_over_holes_and_small_steps_of_depth_but_not_across_a_table():
-    depth = np.full((H, W), 1.0, np.float32)
-    region = np.zeros((H, W), bool)
-    region[10:50, 10:70] = True
-    depth[10:50, 20:23] = 0  # a hole
-    depth[10:50, 40:] -= 0.02  # a step
-    depth[10:50, 55:] -= 0.04  # a larger one
-    region[30, 10:55], depth[30, 20:23] = False, 1.0  # a strip of something else
-    part = patch_of(depth).linked(region, ~region & (depth > 0), 0.03)
-    assert (part > 0).sum() == (region & (depth > 0)).sum()
-    above, below = part[12, [12, 25, 45, 60]], part[48, [12, 25, 45, 60]]
-    for row in above, below:
-        assert row[0] == row[1] == row[2] != row[3]
-    assert above[0] != below[0] and above[3] == below[3]
-    assert len(np.unique(part[part > 0])) == 3
-
-
 def test_what_lies_on_a_table_and_looks_unlike_it_is_one_thing():
     """The grey head of something flat is clicked, its handle is blue; the table is lit from one side."""
     rng = np.random.default_rng(0)
@@ -136,20 +118,6 @@ def test_what_lies_on_a_table_and_looks_unlike_it_is_one_thing():
     connected = by_connection(patch, clicked, Height.of(patch, clicked))
     assert (connected[29:31, 21:58] > 0).all()
     assert not (connected[:24] > 0).any() and not (connected[38:] > 0).any() and (connected[35] > 0).mean() < 0.1
-
-
-def test_what_lies_right_beside_it_is_not_linked_with_it():
-    """Two dark bars on a light table, less than a coarse cell apart; one is clicked."""
-    rgb, cells = np.full((480, 640, 3), (200, 170, 130), np.uint8), preset().segmentation
-    rgb[200:280, 300:310] = rgb[200:280, 313:323] = (40, 40, 50)
-    frame, camera = Frame(0, 0.0, rgb, np.ones((480, 640), np.float32)), Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
-    clicks_px = np.array([[304.0, 210], [305, 240], [304, 270]])
-    cutter = Cutter(frame, camera, cells, Prompt("bar", 0, points_px=clicks_px), np.zeros((0, 2)))
-    patch = Patch.of(frame, Box(120, 60, 500, 420), camera, cells)
-    height = Height.of(patch, Clicked.of(patch, clicks_px, 1.0))
-    connected = np.zeros(frame.shape, np.float32)
-    connected[patch.box.slices] = patch.up(cutter._connected(patch, clicks_px, 1.0, 1.0, height))
-    assert (connected[205:275, 303:307] > 0).all() and not (connected[205:275, 316:321] > 0).any()
 
 
 @pytest.mark.parametrize("height_m", [0.0, 0.002])

@@ -5,6 +5,7 @@ Log-odds of different evidence add up; they are positive for the object.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -105,14 +106,20 @@ def strange(patch: Patch, mask: np.ndarray, own: np.ndarray) -> bool:
     return bool(evidence(own, histogram(patch.codes[~mask]))[patch.codes[mask]].mean() < _STRANGE)
 
 
-def by_surface(patch: Patch, hint: Hint, config: SegmentationConfig) -> np.ndarray:
-    """(h, w) log-odds for pixels on the object's reconstructed surface, and against those before it or far off."""
-    if hint.distance_m is None:
-        return np.zeros(patch.shape, np.float32)
-    distance_m = patch.nearest(hint.distance_m)
-    on, before = np.abs(distance_m) < _ON_SURFACE_M, distance_m > 2 * _ON_SURFACE_M
-    far = np.isinf(distance_m) & (len(hint.uv_px) >= config.find_points)  # only if the pose can be trusted
-    return config.surface_weight * (on.astype(np.float32) - before - far)
+def by_surface(patch: Patch, hint: Hint, others: Sequence[Hint], config: SegmentationConfig) -> np.ndarray:
+    """(h, w) log-odds for pixels on the object's reconstructed surface, and against those before it or far off.
+
+    Against those on the surfaces of ``others`` alone, too. Only poses that can be trusted say what is not the object's.
+    """
+    on, off = np.zeros(patch.shape, bool), np.zeros(patch.shape, np.float32)
+    if hint.distance_m is not None:
+        distance_m = patch.nearest(hint.distance_m)
+        on, off = np.abs(distance_m) < _ON_SURFACE_M, (distance_m > 2 * _ON_SURFACE_M).astype(np.float32)
+        off += np.isinf(distance_m) & (len(hint.uv_px) >= config.find_points)
+    for other in others:
+        if other.distance_m is not None and len(other.uv_px) >= config.find_points:
+            off += (np.abs(patch.nearest(other.distance_m)) < _ON_SURFACE_M) & ~on
+    return config.surface_weight * (on - off)
 
 
 def cut(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,7 +68,7 @@ def predict(view: View, target: Target) -> Prediction:
     return Prediction(patch, prior, jumped, shown, bool(left), bool(doubtful))
 
 
-def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Claim:
+def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: Prediction) -> Claim:
     """Cut the object out around its predicted mask.
 
     None if it has left: what shows there lies behind it, or has the surroundings' colours without its points.
@@ -86,7 +87,7 @@ def follow(view: View, target: Target, hint: Hint, predicted: Prediction) -> Cla
     # Parts that come into view are connected with those that were seen before.
     log_odds += np.where(component, np.maximum(stays, 0), stays)
     log_odds[jumped] -= cfg.geometry_weight
-    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg)
+    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, others, cfg)
     x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
     adjacent = dilated((x > 0.5) & (patch.depth_m > 0), 1)
     x = np.where((patch.depth_m > 0) | (prior > 0.5) | adjacent, x, 0)

@@ -27,8 +27,6 @@ _SMALLEST_M2 = 1e-3
 #: The three points of each plane, by a low-discrepancy sequence (Roberts 2018).
 _STEPS = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 _TRIPLES = ((0.5 + np.arange(_PLANES) * _STEPS[:, None]) % 1 * _PLANE_POINTS).astype(int)
-#: Cells are linked in these directions (down, right) and back, over so many cells.
-_TOWARDS, _LINK_CELLS = ((0, 1), (1, 0), (1, 1), (1, -1)), 4
 #: A support plane holds at least this share of the pixels.
 _SUPPORTS = 0.2
 
@@ -51,6 +49,11 @@ class Box:
     def slices(self) -> tuple[slice, slice]:
         """To index an image with."""
         return np.s_[self.top : self.bottom, self.left : self.right]
+
+    def near(self, other: Box, within_px: int) -> bool:
+        """Whether the gap to another box is smaller than this in both directions."""
+        across = max(self.left, other.left) - min(self.right, other.right)
+        return max(across, max(self.top, other.top) - min(self.bottom, other.bottom)) < within_px
 
 
 def around(centre: np.ndarray, half: np.ndarray, shape: tuple[int, int]) -> Box:
@@ -177,29 +180,6 @@ class Patch:
         )
         return np.broadcast_to(to_one < to_other, number.size).reshape(self.shape)
 
-    def linked(self, region: np.ndarray, barred: np.ndarray, gap_m: float) -> np.ndarray:
-        """(h, w) int: the number, from 1, of each part of what is measured in a region (h, w) bool; 0 elsewhere.
-
-        Cells of one part are linked over gaps in space up to ``gap_m``: steps of depth, as at a cup's rim, and holes of
-        the depth. Nothing is linked across cells that are ``barred`` (h, w) bool.
-        """
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components as parts_of
-
-        points, inside = self.points(), region & (self.depth_m > 0)
-        number, links = np.arange(inside.size).reshape(self.shape), []
-        for down, right in _TOWARDS:
-            clear = inside.copy()
-            for cells in range(1, _LINK_CELLS + 1):
-                one, other = _pairs(self.shape, down * cells, right * cells)
-                near = clear[one] & inside[other]
-                near[near] = np.linalg.norm(points[one][near] - points[other][near], axis=-1) < gap_m
-                links.append(np.stack([number[one][near], number[other][near]]))
-                clear[one] &= ~barred[other]
-        ends = np.concatenate(links, 1)
-        graph = coo_array((np.ones(ends.shape[1], bool), tuple(ends)), shape=(inside.size,) * 2)
-        return np.where(inside, parts_of(graph, directed=False)[1].reshape(self.shape) + 1, 0)
-
     def border(self) -> np.ndarray:
         """(h, w) bool: the outermost pixels."""
         edge = np.ones(self.shape, bool)
@@ -226,15 +206,6 @@ class Patch:
         """Image coordinates of the middles of the grid's columns (w,) and rows (h,)."""
         u, v = ((np.arange(n) + 0.5) * self.cell_px - 0.5 for n in self.shape[::-1])
         return u + self.box.left, v + self.box.top
-
-
-def _pairs(shape: tuple[int, int], down: int, right: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """To index the cells of a grid that have a neighbour so far down and to the right, and these neighbours."""
-    w = shape[1]
-    return (
-        (slice(0, max(shape[0] - down, 0)), slice(max(-right, 0), max(min(w, w - right), 0))),
-        (slice(down, None), slice(max(right, 0), max(min(w, w + right), 0))),
-    )
 
 
 def _whole_cells(box: Box, cell_px: int, shape: tuple[int, int]) -> Box:

@@ -116,7 +116,7 @@ class Cutter:
         cfg = self.config
         clicked = Clicked.of(patch, clicks_px, z_m, scale)
         height = Height.of(patch, clicked)
-        connected = self._connected(patch, clicks_px, z_m, scale, height) + self._nearer_to_others(patch, clicked)
+        connected = by_connection(patch, clicked, height) + self._nearer_to_others(patch, clicked)
         prior = clicked.prior_beside(connected)
         x = self._cut_out(patch, clicked, prior, by_distance(patch, z_m, cfg) + height.log_odds + connected)
         whole, there = np.zeros((2, *self.frame.shape), np.float32)
@@ -131,14 +131,6 @@ class Cutter:
         mask, others = x > 0.5, patch.dots(self._others_px, _AROUND_PX)
         inside = mask[others].mean() if others.any() else 0.0
         return Cut(float(patch.outline_tie(mask) + inside) / _SCALES[scale], patch.box, patch.up(x))
-
-    def _connected(self, patch: Patch, clicks_px: np.ndarray, z_m: float, scale: float, height: Height) -> np.ndarray:
-        """:func:`by_connection` on a grid twice as fine, averaged onto this one's: coarse cells link what is near."""
-        fine = Patch.of(self.frame, patch.box, self.camera, replace(self.config, side_px=2 * self.config.side_px))
-        clicked = Clicked.of(fine, clicks_px, z_m, scale)
-        whole = np.zeros(self.frame.shape, np.float32)
-        whole[fine.box.slices] = fine.up(by_connection(fine, clicked, height.on(fine, clicked)))
-        return patch.down(whole)
 
     def correct(self, was: np.ndarray, known_px: np.ndarray) -> tuple[Box, np.ndarray]:
         """Cut anew, from the clicks that correct a mask (H, W) bool, and from what is right about the mask.

@@ -33,6 +33,8 @@ from p2p_lib.segmenters.builtin.view import Claim, View
 #: An object with a confident pose is cut out in every third frame, in turns, and moved by the optical flow in between.
 _TURNS = 3
 _NO_HINT = Hint()
+#: Objects are beside each other whose boxes are so near, px.
+_BESIDE_PX = 12
 
 
 class Refiner(Protocol):
@@ -129,45 +131,60 @@ class BuiltinSegmenter:
         """Locate one object outside what is ``taken`` (H, W) bool; the updated target and its probability map."""
         target = self._targets.get(name, Target()).with_learnt(view.previous, view.focal_px, view.config)
         if cutter is not None:
-            claim = self._segment_prompt(view, cutter, target, hints.get(name, _NO_HINT), taken)
+            claim = self._segment_prompt(view, cutter, target, self._hints(name, hints), taken)
             return Target(), claim  # its colours and its size are learnt anew
         predicted = None if target.seen is None else predict(view, target)
         if predicted is not None and not (self._cuts(target, due) or predicted.doubtful):
             return target, predicted.claim
-        return self._cut_out(view, target, hints.get(name, _NO_HINT), taken, predicted)
+        return self._cut_out(view, target, self._hints(name, hints), taken, predicted)
 
-    def _segment_prompt(self, view: View, cutter: Cutter, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
+    def _hints(self, name: str, hints: Mapping[str, Hint]) -> tuple[Hint, list[Hint]]:
+        """The hint of an object, and those of objects beside it a frame ago: hints cost."""
+        seen = {other: target.seen for other, target in self._targets.items() if target.seen is not None}
+        own = seen.pop(name, None)
+        beside = [] if own is None else [other for other, at in seen.items() if at.box.near(own.box, _BESIDE_PX)]
+        return hints.get(name, _NO_HINT), [hints.get(other, _NO_HINT) for other in beside]
+
+    def _segment_prompt(
+        self, view: View, cutter: Cutter, target: Target, told: tuple[Hint, list[Hint]], taken: np.ndarray
+    ) -> Claim:
         """Segment from a prompt; clicks on an object that has a mask in this frame correct that mask."""
         was = np.zeros(view.frame.shape, bool)
         predicted = None if target.seen is None else predict(view, target)
         if cutter.prompt.box_px is None:
-            _mark(was, self._cut_out(view, target, hint, taken, predicted)[1])
+            _mark(was, self._cut_out(view, target, told, taken, predicted)[1])
         if was.any():
-            return cutter.correct(was, hint.uv_px)
+            return cutter.correct(was, told[0].uv_px)
         return cutter.start() if cutter.prompt.starts else None
 
     def _cut_out(
-        self, view: View, target: Target, hint: Hint, taken: np.ndarray, predicted: Prediction | None
+        self,
+        view: View,
+        target: Target,
+        told: tuple[Hint, list[Hint]],
+        taken: np.ndarray,
+        predicted: Prediction | None,
     ) -> tuple[Target, Claim]:
         """Follow an object that was seen a frame ago, else find it outside what is ``taken`` (H, W) bool."""
+        hint, others = told
         agreed = hint.T_cam_obj is not None and len(hint.uv_px) >= view.config.find_points
         held, target = target.confident, replace(target, confident=agreed)
         if hint.gone:
             return target, None
         if predicted is None or hint.sighted:  # a sighting overrules the mask that was followed
-            return replace(target, proven=agreed or hint.sighted), find(view, target, hint, taken)
+            return replace(target, proven=agreed or hint.sighted), find(view, target, hint, others, taken)
         due = target.confident and target.past.due(view.frame)
         target = with_room(view, target, hint) if due else target
-        claim = follow(view, target, hint, predicted)
+        claim = follow(view, target, hint, others, predicted)
         if agreed and claim is not None:
             if holds(claim, hint.uv_px):
                 target = replace(target, proven=True)
             elif held or not target.proven:  # its points overrule the flow, or a find by colour
-                claim = find(view, target, hint, taken) or claim
+                claim = find(view, target, hint, others, taken) or claim
             else:
                 target = replace(target, confident=False)
         if claim is None:  # too fast for the flow: look near its last place
-            return target, find(view, target, near_last(view, target, hint), taken)
+            return target, find(view, target, near_last(view, target, hint), others, taken)
         if due and hint.T_cam_obj is not None:
             target = replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj))
         return target, claim

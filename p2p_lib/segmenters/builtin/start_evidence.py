@@ -16,6 +16,7 @@ from p2p_lib.segmenters.builtin.patch import (
     Patch,
     approximate_median,
     components_touching,
+    connected_components,
     dilated,
     plane_heights,
     support_plane,
@@ -38,8 +39,6 @@ _CONNECTED, _APART, _UNLIKE = 2.5, -1.5, 1.0
 _NEARBY, _LOOK, _SHADE = 0.2, 4.0, 0.4
 #: Standard deviations up to which a colour is the support's, and from which on another; so many times it is looked.
 _ALIKE, _OTHER, _LOOKS = 3.0, 4.0, 4
-#: What stands on a support is linked over smaller gaps, as between inside and outside of a cup, m.
-_LINK_M = 0.03
 #: A component may cover up to this share of the patch's border by accident.
 _AT_THE_BORDER = 0.02
 #: An unmeasured pixel has this share of its nearest measured one's log-odds.
@@ -132,20 +131,20 @@ def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndar
 
 
 def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
-    """Evidence for what is linked with the clicks and is not their support, if it ends within the patch.
+    """Evidence for what depth connects with the clicks and is not their support, if it ends within the patch.
 
     What is not the support stands above it or, as the handle of a fork on a table, does not look like it.
     """
     log_odds, measured = np.zeros(patch.shape, np.float32), patch.depth_m > 0
     above = np.zeros(patch.shape, bool) if height.flat else height.log_odds >= 0
     if not height.flat:
-        component = components_touching(patch.linked(above, measured & ~above, _LINK_M), clicked.seeds)
+        component = components_touching(connected_components(above & patch.smooth), clicked.seeds)
         log_odds[measured & ~dilated(component, 1)] = _APART
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = _CONNECTED
     if height.plane is not None:
         other = (above & measured) | unlike(patch, height.plane)
-        component = components_touching(patch.linked(other, ~other, _LINK_M), clicked.seeds)
+        component = components_touching(connected_components(other & (patch.smooth | ~measured)), clicked.seeds)
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
     return log_odds
