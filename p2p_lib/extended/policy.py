@@ -316,12 +316,11 @@ class OurPolicy(Policy):
     def request(self, obs: OurObservation, known: Known, best: Proposal, admission: Admission) -> Requests:
         """Tracks of keypoints that contradict the pose are rejected, if the frame is learnt from and others agree.
 
-        A pose that the surface alone has says nothing against points, and uncertain ones took no part in it.
+        A pose that the surface alone has says nothing against points.
         """
         if "rejection" not in self.on or not admission.learns or best.hypothesis.support < FIXED_BY:
             return Requests()
-        certain = self.correspondences(obs, known)[1]
-        return Requests(reject=known.map.ids[certain & known.map.promoted & ~best.hypothesis.inliers])
+        return Requests(reject=known.map.ids[known.keypoints(obs) & ~best.hypothesis.inliers])
 
     # -- the object's life ---------------------------------------------------------------------
 

@@ -397,14 +397,6 @@ def test_a_pose_that_no_point_agrees_with_rejects_none():
     assert not len(step.requests.reject)
 
 
-@pytest.mark.parametrize(("uncertainty", "rejects"), [(0.1, True), (0.9, False)])
-def test_uncertain_tracks_are_not_rejected(uncertainty, rejects):
-    """They take no part in registration, so that they agree with nothing."""
-    lump = settled(begun(), [2])
-    step = lump.see(turned(4), moved_to(turned(18), lump, visible_first(8), uncertainty))
-    assert bool(len(step.requests.reject)) == rejects and step.estimate.inliers > 8
-
-
 @pytest.mark.parametrize("gates", [True, False])
 def test_what_slides_over_the_object_does_not_enter_the_graph(gates):
     """As a reflection does, from keyframe to keyframe: the pose may be right, and yet the graph would follow it."""
