@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pandas import Series
 from scipy.spatial import cKDTree
 
 from p2p_lib.core import se3
@@ -155,10 +154,3 @@ class Playback:
     def masks(self, i: int) -> dict[str, np.ndarray]:
         """The masks (H, W) bool of row i, as the run gives them; none without a sequence."""
         return {} if self.sequence is None else self.run.masks(self.sequence, int(self.frame_index[i]))
-
-    def add_m(self, name: str) -> np.ndarray:
-        """(n,) ADD in metres, NaN where there is no pose or no truth."""
-        if self.evaluation is None or name not in self.evaluation.objects:
-            return np.full(len(self), np.nan)
-        score = self.evaluation.objects[name]
-        return Series(score.add_m, score.frame_index).reindex(self.frame_index).replace(np.inf, np.nan).to_numpy()

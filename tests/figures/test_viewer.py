@@ -191,12 +191,6 @@ def test_masks_are_the_datasets_or_those_that_were_kept(made, folder, tmp_path):
     assert masks.keys() == {"box"} and masks["box"].sum() == 300
 
 
-def test_errors_of_scored_frames_have_their_places(made, folder):
-    add_m = Playback.of(folder, made.sequence).add_m("box")
-    assert np.flatnonzero(add_m > 0.003).tolist() == [5, 6, 7] and np.isnan(add_m[8])
-    assert add_m[6] == pytest.approx(0.02, abs=1e-6)
-
-
 # --- the command -----------------------------------------------------------------------------------
 
 
