@@ -88,10 +88,10 @@ def test_what_lies_flat_in_its_support_is_not_told_from_it_by_depth(plane):
 def test_the_surface_speaks_for_what_lies_on_it_and_against_what_is_before_it():
     distance_m = np.full((H, W), np.nan, np.float32)
     distance_m[:, :4], distance_m[:, 4:8], distance_m[:, 8:12] = 0.001, 0.05, -0.05
-    says = by_surface(patch_of(np.ones((H, W), np.float32)), Hint(distance_m=distance_m), [], CONFIG)
+    says = by_surface(patch_of(np.ones((H, W), np.float32)), Hint(distance_m=distance_m), CONFIG)
     assert (says[:, :4] == CONFIG.surface_weight).all() and (says[:, 4:8] == -CONFIG.surface_weight).all()
     assert not says[:, 8:].any()
-    assert not by_surface(patch_of(np.ones((H, W), np.float32)), Hint(), [], CONFIG).any()
+    assert not by_surface(patch_of(np.ones((H, W), np.float32)), Hint(), CONFIG).any()
 
 
 def test_what_lies_on_the_surface_of_another_object_alone_is_not_of_this_one():
@@ -99,11 +99,11 @@ def test_what_lies_on_the_surface_of_another_object_alone_is_not_of_this_one():
     own, other = (np.full((H, W), np.nan, np.float32) for _ in range(2))
     own[:, :8], other[:, 4:12] = 0.001, 0.002
     points_px, patch = np.zeros((CONFIG.find_points, 2)), patch_of(np.ones((H, W), np.float32))
-    says = by_surface(patch, Hint(points_px, own), [Hint(points_px, other), Hint()], CONFIG)
+    says = by_surface(patch, Hint(points_px, own), CONFIG, [Hint(points_px, other), Hint()])
     assert (says[:, :8] == CONFIG.surface_weight).all() and (says[:, 8:12] == -CONFIG.surface_weight).all()
     assert not says[:, 12:].any()
-    assert (by_surface(patch, Hint(), [Hint(points_px, other)], CONFIG)[:, 4:12] == -CONFIG.surface_weight).all()
-    assert not by_surface(patch, Hint(), [Hint(points_px[1:], other)], CONFIG).any()
+    assert (by_surface(patch, Hint(), CONFIG, [Hint(points_px, other)])[:, 4:12] == -CONFIG.surface_weight).all()
+    assert not by_surface(patch, Hint(), CONFIG, [Hint(points_px[1:], other)]).any()
 
 
 def test_a_mask_moves_with_the_texture():
@@ -124,7 +124,7 @@ def test_nothing_far_from_a_known_surface_is_of_the_object():
     distance_m[:, : W // 2] = np.inf
     sure, unsure = (np.zeros((k, 2)) for k in (CONFIG.find_points, CONFIG.find_points - 1))
     patch = patch_of(np.ones((H, W), np.float32))
-    says = by_surface(patch, Hint(sure, distance_m), [], CONFIG)
-    before = by_surface(patch, Hint(unsure, distance_m), [], CONFIG)
+    says = by_surface(patch, Hint(sure, distance_m), CONFIG)
+    before = by_surface(patch, Hint(unsure, distance_m), CONFIG)
     far = patch.nearest(distance_m) == np.inf
     assert far.any() and (says[far] < before[far]).all() and not says[~far].any()

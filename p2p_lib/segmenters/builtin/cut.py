@@ -106,7 +106,7 @@ def strange(patch: Patch, mask: np.ndarray, own: np.ndarray) -> bool:
     return bool(evidence(own, histogram(patch.codes[~mask]))[patch.codes[mask]].mean() < _STRANGE)
 
 
-def by_surface(patch: Patch, hint: Hint, others: Sequence[Hint], config: SegmentationConfig) -> np.ndarray:
+def by_surface(patch: Patch, hint: Hint, config: SegmentationConfig, others: Sequence[Hint] = ()) -> np.ndarray:
     """(h, w) log-odds for pixels on the object's reconstructed surface, and against those before it or far off.
 
     Against those on the surfaces of ``others`` alone, too. Only poses that can be trusted say what is not the object's.

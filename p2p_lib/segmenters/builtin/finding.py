@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +30,7 @@ _MIN_COMPONENT_PX, _MIN_LIKELIER = 80, 1.0
 _LEAP_M = 0.15
 
 
-def find(view: View, target: Target, hint: Hint, others: Sequence[Hint], taken: np.ndarray) -> Claim:
+def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
     """Find a target where enough of its points are back or it is expected, outside ``taken`` (H, W) bool."""
     frame, cfg, uv_px = view.frame, view.config, hint.uv_px[~in_mask(hint.uv_px, taken)]
     if target.colours is None or target.size_m is None:
@@ -47,7 +46,7 @@ def find(view: View, target: Target, hint: Hint, others: Sequence[Hint], taken: 
     patch = Patch.of(frame, around((low + high) / 2, half, frame.shape), view.camera, cfg)
     barred = patch.down(taken.astype(np.float32)) > 0.5
     seeds = patch.dots(uv_px, 0 if expected else 1) & (patch.depth_m > 0) & ~barred
-    surface = by_surface(patch, hint, others, cfg)
+    surface = by_surface(patch, hint, cfg)
     outside = ~dilated(seeds | (surface > 0), 3)
     plane = support_plane(patch, (patch.depth_m > 0) & outside)
     log_odds, component = by_geometry(patch, seeds, plane, cfg)

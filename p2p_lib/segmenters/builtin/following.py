@@ -87,7 +87,7 @@ def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predi
     # Parts that come into view are connected with those that were seen before.
     log_odds += np.where(component, np.maximum(stays, 0), stays)
     log_odds[jumped] -= cfg.geometry_weight
-    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, others, cfg)
+    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg, others)
     x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
     adjacent = dilated((x > 0.5) & (patch.depth_m > 0), 1)
     x = np.where((patch.depth_m > 0) | (prior > 0.5) | adjacent, x, 0)

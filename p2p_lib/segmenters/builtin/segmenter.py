@@ -131,60 +131,61 @@ class BuiltinSegmenter:
         """Locate one object outside what is ``taken`` (H, W) bool; the updated target and its probability map."""
         target = self._targets.get(name, Target()).with_learnt(view.previous, view.focal_px, view.config)
         if cutter is not None:
-            claim = self._segment_prompt(view, cutter, target, self._hints(name, hints), taken)
+            claim = self._segment_prompt(view, cutter, target, hints, taken)
             return Target(), claim  # its colours and its size are learnt anew
         predicted = None if target.seen is None else predict(view, target)
         if predicted is not None and not (self._cuts(target, due) or predicted.doubtful):
             return target, predicted.claim
-        return self._cut_out(view, target, self._hints(name, hints), taken, predicted)
+        return self._cut_out(view, name, target, hints, taken, predicted)
 
-    def _hints(self, name: str, hints: Mapping[str, Hint]) -> tuple[Hint, list[Hint]]:
-        """The hint of an object, and those of objects beside it a frame ago: hints cost."""
-        seen = {other: target.seen for other, target in self._targets.items() if target.seen is not None}
-        own = seen.pop(name, None)
-        beside = [] if own is None else [other for other, at in seen.items() if at.box.near(own.box, _BESIDE_PX)]
-        return hints.get(name, _NO_HINT), [hints.get(other, _NO_HINT) for other in beside]
+    def _beside(self, name: str, target: Target, hints: Mapping[str, Hint]) -> list[Hint]:
+        """The hints of objects that were beside this one a frame ago, and of no others: hints cost."""
+        assert target.seen is not None  # a frame ago
+        box = target.seen.box
+        seen = {other: its.seen for other, its in self._targets.items() if other != name and its.seen}
+        return [hints.get(other, _NO_HINT) for other, at in seen.items() if at.box.near(box, _BESIDE_PX)]
 
     def _segment_prompt(
-        self, view: View, cutter: Cutter, target: Target, told: tuple[Hint, list[Hint]], taken: np.ndarray
+        self, view: View, cutter: Cutter, target: Target, hints: Mapping[str, Hint], taken: np.ndarray
     ) -> Claim:
         """Segment from a prompt; clicks on an object that has a mask in this frame correct that mask."""
-        was = np.zeros(view.frame.shape, bool)
+        was, name = np.zeros(view.frame.shape, bool), cutter.prompt.name
         predicted = None if target.seen is None else predict(view, target)
         if cutter.prompt.box_px is None:
-            _mark(was, self._cut_out(view, target, told, taken, predicted)[1])
+            _mark(was, self._cut_out(view, name, target, hints, taken, predicted)[1])
         if was.any():
-            return cutter.correct(was, told[0].uv_px)
+            return cutter.correct(was, hints.get(name, _NO_HINT).uv_px)
         return cutter.start() if cutter.prompt.starts else None
 
     def _cut_out(
         self,
         view: View,
+        name: str,
         target: Target,
-        told: tuple[Hint, list[Hint]],
+        hints: Mapping[str, Hint],
         taken: np.ndarray,
         predicted: Prediction | None,
     ) -> tuple[Target, Claim]:
         """Follow an object that was seen a frame ago, else find it outside what is ``taken`` (H, W) bool."""
-        hint, others = told
+        hint = hints.get(name, _NO_HINT)
         agreed = hint.T_cam_obj is not None and len(hint.uv_px) >= view.config.find_points
         held, target = target.confident, replace(target, confident=agreed)
         if hint.gone:
             return target, None
         if predicted is None or hint.sighted:  # a sighting overrules the mask that was followed
-            return replace(target, proven=agreed or hint.sighted), find(view, target, hint, others, taken)
+            return replace(target, proven=agreed or hint.sighted), find(view, target, hint, taken)
         due = target.confident and target.past.due(view.frame)
         target = with_room(view, target, hint) if due else target
-        claim = follow(view, target, hint, others, predicted)
+        claim = follow(view, target, hint, self._beside(name, target, hints), predicted)
         if agreed and claim is not None:
             if holds(claim, hint.uv_px):
                 target = replace(target, proven=True)
             elif held or not target.proven:  # its points overrule the flow, or a find by colour
-                claim = find(view, target, hint, others, taken) or claim
+                claim = find(view, target, hint, taken) or claim
             else:
                 target = replace(target, confident=False)
         if claim is None:  # too fast for the flow: look near its last place
-            return target, find(view, target, near_last(view, target, hint), others, taken)
+            return target, find(view, target, near_last(view, target, hint), taken)
         if due and hint.T_cam_obj is not None:
             target = replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj))
         return target, claim
