@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SamplingConfig, SegmentationConfig, TrackingConfig
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
-from p2p_lib.core.plugins import find, knows, load
+from p2p_lib.core.plugins import check_part, find, knows, load
+
+T = TypeVar("T")
 
 #: 2D trackers by the name that --tracker takes, as module:callable(config, rng).
 TRACKERS = {
@@ -58,19 +60,21 @@ def make_tracker(
 
     A name may be ``package.module:Class``. :class:`BadInput` lists the known names where this one is unknown.
     """
-    made = _find("tracker", tracker, TRACKERS)(config, rng) if isinstance(tracker, str) else tracker
+    made = _find("tracker", tracker, TRACKERS)(config, rng) if isinstance(tracker, str) else _own("tracker", tracker)
     return load(_SHORT_HORIZON)(made, config.forget_after) if config.forget_after else made
 
 
 def make_detector(detector: str | Detector, config: SamplingConfig, rng: np.random.Generator | None = None) -> Detector:
     """The detector of this name, or the one given; :class:`BadInput` lists the known names."""
-    return _find("detector", detector, DETECTORS)(config, rng) if isinstance(detector, str) else detector
+    return (
+        _find("detector", detector, DETECTORS)(config, rng) if isinstance(detector, str) else _own("detector", detector)
+    )
 
 
 def make_segmenter(segmenter: str | Segmenter, camera: Camera, config: SegmentationConfig) -> Segmenter:
     """The segmenter of this name, or the one given; :class:`BadInput` lists the known names."""
     if not isinstance(segmenter, str):
-        return segmenter
+        return _own("segmenter", segmenter)
     return _find("segmenter", segmenter, SEGMENTERS)(camera, config)
 
 
@@ -86,3 +90,9 @@ def make_recogniser(camera: Camera) -> Any:
 
 def _find(kind: str, name: str, known: dict[str, str]) -> Any:
     return find(kind, ALIASES.get(name, name), known, PROMISES[kind])
+
+
+def _own(kind: str, part: T) -> T:
+    """A part that was given, which has what the method asks of its kind."""
+    check_part(kind, part, PROMISES[kind])
+    return part

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 
 import numpy as np
 
@@ -31,7 +32,8 @@ class Camera:
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
-        if not np.isfinite(values).all() or self.fx <= 0 or self.fy <= 0:
+        numbers = all(isinstance(value, Real) and np.isfinite(value) for value in values)
+        if not numbers or self.fx <= 0 or self.fy <= 0:
             raise BadInput("camera", f"fx, fy, cx, cy = {values}", "finite numbers, focal lengths above 0 (pixels)")
         if self.width < 1 or self.height < 1:
             raise BadInput("camera", f"{self.width}x{self.height}", "an image size of at least 1x1 pixels")

@@ -164,7 +164,7 @@ def load_memories(paths: Sequence[str | Path]) -> dict[str, ObjectMemory]:
     for path in (file for given in paths for file in _files(Path(given))):
         memory = load_memory(path)
         if memory.name in found:
-            fix = "Give one of them, or learn the objects under different names."
+            fix = "Give one of them; in Python, add_object takes the other under another name."
             raise BadInput("memory", f"two of {memory.name!r}", "one an object", fix)
         found[memory.name] = memory
     return found
@@ -175,6 +175,9 @@ def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     folder = path / "maps" if (path / "maps").is_dir() else path
+    if folder is path and (path / "run.json").is_file():
+        fix = "An offline pass keeps none: give the run that it was made of."
+        raise MissingData(str(path), f"a run without maps, expected {_EXPECTED}", fix)
     if not (files := sorted(folder.glob("*.npz"))):
         raise MissingData(str(folder), f"no file in it, expected {_EXPECTED}")
     return files

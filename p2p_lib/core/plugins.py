@@ -97,8 +97,7 @@ def _checked(kind: str, name: str, where: str, has: Iterable[str]) -> Any:
         near = did_you_mean(attribute, [key for key in vars(found) if not key.startswith("_")], f"{module}:")
         raise BadInput(_SAID.get(kind, kind), repr(name), f"something called {attribute} in {found.__name__}", near)
     part = getattr(found, attribute) if attribute else found
-    lacking = [key for key in has if isinstance(part, type) and not _promises(part, key)]
-    if lacking:
+    if lacking := [key for key in has if isinstance(part, type) and not _promises(part, key)]:
         raise BadInput(f"{kind} {name}", f"a class without {', '.join(lacking)}", f"a {kind}, see CONTRIBUTING.md")
     return part
 
@@ -106,3 +105,12 @@ def _checked(kind: str, name: str, where: str, has: Iterable[str]) -> Any:
 def _promises(part: type, key: str) -> bool:
     """Whether instances have it: a method, a value of the class, or one that it annotates."""
     return hasattr(part, key) or any(key in vars(c).get("__annotations__", {}) for c in part.__mro__)
+
+
+def check_part(kind: str, part: object, has: Iterable[str]) -> None:
+    """Refuse what is given as a part and lacks some of ``has``; :class:`BadInput` says what."""
+    if isinstance(part, type):
+        raise BadInput(kind, f"the class {part.__name__}", f"a {kind}: an instance, or a name")
+    if lacking := [key for key in has if not hasattr(part, key)]:
+        got = f"{type(part).__name__} without {', '.join(lacking)}"
+        raise BadInput(kind, got, f"a {kind}, see CONTRIBUTING.md")

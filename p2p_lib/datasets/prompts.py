@@ -19,7 +19,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depths_at
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.files import file_name, parse_json, read_text, replace_text
 from p2p_lib.core.prompts import Prompt, check_apart, check_prompt
 from p2p_lib.core.types import Frame
@@ -71,7 +71,10 @@ def parse_prompts(content: object, folder: Path | None = None) -> tuple[Prompt, 
 
 def _prompt(given: Any, folder: Path | None) -> Prompt:
     """An entry of a file."""
-    if not isinstance(given, dict) or not {"name"} < given.keys() <= KEYS:
+    if isinstance(given, dict) and (unknown := sorted(map(str, given.keys() - KEYS))):
+        expected = f"some of {', '.join(sorted(KEYS))}"
+        raise BadInput(f"prompts: an object {str(given)[:60]}", unknown[0], expected, did_you_mean(unknown[0], KEYS))
+    if not isinstance(given, dict) or not {"name"} < given.keys():
         raise BadInput("prompts", f"the object {str(given)[:60]}", _FORM)
     mask = None
     if isinstance(given.get("mask"), dict):

@@ -244,6 +244,8 @@ class RunWriter:
         parameters = read_text(self.path / "config.toml", "the parameters of the run") == self._config.to_toml()
         theirs: dict[str, Any] = {key: earlier.get(key) for key in mine}
         theirs["objects"] = theirs["objects"][: len(mine["objects"])]  # others may have come later
+        for info in (mine, theirs):  # what was read before the first bad image is the same
+            info["options"] = {**(info.get("options") or {}), "skip_bad": None}
         if (start := self.redo_from) is not None:
             for info in (mine, theirs):
                 info["prompts"] = [prompt for prompt in info.get("prompts") or [] if prompt["frame"] < start]

@@ -141,6 +141,8 @@ class Point2Pose(pipeline.Point2Pose):
         if prompt or more or name in self.objects:
             got = "clicks or a mask, too" if prompt or more else f"{name!r}, which is in use"
             raise BadInput("add_object with a memory", got, "a new name and the memory alone")
+        if not isinstance(memory, ObjectMemory):
+            raise BadInput("add_object with a memory", type(memory).__name__, "a memory, as load_memory reads it")
         if not chosen(self.config):
             raise BadInput("add_object with a memory", "mechanisms none", "preset default: the paper has no memory")
         self.begin(name)

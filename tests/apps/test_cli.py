@@ -378,6 +378,13 @@ def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(seque
     assert run(sequence, tmp_path / "run", "--skip-bad", "--save-masks", "--resume") == 0
 
 
+def test_a_run_that_a_bad_image_ended_goes_on_without_it(sequence, tmp_path, capsys):
+    (sequence / "depth/0005.png").write_bytes(b"no image")
+    assert run(sequence, tmp_path / "run") == 2 and "--skip-bad" in capsys.readouterr().err
+    assert run(sequence, tmp_path / "run", "--skip-bad", "--resume") == 0
+    assert load_run(tmp_path / "run").objects["object"].frame_index.tolist() == [0, 1, 2, 3, 4, 6, 7]
+
+
 @pytest.mark.parametrize(
     "masks, kept, told", [("first", False, True), ("first", True, False), ("dataset", False, False)]
 )
@@ -489,7 +496,7 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     assert cli.main(["benchmark", "--list"]) == 0
     first, *table = capsys.readouterr().out.splitlines()
     assert any(re.match(r"\d+ of 19 plans can run here and now in full; \d+ of \d+ methods", line) for line in table)
-    assert any(re.match(r"ycbineoat +0 of 54 +YCBInEOAT$", line) for line in table)
+    assert any(re.match(r"ycbineoat +0 of 63 +YCBInEOAT$", line) for line in table)
     assert any(re.match(r"sampling_embedded +18 of 30 ", line) for line in table)
     assert max(map(len, [first, *table])) <= 100
     assert cli.main(["benchmark", "--list", "ycbineoat", "runtime"]) == 0

@@ -80,7 +80,7 @@ def test_plans_are_part_of_an_installation():
 def test_what_is_not_there_says_why_and_costs_nothing(monkeypatch):
     monkeypatch.delenv("P2P_DATA", raising=False)
     jobs = jobs_of(read_plan("ycbineoat"), "full")
-    assert len(jobs) == 6 * 27 and not any(job.key for job in jobs)
+    assert len(jobs) == 7 * 27 and not any(job.key for job in jobs)
     assert {"below $P2P_DATA, which is not set" in job.reason for job in jobs if job.method.name == "Ours"} == {True}
     fetch = "; ".join(f"p2p data fetch {name}" for name in ("sam2_video", "superpoint", "tapir"))
     asked = {job.reason for job in jobs if job.method.name == "paper_full"}

@@ -21,6 +21,11 @@ cameras = st.builds(
 )
 
 
+def test_a_focal_length_in_letters_is_refused():
+    with pytest.raises(BadInput, match="expected finite numbers"):
+        Camera("600", 600, 320, 240, 640, 480)
+
+
 # --- projecting and back -----------------------------------------------------------------------
 
 

@@ -165,6 +165,10 @@ def test_what_cannot_be_had_is_said_in_one_line(theirs, sequence):
         make_tracker("their_parts:Unfinished", tracking)
     with pytest.raises(BadInput, match="a class without detect"):
         make_detector("their_parts:Mine", sampling)
+    with pytest.raises(BadInput, match="segmenter: got object without names, segment, remove"):
+        make_segmenter(object(), Camera(100, 100, 10, 10, 20, 20), preset().segmentation)
+    with pytest.raises(BadInput, match="detector: got the class object, expected a detector: an instance, or a name"):
+        make_detector(object, sampling)
     with pytest.raises(BadInput, match="a class without names, segment, remove"):
         make_segmenter("their_parts:Mine", Camera(100, 100, 10, 10, 20, 20), preset().segmentation)
     with pytest.raises(BadInput, match=r"format: got 'marks', .* or your own as package.module:Class"):

@@ -44,6 +44,7 @@ def test_every_kind_survives_the_file(tmp_path):
         "mask of numbers": ({"mask": [[0, 1]]}, BadInput, "an image beside the prompts"),
         "mask and clicks": ({"mask": "m.png", "points": [[1, 2]]}, BadInput, "a mask and clicks"),
         "nothing": ({}, BadInput, "at least one"),
+        "a word misspelt": ({"pionts": [[1, 2]]}, BadInput, r"got pionts, expected some of .* Did you mean points\?"),
     }.values(),
 )
 def test_entries_that_do_not_fit_are_named(entry, error, why, tmp_path):

@@ -121,6 +121,9 @@ def test_a_folder_gives_all_its_memories(learnt, tmp_path):
     (tmp_path / "none").mkdir()
     with pytest.raises(MissingData, match="no file in it, expected a memory"):
         load_memories([tmp_path / "none"])
+    (tmp_path / "none/run.json").write_text("{}")
+    with pytest.raises(MissingData, match=r"a run without maps, .* An offline pass keeps none"):
+        load_memories([tmp_path / "none"])
 
 
 def test_two_of_one_name_and_an_empty_map_are_refused(learnt, kept):
@@ -145,6 +148,8 @@ def test_a_memory_goes_with_nothing_else_and_not_with_the_paper(crossing, learnt
     with pytest.raises(BadInput, match="preset default"):
         Point2Pose(crossing.camera, preset("paper")).add_object("box", memory=learnt.memory)
     method = Point2Pose(crossing.camera)
+    with pytest.raises(BadInput, match="got str, expected a memory, as load_memory reads it"):
+        method.add_object("box", memory="box.npz")
     method.add_object("box", memory=learnt.memory)
     with pytest.raises(BadInput, match="in use"):
         method.add_object("box", memory=learnt.memory)

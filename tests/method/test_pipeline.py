@@ -1,7 +1,9 @@
 """The whole loop on a small rendered scene whose poses are known exactly: cartons before a printed wall."""
 
+import builtins
 import re
 import signal
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -199,6 +201,33 @@ def test_an_object_that_was_named_alone_says_what_it_waits_for():
     assert method.step(film()[2][0], {"left": np.zeros((300, 400), bool)})["left"].reason == "not seen yet"
     started = [method.step(frame, {"left": masks["left"]})["left"].status for frame, masks in film()[3:5]]
     assert started[-1] is Status.TRACKED
+
+
+def test_a_name_that_no_file_can_have_is_refused_before_anything_is_tracked():
+    method = Point2Pose(CAMERA, quick())
+    for name in ("a/b", ""):
+        with pytest.raises(BadInput, match="object name"):
+            method.add_object(name)
+    assert not method.objects
+
+
+def test_a_ctrl_c_that_a_library_takes_for_itself_is_heard(monkeypatch):
+    """trimesh takes whatever is raised while it imports a library for that library's being missing."""
+
+    def imported(name, *more, real=builtins.__import__):
+        if name == "trimesh":
+            with suppress(BaseException):
+                signal.raise_signal(signal.SIGINT)
+        return real(name, *more)
+
+    method = Point2Pose(CAMERA)
+    monkeypatch.setattr(builtins, "__import__", imported)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            method.add_object("left")
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("name", ["default", "paper"])
