@@ -428,6 +428,15 @@ def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, c
     assert "its longest side in centimetres" in capsys.readouterr().err
 
 
+def test_why_a_run_is_not_scored_is_said_once(sequence, tmp_path, capsys):
+    """Behind what says already which run it is."""
+    shutil.rmtree(sequence / "models")
+    assert run(sequence, tmp_path / "run") == 0
+    assert f"Results in {tmp_path / 'run'}; not scored, object: no model for ADD" in capsys.readouterr().out
+    assert cli.main(["eval", str(tmp_path / "run")]) == 0
+    assert "Not scored: object: no model for ADD" in capsys.readouterr().out
+
+
 def test_config_explains_every_parameter_and_how_the_presets_differ(capsys):
     from p2p_lib.core.config import diff, parameters, preset
 
