@@ -134,6 +134,26 @@ def test_its_commands(folder, words, said):
     assert ran.returncode == 0 and said in ran.stdout, ran.stdout[-1000:] + ran.stderr[-1000:]
 
 
+PLAN = """
+title = "A few frames"
+[[method]]
+name = "points"
+settings = { "method.surface" = false, "method.graph" = false }
+[quick]
+seeds = [0]
+sequence = [{ name = "synthetic/crossing", objects = ["box"], stop = 4 }]
+[full]
+seeds = [0]
+sequence = [{ name = "synthetic/crossing" }]
+"""
+
+
+def test_a_benchmark_is_run_and_its_tables_are_written(folder):
+    (folder / "few.toml").write_text(PLAN)
+    assert "1 done, 0 failed" in p2p(folder, "benchmark", "few.toml", "--quick", "--out", "b", "--quiet", "--jobs", 1)
+    assert r"\begin{tabular}" in (folder / "b/few-quick/table.tex").read_text()
+
+
 def test_synthetic_sequences_are_rendered_and_played_as_a_camera(folder, monkeypatch):
     monkeypatch.setenv("P2P_CACHE", str(folder / "cache"))
     assert "Written to mug" in p2p(folder, "synth", "mug", "--out", "mug")

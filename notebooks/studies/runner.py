@@ -144,7 +144,7 @@ def run_notebooks(
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         index = write_gallery(home, profile)
-    say(f"Look at {_near(index)}: {_counted(results)}; images are in {_near(figures)}/")
+    say(f"Look at {_near(index)}, which has all that ran there; images are in {_near(figures)}/")
     return results
 
 

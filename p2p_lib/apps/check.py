@@ -100,7 +100,7 @@ def check_folder(
 
     Files that are missing or cannot be read are findings too, all that can be told without each other.
     """
-    config = config or preset()
+    config, prompts = config or preset(), tuple(prompts)
     try:
         opened = open_sequence(sequence, format, depth_scale, gaps=True)
     except P2PError as error:
@@ -124,7 +124,7 @@ def check_folder(
         except P2PError as error:
             firsts = {}
             wrong.append(_unreadable("clicks" if prompts else "masks", error))
-    sizes_m = lengths_m(sizes, dict.fromkeys([*sequence.objects, *firsts]))
+    sizes_m = lengths_m(sizes, dict.fromkeys(prompt.name for prompt in prompts) or sequence.objects)
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     scale = getattr(sequence, "depth_scale", 1.0)
     depth = _depth(frames, scale)
@@ -134,8 +134,8 @@ def check_folder(
     if depth.level is Level.WRONG:
         return findings  # nothing that follows would mean anything
     findings.append(_truth(sequence))
-    if not firsts:
-        return [*findings, _no_masks(sequence, any(masks), config)]
+    if not firsts:  # of prompts it is said already what is wrong with them
+        return findings if prompts else [*findings, _no_masks(sequence, any(masks), config)]
     if beyond := _beyond(firsts, config, scale):
         return [*findings, beyond]  # what follows would only be its consequences
     for name, (frame, mask) in firsts.items():
@@ -242,7 +242,8 @@ def _size(name: str, known_m: float, frame: Frame, mask: np.ndarray, camera: Cam
     text = size_doubt(known_m, measured_m := mask_length_m(frame, mask, camera))
     if text:
         return Finding(f"{name}: size", Level.LOOK, f"{text} (frame {frame.index})", "Mend K or --depth-scale first.")
-    return Finding(f"{name}: size", Level.OK, f"{100 * measured_m:.1f} cm long in frame {frame.index}, as it should be")
+    text = f"{100 * measured_m:.1f} cm long in frame {frame.index}, {measured_m / known_m:.2f} times its known length"
+    return Finding(f"{name}: size", Level.OK, f"{text}: no more than masks are off")
 
 
 def _times(sequence: Sequence) -> Finding:
@@ -335,7 +336,7 @@ def _registered(frames: list[Frame]) -> Finding:
     name, width = "registration", frames[0].shape[1]
     found = misfit(frames, OFFSET_SHARE * width)
     if found is None:
-        return Finding(name, Level.OK, "too few edges in depth and colour to tell whether they agree")
+        return Finding(name, Level.OPTIONAL, "too few edges in depth and colour to tell whether they agree")
     if found.gain <= GAIN:
         return Finding(name, Level.OK, "edges of depth lie on edges of colour")
     where = f"shifted by ({round(found.du_px):+d}, {round(found.dv_px):+d}) px"
@@ -404,7 +405,7 @@ def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Fin
     seen = [(frame, mask) for frame, mask in seen if mask.sum() >= config.lifecycle.min_mask_px]
     shares = np.array([background_share(mask, frame.depth_m) for frame, mask in seen])
     if np.isnan(shares).all():
-        return Finding(f"{name}: mask", Level.OK, "no depth along its rim to judge it by")
+        return Finding(f"{name}: mask", Level.OPTIONAL, "no depth along its rim to judge it by")
     typical = float(np.nanmedian(shares))
     text = f"{100 * typical:.0f} % of its rim lies on the background (median of {len(shares)} masks)"
     if typical > RIM_SHARE:

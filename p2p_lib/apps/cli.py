@@ -33,6 +33,7 @@ from p2p_lib.apps.command_line import (
     warn,
 )
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
+from p2p_lib.core.files import check_new
 from p2p_lib.core.options import RunOptions, lengths_m, names, pairs
 from p2p_lib.offline import PRODUCTS
 
@@ -69,7 +70,7 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
         "--batch",
         type=Path,
         metavar="FOLDER",
-        help="instead of SEQ: every recording in it, each into DIR/NAME; resumes",
+        help="instead of SEQ: every recording in it, each into DIR/NAME; resumes; exit code 2 if one could not be run",
     ),
     arg("--jobs", type=int, metavar="N", help="recordings of --batch at a time (default: one a core)"),
     arg("--scheduler", metavar="tcp://HOST:PORT", help="for --batch: a Dask cluster that sees DIR"),
@@ -99,11 +100,15 @@ def _run(a: argparse.Namespace) -> int:
         from p2p_lib.benchmark.batch import TABLE, run_batch
         from p2p_lib.core.tables import as_text
 
-        table = run_batch(a.batch, a.out, RunOptions.of_arguments(a), a.jobs, a.scheduler, not a.quiet)
+        table = run_batch(a.batch, a.out, _asked(a), a.jobs, a.scheduler, not a.quiet)
         print(f"{as_text(table)}\nResults in {a.out}, the table in {a.out / TABLE}")
-        return 0 if table["object"].notna().any() else P2PError.exit_code
+        if failed := int(table["object"].isna().sum()):
+            warn(
+                f"p2p run: {failed} of {table['recording'].nunique()} recordings could not be run; the table says why."
+            )
+        return P2PError.exit_code if failed else 0
     film = _film_wanted(a.overlay)
-    options = replace(RunOptions.of_arguments(a), save_masks=a.save_masks or film is not None)
+    options = replace(_asked(a), save_masks=a.save_masks or film is not None)
     how = {"if_exists": a.if_exists or "refuse", "redo_from": a.redo_from, "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
     print("\n".join(result.summary))
@@ -113,7 +118,10 @@ def _run(a: argparse.Namespace) -> int:
         print(result.evaluation.as_table())
         print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
     elif a.out.is_dir():
-        print(f"Results in {a.out}; not scored, {result.not_scored}." + f" Next: p2p view {a.out}" * result.tracked)
+        print(
+            f"Results in {a.out}; not scored, {_reason(result.not_scored, a.out)}."
+            + f" Next: p2p view {a.out}" * result.tracked
+        )
     if film is not None and not result.interrupted:
         print(f"Film in {film(a.out, a.overlay)}")
     if result.interrupted:
@@ -139,7 +147,11 @@ def _run(a: argparse.Namespace) -> int:
         stop="end before the camera's J-th image (default: Ctrl-C)",
     ),
     arg("--to", metavar="URL", help="send the lines to tcp://HOST:PORT or udp://HOST:PORT, not to standard output"),
-    arg("--listen", action="store_true", help="lines of JSON on standard input add, correct and remove objects"),
+    arg(
+        "--listen",
+        action="store_true",
+        help="lines of JSON on standard input add, correct and remove objects; their frame is the next one",
+    ),
     arg("--click", action="store_true", help="a page on the newest image adds, corrects and removes objects"),
     arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
     _FORCE,
@@ -155,7 +167,7 @@ def _live(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.prompts import load_prompts
     from p2p_lib.datasets.run_writer import look_into
 
-    options, count, first = RunOptions.of_arguments(a), LiveCount(), None
+    options, count, first = _asked(a), LiveCount(), None
     options.config()  # what does not fit is said before the camera starts
     _film_wanted(a.overlay)
     keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
@@ -237,14 +249,14 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
 
     run = load_run(a.run)
     score, not_scored = None, ""
-    known_m = lengths_m(options.sizes, run.objects)
+    known_m = lengths_m(options.sizes or (run.info.get("options") or {}).get("sizes"), run.objects)
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
             score = evaluate(run, options.models, a.align, a.min_visible_px)
         except MissingData as error:
-            if run.points or options.models:
+            if run.points.keys() & run.objects.keys() or options.models:
                 raise
-            not_scored = str(error)
+            not_scored = _reason(str(error), a.run)
     elif given_models(options.models or {}, run.objects):
         warn("p2p eval: --models is not used, because the run has no truth.")
     for name, text in size_doubts(a.run, known_m).items() if score else ():
@@ -407,20 +419,23 @@ def _refine(a: argparse.Namespace) -> None:
     "write a run's poses as BOP, TUM or a dataset keeps them, a labelled dataset, or textured models",
     _RUN,
     arg("--format", required=True, choices=("bop", "tum", "poses", *PRODUCTS), help=_FILES),
-    arg("--out", type=Path, required=True, metavar="DIR", help="folder for the files"),
+    arg("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the files"),
     arg("--frame", choices=("object", "model"), help="the tracker's (bop without truth needs it) or the model's"),
     arg("--min-confidence", type=float, metavar="C", help="leave less confident poses out (default 0, of labels 0.5)"),
     arg("--faces", type=int, default=5000, metavar="N", help="of a textured model, at most (default 5000)"),
     QUIET,
 )
 def _export(a: argparse.Namespace) -> None:
+    check_new(a.out)  # before a model takes its minutes
     if a.format in PRODUCTS:
         from p2p_lib.offline.products import write_product
 
         print(write_product(a.run, a.format, a.out, a.min_confidence, a.faces, not a.quiet))
         return
+    from p2p_lib.offline.finished import load_posed
     from p2p_lib.run import export_run
 
+    load_posed(a.run)
     written = export_run(a.run, a.format, a.out, a.frame, a.min_confidence or 0.0)
     files = (f"{path}/*.txt ({len(list(path.iterdir()))})" if path.is_dir() else str(path) for path in written)
     print(f"Written: {', '.join(files)}")
@@ -473,6 +488,19 @@ def _notebooks(a: argparse.Namespace) -> None:
     parameters = pairs(a.parameter or (), "--parameter", "NAME=VALUE")
     how = {"only": names(a.only) or (), "jobs": a.jobs, "parameters": parameters, "out": a.out}
     study("runner").run_notebooks(a.profile, **how)
+
+
+def _asked(a: argparse.Namespace) -> RunOptions:
+    """The options of something that is tracked; one without what it is about is refused."""
+    options = RunOptions.of_arguments(a)
+    if options.frozen and not options.memory:
+        a.parser.error("--frozen keeps the maps of --memory as they are: give --memory PATH, or leave it out")
+    return options
+
+
+def _reason(not_scored: str, folder: Path) -> str:
+    """Why a run is not scored, behind words that say already which run, and that it is not."""
+    return not_scored.removeprefix(f"{folder}: nothing to score: ")
 
 
 def _film_wanted(path: Path | None) -> Callable[..., Path] | None:

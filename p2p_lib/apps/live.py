@@ -7,12 +7,14 @@ and counted.
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from p2p_lib.apps.click import Clicker, wait_for_clicks
 from p2p_lib.apps.live_click import LiveClicker
 from p2p_lib.apps.live_words import Words
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.memory import load_memories
@@ -27,6 +30,7 @@ from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate, status_text
 from p2p_lib.datasets.cameras import DEFAULT_BACKLOG, LiveCamera, Newest, Stream
+from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import Film
@@ -60,6 +64,35 @@ class LiveCount:
     def __str__(self) -> str:
         rate = f" ({self.frames / self.seconds:.1f} Hz)" if self.seconds else ""
         return f"{self.frames} frames in {self.seconds:.1f} s{rate}, {self.dropped} dropped"
+
+
+@dataclass
+class _Until:
+    """A camera up to its image ``stop``: none from there on is read, to push one before it out of the backlog."""
+
+    source: LiveCamera
+    stop: float
+    reached: bool = False
+
+    @property
+    def name(self) -> str:
+        """The camera's."""
+        return self.source.name
+
+    @property
+    def camera(self) -> Camera:
+        """The camera's."""
+        return self.source.camera
+
+    def read(self) -> Frame | None:
+        """Its next frame; None at its end, and from ``stop`` on, which was ``reached`` then."""
+        frame = self.source.read()
+        self.reached = frame is not None and frame.index >= self.stop
+        return None if self.reached else frame
+
+    def close(self) -> None:
+        """Stop the camera."""
+        self.source.close()
 
 
 def track_live(
@@ -131,9 +164,10 @@ def track_live(
                     listen(of, estimates)
 
         start_s = monotonic()
-        newest = kept.enter_context(Newest(camera, {p.frame for p in prompts}, backlog))
+        until = _Until(camera, math.inf if options.stop is None else options.stop)
+        newest = kept.enter_context(Newest(until, {p.frame for p in prompts}, backlog))
         frame = first or newest.take()
-        while frame is not None and (frame is first or options.stop is None or frame.index < options.stop):
+        while frame is not None:
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))
             every_prompt += words.tell(method, frame.index) if words else []
@@ -142,7 +176,7 @@ def track_live(
                 count.count(frame)
             count.seconds = monotonic() - start_s
             frame = newest.take()
-        if frame is not None and options.stop is not None:
+        if until.reached and options.stop is not None:
             count.until(options.stop)
         for estimates in method.finish():
             tell(estimates)
@@ -193,7 +227,9 @@ def _kept(
     """Keeps every frame in a run's folder; Ctrl-C is how one stops a camera, so that it ends the run well."""
     sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
     objects = tuple(dict.fromkeys([*(prompt.name for prompt in prompts), *memories]))
-    writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, if_exists=if_exists)
+    # The models of all its objects: any may be added yet.
+    how: dict[str, Any] = {"models": find_models(sequence), "if_exists": if_exists}
+    writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, **how)
     writer.info |= described(method, options, prompts)
     keeper, stopped = Keeper(writer, method, options.save_masks, prompts), None
 

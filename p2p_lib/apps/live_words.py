@@ -25,8 +25,8 @@ class Words:
     """Lines of JSON that add, correct and remove objects, as they come: by a thread that reads them, or :meth:`hear`.
 
     ``{"name": "mug", "points": [[320, 240]]}`` starts an object in the next frame, or corrects its mask; ``negative``
-    and ``box`` as in a file of ``p2p click``, whose whole content is understood, too. ``{"remove": "mug"}`` ends it.
-    What does not fit is said, and changes nothing.
+    and ``box`` as in a file of ``p2p click``, whose whole content is understood, too: a ``frame`` in it means nothing
+    here. ``{"remove": "mug"}`` ends it. What does not fit is said, and changes nothing.
     """
 
     def __init__(self, lines: Iterable[str] | None, say: Callable[[str], object]):

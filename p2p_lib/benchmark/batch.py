@@ -86,7 +86,7 @@ def run_batch(
             bar.update()
     table = DataFrame([row for one in todo for row in _rows(one, out / one.key, done[one.key])])
     with replacing(out / TABLE) as file:
-        file.write(table.to_csv(index=False).encode())
+        file.write(table.astype({"frames": "Int64"}).to_csv(index=False).encode())  # whole, though some have none
     return table
 
 
@@ -98,7 +98,7 @@ def tracked(job: Recording, out: Path) -> Outcome:
 
 def _rows(job: Recording, out: Path, outcome: Outcome) -> list[dict[str, Any]]:
     if outcome.status != "done":
-        return [{"recording": job.key, "object": None, "note": outcome.reason}]
+        return [{"recording": job.key, "object": None, "frames": None, "note": outcome.reason}]
     done = load_run(out)
     try:
         scores = {row["object"]: row for row in evaluate(done).as_frame().to_dict("records")}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import string
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -54,6 +54,10 @@ _TEX |= {c: "\\" + c for c in "&%$#_{}"} | {"^": r"\textasciicircum{}"}
 
 def _tex(text: str) -> str:
     return "--" if text == "-" else text.translate(str.maketrans(_TEX))
+
+
+def _tex_row(cells: Iterable[str]) -> str:
+    return " & ".join(cells) + r" \\"
 
 
 @dataclass(frozen=True)
@@ -120,13 +124,16 @@ class Table:
 
     def latex(self) -> str:
         """For papers; needs the package booktabs."""
-        table = self._frame(_LATEX)
-        table.iloc[list(self.rules), 0] = [rf"\midrule {cell}" for cell in table.iloc[list(self.rules), 0]]
+        cells = self._frame(_LATEX).to_numpy().tolist()
+        rows = [rf"\midrule {_tex_row(row)}" if k in self.rules else _tex_row(row) for k, row in enumerate(cells)]
+        spans = [rf"\multicolumn{{{n}}}{{c}}{{{_tex(group)}}}" if n > 1 else _tex(group) for group, n in self.groups]
+        heads = [_tex_row(spans)] * bool(spans) + [_tex_row(map(_tex, self.heads))]
         sides = "l" * self.words + "c" * (len(self.heads) - self.words)
-        style = {"column_format": f"@{{}}{sides}@{{}}", "multicol_align": "c", "position_float": "centering"}
-        lines = table.style.hide(axis="index").to_latex(hrules=True, caption=_LATEX.escape(self.title), **style)
-        notes = " ".join(self._lettered_notes(r"\textsuperscript{{{}}}~", _LATEX.escape))
-        return lines.replace(r"\end{table}", rf"\par\footnotesize {notes}" + "\n" + r"\end{table}")
+        notes = " ".join(self._lettered_notes(r"\textsuperscript{{{}}}~", _tex))
+        lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(self.title)}}}"]
+        lines += [rf"\begin{{tabular}}{{@{{}}{sides}@{{}}}}", r"\toprule", *heads, r"\midrule", *rows]
+        lines += [r"\bottomrule", r"\end{tabular}", rf"\par\footnotesize {notes}", r"\end{table}"]
+        return "".join(f"{line}\n" for line in lines)
 
     def csv(self) -> str:
         """Values alone, and a column that says why some are missing."""

@@ -31,6 +31,15 @@ RULE = (
 )
 
 
+def load_posed(folder: str | Path) -> Run:
+    """The run in a folder; :class:`BadInput` for one without any pose, of which nothing can be made."""
+    run = load_run(folder)
+    if not any(obj.has_pose.any() for obj in run.objects.values()):
+        fix = "p2p check says what may be wrong with its data."
+        raise BadInput(str(folder), "a run without a single pose", "poses of an object at least", fix)
+    return run
+
+
 @dataclass(frozen=True, eq=False)
 class Finished:
     """A run with its sequence; raises :class:`MissingData` and :class:`BadInput` if any of it is missing.
@@ -45,10 +54,7 @@ class Finished:
     @classmethod
     def of(cls, folder: str | Path) -> Finished:
         """The run in a folder; it has poses, and all its images are still there."""
-        run = load_run(folder)
-        if not any(obj.has_pose.any() for obj in run.objects.values()):
-            fix = "p2p check says what may be wrong with its data."
-            raise BadInput(str(folder), "a run without a single pose", "poses of an object at least", fix)
+        run = load_posed(folder)
         sequence = reopen(run.info)
         if (last := max(int(obj.frame_index[-1]) for obj in run.objects.values())) >= len(sequence):
             got = f"{len(sequence)} images, and poses up to frame {last}"

@@ -82,7 +82,7 @@ def found(folder, name, **options):
 
 
 def alarms(findings):
-    return [f for f in findings if f.level is not Level.OK]
+    return [f for f in findings if f.level in (Level.LOOK, Level.WRONG)]
 
 
 def test_whether_there_is_truth_is_said(good):
@@ -176,6 +176,21 @@ def test_misfit_says_how_depth_lies(du, dv, scale):
 def test_misfit_of_registered_depth_is_none():
     assert misfit(scene(), 3).gain < 1.05
     assert misfit(scene(2, 1), 3).gain < 1.05, "within the tolerance"
+
+
+def test_what_cannot_be_told_is_not_fine(good, monkeypatch):
+    monkeypatch.setattr(check, "misfit", lambda *_: None)
+    finding = found(good, "registration")
+    assert finding.level is Level.OPTIONAL and "too few edges" in finding.text
+
+
+@pytest.mark.parametrize("frame", [0, 500])
+def test_of_clicks_that_hit_nothing_only_that_is_said(good, frame):
+    """Not that clicks are to be made; a size is of what was clicked on."""
+    prompts = [Prompt("mug", frame, [[5000, 5]])]
+    assert [f.name for f in alarms(check_folder(good, prompts=prompts, sizes={"mug": 11}))] == ["clicks"]
+    with pytest.raises(BadInput, match=r"size: got the name 'mugg', expected one of the objects: mug$"):
+        check_folder(good, prompts=prompts, sizes={"mugg": 11})
 
 
 def test_without_edges_nothing_is_claimed():
@@ -307,6 +322,8 @@ def test_a_known_size_tells_what_nothing_else_does(good):
     length_m = mask_length_m((frame := open_sequence(good).frame(0)), open_sequence(good).masks(0)["box"], CAMERA)
     known = {"sizes": {"box": 100 * length_m}}
     assert found(good, "box: size", **known).level is Level.OK
+    shorter = found(good, "box: size", sizes={"box": 90 * length_m})
+    assert shorter.level is Level.OK and "1.11 times its known length" in shorter.text
     wide = another_K(open_sequence(good), CAMERA.K * [[0.5, 1, 1], [1, 0.5, 1], [1, 1, 1]])
     finding = found(wide, "box: size", **known)
     assert finding.level is Level.LOOK and re.search(r"(1\.[5-9]|2\.0)\d? times: focal length", finding.text)

@@ -421,6 +421,10 @@ def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, c
     assert re.search(
         r"object: known to be 7\.0 cm long, measured 1\d\.\d cm in its masks, 2\.\d+ times", capsys.readouterr().out
     )
+    assert cli.main(["eval", str(tmp_path / "other")]) == 0
+    assert "known to be 7.0 cm long" in capsys.readouterr().err, "as the run was told"
+    assert cli.main(["eval", str(tmp_path / "other"), "--size", "object=15"]) == 0
+    assert "known to be" not in capsys.readouterr().err
     assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=40"]) == 0
     assert "or its length was never in view" in capsys.readouterr().err
     third = ["run", str(sequence), "--out", str(tmp_path / "third")]
@@ -429,6 +433,15 @@ def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, c
         assert "size: got the name 'mug', expected one of the objects: object" in capsys.readouterr().err
     assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=long"]) == 2
     assert "its longest side in centimetres" in capsys.readouterr().err
+
+
+def test_why_a_run_is_not_scored_is_said_once(sequence, tmp_path, capsys):
+    """Behind what says already which run it is."""
+    shutil.rmtree(sequence / "models")
+    assert run(sequence, tmp_path / "run") == 0
+    assert f"Results in {tmp_path / 'run'}; not scored, object: no model for ADD" in capsys.readouterr().out
+    assert cli.main(["eval", str(tmp_path / "run")]) == 0
+    assert "Not scored: object: no model for ADD" in capsys.readouterr().out
 
 
 def test_config_explains_every_parameter_and_how_the_presets_differ(capsys):
@@ -676,6 +689,9 @@ def test_a_damaged_run_is_named(case, done, tmp_path, capsys):
         (["run", "x", "--ouput", "y"], "no option --ouput. Did you mean --out?"),
         (["check", "x", "--jsn"], "no option --jsn. Did you mean --json? See p2p check --help"),
         (["eval", "x", "--align", "best"], "'best'"),
+        (["run", "x", "--out", "y", "--frozen"], "--frozen keeps the maps of --memory"),
+        (["run", "--batch", "x", "--out", "y", "--frozen"], "--frozen keeps the maps of --memory"),
+        (["live", "--camera", "folder:x", "--frozen"], "--frozen keeps the maps of --memory"),
     ],
 )
 def test_words_that_are_no_command_point_to_the_help(words, says, capsys):

@@ -736,3 +736,44 @@ def test_frames_up_to_the_stop_are_all_counted(folder):
         camera.hand.put(sequence.frame(k))
     count = track_live(camera, PROMPTS, lambda estimate: None, RunOptions(settings=SETTINGS, stop=12))
     assert (count.frames, count.dropped) == (3, 9)
+
+
+class AtOnce(Scripted):
+    """Gives all that it has as fast as it is read; every frame waits until the first was taken from it."""
+
+    def __init__(self, camera, frames):
+        super().__init__(camera)
+        for frame in (*frames, None):
+            self.hand.put(frame)
+
+
+@pytest.mark.parametrize(("backlog", "kept"), [(4, [0, 3, 4, 5, 6, 7]), (0, [0, 7]), (8, list(range(8)))])
+def test_images_after_the_stop_push_none_out(folder, backlog, kept, monkeypatch):
+    sequence, got = open_sequence(folder), []
+    camera = AtOnce(sequence.camera, map(sequence.frame, range(FRAMES)))
+    taken = Newest.take
+
+    def take(newest):  # as a tracker that is slower than any camera
+        newest._grabbing.exception()
+        return taken(newest)
+
+    monkeypatch.setattr(Newest, "take", take)
+    options = RunOptions(settings=SETTINGS, stop=8)
+    count = track_live(camera, PROMPTS, got.append, options, backlog=backlog)
+    assert [estimate.frame_index for estimate in got] == kept
+    assert (count.frames, count.dropped) == (len(kept), 8 - len(kept))
+
+
+def test_a_line_may_have_the_frame_of_a_file_of_clicks_which_means_nothing():
+    words, errors = Words(None, print), []
+    words.hear('{"name": "mug", "frame": 40, "points": [[60, 50]]}')
+    with Point2Pose(Camera.from_K(K, W, H)) as method:
+        assert [prompt.frame for prompt in words.tell(method, 3)] == [3] and not errors
+
+
+def test_a_run_of_a_folder_with_models_can_be_scored(folder, tmp_path, capsys):
+    prompts = save_prompts(tmp_path / "p.json", [Prompt("object", 0, [[60, 50]])])
+    words = ["live", "--camera", f"folder:{folder}", "--prompts", str(prompts), "--stop", "6", *WORDS]
+    assert cli.main([*words, "--out", str(tmp_path / "run")]) == 0
+    assert cli.main(["eval", str(tmp_path / "run")]) == 0
+    assert "ADD-S AUC [%]" in capsys.readouterr().out

@@ -37,6 +37,17 @@ def test_every_recording_has_a_row_and_is_run_once(shelf, tmp_path):
     assert (tmp_path / "out/one/poses.npz").stat().st_mtime_ns == written
 
 
+def test_a_recording_that_cannot_be_run_is_a_failure_and_the_table_is_there(shelf, tmp_path, capsys):
+    words = ["run", "--batch", str(shelf), "--out", str(tmp_path / "out"), "--jobs", "1", "--quiet"]
+    words += ["--set", "method.surface=false", "--set", "method.graph=false"]
+    assert cli.main(words) == 2
+    assert "1 of 3 recordings could not be run; the table says why." in capsys.readouterr().err
+    rows = (tmp_path / "out/batch.csv").read_text().splitlines()
+    assert [row.split(",")[2] for row in rows] == ["frames", "", "8", "8"]
+    shutil.rmtree(shelf / "broken")
+    assert cli.main(words) == 0
+
+
 def test_what_is_no_shelf_is_a_sentence(shelf, tmp_path, capsys):
     with pytest.raises(BadInput, match="no recording in it"):
         recordings(shelf / "notes", OPTIONS)

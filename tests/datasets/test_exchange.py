@@ -297,6 +297,8 @@ def test_the_commands(table, tmp_path, capsys):
     there = [f"{tmp_path / 'out/annotated_poses' / n}/*.txt ({count})" for n, count in (("box", N - 1), ("can", N - 3))]
     assert capsys.readouterr().out.splitlines()[-1] == f"Written: {', '.join(there)}"
     assert len(list((tmp_path / "out/annotated_poses/can").iterdir())) == N - 3
+    assert main(["export", str(tmp_path / "run"), "--format", "tum", "--out", str(tmp_path / "out")]) == 2
+    assert "expected a new or empty folder" in capsys.readouterr().err
     words = ["eval", "--poses", str(tmp_path / "out"), "--sequence", str(table)]
     assert main(words) == 0
     assert "imported" in capsys.readouterr().out

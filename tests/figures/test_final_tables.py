@@ -182,6 +182,28 @@ def test_seeds_show_their_spread(tmp_path):
     assert any("over seeds 0, 1, 2" in note for note in table.notes)
 
 
+def test_latex_has_groups_rules_and_notes():
+    heads, groups = ["Method", "ADD (%)", "lost", "Hz"], [("", 1), ("first", 2), ("rate", 1)]
+    rows = [[Cell("a_b"), Cell("1 ± 2", bold=True), Cell(note="none"), Cell("3")], [Cell("c"), *[Cell()] * 3]]
+    table = Table("50 %", heads, rows, groups, rules=[1], notes=["All of it"])
+    assert table.latex().splitlines() == [
+        r"\begin{table}",
+        r"\centering",
+        r"\caption{50 \%}",
+        r"\begin{tabular}{@{}lccc@{}}",
+        r"\toprule",
+        r" & \multicolumn{2}{c}{first} & rate \\",
+        r"Method & ADD (\%) & lost & Hz \\",
+        r"\midrule",
+        r"a\_b & \textbf{1 $\pm$ 2} & --\textsuperscript{a} & 3 \\",
+        r"\midrule c & -- & -- & -- \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+        r"\par\footnotesize \textsuperscript{a}~none. All of it.",
+        r"\end{table}",
+    ]
+
+
 def test_what_did_not_run_says_why(tmp_path):
     failed = Outcome(key="k", status="failed", reason="BadInput: a broken picture.")
     missing = Outcome(key="", status="not run", reason="bleach: $P2P_DATA is not set.")

@@ -12,6 +12,7 @@ import pytest
 from p2p_lib.apps import cli
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.datasets.exchange import FORMATS
 from p2p_lib.datasets.models import MESHES, find_models, load_points
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
@@ -116,5 +117,6 @@ def test_images_that_are_gone_and_runs_without_poses_are_a_sentence_each(finishe
     arrays = dict(np.load(finished / "poses.npz"))
     arrays |= {key: np.full_like(value, np.nan) for key, value in arrays.items() if key.endswith("/T_cam_obj")}
     np.savez(finished / "poses.npz", **arrays)
-    assert cli.main(["export", str(finished), "--format", "bop-dataset", "--out", str(tmp_path / "set")]) == 2
-    assert "a run without a single pose" in capsys.readouterr().err
+    for format in ("bop-dataset", "model", "foundationpose", *FORMATS):
+        assert cli.main(["export", str(finished), "--format", format, "--out", str(tmp_path / "set")]) == 2
+        assert "a run without a single pose" in capsys.readouterr().err and not (tmp_path / "set").exists()
