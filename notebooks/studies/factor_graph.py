@@ -18,9 +18,10 @@ from scipy.stats import chi2
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.extended.graph import BoundedGraph
 from p2p_lib.figures import style
 from p2p_lib.figures.plots import panels
-from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
+from p2p_lib.method.factor_graph import GraphResult
 from p2p_lib.method.registration import covariance, register
 
 
@@ -44,7 +45,7 @@ class Turn:
 class Solved:
     """Keyframe poses and map by one way.
 
-    T_cam_obj   (M, 4, 4), NaN for keyframes that were left out
+    T_cam_obj   (M, 4, 4), NaN for keyframes that were left out or merged into another
     p_obj       (N, 3), NaN where never seen
     covariance  (6, 6) of the newest keyframe, None where the graph does not determine it; of registration alone
                 (M, 6, 6), each relative to the map, NaN for the first
@@ -136,9 +137,9 @@ def optimise_online(turn: Turn, registered: Solved, config: Config) -> list[Solv
     return [Solved.of(turn, graph.optimise()) for graph in _growing_graph(turn, registered, config)]
 
 
-def _growing_graph(turn: Turn, registered: Solved, config: Config) -> Iterator[ObjectGraph]:
+def _growing_graph(turn: Turn, registered: Solved, config: Config) -> Iterator[BoundedGraph]:
     """The graph after each keyframe was added, as the pipeline adds it."""
-    graph, constant = ObjectGraph(config.factor_graph), config.method.noise == "constant"
+    graph, constant = BoundedGraph(config.factor_graph), config.method.noise == "constant"
     assert registered.covariance is not None, "registration always has one"
     for m, ids in enumerate(map(np.flatnonzero, turn.seen)):
         graph.add_keyframe(

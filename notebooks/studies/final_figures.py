@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from pandas import read_csv
+from pandas import read_csv, to_numeric
 
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.core import se3
@@ -55,7 +55,11 @@ def shown_table(benchmark: Benchmark, parameters: Mapping[str, object] | None = 
 def rate_figure(table: Path) -> Figure:
     """Processor time per frame against objects, tracks, resolution and 2D tracker, from the table ``runtime.csv``."""
     rows = read_csv(table).set_index("Setting")
-    time_ms = rows["processor, files included (ms)"].dropna().rename(lambda name: name.partition(",")[0])
+    time_ms = (
+        to_numeric(rows["processor, files included (ms)"], errors="coerce")
+        .dropna()
+        .rename(lambda name: name.partition(",")[0])
+    )
     whole = time_ms.iloc[0]
     panels_of: dict[str, dict[Any, float]] = {
         "objects": {int(k.split()[0]): v for k, v in time_ms.items() if "object" in k},

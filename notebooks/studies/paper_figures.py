@@ -9,7 +9,8 @@ from __future__ import annotations
 import io
 import json
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from pandas import DataFrame
 from PIL import Image
 
 from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.exchange import as_run, read_poses
 from p2p_lib.datasets.models import find_models
@@ -28,7 +30,7 @@ from p2p_lib.figures import overlay, style
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.provenance import Saved, save_figure
 from p2p_lib.figures.scenes import Scene, side_by_side
-from studies import CLONE, mesh_view
+from studies import CLONE, SHIPPED, mesh_view
 from studies.final_figures import rate_figure, scene_of
 from studies.pipeline_diagram import pipeline_diagram
 
@@ -50,21 +52,32 @@ _RETURN = (
 )
 
 
-def draw_all(runs: Benchmark, folder: Path, poses: Path | None = None) -> list[Saved]:
-    """Every figure that ``folder`` gets from these runs, then the index.
+def picked(only: Collection[str] = ()) -> list[str]:
+    """The names of the figures that are drawn here: all of them, or those asked for."""
+    known = [Path(item.file).stem for item in ITEMS.itertuples() if item.command.startswith("p2p figures")]
+    for name in only:
+        if name not in known:
+            raise BadInput("figures --only", name, f"names of {', '.join(known)}", did_you_mean(name, known))
+    return [name for name in known if name in only or not only]
+
+
+def draw_all(runs: Benchmark, folder: Path, names: Collection[str], poses: Path | None = None) -> list[Saved]:
+    """The figures of these names into ``folder`` from these runs, then the index.
 
     poses  of a competitor on ``synthetic/occlusion``, in any form that ``p2p import`` takes; without, ours with and
            without long memory stand in for the two
     """
-    saved = [
-        _save(three_objects(runs), "fig1_three_objects", runs, "Three objects, each hidden by a hand in turn."),
-        _save(framework(runs), "fig2_framework", runs, "The stages, and one frame on its way through them."),
-        _save(airplane_and_can(runs), "fig3_synthetic", runs, "Two objects, one circling the other."),
-        _save(return_beside(runs, poses), "fig5_return", runs, _RETURN if poses is None else _RIVAL),
-    ]
-    times = folder / "tables" / "runtime.csv"
-    if times.is_file():
-        saved.append(save_figure(rate_figure(times), "runtime", "Processor time a frame.", sources=[times]))
+    drawn: dict[str, tuple[Callable[[Benchmark], np.ndarray], str]] = {
+        "fig1_three_objects": (three_objects, "Three objects, each hidden by a hand in turn."),
+        "fig2_framework": (framework, "The stages, and one frame on its way through them."),
+        "fig3_synthetic": (airplane_and_can, "Two objects, one circling the other."),
+        "fig5_return": (partial(return_beside, poses=poses), _RETURN if poses is None else _RIVAL),
+    }
+    of_runs: dict[str, Any] = {"sources": [runs], "parameters": {"profile": runs.profile}, "to": folder}
+    saved = [save_figure(drawn[name][0](runs), name, drawn[name][1], **of_runs) for name in names if name in drawn]
+    if "runtime" in names:
+        times = next(path for path in (folder / "tables" / "runtime.csv", SHIPPED / "runtime.csv") if path.is_file())
+        saved.append(save_figure(rate_figure(times), "runtime", "Processor time a frame.", sources=[times], to=folder))
     (folder / "README.md").write_text(index(folder), encoding="utf-8")
     return saved
 
@@ -149,10 +162,6 @@ def _marked(image: np.ndarray, words: str) -> np.ndarray:
     """With a line above it that says what it stands for."""
     head = overlay.draw_caption(np.full((22, image.shape[1], 3), 90, np.uint8), words)
     return np.concatenate([head, image])
-
-
-def _save(image: np.ndarray, name: str, runs: Benchmark, caption: str) -> Saved:
-    return save_figure(image, name, caption, sources=[runs], parameters={"profile": runs.profile})
 
 
 # --- the index -------------------------------------------------------------------------------------

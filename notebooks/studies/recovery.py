@@ -33,6 +33,8 @@ from p2p_lib.synthetic.noise import Sensor
 from p2p_lib.synthetic.scenarios import SCENARIOS
 from studies.run_plots import draw_strip
 
+#: Of fewer poses a share of right ones is no more than a hint.
+_ENOUGH = 20
 _RIGHT = f"{100 * MAX_M:.0f} cm and {MAX_DEG:.0f}°"
 
 
@@ -170,14 +172,19 @@ def confidence_over_time(run: Run, evaluation: Evaluation) -> Figure:
 
 @style.styled
 def reliability_plot(judged: Mapping[str, Judged]) -> Figure:
-    """The fraction of right poses by stated confidence, and how many there are; the diagonal would be calibrated."""
+    """The fraction of right poses by stated confidence, and how many there are; the diagonal would be calibrated.
+
+    Shares of a few poses are hollow and are not joined: they jump by chance.
+    """
     figure, axes = panels(2, (WIDTH_IN, 3.2), [1.2, 1], side_by_side=True)
     axes[0].plot([0, 1], [0, 100], ":", color="#333333", lw=0.8)
     width = 0.8 / 10 / len(judged)
     for k, ((label, one), colour) in enumerate(zip(judged.items(), style.METHODS)):
         bins = reliability(one)
         label = f"{label}: ECE {one.calibration_error:.2f}, AUROC {one.auroc:.2f}".replace("nan", "-")
-        axes[0].plot(bins.confidence, 100 * bins.right, "o-", ms=4, color=colour, label=label)
+        many = bins.poses >= _ENOUGH
+        axes[0].plot(bins.confidence, (100 * bins.right).where(many), "o-", ms=4, color=colour, label=label)
+        axes[0].plot(bins.confidence[~many], 100 * bins.right[~many], "o", ms=4, color=colour, mfc="none")
         left = np.floor(np.minimum(bins.confidence, 0.999) * 10) / 10 + 0.01 + k * width
         axes[1].bar(left, bins.poses, width, align="edge", color=colour)
     axes[0].set(xlim=(0, 1.02), ylim=(0, 103), xlabel="stated confidence", ylabel=f"within {_RIGHT} [%]")

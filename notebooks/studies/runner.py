@@ -13,7 +13,7 @@ import os
 import re
 import signal
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -200,16 +200,23 @@ def _changed(notebook: NotebookNode, own: Mapping[str, Value]) -> str:
 
 
 def write_gallery(home: Path, profile: str) -> Path:
-    """``index.html`` over all executed notebooks in ``home/notebooks``: title, first image, seconds, checks."""
+    """``index.html`` over all executed notebooks in ``home/notebooks``: title, first image, seconds, checks.
+
+    It and their pages link to each other, and to nothing that was not run.
+    """
     import jinja2
 
     results = [read_result(path) for path in sorted((home / "notebooks").glob("*.ipynb"))]
+    there = {result.name for result in results}
+    for page in (home / "notebooks").glob("*.html"):
+        page.write_text(_as_pages(page.read_text(encoding="utf-8"), there), encoding="utf-8")
     seconds, claims = sum(r.seconds for r in results), sum(len(r.checks) for r in results)
     templates = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
     html = templates.get_template("gallery.html").render(
         title=f"Point2Pose notebooks, profile {profile}",
         summary=f"{_counted(results)}, {seconds:.0f} s, {claims} claims checked",
-        diagram=_as_pages(course.diagram().replace('href="', 'href="notebooks/')),
+        diagram=_as_pages(course.diagram().replace('href="', 'href="notebooks/'), there),
+        missing=[lesson.name for lesson in course.LESSONS if lesson.name not in there],
         lessons={lesson.name: lesson for lesson in course.LESSONS},
         failed=sum(bool(result.error) for result in results),
         results=results,
@@ -301,7 +308,10 @@ def _fitting_parameters(path: Path, given: Mapping[str, Any]) -> dict[str, Value
 
 
 def _write_page(executed: Path) -> None:
-    """The executed notebook as a page for the browser, beside it; nothing in it is fetched from the network."""
+    """The executed notebook as a page for the browser, beside it; nothing in it is fetched from the network.
+
+    Its links are to notebooks, until the gallery knows which of their pages are there.
+    """
     from nbconvert import HTMLExporter
     from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
@@ -319,12 +329,17 @@ def _write_page(executed: Path) -> None:
     exporter = HTMLExporter(embed_images=True, raw_template=template)
     exporter.register_filter("markdown2html", as_html)
     body, _ = exporter.from_filename(str(executed), resources={"equation_style": equations.STYLE})
-    executed.with_suffix(".html").write_text(_as_pages(body), encoding="utf-8")
+    executed.with_suffix(".html").write_text(body, encoding="utf-8")
 
 
-def _as_pages(html: str) -> str:
-    """Links from notebook to notebook as links from page to page."""
-    return re.sub(r'(href="[\w/]*\d\d_\w+)\.ipynb"', r'\1.html"', html)
+def _as_pages(html: str, there: Collection[str]) -> str:
+    """Links from notebook to notebook as links to the pages that are there; others wait for theirs as ``data-href``."""
+
+    def link(found: re.Match[str]) -> str:
+        folder, name = found.groups()
+        return f'{"" if name in there else "data-"}href="{folder}{name}.html"'
+
+    return re.sub(r'(?:data-)?href="([\w/]*?)(\d\d_\w+)\.(?:ipynb|html)"', link, html)
 
 
 def _read(path: Path) -> NotebookNode:

@@ -375,6 +375,13 @@ def _stale(a: argparse.Namespace) -> int:
     "draw the paper's qualitative figures and write the index of all its figures and tables",
     arg("--out", type=Path, metavar="DIR", help="runs, found again the next time (default out/benchmark)"),
     arg(
+        "--figures",
+        type=Path,
+        metavar="DIR",
+        help="pictures and their index go here, over those there (default $P2P_FIGURES, else figures/ of the clone)",
+    ),
+    arg("--only", metavar="fig1_three_objects,runtime", help="these pictures alone, by their names"),
+    arg(
         "--poses",
         type=Path,
         metavar="PATH",
@@ -388,8 +395,11 @@ def _figures(a: argparse.Namespace) -> None:
     from p2p_lib.core.paths import benchmark_dir, figure_dir
 
     figures = study("paper_figures")
+    drawn = figures.picked(names(a.only) or ())  # what does not fit is said before anything runs
     (runs,) = run_benchmarks([figures.PLAN], a.out or benchmark_dir("full"), progress=not a.quiet)
-    for saved in figures.draw_all(runs, figure_dir(), a.poses):
+    if runs.interrupted:
+        raise KeyboardInterrupt
+    for saved in figures.draw_all(runs, a.figures or figure_dir(), drawn, a.poses):
         print(saved.path)
 
 

@@ -24,7 +24,7 @@ from p2p_lib.datasets import manifests
 from p2p_lib.datasets.paper_reported import FAIL, Row, paper_reported
 from p2p_lib.datasets.paper_reported import Table as Reported
 from p2p_lib.datasets.sequence import SYNTHETIC
-from p2p_lib.figures.numbers import AREA_HEADS, AREA_KEYS, METRICS, Numbers
+from p2p_lib.figures.numbers import AREA_HEADS, AREA_KEYS, METRICS, Numbers, is_whole_dataset
 from p2p_lib.figures.run_tables import by_fault, by_grid, by_pair, by_run
 from p2p_lib.figures.tables import Cell, Table, emboldened, number
 
@@ -108,9 +108,14 @@ def _metrics(numbers: Numbers, paper: Reported) -> list[str]:
 
 
 def _places(numbers: Numbers, method: str = "") -> dict[str, tuple[Job, str]]:
-    """Column to the first job (of a method) and object that fill it; one that did not run fills those of its plan."""
+    """Column to the first job (of a method) and object that fill it; one that did not run fills those of its plan.
+
+    Which columns a dataset fills that is not there, nobody knows: it has none, and is the reason of every dash.
+    """
     places: dict[str, tuple[Job, str]] = {}
-    for job, outcome in (at for at in numbers.benchmark.results if method in ("", at[0].method.name)):
+    for job, outcome in numbers.benchmark.results:
+        if method not in ("", job.method.name) or is_whole_dataset(job):
+            continue
         names = list(outcome.objects) or list(job.sequence.columns) or job.sequence.objects or [""]
         for name in names:
             own = shown_name(job) + (f" {name}" if len(names) > 1 else "")
@@ -151,7 +156,8 @@ def _reported_line(paper: Reported, row: Row) -> _Line:
 
 
 def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method: Method) -> _Line:
-    columns, cells, whole, same = _columns(paper), defaultdict(numbers.not_planned), set(), set()
+    absent = numbers.not_planned(method.name)
+    columns, cells, whole, same = _columns(paper), defaultdict(lambda: absent), set(), set()
     frames = {shown_name(j): o.ran.get("frames") for j, o in numbers.benchmark.results if j.method.name == method.name}
     for column, (job, name) in _places(numbers, method.name).items():
         cells[column] = numbers.cell(method.name, METRICS[metric][0], shown_name(job), name, form)
@@ -238,12 +244,20 @@ def by_rate(numbers: Numbers) -> Table:
     heads = {"rate": "rate (Hz)", "95th percentile": "95 % within (ms)"}
     heads |= {stage: stage.removeprefix("stage ") + " (ms)" for stage in stages}
     heads |= {"processor time, files included": "processor, files included (ms)"}
-    lines = [
-        [Cell(method.name), *(number(found.get((method.name, metric)), digits=1) for metric in heads)]
-        for method in numbers.methods
-    ]
+    lines = []
+    for method in numbers.methods:
+        absent = Cell(note="its runs have no such time") if method.name in found else numbers.nothing_ran(method)
+        values = [found.get((method.name, metric), np.nan) for metric in heads]
+        lines.append([Cell(method.name), *(absent if np.isnan(value) else number(value, digits=1) for value in values)])
     reported: Any = paper_reported().statement("rate").value  # from and to
     notes = [f"The paper reports {reported[0]:g} to {reported[1]:g} Hz, on its machine", *numbers.about()]
+    notes += [
+        "Rate: frames by the time that the tracker took for them, without the first two, in which loops are compiled; "
+        "of these frames 95 % took no longer than the next column says; a stage: mean over all frames, those two "
+        "included, so stages can add up to more than a frame; all: means over seeds",
+        "Mapping (the graph's solution, the fusion) runs in two threads beside the stages; graph and fusion are what a "
+        "frame waited for it, and its work is in the processor time",
+    ]
     notes += ["Wall-clock on this machine under the load that it had; processor time does not depend on the load"]
     return Table(numbers.plan.title, ["Setting", *heads.values()], lines, notes=notes)
 

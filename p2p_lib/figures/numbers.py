@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.benchmark.jobs import Job
 from p2p_lib.benchmark.plan import Method
 from p2p_lib.benchmark.rows import MEAN, Row, shown_name
 from p2p_lib.datasets.paper_reported import FAIL
@@ -21,6 +22,11 @@ AREA_KEYS = ("adds_auc", "add_auc")
 AREA_HEADS = [METRICS[key][1] for key in AREA_KEYS]
 _HOW = "exact area under the curve, aligned at the first scored frame, frames without a pose count as 0"
 _REPORTED = "(reported): as the paper prints it, on its own files, masks and machine"
+
+
+def is_whole_dataset(job: Job) -> bool:
+    """Whether a job stands for all of ``DATASET/*``: so it does where none of its sequences is there."""
+    return job.sequence.name.endswith("/*")
 
 
 class Numbers:
@@ -53,19 +59,27 @@ class Numbers:
         planned = {shown_name(job) for job, _ in of}
         ran = {shown_name(job) for job, outcome in of if outcome.status != "not run"}
         if self.row(method.name, metric, MEAN) is None:
-            return self.missing(method.name, shown_name(of[0][0]))
+            return self.nothing_ran(method)
         note = f"{len(ran)} of {len(planned)} sequences" if len(ran) < len(planned) else ""
         return replace(self.cell(method.name, metric, MEAN), note=note)
+
+    def nothing_ran(self, method: Method) -> Cell:
+        """A dash, or ``fail``, for a method of which nothing ran, with the reason that its first run gave."""
+        first = next(job for job, _ in self.benchmark.results if job.method.name == method.name)
+        return self.missing(method.name, shown_name(first))
 
     def missing(self, method: str, sequence: str) -> Cell:
         """A dash, or ``fail``, with the reason that the run gave."""
         for job, outcome in self.benchmark.results:
             if job.method.name == method and shown_name(job) == sequence and outcome.status != "done":
                 return Cell(FAIL if outcome.status == "failed" else "-", note=outcome.reason.rstrip("."))
-        return self.not_planned()
+        return self.not_planned(method)
 
-    def not_planned(self) -> Cell:
-        """A dash for what no run of the plan could give."""
+    def not_planned(self, method: str) -> Cell:
+        """A dash for what no run of a method is of; a dataset that is not there might have had it."""
+        for job, outcome in self.benchmark.results:
+            if job.method.name == method and is_whole_dataset(job):
+                return Cell(note=outcome.reason.rstrip("."))
         return Cell(note="no run of the plan is of this" if self.judges else "the quick form runs bundled data alone")
 
     def notes(self) -> list[str]:

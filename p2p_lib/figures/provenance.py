@@ -65,15 +65,17 @@ def save_figure(
     *,
     sources: Iterable[Any] = (),
     parameters: Mapping[str, Any] | None = None,
+    to: Path | None = None,
 ) -> Saved:
     """Write a Matplotlib figure as PNG and PDF, or an image (H, W, 3) uint8 as PNG, with its note.
 
     caption     whole sentences that say what is seen to somebody who reads nothing else; also the alternative text
     sources     what it was drawn from: runs, evaluations, sequences, files
     parameters  what decided how it was made: profile, seed, ...
+    to          another folder than that of the figures
     """
     sources = list(sources)
-    target = _target(paths.figure_dir(), name, _is_quick(sources, parameters))
+    target = _target(to or paths.figure_dir(), name, _is_quick(sources, parameters))
     png = target.with_name(f"{name}.png")
     if isinstance(figure, np.ndarray):
         if figure.ndim != 3 or figure.shape[2] != 3 or figure.dtype != np.uint8:

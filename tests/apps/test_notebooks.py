@@ -283,9 +283,28 @@ def test_gallery_shows_what_ran(run):
     assert ["seed", "3", "-", "for information", "what is drawn"] in rows
     assert ["AUC [%]", "12.34", "at least 95", "does not hold", "of ADD-S"] in rows
     assert re.search(r"3 notebooks, \d+ s, 10 claims checked, <b class=\"failed\">1 failed</b>", page)
-    assert 'href="notebooks/00_first.html"' in page and re.search(r'href="notebooks/03_\w+\.html"', page)
+    assert set(re.findall(r'[" ]href="(notebooks/[^"]*)"', page)) == {
+        f"notebooks/{name}.html" for name in ("00_first", "01_fails", "02_last")
+    }
+    assert f"{len(LESSONS)} of the course's {len(LESSONS)} notebooks were not run here" in page
     assert not re.search(r'(src|href)="\w+://', page), "nothing is fetched"
     assert (run[1] / "notebooks" / "01_fails.html").exists(), "the failed notebook can be looked at too"
+
+
+def test_pages_link_to_what_was_run_and_to_more_once_that_was_run(tmp_path):
+    def links(page):
+        return set(re.findall(r' href="([\w/]*\d\d_\w+\.\w+)"', (tmp_path / "out" / page).read_text()))
+
+    for path, other in (("03_a", "04_b"), ("04_b", "03_a")):
+        notebook = nbformat.read(write(tmp_path / f"{path}.ipynb"), 4)
+        notebook.cells[0].source += f" [Next]({other}.ipynb)"
+        nbformat.write(notebook, tmp_path / f"{path}.ipynb")
+    how = {"out": tmp_path / "out", "folder": tmp_path, "say": lambda line: None}
+    run_notebooks(only=["03"], **how)
+    assert (links("index.html"), links("notebooks/03_a.html")) == ({"notebooks/03_a.html"}, set())
+    run_notebooks(only=["04"], **how)
+    assert links("index.html") == {"notebooks/03_a.html", "notebooks/04_b.html"}
+    assert (links("notebooks/03_a.html"), links("notebooks/04_b.html")) == ({"04_b.html"}, {"03_a.html"})
 
 
 def test_progress_is_told(run):

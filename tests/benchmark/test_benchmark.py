@@ -289,6 +289,24 @@ def test_an_interrupted_plan_replaces_no_table_that_was_made(plan, tmp_path, mon
     assert table.read_text() == "as it was" and "2 not run" in capsys.readouterr().out
 
 
+def test_interrupted_figures_say_so_and_draw_nothing(tmp_path, monkeypatch, capsys):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr("p2p_lib.benchmark.benchmark.execute", interrupted)
+    folder = tmp_path / "pictures"
+    assert cli.main(["figures", "--out", str(tmp_path / "runs"), "--figures", str(folder), "--quiet"]) == 130
+    assert capsys.readouterr().err == "p2p figures: interrupted\n" and not folder.exists()
+
+
+def test_figures_that_are_not_known_are_refused_before_anything_runs(tmp_path, capsys):
+    assert cli.main(["figures", "--out", str(tmp_path / "runs"), "--only", "runtime,fig5_retrun"]) == 2
+    said = capsys.readouterr().err
+    assert "figures --only: got fig5_retrun, expected names of fig1_three_objects, " in said
+    assert said.endswith("Did you mean fig5_return?\n") and not (tmp_path / "runs").exists()
+
+
 # --- on a cluster --------------------------------------------------------------------------------
 
 

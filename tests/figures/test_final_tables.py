@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.benchmark.benchmark import Benchmark, load_benchmark
 from p2p_lib.benchmark.jobs import Job
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome
 from p2p_lib.benchmark.plan import Plan, read_plan
@@ -306,6 +306,28 @@ def test_rates_and_runs(tmp_path):
     absent = Outcome(key="k", status="not run", reason="no models")
     (row,) = paper_table(benchmark(tmp_path, {("Ours", "a"): [absent]}, kind="runs")).rows
     assert {(c.text, c.note) for c in row[2:]} == {("-", "no models")}, "every dash has its reason"
+
+
+def test_what_has_no_rate_says_why(tmp_path):
+    absent = Outcome(key="", status="not run", reason="no weights of tapir.")
+    failed = Outcome(key="k", status="failed", reason="ValueError: no")
+    runs = {("Ours", "a"): [outcome(90)], ("tapir", "a"): [absent], ("broken", "a"): [failed]}
+    table = paper_table(benchmark(tmp_path, runs, kind="rates"))
+    ours, tapir, broken = ([(c.text, c.note) for c in row[1:]] for row in table.rows)
+    assert ours[0] == ("20.0", "") and set(ours[1:]) == {("-", "its runs have no such time")}
+    assert set(tapir) == {("-", "no weights of tapir")} and set(broken) == {(FAIL, "ValueError: no")}
+
+
+def test_a_dataset_that_is_not_there_is_the_reason_of_every_dash_and_has_no_row(tmp_path, monkeypatch):
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    for name, mine in (("ycbmultitrack_real", "Ours"), ("ycbmultitrack_synthetic", "Ours, the paper's files")):
+        plan = read_plan(name)
+        table = paper_table(load_benchmark(plan, tmp_path, "full"))
+        columns = paper_reported().table(plan.paper).columns
+        assert len(table.rows) == len(columns) + 1, "no row that is not of an object"
+        at = [k for k, head in enumerate(table.heads) if head == mine]
+        reasons = {row[k].note for row in table.rows[:-1] for k in at}
+        assert len(reasons) == 1 and reasons.pop().startswith(f"{name}: no sequence in YCBMultiTrack/")
 
 
 def test_three_files_lie_beside_the_results(tmp_path):

@@ -61,6 +61,14 @@ def test_hidden_keyframes_need_relative_poses():
     assert np.isfinite(kept.T_cam_obj).all() and kept.errors(gap)[0].max() < 12
 
 
+def test_a_bounded_graph_merges_keyframes(turn):
+    registered = register_turn(turn, CONFIG)
+    solved = [optimise_online(turn, registered, preset(name))[-1] for name in ("default", "paper")]
+    kept = [int(np.isfinite(one.T_cam_obj).all((1, 2)).sum()) for one in solved]
+    assert kept == [31, 42], "30 and the newest, which is merged after it is solved for; the paper keeps all"
+    assert solved[0].errors(turn)[0][-1] < 1.5 * solved[1].errors(turn)[0][-1]
+
+
 def test_covariance_is_honest_where_observations_count_once():
     nees = consistency(60, WITHOUT_REG, 9, keyframes=8, points=50)
     assert len(nees) > 45 and (nees.mean(0) > 1.5).all() and (nees.mean(0) < 6).all()

@@ -7,19 +7,20 @@ import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from p2p_lib.benchmark import plan_names, read_plan
+from p2p_lib.benchmark import load_benchmark, plan_names, read_plan
 from p2p_lib.core.paths import PROJECT
 from p2p_lib.datasets.download import sha256
 from p2p_lib.datasets.paper_reported import paper_reported
 from p2p_lib.datasets.provenance import code_digest
 from p2p_lib.figures import provenance
 from p2p_lib.figures.provenance import save_figure
-from studies import anew
+from studies import anew, paper_figures
 from studies.final_figures import rate_figure
-from studies.paper_figures import ITEMS, index
+from studies.paper_figures import ITEMS, PLAN, draw_all, index, picked
 
 FIGURES = PROJECT / "figures"
 
@@ -165,6 +166,16 @@ def test_the_rate_figure_shows_every_number_of_its_table(drawn):
         [15, 30, 60, 10],
     ]
     assert sorted(bar.get_height() for bar in axes[3].patches) == [10, 50]
+
+
+def test_figures_that_are_asked_for_are_drawn_where_they_are_asked_for(tmp_path, monkeypatch):
+    assert picked(["runtime"]) == ["runtime"] and len(picked()) == 5
+    monkeypatch.setenv("P2P_FIGURES", str(tmp_path / "as_they_were"))
+    monkeypatch.setattr(paper_figures, "framework", lambda runs: np.zeros((4, 4, 3), np.uint8))
+    saved = draw_all(load_benchmark(PLAN, tmp_path), tmp_path / "mine", ["fig2_framework", "runtime"])
+    assert [one.path for one in saved] == [tmp_path / "mine" / f"{name}.png" for name in ("fig2_framework", "runtime")]
+    assert {path.suffix for path in (tmp_path / "mine").iterdir()} == {".png", ".pdf", ".json", ".md"}
+    assert not (tmp_path / "as_they_were").exists()
 
 
 def test_a_quick_form_never_takes_the_place_of_a_full_one(tmp_path, monkeypatch):

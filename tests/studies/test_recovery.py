@@ -115,11 +115,13 @@ def test_confidence_marks_wrong_poses(made):
 
 
 def test_the_reliability_plot_says_the_share_of_right_poses():
-    one = Judged(np.array([0.05, 0.95, 0.95, 0.95, 0.95]), np.array([0, 1, 1, 1, 0], bool))
-    figure = recovery.reliability_plot({"one": one, "all right": Judged(np.ones(3), np.ones(3, bool))})
-    _, line, other = figure.axes[0].get_lines()
-    np.testing.assert_allclose(line.get_xydata(), [[0.05, 0], [0.95, 75]])
-    assert line.get_label() == "one: ECE 0.17, AUROC 0.75" and other.get_label() == "all right: ECE 0.00, AUROC -"
+    one = Judged(np.repeat([0.05, 0.55, 0.95], [20, 3, 40]), np.repeat([0, 1, 0], [20, 33, 10]).astype(bool))
+    figure = recovery.reliability_plot({"one": one, "all right": Judged(np.ones(30), np.ones(30, bool))})
+    _, line, few, other, none = figure.axes[0].get_lines()
+    np.testing.assert_allclose(line.get_xydata(), [[0.05, 0], [0.55, np.nan], [0.95, 75]])
+    assert few.get_xydata().tolist() == [[0.55, 100]] and few.get_linestyle() == "None", "three poses: not joined"
+    assert line.get_label() == "one: ECE 0.16, AUROC 0.82" and other.get_label() == "all right: ECE 0.00, AUROC -"
+    assert not len(none.get_xdata())
 
 
 def test_frames_without_a_pose_claim_nothing(made):
