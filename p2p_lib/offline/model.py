@@ -28,9 +28,8 @@ from p2p_lib.offline import texture
 from p2p_lib.offline.finished import Finished, Renderer, new_folder
 
 NAME = "textured_simple"
-#: Components with less of the largest one's area are left out. What is narrower than twice so many rings of vertices
-#: along open borders connects nothing: wisps hang on by a thread.
-_MIN_COMPONENT, _THREAD_RINGS = 0.05, 2
+#: Components with less of the largest one's area are left out.
+_MIN_COMPONENT = 0.05
 #: A patch is open if depth this far behind it, m, was measured in at least so many views.
 _SEEN_THROUGH_M, _SEEN_THROUGH_VIEWS = 0.012, 2
 #: Parts and holes that a surface seen all around has at most, once those that nobody saw are closed.
@@ -149,7 +148,7 @@ def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[
 
 
 def cleaned(surface: Any) -> Shape:
-    """A surface without small parts and wisps, faces of no area and edges of more than two faces; smoothed a little."""
+    """A surface without its small components, faces of no area and edges of more than two faces; smoothed a little."""
     import trimesh
     from scipy.spatial import cKDTree
 
@@ -157,42 +156,15 @@ def cleaned(surface: Any) -> Shape:
     mesh.update_faces(mesh.nondegenerate_faces())
     legacy = _legacy(mesh.vertices, mesh.faces)
     legacy.remove_non_manifold_edges()
-    legacy.remove_triangles_by_mask(~held(np.asarray(legacy.vertices), np.asarray(legacy.triangles)))
+    component, _, area = legacy.cluster_connected_triangles()
+    component, area = np.asarray(component), np.asarray(area)
+    legacy.remove_triangles_by_mask(area[component] < _MIN_COMPONENT * area.max())
     legacy.remove_unreferenced_vertices()
     # Taubin smoothing removes the steps of voxels without shrinking the shape.
     legacy = legacy.filter_smooth_taubin(number_of_iterations=5)
     vertices, faces = np.asarray(legacy.vertices), np.asarray(legacy.triangles)
     colours = np.asarray(surface.visual.vertex_colors)[cKDTree(surface.vertices).query(vertices)[1], :3]
     return Shape(vertices, faces, colours.astype(float), np.zeros(len(faces), bool))
-
-
-def held(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool: the faces of a surface's large components, and of their fringes, told apart without open borders.
-
-    Where all is border, as on a narrow strip, everything is kept.
-    """
-    import trimesh
-    from scipy.sparse import coo_array
-
-    n = len(vertices)
-    edges, count = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0, return_counts=True)
-    beside = coo_array((np.ones(len(edges)), tuple(edges.T)), (n, n)).tocsr()
-    beside = beside + beside.T
-
-    def grown(at: np.ndarray, rings: int) -> np.ndarray:
-        for _ in range(rings):
-            at = at | (beside @ at > 0)
-        return at
-
-    border = np.isin(np.arange(n), edges[count == 1])
-    inner = faces[~grown(border, _THREAD_RINGS)[faces].any(1)]
-    if not len(inner):
-        return np.ones(len(faces), bool)
-    component = trimesh.graph.connected_component_labels(trimesh.graph.face_adjacency(inner), len(inner))
-    area = np.bincount(component, trimesh.triangles.area(vertices[inner]))
-    large = inner[area[component] >= _MIN_COMPONENT * area.max()]
-    # One ring more than was taken away: what was cut off there is open.
-    return grown(np.isin(np.arange(n), large), _THREAD_RINGS + 1)[faces].all(1)
 
 
 def _legacy(vertices: np.ndarray, faces: np.ndarray) -> Any:

@@ -174,24 +174,6 @@ def test_exposure_is_evened_out():
         assert np.abs(view.rgb[10:-10, 10:-10] / even[1].rgb[10:-10, 10:-10] - 1).max() < 0.02
 
 
-def test_what_hangs_on_by_a_thread_is_left_out():
-    """A half ball with a wide rim and, from one edge of it, a long ragged strip; a strip alone is kept."""
-    ball = trimesh.creation.icosphere(4, 0.05)
-    ball.update_faces(ball.triangles_center[:, 2] > 0)
-    ball.remove_unreferenced_vertices()
-    vertices, n = np.array(ball.vertices), len(ball.vertices)
-    edges, count = np.unique(ball.edges_sorted, axis=0, return_counts=True)
-    low, high = edges[count == 1][0]
-    x = 0.06 + 0.003 * np.arange(60)
-    strip = np.concatenate([np.stack([x, y + 0 * x, 0 * x], 1) for y in (0.0, 0.003)])
-    k = np.arange(59)
-    faces = np.concatenate([np.stack([k, k + 1, k + 60], 1), np.stack([k + 1, k + 61, k + 60], 1)])
-    hung = np.concatenate([ball.faces, [[low, high, n], [high, n + 60, n]], n + faces])
-    kept = model.held(np.concatenate([vertices, strip]), hung)
-    assert kept[: len(ball.faces)].mean() > 0.98 and kept[len(ball.faces) + 8 :].sum() == 0
-    assert model.held(strip, faces).all()
-
-
 def test_a_texture_that_is_no_better_than_vertex_colours_is_told():
     told = model.no_better({"texture": 16.34, "vertex_colours": 15.52})
     assert told == ", no better than the surface's vertex colours (error 16.3 against 15.5 of 255)"
