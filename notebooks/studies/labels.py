@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 import trimesh
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from pandas import DataFrame
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.evaluation.suspicions import ON_SURFACE, OVERLAP
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.plots import WIDTH_IN, panels
 from p2p_lib.offline.model import NAME, Shape, Textured, rendered
@@ -75,13 +77,15 @@ def label_errors_mm(scene: Sequence, source: Sequence, frames: list[int], names:
 
 @style.styled
 def evidence_plot(labels: DataFrame) -> Figure:
-    """What ``labels.csv`` says of each label over the images: overlap with the mask, and depth off the surface."""
+    """What ``labels.csv`` says of each label over the images: overlap with the mask, and depth on the surface."""
     figure, axes = panels(2, (WIDTH_IN, 3.6), [1, 1])
-    for name, rows in labels.groupby("object"):
-        axes[0].plot(rows["image"], 100 * rows["mask_iou"], marker=".", label=name)
-        axes[1].plot(rows["image"], rows["depth_off_mm"], marker=".", label=name)
-    axes[0].set(ylabel="mask IoU [%]", ylim=(0, 102))
+    for axis, column, limit in zip(axes, ("visib_iou", "depth_on_surface"), (OVERLAP, ON_SURFACE)):
+        for name, rows in labels.groupby("object"):
+            axis.plot(rows["image"], 100 * rows[column], marker=".", label=name)
+        axis.axhline(100 * limit, color="grey", linestyle="--", linewidth=0.8)
+    axes[0].set(ylabel="visible IoU [%]", ylim=(0, 102))
     axes[0].legend(loc="lower left")
     axes[0].set_title("Two witnesses for each label")
-    axes[1].set(ylabel="depth off [mm]", xlabel="image", ylim=(0, None))
+    axes[1].set(ylabel="depth on it [%]", xlabel="image", ylim=(0, 102))
+    axes[1].xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure

@@ -23,13 +23,30 @@ from p2p_lib.core.types import DOUBTED, Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.bop import Outline, write_models, write_scene
 from p2p_lib.datasets.sequence import ObjectTruth
-from p2p_lib.evaluation.suspicions import OVERLAP
+from p2p_lib.evaluation.evidence import on_surface
+from p2p_lib.evaluation.suspicions import ON_SURFACE, OVERLAP
 from p2p_lib.offline.finished import RULE, Finished, Renderer, Silhouette, new_folder
 
 #: Depth up to this far before a surface does not hide it, m (the BOP toolkit's).
 VISIBLE_M = 0.015
-#: Columns of ``labels.csv``: how well each label fits.
-COLUMNS = ("image", "object", "obj_id", "confidence", "visib_fract", "mask_iou", "depth_off_mm")
+#: Columns of ``labels.csv``: how well each label fits, and whether it is doubtful, by :data:`DOUBTFUL`.
+COLUMNS = (
+    "image",
+    "object",
+    "obj_id",
+    "confidence",
+    "visib_fract",
+    "visib_iou",
+    "depth_on_surface",
+    "depth_off_mm",
+    "doubtful",
+)
+#: The one rule of which labels are to be looked at. Not by ``depth_off_mm``: a tenth of a surface on the background, as
+#: a fringe of it, is decimetres off.
+DOUBTFUL = (
+    f"confidence at most {DOUBTED:g}, or what shows of the surface and the mask overlap by less than {OVERLAP:g} (IoU),"
+    f" or depth lies on less than {100 * ON_SURFACE:.0f} % of what shows"
+)
 SCENE = "train/000001"
 
 
@@ -48,11 +65,22 @@ def outline(silhouette: Silhouette, depth_m: np.ndarray) -> Outline:
 
 
 def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, mask: np.ndarray | None):
-    """How well a label fits: IoU of the visible surface with the mask, and the 90th percentile of depth errors, mm."""
+    """How well a label fits; NaN where nothing tells.
+
+    The IoU of what is shown of the surface with the mask, the share of it on which depth was measured, by the rule of
+    ``p2p eval`` (holes of the depth and what is in front count neither way), and the 90th percentile of its errors, mm.
+    """
+    surface_m = silhouette.depth_in(depth_m)
     iou = np.nan if mask is None else np.count_nonzero(shown & mask) / max(int(np.count_nonzero(shown | mask)), 1)
     both = shown & (depth_m > 0)
-    off_m = np.abs(silhouette.depth_in(depth_m)[both] - depth_m[both])
-    return float(iou), float(1000 * np.quantile(off_m, 0.9)) if len(off_m) else np.nan
+    off_m = np.abs(surface_m[both] - depth_m[both])
+    off_mm = float(1000 * np.quantile(off_m, 0.9)) if len(off_m) else np.nan
+    return float(iou), on_surface(np.where(shown, surface_m, 0), depth_m), off_mm
+
+
+def doubtful(confidence: float, iou: float, on: float) -> bool:
+    """Whether a label is to be looked at, by :data:`DOUBTFUL`; what is not known (NaN) speaks against none."""
+    return confidence <= DOUBTED or iou < OVERLAP or on < ON_SURFACE
 
 
 class _Labels:
@@ -90,11 +118,12 @@ class _Labels:
         (frame, silhouettes), shown, given = self._rendered(i), self.masks(i), self.made.masks(i)
         whole = {name: outline(silhouette, frame.depth_m) for name, silhouette in silhouettes.items()}
         for name, silhouette in silhouettes.items():
-            fits = agreement(silhouette, shown[name], frame.depth_m, given.get(name))
+            iou, on, off_mm = agreement(silhouette, shown[name], frame.depth_m, given.get(name))
             obj = self.made.run.objects[name]
             confidence = obj.confidence[np.searchsorted(obj.frame_index, i)]
             share = np.count_nonzero(shown[name]) / max(whole[name].px, 1)
-            self.rows.append((i, name, self.objects.index(name) + 1, confidence, share, *fits))
+            judged = confidence, share, iou, on, off_mm, doubtful(confidence, iou, on)
+            self.rows.append((i, name, self.objects.index(name) + 1, *judged))
         return whole
 
 
@@ -102,8 +131,8 @@ def write_bop(folder: str | Path, out: str | Path, min_confidence: float = DOUBT
     """Write the run in ``folder`` as the BOP dataset ``out`` (see the module); what it holds, in words.
 
     Its scene is ``train/000001``, its images keep the run's frame numbers, its models are the run's surfaces.
-    ``labels.csv`` says of each label how well it fits, ``labels.json`` by what rule frames were left out and which
-    number is which object. Raises :class:`BadInput` where no frame has a label.
+    ``labels.csv`` says of each label how well it fits, ``labels.json`` by what rules frames were left out and labels
+    are doubtful, and which number is which object. Raises :class:`BadInput` where no frame has a label.
     """
     from pandas import DataFrame
 
@@ -120,7 +149,12 @@ def write_bop(folder: str | Path, out: str | Path, min_confidence: float = DOUBT
         replace_text(there / "camera.json", json.dumps(intrinsics | {"depth_scale": 1.0}, indent=1) + "\n")
         how: Any = {"index": False, "lineterminator": "\n", "float_format": "%.4f", "na_rep": "nan"}
         replace_text(there / "labels.csv", DataFrame(labels.rows, columns=list(COLUMNS)).to_csv(**how))
-        about = {"rule": RULE.format(min_confidence), "min_confidence": min_confidence, "visible_m": VISIBLE_M}
+        about = {
+            "rule": RULE.format(min_confidence),
+            "min_confidence": min_confidence,
+            "visible_m": VISIBLE_M,
+            "doubtful": DOUBTFUL,
+        }
         about |= {"run": made.about, "objects": obj_ids}
         about |= {"frames": len(made.frames), "labelled": len(labels.frames)}
         replace_text(there / "labels.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
@@ -129,13 +163,11 @@ def write_bop(folder: str | Path, out: str | Path, min_confidence: float = DOUBT
 
 def _summary(labels: _Labels, frames: int, min_confidence: float) -> str:
     """How many labels there are, how many images have none and why, and how many labels are to be looked at."""
-    confidence, overlap = (np.array([row[COLUMNS.index(c)] for row in labels.rows]) for c in ("confidence", "mask_iou"))
-    doubtful = np.count_nonzero((confidence <= DOUBTED) | (overlap < OVERLAP))
+    look_at = sum(row[COLUMNS.index("doubtful")] for row in labels.rows)
     lines = [f"{len(labels.rows)} labels in {len(labels.frames)} of {frames} images"]
     if left_out := frames - len(labels.frames):
         lines.append(f"{left_out} left out, in which an object has no pose of confidence above {min_confidence:g}")
-    why = f"confidence at most {DOUBTED:g}, or silhouette and mask overlap by less than {OVERLAP:g} (IoU)"
-    return "; ".join([*lines, f"{doubtful} of the labels doubtful ({why}): see labels.csv"])
+    return "; ".join([*lines, f"{look_at} of the labels doubtful ({DOUBTFUL}): see labels.csv"])
 
 
 def write_foundationpose(

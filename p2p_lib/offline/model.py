@@ -110,13 +110,21 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     about = _about(made, name, textured, len(views), off) | {"collision_faces": len(hull.faces)}
     replace_text(out / "model.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
     guessed = f", {100 * about['guessed_share']:.0f} % of its area guessed" if shape.guessed.any() else ""
-    line = f"{name}: {len(shape.faces)} faces, texture of {len(views)} views{guessed}"
+    line = f"{name}: {len(shape.faces)} faces, texture of {len(views)} views{guessed}{no_better(off)}"
     parts, holes = about["parts"], about["holes"]
     if parts <= _PARTS and holes <= _HOLES:
         return line
     fix = "" if made.about.get("offline") else "a model of RUN/offline (p2p refine RUN) or "
     found = f"{parts} part{'s' * (parts > 1)}, {holes} holes"
     return f"{line}; ragged ({found}): {fix}a video that shows each side longer and nearer has fewer"
+
+
+def no_better(off: dict[str, float]) -> str:
+    """What there is to say of a texture that is no better than vertex colours, by :func:`errors`; else nothing."""
+    texture_off, vertex_off = off["texture"], off["vertex_colours"]
+    if not texture_off >= vertex_off:
+        return ""
+    return f", no better than the surface's vertex colours (error {texture_off:.1f} against {vertex_off:.1f} of 255)"
 
 
 def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[str, float]) -> dict[str, Any]:

@@ -6,6 +6,10 @@ from its neighbours' poses, back and forth; the best is kept (``surface.py``, ``
 without a pose gets one that fits as well as the others do. Causal poses at which the surface fits the masks better are
 kept. The surface is fused anew with half the voxel size.
 
+The confidence of a frame stays the causal one, which judges the causal pose; where the fit gives more, from 1 at no
+cost to 0.5 at the limit, it is that. The rule of causal poses, on the covariance and the points of this pass, tells
+right poses from wrong ones less well: what a pass over all frames has wrong, all frames agree with.
+
 Written to ``RUN/offline``, a run's folder of its own that says ``"offline": true``: causal results stay as they are.
 It has no ``maps/``: keypoints and keyframes, by which an object is found again, stay those of ``RUN/maps``.
 """

@@ -14,6 +14,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.exchange import FORMATS
 from p2p_lib.datasets.models import MESHES, find_models, load_points
+from p2p_lib.offline.dataset import agreement, doubtful, visible
+from p2p_lib.offline.finished import Silhouette
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
 
@@ -36,12 +38,36 @@ def test_what_is_left_out_and_what_is_doubtful_is_counted(made, finished, tmp_pa
     arrays = dict(np.load(finished / "poses.npz"))
     arrays["box/confidence"] = np.where(np.arange(len(made.sequence)) < 3, 0.4, arrays["box/confidence"])
     np.savez(finished / "poses.npz", **arrays)
-    for least, doubtful in ((0.5, 0), (0.3, 3)):
+    for least, look_at in ((0.5, 0), (0.3, 3)):
         said = write_product(finished, "bop-dataset", out := tmp_path / f"set{least}", least)
         rows = list(csv.DictReader((out / "labels.csv").open()))
         frames, n = {row["image"] for row in rows}, len(made.sequence)
         assert said.startswith(f"{len(rows)} labels in {len(frames)} of {n} images; {n - len(frames)} left out")
-        assert f"; {doubtful} of the labels doubtful" in said
+        assert f"; {look_at} of the labels doubtful" in said
+
+
+def test_depth_makes_a_label_doubtful_that_fills_its_mask(finished, tmp_path):
+    arrays = dict(np.load(finished / "poses.npz"))
+    t = arrays["box/T_cam_obj"][10:13, :3, 3]
+    t *= 1 - 0.02 / np.linalg.norm(t, axis=1, keepdims=True)  # 2 cm nearer, along its ray
+    np.savez(finished / "poses.npz", **arrays)
+    write_product(finished, "bop-dataset", out := tmp_path / "set")
+    rows = {int(row["image"]): row for row in csv.DictReader((out / "labels.csv").open()) if row["object"] == "box"}
+    assert {i for i in range(9, 14) if rows[i]["doubtful"] == "True"} == {10, 11, 12}
+    for i in (10, 11, 12):
+        assert float(rows[i]["visib_iou"]) > 0.8 and float(rows[i]["depth_on_surface"]) < 0.6
+    assert "depth" in json.loads((out / "labels.json").read_text())["doubtful"]
+
+
+def test_holes_and_hands_make_no_label_doubtful():
+    depth_m = np.full((40, 60), 0.5, np.float32)
+    label = Silhouette((0, 0), depth_m.copy(), np.zeros(depth_m.shape, int))
+    depth_m[:, :20], depth_m[:, 20:40] = 0, 0.4  # not measured, and hidden
+    iou, on, off_mm = agreement(label, visible(label, depth_m), depth_m, None)
+    assert np.isnan(iou) and on == 1 and off_mm == 0 and not doubtful(1.0, iou, on)
+    depth_m[:, 40:55] = 0.9  # seen through
+    on = agreement(label, visible(label, depth_m), depth_m, None)[1]
+    assert on == 0.25 and doubtful(1.0, np.nan, on)
 
 
 def test_models_are_metric_whatever_the_file_says(made, scene):
@@ -77,8 +103,8 @@ def test_what_says_that_a_label_is_good_tells_the_wrong_ones(made, scene):
     with (scene.path.parents[1] / "labels.csv").open() as file:
         rows = {int(row["image"]): row for row in csv.DictReader(file) if row["object"] == "box"}
     clear = {i: row for i, row in rows.items() if float(row["visib_fract"]) > 0.9 and i not in made.wrong}
-    iou, off_mm = (np.array([float(row[key]) for row in clear.values()]) for key in ("mask_iou", "depth_off_mm"))
-    assert max(float(rows[i]["mask_iou"]) for i in (6, 7)) < iou.min() - 0.05  # 2 cm aside
+    iou, off_mm = (np.array([float(row[key]) for row in clear.values()]) for key in ("visib_iou", "depth_off_mm"))
+    assert max(float(rows[i]["visib_iou"]) for i in (6, 7)) < iou.min() - 0.05  # 2 cm aside
     assert float(rows[5]["depth_off_mm"]) > off_mm.max() + 1  # turned by 5 degrees
 
 

@@ -174,6 +174,12 @@ def test_exposure_is_evened_out():
         assert np.abs(view.rgb[10:-10, 10:-10] / even[1].rgb[10:-10, 10:-10] - 1).max() < 0.02
 
 
+def test_a_texture_that_is_no_better_than_vertex_colours_is_told():
+    told = model.no_better({"texture": 16.34, "vertex_colours": 15.52})
+    assert told == ", no better than the surface's vertex colours (error 16.3 against 15.5 of 255)"
+    assert model.no_better({"texture": 9.0, "vertex_colours": 15.5}) == ""
+
+
 def test_a_surface_is_cleaned_of_what_no_object_has():
     """A ball with the steps of voxels, a speck beside it, a face without area and a third face at an edge."""
     ball = trimesh.creation.icosphere(4, 0.05)
