@@ -25,7 +25,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.masks import MaskFiles
-from p2p_lib.datasets.models import load_mesh, load_points
+from p2p_lib.datasets.models import load_mesh, load_points, read_mesh
 from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import ObjectTruth, Sequence
 
@@ -206,7 +206,9 @@ def _visibility(mask: np.ndarray, whole: Outline | None) -> dict[str, object]:
 
 
 def write_models(folder: str | Path, models: Mapping[int, str | Path]) -> None:
-    """Write ``models/`` of a BOP dataset: ``obj_000001.ply`` in millimetres and ``models_info.json``.
+    """Write ``models/`` of a BOP dataset: ``obj_000001.ply`` in millimetres, and ``models_info.json``.
+
+    The vertices of a mesh keep their colours.
 
     models  BOP's number to a model file (see :func:`~p2p_lib.datasets.models.load_points`)
     """
@@ -223,7 +225,9 @@ def write_models(folder: str | Path, models: Mapping[int, str | Path]) -> None:
             shape: trimesh.PointCloud | trimesh.Trimesh = trimesh.PointCloud(points_mm)
         else:
             vertices, faces = load_mesh(path)
-            shape = trimesh.Trimesh(vertices * 1000, faces, process=False)
+            look: Any = read_mesh(Path(path)).visual
+            colours = look.vertex_colors if look.kind == "vertex" else None
+            shape = trimesh.Trimesh(vertices * 1000, faces, vertex_colors=colours, process=False)
         ply: Any = shape.export(file_type="ply")  # bytes, of this kind of file
         (folder / f"obj_{number:06d}.ply").write_bytes(ply)
         # The two points farthest apart are corners of the hull.

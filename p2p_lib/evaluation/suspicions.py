@@ -182,7 +182,7 @@ def suspicions(e: RunEvidence) -> tuple[Suspicion, ...]:
         count = rule.count(e)
         wrong = count & rule.against(e)
         if wrong.sum() > max(rule.limit * count.sum(), _CHANCE):
-            share = f"{100 * wrong.sum() / count.sum():.0f} %"
+            share = f"in {100 * wrong.sum() / count.sum():.0f} % of the frames"
             found.append(_suspicion(rule.name, f"{rule.text} ({share})", e, wrong, count))
     return tuple(found)
 

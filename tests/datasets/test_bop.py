@@ -208,6 +208,9 @@ def test_depth_that_does_not_fit_is_refused(tmp_path):
 def test_written_models_are_read_back(tmp_path):
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
     mesh.apply_translation([0.01, -0.02, 0.3])
+    colours = np.random.default_rng(0).integers(0, 255, (len(mesh.vertices), 4), np.uint8)
+    colours[:, 3] = 255
+    mesh.visual.vertex_colors = colours
     (tmp_path / "ball.obj").write_text(mesh.export(file_type="obj"))
     (tmp_path / "points.xyz").write_text("\n".join(f"{x} {y} {z}" for x, y, z in mesh.vertices))
     write_models(tmp_path / "models", {1: tmp_path / "ball.obj", 7: tmp_path / "points.xyz"})
@@ -219,3 +222,4 @@ def test_written_models_are_read_back(tmp_path):
     assert info["min_x"] == pytest.approx(-40, rel=1e-3) and info["size_z"] == pytest.approx(100, rel=1e-3)
     again = trimesh.load(tmp_path / "models/obj_000001.ply", process=False)
     assert len(again.faces) == len(mesh.faces)
+    np.testing.assert_allclose(again.visual.vertex_colors, colours, atol=1)

@@ -97,7 +97,7 @@ def test_stretches_are_named_across_frames_that_do_not_count():
     overlap = np.where(ROWS % 10 == 0, 0.9, np.nan)
     overlap[[20, 30, 40, 70]] = 0.1
     (found,) = suspicions(replace(spotless(), overlap=overlap))
-    assert found.text.endswith("(40 %): frames 30 to 50, 80") and found.frames == (30, 40, 50, 80)
+    assert found.text.endswith("(in 40 % of the frames): frames 30 to 50, 80") and found.frames == (30, 40, 50, 80)
 
 
 def test_what_is_not_known_is_not_held_against_anybody():
