@@ -34,8 +34,8 @@ from p2p_lib.method.refinement import surface_distance
 #: A pose on which so many landmarks agree, and under which this share of the surface shows, is the object's. (A label
 #: that repeats on the other side of a tin has half of its colours right.)
 _AGREEING, _RECOGNISED = 8, 0.65
-#: So many places that look alike are compared by how much of the surface shows.
-_ALIKE = 3
+#: So many poses that look alike are compared by how much of the surface shows.
+_ALIKE = 4
 #: Else under a pose have to show: so many landmarks; this share of a keyframe's (all, divided by the keyframes, at most
 #: by this number); this share of the surface; and depth steps along this share of its outline.
 _FEWEST, _OF_A_VIEW, _VIEWS, _SHARE, _OUTLINE = 4, 0.1, 10, 0.8, 0.45
@@ -180,15 +180,17 @@ class Remembered(TwoMaps):
         return [(sighting, False) for sighting in found if sighting.share >= _SHARE]
 
     def _recognised(self, search: ImageSearch, pairs: Any) -> list[Sighting]:
-        """Where landmarks agree on a pose and the surface shows: several places if something looks alike."""
+        """Where landmarks agree on a pose and the surface shows: several where something looks alike, or turned.
+
+        On a label that repeats most landmarks may agree on the wrong side, and those that are left on the right one.
+        """
         p_obj, sample, found = self._memory.p_obj, self.policy.shape.sample(self.model), []
         for _ in range(_ALIKE):
             agreeing = self._recogniser.agreeing(pairs, p_obj)
             if len(agreeing) < _AGREEING:
                 break
             found.append(search.about(agreeing.T_cam_obj, sample))
-            away_m = np.linalg.norm(pairs.p_cam - agreeing.p_cam.mean(0), axis=1)
-            pairs = pairs.select(away_m > np.ptp(sample.p_obj, 0).max())
+            pairs = pairs.select(~np.isin(pairs.rows, agreeing.rows))
         return [sighting for sighting in found if sighting is not None and sighting.share >= _RECOGNISED]
 
     def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ import ast
 
 import pytest
 
+from p2p_lib.benchmark.plan import Method, Plan
 from p2p_lib.datasets import provenance
 
 SOURCE = '"""Doc."""\n\n\ndef f(x: int) -> int:\n    """Doc."""\n    return x + 1  # one more\n'
@@ -53,3 +54,8 @@ def test_every_python_gives_the_same():
             node._fields = (*node._fields, "type_params")
     assert provenance._syntax(tree) == provenance._syntax(ast.parse(SOURCE))
     assert provenance._syntax(ast.parse('x = """Doc."""\n')) != provenance._syntax(ast.parse("x = 1\n"))
+
+
+def test_what_only_memories_use_decides_no_table(digest):
+    assert digest(SOURCE, "extended/remembered.py") == digest("B = 2\n", "extended/remembered.py")
+    assert not {"memory", "frozen"} & {*Method.model_fields, *Plan.model_fields}, "then it decides"

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from p2p_lib import Point2Pose, open_sequence, preset
 from p2p_lib.core import memory as memories
@@ -408,6 +409,22 @@ def test_after_a_reset_it_is_looked_for_as_at_first(crossing, learnt):
         told.append(followed(crossing, method, LATER[:3])[-1]["box"])
         method.reset()
     np.testing.assert_array_equal(told[1].T_cam_obj, told[0].T_cam_obj)
+
+
+def test_a_label_that_repeats_is_looked_at_from_both_sides(crossing, learnt):
+    """Most landmarks agree on the wrong side, and the others on the right one, at the same place."""
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    rows, middle = np.arange(60), learnt.memory.p_obj.mean(0)
+    right = crossing.truth["box"].T_cam_model[LEARNT[-1]] @ se3.inverse(learnt.T_obj_model)
+    turn = Rotation.from_euler("y", 180, degrees=True).as_matrix()
+    wrong = right @ se3.from_rt(turn, middle - turn @ middle)
+    p_obj = learnt.memory.p_obj[rows].astype(float)
+    p_cam = np.where((rows < 35)[:, None], se3.transform(wrong, p_obj), se3.transform(right, p_obj))
+    pairs, asked = Recognised(rows, crossing.camera.project(p_cam), p_cam), []
+    search = SimpleNamespace(about=lambda T_cam_obj, sample: asked.append(T_cam_obj))
+    method.objects["box"]._recognised(search, pairs)
+    assert [np.degrees(se3.angle_rad(se3.inverse(right) @ T)) for T in asked] == pytest.approx([180, 0], abs=1)
 
 
 def test_look_alikes_are_not_taken_for_each_other(opening):
