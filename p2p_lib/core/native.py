@@ -11,6 +11,7 @@ import os
 import shutil
 from types import ModuleType
 
+from p2p_lib.core.compiled import uninterrupted
 from p2p_lib.core.errors import MissingBackend, in_a_line
 from p2p_lib.core.packages import INSTALL, command
 
@@ -54,6 +55,13 @@ def preload_libusb() -> bool:
     except ImportError:
         return False
     return path is not None and loads(str(path))
+
+
+def load_mesh_libraries() -> None:
+    """Import what meshes are made with, which takes seconds."""
+    with uninterrupted():  # trimesh takes a Ctrl-C that comes meanwhile for a library that is missing, and goes on
+        import skimage.measure  # noqa: F401
+        import trimesh  # noqa: F401
 
 
 def load_open3d() -> ModuleType:

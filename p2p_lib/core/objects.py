@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depth_trouble
 from p2p_lib.core.errors import BadInput, doubt
+from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.prediction import Prediction, Predictor
 from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
@@ -90,7 +91,7 @@ class Objects(ABC):
         depth was measured, is forgotten with that frame: ``refused`` and the reason of the object's estimates say why,
         until :meth:`correct` says something better.
         """
-        if name in self.objects:
+        if file_name("object name", name) in self.objects:
             raise BadInput("add_object", repr(name), "a name not in use", f"In use: {', '.join(self.objects)}.")
         if mask is clicks is negative is box is None:
             with self.alone():

@@ -11,6 +11,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.errors import BadInput, doubt
+from p2p_lib.core.files import file_name
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame
 
@@ -39,8 +40,7 @@ class Prompt:
     mask: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
-            raise BadInput("prompt", f"the name {self.name!r}", "a word")
+        file_name("object name", self.name)
         if isinstance(self.frame, bool) or not isinstance(self.frame, int | np.integer) or self.frame < 0:
             raise BadInput(f"prompt of {self.name!r}", f"frame {self.frame!r}", "a whole number from 0")
         for key, what in (("points_px", "clicks on"), ("negative_px", "negative clicks of")):

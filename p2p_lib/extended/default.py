@@ -17,6 +17,7 @@ from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, as_config, from_dict
 from p2p_lib.core.errors import BadInput, did_you_mean
+from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.memory import ObjectMemory, read_memories, save_memories
 from p2p_lib.extended.frame_guard import FrameGuard
@@ -138,7 +139,7 @@ class Point2Pose(pipeline.Point2Pose):
         if memory is None:
             super().add_object(name, *prompt, **more)
             return
-        if prompt or more or name in self.objects:
+        if prompt or more or file_name("object name", name) in self.objects:
             got = "clicks or a mask, too" if prompt or more else f"{name!r}, which is in use"
             raise BadInput("add_object with a memory", got, "a new name and the memory alone")
         if not isinstance(memory, ObjectMemory):

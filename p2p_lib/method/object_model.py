@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.core.compiled import uninterrupted
 from p2p_lib.core.config import Config
+from p2p_lib.core.native import load_mesh_libraries
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import WITH_POSE, Status
 from p2p_lib.method.factor_graph import GraphResult, ObjectGraph
@@ -298,9 +298,7 @@ class Known:
 
 def _volume(config: Config) -> TsdfVolume:
     """An empty surface. The mesh libraries take seconds to import: here, not in the middle of tracking."""
-    with uninterrupted():  # trimesh takes a Ctrl-C that comes meanwhile for a library that is missing, and goes on
-        import skimage.measure  # noqa: F401
-        import trimesh  # noqa: F401
+    load_mesh_libraries()
 
     from p2p_lib.method.tsdf import TsdfVolume
 

@@ -23,7 +23,6 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import uninterrupted
 from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.objects import Objects
 from p2p_lib.core.stopwatch import Stopwatch
@@ -143,8 +142,8 @@ class Point2Pose(Objects):
         self.front.waiting.clear()
 
     def begin(self, name: str) -> None:
-        """Start an object of which nothing is known; its results are kept in files of its name."""
-        rng = np.random.default_rng([self.config.seed, *file_name("object name", name).encode()])
+        """Start an object of which nothing is known."""
+        rng = np.random.default_rng([self.config.seed, *name.encode()])
         made_of = self.camera, self.config, self.detector, rng, self.stopwatch, self._executor
         self.objects[name] = self._parts.object(name, *made_of, map_id=self._next_map.get(name, 0))
 
