@@ -165,7 +165,7 @@ def main() -> None:
             nothing += absent("desk_fast", desk, out / "desk_absent", bottle + own)
         nothing += absent("synthetic/occlusion", "synthetic/occlusion", out / "occlusion_absent", bottle + own)
     rows += synthetic(out, asked.cases)
-    ran = ", ".join(f"{what} {value}" for what, value in machine().items())
+    ran = ", ".join(f"{what} {value}" for what, value in machine().items() if not what.startswith("load"))
     kept = {"machine": ran, "sight": _SIGHT_PX, "frames": _FRAMES}
     page = PAGE.format(found=as_markdown(DataFrame(rows)), absent=as_markdown(DataFrame(nothing)), **kept)
     (Path(__file__).parent / "recall.md").write_text(page)
