@@ -104,7 +104,7 @@ LESSONS = (
         "10_your_own_data",
         "Your own data",
         'figure "Overview of the framework", from the clicks to the mesh',
-        "a folder to poses and a mesh, on a bundled sequence: what to provide, what goes wrong, how to tell that it works",
+        "from a folder to poses and a mesh, on bundled data: what to provide, what goes wrong, how to tell it works",
     ),
     Lesson(
         "11_label_your_own",
