@@ -436,7 +436,6 @@ def _refine(a: argparse.Namespace) -> None:
     QUIET,
 )
 def _export(a: argparse.Namespace) -> None:
-    check_new(a.out)  # before a model takes its minutes
     if a.format in PRODUCTS:
         from p2p_lib.offline.products import write_product
 
@@ -445,6 +444,7 @@ def _export(a: argparse.Namespace) -> None:
     from p2p_lib.offline.finished import load_posed
     from p2p_lib.run import export_run
 
+    check_new(a.out)
     load_posed(a.run)
     written = export_run(a.run, a.format, a.out, a.frame, a.min_confidence or 0.0)
     files = (f"{path}/*.txt ({len(list(path.iterdir()))})" if path.is_dir() else str(path) for path in written)
