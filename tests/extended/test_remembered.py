@@ -151,6 +151,8 @@ def test_a_memory_goes_with_nothing_else_and_not_with_the_paper(crossing, learnt
     method = Point2Pose(crossing.camera)
     with pytest.raises(BadInput, match="got str, expected a memory, as load_memory reads it"):
         method.add_object("box", memory="box.npz")
+    with pytest.raises(BadInput, match="object name"):
+        method.add_object("a/b", memory=learnt.memory)
     method.add_object("box", memory=learnt.memory)
     with pytest.raises(BadInput, match="in use"):
         method.add_object("box", memory=learnt.memory)

@@ -174,9 +174,10 @@ def test_exposure_is_evened_out():
         assert np.abs(view.rgb[10:-10, 10:-10] / even[1].rgb[10:-10, 10:-10] - 1).max() < 0.02
 
 
-def test_a_texture_that_is_no_better_than_vertex_colours_is_told():
-    told = model.no_better({"texture": 16.34, "vertex_colours": 15.52})
-    assert told == ", no better than the surface's vertex colours (error 16.3 against 15.5 of 255)"
+def test_a_texture_that_is_no_better_than_vertex_colours_is_told(finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(model, "errors", lambda *of: {"texture": 16.34, "vertex_colours": 15.52, "frames": 12})
+    told = write_product(finished, "model", tmp_path / "out", faces=100)
+    assert ", no better than the surface's vertex colours (error 16.3 against 15.5 of 255)" in told
     assert model.no_better({"texture": 9.0, "vertex_colours": 15.5}) == ""
 
 
