@@ -176,6 +176,7 @@ def test_exposure_is_evened_out():
 
 def test_a_texture_that_is_no_better_than_vertex_colours_is_told(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(model, "errors", lambda *of: {"texture": 16.34, "vertex_colours": 15.52, "frames": 12})
+    monkeypatch.setattr(model.texture, "chosen_rows", lambda *of: [])  # which take their time
     told = write_product(finished, "model", tmp_path / "out", faces=100)
     assert ", no better than the surface's vertex colours (error 16.3 against 15.5 of 255)" in told
     assert model.no_better({"texture": 9.0, "vertex_colours": 15.5}) == ""
