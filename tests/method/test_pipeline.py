@@ -17,6 +17,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt
+from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.method.object_model import CONFIRM_FRAMES
@@ -208,6 +209,8 @@ def test_a_name_that_no_file_can_have_is_refused_before_anything_is_tracked():
     for name in ("a/b", ""):
         with pytest.raises(BadInput, match="object name"):
             method.add_object(name)
+        with pytest.raises(BadInput, match="object name"):
+            Prompt(name, points_px=[[200, 150]])
     assert not method.objects
 
 
