@@ -51,9 +51,11 @@ def stale(folder: Path, only: Collection[str] = ()) -> DataFrame:
 
 
 def of_earlier_code(folder: Path, note: dict) -> bool:
-    """Whether this is a table or figure of earlier code, or drawn from such a table."""
-    tables = [note_of(folder / "tables" / source["file"]) for source in note["sources"] if "file" in source]
-    return any(earlier(said) for said in [note, *filter(None, tables)])
+    """Whether this is a table or figure of earlier code, or drawn from such a table, or from one that changed since."""
+    drawn_from = {folder / "tables" / s["file"]: s["sha256"] for s in note["sources"] if "file" in s}
+    if any(table.is_file() and sha256(table) != drawn for table, drawn in drawn_from.items()):
+        return True
+    return any(earlier(said) for said in [note, *filter(None, map(note_of, drawn_from))])
 
 
 def say_so(folder: Path) -> None:

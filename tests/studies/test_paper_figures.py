@@ -147,10 +147,12 @@ def drawn(tmp_path, monkeypatch):
 
 
 def test_a_table_that_changed_leaves_its_figure_behind(drawn):
-    assert outdated(drawn) == []
+    note = json.loads((drawn / "runtime.json").read_text())
+    assert outdated(drawn) == [] and not anew.of_earlier_code(drawn, note)
     table = drawn / "tables" / "runtime.csv"
     table.write_text(table.read_text().replace("10", "11"))
     assert outdated(drawn) == ["runtime: runtime.csv is newer than what was drawn from it"]
+    assert anew.of_earlier_code(drawn, note), "p2p benchmark --stale lists it"
 
 
 def test_a_picture_without_its_note_or_with_another_content_is_named(drawn):
