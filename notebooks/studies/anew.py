@@ -1,4 +1,4 @@
-"""What of ``figures/`` was measured by other code than this: the list, the line in each that says so, and its remaking.
+"""What of ``figures/`` was measured by other code than this, or by an earlier plan: the list, the line in each that says so, and its remaking.
 
 ``p2p benchmark --stale`` is this. :func:`p2p_lib.figures.provenance.earlier` decides, and nothing else.
 """
@@ -19,8 +19,8 @@ from p2p_lib.datasets.download import sha256
 from p2p_lib.figures.provenance import earlier
 from studies.paper_figures import ITEMS, commit_of, index, note_of
 
-#: How the line begins that a table of earlier code ends with.
-LINE = "Made by earlier tracking code"
+#: How the line begins that such a table ends with.
+LINE = "Made at an earlier state of the tracking code or of its plan"
 
 
 def stale(folder: Path, only: Collection[str] = ()) -> DataFrame:

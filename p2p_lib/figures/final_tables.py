@@ -168,11 +168,14 @@ def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method:
             same |= {column} if ran and not part and not recreated else set()
             note = part or ("re-created, not the paper's files" if recreated and ran else "")
             cells[column] = replace(cells[column], note=cells[column].note or note)
+    besides = {column for column, cell in cells.items() if column not in columns and cell.text != "-"}
     cells["Mean"] = numbers.cell(method.name, METRICS[metric][0], MEAN, "", form)
     if len(whole) < len(columns):
-        values = [float(cells[column].text.partition(" ")[0]) for column in whole if cells[column].text != FAIL]
+        texts = [cells[column].text for column in whole | besides]
+        values = [float(text.partition(" ")[0]) for text in texts if text != FAIL]
         count = f"{len(whole)} of the table's {len(columns)} columns"
         some = f"of {count}, which were run in whole" if whole else f"{count} were run in whole"
+        some += f"; {len(besides)} more that no column is named for are in the mean" if besides else ""
         cells["Mean"] = replace(number(float(np.mean(values)) if values else None), note=some)
     name = method.name if metric in AREA_KEYS else f"{method.name}, {form}'s form"
     comparable = {*same, "Mean"} if len(same) == len(columns) else same

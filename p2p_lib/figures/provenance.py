@@ -168,8 +168,8 @@ def earlier(note: Mapping[str, Any]) -> bool:
     """Whether a table or figure was measured by other code than this, or as its plan does not say any more."""
     measured = False
     for source in note["sources"]:
-        if "benchmark" in source and source["runs"]:
-            measured = True
+        if "benchmark" in source:
+            measured |= bool(source["runs"])
             if source.get("plan") != _plan_digest(read_plan(source["benchmark"])):
                 return True
         measured |= "run" in source or "evaluation" in source

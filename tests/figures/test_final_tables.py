@@ -103,6 +103,16 @@ def test_ours_is_compared_where_the_whole_sequence_ran(tmp_path):
     assert cell(table, "Mean", *ours) == Cell("98.00", bold=True), "the mean over sequences"
 
 
+def test_the_mean_is_over_the_rows_that_ran_where_no_column_is_named_for_them(tmp_path):
+    runs = {("Ours", "folder_a"): [outcome(90)], ("Ours", "folder_b"): [outcome(80)]}
+    ours = ("ADD (%)", "CAD-free", "Ours")
+    none = "0 of the table's 9 columns were run in whole"
+    said = f"{none}; 2 more that no column is named for are in the mean"
+    assert cell(paper_table(benchmark(tmp_path, runs, **INEOAT)), "Mean", *ours) == Cell("85.00", note=said)
+    runs["Ours", "bleach0"] = [outcome(70, FRAMES["bleach0"])]
+    assert cell(paper_table(benchmark(tmp_path, runs, **INEOAT)), "Mean", *ours).text == "80.00"
+
+
 def test_a_re_creation_is_never_compared_with_the_papers_numbers(tmp_path):
     """It ran in whole and is better than all that is reported: not bold, and said so."""
     plan = read_plan("ycbmultitrack_synthetic")

@@ -89,6 +89,8 @@ def test_a_table_of_earlier_code_says_so_until_it_is_made_anew(tmp_path, monkeyp
     assert (tmp_path / "tables/readme.md").read_text() == "| 1 |\n"
     monkeypatch.setattr(provenance, "_plan_digest", lambda plan: "another")
     assert untold(tmp_path) == ["tables/readme.md"], "its plan asks for something else by now"
+    (tmp_path / "tables/readme.json").write_text(json.dumps(note | {"sources": [runs | {"runs": []}]}))
+    assert untold(tmp_path) == ["tables/readme.md"], "a table of dashes has rows of its plan, too"
 
 
 def test_what_is_stale_is_made_anew_where_it_lies_each_command_once(tmp_path, monkeypatch):
