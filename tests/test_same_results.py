@@ -1,0 +1,31 @@
+"""Whether two codes track alike, and what becomes of tables where they do."""
+
+import json
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def same(tool):
+    return tool("same_results")
+
+
+def test_one_bit_makes_a_difference(same, tmp_path):
+    for side, value in (("a", 1.0), ("b", 1.0), ("c", np.nextafter(1.0, 2.0))):
+        (tmp_path / side).mkdir()
+        np.savez(tmp_path / side / "poses.npz", **{"box/T": np.array([value, np.nan]), "box/status": np.array(["x"])})
+    assert same.differences(tmp_path / "a", tmp_path / "b") == []
+    assert same.differences(tmp_path / "a", tmp_path / "c") == ["poses.npz: box/T"]
+    np.savez(tmp_path / "b" / "masks.npz", box=np.zeros(2))
+    assert same.differences(tmp_path / "a", tmp_path / "b") == ["masks.npz: box"], "one of them alone has it"
+
+
+def test_tables_of_the_same_code_get_its_digest_and_say_what_was_compared(same, tmp_path):
+    (tmp_path / "tables").mkdir()
+    for name, code in (("old", "x"), ("mine", "a")):
+        (tmp_path / f"tables/{name}.json").write_text(json.dumps({"code": code, "commit": "c"}))
+    assert same.restamp(tmp_path, "a", "b", 12) == ["mine.json"]
+    assert json.loads((tmp_path / "tables/old.json").read_text()) == {"code": "x", "commit": "c"}
+    note = json.loads((tmp_path / "tables/mine.json").read_text())
+    assert note == {"code": "b", "commit": "c", "same_as": [{"code": "a", "runs compared": 12}]}

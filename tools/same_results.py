@@ -1,0 +1,119 @@
+"""Does this code track as another commit's does, bit for bit? Then tables of that commit are tables of this code.
+
+    python tools/same_results.py COMMIT [--only SEQUENCE ...]
+
+For a change that decides no pose: names, types, messages, what is kept and shown. Runs of both presets, of 2D trackers
+that need no weights, and of every source of masks are made with the library of COMMIT and with this one, and every
+array of their poses, keypoints and masks is compared. Where all are the same, tables and figures whose note has the
+digest of COMMIT's code get this code's, and ``same_as``: the digest that they were made with, and how many runs were
+compared. Ends with exit code 1 where a run differs; then nothing is written. Sequences below ``$P2P_DATA`` are compared
+where they are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+FIGURES = ROOT / "figures"
+#: Sequence, and what it is run with.
+CASES: tuple[tuple[str, ...], ...] = (
+    ("synthetic/crossing", "--masks", "clicks"),
+    ("synthetic/look_away", "--masks", "first"),
+    ("synthetic/mug", "--stop", "160"),
+    ("synthetic/other_side", "--seed", "1"),
+    ("synthetic/in_hand", "--masks", "clicks", "--stop", "200"),
+    ("synthetic/thin_tools", "--masks", "clicks", "--stop", "150"),
+    ("synthetic/cluttered_desk", "--masks", "clicks", "--stop", "150"),
+    ("synthetic/occlusion", "--set", "tracking.forget_after=10"),
+    ("synthetic/crossing", "--preset", "paper", "--tracker", "builtin2d", "--stop", "150"),
+    ("synthetic/weak_texture", "--preset", "paper", "--tracker", "lk", "--stop", "120"),
+    ("synthetic/crossing", "--tracker", "oracle", "--stop", "120"),
+    ("redkitchen_table", "--masks", "clicks"),
+    ("desk_fast", "--masks", "clicks"),
+    ("YCBInEOAT/mustard0", "--masks", "first", "--stop", "150"),
+)
+ARRAYS = ("poses.npz", "keypoints.npz", "masks.npz")
+#: Of the library that is imported: prints its digest; is its command line.
+_DIGEST = "from p2p_lib.datasets.provenance import code_digest; print(code_digest())"
+_P2P = "import sys; from p2p_lib.apps.command_line import main; sys.exit(main())"
+
+
+def of_commit(commit: str, folder: Path) -> Path:
+    """The library of a commit, below ``folder``."""
+    packed = subprocess.run(["git", "-C", str(ROOT), "archive", commit, "p2p_lib"], check=True, capture_output=True)
+    with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
+        archive.extractall(folder, filter="data")
+    return folder
+
+
+def python(library: Path, *arguments: str) -> str:
+    """What Python prints with this library; raises where it fails."""
+    environment = os.environ | {"PYTHONPATH": str(library), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, *arguments], env=environment, cwd=library, text=True, capture_output=True)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(arguments)}\n{done.stderr}")
+    return done.stdout.strip()
+
+
+def differences(one: Path, other: Path) -> list[str]:
+    """Arrays of two runs that are not the same to the last bit."""
+    found = []
+    for name in ARRAYS:
+        kept = [dict(np.load(folder / name)) if (folder / name).is_file() else {} for folder in (one, other)]
+        for key in sorted({*kept[0], *kept[1]}):
+            a, b = (arrays.get(key) for arrays in kept)
+            if a is None or b is None or a.dtype != b.dtype or a.tobytes() != b.tobytes():
+                found.append(f"{name}: {key}")
+    return found
+
+
+def restamp(folder: Path, was: str, now: str, compared: int) -> list[str]:
+    """Give notes that hold the digest ``was`` the digest ``now``, and say so in them; the names of their files."""
+    changed = []
+    for path in sorted([*folder.glob("*.json"), *folder.glob("tables/*.json")]):
+        note = json.loads(path.read_text(encoding="utf-8"))
+        if note.get("code") != was:
+            continue
+        note |= {"code": now, "same_as": [*note.get("same_as", []), {"code": was, "runs compared": compared}]}
+        path.write_text(json.dumps(note, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        changed.append(path.name)
+    return changed
+
+
+def main() -> int:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("commit")
+    parser.add_argument("--only", nargs="*", default=(), metavar="SEQUENCE")
+    asked = parser.parse_args()
+    data = Path(os.environ.get("P2P_DATA", os.devnull))
+    cases = [c for c in CASES if c[0].startswith("synthetic/") or (data / c[0]).is_dir()]
+    cases = [c for c in cases if not asked.only or c[0] in asked.only]
+    with tempfile.TemporaryDirectory() as scratch:
+        before = of_commit(asked.commit, Path(scratch) / "before")
+        was, now = python(before, "-c", _DIGEST), python(ROOT, "-c", _DIGEST)
+        for k, (sequence, *options) in enumerate(cases):
+            runs = [Path(scratch) / f"{k}_{side}" for side in ("before", "now")]
+            for library, out in zip((before, ROOT), runs, strict=True):
+                python(library, "-c", _P2P, "run", sequence, *options, "--out", str(out), "--quiet")
+            differ = differences(*runs)
+            print(f"{'differs' if differ else 'same'}: {sequence} {' '.join(options)}", *differ[:5], flush=True)
+            if differ:
+                return 1
+    print(f"{len(cases)} runs are the same; {was} -> {now}:", *restamp(FIGURES, was, now, len(cases)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
