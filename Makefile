@@ -22,6 +22,7 @@ book: docs ## notebooks as make reproduce left them, and the API reference, as o
 	@test -f out/quick/index.html || $(MAKE) reproduce
 	@rm -rf out/book && mkdir -p out/book/notebooks
 	@cp out/quick/index.html out/book && cp out/quick/notebooks/*.html out/book/notebooks && cp -r out/docs out/book/api
+	@sed -i 's|</h1>|</h1><p><a href="api/index.html">API reference</a></p>|' out/book/index.html
 	@echo "Open out/book/index.html"
 
 figures: setup ## every table and figure of the paper from the data and backends present; goes on where it was stopped

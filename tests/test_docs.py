@@ -124,7 +124,8 @@ def test_commands_and_their_options_are_known(name):
 
 
 def test_the_map_of_notebooks_is_whole():
-    assert re.findall(r"(?m)^\| `(\d\d_\w+)` \|", read("README.md")) == [path.stem for path in list_notebooks()]
+    listed = re.findall(r"(?m)^\| \[`(\d\d_\w+)`\]\(notebooks/\1\.ipynb\) \|", read("README.md"))
+    assert listed == [path.stem for path in list_notebooks()]
 
 
 def test_the_example_tracker_tracks():
