@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from p2p_lib.core.errors import BadInput, Doubt
-from p2p_lib.core.memory import save_memory
+from p2p_lib.core.errors import Doubt
 from p2p_lib.core.mesh import save as save_mesh
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
@@ -25,7 +24,8 @@ from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation.consistency import consistency
-from p2p_lib.extended.default import Point2Pose, memory_in
+from p2p_lib.extended.default import Point2Pose
+from p2p_lib.extended.saving import keep_memory
 
 #: Frames whose images are looked at when a run is judged at its end; ``p2p eval`` looks at more.
 RUN_LOOKS = 30
@@ -81,16 +81,14 @@ class Keeper:
 
     def save_maps(self) -> None:
         """``meshes/<object>.ply`` and ``maps/<object>.npz`` of each surface in its object's frame, and the two logs."""
-        path, info, maps = self.writer.path, self.writer.info, {}
-        made_of = {key: info[key] for key in ("sequence", "tracker", "start", "stop") if key in info}
+        path, maps = self.writer.path, {}
         for name, trackers in self.followed.items():
             map_id = self.writer.kept_map(name)
             for obj in (obj for obj in trackers if obj.known_as(map_id) is not None):
                 model = obj.known_as(map_id).model
                 if model.surface is not None and len((mesh := model.surface.mesh()).faces):
                     save_mesh(mesh, path / "meshes" / f"{name}.ply")
-                with suppress(BadInput):  # too little is known to find it again
-                    save_memory(path / "maps" / f"{name}.npz", memory_in(obj, map_id, **made_of, map_id=map_id))
+                keep_memory(path / "maps" / f"{name}.npz", obj, map_id, self.writer.info)
                 maps[name] = model.map.ids, model.map.p_obj, model.map.promoted
         self.keypoints.save(path, maps)
         self.mask_log.save(path)

@@ -111,7 +111,7 @@ def _run(a: argparse.Namespace) -> int:
     options = replace(_asked(a), save_masks=a.save_masks or film is not None)
     how = {"if_exists": a.if_exists or "refuse", "redo_from": a.redo_from, "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
-    print("\n".join(result.summary))
+    print("\n".join([*result.summary, *_without_map(a.out)]))
     if result.look_at:
         print("\n".join(["What to look at before it is believed:", *(f"  {line}" for line in result.look_at)]))
     if result.evaluation is not None:
@@ -130,6 +130,14 @@ def _run(a: argparse.Namespace) -> int:
     if result.advice:
         warn(f"p2p run: {result.advice}")
     return 0 if result.tracked else P2PError.exit_code
+
+
+def _without_map(run: Path) -> list[str]:
+    """A line for each object of which too little was learnt for a map, with the reason."""
+    from p2p_lib.datasets.runs import read_info
+
+    without = (read_info(run) or {}).get("without_map") or {}
+    return [f"{name}: no map was kept, by which --memory would find it: {why}" for name, why in without.items()]
 
 
 @command(
@@ -193,7 +201,7 @@ def _live(a: argparse.Namespace) -> None:
         pass  # how one stops a camera
     finally:
         camera.close()
-    warn(count)
+    warn("\n".join([str(count), *(_without_map(a.out) if a.out is not None else ())]))
 
 
 # --- scoring -------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ A memory is of the object alone. It is metric, so that another camera, another p
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -15,14 +15,24 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.files import check_arrays, file_name, load_arrays, parse_json, save_arrays
+from p2p_lib.core.files import file_name, load_arrays, parse_json, read_text, save_arrays
 
 #: Of the files that this library writes, and reads.
 VERSION = 2
+#: Scales and bytes of a landmark's descriptor, as the recogniser makes and compares them.
+DESCRIPTOR = (2, 128)
 _KIND = "p2p object memory"
 _EXPECTED = "a memory as p2p run writes it (maps/OBJECT.npz)"
 #: Keyframe poses were rounded to this and more.
 _POSE_TOLERANCE = 5e-3
+#: What is farther away than a depth camera sees is in other units, m; so are landmarks that are so many times the
+#: lattice's longest side away from it (the lattice of a large object ends where its voxels are used up).
+_FARTHEST_M, _BESIDE = 100.0, 10
+#: Above the weight that is written.
+_MOST_WEIGHT = 1e6
+#: What an array holds, and numpy's letters for that.
+_INTEGERS = np.typecodes["AllInteger"]
+_LETTERS = {"numbers": _INTEGERS + np.typecodes["Float"], "whole numbers": _INTEGERS, "bytes": "B"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +42,10 @@ class SurfaceMemory:
     voxel_m        the lattice's step, and tau_m, the distance that a value of 1 stands for; metres
     origin_m       (3,) where the lattice is anchored in the object frame; lo (3,) index of its first voxel
     shape          (3,) voxels
-    index          (M,) which voxels, counted in C order; value (M,) from -1, inside, to 1; weight (M,)
+    index          (M,) which voxels, counted in C order, ascending; value (M,) from -1, inside, to 1; weight (M,)
     rgb            (M, 3) uint8, and rgb_weight (M,), 0 where no colour was seen
+
+    Raises :class:`BadInput` for what is no such surface.
     """
 
     voxel_m: np.ndarray
@@ -48,15 +60,35 @@ class SurfaceMemory:
     rgb_weight: np.ndarray
 
     def __post_init__(self) -> None:
+        what = "memory surface"
+        _check(what, self, "numbers", voxel_m=(), tau_m=(), origin_m=(3,))
+        _check(what, self, "whole numbers", lo=(3,), shape=(3,), index=(None,))
         m = len(self.index)
-        single = {"voxel_m": (), "tau_m": (), "origin_m": (3,), "lo": (3,), "shape": (3,)}
-        of_each = {"value": (m,), "weight": (m,), "rgb": (m, 3), "rgb_weight": (m,)}
-        check_arrays("memory surface", self, single | of_each, finite=True)
+        _check(what, self, "numbers", value=(m,), weight=(m,), rgb_weight=(m,))
+        _check(what, self, "bytes", rgb=(m, 3))
         voxels = np.prod(self.shape.astype(float))
-        if not (0 < float(self.voxel_m) < 1 and float(self.tau_m) > 0 and (self.shape > 1).all() and voxels < 1 << 31):
-            raise BadInput("memory surface", f"{self.shape} voxels of {self.voxel_m} m", "a grid of voxels")
-        if not m or self.index.min() < 0 or self.index.max() >= voxels:
-            raise BadInput("memory surface", "no voxels, or some outside the grid", "observed voxels of the grid")
+        if not (0 < float(self.voxel_m) < 1 and 0 < float(self.tau_m) < 1 and (self.shape > 1).all()):
+            got = f"{_of(self.shape)} voxels of {self.voxel_m} m, which end {self.tau_m} m from the surface"
+            raise BadInput(what, got, "a grid of voxels")
+        if voxels >= 1 << 31:
+            raise BadInput(what, f"{_of(self.shape)} voxels", "as many as a computer holds")
+        if np.abs(self.corners_m).max() > _FARTHEST_M:
+            raise BadInput(what, f"voxels {np.abs(self.corners_m).max():.3g} m away", "metres, near the object frame")
+        index = self.index.astype(np.int64)
+        if not m or index.min() < 0 or index.max() >= voxels or (np.diff(index) <= 0).any():
+            raise BadInput(f"{what}: index", "none, some twice, or some outside the grid", "voxels of it, ascending")
+        for key, (least, most) in {
+            "value": (-1, 1),
+            "weight": (0, _MOST_WEIGHT),
+            "rgb_weight": (0, _MOST_WEIGHT),
+        }.items():
+            _check_between(f"{what}: {key}", getattr(self, key), least, most)
+
+    @property
+    def corners_m(self) -> np.ndarray:
+        """(2, 3) the first and the last corner of the lattice in the object frame."""
+        lo = self.lo.astype(float)
+        return self.origin_m + float(self.voxel_m) * np.stack([lo, lo + self.shape])
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,13 +97,20 @@ class ObjectMemory:
 
     name         of the object
     p_obj        (N, 3) its landmarks, metres
-    descriptors  (N, scales, SIZE) uint8: how each looks on the surface
+    descriptors  (N, scales, SIZE) uint8: how each looks on the surface (:data:`DESCRIPTOR`)
     confidence   (N,) of the poses that placed them
     T_cam_obj    (V, 4, 4) poses of its keyframes: from where it was seen
     covariance   (6, 6) of the newest keyframe, right tangent of T_cam_obj
     seen_m2      the most that a keyframe showed of it, across the line of sight
     surface      with colours
-    made_of      where it comes from: plain values
+    made_of      where it comes from: plain values, and as ``before`` a list of the same of the memories that it began
+                 with, the oldest first, whose object frame it is in
+
+    There is one covariance, not one a keyframe: that of the map, to which the covariance of a frame is added, is its
+    newest keyframe's. How well the older ones were known is in the landmarks, each with the ``confidence`` of the pose
+    that placed it; nothing is measured from those keyframes again.
+
+    Raises :class:`BadInput` for what is no such memory, and for one of which too little is known.
     """
 
     name: str
@@ -85,19 +124,65 @@ class ObjectMemory:
     made_of: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        file_name("memory name", self.name)
+        what = f"memory of {file_name('memory name', self.name)!r}"
+        _check(what, self, "numbers", p_obj=(None, 3), T_cam_obj=(None, 4, 4), covariance=(6, 6), seen_m2=())
         n, v = len(self.p_obj), len(self.T_cam_obj)
         if not n or not v:
-            what = f"{n} landmarks and {v} keyframes"
             fix = "Learn the object from more or sharper frames, or with more texture."
-            raise BadInput(f"memory of {self.name!r}", what, "an object that can be found again by them", fix)
-        if self.descriptors.ndim != 3 or self.descriptors.dtype != np.uint8:
-            raise BadInput("memory descriptors", f"{self.descriptors.shape}", "(N, scales, SIZE) uint8")
-        shapes = {"p_obj": (n, 3), "descriptors": (n, *self.descriptors.shape[1:]), "confidence": (n,)}
-        shapes |= {"T_cam_obj": (v, 4, 4), "covariance": (6, 6), "seen_m2": ()}
-        check_arrays(f"memory of {self.name!r}", self, shapes, finite=True)
+            got, expected = f"{n} landmarks and {v} keyframes", "an object that can be found again by them"
+            raise BadInput(what, got, expected, fix)
+        _check(what, self, "bytes", descriptors=(n, *DESCRIPTOR))
+        _check(what, self, "numbers", confidence=(n,))
+        _check_between(f"{what}: confidence", self.confidence, 0, 1)
+        _check_between(f"{what}: seen_m2", self.seen_m2, 0, _FARTHEST_M**2)
         for T in self.T_cam_obj:
-            se3.check("memory T_cam_obj", T, _POSE_TOLERANCE)
+            se3.check(f"{what}: T_cam_obj", T, _POSE_TOLERANCE)
+        far_m = np.linalg.norm(self.T_cam_obj[:, :3, 3], axis=1).max()
+        if far_m > _FARTHEST_M:
+            raise BadInput(f"{what}: T_cam_obj", f"a keyframe {far_m:.3g} m away", "metres")
+        first, last = self.surface.corners_m
+        beside_m = np.maximum(first - self.p_obj, self.p_obj - last).max()
+        if beside_m > _BESIDE * (last - first).max():
+            raise BadInput(f"{what}: p_obj", f"landmarks {beside_m:.3g} m beside the surface", "metres, on the surface")
+        if not _is_covariance(self.covariance):
+            raise BadInput(f"{what}: covariance", "no covariance", "a symmetric matrix without negative variances")
+        _check_origins(what, self.made_of)
+
+
+def _check(what: str, of: Any, kind: str, /, **shapes: tuple[int | None, ...]) -> None:
+    """Raise :class:`BadInput` for a field that is no array of this kind and shape (None: any length), all finite."""
+    for key, shape in shapes.items():
+        got, expected = getattr(of, key), f"{kind} {_of(shape) or 'alone'}"
+        if not isinstance(got, np.ndarray):
+            raise BadInput(f"{what}: {key}", "no array", expected)
+        fits = len(shape) == got.ndim and all(w in (None, n) for w, n in zip(shape, got.shape, strict=True))
+        if not fits or got.dtype.char not in _LETTERS[kind]:
+            raise BadInput(f"{what}: {key}", f"{got.dtype} {_of(got.shape) or 'alone'}", expected)
+        if not np.isfinite(got).all():
+            raise BadInput(f"{what}: {key}", "some that are not finite", f"finite {expected}")
+
+
+def _of(shape: Iterable[int | None]) -> str:
+    return " x ".join("any" if n is None else str(n) for n in shape)
+
+
+def _check_between(what: str, values: np.ndarray, least: float, most: float) -> None:
+    low, high = float(values.min()), float(values.max())
+    if low < least or high > most:
+        raise BadInput(what, f"{low:g} to {high:g}", f"{least:g} to {most:g}")
+
+
+def _is_covariance(matrix: np.ndarray) -> bool:
+    """Whether it is symmetric and has no negative variance, but for rounding."""
+    tolerance = 1e-3 * np.abs(matrix).max()
+    symmetric = np.abs(matrix - matrix.T).max() <= tolerance
+    return bool(symmetric and np.linalg.eigvalsh((matrix + matrix.T) / 2).min() >= -tolerance)
+
+
+def _check_origins(what: str, made_of: Mapping[str, Any]) -> None:
+    before = made_of.get("before", []) if isinstance(made_of, Mapping) else None
+    if not isinstance(before, list) or not all(isinstance(origin, Mapping) for origin in before):
+        raise BadInput(f"{what}: made_of", repr(made_of)[:120], "values by name, and before, a list of such")
 
 
 def save_memory(path: str | Path, memory: ObjectMemory) -> None:
@@ -139,11 +224,14 @@ def read_memories(path: str | Path, kind: str, expected: str) -> tuple[dict[str,
     if not isinstance(head, dict) or head.get("kind") != kind:
         raise BadInput(str(path), "an archive of something else", expected)
     if head.get("version") != VERSION:
-        fix = "Make it again with this version."
-        raise BadInput(str(path), f"version {head.get('version')}", f"{expected} of version {VERSION}", fix)
+        got, fix = json.dumps(head.get("version"))[:40], "Make it again with this version."
+        raise BadInput(str(path), f"version {got}", f"{expected} of version {VERSION}", fix)
+    about, objects = head.get("about"), head.get("objects")
+    if not isinstance(about, dict) or not isinstance(objects, dict):
+        raise BadInput(str(path), "a file that does not say what is in it", expected)
     try:
-        return dict(head["about"]), {name: _memory(name, of, arrays) for name, of in head["objects"].items()}
-    except (KeyError, AttributeError, TypeError) as error:
+        return about, {name: _memory(name, of, arrays) for name, of in objects.items()}
+    except KeyError as error:
         raise BadInput(str(path), f"a file without {error}", expected) from None
     except BadInput as error:
         raise BadInput(f"{path}: {error.name}", error.got, error.expected, error.fix) from None
@@ -152,7 +240,7 @@ def read_memories(path: str | Path, kind: str, expected: str) -> tuple[dict[str,
 def _memory(name: str, made_of: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> ObjectMemory:
     surface = SurfaceMemory(*(arrays[f"{name}/surface/{f.name}"] for f in fields(SurfaceMemory)))
     own = {f.name: arrays[f"{name}/{f.name}"] for f in _array_fields(ObjectMemory)}
-    return ObjectMemory(name, **own, surface=surface, made_of=dict(made_of))
+    return ObjectMemory(name, **own, surface=surface, made_of=made_of)
 
 
 def load_memories(paths: Sequence[str | Path]) -> dict[str, ObjectMemory]:
@@ -176,11 +264,20 @@ def _files(path: Path) -> list[Path]:
         return [path]
     folder = path / "maps" if (path / "maps").is_dir() else path
     if folder is path and (path / "run.json").is_file():
-        fix = "An offline pass keeps none: give the run that it was made of."
-        raise MissingData(str(path), f"a run without maps, expected {_EXPECTED}", fix)
+        raise MissingData(str(path), f"a run without maps, expected {_EXPECTED}", _why_without(path / "run.json"))
     if not (files := sorted(folder.glob("*.npz"))):
         raise MissingData(str(folder), f"no file in it, expected {_EXPECTED}")
     return files
+
+
+def _why_without(run_json: Path) -> str:
+    """Why a run has no maps, and what to do."""
+    expected = "what p2p run writes"
+    info = parse_json(read_text(run_json, expected), str(run_json), expected)
+    if isinstance(info, dict) and info.get("offline"):
+        return "An offline pass keeps none: give the run that it was made of."
+    why = "No object was learnt well enough in it, or it was cut short before it kept any."
+    return f"{why} Learn from more or sharper frames, or go on with it (--resume)."
 
 
 def _array_fields(kind: type) -> list[Any]:

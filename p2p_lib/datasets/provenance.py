@@ -21,8 +21,9 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 # opens, runs and scores a sequence decides, and what makes numbers of that.
 _WITHOUT = {"__init__.py", "apps", "benchmark", "figures", "offline"}
 _BUT = {f"benchmark/{name}.py" for name in ("execution", "jobs", "rows", "scoring")}
-# No table's run begins with a memory.
-_MEMORY = {"core/memory.py", "extended/remembered.py", "extended/remembering.py", "trackers/builtin/recogniser.py"}
+# No table's run begins with a memory, and what is kept of a tracker is asked when the last frame has been tracked.
+_MEMORY = {f"extended/{name}.py" for name in ("remembered", "remembering", "saving")}
+_MEMORY |= {"core/memory.py", "trackers/builtin/recogniser.py"}
 
 
 @cache

@@ -13,4 +13,7 @@ plug in at four places:
 - inside an object's step: ``policy`` replaces the paper's. ``gates`` judge a pose, ``agreement`` says whether depth and
   masks are consistent over time, ``contour`` where something flat ends, ``motion`` where an object goes, ``confidence``
   how well a pose is known, ``lifecycle`` is an object's state; ``model``, ``graph`` and ``views`` are its map.
+
+Beside them is what outlasts a video: ``remembered`` is an object that began with a memory, ``remembering`` what is
+known of one as a memory, ``saving`` a tracker as a file.
 """

@@ -6,26 +6,24 @@ Deleting a line here takes a mechanism out; ``method.mechanisms = "all but NAME"
 from __future__ import annotations
 
 from collections.abc import Container
-from dataclasses import asdict
 from functools import partial
-from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.config import Config, as_config, from_dict
+from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
-from p2p_lib.core.memory import ObjectMemory, read_memories, save_memories
+from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.extended.model import JoinableModel
 from p2p_lib.extended.policy import OurPolicy
 from p2p_lib.extended.reacquisition import Reacquisition
 from p2p_lib.extended.remembered import Remembered
-from p2p_lib.extended.remembering import memory_of
+from p2p_lib.extended.saving import Savable
 from p2p_lib.extended.scene import Scene
 from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method import pipeline
@@ -66,8 +64,6 @@ MECHANISMS = {
     "sure_keyframes": "Poses of low confidence and unconfirmed returns make no keyframes.",
     "stray_points": "A point observed far from its predicted place stays out of the graph.",
 }
-#: A file of :meth:`Point2Pose.save`: its kind, and what that is to people.
-_SAVED, _SAVED_BY = "p2p tracker", "a tracker as Point2Pose.save writes it"
 ALL, NONE, ALL_BUT = "all", "none", "all but "
 
 
@@ -89,7 +85,7 @@ def chosen(config: Config) -> frozenset[str]:
     return frozenset(set(MECHANISMS) - names if spec.startswith(ALL_BUT) else names)
 
 
-class Point2Pose(pipeline.Point2Pose):
+class Point2Pose(Savable):
     """Causal 6D tracking of any number of unknown rigid objects in one RGB-D stream.
 
     config  parameters, or the name of a preset (default: ``default``)
@@ -149,52 +145,6 @@ class Point2Pose(pipeline.Point2Pose):
         self.begin(name)
         self._recogniser = self._recogniser or backends.make_recogniser(self.camera)
         self.objects[name] = Remembered(self.objects[name].own, memory, self._recogniser, frozen)
-
-    def save(self, path: str | Path) -> None:
-        """Keep what is known of all objects, as plain data, for :meth:`load`.
-
-        :class:`BadInput` for an object of which too little is known to find it again.
-        """
-        learnt = {name: self.memory(name) for name, obj in self.objects.items() if not obj.model.empty}
-        parts = {"tracker": self.tracker.name, "detector": self.detector.name, "segmenter": self.segmenter.name}
-        frozen = {name: isinstance(obj, Remembered) and obj.frozen for name, obj in self.objects.items()}
-        about = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": frozen, **parts}
-        save_memories(path, learnt, _SAVED, about)
-
-    @classmethod
-    def load(cls, path: str | Path, camera: Camera | None = None, **parts: Any) -> Self:
-        """A tracker that knows what another one knew when it was saved; its objects are looked for, and found, anew.
-
-        camera  if it is another one now; ``parts``: a tracker, detector or segmenter in place of the saved ones
-        """
-        about, learnt = read_memories(path, _SAVED, _SAVED_BY)
-        try:
-            named = {name: about[name] for name in ("tracker", "detector", "segmenter")} | parts
-            loaded = cls(camera or Camera(**about["camera"]), from_dict(about["config"], str(path)), **named)
-            for name, frozen in about["objects"].items():
-                loaded.add_object(name, memory=learnt.get(name), frozen=frozen)
-        except (KeyError, TypeError, AttributeError) as error:
-            raise BadInput(str(path), f"a file without {error}", _SAVED_BY) from None
-        return loaded
-
-    def memory(self, name: str, **made_of: Any) -> ObjectMemory:
-        """What is known of an object now, to be kept by :func:`p2p_lib.core.memory.save_memory`.
-
-        made_of  plain values that say where it comes from
-
-        Raises :class:`BadInput` where too little is known to find it again.
-        """
-        if name not in self.objects:
-            raise BadInput("memory", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        return memory_in(self.objects[name], self.objects[name].known.map_id, **made_of)
-
-
-def memory_in(obj: TwoMaps | ObjectTracker, number: int, **made_of: Any) -> ObjectMemory:
-    """What an object's map of this ``number`` holds; raises as :meth:`Point2Pose.memory`."""
-    before, known = (obj.began_with(number) if isinstance(obj, Remembered) else None), obj.known_as(number)
-    if known is None:
-        raise BadInput(f"memory of {obj.name!r}", f"map {number}, which was given up", "a map that is kept")
-    return memory_of(obj.name, known, made_of, before)
 
 
 def compose(camera: Camera, config: Config) -> pipeline.Parts:

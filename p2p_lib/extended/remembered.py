@@ -81,6 +81,7 @@ class Remembered(TwoMaps):
         own, memory = self.own, self._memory
         own.known = Known(own.new_model(), replace(self.policy.life, seen_m2=float(memory.seen_m2)), self._first_map)
         own.model.recall(memory)
+        self._recalled = own.model.revision
         self.other, self.policy.frozen, self.policy.trusted = None, True, None
         self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
         self._since = 0  # frames since landmarks were looked for on it
@@ -111,6 +112,12 @@ class Remembered(TwoMaps):
     def began_with(self, map_id: int) -> ObjectMemory | None:
         """The memory that this map began with; None for a later map."""
         return self._memory if map_id == self._first_map else None
+
+    @property
+    def has_learnt(self) -> bool:
+        """Whether the map that the memory began holds more than the memory."""
+        known = self.known_as(self._first_map)
+        return known is not None and known.model.revision > self._recalled
 
     def find(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Recognition | None:
         """Look for it in a frame, outside of what other objects have ``taken`` and inside its ``mask``, (H, W) bool.
@@ -228,7 +235,7 @@ class Remembered(TwoMaps):
             self._borne_out += step.estimate.inliers >= self.config.lifecycle.return_inliers
             self.policy.frozen = self.frozen or not self._confirmed
         self._since += 1
-        due = self._since >= _EVERY and step.estimate.T_cam_obj is not None and self.known.map_id == 0
+        due = self._since >= _EVERY and step.estimate.T_cam_obj is not None and self.known.map_id == self._first_map
         if not due or followed >= _ENOUGH or step.estimate.status is Status.DEGRADED or obs.mask is None:
             return step
         self._since = 0

@@ -26,12 +26,15 @@ if TYPE_CHECKING:
 _LANDMARKS, _SHOWS_M = 1500, 0.01
 #: Voxel weights are cut at this, so that later frames still change the average.
 _MOST_WEIGHT = 200.0
+#: So many origins are kept: the first, which the object frame is of, and the newest.
+_ORIGINS = 100
 
 
 def memory_of(name: str, known: Known, made_of: dict[str, Any], before: ObjectMemory | None = None) -> ObjectMemory:
     """What is known of an object; :class:`BadInput` where that is too little to find it again.
 
-    before  what its map began with; its landmarks are kept
+    made_of  plain values that say where it comes from
+    before   what its map began with; its landmarks are kept, and where it comes from
     """
     surface = known.model.surface
     if surface is None or surface.empty:
@@ -39,12 +42,20 @@ def memory_of(name: str, known: Known, made_of: dict[str, Any], before: ObjectMe
     columns = [_landmarks(known, surface)]
     if before is not None:
         columns.append((before.p_obj, before.descriptors, before.confidence))
+        made_of = made_of | {"before": _origins(before)}
     columns = [column for column in columns if len(column[0])] or columns[:1]
     p_obj, descriptors, confidence = (np.concatenate(of) for of in zip(*columns, strict=True))
     kept = np.sort(np.random.default_rng(0).permutation(len(p_obj))[:_LANDMARKS])
     landmarks = p_obj[kept], descriptors[kept], confidence[kept]
     rest = known.model.views.T_cam_obj, known.model.covariance, np.array(getattr(known.life, "seen_m2", 0.0))
     return ObjectMemory(name, *landmarks, *rest, _surface_memory(surface), made_of)
+
+
+def _origins(before: ObjectMemory) -> list[dict[str, Any]]:
+    """Where a memory, and those that it began with, come from, the oldest first."""
+    own = dict(before.made_of)
+    every = [*own.pop("before", []), own]
+    return every[:1] + every[1:][1 - _ORIGINS :]
 
 
 def _landmarks(known: Known, surface: TsdfVolume) -> tuple[np.ndarray, ...]:

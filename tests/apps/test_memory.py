@@ -1,5 +1,6 @@
 """``p2p run`` keeps what it learnt of each object, and ``--memory`` looks for it in another video."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -33,6 +34,36 @@ def test_each_object_is_kept_and_all_are_found_without_masks(learnt, tmp_path):
         T_obj_model = np.linalg.inv(before.objects[name].T_cam_obj[0]) @ before.objects[name].T_cam_model[0]
         off_m = (obj.T_cam_obj[3:] @ T_obj_model - obj.T_cam_model[3:])[:, :3, 3]
         assert np.linalg.norm(off_m, axis=1).max() < 0.01
+
+
+def test_before_a_camera_it_is_found_without_a_click(learnt, tmp_path, capsys):
+    words = [
+        "--memory",
+        str(learnt / "maps/box.npz"),
+        "--backlog",
+        "20",
+        "--stop",
+        "6",
+        "--out",
+        str(tmp_path / "live"),
+    ]
+    assert main(["live", "--camera", "folder:synthetic/crossing", "--rate", "5", *words]) == 0
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {one["object"] for one in told} == {"box"}
+    assert told[0]["T_cam_obj"] is None and told[0]["reason"] == "known from memory, not found yet"
+    before = load_run(learnt).objects["box"]
+    off_m = [np.array(one["T_cam_obj"])[:3, 3] - before.T_cam_obj[one["frame"], :3, 3] for one in told[2:]]
+    assert len(off_m) >= 3 and np.linalg.norm(off_m, axis=1).max() < 0.006, "in the frame of the map"
+    assert load_memory(tmp_path / "live/maps/box.npz").made_of["sequence"]
+
+
+def test_what_too_little_was_learnt_of_is_said_at_the_end(tmp_path, capsys):
+    words = ["--stop", "2", "--set", "method.surface=false", "--objects", "box", "--out", str(tmp_path / "out")]
+    assert main([*CROSSING, *words]) == 0
+    line = "box: no map was kept, by which --memory would find it: no surface"
+    assert line in capsys.readouterr().out.splitlines()
+    assert main([*CROSSING, "--memory", str(tmp_path / "out"), "--out", str(tmp_path / "again")]) == 2
+    assert "No object was learnt well enough" in capsys.readouterr().err
 
 
 def test_one_that_is_not_there_is_no_fault_of_the_data(learnt, tmp_path, capsys):

@@ -1,11 +1,14 @@
 """The digest of the code changes with what decides a number, and with nothing else."""
 
 import ast
+from types import FunctionType
 
 import pytest
 
 from p2p_lib.benchmark.plan import Method, Plan
 from p2p_lib.datasets import provenance
+from p2p_lib.extended.saving import Savable
+from p2p_lib.method import pipeline
 
 SOURCE = '"""Doc."""\n\n\ndef f(x: int) -> int:\n    """Doc."""\n    return x + 1  # one more\n'
 
@@ -57,5 +60,13 @@ def test_every_python_gives_the_same():
 
 
 def test_what_only_memories_use_decides_no_table(digest):
-    assert digest(SOURCE, "extended/remembered.py") == digest("B = 2\n", "extended/remembered.py")
+    for name in ("remembered", "remembering", "saving"):
+        assert digest(SOURCE, f"extended/{name}.py") == digest("B = 2\n", f"extended/{name}.py"), name
     assert not {"memory", "frozen"} & {*Method.model_fields, *Plan.model_fields}, "then it decides"
+
+
+def test_what_saves_a_tracker_has_no_part_in_tracking():
+    """It stands between the method and the class that users call, and would go before the method."""
+    own = {name for name, value in vars(Savable).items() if isinstance(value, FunctionType | classmethod | property)}
+    assert own == {"save", "load", "memory"}
+    assert not own & set(dir(pipeline.Point2Pose))

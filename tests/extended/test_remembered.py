@@ -4,6 +4,7 @@ import json
 from dataclasses import fields, replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,10 +15,12 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.memory import ObjectMemory, SurfaceMemory, load_memories, load_memory, save_memory
 from p2p_lib.core.types import Status
+from p2p_lib.datasets.resized import Resized
 from p2p_lib.extended.graph import BoundedGraph
 from p2p_lib.extended.image_search import ImageSearch
 from p2p_lib.extended.remembered import _certain
 from p2p_lib.trackers.builtin.recogniser import Recognised, Recogniser
+from p2p_lib.trackers.rollouts import RolloutTracker
 
 LEARNT, LATER = range(0, 45), range(74, 85)
 
@@ -67,7 +70,7 @@ def test_a_memory_is_read_as_it_was_written_and_is_small(learnt, kept):
             if isinstance(getattr(one, f.name), np.ndarray):
                 np.testing.assert_array_equal(getattr(other, f.name), getattr(one, f.name))
                 assert getattr(other, f.name).dtype == getattr(one, f.name).dtype
-    assert read.name == "box" and read.made_of == {"sequence": "crossing"}
+    assert read.name == "box" and read.made_of == learnt.memory.made_of and read.made_of["sequence"] == "crossing"
     assert kept.stat().st_size < 2e6
     with np.load(kept, allow_pickle=False) as file:
         assert all(file[name].dtype.kind in "iufb" for name in file.files)
@@ -123,7 +126,7 @@ def test_a_folder_gives_all_its_memories(learnt, tmp_path):
     with pytest.raises(MissingData, match="no file in it, expected a memory"):
         load_memories([tmp_path / "none"])
     (tmp_path / "none/run.json").write_text("{}")
-    with pytest.raises(MissingData, match=r"a run without maps, .* An offline pass keeps none"):
+    with pytest.raises(MissingData, match=r"a run without maps, .* No object was learnt well enough"):
         load_memories([tmp_path / "none"])
 
 
@@ -175,7 +178,7 @@ def test_it_is_found_by_a_second_image_in_the_frame_of_its_map(crossing, learnt,
     assert again.told[0]["box"].status is Status.INITIALISING
     for i, told in zip(LATER[2:], again.told[2:], strict=True):
         assert told["box"].T_cam_obj is not None and told["box"].map_id == 0
-        off = se3.inverse(crossing.truth["box"].T_cam_model[i]) @ told["box"].T_cam_obj @ learnt.T_obj_model
+        off = off_truth(crossing, learnt, told, i)
         assert np.linalg.norm(off[:3, 3]) < 0.006 and np.degrees(se3.angle_rad(off)) < 3
     assert again.told[2]["box"].status is Status.RECOVERED
     mask, true = again.method.masks["box"], crossing.masks(LATER[-1])["box"]
@@ -186,6 +189,20 @@ def test_landmarks_that_come_into_view_become_keypoints(again):
     of_memory = again.method.objects["box"]._key
     assert again.keypoints >= 8
     assert (of_memory >= 0).sum() > again.keypoints
+
+
+def test_so_do_those_of_one_that_was_removed_and_added_again(crossing, learnt):
+    """Its map has another number then."""
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    followed(crossing, method, range(LATER[0] - 1, LATER[0]))
+    method.remove_object("box")
+    method.add_object("box", memory=learnt.memory)
+    assert followed(crossing, method, LATER[:3])[-1]["box"].map_id == 1
+    of_memory = method.objects["box"]._key
+    at_first = (of_memory >= 0).sum()
+    followed(crossing, method, LATER[3:])
+    assert (of_memory >= 0).sum() > at_first
 
 
 def test_keypoints_lie_where_they_are_seen(crossing, again):
@@ -209,6 +226,64 @@ def test_a_tracker_without_features_follows_what_was_found(crossing, learnt):
     method = Point2Pose(crossing.camera, tracker="lk")
     method.add_object("box", memory=learnt.memory)
     assert all(one["box"].T_cam_obj is not None for one in followed(crossing, method, LATER[:6])[2:])
+
+
+def off_truth(crossing, learnt, told, i):
+    """(4, 4) from where an estimate has the model in frame i to where it is."""
+    return se3.inverse(crossing.truth["box"].T_cam_model[i]) @ told["box"].T_cam_obj @ learnt.T_obj_model
+
+
+class Flow:
+    """A rollout that carries its queries from image to image by optical flow."""
+
+    def __init__(self, pictures, uv_px):
+        self.uv_px, self.waiting = uv_px.astype(np.float32), [cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in pictures]
+
+    def step(self, rgb):
+        self.waiting.append(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+        self.uv_px, found, _ = cv2.calcOpticalFlowPyrLK(*self.waiting[:2], self.uv_px[:, None], None)
+        self.uv_px, self.waiting = self.uv_px[:, 0], self.waiting[1:]
+        return self.uv_px.astype(float), found[:, 0] > 0, np.full(len(found), 0.1)
+
+
+@pytest.mark.parametrize("late", [0, 3])
+def test_a_model_of_rollouts_follows_what_was_found(crossing, learnt, late):
+    """Landmarks that are recognised in a frame become its queries there; no image of the first video is needed."""
+    tracker = RolloutTracker("flow", Flow, late)
+    method = Point2Pose(crossing.camera, tracker=tracker)
+    method.add_object("box", memory=learnt.memory)
+    told = [one for one in followed(crossing, method, LATER) if one]
+    assert len(told) == len(LATER) - late
+    for i, one in zip(LATER[2:], told[2:], strict=False):
+        off = off_truth(crossing, learnt, one, i)
+        assert np.linalg.norm(off[:3, 3]) < 0.006 and np.degrees(se3.angle_rad(off)) < 3
+    mine = np.isin(method.tracks.ids, method.objects["box"].map.ids)
+    assert method.tracks.visible[mine].sum() >= 8 and told[-1]["box"].inliers >= 8
+
+
+def test_a_camera_of_half_the_size_finds_it_at_the_same_place(crossing, learnt):
+    small, frames = Resized(crossing, 0.5), range(45, 51)
+    method = Point2Pose(small.camera)
+    method.add_object("box", memory=learnt.memory)
+    assert small.camera.width == 320
+    for i, one in zip(frames[1:], followed(small, method, frames)[1:], strict=True):
+        off = off_truth(crossing, learnt, one, i)
+        assert np.linalg.norm(off[:3, 3]) < 0.003 and np.degrees(se3.angle_rad(off)) < 2
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_side_that_was_not_seen_before_is_in_the_memory_unless_it_is_frozen(crossing, learnt, frozen):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory, frozen=frozen)
+    followed(crossing, method, range(45, 75))
+    before, kept = learnt.memory, method.memory("box", sequence="later")
+    new = {tuple(p) for p in kept.p_obj} - {tuple(p) for p in before.p_obj}
+    surface = (
+        kept.surface.value.shape == before.surface.value.shape and (kept.surface.value == before.surface.value).all()
+    )
+    grown = [len(kept.T_cam_obj) > len(before.T_cam_obj), len(new) >= 20, not surface]
+    assert grown == [not frozen] * 3
+    assert kept.made_of.get("before") == (None if frozen else [before.made_of])
 
 
 def sightings(crossing, memory, frame, pairs=None):
