@@ -1,4 +1,4 @@
-"""What of ``figures/`` was measured by other code than this, or by an earlier plan: the list, the line in each that says so, and its remaking.
+"""What of ``figures/`` was measured by other code than this, or by an earlier plan: list, a line in each, remaking.
 
 ``p2p benchmark --stale`` is this. :func:`p2p_lib.figures.provenance.earlier` decides, and nothing else.
 """
