@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from threading import RLock
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,6 +56,23 @@ class Objects(ABC):
             yield
         finally:
             self._turn.release()
+
+    def close(self) -> None:
+        """End the threads once their work is done; afterwards nothing can be tracked. Once more does nothing."""
+        if not self.closed:
+            with self.alone():
+                self.closed = True
+                self.end()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def end(self) -> None:
+        """End what runs beside the calls; nothing is called afterwards."""
 
     @property
     @abstractmethod

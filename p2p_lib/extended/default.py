@@ -146,9 +146,10 @@ class Point2Pose(pipeline.Point2Pose):
             raise BadInput("add_object with a memory", type(memory).__name__, "a memory, as load_memory reads it")
         if not chosen(self.config):
             raise BadInput("add_object with a memory", "mechanisms none", "preset default: the paper has no memory")
-        self.begin(name)
-        self._recogniser = self._recogniser or backends.make_recogniser(self.camera)
-        self.objects[name] = Remembered(self.objects[name].own, memory, self._recogniser, frozen)
+        with self.alone():
+            self.begin(name)
+            self._recogniser = self._recogniser or backends.make_recogniser(self.camera)
+            self.objects[name] = Remembered(self.objects[name].own, memory, self._recogniser, frozen)
 
     def save(self, path: str | Path) -> None:
         """Keep what is known of all objects, as plain data, for :meth:`load`.

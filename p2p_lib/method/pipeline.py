@@ -14,7 +14,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -157,13 +157,6 @@ class Point2Pose(Objects):
 
     # -- the end -------------------------------------------------------------------------------
 
-    def close(self) -> None:
-        """End the threads once their work is done; afterwards nothing can be tracked."""
-        self.closed = True
+    def end(self) -> None:
+        """End the threads once their work is done."""
         self._executor.shutdown()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
