@@ -34,6 +34,9 @@ class Objects(ABC):
     """
 
     def __init__(self, camera: Camera):
+        if not isinstance(camera, Camera):
+            fix = "Make one: Camera(fx, fy, cx, cy, width, height), or Camera.from_K(K, width, height)."
+            raise BadInput("tracker camera", type(camera).__name__, "a p2p_lib.Camera", fix)
         self.camera = camera
         self.objects: dict[str, Any] = {}
         self.refused: dict[str, BadInput] = {}
@@ -158,7 +161,8 @@ class Objects(ABC):
         time_s  not before the newest pose of more confidence than 0.5. The covariance grows with the time since:
                 after a second it says little
 
-        None until there is such a pose. Raises :class:`BadInput` for an unknown name and an earlier time.
+        None until there is such a pose. Raises :class:`BadInput` for an unknown name, an earlier time
+        and what is no time.
         """
         with self.alone():
             if name not in self.objects:

@@ -12,6 +12,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.memory import ObjectMemory, SurfaceMemory
 from p2p_lib.core.types import NOT_FOUND, Status, status_text, status_word
 from p2p_lib.extended.default import Point2Pose
+from p2p_lib.method import pipeline
 from p2p_lib.segmenters.anchored import builtin
 from tests.method.test_pipeline import CAMERA, HIDDEN, assert_same, film, quick, track
 
@@ -55,6 +56,13 @@ def test_a_closed_tracker_says_so_and_can_be_reset():
     method.reset()
     assert method.step(film()[0][0]) == {}
     method.close()
+
+
+@pytest.mark.parametrize("camera", ["cam", None, np.eye(3)], ids=["text", "none", "matrix"])
+@pytest.mark.parametrize("tracker", [Point2Pose, pipeline.Point2Pose])
+def test_what_is_no_camera_is_refused_at_once(camera, tracker):
+    with pytest.raises(BadInput, match=r"tracker camera: got .*, expected a p2p_lib\.Camera\. Make one: Camera\(fx"):
+        tracker(camera)
 
 
 def test_a_reset_forgets_the_objects_of_a_segmenter_that_was_given():
@@ -141,9 +149,12 @@ def test_a_prediction_refuses_what_it_cannot_answer():
             method.predict("mug", 1.0)
         method.add_object("left")
         assert method.predict("left", 1.0) is None
+        for no_time in (None, "1"):
+            with pytest.raises(BadInput, match=r"predict time_s: got .*, expected a time in seconds"):
+                method.predict("left", no_time)
         for frame, masks in film()[:3]:
             method.step(frame, {"left": masks["left"]})
-        for time_s in (0.0, np.nan, np.inf):
+        for time_s in (0.0, np.nan, np.inf, None, "1"):
             with pytest.raises(BadInput, match="predict time_s"):
                 method.predict("left", time_s)
         method.remove_object("left")
