@@ -27,7 +27,7 @@ from p2p_lib.extended.reacquisition import Reacquisition
 from p2p_lib.extended.remembered import Remembered
 from p2p_lib.extended.remembering import memory_of
 from p2p_lib.extended.scene import Scene
-from p2p_lib.extended.two_maps import TwoMaps
+from p2p_lib.extended.two_maps import OurTracker, TwoMaps
 from p2p_lib.method import pipeline
 from p2p_lib.method.object_tracker import ObjectTracker
 
@@ -89,7 +89,7 @@ def chosen(config: Config) -> frozenset[str]:
     return frozenset(set(MECHANISMS) - names if spec.startswith(ALL_BUT) else names)
 
 
-class Point2Pose(pipeline.Point2Pose):
+class Point2Pose(pipeline.Point2Pose[TwoMaps]):
     """Causal 6D tracking of any number of unknown rigid objects in one RGB-D stream.
 
     config  parameters, or the name of a preset (default: ``default``)
@@ -212,5 +212,5 @@ def compose(camera: Camera, config: Config) -> pipeline.Parts:
 
 def object_tracker(*paper: Any, on: Container[str] = frozenset(MECHANISMS), map_id: int = 0) -> TwoMaps:
     """An object with the mechanisms that are ``on``; the others are the arguments of :class:`ObjectTracker`."""
-    own = partial(ObjectTracker, policy=partial(OurPolicy, on=on), model=JoinableModel)
+    own = partial(OurTracker, policy=partial(OurPolicy, on=on), model=JoinableModel)
     return TwoMaps(own(*paper, map_id=map_id))
