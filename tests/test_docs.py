@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import yaml
 
 import p2p_lib
 from p2p_lib import Point2Pose, preset
-from p2p_lib.apps import cli, command_line  # noqa: F401 - importing cli declares the commands
+from p2p_lib.apps import cli, command_line
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.images import save_png
@@ -100,6 +101,17 @@ def test_pages_lead_to_pages_and_dead_links_are_found(tool, tmp_path):
     assert list(docs.dead_links(tmp_path)) == [f"page.html: {href}" for href in sorted(hrefs[3:])]
 
 
+def test_pages_that_weigh_too_much_are_refused(tool, tmp_path):
+    docs = tool("docs")
+    for name, size in (("page.html", 4_000_000), ("below/picture.webp", 6_000_000)):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        with open(tmp_path / name, "wb") as file:
+            file.truncate(size)
+    assert not list(docs.too_large(tmp_path))
+    (tmp_path / "one_more.html").write_bytes(bytes(100_000))
+    assert list(docs.too_large(tmp_path)) == ["The reference has 10.1 MB, expected at most 10."]
+
+
 def commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     return dict(groups[0].choices) if groups else {}
@@ -164,6 +176,36 @@ def test_the_example_loader_loads(tmp_path, monkeypatch):
     sequence = open_sequence(tmp_path / "mine", format="documented_loader:load")
     assert np.allclose(sequence.frame(0).depth_m, 0.6) and sequence.camera.fx == 500
     np.testing.assert_array_equal(sequence.masks(0)["mug"], mask)
+
+
+def test_the_example_camera_is_played_live(tmp_path, monkeypatch, capsys):
+    """The camera of CONTRIBUTING.md, taken from there, by its place: what a program has put there is tracked."""
+    source = re.search(r"```python\n(import time\n.*?)```", read("CONTRIBUTING.md"), re.DOTALL)[1]
+    (tmp_path / "documented_camera.py").write_text(source)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "frames").mkdir()
+    print_ = np.kron(np.random.default_rng(0).integers(0, 255, (20, 25, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+    for k in range(4):
+        rgb, depth_m = np.full((480, 640, 3), 90, np.uint8), np.full((480, 640), 1.0, np.float32)
+        part = np.s_[160:320, 220 + 4 * k : 420 + 4 * k]
+        rgb[part], depth_m[part] = print_, 0.6
+        np.savez(tmp_path / f"frames/{k}.npz", time_s=k / 30, rgb=rgb, depth_m=depth_m)
+    (tmp_path / "frames/end").touch()
+    (tmp_path / "prompts.json").write_text('{"objects": [{"name": "card", "points": [[320, 240], [331, 252]]}]}')
+    words = ["live", "--camera", "documented_camera:DropFolder", "--prompts", "prompts.json"]
+    assert cli.main([*words, "--set", "method.surface=false", "--set", "method.graph=false"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["frame"] for line in lines] == [0, 1, 2, 3] and {line["object"] for line in lines} == {"card"}
+    assert all(line["T_cam_obj"] is not None for line in lines)
+
+    camera = importlib.import_module("documented_camera").DropFolder()
+    (tmp_path / "frames/end").unlink()
+    with ThreadPoolExecutor(1) as pool:  # a read that waits comes back when the camera is closed
+        assert [camera.read().index for _ in range(4)] == [0, 1, 2, 3]
+        waits = pool.submit(camera.read)
+        camera.close()
+        assert waits.result(20) is None
 
 
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ from packaging.utils import canonicalize_name
 
 from p2p_lib.core.packages import EXTRAS
 from p2p_lib.core.paths import cache_dir
+from p2p_lib.offline import PRODUCTS
 
 PROJECT = Path(__file__).resolve().parents[1]
 PYPROJECT = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
@@ -174,6 +175,8 @@ def test_synthetic_sequences_are_rendered_and_played_as_a_camera(folder, monkeyp
         ("convert recording.bag --out converted", "ros"),
         ("live --camera realsense", "realsense"),
         ("convert recording.mkv --out converted", "open3d"),
+        ("export run --format model --out models", "open3d"),
+        ("export run --format foundationpose --out demo", "open3d"),
         ("run synthetic/crossing --stop 2 --device cuda --out cuda", "torch"),
         ("run synthetic/crossing --stop 2 --masks sam2 --out sam2", "sam2"),
         ("benchmark trackers --quick --scheduler tcp://127.0.0.1:1 --out b --quiet", "dask"),
@@ -193,4 +196,9 @@ def test_every_extra_is_known_and_said():
     (everything,) = map(Requirement, PYPROJECT["optional-dependencies"]["all"])
     assert everything.extras == declared - {"sam2", "sam2-video"}
     page = (PROJECT / "environment.md").read_text()
+    (row,) = re.findall(r"(?m)^\| `open3d` \| .*", page)
+    written = dict(re.findall(r"(?m)^\| `([\w-]+)` \| (a .*)", (PROJECT / "README.md").read_text()))
+    for product in {*PRODUCTS} - {"bop-dataset"}:  # what has a textured model
+        assert all(product in said for said in (EXTRAS["open3d"], row)), product
+        assert "Needs the extra `open3d`" in written[product]
     assert not [name for name in declared if f"`{name}`" not in page]

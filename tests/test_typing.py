@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -58,8 +59,24 @@ def test_a_script_sees_the_types_of_an_editable_install(edited, tmp_path):
     assert "Found 1 error" in said
 
 
-def test_the_python_of_the_readme_is_sound(tmp_path):
+def test_the_python_of_the_readme_is_sound_and_what_it_guards_against_is_reported(tmp_path):
     blocks = re.findall(r"```python\n(.*?)```", (PROJECT / "README.md").read_text(), re.DOTALL)
-    given = "import numpy as np\nvideo: list[tuple[np.ndarray, np.ndarray]] = []\n"
-    (tmp_path / "readme.py").write_text(given + "\n".join(blocks))
-    assert "Success" in checked(tmp_path / "readme.py", "--strict", "--follow-imports=silent", MYPYPATH=str(PROJECT))
+    given, found = "import numpy as np\nvideo: list[tuple[np.ndarray, np.ndarray]] = []\n", {}
+    for name, guard in (("readme", "if model.surface is not None:"), ("unguarded", "if True:")):
+        path = tmp_path / f"{name}.py"
+        path.write_text((given + "\n".join(blocks)).replace("if model.surface is not None:", guard))
+        found[name] = checked(path, "--strict", "--follow-imports=silent", MYPYPATH=str(PROJECT))
+    assert "Success" in found["readme"]
+    assert 'Item "None" of "TsdfVolume | None" has no attribute "mesh"' in found["unguarded"]
+    assert "Found 1 error" in found["unguarded"]
+
+
+def test_no_file_of_the_library_is_left_out():
+    """And no module is let off by a section of its own."""
+    mypy = tomllib.loads((PROJECT / "pyproject.toml").read_text())["tool"]["mypy"]
+    assert "p2p_lib" in mypy["files"] and mypy["check_untyped_defs"] and "exclude" not in mypy
+    assert not [name for of in mypy["overrides"] for name in of["module"] if name.startswith("p2p_lib")]
+    ignored = [
+        path for path in (PROJECT / "p2p_lib").rglob("*.py") if re.search("(?m)^# (mypy|type):", path.read_text())
+    ]
+    assert not ignored

@@ -26,6 +26,8 @@ import p2p_lib
 ROOT = Path(__file__).resolve().parents[1]
 #: What a page has of its own to the suffix of a file and how pages get it.
 _SHARED = {"style": ("css", '<link rel="stylesheet" href="{}">'), "script": ("js", '<script src="{}"></script>')}
+#: All pages together; without pictures as WebP and shared styles they have several times as much.
+_MOST_MB = 10
 _LINK = re.compile(r"(\]\()([^)\s#:]*)(#[^)\s]*)?\)")
 _PAGE = """<!doctype html>
 <html lang="en">
@@ -165,6 +167,13 @@ def dead_links(out):
                 yield f"{path.relative_to(out.resolve())}: {link}"
 
 
+def too_large(out):
+    """What is to be said of pages that weigh more than a reference should."""
+    weight_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
+    if weight_mb > _MOST_MB:
+        yield f"The reference has {weight_mb:.1f} MB, expected at most {_MOST_MB}."
+
+
 def write(out):
     """Render all; whatever cannot be imported or resolved is an error, not a gap."""
     for name in p2p_lib.__all__:  # pdoc sees what is there, not what is loaded when asked for
@@ -186,6 +195,8 @@ def write(out):
     shutil.copy(out / "README.html", out / "index.html")
     if dead := list(dead_links(out)):
         sys.exit("\n".join(["These links of the reference lead nowhere:", *dead]))
+    if heavy := list(too_large(out)):
+        sys.exit("\n".join(heavy))
     return out / "index.html"
 
 

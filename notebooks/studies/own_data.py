@@ -17,6 +17,7 @@ from pandas import DataFrame, Series, read_csv, to_numeric
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.mesh import oriented_box
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.alignment import background_share, rim
@@ -104,17 +105,17 @@ def edges_mm(mesh: trimesh.Trimesh) -> np.ndarray:
     """
     p_obj = np.asarray(mesh.vertices)
     for _ in range(2):
-        T_box_obj, _ = trimesh.bounds.oriented_bounds(p_obj)
+        T_box_obj, _ = oriented_box(p_obj)
         p_box = se3.transform(se3.orthonormalised(T_box_obj), p_obj)
         low, high = np.quantile(p_box, [0.005, 0.995], axis=0)
         p_obj = p_obj[((p_box >= low) & (p_box <= high)).all(1)]
-    return np.sort(1e3 * trimesh.bounds.oriented_bounds(p_obj)[1])[::-1]
+    return np.sort(1e3 * oriented_box(p_obj)[1])[::-1]
 
 
 def true_edges_mm(sequence: Recording) -> dict[str, np.ndarray]:
     """Per object with a model, (3,) edges of the box around it, longest first."""
     meshes = {name: load_mesh(file) for name, file in find_models(sequence, MESHES).items()}
-    return {k: np.sort(1e3 * trimesh.bounds.oriented_bounds(m.vertices)[1])[::-1] for k, m in meshes.items()}
+    return {k: np.sort(1e3 * oriented_box(m.vertices)[1])[::-1] for k, m in meshes.items()}
 
 
 def edges_table(edges: Mapping[str, np.ndarray], ruler: Mapping[str, np.ndarray]) -> DataFrame:

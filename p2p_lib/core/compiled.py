@@ -14,7 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import wraps
+from functools import cache, wraps
 from importlib import import_module
 from time import monotonic
 from types import FrameType
@@ -75,16 +75,17 @@ def warm_up(say: Callable[[str], object] = lambda line: None) -> float:
     two free cores, longer where other programs run; later ones a second. Without it a step compiles what it is the
     first to meet, as at an object's first absence, and takes as long. Safe to call again, and in any thread.
 
-    say  told a line before anything is compiled; nothing where it is only loaded
+    say  told a line when the first function is not kept from before; nothing where all is only loaded
     """
     start_s = monotonic()
     child: subprocess.Popen | None = None
+    line = "Compiling inner loops, once on this machine: 10 to 25 s, longer where other programs run."
+    missed = cache(lambda: say(line))  # once, however many are missed
     try:
         for module in (name for name in (*LOOPS, *LOOPS_IN_BACKGROUND) if name not in _warm):
             if module == LOOPS_IN_BACKGROUND[0] and child is not None:
                 child.wait()  # what it has compiled is loaded; what it has not is compiled here
-            if _ready(module) and module == LOOPS[0]:
-                say("Compiling inner loops, once on this machine: 10 to 25 s, longer where other programs run.")
+            if _ready(module, missed) and module == LOOPS[0]:
                 child = _compile_in_background() if len(os.sched_getaffinity(0)) > 1 else None
     finally:
         if child is not None:
@@ -93,19 +94,21 @@ def warm_up(say: Callable[[str], object] = lambda line: None) -> float:
     return monotonic() - start_s
 
 
-def _ready(module: str) -> int:
-    """Have all functions of a module compiled; how many were not kept from before."""
+def _ready(module: str, missed: Callable[[], object] = lambda: None) -> bool:
+    """Have all functions of a module compiled; whether any was not kept from before, and ``missed`` called at each."""
     import_module(module)
     _compile(module)
-    missed = 0
+    any_missed = False
     _warm.add(module)
     for (of, name), arguments in _arguments.items():
         if of == module and arguments:
             function = getattr(sys.modules[module], name)
             for types in arguments:
                 function.compile(f"({types})")
-            missed += sum(function.stats.cache_misses.values())
-    return missed
+            if sum(function.stats.cache_misses.values()):
+                any_missed = True
+                missed()
+    return any_missed
 
 
 def _compile_in_background() -> subprocess.Popen | None:

@@ -1,4 +1,4 @@
-"""Meshes from the fused volume: marching cubes, vertex colours, components, PLY and GLB."""
+"""Meshes from the fused volume: marching cubes, vertex colours, components, PLY and GLB; the box around one."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from p2p_lib.core.files import replacing
 
 if TYPE_CHECKING:
     import trimesh
+
+#: What is thinner than this share of its length is flat, or a line.
+_FLAT = 1e-6
 
 
 def extract(
@@ -54,6 +57,32 @@ def save(mesh: trimesh.Trimesh, path: str | Path) -> Path:
     with replacing(path) as file:
         mesh.export(file, file_type=path.suffix[1:].lower())
     return path
+
+
+def oriented_box(shape: trimesh.Trimesh | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest box around a surface or points (N, 3), N > 0: T_box_obj (4, 4) and its three sides.
+
+    Box axes stand in no order. trimesh searches among the faces of the convex hull, which a flat surface and points
+    on a line lack: its plane is that of the principal axes.
+    """
+    import trimesh
+
+    p = np.asarray(shape if isinstance(shape, np.ndarray) else shape.vertices, float)
+    middle = p.mean(0)
+    axes = np.linalg.eigh((p - middle).T @ (p - middle))[1][:, ::-1]
+    axes *= np.sign(np.linalg.det(axes))
+    along = (p - middle) @ axes
+    thin = np.ptp(along, axis=0) <= _FLAT * np.ptp(along[:, 0])
+    if not thin[2]:
+        return trimesh.bounds.oriented_bounds(shape)
+    T_box_obj = np.eye(4)
+    T_box_obj[:3] = np.column_stack([axes.T, -axes.T @ middle])
+    if not thin[1]:  # principal axes of a square are any: the smallest rectangle in its plane
+        turn = trimesh.bounds.oriented_bounds(along[:, :2])[0]
+        T_box_obj = trimesh.transformations.planar_matrix_to_3D(turn) @ T_box_obj
+    q = p @ T_box_obj[:3, :3].T + T_box_obj[:3, 3]
+    T_box_obj[:3, 3] -= (q.min(0) + q.max(0)) / 2
+    return T_box_obj, np.ptp(q, axis=0)
 
 
 def _marching_cubes(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from threading import RLock
-from typing import Any
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,19 +23,37 @@ from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
 from p2p_lib.core.types import NOT_FOUND, OUT_OF_VIEW, Frame, PoseEstimate, Status
 
 
-class Objects(ABC):
+class Followed(Protocol):
+    """What follows one object, as :class:`Objects` needs it; users find what it has learnt beyond that."""
+
+    @property
+    def ids(self) -> np.ndarray:
+        """The 2D tracker's ids of all its points."""
+
+    def step(self, obs: Any) -> Any:
+        """What it makes of an observation of its own kind."""
+
+
+FollowedT = TypeVar("FollowedT", bound=Followed)
+
+
+class Objects(ABC, Generic[FollowedT]):
     """What a user adds, corrects and removes; whoever tracks them says what it is to ``begin`` one.
 
     One thread at a time calls it, whichever that is: another one that comes meanwhile gets :class:`BadInput`, and
     nothing has changed.
 
+    objects  what follows each of them, by name
     closed   whether it has been ended
     refused  of objects whose last prompt did not fit the frame that it was made on: why it was not used
     """
 
     def __init__(self, camera: Camera):
+        if not isinstance(camera, Camera):
+            fix = "Make one: Camera(fx, fy, cx, cy, width, height), or Camera.from_K(K, width, height)."
+            raise BadInput("tracker camera", type(camera).__name__, "a p2p_lib.Camera", fix)
         self.camera = camera
-        self.objects: dict[str, Any] = {}
+        self.objects: dict[str, FollowedT] = {}
         self.refused: dict[str, BadInput] = {}
         self._prompts: dict[str, Prompt] = {}  # in the frame to come
         self._next_map: dict[str, int] = {}  # by object, which no pose of its name has had yet
@@ -56,6 +74,23 @@ class Objects(ABC):
             yield
         finally:
             self._turn.release()
+
+    def close(self) -> None:
+        """End the threads once their work is done; afterwards nothing can be tracked. Once more does nothing."""
+        if not self.closed:
+            with self.alone():
+                self.closed = True
+                self.end()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def end(self) -> None:
+        """End what runs beside the calls; nothing is called afterwards."""
 
     @property
     @abstractmethod
@@ -141,7 +176,8 @@ class Objects(ABC):
         time_s  not before the newest pose of more confidence than 0.5. The covariance grows with the time since:
                 after a second it says little
 
-        None until there is such a pose. Raises :class:`BadInput` for an unknown name and an earlier time.
+        None until there is such a pose. Raises :class:`BadInput` for an unknown name, an earlier time
+        and what is no time.
         """
         with self.alone():
             if name not in self.objects:

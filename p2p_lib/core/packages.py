@@ -12,7 +12,6 @@ from pathlib import Path
 from types import ModuleType
 
 from p2p_lib.core.errors import MissingBackend, in_a_line
-from p2p_lib.core.paths import PROJECT
 
 _PIP = "{pip} install "
 # Without its dependencies: those of the JAX version are gigabytes that the PyTorch version does not use.
@@ -24,7 +23,7 @@ EXTRAS = {
     "notebooks": "notebooks and their figures: make lab, p2p notebooks, p2p figures",
     "view": "p2p view, and films as .mp4",
     "torch": "surfaces on a GPU (--device cuda), and all networks",
-    "open3d": "scores of reconstructions in p2p benchmark, Azure Kinect recordings",
+    "open3d": "p2p export --format model or foundationpose, scores of p2p benchmark, Azure Kinect recordings",
     "dask": "runs on a cluster, p2p benchmark --scheduler",
     "ros": "ROS 1 and 2 recordings, p2p convert",
     "realsense": "RealSense cameras and recordings, p2p live and p2p convert",
@@ -64,8 +63,8 @@ def command(template: str) -> str:
 
 
 def from_here(path: str) -> str:
-    """The path as seen from the project's folder where it lies below it."""
-    return str(Path(path).relative_to(PROJECT)) if Path(path).is_relative_to(PROJECT) else path
+    """The path as seen from the working folder where it lies below it: what is typed there finds it."""
+    return str(Path(path).relative_to(Path.cwd())) if Path(path).is_relative_to(Path.cwd()) else path
 
 
 def load(module: str, backend: str, package: str) -> ModuleType:

@@ -6,6 +6,7 @@ A Kalman filter of constant velocity on SE(3), beside the tracker: nothing of th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Real
 
 import numpy as np
 
@@ -104,6 +105,8 @@ class Predictor:
 
     def predict(self, name: str, time_s: float) -> Prediction | None:
         """The pose at a time, at or after that of the newest sure pose; None where there never was one."""
+        if not isinstance(time_s, Real):
+            raise BadInput("predict time_s", repr(time_s), "a time in seconds")
         known = self._moving.get(name)
         if known is None or (known.in_world and self._T_world_cam is None):
             return None

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from p2p_lib.core.mesh import oriented_box
 from p2p_lib.datasets.mask_log import load_masks
 
 #: What is longer than known by more than this factor and this slack, m, is not the object as it is, nor what is always
@@ -61,5 +62,5 @@ def mesh_length_m(path: Path) -> float:
     if len(mesh.vertices) < 4:
         return float("nan")
     p, _ = trimesh.sample.sample_surface(mesh, _POINTS, seed=0)
-    sides = p @ mesh.bounding_box_oriented.primitive.transform[:3, :3]
+    sides = p @ np.linalg.inv(oriented_box(mesh)[0])[:3, :3]
     return float(np.ptp(np.quantile(sides, [_SHREDS, 1 - _SHREDS], axis=0), axis=0).max())

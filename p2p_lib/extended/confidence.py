@@ -16,6 +16,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.image import nearest_px
 from p2p_lib.core.types import Frame
+from p2p_lib.extended.views import AccumulatedViews
 from p2p_lib.method.object_model import Known, ObjectModel
 from p2p_lib.method.observation import Observation
 from p2p_lib.method.policy import Candidate, Policy
@@ -94,6 +95,7 @@ class Belief:
         config = policy.config
         bounds = config.tracking.textureless_contrast, config.lifecycle.return_inliers
         constrained = not texture or _constrained(obs, best, policy.observer.camera, *bounds)
+        assert best.refined is not None, "a pose that is believed was refined"
         free, slides = best.refined.free_rotations, may_slide(best.refined, config.refinement.min_eigenvalue)
         return cls(policy.covariance(obs, known, best), free, slides, constrained, support, agreement)
 
@@ -105,6 +107,7 @@ class Belief:
         most         upper bound of the confidence
         constrained  used instead of the belief's own, if given
         """
+        assert isinstance(model.views, AccumulatedViews)
         accumulated_rad = model.views.accumulated_rad(T_cam_obj)
         constrained = self.constrained if constrained is None else constrained
         covariance = pose_covariance(self.of_frame, model.covariance, self.free_rotations, accumulated_rad, constrained)
@@ -120,6 +123,7 @@ class Belief:
 
 def _constrained(obs: Observation, best: Candidate, camera: Camera, least: float, points: int) -> bool:
     """Whether the texture at the points that agree constrains every turn that the shape leaves free."""
+    assert best.refined is not None
     p_cam = obs.p_cam[best.hypothesis.inliers]
     along = (contrast_along(obs.frame, camera, best.T_cam_obj, p_cam, turn) for turn in best.refined.free_rotations)
     return all((contrast >= least).sum() >= points for contrast in along)

@@ -25,9 +25,8 @@ from p2p_lib.extended.reacquisition import Reacquisition
 from p2p_lib.extended.remembered import Remembered
 from p2p_lib.extended.saving import Savable
 from p2p_lib.extended.scene import Scene
-from p2p_lib.extended.two_maps import TwoMaps
+from p2p_lib.extended.two_maps import OurTracker, TwoMaps
 from p2p_lib.method import pipeline
-from p2p_lib.method.object_tracker import ObjectTracker
 
 #: Name to what it does.
 MECHANISMS = {
@@ -142,9 +141,10 @@ class Point2Pose(Savable):
             raise BadInput("add_object with a memory", type(memory).__name__, "a memory, as load_memory reads it")
         if not chosen(self.config):
             raise BadInput("add_object with a memory", "mechanisms none", "preset default: the paper has no memory")
-        self.begin(name)
-        self._recogniser = self._recogniser or backends.make_recogniser(self.camera)
-        self.objects[name] = Remembered(self.objects[name].own, memory, self._recogniser, frozen)
+        with self.alone():
+            self.begin(name)
+            self._recogniser = self._recogniser or backends.make_recogniser(self.camera)
+            self.objects[name] = Remembered(self.objects[name].own, memory, self._recogniser, frozen)
 
 
 def compose(camera: Camera, config: Config) -> pipeline.Parts:
@@ -161,5 +161,5 @@ def compose(camera: Camera, config: Config) -> pipeline.Parts:
 
 def object_tracker(*paper: Any, on: Container[str] = frozenset(MECHANISMS), map_id: int = 0) -> TwoMaps:
     """An object with the mechanisms that are ``on``; the others are the arguments of :class:`ObjectTracker`."""
-    own = partial(ObjectTracker, policy=partial(OurPolicy, on=on), model=JoinableModel)
+    own = partial(OurTracker, policy=partial(OurPolicy, on=on), model=JoinableModel)
     return TwoMaps(own(*paper, map_id=map_id))

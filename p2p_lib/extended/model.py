@@ -10,16 +10,25 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.extended.graph import BoundedGraph
+from p2p_lib.extended.lifecycle import Lifecycle
 from p2p_lib.extended.remembering import restored
 from p2p_lib.extended.views import AccumulatedViews
-from p2p_lib.method.object_model import NO_IDS, ObjectModel, Requests
+from p2p_lib.method.object_model import NO_IDS, Known, ObjectModel, Requests
 
 
 class JoinableModel(ObjectModel):
     """A model that can take in another one; ``revision`` grows with every keyframe and with every model taken in."""
 
     make_graph, make_views = BoundedGraph, AccumulatedViews
+    views: AccumulatedViews
+    _graph: BoundedGraph | None
     revision = 0
+
+    @property
+    def graph(self) -> BoundedGraph | None:
+        """As in the paper."""
+        self._settle()
+        return self._graph
 
     def insert_keyframe(self, *args: Any) -> Requests:
         """As in the paper, counted in ``revision``."""
@@ -31,8 +40,8 @@ class JoinableModel(ObjectModel):
         kept, config = memory.surface, self.config.tsdf
         if self._surface is not None:
             voxel_m = float(kept.voxel_m)
-            how = {"voxel_m": voxel_m, "truncation_voxels": float(kept.tau_m) / voxel_m}
-            self._surface = restored(kept, replace(config, **how), self.config.device)
+            how = replace(config, voxel_m=voxel_m, truncation_voxels=float(kept.tau_m) / voxel_m)
+            self._surface = restored(kept, how, self.config.device)
         if self._graph is not None:
             self._graph.add_keyframe(memory.T_cam_obj[0], NO_IDS, np.zeros((0, 3)), p_obj_init=np.zeros((0, 3)))
             self._graph.optimise()
@@ -61,11 +70,15 @@ class JoinableModel(ObjectModel):
         """
         self.map.join(other.map, T_obj_other, self._next_key)
         vertices = 0 if self.graph is None else self.graph.next_key
-        if self.graph is not None:
+        if self.graph is not None and other.graph is not None:
             self.graph.join(other.graph, T_obj_other, self._next_key)
-        if self.surface is not None:
-            self._submit(self._surface.join, other.surface, T_obj_other, vertices)
+        if (surface := self.surface) is not None:
+            self._submit(surface.join, other.surface, T_obj_other, vertices)
         for T_cam_obj in other.views.T_cam_obj @ se3.inverse(T_obj_other):
             self.views.add(T_cam_obj)
         self._next_key += other._next_key
         self.revision += 1
+
+
+#: What is known of an object in one of its maps.
+OurKnown = Known[JoinableModel, Lifecycle]

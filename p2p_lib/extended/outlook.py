@@ -14,9 +14,10 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
+from p2p_lib.extended.model import OurKnown
 from p2p_lib.extended.observation import OurObservation, expected_px
 from p2p_lib.extended.policy import OurPolicy
-from p2p_lib.method.object_model import Known, Requests
+from p2p_lib.method.object_model import Requests
 from p2p_lib.method.object_tracker import hint_at
 
 #: While an object has a pose, the tracker is asked every so many frames to look for points that are not seen.
@@ -27,9 +28,9 @@ _LOOK_EVERY = 3
 class Outlook:
     """By what is ``known`` of one object, or by its ``other`` map where that finds nothing."""
 
-    known: Known
+    known: OurKnown
     policy: OurPolicy
-    other: Known | None = None
+    other: OurKnown | None = None
 
     @property
     def sought(self) -> bool:
@@ -90,6 +91,7 @@ class Outlook:
                 return self._hint(obs.frame, uv_px, obs.sighting.T_cam_obj, True), requests
             best = best if enough else None
         if best is None and self.other is not None:
+            assert obs.other is not None, "it is observed, too"
             by_other, _ = replace(self, known=self.other, other=None).hint(obs.other)
             if len(by_other.uv_px):
                 return by_other, requests
@@ -106,9 +108,9 @@ class Outlook:
 
     def _place(self, time_s: float) -> np.ndarray | None:
         """Where an absent object's motion leads: see :class:`p2p_lib.core.interfaces.Hint`."""
-        if not (self.sought and self.policy.carried(self.known, time_s)):
-            return None
         motion = self.known.life.motion
+        if motion is None or not (self.sought and self.policy.carried(self.known, time_s)):
+            return None
         centre = se3.transform(motion.at(time_s), self.known.map.p_obj.mean(0, keepdims=True))[0]
         return np.append(centre, motion.reach_m(time_s))
 

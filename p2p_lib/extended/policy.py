@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Container
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.config import Config
+from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import DOUBTED, Status
 from p2p_lib.extended.agreement import scene_ratio, size_ratio
 from p2p_lib.extended.confidence import Belief, may_slide
@@ -19,11 +22,13 @@ from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Judgement, PoseEvidence, j
 from p2p_lib.extended.graph import explained
 from p2p_lib.extended.image_search import laid_on
 from p2p_lib.extended.lifecycle import TELLING, Lifecycle, same_place
+from p2p_lib.extended.model import OurKnown
 from p2p_lib.extended.motion import motion_weight
 from p2p_lib.extended.observation import OurObservation, cut_off, empty
 from p2p_lib.extended.shape_search import ShapeSearch
 from p2p_lib.method import registration
-from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
+from p2p_lib.method.object_model import ObjectModel, Requests
+from p2p_lib.method.observation import Observation, Observer
 from p2p_lib.method.policy import Admission, Candidate, Policy, Verdict
 from p2p_lib.method.refinement import Refinement as Refinement  # the type of an inherited field
 from p2p_lib.method.registration import Hypothesis
@@ -53,6 +58,7 @@ class Proposal(Candidate):
     @property
     def evidence(self) -> PoseEvidence:
         """What speaks for it."""
+        assert self.refined is not None, "a pose is judged once it is refined"
         share = self.refined.inliers if self.refined.refined else None
         return PoseEvidence(self.hypothesis.support, share, self.sighting, self.lead)
 
@@ -78,7 +84,7 @@ class BelievedAdmission(Admission):
     most: float = 1.0
     stray_sigma: np.ndarray | None = None
 
-    def rows(self, obs: OurObservation, model: ObjectModel) -> np.ndarray:
+    def rows(self, obs: Observation, model: ObjectModel) -> np.ndarray:
         """As in the paper, without stray points."""
         rows = super().rows(obs, model)
         if self.stray_sigma is None:
@@ -90,11 +96,15 @@ class BelievedAdmission(Admission):
         return super().rated(model) if self.belief is None else self.belief.at(self.T_cam_obj, model, self.most)
 
 
-class OurPolicy(Policy):
+class OurPolicy(Policy[OurObservation, OurKnown]):
     """The paper's answers with the mechanisms that are ``on``."""
 
-    def __init__(self, *paper: object, on: Container[str]):
-        super().__init__(*paper, life=Lifecycle())
+    life: Lifecycle
+
+    def __init__(
+        self, observer: Observer, config: Config, rng: np.random.Generator, stopwatch: Stopwatch, on: Container[str]
+    ):
+        super().__init__(observer, config, rng, stopwatch, Lifecycle())
         self.on = on
         self.shape = ShapeSearch(self.observer, self.config, self.stopwatch, "shape_search" in on)
         self.frozen = False  # whether the map does not grow
@@ -104,7 +114,7 @@ class OurPolicy(Policy):
 
     # -- propose -------------------------------------------------------------------------------
 
-    def propose(self, obs: OurObservation, known: Known) -> list[Hypothesis]:
+    def propose(self, obs: OurObservation, known: OurKnown) -> list[Hypothesis]:
         """Candidate poses from the visible keypoints and from priors: the last poses, a sighting."""
         cfg = self.config.registration
         with self.stopwatch("registration"):
@@ -122,26 +132,26 @@ class OurPolicy(Policy):
                 found += self._along_surface(obs, known, p_cam, priors)
             return found or self._surface_only(known, priors)
 
-    def min_keypoints(self, known: Known) -> int:
+    def min_keypoints(self, known: OurKnown) -> int:
         """While an object is followed, more: a fast turn leaves pending points where keypoints are few."""
         if "pending_points" in self.on and not known.life.unconfirmed:
             return self.config.keypoint_map.keyframe_min_points
         return super().min_keypoints(known)
 
-    def _motion_priors(self, obs: OurObservation, known: Known) -> dict[str, np.ndarray]:
+    def _motion_priors(self, obs: OurObservation, known: OurKnown) -> dict[str, np.ndarray]:
         """Where the object is by its motion: name to T_cam_obj (4, 4)."""
         priors = known.life.motion_priors() if "motion_prior" in self.on else {}
         return priors or self._carried_on(obs, known)
 
-    def carried(self, known: Known, time_s: float) -> bool:
+    def carried(self, known: OurKnown, time_s: float) -> bool:
         """Whether its motion before a gap still says where the object is at this time."""
         motion = known.life.motion
         return "motion_over_gaps" in self.on and motion is not None and motion.holds(time_s)
 
-    def _carried_on(self, obs: OurObservation, known: Known) -> dict[str, np.ndarray]:
+    def _carried_on(self, obs: OurObservation, known: OurKnown) -> dict[str, np.ndarray]:
         """Where an absent object is if its motion went on, and that turn placed on its measured depth."""
         motion, time_s = known.life.motion, obs.frame.time_s
-        if not (self.carried(known, time_s) and len(obs.cloud) and self.shape.knows(known)):
+        if motion is None or not (self.carried(known, time_s) and len(obs.cloud) and self.shape.knows(known)):
             return {}
         T_cam_obj = motion.at(time_s)
         (on_depth,) = laid_on(T_cam_obj[None], obs.cloud, self.shape.sample(known.model))
@@ -149,7 +159,7 @@ class OurPolicy(Policy):
         return {"motion": T_cam_obj} | ({"motion, on its depth": on_depth} if near else {})
 
     def _along_surface(
-        self, obs: OurObservation, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray]
+        self, obs: OurObservation, known: OurKnown, p_cam: np.ndarray, priors: dict[str, np.ndarray]
     ) -> list[Hypothesis]:
         """The hypothesis that is refit from the pose that the surface alone leads to; or none."""
         start = self.refined(obs, known, list(priors.values())[-1])
@@ -158,7 +168,7 @@ class OurPolicy(Policy):
         cfg, sigma_m = self.config.registration, known.model.noise_m(p_cam)
         return registration.refit(start.T_cam_obj, "surface", known.map.p_obj, p_cam, cfg, sigma_m)
 
-    def _surface_only(self, known: Known, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
+    def _surface_only(self, known: OurKnown, priors: dict[str, np.ndarray]) -> list[Hypothesis]:
         """Hypotheses without points, at the priors, for when too few points register: the surface may refine them."""
         no_inliers, no_residual = np.zeros(len(known.map), bool), np.full(len(known.map), np.inf)
         return [Hypothesis(T_cam_obj, no_inliers, no_residual, name) for name, T_cam_obj in priors.items()]
@@ -166,15 +176,19 @@ class OurPolicy(Policy):
     # -- choose --------------------------------------------------------------------------------
 
     def refined(
-        self, obs: OurObservation, known: Known, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None
+        self, obs: OurObservation, known: OurKnown, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None
     ) -> Refinement:
         """As in the paper; something flat that no points hold is held by where it ends, while it is followed."""
         found = super().refined(obs, known, T_cam_obj, agrees)
         held = known.life.unconfirmed or (agrees is not None and agrees.sum() >= FIXED_BY)
         fit = None if held else self._contour(obs, known, found)
-        return found if fit is None else fit.refined(found, obs.cloud, known.model.surface, self.config.refinement)
+        if fit is None:
+            return found
+        surface = known.model.surface
+        assert surface is not None, "what is flat was refined on it"
+        return fit.refined(found, obs.cloud, surface, self.config.refinement)
 
-    def _contour(self, obs: OurObservation, known: Known, refined: Refinement) -> ContourFit | None:
+    def _contour(self, obs: OurObservation, known: OurKnown, refined: Refinement) -> ContourFit | None:
         """The contour that something flat is known by beside the one that is seen; None where there is none."""
         if not self._flat(refined) or known.life.contour is None:
             return None
@@ -184,7 +198,7 @@ class OurPolicy(Policy):
         """Whether the contour has a say: where the surface leaves free to all sides where the object is."""
         return "contour" in self.on and may_slide(refined, self.config.refinement.min_eigenvalue, 2)
 
-    def choose(self, obs: OurObservation, known: Known, hypotheses: list[Hypothesis]) -> tuple[Proposal | None, str]:
+    def choose(self, obs: OurObservation, known: OurKnown, hypotheses: list[Hypothesis]) -> tuple[Proposal | None, str]:
         """The best of some hypotheses, refined, and why. The paper selects one and refines that; ours refines all."""
         candidates = [Proposal(hypothesis) for hypothesis in hypotheses]
         if self.config.selection.rule == "support":
@@ -194,7 +208,7 @@ class OurPolicy(Policy):
             return None, reason
         return self._compared(obs, known, best if best.refined else self.refine(obs, known, best)), reason
 
-    def _best(self, obs: OurObservation, known: Known, candidates: list[Proposal]) -> tuple[Proposal | None, str]:
+    def _best(self, obs: OurObservation, known: OurKnown, candidates: list[Proposal]) -> tuple[Proposal | None, str]:
         """The candidate to go on with, and why."""
         few = max((c.hypothesis.support for c in candidates), default=0) < self.config.lifecycle.return_inliers
         if few and any((c.sighting or 0.0) > 0 for c in candidates):
@@ -204,14 +218,14 @@ class OurPolicy(Policy):
             weight = motion_weight([c.T_cam_obj for c in candidates], list(known.life.motion_priors().values()))
         return self.select(obs, known, candidates, weight)
 
-    def _look_again(self, obs: OurObservation, known: Known, candidates: list[Proposal]) -> list[Proposal]:
+    def _look_again(self, obs: OurObservation, known: OurKnown, candidates: list[Proposal]) -> list[Proposal]:
         """Candidates for a return, with how much of the surface shows in the image under each."""
         if not (known.life.unconfirmed and self.shape.knows(known)):
             return candidates
         found = self.shape.at(obs, known, [c.T_cam_obj for c in candidates])
         return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
 
-    def _compared(self, obs: OurObservation, known: Known, best: Proposal) -> Proposal:
+    def _compared(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
         """The pose of a return with its lead over the best other turn, or that turn if much more of the surface shows.
 
         Repeated now and then until the lead is telling. Where no other turn is known, the keypoints' agreement leads.
@@ -226,36 +240,38 @@ class OurPolicy(Policy):
         lead = (own.share - other.share) / max(own.share, other.share, 1e-6)
         if lead > -TELLING or other.share < SIGHTED or cut_off(self.observer, obs):
             return replace(best, lead=lead)
-        turned = self.refine(obs, known, Proposal(*self._surface_only(known, {"other turn": other.T_cam_obj})))
+        (hypothesis,) = self._surface_only(known, {"other turn": other.T_cam_obj})
+        turned = self.refine(obs, known, Proposal(hypothesis))
         return replace(turned, sighting=other.share, lead=0.0)
 
     # -- judge ---------------------------------------------------------------------------------
 
-    def start(self, known: Known, points: int) -> Verdict:
+    def start(self, known: OurKnown, points: int) -> Verdict:
         """A map may begin with fewer points than registration needs, if the surface can track."""
         verdict = super().start(known, points)
         if verdict.accepted or known.model.surface is None or "motion_prior" not in self.on:
             return verdict
         return Verdict(True, Status.DEGRADED, verdict.reason)
 
-    def judge(self, obs: OurObservation, known: Known, best: Proposal) -> Judgement:
+    def judge(self, obs: OurObservation, known: OurKnown, best: Candidate) -> Judgement:
         """Whether the pose stands, by its evidence and by the consistency of depth and masks."""
+        assert isinstance(best, Proposal) and best.refined is not None
         size = self._size(obs, known, best) if "size" in self.on else None
         outline = self.outline(obs) if "outline" in self.on else 1.0
         carried = self.carried(known, obs.frame.time_s)
         slides = "sliding_gate" in self.on and may_slide(best.refined, self.config.refinement.min_eigenvalue)
         fit = self._contour(obs, known, best.refined)
         rests = self._rests(obs, known, best) if "rest" in self.on else None
-        terms = {"size": size, "outline": outline, "still": obs.still, "carried": carried, "slides": slides}
-        terms["contour"] = 0.0 if fit is None else fit.share(best.T_cam_obj)
-        evidence = replace(best.evidence, rests=rests, **terms)
+        contour = 0.0 if fit is None else fit.share(best.T_cam_obj)
+        consistent = replace(best.evidence, size=size, outline=outline, still=obs.still, rests=rests)
+        evidence = replace(consistent, carried=carried, slides=slides, contour=contour)
         return judge(known.life, evidence, self.on, self.config.lifecycle)
 
-    def judge_other(self, obs: OurObservation, known: Known, best: Proposal) -> Judgement:
+    def judge_other(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Judgement:
         """The same in the other map, by the pose's own evidence alone."""
         return judge(known.life, replace(best.evidence, still=obs.still), self.on, self.config.lifecycle)
 
-    def _rests(self, obs: OurObservation, known: Known, best: Proposal) -> bool | None:
+    def _rests(self, obs: OurObservation, known: OurKnown, best: Proposal) -> bool | None:
         """Whether an object that lay still is where the scene has it; None if unknown, or the place is seen empty."""
         place = known.life.scene_prior(obs.frame.T_world_cam).get("scene") if known.life.lay_still else None
         if place is None:
@@ -268,13 +284,16 @@ class OurPolicy(Policy):
         before = self.trusted
         return None if obs.mask is None or before is None or before.mask is None else before
 
-    def _size(self, obs: OurObservation, known: Known, best: Proposal) -> tuple[float, float] | None:
+    def _size(self, obs: OurObservation, known: OurKnown, best: Proposal) -> tuple[float, float] | None:
         """The size ratio and its deviation, if the scene beside the object has changed its depth, too; else None.
 
         Points that slide over an object change only the object's size.
         """
         before = self._before(obs)
-        if before is None or not off_size(scene_ratio(obs.frame, obs.mask, before.frame, before.mask)):
+        if before is None:
+            return None
+        assert obs.mask is not None and before.mask is not None, "both have one"
+        if not off_size(scene_ratio(obs.frame, obs.mask, before.frame, before.mask)):
             return None
         keypoints = known.keypoints(obs)
         agreeing = keypoints & best.hypothesis.inliers
@@ -290,12 +309,13 @@ class OurPolicy(Policy):
 
     # -- admit and request ---------------------------------------------------------------------
 
-    def admit(self, obs: OurObservation, known: Known, best: Proposal, verdict: Judgement) -> BelievedAdmission:
+    def admit(self, obs: OurObservation, known: OurKnown, best: Candidate, verdict: Verdict) -> BelievedAdmission:
         """Nothing is learnt from a doubted pose, and one of little confidence makes no keyframe."""
+        assert isinstance(best, Proposal) and isinstance(verdict, Judgement)
         belief = Belief.of(obs, best, known, self, "texture" in self.on) if "confidence" in self.on else None
         life = known.life.with_verdict(best.T_cam_obj, obs.frame.time_s, verdict, best.lead)
         most = DOUBTED if verdict.doubted or life.doubted else 1.0
-        kept = {"life": life, "T_cam_obj": best.T_cam_obj, "belief": belief, "most": most}
+        kept: dict[str, Any] = {"life": life, "T_cam_obj": best.T_cam_obj, "belief": belief, "most": most}
         kept |= {"learns": not verdict.doubted, "in_camera": "moving_points" in self.on}
         if "stray_points" in self.on and not verdict.joins:  # joined maps are only as well aligned as their poses
             sigma_m = self.observer.noise_m(obs.p_cam)
@@ -313,7 +333,7 @@ class OurPolicy(Policy):
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNCONSTRAINED)
         return BelievedAdmission(verdict, best.hypothesis.inliers, belief.of_frame, confidence, **kept)
 
-    def request(self, obs: OurObservation, known: Known, best: Proposal, admission: Admission) -> Requests:
+    def request(self, obs: OurObservation, known: OurKnown, best: Candidate, admission: Admission) -> Requests:
         """Tracks of keypoints that contradict the pose are rejected, if the frame is learnt from and others agree.
 
         A pose that the surface alone has says nothing against points.
@@ -324,16 +344,19 @@ class OurPolicy(Policy):
 
     # -- the object's life ---------------------------------------------------------------------
 
-    def begun(self, obs: OurObservation, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
+    def begun(self, obs: OurObservation, T_cam_obj: np.ndarray, verdict: Verdict) -> Lifecycle:
         """As in the paper, with its place in the scene; the frame becomes the trusted one."""
         self.trusted = obs
-        life = super().begun(obs, T_cam_obj, verdict).placed(obs.frame.T_world_cam)
+        life = super().begun(obs, T_cam_obj, verdict)
+        assert isinstance(life, Lifecycle)
+        life = life.placed(obs.frame.T_world_cam)
         return self._outlined(life, obs, T_cam_obj) if "contour" in self.on else life
 
     def followed(
-        self, obs: OurObservation, known: Known, best: Proposal, admitted: BelievedAdmission, confidence: float
+        self, obs: OurObservation, known: OurKnown, best: Candidate, admitted: Admission, confidence: float
     ) -> Lifecycle:
         """A frame that is learnt from updates its place in the scene and its motion, too."""
+        assert isinstance(admitted, BelievedAdmission) and best.refined is not None
         life = admitted.life
         if not admitted.learns:
             return life
@@ -347,7 +370,7 @@ class OurPolicy(Policy):
         p_cam = on_plane(obs.contour_px, obs.cloud, self.observer.camera)
         return life if p_cam is None else replace(life, contour=se3.transform(se3.inverse(T_cam_obj), p_cam))
 
-    def expected(self, obs: OurObservation, known: Known) -> np.ndarray | None:
+    def expected(self, obs: OurObservation, known: OurKnown) -> np.ndarray | None:
         """Where it was left in the static scene, by the newest frame that located the camera; else as in the paper."""
         last = super().expected(obs, known)
         if known.life.lay_still and (prior := known.life.scene_prior(obs.frame.T_world_cam)):
@@ -355,7 +378,7 @@ class OurPolicy(Policy):
         since, lies = self._lies
         return lies if since is last and since is not None else last
 
-    def missed(self, obs: OurObservation, known: Known, verdict: Verdict) -> Lifecycle:
+    def missed(self, obs: OurObservation, known: OurKnown, verdict: Verdict) -> Lifecycle:
         """After a frame in which the object was hidden, later ones are not compared with those before."""
         self.trusted = self.trusted if verdict.status is Status.LOST else None
         return known.life.without_pose(verdict.status, obs.mask_px, self.carried(known, obs.frame.time_s))

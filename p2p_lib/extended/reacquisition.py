@@ -7,14 +7,17 @@ tracker looks for their points there; the observations then show which tracks ar
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import cache
+from typing import Any, cast
 
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.image import either
-from p2p_lib.core.interfaces import Hint, LazyHints, checked_tracks
+from p2p_lib.core.interfaces import Hint, LazyHints, PointTracker, Segmenter, checked_tracks
+from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
 from p2p_lib.extended.observation import OurObservation
@@ -31,11 +34,20 @@ _LOCATE_EVERY, _LOCATE_EVERY_AWAY = 5, 2
 class Reacquisition(Frontend):
     """The paper's front end with the mechanisms that are ``on``; ``scene`` locates the camera."""
 
-    objects: dict[str, TwoMaps]
-
-    def __init__(self, *paper: object, on: Container[str], scene: Scene | None):
-        super().__init__(*paper)
-        self.on, self.scene = on, scene
+    def __init__(
+        self,
+        camera: Camera,
+        tracker: PointTracker,
+        segmenter: Segmenter,
+        objects: dict[str, TwoMaps],
+        stopwatch: Stopwatch,
+        executor: Executor,
+        on: Container[str],
+        scene: Scene | None,
+    ):
+        # To the paper's steps an object's two maps are its ObjectTracker, but for hint(), which is not asked for here.
+        super().__init__(camera, tracker, segmenter, cast(Any, objects), stopwatch, executor)
+        self.maps, self.on, self.scene = objects, on, scene
         self._unlocated = _LOCATE_EVERY
         self._sightings: Mapping[str, Sighting] = {}
         self._turn = 0  # counts frames: which remembered object is searched for
@@ -53,7 +65,7 @@ class Reacquisition(Frontend):
     def _locate(self, frame: Frame) -> Future[np.ndarray | None] | None:
         """The camera's pose, computed in the background: often while an object is away, else now and then."""
         self._unlocated += 1
-        sought = any(obj.outlook.sought for obj in self.objects.values())
+        sought = any(obj.outlook.sought for obj in self.maps.values())
         every = _LOCATE_EVERY_AWAY if sought else _LOCATE_EVERY
         if self.scene is None or frame.T_world_cam is not None or self._unlocated < every:
             return None
@@ -68,28 +80,28 @@ class Reacquisition(Frontend):
 
     def _recalled(self, inputs: FrameInputs) -> FrameInputs:
         """With the mask of a remembered object, if it is found: one of them is looked for in each frame."""
-        sought = [n for n, obj in sorted(self.objects.items()) if isinstance(obj, Remembered) and obj.recalls]
-        sought = [name for name in sought if name in inputs.masks and name not in inputs.prompts]
+        known = {n: obj for n, obj in sorted(self.maps.items()) if isinstance(obj, Remembered) and obj.recalls}
+        sought = [name for name in known if name in inputs.masks and name not in inputs.prompts]
         if not sought:
             return inputs
         self._turn += 1
         name = sought[self._turn % len(sought)]
         others = [mask for other, mask in self.masks.items() if other != name and mask is not None]
         with self.stopwatch("search"):
-            found = self.objects[name].find(inputs.frame, inputs.masks[name], either(others) if others else None)
-        if self.objects[name].forsaken:
-            self.apply({name: self.objects[name].withdraw()})
+            found = known[name].find(inputs.frame, inputs.masks[name], either(others) if others else None)
+        if known[name].forsaken:
+            self.apply({name: known[name].withdraw()})
             if name in self.segmenter.names:
                 self.segmenter.remove(name)
         if found is None:
             return inputs
-        self.tracks = follow(self.objects[name], found, self.tracker, self.tracks)
+        self.tracks = follow(known[name], found, self.tracker, self.tracks)
         self._sightings = {**self._sightings, name: found.sighting}
         return replace(inputs, masks=inputs.masks | {name: found.mask})
 
     def _sighted(self, frame: Frame, masks: Masks) -> dict[str, Sighting]:
         """Sought objects that show by shape and colour; the tracker looks for their points there."""
-        objects = {name: self.objects[name] for name in sorted(self.objects) if name in masks}
+        objects = {name: self.maps[name] for name in sorted(self.maps) if name in masks}
         sought = [name for name, obj in objects.items() if obj.outlook.sought]
         seen = {name: objects[name].observe(frame, masks[name], self.tracks) for name in sought}
         looked = {name: objects[name].outlook.sighted(obs) for name, obs in seen.items()}
@@ -101,9 +113,9 @@ class Reacquisition(Frontend):
 
     def hints(self, frame: Frame, sought: Sequence[str]) -> Mapping[str, Hint]:
         """Where these objects should be; tracks of the absent that agree on no pose are rejected."""
-        hint = cache(lambda name: self._hint(self.objects[name], frame, self._sightings.get(name)))
+        hint = cache(lambda name: self._hint(self.maps[name], frame, self._sightings.get(name)))
         if "rejection" in self.on:
-            self.apply({name: hint(name)[1] for name in sought if self.objects[name].outlook.sought})
+            self.apply({name: hint(name)[1] for name in sought if self.maps[name].outlook.sought})
         return LazyHints(sought, lambda name: hint(name)[0])
 
     def _hint(self, obj: TwoMaps, frame: Frame, sighting: Sighting | None) -> tuple[Hint, Requests]:
@@ -112,7 +124,7 @@ class Reacquisition(Frontend):
     def observe(self, inputs: FrameInputs) -> Mapping[str, OurObservation]:
         """What the frame shows of every object, after misplaced tracks are rejected and missing points looked for."""
         seen = {
-            name: self.objects[name].observe(
+            name: self.maps[name].observe(
                 inputs.frame, mask, self.tracks, self._sightings.get(name), inputs.masks[name] is not None
             )
             for name, mask in self.masks.items()
@@ -129,14 +141,14 @@ class Reacquisition(Frontend):
         nowhere = {name for name, obs in seen.items() if given[name] is None and obs.mask_px == 0}
         elsewhere = ~either(self.masks.values()) if nowhere else None
         within = {name: elsewhere if name in nowhere else obs.mask for name, obs in seen.items()}
-        return {name: self.objects[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
+        return {name: self.maps[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
     def _redetect(self, frame: Frame, seen: Mapping[str, OurObservation]) -> dict[str, OurObservation]:
         """Guided re-detection: the tracker looks for points where objects expect them; the new observations."""
-        looked = {name: self.objects[name].outlook.expected_px(obs) for name, obs in seen.items()}
+        looked = {name: self.maps[name].outlook.expected_px(obs) for name, obs in seen.items()}
         expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}
         self._suggest(frame, expected)
-        return {name: self.objects[name].seen_anew(seen[name], self.tracks) for name in expected}
+        return {name: self.maps[name].seen_anew(seen[name], self.tracks) for name in expected}
 
     def _suggest(self, frame: Frame, expected_px: Mapping[str, np.ndarray]) -> None:
         """Have the tracker look for points where their objects expect them, unless it answers late."""
@@ -144,5 +156,5 @@ class Reacquisition(Frontend):
             return
         with self.stopwatch("tracking"):
             for name, uv_px in expected_px.items():
-                found = self.tracker.suggest(self.objects[name].map.ids, uv_px)
+                found = self.tracker.suggest(self.maps[name].map.ids, uv_px)
                 self.tracks = self.tracks if found is None else checked_tracks(self.tracker, found, frame)

@@ -25,9 +25,9 @@ from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.agreement import outline_share
 from p2p_lib.extended.image_search import ImageSearch, Sighting, laid_at
 from p2p_lib.extended.observation import OurObservation
-from p2p_lib.extended.two_maps import TwoMaps
+from p2p_lib.extended.two_maps import OurTracker, TwoMaps
 from p2p_lib.method.object_model import CONFIRM_FRAMES, Known, Requests
-from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
+from p2p_lib.method.object_tracker import ObjectStep
 from p2p_lib.method.policy import Verdict
 from p2p_lib.method.refinement import surface_distance
 
@@ -67,7 +67,7 @@ class Remembered(TwoMaps):
     recogniser  what finds landmarks in images (:func:`p2p_lib.core.backends.make_recogniser`); objects may share it
     """
 
-    def __init__(self, own: ObjectTracker, memory: ObjectMemory, recogniser: Any, frozen: bool = False):
+    def __init__(self, own: OurTracker, memory: ObjectMemory, recogniser: Any, frozen: bool = False):
         super().__init__(own)
         self._rng = np.random.default_rng(0)
         self._memory, self.frozen = memory, frozen
@@ -80,8 +80,8 @@ class Remembered(TwoMaps):
         """Reset what is known to the memory alone."""
         own, memory = self.own, self._memory
         own.known = Known(own.new_model(), replace(self.policy.life, seen_m2=float(memory.seen_m2)), self._first_map)
-        own.model.recall(memory)
-        self._recalled = own.model.revision
+        own.known.model.recall(memory)
+        self._recalled = own.known.model.revision
         self.other, self.policy.frozen, self.policy.trusted = None, True, None
         self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
         self._since = 0  # frames since landmarks were looked for on it
@@ -127,7 +127,7 @@ class Remembered(TwoMaps):
         found = self._look(frame, mask, taken)
         T = None if found is None else found.sighting.T_cam_obj
         before = [(self.life.seen_s, self.life.T_cam_obj)] if self.life.has_pose else self._finds
-        alike = (self._alike(T, other, frame.time_s - time_s) for time_s, other in before)
+        alike = (T is not None and self._alike(T, other, frame.time_s - time_s) for time_s, other in before)
         again = found is not None and (mask is not None or any(alike))
         self._finds = [] if again or self.life.has_pose else [*self._finds, (frame.time_s, T)][-_LOOKS:]
         self._in_vain = 0 if again else self._in_vain + 1
@@ -202,7 +202,9 @@ class Remembered(TwoMaps):
 
     def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
         """(H, W) bool: pixels on the surface under a pose that are connected with pixels uv_px (M, 2) on it."""
-        distance_m = surface_distance(self.model.surface, frame.depth_m, self.observer.camera, T_cam_obj)
+        surface = self.model.surface
+        assert surface is not None, "a memory has one"
+        distance_m = surface_distance(surface, frame.depth_m, self.observer.camera, T_cam_obj)
         near = (np.abs(distance_m) < _ON_SURFACE_M).astype(np.uint8)
         near = cv2.morphologyEx(near, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
         _, label = cv2.connectedComponents(near)
@@ -235,11 +237,11 @@ class Remembered(TwoMaps):
             self._borne_out += step.estimate.inliers >= self.config.lifecycle.return_inliers
             self.policy.frozen = self.frozen or not self._confirmed
         self._since += 1
-        due = self._since >= _EVERY and step.estimate.T_cam_obj is not None and self.known.map_id == self._first_map
-        if not due or followed >= _ENOUGH or step.estimate.status is Status.DEGRADED or obs.mask is None:
+        T_cam_obj = step.estimate.T_cam_obj if self._since >= _EVERY and self.known.map_id == self._first_map else None
+        if T_cam_obj is None or followed >= _ENOUGH or step.estimate.status is Status.DEGRADED or obs.mask is None:
             return step
         self._since = 0
-        return replace(step, requests=self._with_more(step.requests, obs, step.estimate.T_cam_obj))
+        return replace(step, requests=self._with_more(step.requests, obs, T_cam_obj))
 
     def _with_more(self, requests: Requests, obs: OurObservation, T_cam_obj: np.ndarray) -> Requests:
         """Requests with landmarks that are seen under a pose, and are not followed yet."""

@@ -29,7 +29,7 @@ _PARTS = ("tracker", "detector", "segmenter")
 _OF_RUN = ("sequence", "tracker", "start", "stop", "commit", "modified")
 
 
-class Savable(pipeline.Point2Pose):
+class Savable(pipeline.Point2Pose[TwoMaps]):
     """A tracker that can be saved, and its objects' memories taken.
 
     _made_of  what its class was called with: camera, config, tracker, detector, segmenter

@@ -14,8 +14,8 @@ from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.gates import SIGHTED
 from p2p_lib.extended.image_search import ImageSearch, Sighting, SurfaceSample
+from p2p_lib.extended.model import JoinableModel, OurKnown
 from p2p_lib.extended.observation import OurObservation, cut_off
-from p2p_lib.method.object_model import Known, ObjectModel
 from p2p_lib.method.observation import Observer
 from p2p_lib.method.refinement import surface_distances
 
@@ -29,32 +29,35 @@ class ShapeSearch:
 
     def __init__(self, observer: Observer, config: Config, stopwatch: Stopwatch, on: bool = True):
         self.observer, self.config, self._stopwatch, self._on = observer, config, stopwatch, on
-        self._samples: WeakKeyDictionary[ObjectModel, tuple[int, SurfaceSample]] = WeakKeyDictionary()
+        self._samples: WeakKeyDictionary[JoinableModel, tuple[int, SurfaceSample]] = WeakKeyDictionary()
 
-    def knows(self, known: Known) -> bool:
+    def knows(self, known: OurKnown) -> bool:
         """Whether there is a surface to search with."""
         return self._on and known.model.seen_surface is not None and len(self.sample(known.model)) > 0
 
-    def sample(self, model: ObjectModel) -> SurfaceSample:
+    def sample(self, model: JoinableModel) -> SurfaceSample:
         """Points of the surface, sampled when first asked for after a keyframe."""
         revision, sample = self._samples.get(model, (None, None))
-        if revision != model.revision:
-            sample = SurfaceSample.of(model.surface.mesh())
+        if sample is None or revision != model.revision:
+            surface = model.surface
+            assert surface is not None, "it is asked for where there is one"
+            sample = SurfaceSample.of(surface.mesh())
             self._samples[model] = model.revision, sample
         return sample
 
-    def at(self, obs: OurObservation, known: Known, poses: list[np.ndarray]) -> list[Sighting | None]:
+    def at(self, obs: OurObservation, known: OurKnown, poses: list[np.ndarray]) -> list[Sighting | None]:
         """What of the surface shows under each of some poses; None where too little would show."""
         search = self._search(obs.frame)
         return [search.at(T_cam_obj, self.sample(known.model)) for T_cam_obj in poses]
 
-    def sighted(self, obs: OurObservation, known: Known, carried: bool) -> Sighting | None:
+    def sighted(self, obs: OurObservation, known: OurKnown, carried: bool) -> Sighting | None:
         """Where a sought object shows: near its place by scene, motion or the frame before, or in its mask."""
         life, model, time_s = known.life, known.model, obs.frame.time_s
         proposed = [*life.scene_prior(obs.frame.T_world_cam).values()]
-        if obs.mask is None and carried:  # with a mask the policy proposes it, on its depth, too
+        # With a mask the policy proposes it, on its depth, too.
+        if obs.mask is None and carried and life.motion is not None:
             proposed.append(life.motion.at(time_s))
-        proposed += [life.T_cam_obj] if life.has_pose else []
+        proposed += [life.T_cam_obj] if life.has_pose and life.T_cam_obj is not None else []
         with self._stopwatch("search"):
             search = self._search(obs.frame)
             found = [search.about(T_cam_obj, self.sample(model)) for T_cam_obj in proposed]
@@ -63,19 +66,21 @@ class ShapeSearch:
             best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
             return best if best is not None and best.share >= SIGHTED else None
 
-    def otherwise(self, obs: OurObservation, known: Known, T_cam_obj: np.ndarray) -> tuple[Sighting | None, ...]:
+    def otherwise(self, obs: OurObservation, known: OurKnown, T_cam_obj: np.ndarray) -> tuple[Sighting | None, ...]:
         """What shows under a pose, and the best that is turned otherwise; None where it cannot be said."""
         with self._stopwatch("search"):
             search, sample = self._search(obs.frame), self.sample(known.model)
             views = known.model.views.some(_TURNS)
             return search.at(T_cam_obj, sample), search.otherwise(T_cam_obj, views, obs.cloud, sample)
 
-    def _turned(self, obs: OurObservation, known: Known, search: ImageSearch) -> Sighting | None:
+    def _turned(self, obs: OurObservation, known: OurKnown, search: ImageSearch) -> Sighting | None:
         """Where a lost object shows in its mask, in a turn of one of its keyframes, if enough depth fits."""
         found = search.turned(known.model.views.some(_TURNS), obs.cloud, self.sample(known.model))
         if found is None:
             return None
-        distance_m = surface_distances(known.model.surface, obs.cloud, found.T_cam_obj[None])[0]
+        surface = known.model.surface
+        assert surface is not None, "it was searched with"
+        distance_m = surface_distances(surface, obs.cloud, found.T_cam_obj[None])[0]
         return found if (distance_m < _ON_M).mean() >= self.config.lifecycle.surface_only_share else None
 
     def _search(self, frame: Frame) -> ImageSearch:

@@ -7,6 +7,7 @@ one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
 
@@ -17,13 +18,14 @@ from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.gates import OUTLINE, Judgement
 from p2p_lib.extended.image_search import Sighting
 from p2p_lib.extended.lifecycle import Lifecycle
+from p2p_lib.extended.model import JoinableModel, OurKnown
 from p2p_lib.extended.observation import OurObservation, area_m2, cut_off, with_tracks
 from p2p_lib.extended.outlook import Outlook
 from p2p_lib.extended.policy import OurPolicy, Proposal
 from p2p_lib.method.keypoint_map import KeypointMap
-from p2p_lib.method.object_model import NO_IDS, Known, ObjectModel
+from p2p_lib.method.object_model import NO_IDS, Known
 from p2p_lib.method.object_tracker import ObjectStep, ObjectTracker
-from p2p_lib.method.policy import Verdict
+from p2p_lib.method.policy import Candidate, Verdict
 from p2p_lib.method.registration import Hypothesis
 
 #: Two maps become one where so many frames, one after the other, agree on the transformation between them: m, rad.
@@ -80,29 +82,38 @@ def agreeing_together(own: Hypothesis, other: Hypothesis) -> Hypothesis:
     return replace(own, inliers=np.concatenate(inliers), residual_m=np.concatenate(residual_m))
 
 
+class OurTracker(ObjectTracker):
+    """The paper's step of one object, with our policy, model and life."""
+
+    policy: OurPolicy
+    known: OurKnown
+    new_model: Callable[[], JoinableModel]
+
+
 class TwoMaps:
     """One object: ``own`` follows it, ``other`` is asked whether it knows the object again.
 
     It takes the place of the :class:`~p2p_lib.method.object_tracker.ObjectTracker` that it is made from.
     """
 
-    def __init__(self, own: ObjectTracker):
-        self.own, self.other = own, None
-        self.policy: OurPolicy = own.policy
+    def __init__(self, own: OurTracker):
+        self.own = own
+        self.other: OurTracker | None = None
+        self.policy = own.policy
         self.observer, self.config, self.name = own.observer, own.config, own.name
         self._on = self.policy.on
         self._relation = Relation()  # of the other map to this one
         self.next_map = own.known.map_id + 1  # which no map has had yet
 
     @property
-    def known(self) -> Known:
+    def known(self) -> OurKnown:
         """The map in which the object is followed, and its life in it."""
         return self.own.known
 
     @property
-    def model(self) -> ObjectModel:
+    def model(self) -> JoinableModel:
         """Its keypoint map, surface and graph."""
-        return self.own.model
+        return self.own.known.model
 
     @property
     def map(self) -> KeypointMap:
@@ -112,7 +123,7 @@ class TwoMaps:
     @property
     def life(self) -> Lifecycle:
         """The object's state in this map."""
-        return self.own.life
+        return self.own.known.life
 
     @life.setter
     def life(self, life: Lifecycle) -> None:
@@ -192,7 +203,8 @@ class TwoMaps:
             return self._begin_anew(obs, keep=not outgrown)
         return own.absent(obs, verdict)
 
-    def _accept(self, obs: OurObservation, best: Proposal, verdict: Judgement) -> ObjectStep:
+    def _accept(self, obs: OurObservation, best: Candidate, verdict: Verdict) -> ObjectStep:
+        assert isinstance(verdict, Judgement)
         if not verdict.doubted:
             self.policy.trusted = obs
         return self.own.accept(obs, best, verdict)
@@ -252,7 +264,7 @@ class TwoMaps:
 
     # -- two maps ------------------------------------------------------------------------------
 
-    def _by_other(self, obs: OurObservation, best: Proposal | None, verdict: Verdict) -> ObjectStep | None:
+    def _by_other(self, obs: OurObservation, best: Candidate | None, verdict: Verdict) -> ObjectStep | None:
         """The step by the other map, if it alone finds the object, or by the joined maps; else None."""
         other = self.other
         known = None if other is None or obs.other is None else self._known_again(obs.other, other.known)
@@ -260,13 +272,14 @@ class TwoMaps:
             return None
         if best is None or not verdict.accepted:
             return self._accept(self._exchanged(obs), *known)
+        assert other is not None and isinstance(verdict, Judgement)
         if verdict.doubted:
             return None
         T_obj_other = se3.inverse(best.T_cam_obj) @ known[0].T_cam_obj
         self._relation = self._relation.with_frame(T_obj_other, other.map.p_obj)
         return self._joined(obs, best, known[0]) if self._relation.certain else None
 
-    def _known_again(self, obs: OurObservation, other: Known) -> tuple[Proposal, Judgement] | None:
+    def _known_again(self, obs: OurObservation, other: OurKnown) -> tuple[Proposal, Judgement] | None:
         """The pose by the other map, where points and surface say that it is this object; else None."""
         cfg = self.config.lifecycle
         found = [h for h in self.policy.propose(obs, other) if h.support >= cfg.return_inliers]
@@ -280,11 +293,13 @@ class TwoMaps:
 
     def _exchanged(self, obs: OurObservation) -> OurObservation:
         """Exchange the two maps; returns the observation of the one to go on in."""
+        assert self.other is not None and obs.other is not None
         self.own, self.other, self._relation = self.other, _lost(self.own), Relation()
         return replace(obs.other, other=replace(obs, other=None))
 
-    def _joined(self, obs: OurObservation, best: Proposal, known: Proposal) -> ObjectStep:
+    def _joined(self, obs: OurObservation, best: Candidate, known: Candidate) -> ObjectStep:
         """Join two maps that fit this frame, in the frame of the older; a keyframe ties the points of both."""
+        assert self.other is not None
         T_obj_other = self._relation.mean
         if self.other.known.map_id < self.known.map_id:
             life = self.life.in_frame(T_obj_other)
@@ -296,16 +311,17 @@ class TwoMaps:
         both = replace(best, hypothesis=agreeing_together(best.hypothesis, known.hypothesis))
         maps = f"maps {self.known.map_id} and {gone.map_id} were joined"
         verdict = Judgement(True, Status.RECOVERED, maps, joins=True)
+        assert obs.other is not None
         step = self.own.accept(seen_together(obs, obs.other), both, verdict, due=True)
         return replace(step, estimate=replace(step.estimate, joined=(gone.map_id, T_obj_other)))
 
 
-def _lost(tracker: ObjectTracker) -> ObjectTracker:
+def _lost(tracker: OurTracker) -> OurTracker:
     """The tracker after a frame in which the object was not found by it."""
-    tracker.life = tracker.life.without_pose(Status.LOST)
+    tracker.life = tracker.known.life.without_pose(Status.LOST)
     return tracker
 
 
-def _first_view_alone(known: Known) -> bool:
+def _first_view_alone(known: OurKnown) -> bool:
     """Whether an object is known from the view that it began with, and never was sure of another pose."""
     return known.life.motion is None and len(known.model.views) == 1

@@ -10,14 +10,14 @@ from __future__ import annotations
 import numpy as np
 
 from p2p_lib.core.types import evenly
-from p2p_lib.method.keyframe_views import KeyframeViews
+from p2p_lib.method.keyframe_views import MOST, KeyframeViews
 
 
 class AccumulatedViews(KeyframeViews):
     """Keyframe poses with the accumulated rotation up to each of them."""
 
-    def __init__(self, *args: int):
-        super().__init__(*args)
+    def __init__(self, most: int = MOST):
+        super().__init__(most)
         self._accumulated_rad = np.zeros(0)
 
     def accumulated_rad(self, T_cam_obj: np.ndarray) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.mesh import oriented_box
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.figures import style
 
@@ -64,9 +65,7 @@ class Box:
 
 def tight_box(mesh: trimesh.Trimesh) -> Box:
     """The smallest box around a surface, along its own axes."""
-    import trimesh
-
-    T_box_obj, size_m = trimesh.bounds.oriented_bounds(mesh)
+    T_box_obj, size_m = oriented_box(mesh)
     return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
 
 

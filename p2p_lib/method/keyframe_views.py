@@ -7,13 +7,13 @@ import numpy as np
 from p2p_lib.core import se3
 
 #: At most so many views are remembered, which bounds memory and time on long videos.
-_MOST = 1000
+MOST = 1000
 
 
 class KeyframeViews:
     """Keyframe poses T_cam_obj (N, 4, 4) as registered; a view far from all of them asks for a keyframe."""
 
-    def __init__(self, most: int = _MOST):
+    def __init__(self, most: int = MOST):
         self._most = most
         self.T_cam_obj = np.zeros((0, 4, 4))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Generic, Self, TypeVar
 
 import numpy as np
 
@@ -278,12 +278,16 @@ class Life:
         return float(moved_m), float(np.degrees(se3.angle_rad(se3.inverse(self.T_cam_obj) @ T_cam_obj)))
 
 
+ModelT = TypeVar("ModelT", bound=ObjectModel, covariant=True)
+LifeT = TypeVar("LifeT", bound=Life, covariant=True)
+
+
 @dataclass(frozen=True, eq=False)
-class Known:
+class Known(Generic[ModelT, LifeT]):
     """What is known of an object in one object frame: its model, and its life since that was begun."""
 
-    model: ObjectModel
-    life: Life = field(default_factory=Life)
+    model: ModelT
+    life: LifeT
     map_id: int = 0
 
     @property

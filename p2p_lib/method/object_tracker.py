@@ -58,7 +58,7 @@ class ObjectTracker:
     ):
         self.name, self.config, self.detector = name, config, detector
         self.observer = Observer(camera, config.depth, config.refinement.max_points if config.method.surface else 0)
-        self.new_model = partial(model, config, self.observer, stopwatch, executor)
+        self.new_model: Callable[[], ObjectModel] = partial(model, config, self.observer, stopwatch, executor)
         self.policy = policy(self.observer, config, rng, stopwatch)
         self.known = Known(self.new_model(), self.policy.life, map_id)
         self._stopwatch = stopwatch

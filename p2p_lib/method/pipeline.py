@@ -14,7 +14,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from p2p_lib.core.compiled import uninterrupted
 from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker, Segmenter
-from p2p_lib.core.objects import Objects
+from p2p_lib.core.objects import FollowedT, Objects
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method.frontend import FrameInputs, Frontend, Masks
@@ -47,7 +47,7 @@ class Parts:
     object: Callable[..., Any] = ObjectTracker
 
 
-class Point2Pose(Objects):
+class Point2Pose(Objects[FollowedT]):
     """Causal 6D tracking of any number of unknown rigid objects in one RGB-D stream.
 
     config  parameters, or the name of a preset
@@ -157,13 +157,6 @@ class Point2Pose(Objects):
 
     # -- the end -------------------------------------------------------------------------------
 
-    def close(self) -> None:
-        """End the threads once their work is done; afterwards nothing can be tracked."""
-        self.closed = True
+    def end(self) -> None:
+        """End the threads once their work is done."""
         self._executor.shutdown()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -8,6 +8,7 @@ that lies nearest to the surface, accepts every pose that it finds, and learns f
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -72,8 +73,13 @@ class Admission:
         return self.covariance + model.covariance, self.confidence
 
 
+ObsT = TypeVar("ObsT", bound=Observation)
+KnownT = TypeVar("KnownT", bound="Known[ObjectModel, Life]")
+CandidateT = TypeVar("CandidateT", bound=Candidate)
+
+
 @dataclass(eq=False)
-class Policy:
+class Policy(Generic[ObsT, KnownT]):
     """The paper's answers for one object; ``known`` is its model and its life so far."""
 
     observer: Observer
@@ -84,28 +90,28 @@ class Policy:
 
     # -- propose -------------------------------------------------------------------------------
 
-    def propose(self, obs: Observation, known: Known) -> list[Hypothesis]:
+    def propose(self, obs: ObsT, known: KnownT) -> list[Hypothesis]:
         """Candidate poses from the visible keypoints."""
         with self.stopwatch("registration"):
             use, _ = self.correspondences(obs, known)
             return self.register(known, np.where(use[:, None], obs.p_cam, np.nan))
 
-    def hidden(self, obs: Observation) -> bool:
+    def hidden(self, obs: ObsT) -> bool:
         """Whether the mask says that nothing of the object is to be seen."""
         return obs.mask_px is not None and obs.mask_px < self.config.lifecycle.min_mask_px
 
-    def correspondences(self, obs: Observation, known: Known) -> tuple[np.ndarray, np.ndarray]:
+    def correspondences(self, obs: ObsT, known: KnownT) -> tuple[np.ndarray, np.ndarray]:
         """(N,) bool each: the points to register, and all that are certain enough for it."""
         certain = obs.seen & (obs.tracks.uncertainty <= self.config.registration.max_uncertainty)
         use = certain & known.map.promoted
         return (use if use.sum() >= self.min_keypoints(known) else certain), certain
 
-    def min_keypoints(self, known: Known) -> int:
+    def min_keypoints(self, known: KnownT) -> int:
         """With fewer visible keypoints than this, pending points help to register (the release's number)."""
         return 12
 
     def register(
-        self, known: Known, p_cam: np.ndarray, priors: dict[str, np.ndarray] | None = None
+        self, known: KnownT, p_cam: np.ndarray, priors: dict[str, np.ndarray] | None = None
     ) -> list[Hypothesis]:
         """Hypotheses from the map's points as measured, p_cam (N, 3); rows of NaN are ignored."""
         cfg, sigma_m = self.config.registration, known.model.noise_m(p_cam)
@@ -113,14 +119,14 @@ class Policy:
 
     # -- choose --------------------------------------------------------------------------------
 
-    def choose(self, obs: Observation, known: Known, hypotheses: list[Hypothesis]) -> tuple[Candidate | None, str]:
+    def choose(self, obs: ObsT, known: KnownT, hypotheses: list[Hypothesis]) -> tuple[Candidate | None, str]:
         """One of the hypotheses, refined on the surface, and the reason for the choice."""
         best, reason = self.select(obs, known, [Candidate(hypothesis) for hypothesis in hypotheses])
         return (None if best is None else self.refine(obs, known, best)), reason
 
     def select(
-        self, obs: Observation, known: Known, candidates: list[Candidate], weight: np.ndarray | None = None
-    ) -> tuple[Candidate | None, str]:
+        self, obs: ObsT, known: KnownT, candidates: list[CandidateT], weight: np.ndarray | None = None
+    ) -> tuple[CandidateT | None, str]:
         """The candidate to go on with, and why; ``weight`` (H,) factors of their support."""
         with self.stopwatch("selection"):
             poses, distance_m = [c.T_cam_obj for c in candidates], None
@@ -130,15 +136,13 @@ class Policy:
             row, reason = selection.select(hypotheses, distance_m, self.config.selection, weight)
             return (None if row is None else candidates[row]), reason
 
-    def refine(self, obs: Observation, known: Known, candidate: Candidate) -> Candidate:
+    def refine(self, obs: ObsT, known: KnownT, candidate: CandidateT) -> CandidateT:
         """The candidate with its refined pose."""
         with self.stopwatch("refinement"):
             refined = self.refined(obs, known, candidate.T_cam_obj, candidate.hypothesis.inliers)
             return replace(candidate, refined=refined)
 
-    def refined(
-        self, obs: Observation, known: Known, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None
-    ) -> Refinement:
+    def refined(self, obs: ObsT, known: KnownT, T_cam_obj: np.ndarray, agrees: np.ndarray | None = None) -> Refinement:
         """The pose refined on the surface, with the keypoints ``agrees`` (N,) bool where the configuration says so."""
         cfg, keypoints = self.config.refinement, None
         if cfg.residuals == "none" or not len(obs.cloud) or (surface := known.model.seen_surface) is None:
@@ -150,47 +154,47 @@ class Policy:
 
     # -- judge, admit, request -----------------------------------------------------------------
 
-    def start(self, known: Known, points: int) -> Verdict:
+    def start(self, known: KnownT, points: int) -> Verdict:
         """Whether a map may begin with this number of ``points``."""
         enough = points >= self.config.registration.min_inliers
         return Verdict(enough, Status.TRACKED, "" if enough else f"only {points} points to start a map")
 
-    def judge(self, obs: Observation, known: Known, best: Candidate) -> Verdict:
+    def judge(self, obs: ObsT, known: KnownT, best: Candidate) -> Verdict:
         """Every pose stands; few points degrade it."""
         support, enough = best.hypothesis.support, self.config.lifecycle.return_inliers
         if support < enough:
             return Verdict(True, Status.DEGRADED, f"only {support} points agree with the pose, fewer than {enough}")
         return Verdict(True, Status.RECOVERED if known.life.returning else Status.TRACKED)
 
-    def admit(self, obs: Observation, known: Known, best: Candidate, verdict: Verdict) -> Admission:
+    def admit(self, obs: ObsT, known: KnownT, best: Candidate, verdict: Verdict) -> Admission:
         """Every frame with a pose is learnt from."""
         return Admission(verdict, best.hypothesis.inliers, self.covariance(obs, known, best))
 
-    def covariance(self, obs: Observation, known: Known, best: Candidate) -> np.ndarray:
+    def covariance(self, obs: ObsT, known: KnownT, best: Candidate) -> np.ndarray:
         """(6, 6) of the pose relative to the map: from the refinement, else from the keypoints alone."""
         if best.refined is not None and best.refined.covariance is not None:
             return best.refined.covariance
         noise_m = self.observer.noise_m(obs.p_cam)
         return registration.covariance(best.hypothesis, known.map.p_obj, obs.p_cam, noise_m)
 
-    def request(self, obs: Observation, known: Known, best: Candidate, admission: Admission) -> Requests:
+    def request(self, obs: ObsT, known: KnownT, best: Candidate, admission: Admission) -> Requests:
         """No track is rejected."""
         return Requests()
 
     # -- the object's life ---------------------------------------------------------------------
 
-    def begun(self, obs: Observation, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
+    def begun(self, obs: ObsT, T_cam_obj: np.ndarray, verdict: Verdict) -> Life:
         """The life of a map after its first frame."""
         return replace(self.life, status=verdict.status, T_cam_obj=T_cam_obj, seen_s=obs.frame.time_s)
 
-    def followed(self, obs: Observation, known: Known, best: Candidate, admitted: Admission, confidence: float) -> Life:
+    def followed(self, obs: ObsT, known: KnownT, best: Candidate, admitted: Admission, confidence: float) -> Life:
         """The life after a frame with a pose that is reported with this confidence."""
         return known.life.with_pose(best.T_cam_obj, obs.frame.time_s, admitted.verdict.status)
 
-    def missed(self, obs: Observation, known: Known, verdict: Verdict) -> Life:
+    def missed(self, obs: ObsT, known: KnownT, verdict: Verdict) -> Life:
         """The life after a frame without a pose."""
         return replace(known.life, status=verdict.status)
 
-    def expected(self, obs: Observation, known: Known) -> np.ndarray | None:
+    def expected(self, obs: ObsT, known: KnownT) -> np.ndarray | None:
         """T_cam_obj of an absent object: its last pose, None where it had none."""
         return known.life.T_cam_obj

@@ -20,6 +20,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import replace_text, replacing
 from p2p_lib.core.image import nearest_px
+from p2p_lib.core.mesh import oriented_box
 from p2p_lib.core.native import load_open3d
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, evenly
@@ -138,7 +139,7 @@ def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[
         "watertight": bool(mesh.is_watertight),
     }
     record |= {"guessed_share": float(mesh.area_faces[shape.guessed].sum() / mesh.area), "views": views}
-    sides_m = sorted(mesh.bounding_box_oriented.primitive.extents.tolist(), reverse=True)
+    sides_m = sorted(oriented_box(mesh)[1].tolist(), reverse=True)
     parts, holes = torn(shape)
     record |= {"parts": parts, "holes": holes, "size_m": np.round(sides_m, 5).tolist(), "colour_error_of_255": off}
     return record | {"run": made.about}

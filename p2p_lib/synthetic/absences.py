@@ -210,7 +210,7 @@ def half_hidden_start(seed: int, models: str = "") -> Scenario:
         names = "011_banana", "061_foam_brick"
         meshes = [shapes.load_ycb(models, name) for name in names]
     else:
-        names, meshes = ("tin", "box"), (shapes.box(rng, (0.10, 0.058, 0.035)), _carton(rng))
+        names, meshes = ("tin", "box"), [shapes.box(rng, (0.10, 0.058, 0.035)), _carton(rng)]
     time, way = np.arange(_FRAMES) / _FRAMES, rng.choice([-1.0, 1.0])
     bodies = []
     for name, mesh, ahead in zip(names, meshes, (np.pi / 2, -np.pi / 2), strict=True):
@@ -239,7 +239,8 @@ def half_hidden_start(seed: int, models: str = "") -> Scenario:
 def _first_share(scenario: Scenario) -> float:
     """Share of the first body's pixels that show at the first frame."""
     alone = replace(scenario, bodies=scenario.bodies[:1]).rendered(0).label
-    return np.count_nonzero(scenario.rendered(0).label == 1) / max(np.count_nonzero(alone), 1)
+    shown = np.count_nonzero(scenario.rendered(0).label == 1)
+    return int(shown) / max(int(np.count_nonzero(alone)), 1)
 
 
 def _carton(rng: np.random.Generator) -> Mesh:

@@ -84,7 +84,8 @@ def _arranged(rng: np.random.Generator) -> list[tuple[str, Mesh, np.ndarray, boo
             here = np.zeros_like(taken)
             cells = np.round(outline + at / _CELL_M + _HALF).astype(np.int32)
             cv2.fillConvexPoly(here, cells, 1)
-            if not (cv2.dilate(here, np.ones((2 * apart + 1,) * 2, np.uint8)) & taken).any():
+            grown: np.ndarray = cv2.dilate(here, np.ones((2 * apart + 1,) * 2, np.uint8))
+            if not (grown & taken).any():
                 break
         taken |= here
         T[:2, 3] = at
@@ -146,7 +147,7 @@ def _carried(rng: np.random.Generator, frames: int, fastest_deg: float) -> np.nd
             to[axis] = rng.uniform(*_AWAY_DEG[axis]) * (1 if axis == 1 else rng.choice([-1, 1]))
         turn = np.linalg.norm(to[:3] - values[-1][:3])
         # A monotone cubic between two stops is at most 1.5 times as fast as on average.
-        keys.append(keys[-1] + max(8.0, 1.5 * turn / (fastest_deg * rng.uniform(0.55, 1.0))))
+        keys.append(keys[-1] + max(8.0, float(1.5 * turn / (fastest_deg * rng.uniform(0.55, 1.0)))))
         keys.append(keys[-1] + rng.uniform(3, 12 if away else 7))
         values += [to, to + np.r_[rng.uniform(-3, 3, 3), rng.uniform(-0.02, 0.02, 3)]]
         if keys[-1] > frames:
@@ -216,7 +217,7 @@ def _papers(rng: np.random.Generator, page: np.ndarray) -> None:
         else:
             for row in range(24, 270, 9):
                 cv2.line(sheet, (20, row), (int(rng.uniform(90, 190)), row), (120, 120, 125), 2)
-        M = cv2.getRotationMatrix2D((105, 148), rng.uniform(0, 360), 1.0)
+        M: np.ndarray = cv2.getRotationMatrix2D((105, 148), rng.uniform(0, 360), 1.0)
         M[:, 2] += at - [105, 148]
         on = cv2.warpAffine(np.full(sheet.shape[:2], 255, np.uint8), M, page.shape[1::-1]) > 127
         page[on] = cv2.warpAffine(sheet, M, page.shape[1::-1])[on]

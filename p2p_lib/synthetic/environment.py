@@ -53,7 +53,7 @@ def living_room(rng: np.random.Generator, windows: int = 2, height: int = 512) -
 def _window(rng: np.random.Generator, page: np.ndarray, left: int, right: int, top: int, bottom: int) -> None:
     """Sky, roofs, trees at several times the brightness of paper, behind a dark cross of bars."""
     h, w = bottom - top, right - left
-    sky = np.linspace(3600, 2200, h, dtype=np.float32)[:, None, None] * np.float32([0.92, 0.97, 1.0])
+    sky = np.linspace(3600, 2200, h, dtype=np.float32)[:, None, None] * np.array([0.92, 0.97, 1.0], np.float32)
     view = np.broadcast_to(sky, (h, w, 3)).copy()
     for _ in range(int(rng.integers(6, 10))):
         x, y, size = int(rng.uniform(0, w)), int(h * rng.uniform(0.15, 0.9)), int(w * rng.uniform(0.12, 0.3))

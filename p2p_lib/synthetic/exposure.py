@@ -74,14 +74,17 @@ def _smeared(
     rgb, passing = image.rgb.copy(), [image.depth_m]
     if not still:
         ends = [(u + a * shift[:, 0], v + a * shift[:, 1]) for a in (-0.4, 0.4)]
-        at = [np.stack(end).reshape(2, camera.height, camera.width) for end in ends]
-        found = [cv2.remap(image.depth_m, *a, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) for a in at]
-        passing = [found[0], image.depth_m, found[1]]
+        images = [np.stack(end).reshape(2, camera.height, camera.width) for end in ends]
+        first, last = (
+            cv2.remap(image.depth_m, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) for x, y in images
+        )
+        passing = [first, image.depth_m, last]
     total = np.zeros((len(pixel), 3), np.float32)
     at = np.zeros((2, -(-max(1, len(pixel)) // 1024) * 1024), np.float32)
     for a in (np.arange(_SMEARS, dtype=np.float32) + 0.5) / _SMEARS - 0.5:
         at[:, : len(pixel)] = u + a * shift[:, 0], v + a * shift[:, 1]
-        found = cv2.remap(image.rgb, *at.reshape(2, -1, 1024), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        x, y = at.reshape(2, -1, 1024)
+        found = cv2.remap(image.rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         total += found.reshape(-1, 3)[: len(pixel)]
     rgb.reshape(-1, 3)[pixel] = total / np.float32(_SMEARS)
     return rgb, passing
@@ -101,7 +104,7 @@ def _motion_px(
         p = se3.transform(T_now_s.astype(np.float32), p_s)
         for k, body in enumerate(scenario.bodies, 1):
             T0, T1 = (at_time(body.T_world_model, moment) for moment in (s, time))
-            on = np.flatnonzero(label == k) if (T0 != T1).any() else []
+            on = np.flatnonzero(label == k) if (T0 != T1).any() else np.zeros(0, int)
             if len(on):
                 T = se3.inverse(T_world_now) @ T1 @ se3.inverse(T0) @ T_world_cam[0]
                 p[on] = se3.transform(T.astype(np.float32), p_s[on])

@@ -69,6 +69,11 @@ class Faulty:
             raise BadInput("frames of a fault", f"{self.start} to {stop}", f"some of {len(self.original)}")
         object.__setattr__(self, "stop", stop)
 
+    @property
+    def end(self) -> int:
+        """The frame of the original after all of it."""
+        return len(self.original) if self.stop is None else self.stop
+
     @cached_property
     def kept(self) -> np.ndarray:
         """The original's frames that are there."""
@@ -77,7 +82,7 @@ class Faulty:
     @property
     def during(self) -> tuple[int, int]:
         """The frames of the fault, from and to, as they are counted here; none of them where all are left out."""
-        first, end = np.searchsorted(self.kept, (self.start, self.stop))
+        first, end = np.searchsorted(self.kept, (self.start, self.end))
         return int(first), int(end)
 
     @property
@@ -129,7 +134,7 @@ class Faulty:
     def _acting(self, i: int) -> tuple[int, Fault]:
         """What frame i is of the original, and the fault that acts there."""
         k = int(self.kept[i])
-        return k, FAULTS[self.fault if self.start <= k < self.stop else "none"]
+        return k, FAULTS[self.fault if self.start <= k < self.end else "none"]
 
     def __len__(self) -> int:
         return len(self.kept)
@@ -213,7 +218,7 @@ def _board(frame: Frame, of: Faulty, i: int) -> Frame:
     behind = frame.depth_m[(objects if objects.any() else True) & (frame.depth_m > 0)]
     near_m = _BOARD_SHARE * np.percentile(behind, 5) if len(behind) else 0.3
     wide = max(int(of.severity * w), 1)
-    left = round((i - of.start + 0.5) / (of.stop - of.start) * (w + wide)) - wide
+    left = round((i - of.start + 0.5) / (of.end - of.start) * (w + wide)) - wide
     grain = np.random.default_rng(of.seed).integers(90, 170, (h // 8 + 1, wide // 8 + 1, 3), np.uint8)
     texture = cv2.resize(grain, (wide, h))
     seen = np.arange(max(left, 0), min(left + wide, w))

@@ -86,8 +86,11 @@ def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, 
     for k, body in labelled.items():
         T_cam_model = se3.inverse(scenario.T_world_cam[frames]) @ body.T_world_model[frames]
         uv_px = scenario.camera.project(se3.transform(T_cam_model, body.mesh.vertices))
-        labels = np.array([k in seen for seen in visible]), scenario.camera.inside(uv_px).any(1)
-        write_truth(folder, body.name, [f"{t:06d}" for t in frames], T_cam_model, *labels)
+        labelled_in, inside = (
+            np.array([k in seen for seen in visible]),
+            np.asarray(scenario.camera.inside(uv_px).any(1)),
+        )
+        write_truth(folder, body.name, [f"{t:06d}" for t in frames], T_cam_model, labelled_in, inside)
         points, _ = body.mesh.sample(_MODEL_POINTS, np.random.default_rng(k))
         np.savetxt(folder / f"models/{body.name}/points.xyz", points, fmt="%.6f")
         _write_obj(folder / f"models/{body.name}", body.mesh)
@@ -191,9 +194,9 @@ def _settings(name: str, seed: int, overrides: dict) -> tuple[dict, Sensor]:
         raise BadInput(f"{SYNTHETIC}{name} seed", repr(seed), "a whole number, 0 or above")
     taken = list(inspect.signature(SCENARIOS[name]).parameters.values())[1:]
     own = {p.name: p.default for p in taken if p.kind is not p.KEYWORD_ONLY}
-    known = [*own, *(f.name for f in fields(Sensor))]
-    for key in overrides.keys() - known:
-        raise BadInput(f"{SYNTHETIC}{name} parameter", repr(key), "one of " + ", ".join(known))
+    keys = [*own, *(f.name for f in fields(Sensor))]
+    for key in overrides.keys() - keys:
+        raise BadInput(f"{SYNTHETIC}{name} parameter", repr(key), "one of " + ", ".join(keys))
     sensor = Sensor(**{k: v for k, v in overrides.items() if k not in own})
     return own | {k: v for k, v in overrides.items() if k in own}, sensor
 

@@ -158,11 +158,11 @@ def _skin(rng: np.random.Generator) -> np.ndarray:
     """Skin (512, 512, 3) uint8: a tone, redder and paler blotches, pores."""
     light = rng.uniform(0.45, 1.05)
     tone = (
-        np.float32([208, 158, 132])
+        np.array([208, 158, 132], np.float32)
         * np.float32(light)
-        * np.float32([1, rng.uniform(0.94, 1.02), rng.uniform(0.9, 1.0)])
+        * np.array([1, rng.uniform(0.94, 1.02), rng.uniform(0.9, 1.0)], np.float32)
     )
-    blotches = labels.smooth_noise(rng, 512, 512, (4, 5), 5)[..., None] * np.float32([0.05, 0.10, 0.11])
+    blotches = labels.smooth_noise(rng, 512, 512, (4, 5), 5)[..., None] * np.array([0.05, 0.10, 0.11], np.float32)
     shade = labels.smooth_noise(rng, 512, 512, (2, 2), 3)[..., None] * 0.07
     pores = cv2.GaussianBlur(rng.standard_normal((512, 512), np.float32), (0, 0), 1.2)[..., None] * 0.05
     return np.clip(tone * (1 + blotches + shade + pores), 0, 255).astype(np.uint8)
@@ -171,14 +171,14 @@ def _skin(rng: np.random.Generator) -> np.ndarray:
 def _finger(rng: np.random.Generator, skin: np.ndarray, nail: bool) -> np.ndarray:
     """A phalanx (128, 128, 3): a piece of skin with the creases of its joints, redder at the tip, perhaps a nail."""
     u, v = rng.integers(0, 384, 2)
-    page = skin[v : v + 128, u : u + 128].astype(np.float32)
+    page: np.ndarray = skin[v : v + 128, u : u + 128].astype(np.float32)
     page = cv2.resize(page, (128, 128))
     for row in (18, 22, 27, 104, 110):
         depth = rng.uniform(0.78, 0.92)
         wave = (row + 1.5 * np.sin(np.linspace(0, 6, 128) + rng.uniform(0, 6))).round().astype(int)
         page[np.clip(wave, 0, 127), np.arange(128)] *= depth
     if nail:  # the image's top is the end, and the back of the hand (+y) a quarter around
-        page[:40] *= np.float32([1.03, 0.93, 0.92])
+        page[:40] *= np.array([1.03, 0.93, 0.92], np.float32)
         cv2.ellipse(
             page,
             (32, 34),
@@ -195,7 +195,7 @@ def _finger(rng: np.random.Generator, skin: np.ndarray, nail: bool) -> np.ndarra
 
 def cloth(rng: np.random.Generator) -> np.ndarray:
     """A sleeve (512, 512, 3): one colour, a weave, folds across."""
-    hsv = np.uint8([[[rng.integers(0, 180), rng.integers(10, 120), rng.integers(50, 200)]]])
+    hsv = np.array([[[rng.integers(0, 180), rng.integers(10, 120), rng.integers(50, 200)]]], np.uint8)
     tone = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0].astype(np.float32)
     folds = 0.22 * labels.smooth_noise(rng, 512, 512, (3, 12), 3)
     weave = 0.05 * np.sign(np.sin(np.arange(512) * 1.3))[None] * np.sign(np.sin(np.arange(512) * 1.3))[:, None]

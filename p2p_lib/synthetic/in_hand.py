@@ -78,7 +78,8 @@ class _Film:
 
     def __init__(self, rng: np.random.Generator, mesh: Mesh, pace: float) -> None:
         """``pace``: what takes a second takes so many times 30 frames."""
-        self.rng, self.mesh, self.pace, self.frames = rng, mesh, pace, []
+        self.rng, self.mesh, self.pace = rng, mesh, pace
+        self.frames: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         self.hand = gripping.make_hand(rng)
         self.eye = np.array([0, -0.40, 0.33]) + rng.uniform(-0.04, 0.04, 3)
         self.T_world_cam = look_at(self.eye, np.array([0.0, 0.02, 0.06]))
@@ -116,7 +117,7 @@ class _Film:
         carry = self._drawn(turn_deg=[(20, 120), (105, 178), (60, 178)][kind], shake=kind == 2)
         held, angles = carry.T_thing_hand, carry.angles
         # Open fingers do not touch the thing where the palm is a few centimetres off.
-        near = held @ se3.from_rt(np.eye(3), [0, rng.uniform(0.04, 0.07), rng.uniform(-0.04, 0.0)])
+        near = held @ se3.from_rt(np.eye(3), np.array([0, rng.uniform(0.04, 0.07), rng.uniform(-0.04, 0.0)]))
         if self.frames or rng.uniform() < 0.5:
             self.wait(rng.uniform(1, 6))
             self._reach([self.away, self.thing @ near], [OPEN, OPEN], rng.uniform(7, 11))
@@ -138,7 +139,7 @@ class _Film:
         """The hand moves alone, from one pose to another and from one set of angles to another."""
         count = max(3, round(frames * self.pace))
         bent = angles[0] + minimum_jerk(count)[1:, None, None] * (angles[1] - angles[0])
-        path = carried(*hands, count, np.zeros(3))
+        path = carried(hands[0], hands[1], count, np.zeros(3))
         self.frames += [(self.thing, hand, a) for hand, a in zip(path, bent, strict=True)]
 
     def _count(self, pose: np.ndarray, deg: float, px: float) -> int:
@@ -180,7 +181,7 @@ class _Film:
                         break
                 else:
                     best, least = _Carry(held, angles, stops), worst
-                if least <= 0:
+                if best is not None and least <= 0:
                     return best
         if best is None:
             raise BadInput(
@@ -280,11 +281,11 @@ def _table(rng: np.random.Generator) -> tuple[Mesh, ...]:
     page = np.clip(page + 5 * rng.standard_normal(page.shape), 0, 255).astype(np.uint8)
     corners = np.array([[-0.24, -0.17, 0], [0.24, -0.17, 0], [0.24, 0.17, 0], [-0.24, 0.17, 0]])
     corners[:, :2] += rng.uniform(-0.012, 0.012, (4, 2))
-    lies = _yawed(se3.from_rt(np.eye(3), [0, 0, 0.0004]), rng.uniform(-0.5, 0.5), np.zeros(2))
+    lies = _yawed(se3.from_rt(np.eye(3), np.array([0, 0, 0.0004])), rng.uniform(-0.5, 0.5), np.zeros(2))
     parts = [shapes.plane(page, se3.transform(lies, corners))]
     behind = [shapes.box(rng, tuple(rng.uniform([0.08, 0.05, 0.1], [0.2, 0.1, 0.22]))), shapes.can(rng, 0.04, 0.13)]
     for k, mesh in enumerate(behind):
         at = np.array([(k - 0.5) * rng.uniform(0.4, 0.7), rng.uniform(0.28, 0.38)])
-        stands = se3.from_rt(np.eye(3), [0, 0, -mesh.vertices[:, 2].min()])
+        stands = se3.from_rt(np.eye(3), np.array([0, 0, -mesh.vertices[:, 2].min()]))
         parts.append(shapes.moved(mesh, _yawed(stands, rng.uniform(0, 6), at)))
     return (*room(rng), *parts)

@@ -74,14 +74,14 @@ def wood(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
     """A table top of planks, (height, width, 3) uint8."""
     grain = smooth_noise(rng, width, height, (3, 40), 4) + 0.5 * smooth_noise(rng, width, height, (6, 6), 3)
     planks = np.repeat(rng.uniform(-0.25, 0.25, 7), -(-height // 7))[:height, None]
-    page = np.float32([168, 132, 96]) * (1 + 0.22 * grain + planks * 0.6)[..., None]
+    page = np.array([168, 132, 96], np.float32) * (1 + 0.22 * grain + planks * 0.6)[..., None]
     page[:: -(-height // 7)] *= 0.55
     return np.clip(page, 0, 255).astype(np.uint8)
 
 
 def plaster(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
     """A wall, (height, width, 3) uint8: almost even, a little dirty."""
-    page = np.float32([188, 190, 184]) * (1 + 0.06 * smooth_noise(rng, width, height, (5, 4), 6))[..., None]
+    page = np.array([188, 190, 184], np.float32) * (1 + 0.06 * smooth_noise(rng, width, height, (5, 4), 6))[..., None]
     return np.clip(page, 0, 255).astype(np.uint8)
 
 
@@ -89,7 +89,9 @@ def cardboard(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
     """Plain brown board with flutes and one faint stamp, (height, width, 3) uint8."""
     flutes = np.sin(np.arange(width) * (2 * np.pi / 14))[None]
     stain = smooth_noise(rng, width, height, (3, 3), 6)
-    page = np.clip(np.float32([176, 140, 100]) * (1 + 0.03 * flutes + 0.1 * stain)[..., None], 0, 255).astype(np.uint8)
+    page = np.clip(np.array([176, 140, 100], np.float32) * (1 + 0.03 * flutes + 0.1 * stain)[..., None], 0, 255).astype(
+        np.uint8
+    )
     cv2.putText(page, "FRAGILE", (width // 8, int(height * 0.6)), _FONTS[1], width / 190, (120, 60, 50), 4, cv2.LINE_AA)
     return page
 
@@ -99,12 +101,14 @@ def _palette(rng: np.random.Generator) -> tuple[tuple, tuple, tuple]:
     hue = rng.uniform(0, 180)
     light = [(hue, 70, 225), (hue + 95, 170, 70), (hue + rng.uniform(40, 140), 190, 175)]
     hsv = np.array([[(h % 180, s, v) for h, s, v in light]], np.uint8)
-    return tuple(tuple(int(c) for c in rgb) for rgb in cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0])
+    ground, ink, accent = (tuple(int(c) for c in rgb) for rgb in cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0])
+    return ground, ink, accent
 
 
 def _random_colour(rng: np.random.Generator) -> tuple[int, int, int]:
-    hsv = np.uint8([[[rng.integers(0, 180), rng.integers(90, 230), rng.integers(70, 240)]]])
-    return tuple(int(c) for c in cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0])
+    hsv = np.array([[[rng.integers(0, 180), rng.integers(90, 230), rng.integers(70, 240)]]], np.uint8)
+    red, green, blue = (int(c) for c in cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0])
+    return red, green, blue
 
 
 def _blend_bands(rng: np.random.Generator, page: np.ndarray, accent: tuple) -> None:

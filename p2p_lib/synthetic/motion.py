@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from p2p_lib.core import se3
 
 
-def varied(rng: np.random.Generator, keys: list[tuple], yaw_deg: float = 0.0, mirrored: float = 1.0) -> np.ndarray:
+def varied(rng: np.random.Generator, keys: ArrayLike, yaw_deg: float = 0.0, mirrored: float = 1.0) -> np.ndarray:
     """Keys (K, 7) of :func:`path` moved by about a centimetre and a few degrees, turned, perhaps mirrored (-1)."""
-    keys = np.array(keys, float)
-    keys[:, 1:4] += rng.uniform(-0.008, 0.008, (len(keys), 3))
-    keys[:, 4:] += rng.uniform(-3, 3, (len(keys), 3))
-    keys[:, 4] += yaw_deg
-    keys[:, [1, 4, 6]] *= mirrored
-    return keys
+    at = np.array(keys, float)
+    at[:, 1:4] += rng.uniform(-0.008, 0.008, (len(at), 3))
+    at[:, 4:] += rng.uniform(-3, 3, (len(at), 3))
+    at[:, 4] += yaw_deg
+    at[:, [1, 4, 6]] *= mirrored
+    return at
 
 
 def path(keys: np.ndarray, frames: int) -> np.ndarray:
@@ -38,7 +39,7 @@ def wander(rng: np.random.Generator, frames: int, reach_m: float, reach_deg: flo
     return T
 
 
-def through(keys: np.ndarray, values: np.ndarray, frames: np.ndarray, sigma: float) -> np.ndarray:
+def through(keys: ArrayLike, values: ArrayLike, frames: np.ndarray, sigma: float) -> np.ndarray:
     """Values (T, ...) at frames (T,), by monotone cubics through values (K, ...) at keys (K,), see :func:`eased`."""
     from scipy.interpolate import PchipInterpolator
 

@@ -104,7 +104,8 @@ def in_motion(
     passed = cv2.dilate(edges, np.ones((_PASSED_PX, _PASSED_PX), np.uint8)) > 0
     v, u = np.nonzero(passed & (near - far > sensor.edge_m * near * far))
     every = np.stack([a[v, u] for a in inverse])
-    patchy = [_even(_correlated(*measured_m.shape, 2 * sensor.correlation_px, rng)[v, u]) for _ in range(2)]
+    height, width = measured_m.shape
+    patchy = [_even(_correlated(height, width, 2 * sensor.correlation_px, rng)[v, u]) for _ in range(2)]
     seen = every[(patchy[0] * len(every)).astype(int), np.arange(len(v))]
     seen = np.where(rng.random(len(v)) < 0.2, every.mean(0), seen)
     seen[patchy[1] < sensor.edge_loss] = 0

@@ -144,6 +144,7 @@ def _pixels_around(p_cam: np.ndarray, camera: Camera) -> np.ndarray:
 def _shade(seen: _Hits, camera: Camera, light: Light, T_cam_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colour (N, 3) and cosine of incidence (N,) of pixels."""
     mesh, face = seen.mesh, seen.face
+    assert mesh.normals is not None and mesh.reflectance is not None, "a mesh fills them in"
     v, u = np.divmod(seen.pixel, camera.width)
     # What is of faces is worked out there and then taken: they are fewer than pixels.
     per_u, per_v, offset = (np.ascontiguousarray(seen.planes[..., k])[face] for k in range(3))

@@ -46,4 +46,4 @@ def describe(name: str) -> str:
         return f"as in the paper's synthetic subset: {parts}, {paper_subset.FRAMES} frames."
     if name in tools.SCENARIOS:
         return f"as thin_tools, the tool: {name.removeprefix('thin_')}."
-    return SCENARIOS[name].__doc__.splitlines()[0]
+    return (SCENARIOS[name].__doc__ or "").splitlines()[0]

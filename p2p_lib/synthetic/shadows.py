@@ -27,7 +27,7 @@ def shadowed(
     v, u = (a.ravel() for a in np.mgrid[_EVERY // 2 : camera.height : _EVERY, _EVERY // 2 : camera.width : _EVERY])
     points = se3.transform(T_world_cam, camera.rays[v, u].astype(float) * room.depth_m[v, u, None])
     size = -(-camera.height // _EVERY), -(-camera.width // _EVERY)
-    dark = darkness(points, bodies, light).reshape(size).astype(np.float32)
+    dark: np.ndarray = darkness(points, bodies, light).reshape(size).astype(np.float32)
     dark = cv2.resize(
         cv2.GaussianBlur(dark, (0, 0), 1.0), (camera.width, camera.height), interpolation=cv2.INTER_LINEAR
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
@@ -205,7 +206,7 @@ def block(rng: np.random.Generator, radius_m: float, height_m: float, contrast: 
     return assembled(patches, [[k] for k in reversed(range(len(patches)))])
 
 
-def plane(image: np.ndarray, corners_m: np.ndarray) -> Mesh:
+def plane(image: np.ndarray, corners_m: ArrayLike) -> Mesh:
     """A flat image: corners (4, 3) at its bottom left, bottom right, top right, top left."""
     uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
@@ -241,7 +242,7 @@ def load_mesh(path: str | Path) -> Mesh:
     path = Path(path).expanduser()
     if not path.is_file():
         raise MissingData(f"mesh {path}", "no such file", "YCB models lie in a folder each: NAME/textured.obj.")
-    m = trimesh.load(path, process=False, force="mesh")
+    m: Any = trimesh.load(path, process=False, force="mesh")
     uv = getattr(m.visual, "uv", None)
     material = getattr(m.visual, "material", None)
     image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)

@@ -43,7 +43,7 @@ def speckled_mug(rng: np.random.Generator, radius_m: float = 0.042, height_m: fl
     length = np.linalg.norm(np.diff(profile, axis=0), axis=1).sum()
     around, along = round(2 * np.pi * radius_m * TEXELS_PER_M), round(length * TEXELS_PER_M)
     glaze = cv2.cvtColor(
-        np.uint8([[[rng.integers(0, 180), rng.integers(90, 170), rng.integers(80, 150)]]]), cv2.COLOR_HSV2RGB
+        np.array([[[rng.integers(0, 180), rng.integers(90, 170), rng.integers(80, 150)]]], np.uint8), cv2.COLOR_HSV2RGB
     )
     clay = _speckles(rng, around, along, glaze[0, 0], 0.05)
     tall, foot = round(height_m * TEXELS_PER_M), round(radius_m * 0.62 * TEXELS_PER_M)
@@ -60,7 +60,7 @@ def speckled_mug(rng: np.random.Generator, radius_m: float = 0.042, height_m: fl
 def hand(rng: np.random.Generator) -> Mesh:
     """A right hand held flat, fingers together and up (+z), palm towards -y, its middle at the origin; plain skin."""
     size = rng.uniform(0.95, 1.08)
-    tone = np.float32([205, 160, 132]) * np.float32(rng.uniform(0.55, 1.05))
+    tone = np.array([205, 160, 132], np.float32) * np.float32(rng.uniform(0.55, 1.05))
     blotches = labels.smooth_noise(rng, 256, 512, (3, 6), 5)[..., None]
     skin = np.clip(tone * (1 + 0.08 * blotches), 0, 255).astype(np.uint8)
     fingers = [(-0.0285, 0.066), (-0.0095, 0.078), (0.0095, 0.073), (0.0285, 0.058)]
@@ -138,10 +138,10 @@ def _mug_handle(profile: np.ndarray, radius_m: float, height_m: float) -> np.nda
 
 def _speckles(rng: np.random.Generator, width: int, height: int, glaze: tuple, share: float) -> np.ndarray:
     """Glaze (height, width, 3) uint8 with a cloud in it, and light and dark specks that cover about ``share`` of it."""
-    page = np.float32(glaze) * (1 + 0.08 * labels.smooth_noise(rng, width, height, (4, 4), 4))[..., None]
+    page = np.array(glaze, np.float32) * (1 + 0.08 * labels.smooth_noise(rng, width, height, (4, 4), 4))[..., None]
     for size, shade in ((3, 225), (5, 210), (8, 230), (5, 30)):
         n = round(share * width * height / 4 / (0.8 * size**2))
-        specks = np.zeros((height, width), np.float32)
+        specks: np.ndarray = np.zeros((height, width), np.float32)
         specks[rng.integers(0, height, n), rng.integers(0, width, n)] = 1
         specks = cv2.dilate(specks, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))[..., None]
         page += 0.75 * specks * (shade - page)
@@ -178,7 +178,10 @@ def _print_marks(rng: np.random.Generator, glaze: np.ndarray, marks: int, tall: 
 def _speckled(rng: np.random.Generator) -> np.ndarray:
     """Matt clay (512, 128, 3) uint8 with dark and light speckles."""
     width, height = 128, 512
-    page = np.float32([176, 150, 120]) * (1 + 0.1 * labels.smooth_noise(rng, width, height, (2, 8), 3))[..., None]
+    page = (
+        np.array([176, 150, 120], np.float32)
+        * (1 + 0.1 * labels.smooth_noise(rng, width, height, (2, 8), 3))[..., None]
+    )
     page = np.clip(page, 0, 255).astype(np.uint8)
     for _ in range(110):
         at = int(rng.integers(width)), int(rng.integers(height))

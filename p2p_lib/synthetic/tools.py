@@ -169,7 +169,7 @@ def _steel(rng: np.random.Generator, stamped: str = "") -> np.ndarray:
     """Brushed steel (256, 128, 3), spots on it, perhaps a word along it."""
     brushed = cv2.GaussianBlur(rng.standard_normal((256, 128), np.float32), (0, 0), sigmaX=0.6, sigmaY=9.0) * 3
     page = (
-        np.float32([150, 152, 156])
+        np.array([150, 152, 156], np.float32)
         * (1 + 0.05 * brushed + 0.16 * labels.smooth_noise(rng, 128, 256, (3, 8), 4))[..., None]
     )
     page = np.clip(_scratched(rng, page, 40), 0, 255).astype(np.uint8)

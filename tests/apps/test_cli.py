@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 import p2p_lib
 from p2p_lib.apps import cli
@@ -433,6 +434,19 @@ def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, c
         assert "size: got the name 'mug', expected one of the objects: object" in capsys.readouterr().err
     assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=long"]) == 2
     assert "its longest side in centimetres" in capsys.readouterr().err
+
+
+def test_a_surface_that_is_exactly_flat_is_measured_and_drawn(pristine, tmp_path, capsys):
+    """The board's side is 14.4 cm of surface: no 20, as along its diagonal."""
+    out, words = str(tmp_path / "run"), ["--stop", "4", "--quiet", "--size", "object=15"]
+    assert cli.main(["run", str(pristine), "--out", out, *words]) == 0
+    assert np.ptp(trimesh.load_mesh(tmp_path / "run/meshes/object.ply").vertices[:, 2]) == 0
+    assert cli.main(["eval", out, "--size", "object=15"]) == 0
+    said = capsys.readouterr()
+    assert "known to be" not in said.out + said.err
+    assert cli.main(["eval", out, "--size", "object=7"]) == 0
+    assert re.search(r"1[45]\.\d cm of its surface", capsys.readouterr().err)
+    assert cli.main(["film", out, "--out", str(tmp_path / "film.webp")]) == 0
 
 
 def test_why_a_run_is_not_scored_is_said_once(sequence, tmp_path, capsys):

@@ -13,6 +13,7 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from p2p_lib.core.errors import BadInput, MissingData
+from studies import runner
 from studies.claims import Claim, check
 from studies.course import LESSONS
 from studies.runner import (
@@ -345,6 +346,20 @@ def test_refusals(tmp_path, arguments, message):
         run_notebooks(**{"only": ["00"], **arguments}, out=tmp_path / "out", folder=tmp_path, say=lambda line: None)
     assert str(refused.value).startswith(message)
     assert not (tmp_path / "out").exists()
+
+
+def test_what_runs_with_other_values_goes_beside_and_not_over(tmp_path, monkeypatch):
+    """Also of the full profile, whose images are those of the repository else."""
+    monkeypatch.setattr(runner, "CLONE", tmp_path / "clone")
+    write(tmp_path / "00_a.ipynb")
+    earlier = tmp_path / "clone/out/full/notebooks/00_a.ipynb"
+    earlier.parent.mkdir(parents=True)
+    earlier.write_text("earlier")
+    run_notebooks("full", folder=tmp_path, parameters={"SEED": "3", "NAME": "a b"}, say=lambda line: None)
+    (home,) = set((tmp_path / "clone/out").iterdir()) - {earlier.parents[1]}
+    assert home.name == "full_SEED-3_NAME-a-b" and earlier.read_text() == "earlier"
+    assert (home / "notebooks/00_a.ipynb").is_file() and (home / "index.html").is_file()
+    assert (home / "figures").is_dir() and not (tmp_path / "clone/figures").exists()
 
 
 def test_a_parameter_must_be_known_to_all_notebooks_that_run(tmp_path):

@@ -9,12 +9,18 @@ import pytest
 from p2p_lib import open_sequence
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.memory import ObjectMemory, SurfaceMemory
 from p2p_lib.core.types import NOT_FOUND, Status, status_text, status_word
 from p2p_lib.extended.default import Point2Pose
+from p2p_lib.method import pipeline
 from p2p_lib.segmenters.anchored import builtin
 from tests.method.test_pipeline import CAMERA, HIDDEN, assert_same, film, quick, track
 
 FEW = 8
+_VOXELS = [np.arange(8, dtype=np.int32), *(np.ones((8, *of), np.float16) for of in ((), (), (3,), ()))]
+_SURFACE = SurfaceMemory(np.array(0.01), np.array(0.03), np.zeros(3), np.zeros(3, int), np.array([2, 2, 2]), *_VOXELS)
+_LANDMARK = np.zeros((1, 3)), np.zeros((1, 1, 1), np.uint8), np.ones(1)
+MEMORY = ObjectMemory("mug", *_LANDMARK, np.eye(4)[None], np.eye(6), np.array(0.01), _SURFACE)
 
 
 def followed(method: Point2Pose, frames) -> list:
@@ -52,6 +58,13 @@ def test_a_closed_tracker_says_so_and_can_be_reset():
     method.close()
 
 
+@pytest.mark.parametrize("camera", ["cam", None, np.eye(3)], ids=["text", "none", "matrix"])
+@pytest.mark.parametrize("tracker", [Point2Pose, pipeline.Point2Pose])
+def test_what_is_no_camera_is_refused_at_once(camera, tracker):
+    with pytest.raises(BadInput, match=r"tracker camera: got .*, expected a p2p_lib\.Camera\. Make one: Camera\(fx"):
+        tracker(camera)
+
+
 def test_a_reset_forgets_the_objects_of_a_segmenter_that_was_given():
     own = builtin(CAMERA, quick().segmentation)
     with Point2Pose(CAMERA, quick(), segmenter=own) as method:
@@ -87,15 +100,18 @@ def test_a_second_thread_is_told_so_and_nothing_has_changed():
             "remove": lambda: method.remove_object("left"),
             "reset": method.reset,
             "predict": lambda: method.predict("left", 1.0),
+            "remembered": lambda: method.add_object("mug", memory=MEMORY),
+            "close": method.close,
         }
         for call in calls.values():
             with pytest.raises(BadInput, match=r"a call from a second thread .* one thread at a time.* lock"):
                 call()
         go_on.set()
         first.join()
-        assert list(method.objects) == ["left"] and answers[0]["left"].status is Status.TRACKED
+        assert list(method.objects) == ["left"] and answers[0]["left"].status is Status.TRACKED and not method.closed
         method.front.track = track_frame
         method.step(second)  # a third thread, or this one, when nobody is inside
+    method.close()
 
 
 def test_poses_are_in_the_world_where_the_camera_is_given():
@@ -133,9 +149,12 @@ def test_a_prediction_refuses_what_it_cannot_answer():
             method.predict("mug", 1.0)
         method.add_object("left")
         assert method.predict("left", 1.0) is None
+        for no_time in (None, "1"):
+            with pytest.raises(BadInput, match=r"predict time_s: got .*, expected a time in seconds"):
+                method.predict("left", no_time)
         for frame, masks in film()[:3]:
             method.step(frame, {"left": masks["left"]})
-        for time_s in (0.0, np.nan, np.inf):
+        for time_s in (0.0, np.nan, np.inf, None, "1"):
             with pytest.raises(BadInput, match="predict time_s"):
                 method.predict("left", time_s)
         method.remove_object("left")
