@@ -35,6 +35,7 @@ from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, tum_line
+from p2p_lib.offline import OFFLINE_COMMENT
 from p2p_lib.offline.evidence import VideoEvidence, VideoPoses, gather
 from p2p_lib.offline.finished import Finished
 from p2p_lib.offline.surface import SurfacePoses, fused
@@ -187,7 +188,7 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
         arrays |= {f"{name}/{column}": getattr(offline, column) for column in COLUMNS}
         has = offline.has_pose
         lines = map(tum_line, offline.time_s[has].tolist(), offline.T_cam_obj[has])
-        replace_text(new / "poses" / f"{name}.txt", "".join(lines))
+        replace_text(new / "poses" / f"{name}.txt", "".join([OFFLINE_COMMENT] * bool(has.any()) + list(lines)))
         off = np.flatnonzero(disagreement(obj, offline) > _CHI2_6)
         disagrees[name] = [int(obj.frame_index[k]) for k in off]
         more, less = int((has & ~obj.has_pose).sum()), int((~has & obj.has_pose).sum())

@@ -20,6 +20,7 @@ from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.protocol import evaluate
+from p2p_lib.offline import PRODUCTS
 from p2p_lib.run import evaluate_poses, export_run
 
 W, H, N = 40, 30, 12
@@ -156,6 +157,44 @@ def test_poses_of_little_confidence_are_left_out_where_that_is_asked(table, tmp_
         kept = run.objects[path.stem]
         lines = path.read_text().splitlines()
         assert len(lines) == (kept.has_pose & (kept.confidence >= asked)).sum()
+
+
+@pytest.mark.parametrize("format", [*FORMATS, *PRODUCTS])
+@pytest.mark.parametrize(("least", "says"), [("7", "min_confidence: got 7"), ("nan", "got nan"), ("-1", "got -1")])
+def test_a_confidence_that_none_can_have_is_refused(table, tmp_path, capsys, format, least, says):
+    run_on(table, tmp_path / "run")
+    words = ["export", str(tmp_path / "run"), "--format", format, "--out", str(tmp_path / "out")]
+    assert main([*words, f"--min-confidence={least}"]) == 2
+    assert says in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_where_no_pose_is_that_confident_nothing_is_written(table, tmp_path, capsys, format):
+    run_on(table, tmp_path / "run")
+    words = ["export", str(tmp_path / "run"), "--format", format, "--out", str(tmp_path / "out")]
+    assert main([*words, "--min-confidence", "0.9"]) == 2
+    assert "no pose of confidence 0.9 or more" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert main([*words, "--min-confidence", "0.8"]) == 0
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_poses_of_an_offline_run_say_so_and_read_back_the_same(table, tmp_path, capsys, format):
+    causal, refined = tmp_path / "run", tmp_path / "refined"
+    run_on(table, causal)
+    shutil.copytree(causal, refined)
+    (refined / "run.json").write_text(json.dumps(json.loads((causal / "run.json").read_text()) | {"offline": True}))
+    read = []
+    for folder in (causal, refined):
+        out = folder / "out"
+        assert main(["export", str(folder), "--format", format, "--out", str(out)]) == 0
+        files = sorted(path for path in out.rglob("*") if path.is_file())
+        told = capsys.readouterr().out.removeprefix("Written: ").strip().split(", ")
+        assert all(Path(path.partition("/*.txt")[0]).exists() for path in told)
+        marked = [path.name.startswith("p2p-offline_") or path.read_text().startswith("# offline\n") for path in files]
+        assert files and set(marked) == {folder == refined}
+        read.append(read_poses(out, open_sequence(table)))
+    for name, poses in read[0].items():
+        np.testing.assert_array_equal(read[1][name], poses)
 
 
 def test_tum_as_scipy_reads_it(table, tmp_path):
