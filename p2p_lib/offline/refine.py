@@ -78,7 +78,7 @@ def refine_run(folder: str | Path, progress: bool = False) -> list[str]:
         passes = 1 + 2 * len(todo) if todo else 0  # over the frames: one for all objects, then two for each
         title = f"refine, {passes} passes over {len(made.frames)} frames"
         with progress_bar(title, passes * len(made.frames), shown=progress) as bar:
-            evidence = gather(made, todo, config, bar) if todo else {}
+            evidence = gather(made, todo, config, parts, bar) if todo else {}
             for name in todo:
                 _part(made, name, config, evidence.pop(name), parts, bar)
         summary = _write(made, parts, stamp)
@@ -153,7 +153,7 @@ def _stays(T: np.ndarray, causal: np.ndarray, evidence: VideoEvidence, check: Su
         return np.zeros(len(T), bool)
     better = [check.overlap(k, causal[k]) - check.overlap(k, T[k]) for k in rows.tolist()]
     mean = uniform_filter1d(np.array(better), min(_JUDGED, len(rows)), mode="nearest")
-    nearest = np.abs(np.arange(len(T))[:, None] - rows).argmin(1)
+    nearest = np.searchsorted((rows[1:] + rows[:-1]) / 2, np.arange(len(T)))
     return has & (mean[nearest] > 0)
 
 

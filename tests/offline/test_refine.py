@@ -18,7 +18,7 @@ from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, read_mesh
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.method.refinement import Keypoints
-from p2p_lib.offline import evidence, loops, surface
+from p2p_lib.offline import adjustment, evidence, loops, surface
 from p2p_lib.offline import refine as offline
 from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished
@@ -69,6 +69,50 @@ def test_tracks_that_slid_away_count_for_nothing(scene):
     assert np.abs(off(best, T)[:, 3:]).mean() < 0.001
     alone = locate(T @ se3.exp(np.full(6, 0.01)), p, seen)
     assert np.abs(se3.log(se3.inverse(alone) @ T)[:, 3:]).mean() < 0.002
+
+
+def test_poses_are_located_some_at_a_time(scene, monkeypatch):
+    T, p, seen, _ = scene
+    start = T @ se3.exp(np.full(6, 0.01))
+    at_once = locate(start, p, seen)
+    held, located = [], adjustment._located
+    monkeypatch.setattr(adjustment, "_AT_ONCE", 8)
+    monkeypatch.setattr(adjustment, "_located", lambda T, *of: held.append(len(T)) or located(T, *of))
+    np.testing.assert_allclose(locate(start, p, seen), at_once, atol=1e-4)
+    assert held == [8, 8, 4]
+
+
+def test_of_too_many_points_those_that_most_poses_see_decide_and_each_pose_has_some(scene, monkeypatch):
+    """Ten poses see points 0 to 19, the other ten half of the other points each: those are seen less often."""
+    T, p, seen, rng = scene
+    apart = (seen.point < 20) == (seen.pose < 10)
+    alike = seen.select(apart & ((seen.pose < 10) | ((seen.point + seen.pose) % 2 == 0)))
+    monkeypatch.setattr(adjustment, "MOST_POINTS", 20)
+    used = adjustment.best_seen(alike, 20, 40)
+    assert used.sum() == 20 and used[:20].sum() >= 17
+    assert (np.bincount(alike.pose[used[alike.point]], minlength=20) >= 1).all()
+    assert adjustment.best_seen(alike, 20, 20).all()
+    sizes = []
+    solve = adjustment._adjusted
+    monkeypatch.setattr(
+        adjustment, "_adjusted", lambda T, p, seen: sizes.append((len(p), seen.point.max())) or solve(T, p, seen)
+    )
+    start = T @ se3.exp(rng.normal(size=(20, 6)) * ([0.05] * 3 + [0.005] * 3))
+    best, points = adjust(start, placed(start, seen, 40) + rng.normal(scale=0.01, size=(40, 3)), seen)
+    assert sizes == [(20, 19)]
+    assert np.abs(off(best, T)[:, 3:]).mean() < 0.0006  # of half as many points
+    assert np.abs(se3.transform(best[seen.pose], points[seen.point][:, None])[:, 0] - seen.p_cam).mean() < 0.002
+
+
+def test_clouds_are_kept_in_a_file_and_read_back_as_they_were(tmp_path):
+    rng, clouds = np.random.default_rng(0), evidence.StoredClouds(tmp_path)
+    given = [rng.normal(size=(n, 3)).astype(np.float32) for n in (5, 0, 7, 1)]
+    for k, cloud in enumerate(given):
+        clouds.append(cloud)
+        np.testing.assert_array_equal(clouds[k // 2], given[k // 2])  # read between
+    for k in (3, 0, 1, 2):
+        np.testing.assert_array_equal(clouds[k], given[k])
+    assert not list(tmp_path.iterdir()), "nothing is left behind, however it ends"
 
 
 def view(T_cam_obj, stands_still):
