@@ -2,7 +2,7 @@
 
 A folder per object: ``textured_simple.obj`` with ``.mtl`` and ``.png``, ``textured_simple.glb``,
 ``collision.obj`` (convex) and ``model.json``, which says what they are. All in metres, in the object frame of the
-run's poses. Faces that nobody saw are in the OBJ's group ``guessed``. ``size_m`` in ``model.json`` has the sides of the
+run's poses. Faces that nobody saw are the group, in the GLB the mesh, ``guessed``. ``size_m`` in ``model.json`` has the sides of the
 smallest box around the model, longest first, however the object frame lies in it.
 """
 
@@ -388,22 +388,27 @@ def write_obj(textured: Textured, folder: Path) -> None:
 
 
 def write_glb(textured: Textured, path: Path) -> None:
-    """One file with mesh and texture (glTF: metres)."""
+    """One file with meshes ``seen`` and ``guessed``, as the groups of the OBJ, and one texture (glTF: metres)."""
     import trimesh
     from PIL import Image
 
-    shape = textured.shape
-    corners, which = np.unique(
-        np.concatenate([shape.faces.reshape(-1, 1), textured.uv.reshape(-1, 2).round(7)], 1),
-        axis=0,
-        return_inverse=True,
-    )
+    # Of one material: where a reader makes one mesh of both, the texture stays as it is.
     material = trimesh.visual.material.PBRMaterial(
         baseColorTexture=Image.fromarray(textured.image), metallicFactor=0.0, roughnessFactor=1.0
     )
-    visual = trimesh.visual.TextureVisuals(uv=corners[:, 1:], material=material)
-    vertices = shape.vertices[corners[:, 0].astype(int)]
-    mesh = trimesh.Trimesh(vertices, which.reshape(-1, 3), visual=visual, process=False)
-    glb: Any = mesh.export(file_type="glb")  # bytes, of this kind of file
+    shape, scene = textured.shape, trimesh.Scene()
+    for name, of in (("seen", ~shape.guessed), ("guessed", shape.guessed)):
+        if not of.any():
+            continue
+        corners, which = np.unique(
+            np.concatenate([shape.faces[of].reshape(-1, 1), textured.uv[of].reshape(-1, 2).round(7)], 1),
+            axis=0,
+            return_inverse=True,
+        )
+        visual = trimesh.visual.TextureVisuals(uv=corners[:, 1:], material=material)
+        vertices = shape.vertices[corners[:, 0].astype(int)]
+        mesh = trimesh.Trimesh(vertices, which.reshape(-1, 3), visual=visual, process=False)
+        scene.add_geometry(mesh, node_name=name, geom_name=name)
+    glb: Any = scene.export(file_type="glb")  # bytes, of this kind of file
     with replacing(path) as file:
         file.write(glb)

@@ -120,6 +120,25 @@ def test_holes_are_closed_and_marked_unless_a_camera_looked_through():
     assert not still_open.mesh.is_watertight and not still_open.guessed.any()
 
 
+def test_files_tell_what_is_guessed_from_what_was_seen(tmp_path):
+    shape = model.closed(box(), Camera(300, 300, 79.5, 59.5, 160, 120), [])
+    image = np.random.default_rng(0).integers(0, 255, (512, 512, 3), np.uint8)
+    textured = model.Textured(shape, model.atlas(len(shape.faces), 512), image)
+    model.write_glb(textured, tmp_path / "box.glb")
+    read = trimesh.load(tmp_path / "box.glb")
+    assert set(read.geometry) == {"seen", "guessed"}
+    for name, of in (("seen", ~shape.guessed), ("guessed", shape.guessed)):
+        mesh, own = read.geometry[name], trimesh.Trimesh(shape.vertices, shape.faces[of], process=False)
+        np.testing.assert_allclose(mesh.triangles, own.triangles, atol=1e-6)
+        np.testing.assert_allclose(mesh.visual.uv[mesh.faces], textured.uv[of], atol=1e-5)
+        np.testing.assert_array_equal(np.asarray(mesh.visual.material.baseColorTexture.convert("RGB")), image)
+    whole = trimesh.load(tmp_path / "box.glb", force="mesh")
+    assert len(whole.faces) == len(shape.faces) and whole.visual.material.baseColorTexture.size == (512, 512)
+    model.write_obj(textured, tmp_path)
+    lines = (tmp_path / "textured_simple.obj").read_text().splitlines()
+    assert sum(line.startswith("f ") for line in lines[lines.index("g guessed") :]) == shape.guessed.sum() > 0
+
+
 def test_parts_and_holes_are_counted():
     whole, opened = model.closed(box(), Camera(300, 300, 79.5, 59.5, 160, 120), []), box()
     assert model.torn(whole) == (1, 0) and model.torn(opened) == (1, 1)
