@@ -225,6 +225,19 @@ def test_bop_csv_as_its_page_says(scene, tmp_path):
     assert all(len(found) == 1 for found in times.values())  # one time for all estimates of a picture
 
 
+@pytest.mark.parametrize("refined", [False, True])
+def test_bop_csv_as_the_fields_own_toolkit_reads_it(scene, tmp_path, refined):
+    inout = pytest.importorskip("bop_toolkit_lib.inout")
+    done, info = run_on(scene, tmp_path / "run"), tmp_path / "run/run.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"offline": refined}))
+    assert main(["export", str(tmp_path / "run"), "--format", "bop", "--out", str(tmp_path / "out")]) == 0
+    (path,) = (tmp_path / "out").glob("*.csv")
+    _, method, dataset, split, *_ = inout.parse_result_filename(path)
+    assert (method, dataset, split) == ("p2p-offline" if refined else "p2p", "000007", "test")
+    assert inout.check_bop_results(str(path))[0]
+    assert len(inout.load_bop_results(path)) == sum(obj.has_pose.sum() for obj in done.objects.values())
+
+
 def test_bop_csv_takes_the_best_score_and_skips_other_scenes(scene, tmp_path):
     header = "scene_id,im_id,obj_id,score,R,t,time\n"
     one = "1 0 0 0 1 0 0 0 1"
