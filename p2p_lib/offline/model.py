@@ -305,6 +305,8 @@ def atlas(faces: int, size: int) -> np.ndarray:
     """(F, 3, 2) places of faces in a texture: each its own triangle, two in a square.
 
     Open3D's atlas (UVAtlas) has larger charts; on reconstructed surfaces it takes minutes, and some end the process.
+    xatlas (0.0.11) has larger charts in 0.4 s and is no better: on two reconstructed surfaces of 5000 faces it uses 55
+    and 47 % of the texture, ours 56; colour errors 3.24 against 3.29 and 8.53 against 8.52.
     """
     squares = _squares(faces)
     low, high = _GUTTER_PX * squares / size, 1 - 2.5 * _GUTTER_PX * squares / size

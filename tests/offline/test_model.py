@@ -56,6 +56,21 @@ def test_other_libraries_open_them_in_metres(made, models):
         np.testing.assert_allclose(about["size_m"], sides_m, atol=0.005)
 
 
+def test_blender_opens_them_in_metres(made, models):
+    bpy = pytest.importorskip("bpy")
+    for name, path in find_models(made.sequence, MESHES).items():
+        size_m = np.ptp(se3.transform(T_OBJ_MODEL, load_mesh(path)[0]), axis=0)
+        for kind, read in (("obj", bpy.ops.wm.obj_import), ("glb", bpy.ops.import_scene.gltf)):
+            bpy.ops.wm.read_factory_settings(use_empty=True)
+            read(filepath=str(models / name / f"textured_simple.{kind}"))
+            meshes = [each for each in bpy.data.objects if each.type == "MESH"]
+            vertices = np.array([each.matrix_world @ v.co for each in meshes for v in each.data.vertices])
+            # Both importers take y for up, where Blender has z.
+            np.testing.assert_allclose(np.ptp(vertices, axis=0), size_m[[0, 2, 1]], atol=0.004)
+            assert all(each.data.uv_layers for each in meshes)
+            assert any(image.size[0] in (512, 1024, 2048) for image in bpy.data.images)
+
+
 def test_the_texture_is_what_the_camera_saw(models):
     for folder in models.iterdir():
         off = json.loads((folder / "model.json").read_text())["colour_error_of_255"]
