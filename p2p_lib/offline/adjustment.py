@@ -2,9 +2,9 @@
 
 Minimises, over poses T_k in SE(3) and points p_j of the object, ``sum rho(e^T W e)`` with ``e = T_k p_j - z_kj``: z is
 where point j was measured in the camera of frame k, W the information of that measurement, larger across its ray than
-along it. Of more than :data:`MOST_POINTS` points those that most poses see decide the poses, so that memory is bounded
-(:func:`best_seen`). Gauss-Newton with the points eliminated (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000); rho
-is Geman and McClure's, so that a track that slid away has no weight.
+along it. Gauss-Newton with the points eliminated (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000); rho
+is Geman and McClure's, so that a track that slid away has no weight. Of more than :data:`MOST_POINTS` points those that
+most poses see decide the poses, so that memory is bounded (:func:`best_seen`).
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _adjusted(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: PointObservations)
         C = _summed(seen.point, V, N) + 1e-3 * np.eye(3)
         c = _summed(seen.point, g, N)
         blocks = np.zeros((K, 6, N, 3))
-        np.add.at(blocks, (seen.pose, slice(None), seen.point), AV)
+        np.add.at(blocks.swapaxes(1, 2), (seen.pose, seen.point), AV)
         E = blocks.reshape(6 * K, 3 * N)
         C_inverse = np.linalg.inv(C)
         F = np.einsum("anj,njk->ank", E.reshape(6 * K, N, 3), C_inverse).reshape(6 * K, 3 * N)

@@ -2,8 +2,8 @@
 
 A folder per object: ``textured_simple.obj`` with ``.mtl`` and ``.png``, ``textured_simple.glb``,
 ``collision.obj`` (convex) and ``model.json``, which says what they are. All in metres, in the object frame of the
-run's poses. Faces that nobody saw are the group, in the GLB the mesh, ``guessed``. ``size_m`` in ``model.json`` has the sides of the
-smallest box around the model, longest first, however the object frame lies in it.
+run's poses. Faces that nobody saw are the group, in the GLB the mesh, ``guessed``. ``size_m`` in ``model.json`` has the
+sides of the smallest box around the model, longest first, however the object frame lies in it.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ def test_poses_are_located_some_at_a_time(scene, monkeypatch):
 
 def test_of_too_many_points_those_that_most_poses_see_decide_and_each_pose_has_some(scene, monkeypatch):
     """Ten poses see points 0 to 19, the other ten half of the other points each: those are seen less often."""
-    T, p, seen, rng = scene
+    T, _, seen, rng = scene
     apart = (seen.point < 20) == (seen.pose < 10)
     alike = seen.select(apart & ((seen.pose < 10) | ((seen.point + seen.pose) % 2 == 0)))
     monkeypatch.setattr(adjustment, "MOST_POINTS", 20)
