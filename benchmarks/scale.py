@@ -39,7 +39,9 @@ the 95th percentile, and in processor time of all threads in the mean. Below 1 o
 | surface | Open3D's VoxelBlockGrid and point-to-plane ICP, SciPy's interpolation |
 | 2D tracker | OpenCV's Lucas-Kanade, checked forward and backward |
 
-What mechanisms are worth in accuracy is in [mechanisms.md](mechanisms.md).
+What mechanisms are worth in accuracy is in [mechanisms.md](mechanisms.md), what memories of objects find again in
+[recall.md](recall.md) (`bench_recall.py`). `bench_offline.py` measures what `p2p refine` is worth, and `bench_hand.py`
+a mug that a hand turns; each writes a page of its own here.
 
 """
 

@@ -110,7 +110,7 @@ LESSONS = (
         "11_label_your_own",
         "Label your own",
         'section "3D Reconstruction", and what follows from it',
-        "from a video and a click to a textured model and a labelled dataset, and how to tell that a label is good",
+        "from a video and three clicks to a textured model and labelled images, and how to tell that a label is good",
     ),
 )
 

@@ -35,7 +35,7 @@ from p2p_lib.apps.command_line import (
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.files import check_new
 from p2p_lib.core.options import RunOptions, lengths_m, names, pairs
-from p2p_lib.offline import PRODUCTS
+from p2p_lib.offline import NOT_CAUSAL, PRODUCTS
 
 #: Options that choose the method and its parameters.
 METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "detector")
@@ -94,6 +94,11 @@ def _run(a: argparse.Namespace) -> int:
 
     if (a.sequence is None) == (a.batch is None):
         a.parser.error("needs either SEQ or --batch FOLDER")
+    if a.batch is not None and (a.if_exists == "replace" or a.overlay is not None):
+        word, fix = ("--force", "another --out") if a.overlay is None else ("--overlay", "p2p film DIR/NAME afterwards")
+        a.parser.error(f"{word} does not go with --batch, which goes on with what is in DIR: {fix}")
+    if a.batch is None and (a.jobs is not None or a.scheduler is not None):
+        a.parser.error("--jobs and --scheduler go with --batch FOLDER: one recording is one job")
     if a.redo_from is not None and (a.batch is not None or a.if_exists != "resume"):
         a.parser.error("--from goes with --resume, and with SEQ")
     if a.batch is not None:
@@ -235,8 +240,11 @@ def _eval(a: argparse.Namespace) -> None:
     if a.rows:
         from p2p_lib.benchmark.rows import COLUMNS, as_csv
         from p2p_lib.benchmark.scoring import run_rows
+        from p2p_lib.datasets.runs import read_info
 
-        print(as_csv(run_rows(a.run, options.models), COLUMNS), end="")
+        rows = run_rows(a.run, options.models)
+        rows = [row | {"plan": "offline run"} for row in rows] if (read_info(a.run) or {}).get("offline") else rows
+        print(as_csv(rows, COLUMNS), end="")
     elif a.poses is not None:
         from p2p_lib.run import evaluate_poses
 
@@ -269,7 +277,8 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
         warn("p2p eval: --models is not used, because the run has no truth.")
     for name, text in size_doubts(a.run, known_m).items() if score else ():
         warn(f"p2p eval: {name}: {text}")
-    _show(score or replace(consistency(run, known_m=known_m), not_scored=not_scored), a.json)
+    shown = score or replace(consistency(run, known_m=known_m), not_scored=not_scored)
+    _show(shown, a.json, offline=bool(run.info.get("offline")))
     if not (score or a.json or (a.run / MASK_LOG).is_file()):
         then = f"Next: {again(run.info, a.run)} --force"
         warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")
@@ -444,17 +453,19 @@ def _refine(a: argparse.Namespace) -> None:
     QUIET,
 )
 def _export(a: argparse.Namespace) -> None:
-    if a.format in PRODUCTS:
-        from p2p_lib.offline.products import write_product
+    from p2p_lib.offline.products import marked, write_product
 
+    if a.format in PRODUCTS:
         print(write_product(a.run, a.format, a.out, a.min_confidence, a.faces, not a.quiet))
         return
     from p2p_lib.offline.finished import load_posed
     from p2p_lib.run import export_run
 
     check_new(a.out)
-    load_posed(a.run)
-    written = export_run(a.run, a.format, a.out, a.frame, a.min_confidence or 0.0)
+    least = a.min_confidence or 0.0
+    run = load_posed(a.run, least)
+    written = export_run(a.run, a.format, a.out, a.frame, least)
+    written = [marked(path) for path in written] if run.info.get("offline") else written
     files = (f"{path}/*.txt ({len(list(path.iterdir()))})" if path.is_dir() else str(path) for path in written)
     print(f"Written: {', '.join(files)}")
 
@@ -531,8 +542,11 @@ def _film_wanted(path: Path | None) -> Callable[..., Path] | None:
     return write_film
 
 
-def _show(score: Any, as_json: bool) -> None:
-    print(json.dumps(score.as_dict()) if as_json else score.as_table())
+def _show(score: Any, as_json: bool, offline: bool = False) -> None:
+    if as_json:
+        print(json.dumps(score.as_dict() | ({"offline": True} if offline else {})))
+    else:
+        print("\n".join([score.as_table(), *[NOT_CAUSAL] * offline]))
 
 
 from p2p_lib.apps import data_commands  # noqa: E402, F401 - declared, and listed by --help, after those above

@@ -186,7 +186,7 @@ def _plain_words(caption: str) -> str:
 
 
 def _what_ran(info: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: info.get(key) for key in _WHAT_RAN}
+    return {key: info.get(key) for key in _WHAT_RAN} | ({"offline": True} if info.get("offline") else {})
 
 
 def _sha256(path: Path) -> str | None:

@@ -104,9 +104,9 @@ class Scene:
     ) -> np.ndarray:
         """The run's ``row``-th frame, cut to a region and scaled to a width; ``words`` are names, statuses, the time.
 
-        Estimated boxes are in their object's colour, true ones white and dashed; ``trail`` is how many earlier frames
-        the path goes back; ``dots`` are pixels (K, 2) of the whole image and their colours (K, 3); ``note`` stands in
-        the lower left corner.
+        They say of an offline run that it is one. Estimated boxes are in their object's colour, true ones white and
+        dashed; ``trail`` is how many earlier frames the path goes back; ``dots`` are pixels (K, 2) of the whole image
+        and their colours (K, 3); ``note`` stands in the lower left corner.
         """
         first = next(iter(self.objects.values()))
         frame = self.sequence.frame(int(first.frame_index[row]))
@@ -124,6 +124,7 @@ class Scene:
         if not words:
             return image
         caption = f"{self.sequence.name}  {frame.time_s - first.time_s[0]:.2f} s"
+        caption += "  offline" * bool(self.run.info.get("offline"))
         return overlay.draw_labels(image, labels, caption)
 
     def story(self, count: int = 6, columns: int = 3, width_px: int = 360) -> np.ndarray:

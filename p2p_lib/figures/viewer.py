@@ -207,6 +207,7 @@ def _legend(playback: Playback, shown: int, points: int) -> str:
     occurring = [s for s in style.STATUS if any((obj.status == str(s)).any() for obj in run.objects.values())]
     title = f"{info['sequence']}, tracker {info['tracker']}, "
     title += f"{len(playback)} frames" if shown == len(playback) else f"{shown} of {len(playback)} frames are shown"
+    title += ", offline" * bool(info.get("offline"))
     if playback.sequence is not None:
         title += f", about {points} points of each, up to {CLOUD_MAX_M:g} m away"
     return _LEGEND.format(

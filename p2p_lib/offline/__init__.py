@@ -7,3 +7,7 @@ there first. ``adjustment.py``, ``loops.py`` and :mod:`p2p_lib.offline.refine` a
 
 #: What ``p2p export`` writes besides files of poses.
 PRODUCTS = ("bop-dataset", "foundationpose", "model")
+#: What is said of a result of ``p2p refine``, wherever people read of it.
+NOT_CAUSAL = "offline: poses by the whole video (p2p refine), not as they were said frame by frame"
+#: The first line of its files of poses.
+OFFLINE_COMMENT = "# offline\n"

@@ -3,12 +3,13 @@
 Minimises, over poses T_k in SE(3) and points p_j of the object, ``sum rho(e^T W e)`` with ``e = T_k p_j - z_kj``: z is
 where point j was measured in the camera of frame k, W the information of that measurement, larger across its ray than
 along it. Gauss-Newton with the points eliminated (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000); rho
-is Geman and McClure's, so that a track that slid away has no weight.
+is Geman and McClure's, so that a track that slid away has no weight. Of more than :data:`MOST_POINTS` points those that
+most poses see decide the poses, so that memory is bounded (:func:`best_seen`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +19,10 @@ from p2p_lib.core import se3
 _HALF, _WIDE, _NARROWER = 3.0, 8.0, 0.6
 #: Most steps; a mean step below this, in metres and radians, ends them.
 _ITERATIONS, _TOLERANCE = 15, 2e-6
+#: Poses that are located at a time.
+_AT_ONCE = 2000
+#: Points that are adjusted together with the poses at most: with 200 poses two arrays of 170 MB.
+MOST_POINTS = 6000
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +58,36 @@ def placed(T_cam_obj: np.ndarray, seen: PointObservations, count: int) -> np.nda
 
 
 def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: PointObservations) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (K, 4, 4) and points (N, 3) adjusted from these; each must have a sighting at least."""
+    """Poses (K, 4, 4) and points (N, 3) adjusted from these; each must have a sighting at least.
+
+    Of more than :data:`MOST_POINTS` points the others are put where the adjusted poses have them (:func:`placed`).
+    """
+    p, used = np.array(p_obj, float), best_seen(seen, len(T_cam_obj), len(p_obj))
+    few = seen.select(used[seen.point])
+    T, p[used] = _adjusted(T_cam_obj, p[used], replace(few, point=(np.cumsum(used) - 1)[few.point]))
+    if not used.all():
+        p[~used] = placed(T, seen, len(p))[~used]
+    return T, p
+
+
+def best_seen(seen: PointObservations, poses: int, points: int) -> np.ndarray:
+    """(points,) bool: at most :data:`MOST_POINTS`, those that most of the ``poses`` see; of each pose its best first.
+
+    Without the latter all points might be of one half of a video, and nothing would hold the poses of the other.
+    """
+    if points <= MOST_POINTS:
+        return np.ones(points, bool)
+    count = np.bincount(seen.point, minlength=points)
+    order = np.lexsort((seen.point, -count[seen.point], seen.pose))
+    place = np.full(points, len(order))  # the best that a point has among those of a pose
+    pose = seen.pose[order]
+    np.minimum.at(place, seen.point[order], np.arange(len(order)) - np.searchsorted(pose, pose))
+    used = np.zeros(points, bool)
+    used[np.lexsort((-count, place >= MOST_POINTS // poses))[:MOST_POINTS]] = True
+    return used
+
+
+def _adjusted(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: PointObservations) -> tuple[np.ndarray, np.ndarray]:
     T, p = np.array(T_cam_obj, float), np.array(p_obj, float)
     K, N = len(T), len(p)
     same = np.tile(np.eye(6), (K, 1)) / np.sqrt(K)  # gauge: one change of the object frame for all poses
@@ -65,9 +99,9 @@ def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: PointObservations) ->
         b = _summed(seen.pose, np.einsum("mia,mi->ma", A, g), K)
         C = _summed(seen.point, V, N) + 1e-3 * np.eye(3)
         c = _summed(seen.point, g, N)
-        blocks = np.zeros((K, N, 6, 3))
-        np.add.at(blocks, (seen.pose, seen.point), AV)
-        E = blocks.swapaxes(1, 2).reshape(6 * K, 3 * N)
+        blocks = np.zeros((K, 6, N, 3))
+        np.add.at(blocks.swapaxes(1, 2), (seen.pose, seen.point), AV)
+        E = blocks.reshape(6 * K, 3 * N)
         C_inverse = np.linalg.inv(C)
         F = np.einsum("anj,njk->ank", E.reshape(6 * K, N, 3), C_inverse).reshape(6 * K, 3 * N)
         S = -F @ E.T
@@ -86,7 +120,16 @@ def adjust(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: PointObservations) ->
 
 def locate(T_cam_obj: np.ndarray, p_obj: np.ndarray, seen: PointObservations) -> np.ndarray:
     """Each pose (K, 4, 4) adjusted by itself to fixed points (N, 3); one with few sightings hardly moves."""
-    T, K = np.array(T_cam_obj, float), len(T_cam_obj)
+    T = np.array(T_cam_obj, float)
+    for first in range(0, len(T), _AT_ONCE):
+        some = seen.select((seen.pose >= first) & (seen.pose < first + _AT_ONCE))
+        at = slice(first, first + _AT_ONCE)
+        T[at] = _located(T[at], p_obj, replace(some, pose=some.pose - first))
+    return T
+
+
+def _located(T: np.ndarray, p_obj: np.ndarray, seen: PointObservations) -> np.ndarray:
+    K = len(T)
     weak = np.diag(np.repeat([0.5, 0.1], 3) ** -2.0)
     for step_number in range(_ITERATIONS):
         V, e, A = _linear(T, p_obj, seen, max(_WIDE * _NARROWER ** (2 * step_number), 1.0))

@@ -7,6 +7,8 @@ follow the strongest ties, then a bundle adjustment (``adjustment.py``) takes tr
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,25 @@ _STRONG, _LEAST = 5.0, 1e-3
 STEP_M = 0.02
 
 
+class StoredClouds:
+    """Clouds (P, 3) float32 by number, in a file of a folder that has no name and goes with the object.
+
+    In memory the clouds of an hour of video would take a gigabyte for each object.
+    """
+
+    def __init__(self, folder: Path):
+        self._file, self._ends = TemporaryFile(dir=folder), [0]
+
+    def append(self, cloud: np.ndarray) -> None:
+        """One more."""
+        self._file.seek(self._ends[-1])
+        self._ends.append(self._ends[-1] + self._file.write(cloud.astype(np.float32).tobytes()))
+
+    def __getitem__(self, k: int) -> np.ndarray:
+        self._file.seek(self._ends[k])
+        return np.frombuffer(self._file.read(self._ends[k + 1] - self._ends[k]), np.float32).reshape(-1, 3)
+
+
 @dataclass(eq=False)
 class VideoEvidence:
     """What the n frames of a run show of an object.
@@ -43,7 +64,7 @@ class VideoEvidence:
     views    (K,) their features
     """
 
-    clouds: list[np.ndarray] = field(default_factory=list)
+    clouds: list[np.ndarray] | StoredClouds = field(default_factory=list)
     mask_px: list[int] = field(default_factory=list)
     tracks: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
     key: list[int] = field(default_factory=list)
@@ -55,10 +76,10 @@ class VideoEvidence:
         return np.array(self.mask_px) >= MIN_VISIBLE_PX
 
 
-def gather(made: Finished, names: list[str], config: Config, bar: Any) -> dict[str, VideoEvidence]:
-    """Object to what the video shows of it."""
+def gather(made: Finished, names: list[str], config: Config, folder: Path, bar: Any) -> dict[str, VideoEvidence]:
+    """Object to what the video shows of it; clouds are kept in ``folder``."""
     logs, frames, camera = load_keypoints(made.run.path), made.frames, made.sequence.camera
-    found = {name: VideoEvidence() for name in names}
+    found = {name: VideoEvidence(StoredClouds(folder)) for name in names}
     wanted = evenly(np.arange(len(frames)), KEYFRAMES)
     for k, i in enumerate(frames.tolist()):
         frame, masks = made.sequence.frame(i), made.masks(i)
@@ -66,7 +87,7 @@ def gather(made: Finished, names: list[str], config: Config, bar: Any) -> dict[s
         for name, of in found.items():
             mask = masks.get(name, np.zeros(frame.shape, bool))
             vu = evenly(np.argwhere(mask & good), config.refinement.max_points)
-            of.clouds.append(camera.unproject(vu[:, ::-1], frame.depth_m[tuple(vu.T)]).astype(np.float32))
+            of.clouds.append(camera.unproject(vu[:, ::-1], frame.depth_m[tuple(vu.T)]))
             of.mask_px.append(int(np.count_nonzero(mask)))
             log, at = logs[name], logs[name].at(i)
             p_cam = lift(frame, log.uv_px[at].astype(float), camera, config.depth)

@@ -31,13 +31,23 @@ RULE = (
 )
 
 
-def load_posed(folder: str | Path) -> Run:
-    """The run in a folder; :class:`BadInput` for one without any pose, of which nothing can be made."""
+def load_posed(folder: str | Path, min_confidence: float = 0.0) -> Run:
+    """The run in a folder; :class:`BadInput` for one of which nothing can be made: no pose, or none so confident."""
+    check_confidence(min_confidence)
     run = load_run(folder)
     if not any(obj.has_pose.any() for obj in run.objects.values()):
         fix = "p2p check says what may be wrong with its data."
         raise BadInput(str(folder), "a run without a single pose", "poses of an object at least", fix)
+    if not any(obj.of_confidence(min_confidence).has_pose.any() for obj in run.objects.values()):
+        got = f"no pose of confidence {min_confidence:g} or more"
+        raise BadInput(str(folder), got, "one at least", "Lower --min-confidence.")
     return run
+
+
+def check_confidence(least: float) -> None:
+    """Refuse what is no least confidence that a pose could pass."""
+    if not 0 <= least < 1:
+        raise BadInput("min_confidence", f"{least:g}", "at least 0 and below 1")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,8 @@
 
 A folder per object: ``textured_simple.obj`` with ``.mtl`` and ``.png``, ``textured_simple.glb``,
 ``collision.obj`` (convex) and ``model.json``, which says what they are. All in metres, in the object frame of the
-run's poses. Faces that nobody saw are in the OBJ's group ``guessed``. ``size_m`` in ``model.json`` has the sides of the
-smallest box around the model, longest first, however the object frame lies in it.
+run's poses. Faces that nobody saw are the group, in the GLB the mesh, ``guessed``. ``size_m`` in ``model.json`` has the
+sides of the smallest box around the model, longest first, however the object frame lies in it.
 """
 
 from __future__ import annotations
@@ -306,6 +306,8 @@ def atlas(faces: int, size: int) -> np.ndarray:
     """(F, 3, 2) places of faces in a texture: each its own triangle, two in a square.
 
     Open3D's atlas (UVAtlas) has larger charts; on reconstructed surfaces it takes minutes, and some end the process.
+    xatlas (0.0.11) has larger charts in 0.4 s and is no better: on two reconstructed surfaces of 5000 faces it uses 55
+    and 47 % of the texture, ours 56; colour errors 3.24 against 3.29 and 8.53 against 8.52.
     """
     squares = _squares(faces)
     low, high = _GUTTER_PX * squares / size, 1 - 2.5 * _GUTTER_PX * squares / size
@@ -389,22 +391,27 @@ def write_obj(textured: Textured, folder: Path) -> None:
 
 
 def write_glb(textured: Textured, path: Path) -> None:
-    """One file with mesh and texture (glTF: metres)."""
+    """One file with meshes ``seen`` and ``guessed``, as the groups of the OBJ, and one texture (glTF: metres)."""
     import trimesh
     from PIL import Image
 
-    shape = textured.shape
-    corners, which = np.unique(
-        np.concatenate([shape.faces.reshape(-1, 1), textured.uv.reshape(-1, 2).round(7)], 1),
-        axis=0,
-        return_inverse=True,
-    )
+    # Of one material: where a reader makes one mesh of both, the texture stays as it is.
     material = trimesh.visual.material.PBRMaterial(
         baseColorTexture=Image.fromarray(textured.image), metallicFactor=0.0, roughnessFactor=1.0
     )
-    visual = trimesh.visual.TextureVisuals(uv=corners[:, 1:], material=material)
-    vertices = shape.vertices[corners[:, 0].astype(int)]
-    mesh = trimesh.Trimesh(vertices, which.reshape(-1, 3), visual=visual, process=False)
-    glb: Any = mesh.export(file_type="glb")  # bytes, of this kind of file
+    shape, scene = textured.shape, trimesh.Scene()
+    for name, of in (("seen", ~shape.guessed), ("guessed", shape.guessed)):
+        if not of.any():
+            continue
+        corners, which = np.unique(
+            np.concatenate([shape.faces[of].reshape(-1, 1), textured.uv[of].reshape(-1, 2).round(7)], 1),
+            axis=0,
+            return_inverse=True,
+        )
+        visual = trimesh.visual.TextureVisuals(uv=corners[:, 1:], material=material)
+        vertices = shape.vertices[corners[:, 0].astype(int)]
+        mesh = trimesh.Trimesh(vertices, which.reshape(-1, 3), visual=visual, process=False)
+        scene.add_geometry(mesh, node_name=name, geom_name=name)
+    glb: Any = scene.export(file_type="glb")  # bytes, of this kind of file
     with replacing(path) as file:
         file.write(glb)

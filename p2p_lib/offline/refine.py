@@ -11,6 +11,7 @@ cost to 0.5 at the limit, it is that. The rule of causal poses, on the covarianc
 right poses from wrong ones less well: what a pass over all frames has wrong, all frames agree with.
 
 Written to ``RUN/offline``, a run's folder of its own that says ``"offline": true``: causal results stay as they are.
+``<object>/causal`` in its ``poses.npz``, (n,) bool, says in which frames the pose is the causal one that was kept.
 It has no ``maps/``: keypoints and keyframes, by which an object is found again, stay those of ``RUN/maps``.
 """
 
@@ -35,6 +36,7 @@ from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, tum_line
+from p2p_lib.offline import OFFLINE_COMMENT
 from p2p_lib.offline.evidence import VideoEvidence, VideoPoses, gather
 from p2p_lib.offline.finished import Finished
 from p2p_lib.offline.surface import SurfacePoses, fused
@@ -47,6 +49,8 @@ FUSED, FUSED_LAST = 80, 150
 _JUDGED_EVERY, _JUDGED = 3, 7
 #: A causal pose that costs more than this times the limit was wrong in that frame, and is not kept.
 _GROSS = 2.0
+#: The column of ``poses.npz`` that causal runs do not have.
+CAUSAL = "causal"
 #: Of a squared Mahalanobis distance with six degrees of freedom: three standard deviations (99.73 %).
 _CHI2_6 = 20.06
 
@@ -74,7 +78,7 @@ def refine_run(folder: str | Path, progress: bool = False) -> list[str]:
         passes = 1 + 2 * len(todo) if todo else 0  # over the frames: one for all objects, then two for each
         title = f"refine, {passes} passes over {len(made.frames)} frames"
         with progress_bar(title, passes * len(made.frames), shown=progress) as bar:
-            evidence = gather(made, todo, config, bar) if todo else {}
+            evidence = gather(made, todo, config, parts, bar) if todo else {}
             for name in todo:
                 _part(made, name, config, evidence.pop(name), parts, bar)
         summary = _write(made, parts, stamp)
@@ -114,7 +118,10 @@ def _part(made: Finished, name: str, config: Config, evidence: VideoEvidence, pa
 def _columns(
     obj: ObjectRun, poses: SurfacePoses, evidence: VideoEvidence, check: SurfaceCheck | None
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Columns of a run, in the causal object frame, and (n,) bool which poses fit; better causal poses are kept."""
+    """Columns of a run, in the causal object frame, and (n,) bool which poses fit; better causal poses are kept.
+
+    :data:`CAUSAL` says which.
+    """
     fits, T, covariance = poses.cost <= poses.limit, poses.T.copy(), poses.covariance.copy()
     lost = ~obj.has_pose & ~fits
     T[lost], covariance[lost] = NO_POSE, np.nan
@@ -131,7 +138,7 @@ def _columns(
     T[stays], covariance[stays] = obj.T_cam_obj[stays], obj.covariance[stays]
     confidence = np.where(stays, obj.confidence, confidence)
     confidence = np.where(has, np.minimum(confidence, 1), 0.0)
-    return {"T_cam_obj": T, "covariance": covariance, "confidence": confidence}, has & fits
+    return {"T_cam_obj": T, "covariance": covariance, "confidence": confidence, CAUSAL: stays}, has & fits
 
 
 def _stays(T: np.ndarray, causal: np.ndarray, evidence: VideoEvidence, check: SurfaceCheck | None) -> np.ndarray:
@@ -146,7 +153,7 @@ def _stays(T: np.ndarray, causal: np.ndarray, evidence: VideoEvidence, check: Su
         return np.zeros(len(T), bool)
     better = [check.overlap(k, causal[k]) - check.overlap(k, T[k]) for k in rows.tolist()]
     mean = uniform_filter1d(np.array(better), min(_JUDGED, len(rows)), mode="nearest")
-    nearest = np.abs(np.arange(len(T))[:, None] - rows).argmin(1)
+    nearest = np.searchsorted((rows[1:] + rows[:-1]) / 2, np.arange(len(T)))
     return has & (mean[nearest] > 0)
 
 
@@ -154,7 +161,7 @@ def _stays(T: np.ndarray, causal: np.ndarray, evidence: VideoEvidence, check: Su
 
 
 def _merged(obj: ObjectRun, part: dict[str, np.ndarray]) -> ObjectRun:
-    """An object's run with the offline poses."""
+    """An object's run with the offline poses, its columns in ``part``."""
     has, n = np.isfinite(part["T_cam_obj"]).all((1, 2)), len(obj)
     status = np.where(has & ~obj.has_pose, str(Status.RECOVERED), obj.status)
     reason = np.where(has & ~obj.has_pose, "found by the offline pass", obj.reason)
@@ -183,18 +190,16 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
     summary, disagrees = [], {}
     for name, obj in made.run.objects.items():
         part = load_arrays(parts / f"{name}.npz")
+        kept = part.pop(CAUSAL, np.zeros(len(obj), bool))  # an object that never had a pose has no part
         offline = _merged(obj, part) if part else obj
-        arrays |= {f"{name}/{column}": getattr(offline, column) for column in COLUMNS}
+        arrays |= {f"{name}/{column}": getattr(offline, column) for column in COLUMNS} | {f"{name}/{CAUSAL}": kept}
         has = offline.has_pose
         lines = map(tum_line, offline.time_s[has].tolist(), offline.T_cam_obj[has])
-        replace_text(new / "poses" / f"{name}.txt", "".join(lines))
+        replace_text(new / "poses" / f"{name}.txt", "".join([OFFLINE_COMMENT] * bool(has.any()) + list(lines)))
         off = np.flatnonzero(disagreement(obj, offline) > _CHI2_6)
         disagrees[name] = [int(obj.frame_index[k]) for k in off]
-        more, less = int((has & ~obj.has_pose).sum()), int((~has & obj.has_pose).sum())
-        line = f"{name}: a pose in {int(has.sum())} of {len(obj)} frames ({more} more, {less} fewer than causally)"
-        summary.append(
-            line + f", {len(off)} of them more than three sigmas from the causal one" + in_ranges(disagrees[name])
-        )
+        told = f", {int(kept.sum())} of them the causal one, {len(off)} more than three sigmas from it"
+        summary.append(f"{name}: {_in_words(obj, offline)}{told}{in_ranges(disagrees[name])}")
     save_arrays(new / "poses.npz", arrays)
     for file_name in ("config.toml", "models.npz", "masks.npz"):
         if (made.run.path / file_name).is_file():
@@ -206,6 +211,15 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
     shutil.rmtree(made.run.path / OFFLINE, ignore_errors=True)
     new.rename(made.run.path / OFFLINE)
     return summary
+
+
+def _in_words(causal: ObjectRun, offline: ObjectRun) -> str:
+    """In how many frames there is a pose, and how many are in another map alone."""
+    has, had = offline.has_pose, causal.has_pose
+    more, fewer = int((has & ~had).sum()), int((~has & had).sum())
+    apart = int((~has & ~had & np.isin(causal.status, list(WITH_POSE))).sum())
+    in_other = f", none in {apart} frames of a map that never met this one" if apart else ""
+    return f"a pose in {int(has.sum())} of {len(causal)} frames ({more} more, {fewer} fewer than causally{in_other})"
 
 
 def in_ranges(frames: list[int]) -> str:

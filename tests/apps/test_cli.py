@@ -112,6 +112,31 @@ def test_eval_prints_a_table_for_people(done, capsys):
     assert not out.startswith("{") and "ADD-S" in out and "Hz" in out and "seed 7" in out
 
 
+def test_eval_of_an_offline_run_says_that_it_is_one(done, tmp_path, capsys):
+    refined = shutil.copytree(done, tmp_path / "refined")
+    info = json.loads((refined / "run.json").read_text())
+    (refined / "run.json").write_text(json.dumps(info | {"offline": True}))
+    for folder, marked in ((done, False), (refined, True)):
+        said = {}
+        for how in ((), ("--json",), ("--rows",)):
+            assert cli.main(["eval", str(folder), *how]) == 0
+            said[how] = capsys.readouterr().out
+        assert ("offline" in said[()].splitlines()[-1]) == marked
+        assert json.loads(said["--json",]).get("offline", False) is marked
+        plans = {row.partition(",")[0] for row in said["--rows",].splitlines()[1:]}
+        assert plans == {"offline run" if marked else "run"}
+
+
+def test_eval_without_truth_says_of_an_offline_run_that_it_is_one(sequence, tmp_path, capsys):
+    shutil.rmtree(sequence / "annotated_poses")
+    assert run(sequence, tmp_path / "run") == 0
+    info = json.loads((tmp_path / "run/run.json").read_text())
+    (tmp_path / "run/run.json").write_text(json.dumps(info | {"offline": True}))
+    capsys.readouterr()
+    assert cli.main(["eval", str(tmp_path / "run"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["offline"] is True
+
+
 def test_options_reach_the_run(sequence, tmp_path, capsys):
     shutil.copytree(sequence / "gt_mask", sequence / "drawn")
     (tmp_path / "mine.toml").write_text("[sampling]\npoints = 17\n[keypoint_map]\nstreak = 2\n")
@@ -654,6 +679,10 @@ BAD_WORDS = {
     "model of nobody": (["run", "{seq}", "--out", "{out}", "--models", "mug={seq}"], ["'mug'", "object"]),
     "out is a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt"], ["cam_K.txt", "a folder for the results"]),
     "out within a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt"]),
+    "export of too little": (
+        ["export", "{done}", "--format", "tum", "--out", "{out}", "--min-confidence", "-0.1"],
+        ["min_confidence", "-0.1"],
+    ),
     "no run": (["eval", "{seq}"], ["slide", "no run there", "p2p run SEQ --out"]),
     "eval nowhere": (["eval", "{seq}/none", "--json"], ["none", "no run there"]),
     "eval unknown model": (["eval", "{done}", "--models", "mug={seq}"], ["'mug'", "object"]),

@@ -58,6 +58,21 @@ def test_what_is_no_shelf_is_a_sentence(shelf, tmp_path, capsys):
     assert "needs either SEQ or --batch FOLDER" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--batch", "{shelf}", "--force"], "--force does not go with --batch"),
+        (["--batch", "{shelf}", "--overlay", "film.mp4"], "--overlay does not go with --batch"),
+        (["{shelf}/one", "--jobs", "2"], "--jobs and --scheduler go with --batch"),
+        (["{shelf}/one", "--scheduler", "tcp://here:1"], "--jobs and --scheduler go with --batch"),
+    ],
+)
+def test_words_that_would_be_passed_over_are_refused(shelf, tmp_path, capsys, words, says):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["run", *(word.format(shelf=shelf) for word in words), "--out", str(tmp_path / "out"), "--quiet"])
+    assert says in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 def test_prompts_of_its_own_are_a_recordings_options(shelf):
     (shelf / "two/prompts.json").write_text("{}")
     found = {one.key: one.options for one in recordings(shelf, OPTIONS)}

@@ -19,7 +19,8 @@ from p2p_lib.datasets.exchange import FORMATS, export, read_poses
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.evaluation.protocol import evaluate
+from p2p_lib.evaluation.protocol import evaluate, model_frames
+from p2p_lib.offline import PRODUCTS
 from p2p_lib.run import evaluate_poses, export_run
 
 W, H, N = 40, 30, 12
@@ -158,6 +159,44 @@ def test_poses_of_little_confidence_are_left_out_where_that_is_asked(table, tmp_
         assert len(lines) == (kept.has_pose & (kept.confidence >= asked)).sum()
 
 
+@pytest.mark.parametrize("format", [*FORMATS, *PRODUCTS])
+@pytest.mark.parametrize(("least", "says"), [("7", "min_confidence: got 7"), ("nan", "got nan"), ("-1", "got -1")])
+def test_a_confidence_that_none_can_have_is_refused(table, tmp_path, capsys, format, least, says):
+    run_on(table, tmp_path / "run")
+    words = ["export", str(tmp_path / "run"), "--format", format, "--out", str(tmp_path / "out")]
+    assert main([*words, f"--min-confidence={least}"]) == 2
+    assert says in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_where_no_pose_is_that_confident_nothing_is_written(table, tmp_path, capsys, format):
+    run_on(table, tmp_path / "run")
+    words = ["export", str(tmp_path / "run"), "--format", format, "--out", str(tmp_path / "out")]
+    assert main([*words, "--min-confidence", "0.9"]) == 2
+    assert "no pose of confidence 0.9 or more" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert main([*words, "--min-confidence", "0.8"]) == 0
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_poses_of_an_offline_run_say_so_and_read_back_the_same(table, tmp_path, capsys, format):
+    causal, refined = tmp_path / "run", tmp_path / "refined"
+    run_on(table, causal)
+    shutil.copytree(causal, refined)
+    (refined / "run.json").write_text(json.dumps(json.loads((causal / "run.json").read_text()) | {"offline": True}))
+    read = []
+    for folder in (causal, refined):
+        out = folder / "out"
+        assert main(["export", str(folder), "--format", format, "--out", str(out)]) == 0
+        files = sorted(path for path in out.rglob("*") if path.is_file())
+        told = capsys.readouterr().out.removeprefix("Written: ").strip().split(", ")
+        assert all(Path(path.partition("/*.txt")[0]).exists() for path in told)
+        marked = [path.name.startswith("p2p-offline_") or path.read_text().startswith("# offline\n") for path in files]
+        assert files and set(marked) == {folder == refined}
+        read.append(read_poses(out, open_sequence(table)))
+    for name, poses in read[0].items():
+        np.testing.assert_array_equal(read[1][name], poses)
+
+
 def test_tum_as_scipy_reads_it(table, tmp_path):
     run = run_on(table, tmp_path / "run")
     export(run, tmp_path / "out", "tum")
@@ -184,6 +223,23 @@ def test_bop_csv_as_its_page_says(scene, tmp_path):
     for line in lines[1:]:
         times[line.split(",")[1]].add(line.split(",")[6])
     assert all(len(found) == 1 for found in times.values())  # one time for all estimates of a picture
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_bop_csv_as_the_fields_own_toolkit_reads_it(scene, tmp_path, refined):
+    inout = pytest.importorskip("bop_toolkit_lib.inout")
+    done, info = run_on(scene, tmp_path / "run"), tmp_path / "run/run.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"offline": refined}))
+    assert main(["export", str(tmp_path / "run"), "--format", "bop", "--out", str(tmp_path / "out")]) == 0
+    (path,) = (tmp_path / "out").glob("*.csv")
+    _, method, dataset, split, *_ = inout.parse_result_filename(path)
+    assert (method, dataset, split) == ("p2p-offline" if refined else "p2p", "000007", "test")
+    assert inout.check_bop_results(str(path))[0]
+    told, frames = inout.load_bop_results(path), model_frames(done)
+    for number, (name, T_obj_model) in enumerate(frames.items(), 1):
+        obj = done.objects[name].select(done.objects[name].has_pose)
+        t_mm = np.array([one["t"].ravel() for one in told if one["obj_id"] == number])
+        np.testing.assert_allclose(t_mm / 1000, (obj.T_cam_obj @ T_obj_model)[:, :3, 3], atol=1e-6)
 
 
 def test_bop_csv_takes_the_best_score_and_skips_other_scenes(scene, tmp_path):

@@ -71,6 +71,16 @@ def test_note_says_what_was_made_from_what(made, folders):
     assert note["sha256"]["plot.png"] == hashlib.sha256((folder / "figures" / "plot.png").read_bytes()).hexdigest()
 
 
+def test_a_note_says_of_an_offline_run_that_it_is_one(made):
+    refined = {"offline": True}
+    run = replace(made.run, info=made.run.info | refined)
+    for causal, offline in ((made.run, run), (made.evaluation, replace(made.evaluation, info=run.info))):
+        before, after = provenance.describe(causal), provenance.describe(offline)
+        ran = after if "run" in after else after["evaluation"]
+        assert "offline" not in json.dumps(before) and ran["offline"] is True
+    assert provenance.describe(made.run)["run"] != provenance.describe(run)["run"]
+
+
 def test_a_note_changes_only_with_what_it_is_of(made, folders, monkeypatch):
     """Drawn again by another commit it stays, so that nothing tracked changes where nothing did."""
     folder, earlier = folders("out"), provenance.provenance

@@ -131,6 +131,14 @@ def test_seconds_count_from_the_start(made):
     np.testing.assert_array_equal(*images)
 
 
+def test_images_of_an_offline_run_say_so_in_their_corner(made):
+    refined = replace(made.run, info=made.run.info | {"offline": True})
+    plain, marked = (Scene(made.sequence, run).draw(3) for run in (made.run, refined))
+    v, u = np.nonzero((plain != marked).any(-1))
+    assert len(v) > 100 and v.max() < 40 and u.max() < 400
+    np.testing.assert_array_equal(*(Scene(made.sequence, run).draw(3, words=False) for run in (made.run, refined)))
+
+
 def test_a_film_of_images_that_are_gone_says_so(made, tmp_path):
     run = shutil.copytree(made.run.path, tmp_path / "run")
     info = (run / "run.json").read_text()

@@ -5,6 +5,7 @@ import html
 import re
 import shutil
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import find_models, load_points
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.figures.playback import Playback
-from p2p_lib.figures.viewer import _thinned, scene_page, show_run, write_page
+from p2p_lib.figures.viewer import _legend, _thinned, scene_page, show_run, write_page
 
 FRAMES = 40
 
@@ -138,6 +139,12 @@ def test_the_legend_names_objects_and_statuses(page):
     assert "synthetic" in page or "crossing" in page
     for word in (">box</b>", ">can</b>", "tracked", "degraded", "lost"):
         assert word in page, word
+
+
+def test_the_page_of_an_offline_run_says_so(made):
+    refined = replace(made.run, info=made.run.info | {"offline": True})
+    said = [_legend(Playback.of(run, made.sequence), 1, 1) for run in (made.run, refined)]
+    assert ["offline" in legend for legend in said] == [False, True]
 
 
 def test_a_browser_draws_it(page, browser, tmp_path):

@@ -99,6 +99,28 @@ def test_masks_and_counts_are_those_of_bop(scene):
     assert min(fractions) < 0.5 and np.median(fractions) > 0.9  # the two cross
 
 
+def test_the_fields_own_toolkit_reads_the_same(made, scene):
+    inout = pytest.importorskip("bop_toolkit_lib.inout")
+    folder, root, told = scene.path, scene.path.parents[1], 0
+    labels, cameras = (getattr(inout, f"load_scene_{of}")(folder / f"scene_{of}.json") for of in ("gt", "camera"))
+    for k, image in enumerate(map(int, scene.frame_names)):
+        np.testing.assert_allclose(cameras[image]["cam_K"], scene.camera.K)
+        depth_m = inout.load_depth(folder / f"depth/{image:06d}.png") * cameras[image]["depth_scale"] / 1000
+        np.testing.assert_allclose(depth_m, made.sequence.frame(image).depth_m, atol=6e-4)
+        for label in labels[image]:
+            T_cam_model = se3.from_rt(label["cam_R_m2c"], label["cam_t_m2c"].ravel() / 1000)
+            name = f"obj_{label['obj_id']:06d}"
+            np.testing.assert_allclose(T_cam_model, scene.truth[name].T_cam_model[k], atol=1e-6)
+            told += 1
+    assert told == sum(int(truth.labelled.sum()) for truth in scene.truth.values()) > 40
+    sizes = inout.load_json(root / "models/models_info.json", keys_to_int=True)
+    for name, path in find_models(scene).items():
+        model = inout.load_ply(str(root / f"models/{name}.ply"))
+        np.testing.assert_allclose(model["pts"] / 1000, load_points(path), atol=1e-6)
+        size_mm = [sizes[int(name[4:])][f"size_{axis}"] for axis in "xyz"]
+        np.testing.assert_allclose(size_mm, np.ptp(model["pts"], axis=0), atol=0.01)
+
+
 def test_what_says_that_a_label_is_good_tells_the_wrong_ones(made, scene):
     with (scene.path.parents[1] / "labels.csv").open() as file:
         rows = {int(row["image"]): row for row in csv.DictReader(file) if row["object"] == "box"}

@@ -56,6 +56,21 @@ def test_other_libraries_open_them_in_metres(made, models):
         np.testing.assert_allclose(about["size_m"], sides_m, atol=0.005)
 
 
+def test_blender_opens_them_in_metres(made, models):
+    bpy = pytest.importorskip("bpy")
+    for name, path in find_models(made.sequence, MESHES).items():
+        size_m = np.ptp(se3.transform(T_OBJ_MODEL, load_mesh(path)[0]), axis=0)
+        for kind, read in (("obj", bpy.ops.wm.obj_import), ("glb", bpy.ops.import_scene.gltf)):
+            bpy.ops.wm.read_factory_settings(use_empty=True)
+            read(filepath=str(models / name / f"textured_simple.{kind}"))
+            meshes = [each for each in bpy.data.objects if each.type == "MESH"]
+            vertices = np.array([each.matrix_world @ v.co for each in meshes for v in each.data.vertices])
+            # Both importers take y for up, where Blender has z.
+            np.testing.assert_allclose(np.ptp(vertices, axis=0), size_m[[0, 2, 1]], atol=0.004)
+            assert all(each.data.uv_layers for each in meshes)
+            assert any(image.size[0] in (512, 1024, 2048) for image in bpy.data.images)
+
+
 def test_the_texture_is_what_the_camera_saw(models):
     for folder in models.iterdir():
         off = json.loads((folder / "model.json").read_text())["colour_error_of_255"]
@@ -118,6 +133,25 @@ def test_holes_are_closed_and_marked_unless_a_camera_looked_through():
     assert (shut.vertices[shut.faces[shut.guessed]][..., 2] > 0.049).all()
     still_open = model.closed(box(), camera, into)
     assert not still_open.mesh.is_watertight and not still_open.guessed.any()
+
+
+def test_files_tell_what_is_guessed_from_what_was_seen(tmp_path):
+    shape = model.closed(box(), Camera(300, 300, 79.5, 59.5, 160, 120), [])
+    image = np.random.default_rng(0).integers(0, 255, (512, 512, 3), np.uint8)
+    textured = model.Textured(shape, model.atlas(len(shape.faces), 512), image)
+    model.write_glb(textured, tmp_path / "box.glb")
+    read = trimesh.load(tmp_path / "box.glb")
+    assert set(read.geometry) == {"seen", "guessed"}
+    for name, of in (("seen", ~shape.guessed), ("guessed", shape.guessed)):
+        mesh, own = read.geometry[name], trimesh.Trimesh(shape.vertices, shape.faces[of], process=False)
+        np.testing.assert_allclose(mesh.triangles, own.triangles, atol=1e-6)
+        np.testing.assert_allclose(mesh.visual.uv[mesh.faces], textured.uv[of], atol=1e-5)
+        np.testing.assert_array_equal(np.asarray(mesh.visual.material.baseColorTexture.convert("RGB")), image)
+    whole = trimesh.load(tmp_path / "box.glb", force="mesh")
+    assert len(whole.faces) == len(shape.faces) and whole.visual.material.baseColorTexture.size == (512, 512)
+    model.write_obj(textured, tmp_path)
+    lines = (tmp_path / "textured_simple.obj").read_text().splitlines()
+    assert sum(line.startswith("f ") for line in lines[lines.index("g guessed") :]) == shape.guessed.sum() > 0
 
 
 def test_parts_and_holes_are_counted():

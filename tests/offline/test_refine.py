@@ -18,7 +18,7 @@ from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, read_mesh
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.method.refinement import Keypoints
-from p2p_lib.offline import evidence, loops, surface
+from p2p_lib.offline import adjustment, evidence, loops, surface
 from p2p_lib.offline import refine as offline
 from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished
@@ -69,6 +69,50 @@ def test_tracks_that_slid_away_count_for_nothing(scene):
     assert np.abs(off(best, T)[:, 3:]).mean() < 0.001
     alone = locate(T @ se3.exp(np.full(6, 0.01)), p, seen)
     assert np.abs(se3.log(se3.inverse(alone) @ T)[:, 3:]).mean() < 0.002
+
+
+def test_poses_are_located_some_at_a_time(scene, monkeypatch):
+    T, p, seen, _ = scene
+    start = T @ se3.exp(np.full(6, 0.01))
+    at_once = locate(start, p, seen)
+    held, located = [], adjustment._located
+    monkeypatch.setattr(adjustment, "_AT_ONCE", 8)
+    monkeypatch.setattr(adjustment, "_located", lambda T, *of: held.append(len(T)) or located(T, *of))
+    np.testing.assert_allclose(locate(start, p, seen), at_once, atol=1e-4)
+    assert held == [8, 8, 4]
+
+
+def test_of_too_many_points_those_that_most_poses_see_decide_and_each_pose_has_some(scene, monkeypatch):
+    """Ten poses see points 0 to 19, the other ten half of the other points each: those are seen less often."""
+    T, _, seen, rng = scene
+    apart = (seen.point < 20) == (seen.pose < 10)
+    alike = seen.select(apart & ((seen.pose < 10) | ((seen.point + seen.pose) % 2 == 0)))
+    monkeypatch.setattr(adjustment, "MOST_POINTS", 20)
+    used = adjustment.best_seen(alike, 20, 40)
+    assert used.sum() == 20 and used[:20].sum() >= 17
+    assert (np.bincount(alike.pose[used[alike.point]], minlength=20) >= 1).all()
+    assert adjustment.best_seen(alike, 20, 20).all()
+    sizes = []
+    solve = adjustment._adjusted
+    monkeypatch.setattr(
+        adjustment, "_adjusted", lambda T, p, seen: sizes.append((len(p), seen.point.max())) or solve(T, p, seen)
+    )
+    start = T @ se3.exp(rng.normal(size=(20, 6)) * ([0.05] * 3 + [0.005] * 3))
+    best, points = adjust(start, placed(start, seen, 40) + rng.normal(scale=0.01, size=(40, 3)), seen)
+    assert sizes == [(20, 19)]
+    assert np.abs(off(best, T)[:, 3:]).mean() < 0.0006  # of half as many points
+    assert np.abs(se3.transform(best[seen.pose], points[seen.point][:, None])[:, 0] - seen.p_cam).mean() < 0.002
+
+
+def test_clouds_are_kept_in_a_file_and_read_back_as_they_were(tmp_path):
+    rng, clouds = np.random.default_rng(0), evidence.StoredClouds(tmp_path)
+    given = [rng.normal(size=(n, 3)).astype(np.float32) for n in (5, 0, 7, 1)]
+    for k, cloud in enumerate(given):
+        clouds.append(cloud)
+        np.testing.assert_array_equal(clouds[k // 2], given[k // 2])  # read between
+    for k in (3, 0, 1, 2):
+        np.testing.assert_array_equal(clouds[k], given[k])
+    assert not list(tmp_path.iterdir()), "nothing is left behind, however it ends"
 
 
 def view(T_cam_obj, stands_still):
@@ -205,9 +249,15 @@ def test_poses_that_fill_the_masks_better_stay(made, tracked, monkeypatch):
         return FittedPose(se3.exp(np.array([0, 0, 0, *rng.uniform(-0.01, 0.01, 2), 0])) @ T, covariance, cost)
 
     monkeypatch.setattr(SurfacePoses, "_best_of", beside)
-    offline.refine_run(tracked)
+    told = offline.refine_run(tracked)
     causal, refined = (load_run(folder).objects["can"] for folder in (tracked, tracked / "offline"))
     np.testing.assert_array_equal(refined.T_cam_obj[causal.has_pose], causal.T_cam_obj[causal.has_pose])
+    kept = {name: np.load(tracked / "offline/poses.npz")[f"{name}/causal"] for name in ("box", "can")}
+    np.testing.assert_array_equal(kept["can"], causal.has_pose)
+    assert f", {causal.has_pose.sum()} of them the causal one, " in told[1]
+    before, after = (load_run(folder).objects["box"].T_cam_obj for folder in (tracked, tracked / "offline"))
+    np.testing.assert_array_equal(kept["box"], (before == after).all((1, 2)))
+    assert not kept["box"][[6, 8]].any()  # of the first the pose was grossly wrong, the second had none
     _, mm = errors(made, tracked / "offline", "box")
     assert np.nanmedian(mm) < 0.1 and mm[6] < 18  # of 20 that the causal pose is off in that frame alone
 
@@ -220,7 +270,7 @@ def test_an_interrupted_pass_goes_on(tracked, monkeypatch):
         if did == ["box", "can"]:
             raise KeyboardInterrupt
         moved = made.run.objects[name].T_cam_obj @ se3.exp(np.full(6, 0.001 * len(did)))
-        np.savez(parts / f"{name}.npz", T_cam_obj=moved)
+        np.savez(parts / f"{name}.npz", T_cam_obj=moved, causal=np.zeros(len(moved), bool))
 
     monkeypatch.setattr(offline, "_part", part)
     monkeypatch.setattr(offline, "gather", lambda made, names, *_: dict.fromkeys(names))
@@ -234,6 +284,77 @@ def test_an_interrupted_pass_goes_on(tracked, monkeypatch):
     for name, times in {"box": 1, "can": 3}.items():
         moved = before[name].T_cam_obj @ se3.exp(np.full(6, 0.001 * times))
         np.testing.assert_allclose(after[name].T_cam_obj, moved, equal_nan=True)
+
+
+def with_covariances(folder, name):
+    """The run in a folder says of each pose of an object that it is good to half a degree and 3 mm."""
+    arrays = dict(np.load(folder / "poses.npz"))
+    has = np.isfinite(arrays[f"{name}/T_cam_obj"]).all((1, 2))
+    arrays[f"{name}/covariance"][has] = np.diag([np.radians(0.5) ** 2] * 3 + [0.003**2] * 3)
+    np.savez(folder / "poses.npz", **arrays)
+
+
+def test_covariances_are_new_and_where_both_disagree_is_told(made, tracked, monkeypatch):
+    with_covariances(tracked, "box")
+    told = offline.refine_run(tracked)
+    causal, refined = (load_run(folder).objects["box"] for folder in (tracked, tracked / "offline"))
+    kept = np.load(tracked / "offline/poses.npz")["box/causal"]
+    new = refined.has_pose & ~kept
+    assert new.sum() > 5
+    assert (np.linalg.eigvalsh(refined.covariance[new]) > 0).all()
+    before, after = (np.diagonal(obj.covariance, axis1=1, axis2=2)[new & causal.has_pose] for obj in (causal, refined))
+    assert (np.abs(after / before - 1).max(1) > 0.01).all()
+    np.testing.assert_array_equal(refined.covariance[kept], causal.covariance[kept])
+    wrong = json.loads((tracked / "offline/run.json").read_text())["disagrees_above_3_sigma"]
+    assert {5, 6, 7} <= set(wrong["box"]) and len(wrong["box"]) < 10 and wrong["can"] == []
+    assert f"{len(wrong['box'])} more than three sigmas from it{offline.in_ranges(wrong['box'])}" in told[0]
+    assert told[1].endswith("0 more than three sigmas from it")
+
+
+def test_covariances_turn_with_the_object_frame(made):
+    """By definition: of poses drawn around the new one, the spread as it is in the causal frame."""
+    obj, moved = made.run.objects["can"], se3.exp(np.array([0.9, -0.4, 0.3, 0.2, 0.1, -0.3]))
+    has, n, rng = obj.has_pose, len(obj), np.random.default_rng(0)
+    root = np.diag([0.01, 0.002, 0.004, 0.003, 0.001, 0.002])
+    poses = SimpleNamespace(
+        T=np.where(has[:, None, None], obj.T_cam_obj, np.eye(4)) @ moved,
+        covariance=np.tile(root @ root, (n, 1, 1)),
+        cost=np.full(n, 0.2),
+        limit=0.5,
+    )
+    columns, _ = offline._columns(obj, poses, evidence.VideoEvidence(mask_px=[0] * n), None)
+    k = int(np.flatnonzero(has)[3])
+    drawn = poses.T[k] @ se3.exp(rng.normal(size=(20_000, 6)) @ root) @ se3.inverse(moved)
+    spread = np.cov(se3.log(se3.inverse(columns["T_cam_obj"][k]) @ drawn).T)
+    scale = np.sqrt(np.outer(*[np.diag(spread)] * 2))
+    np.testing.assert_allclose(columns["covariance"][k] / scale, spread / scale, atol=0.05)
+
+
+@pytest.mark.parametrize("findable", [True, False])
+def test_a_map_that_never_met_the_other_gets_poses_in_it_or_none(made, tracked, monkeypatch, findable):
+    """The last frames of the can are said in a map of its own, whose frame has nothing to do with the first one's."""
+    arrays, apart = dict(np.load(tracked / "poses.npz")), np.arange(len(made.sequence)) >= 30
+    arrays["can/map_id"] = apart.astype(int)
+    arrays["can/T_cam_obj"] = np.where(
+        apart[:, None, None], arrays["can/T_cam_obj"] @ se3.exp(np.full(6, 0.3)), arrays["can/T_cam_obj"]
+    )
+    np.savez(tracked / "poses.npz", **arrays)
+    other = apart & np.isfinite(arrays["can/T_cam_obj"]).all((1, 2))
+    assert other.sum() > 5
+    if not findable:
+        monkeypatch.setattr(loops, "ties", lambda *of: [])
+        monkeypatch.setattr(SurfacePoses, "ask_neighbours", lambda *of: None)
+    told = offline.refine_run(tracked)
+    refined = load_run(tracked / "offline", every_map=True).objects["can"]
+    found, lost = other & refined.has_pose, other & ~refined.has_pose
+    assert (refined.map_id == 0).all() and found.any() == findable
+    deg, mm = errors(made, tracked / "offline", "can")
+    assert (deg[found] < 2).all() and (mm[found] < 5).all(), "in the frame of the map that is kept"
+    assert set(refined.status[found]) <= {"recovered"}
+    assert set(refined.status[lost]) == {"lost"} and set(refined.reason[lost]) == {"no pose fits"}
+    assert f"none in {lost.sum()} frames of a map that never met this one)" in told[1]
+    lines = (tracked / "offline/poses/can.txt").read_text().splitlines()
+    assert lines[0] == "# offline" and len(lines) == 1 + refined.has_pose.sum()
 
 
 def test_disagreement_is_measured_by_the_causal_covariance(made):
@@ -269,6 +390,7 @@ def test_frames_keep_the_causal_object_frame_and_what_does_not_fit_has_no_pose(m
     assert np.isnan(columns["T_cam_obj"][~has]).all() and (columns["confidence"][~has] == 0).all()
     assert (fits == has).all()
     columns["T_cam_obj"][3], columns["T_cam_obj"][~has] = np.nan, np.eye(4)
+    columns.pop(offline.CAUSAL)
     refined = offline._merged(obj, columns)
     assert refined.status[3] == "lost" and set(refined.status[~has]) == {"recovered"}
     assert (refined.status[4:8] == obj.status[4:8]).all()
