@@ -20,6 +20,8 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
+from tqdm import tqdm
+
 from p2p_lib import __version__
 from p2p_lib.core.backends import DETECTORS, SEGMENTERS, TRACKERS
 from p2p_lib.core.errors import Doubt, P2PError, did_you_mean, in_a_line
@@ -199,8 +201,8 @@ def again(info: Mapping[str, Any], out: Path, **changes: Any) -> str:
 
 
 def warn(line: object) -> None:
-    """Standard output is for results."""
-    print(line, file=sys.stderr)
+    """Standard output is for results. What a bar, or a line of what is waited for, has written makes room for it."""
+    tqdm.write(str(line), sys.stderr)
 
 
 def open_page(url: str) -> bool:
