@@ -21,6 +21,7 @@ from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar, waiting_for
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, status_text
+from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import moving_scale
 from p2p_lib.datasets.exchange import as_run, export, read_poses
@@ -208,6 +209,7 @@ class _Job:
 def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions, progress: bool) -> _Job:
     """Check the options, before anything is tracked."""
     config, prompts, source = options.config(), options.prompts, str(sequence)
+    check_device(config.device)  # otherwise it shows at the first surface
     if options.depth_scale is not None:
         source += f" --depth-scale {options.depth_scale:g}"
     if isinstance(prompts, str | Path):
@@ -329,8 +331,9 @@ def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Calla
             say(compiling)
 
         warm_up(instead if progress else lambda line: None)
-    how = {"shown": progress, "first": "First masks"}  # which SAM 2 takes seconds for
-    with noted(keeper.doubts), progress_bar(job.sequence.name, len(job.frames), **how) as bar:
+    # SAM 2 takes seconds for the first masks.
+    bar = progress_bar(job.sequence.name, len(job.frames), shown=progress, first="First masks")
+    with noted(keeper.doubts), bar:
         left_out = writer.info["left_out"]
 
         def leave_out(index: int, unreadable: P2PError) -> None:

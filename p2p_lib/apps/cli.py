@@ -165,12 +165,13 @@ def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
     from p2p_lib.apps.live_click import LiveClicker
     from p2p_lib.apps.live_words import Words, outlet
+    from p2p_lib.core.voxels import check_device
     from p2p_lib.datasets.cameras import open_camera
     from p2p_lib.datasets.prompts import load_prompts
     from p2p_lib.datasets.run_writer import look_into
 
     options, count, first = _asked(a), LiveCount(), None
-    options.config()  # what does not fit is said before the camera starts
+    check_device(options.config().device)  # what does not fit is said before the camera starts
     _film_wanted(a.overlay)
     keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
     keep["say"] = warn

@@ -717,6 +717,14 @@ def test_words_that_are_no_command_point_to_the_help(words, says, capsys):
     assert "See p2p" in err and err.rstrip().endswith("--help")
 
 
+@pytest.mark.parametrize("words", [["run", "nowhere", "--out", "x"], ["live", "--camera", "nowhere:Camera"]])
+def test_a_device_that_is_not_there_is_said_before_anything_is_waited_for(words, capsys, monkeypatch):
+    torch = pytest.importorskip("torch")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert cli.main([*words, "--device", "cuda", *["--quiet"] * (words[0] == "run")]) == 2
+    assert "device cuda: PyTorch finds no CUDA device here" in one_line(capsys, words[0])
+
+
 def test_debug_shows_where_it_went_wrong(sequence, tmp_path, capsys):
     words = ["run", str(sequence), "--out", str(tmp_path / "out"), "--tracker", "nope", "--quiet"]
     assert cli.main([*words, "--debug"]) == 2

@@ -91,7 +91,7 @@ def test_a_whole_visit(sequence, out):
         assert not clicker.wait(0) and not out.exists()
         assert post(clicker.url, {"objects": [one()]})[0] == 200 and out.exists() and not clicker.wait(0), "it goes on"
         status, answer = post(clicker.url, {"objects": [one(), one("bowl", 2, [(60, 40)])], "finish": True})
-        assert (status, answer) == (200, {"saved": str(out)}) and clicker.wait(0)
+        assert (status, answer) == (200, {"saved": str(out), "again": ""}) and clicker.wait(0)
         assert [p.name for p in clicker.prompts] == ["cup", "bowl"]
     cup, bowl = load_prompts(out)
     assert (cup.name, cup.frame, bowl.name, bowl.frame) == ("cup", 0, "bowl", 2)
@@ -217,11 +217,11 @@ def test_the_page_needs_nothing_from_elsewhere():
     assert "http" not in text.replace("http-equiv", "") and 'src="' not in text
 
 
-def visit(session: dict, *steps: list) -> dict:
+def visit(session: dict, *steps: list, again: str = "") -> dict:
     """What the page's own script makes of these steps of a user; nothing is known without node, which runs it."""
     if shutil.which("node") is None:
         pytest.skip("no node to run the page's script (Debian: apt-get install nodejs)")
-    given = json.dumps({"session": session, "steps": steps})
+    given = json.dumps({"session": session, "steps": steps, "again": again})
     probe = Path(__file__).with_name("click_probe.js")
     done = subprocess.run(["node", str(probe), str(PAGE)], input=given, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
