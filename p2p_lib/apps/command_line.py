@@ -57,7 +57,7 @@ SEQUENCE = arg(
     "sequence", metavar="SEQ", help="a folder, synthetic/NAME or NAME@SEED (bundled), or a name below $P2P_DATA"
 )
 JSON = arg("--json", action="store_true", help="JSON instead of a table")
-QUIET = arg("--quiet", action="store_true", help="no progress bar")
+QUIET = arg("--quiet", action="store_true", help="no progress bar, and no word on what is waited for")
 NO_BROWSER = arg("--no-browser", action="store_true", help="only say where the page is")
 
 

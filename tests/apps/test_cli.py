@@ -506,8 +506,12 @@ def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys
 
 def test_a_scenario_is_known_by_the_name_that_run_takes(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr("p2p_lib.synthetic.write_sequence", lambda name, out, *more: made.append(name) or out)
-    assert cli.main(["synth", "synthetic/crossing", "--out", str(tmp_path)]) == 0 and made == ["crossing"]
+    monkeypatch.setattr(
+        "p2p_lib.synthetic.write_sequence", lambda name, out, *more: made.append((name, more[-1])) or out
+    )
+    for more in ([], ["--quiet"]):
+        assert cli.main(["synth", "synthetic/crossing", "--out", str(tmp_path), *more]) == 0
+    assert made == [("crossing", True), ("crossing", False)], "what it is, and whether progress is shown"
 
 
 def test_the_list_of_scenarios_has_no_markup(capsys):

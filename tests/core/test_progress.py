@@ -3,6 +3,9 @@
 import sys
 
 from p2p_lib.core.progress import progress_bar, waiting_for
+from p2p_lib.synthetic import SCENARIOS
+from p2p_lib.synthetic.generate import write_scenario
+from p2p_lib.synthetic.noise import Sensor
 from tests.fixtures.terminal import left_on_it, shown_on_a_terminal
 
 
@@ -60,6 +63,12 @@ def test_rendering_has_its_bar_from_the_first_frame_on(tmp_path):
     shown = shown_on_a_terminal("-c", code.format(True), P2P_CACHE=str(tmp_path / "a"))
     assert "rendering synthetic/crossing:   0%" in shown and "| 0/2 " in shown
     assert shown_on_a_terminal("-c", code.format(False), P2P_CACHE=str(tmp_path / "b")) == ""
+
+
+def test_rendering_in_a_pipe_is_one_line(tmp_path, capsys):
+    write_scenario(tmp_path / "s", SCENARIOS["crossing"](0, frames=2), Sensor(), 0, "rendering crossing", True)
+    err = capsys.readouterr().err
+    assert err.startswith("rendering crossing: 100%") and "2/2" in err and err.count("\n") == 1 and "\r" not in err
 
 
 def test_what_is_waited_for_is_said_at_once(capsys):
