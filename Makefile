@@ -45,7 +45,7 @@ release: setup ## wheel and sdist into out/release, installed and tried; publish
 test-backends: setup ## the adapters of third-party networks against the official classes, in .venv-backends (no weights)
 	@.venv/bin/python tools/test_backends.py
 
-test-ros: setup ## the package for ROS 2 on a real ROS, in .venv-ros (needs cmake and a compiler of C++)
+test-ros: setup ## the package for ROS 2 on a real ROS, in .venv-ros (needs cmake and g++)
 	@.venv/bin/python tools/test_ros.py
 
 seeds: setup ## run every notebook on seeds 1 to 4 (an hour and more)
