@@ -8,7 +8,7 @@ export MKL_NUM_THREADS := $(THREADS)
 # ROS and others put packages of another Python there.
 unexport PYTHONPATH PYTHONHOME
 
-.PHONY: help setup reproduce book test release test-backends docs mutants seeds bench lab figures lock
+.PHONY: help setup reproduce book test release test-backends test-ros docs mutants seeds bench lab figures lock
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 22
 
@@ -45,6 +45,9 @@ release: setup ## wheel and sdist into out/release, installed and tried; publish
 
 test-backends: setup ## the adapters of third-party networks against the official classes, in .venv-backends (no weights)
 	@.venv/bin/python tools/test_backends.py
+
+test-ros: setup ## the package for ROS 2 on a real ROS, in .venv-ros (needs cmake and g++)
+	@.venv/bin/python tools/test_ros.py
 
 seeds: setup ## run every notebook on seeds 1 to 4 (an hour and more)
 	@P2P_SEEDS=1,2,3,4 .venv/bin/python -m pytest -q tests/apps/test_notebooks.py -k other_seeds

@@ -5,7 +5,6 @@ Scores a 2D tracker by itself and any method's poses as well, and writes a run i
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,9 +18,10 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised, doubt
 from p2p_lib.core.memory import ObjectMemory, load_memories
 from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
-from p2p_lib.core.progress import progress_bar
+from p2p_lib.core.progress import progress_bar, waiting_for
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, status_text
+from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import moving_scale
 from p2p_lib.datasets.exchange import as_run, export, read_poses
@@ -93,18 +93,18 @@ def run(
     and is reported in the result.
     """
     options = replace(options or RunOptions(), **changes)
-    with progress_bar("reading", shown=progress and sys.stderr.isatty(), leave=False, bar_format="{desc} ..."):
-        job = _prepare(sequence, options)
-    sizes_m = lengths_m(options.sizes, job.objects)
-    _doubt_scale(job)
-    tracker = options.tracker
-    if tracker == OracleTracker.name:  # which has to know the sequence
-        tracker = OracleTracker(TrueScene.of(job.sequence, options.models), job.config.oracle, job.config.seed)
-    method = Point2Pose(job.sequence.camera, job.config, tracker, options.detector, job.masks.segmenter)
-    recall(method, job.memories, options.frozen)
-    for name in [n for n in job.objects if n not in job.memories] if job.masks.every_mask else ():
-        method.add_object(name)
-    writer = _writer(job, options, method, out, if_exists if redo_from is None else "resume", redo_from)
+    with waiting_for("Reading the sequence", progress):
+        job = _prepare(sequence, options, progress)
+        sizes_m = lengths_m(options.sizes, job.objects)
+        _doubt_scale(job)
+        tracker = options.tracker
+        if tracker == OracleTracker.name:  # which has to know the sequence
+            tracker = OracleTracker(TrueScene.of(job.sequence, options.models), job.config.oracle, job.config.seed)
+        method = Point2Pose(job.sequence.camera, job.config, tracker, options.detector, job.masks.segmenter)
+        recall(method, job.memories, options.frozen)
+        for name in [n for n in job.objects if n not in job.memories] if job.masks.every_mask else ():
+            method.add_object(name)
+        writer = _writer(job, options, method, out, if_exists if redo_from is None else "resume", redo_from)
     with writer:
         _say_what_was_there(writer, say)
         if not writer.complete:
@@ -206,9 +206,10 @@ class _Job:
     memories: Mapping[str, ObjectMemory]
 
 
-def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> _Job:
+def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions, progress: bool) -> _Job:
     """Check the options, before anything is tracked."""
     config, prompts, source = options.config(), options.prompts, str(sequence)
+    check_device(config.device)  # otherwise it shows at the first surface
     if options.depth_scale is not None:
         source += f" --depth-scale {options.depth_scale:g}"
     if isinstance(prompts, str | Path):
@@ -217,7 +218,7 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions) -> 
     prompts, memories = tuple(prompts or ()), load_memories(options.memory or ())
     masks = options.mask_source()
     how = options.format, options.depth_scale
-    sequence = sequences.open_sequence(sequence, *how, masks=masks.folder, gaps=options.skip_bad)
+    sequence = sequences.open_sequence(sequence, *how, masks=masks.folder, gaps=options.skip_bad, progress=progress)
     frames = _frame_range(len(sequence), options.start, options.stop)
     prompted = masks.name == "clicks" and bool(prompts or memories)  # all that is known of the objects
     objects = [p.name for p in prompts] if prompted else sequence.objects
@@ -323,9 +324,16 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None
 def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Callable[[str], object]) -> None:
     """Every frame, and at the end the maps; Ctrl-C ends it early."""
     writer, method = keeper.writer, keeper.method
-    warm_up(say if progress else lambda line: None)
-    with noted(keeper.doubts), progress_bar(job.sequence.name, len(job.frames), shown=progress) as bar:
-        bar.set_postfix_str("first masks")  # which SAM 2 takes seconds for
+    with waiting_for("Loading compiled loops", progress) as line:
+
+        def instead(compiling: str) -> None:
+            line.clear()
+            say(compiling)
+
+        warm_up(instead if progress else lambda line: None)
+    # SAM 2 takes seconds for the first masks.
+    bar = progress_bar(job.sequence.name, len(job.frames), shown=progress, first="First masks")
+    with noted(keeper.doubts), bar:
         left_out = writer.info["left_out"]
 
         def leave_out(index: int, unreadable: P2PError) -> None:

@@ -3,6 +3,7 @@
 The definitions are those of rosbags, which writes what is filled as ROS would send it.
 """
 
+import importlib
 import io
 import re
 import shutil
@@ -10,7 +11,8 @@ import subprocess
 import sys
 import xml.etree.ElementTree as xml
 from array import array
-from functools import cache
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -356,7 +358,178 @@ def test_what_is_wrong_with_the_node_is_one_line(spun, tmp_path):
     with pytest.raises(SystemExit, match=r"point2pose: .*missing\.json"):
         spun({"prompts": str(tmp_path / "missing.json")}, lambda node: None)
     ran = subprocess.run([sys.executable, "-m", "point2pose_ros.node"], cwd=NODE, capture_output=True, text=True)
-    assert ran.returncode == 1 and "Traceback" not in ran.stderr and "rclpy of ROS 2 is not to be found" in ran.stderr
+    assert ran.returncode == 1 and "Traceback" not in ran.stderr and "of ROS 2 is not to be found" in ran.stderr
+
+
+# --- ROS itself, where it is installed: make test-ros ------------------------------------------
+
+
+@pytest.fixture
+def rclpy(monkeypatch):
+    """The real one, with the messages built; heard on this machine alone."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    for name in ("rclpy", "point2pose_msgs.msg"):
+        pytest.importorskip(name, reason="no ROS is installed. Run: make test-ros")
+    return sys.modules["rclpy"]
+
+
+def real(message: Any, into: Any = None) -> Any:
+    """The same message of ROS itself; ``into`` a request, whose kind ROS calls otherwise."""
+    package, name = message.__msgtype__.split("/msg/")
+    made = into or getattr(importlib.import_module(f"{package}.msg"), name)()
+    for field, _ in definitions().fielddefs[message.__msgtype__][1]:
+        value = getattr(message, field)
+        if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+            value = array("B", value.tobytes())
+        values = [
+            real(one) if hasattr(one, "__msgtype__") else one for one in (value if isinstance(value, list) else [value])
+        ]
+        setattr(made, field, values if isinstance(value, list) else values[0])
+    return made
+
+
+def test_real_messages_are_filled_and_sent_as_the_definitions_say(rclpy):
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    T, ball = se3.exp(np.array([0.3, -0.2, 0.9, 0.1, 0.2, 0.7])), trimesh.creation.icosphere(1, 0.05)
+    sure = np.diag([4.0, 1, 1, 9, 1, 1]) * 1e-6
+    mug = PoseEstimate("mug", 3, 0.1, Status.DEGRADED, T, 0.75, sure, map_id=2, reason="a doubt")
+    filled = {
+        "geometry_msgs/msg/PoseWithCovarianceStamped": lambda blank, header: ros.fill_pose(blank, mug, header),
+        "point2pose_msgs/msg/ObjectEstimate": lambda blank, header: ros.fill_estimate(blank, mug, header),
+        "geometry_msgs/msg/TransformStamped": lambda blank, header: ros.fill_transform(blank, mug, header, "arm/"),
+        "visualization_msgs/msg/Marker": lambda blank, header: ros.fill_marker(blank, "mug", ball, "arm/"),
+    }
+    for kind, fill_it in filled.items():
+        made = fill_it(real(blank(kind)), real(header((5, 7))))
+        sent = serialize_message(made)
+        assert deserialize_message(sent, type(made)) == made
+        theirs = fill_it(blank(kind), header((5, 7)))
+        check_fields(theirs)
+        again = definitions().deserialize_cdr(sent, kind)  # what ROS leaves between fields is not the same twice
+        assert definitions().serialize_cdr(again, kind) == definitions().serialize_cdr(theirs, kind), kind
+
+
+class Driver:
+    """A camera and somebody who listens, in a context of ROS of their own."""
+
+    def __init__(self, rclpy):
+        from rclpy.executors import SingleThreadedExecutor
+
+        self.rclpy, self.context = rclpy, rclpy.Context()
+        rclpy.init(args=[], context=self.context)
+        self.node = rclpy.create_node("camera", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        sent = real(images(0)[0]), real(images(0)[1]), real(images(0)[2])
+        self.topics = [self.node.create_publisher(type(m), n, 5) for m, n in zip(sent, ("rgb", "depth", "camera_info"))]
+
+    def heard(self, kind: Any, topic: str) -> list[Any]:
+        came: list[Any] = []
+        self.node.create_subscription(kind, topic, came.append, 10)
+        return came
+
+    def until(self, done, again=lambda: None) -> None:
+        """Do it again every half second until something has come; what is sent as sensors do may be lost."""
+        for _ in range(120):
+            again()
+            for _ in range(10):
+                self.executor.spin_once(timeout_sec=0.05)
+                if done():
+                    return
+        raise AssertionError("nothing came in a minute")
+
+    def show(self, k: int) -> None:
+        """The k-th image, with its depth and camera."""
+        for topic, message in zip(self.topics, map(real, images(k))):
+            message.header.stamp.sec, message.header.stamp.nanosec = 5, k * 33_000_000
+            topic.publish(message)
+
+    def call(self, service: str, asked: Any) -> Any:
+        kind = getattr(importlib.import_module("point2pose_msgs.srv"), asked.__msgtype__.split("/")[-1])
+        client = self.node.create_client(kind, f"/point2pose/{service}")
+        self.until(client.service_is_ready)
+        answered = client.call_async(real(asked, kind.Request()))
+        self.until(answered.done)
+        return answered.result()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.rclpy.shutdown(context=self.context)
+        self.rclpy.try_shutdown()  # the node's, which ends it
+
+
+class Subscriber:
+    """Of message_filters: a subscription, whose messages go to whoever synchronises."""
+
+    def __init__(self, node, kind, topic, qos_profile):
+        self.take = lambda message: None
+        self.subscription = node.create_subscription(kind, topic, lambda message: self.take(message), qos_profile)
+
+
+class Together:
+    """Of message_filters: calls with messages of one time, once."""
+
+    def __init__(self, topics, queue_size, slop):
+        self.topics, self.waiting = topics, {}
+
+    def registerCallback(self, call):
+        def take(index, message):
+            of_time = self.waiting.setdefault((message.header.stamp.sec, message.header.stamp.nanosec), {})
+            before, of_time[index] = len(of_time), message
+            if before < len(of_time) == len(self.topics):
+                call(*(of_time[k] for k in range(len(self.topics))))
+
+        for index, topic in enumerate(self.topics):
+            topic.take = partial(take, index)
+
+
+def test_a_real_node_serves_and_publishes(rclpy, monkeypatch):
+    """Over DDS, with parameters as a command gives them; message_filters and tf2_ros alone, of no wheels, stand in."""
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+    from point2pose_msgs.msg import ObjectEstimate
+    from visualization_msgs.msg import MarkerArray
+
+    transforms: list[Any] = []
+    module(monkeypatch, "message_filters", Subscriber=Subscriber, ApproximateTimeSynchronizer=Together)
+    module(monkeypatch, "tf2_ros", TransformBroadcaster=lambda node: Part(sendTransform=transforms.append))
+    given = {"mesh_period_s": "0.2", "frame_prefix": "arm/", "settings": "['tsdf.voxel_m=0.004']"}
+    words = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+    monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *words])
+
+    def drive(driver: Driver) -> tuple[list, list]:
+        try:
+            estimates = driver.heard(ObjectEstimate, "/point2pose/estimates")
+            poses = driver.heard(PoseWithCovarianceStamped, "/point2pose/poses/card")
+            shown = driver.heard(MarkerArray, "/point2pose/meshes")
+            said = [driver.call("add_object", card := request("AddObject", "card", CARD.points_px))]
+            while not said[-1].success:
+                assert "before the first image" in said[-1].message
+                driver.show(0)
+                said.append(driver.call("add_object", card))
+            for k in range(1, 4):
+                driver.until(lambda k=k: len(estimates) >= k and len(poses) >= k, partial(driver.show, k))
+            driver.until(lambda: any(array_of.markers for array_of in shown))
+            (marker,) = next(array_of.markers for array_of in shown if array_of.markers)
+            mesh = trimesh.load_mesh(io.BytesIO(bytes(marker.mesh_file.data)), "ply")
+            assert marker.header.frame_id == "arm/card" and len(mesh.faces) > 100
+            assert driver.call("remove_object", request("RemoveObject", "card")).success
+            driver.until(lambda: any(m.action == ros.DELETE for array_of in shown for m in array_of.markers))
+            return estimates, poses
+        finally:
+            driver.close()
+
+    with ThreadPoolExecutor(1) as pool:
+        driven = pool.submit(drive, Driver(rclpy))
+        nodes.main()
+        estimates, poses = driven.result()
+    assert [(e.object, e.status, e.header.stamp.nanosec) for e in estimates] == [
+        ("card", "tracked", k * 33_000_000) for k in range(1, 4)
+    ]
+    moved_m = poses[2].pose.pose.position.x - poses[0].pose.pose.position.x
+    assert moved_m == pytest.approx(2 * 3 * 0.6 / 300, abs=0.002) and poses[0].header.frame_id == "camera_optical"
+    assert [t.child_frame_id for t in transforms] == ["arm/card"] * 3
 
 
 def test_the_package_is_whole(tmp_path):

@@ -342,7 +342,7 @@ def test_the_workflow_runs_the_two_commands_on_every_python():
     weekly = flow["jobs"]["weekly"]
     assert weekly["steps"][-1]["run"] == "make ${{ matrix.target }}"
     once_a_week = set(weekly["strategy"]["matrix"]["target"])
-    assert once_a_week == {"test-backends", "figures", "seeds"}
+    assert once_a_week == {"test-backends", "test-ros", "figures", "seeds"}
     targets = set(re.findall(r"(?m)^([a-z-]+):", (PROJECT / "Makefile").read_text()))
     assert {line.split()[1] for line in run if line.startswith("make ")} | once_a_week <= targets
     for step in [step for job in flow["jobs"].values() for step in job["steps"]]:

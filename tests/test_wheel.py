@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import tomllib
 import zipfile
 from email import message_from_bytes
@@ -32,15 +33,25 @@ def ran(*words: object, code: int = 0, **more) -> str:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    """Built of a copy, so that nothing is left in the checkout."""
+def source(tmp_path_factory) -> Path:
+    """A copy, so that nothing is left in the checkout; without git, as an archive is."""
     pytest.importorskip("setuptools")
-    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    folder = tmp_path_factory.mktemp("source")
     for name in SOURCES:
         copy = shutil.copytree if (PROJECT / name).is_dir() else shutil.copy
-        copy(PROJECT / name, source / name)
+        copy(PROJECT / name, folder / name)
+    return folder
+
+
+def built(source: Path, out: Path) -> Path:
+    """The wheel of a folder or an archive."""
     ran(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", out, source)
     return next(out.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def wheel(source, tmp_path_factory) -> Path:
+    return built(source, tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +99,20 @@ def test_the_wheel_requires_what_tracks_and_holds_nothing_of_the_notebooks(wheel
     assert required == {Requirement(need).name for need in project["dependencies"]}
     assert set(said.get_all("Provides-Extra")) == set(project["optional-dependencies"])
     assert not [name for name in listed if "studies" in name or name.endswith(".ipynb")]
+
+
+def test_the_sdist_makes_the_same_wheel(source, wheel, tmp_path):
+    """As ``make release`` builds it; what it lacks the wheel of it lacks, and it has its readme and licence."""
+    code = "import sys; from setuptools.build_meta import build_sdist; print(build_sdist(sys.argv[1]))"
+    sdist = tmp_path / ran(sys.executable, "-c", code, tmp_path, cwd=source).splitlines()[-1]
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"README.md", "LICENSE", "pyproject.toml"} <= names
+
+    def held(path: Path) -> dict[str, int]:
+        return {info.filename: info.CRC for info in zipfile.ZipFile(path).infolist() if "RECORD" not in info.filename}
+
+    assert held(built(sdist, tmp_path / "wheel")) == held(wheel)
 
 
 def test_commands_of_a_clone_say_that_they_need_one(p2p):

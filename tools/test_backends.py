@@ -32,16 +32,21 @@ TRIED = {
 WHOLE = ("transformers", "einshape", "dm-tree", "einops")
 
 
-def install():
-    """Make the environment where it is not there, and put into it what it lacks."""
-    if not PYTHON.exists():
+def on_top_of_venv(folder):
+    """An environment in this folder, made where it is not there, that has all that .venv has and takes more."""
+    if not (folder / "bin/python").exists():
         base = subprocess.check_output(
             [HOME / "bin/python", "-c", "import sys; print(sys._base_executable)"], text=True
         )
-        subprocess.run([base.strip(), "-m", "venv", "--clear", "--without-pip", VENV], check=True)
-        (inner,) = VENV.glob("lib/python*/site-packages")
+        subprocess.run([base.strip(), "-m", "venv", "--clear", "--without-pip", folder], check=True)
+        (inner,) = folder.glob("lib/python*/site-packages")
         (outer,) = HOME.glob("lib/python*/site-packages")
         inner.joinpath("_of_venv.pth").write_text(f"import site; site.addsitedir({str(outer)!r})\n")
+
+
+def install():
+    """Make the environment where it is not there, and put into it what it lacks."""
+    on_top_of_venv(VENV)
     uv = [HOME / "bin/uv", "pip", "install", "-q", "--python", PYTHON]
     lacking = "import importlib.util as u, sys; print(*[n for n in sys.argv[1:] if not u.find_spec(n)])"
     names = ("transformers", "einshape", "tree", "einops", *ALONE)

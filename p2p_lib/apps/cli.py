@@ -35,6 +35,7 @@ from p2p_lib.apps.command_line import (
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.files import check_new
 from p2p_lib.core.options import RunOptions, lengths_m, names, pairs
+from p2p_lib.core.progress import waiting_for
 from p2p_lib.offline import NOT_CAUSAL, PRODUCTS
 
 #: Options that choose the method and its parameters.
@@ -89,9 +90,6 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     QUIET,
 )
 def _run(a: argparse.Namespace) -> int:
-    from p2p_lib.datasets.runs import read_info
-    from p2p_lib.run import run
-
     if (a.sequence is None) == (a.batch is None):
         a.parser.error("needs either SEQ or --batch FOLDER")
     if a.batch is not None and (a.if_exists == "replace" or a.overlay is not None):
@@ -101,11 +99,15 @@ def _run(a: argparse.Namespace) -> int:
         a.parser.error("--jobs and --scheduler go with --batch FOLDER: one recording is one job")
     if a.redo_from is not None and (a.batch is not None or a.if_exists != "resume"):
         a.parser.error("--from goes with --resume, and with SEQ")
+    options = _asked(a)
+    with waiting_for("Loading libraries", not a.quiet):
+        from p2p_lib.datasets.runs import read_info
+        from p2p_lib.run import run
     if a.batch is not None:
         from p2p_lib.benchmark.batch import TABLE, run_batch
         from p2p_lib.core.tables import as_text
 
-        table = run_batch(a.batch, a.out, _asked(a), a.jobs, a.scheduler, not a.quiet)
+        table = run_batch(a.batch, a.out, options, a.jobs, a.scheduler, not a.quiet)
         print(f"{as_text(table)}\nResults in {a.out}, the table in {a.out / TABLE}")
         if failed := int(table["object"].isna().sum()):
             warn(
@@ -113,7 +115,7 @@ def _run(a: argparse.Namespace) -> int:
             )
         return P2PError.exit_code if failed else 0
     film = _film_wanted(a.overlay)
-    options = replace(_asked(a), save_masks=a.save_masks or film is not None)
+    options = replace(options, save_masks=a.save_masks or film is not None)
     how = {"if_exists": a.if_exists or "refuse", "redo_from": a.redo_from, "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
     print("\n".join([*result.summary, *_without_map(a.out)]))
@@ -176,12 +178,13 @@ def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
     from p2p_lib.apps.live_click import LiveClicker
     from p2p_lib.apps.live_words import Words, outlet
+    from p2p_lib.core.voxels import check_device
     from p2p_lib.datasets.cameras import open_camera
     from p2p_lib.datasets.prompts import load_prompts
     from p2p_lib.datasets.run_writer import look_into
 
     options, count, first = _asked(a), LiveCount(), None
-    options.config()  # what does not fit is said before the camera starts
+    check_device(options.config().device)  # what does not fit is said before the camera starts
     _film_wanted(a.overlay)
     keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
     keep["say"] = warn

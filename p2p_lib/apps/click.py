@@ -115,13 +115,17 @@ class Clicker(AbstractContextManager):
         frame, prompts = given.get("frame"), parse_prompts(given) if given.get("objects") else ()
         if not isinstance(frame, int) or not 0 <= frame < len(self.sequence):
             raise BadInput("frame", repr(frame), f"a number from 0 to {len(self.sequence) - 1}")
-        found = self.kept_masks(frame)
+        made, doubts = self.made(prompts)
+        found = self.kept_masks(frame) | made
+        return {"masks": {name: run_lengths(mask)["counts"] for name, mask in found.items()}, "doubts": doubts}
+
+    def made(self, prompts: Iterable[Prompt]) -> tuple[dict[str, np.ndarray], list[str]]:
+        """The mask (H, W) bool of each object that its prompts can start, and what is doubtful about them."""
         with self._segmenting, warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", Doubt)
             made = clicked_masks(self.sequence, [prompt for prompt in prompts if prompt.starts])
-        found |= {name: mask for name, (_, mask) in made.items()}
         texts = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
-        return {"masks": {name: run_lengths(mask)["counts"] for name, mask in found.items()}, "doubts": texts}
+        return {name: mask for name, (_, mask) in made.items()}, texts
 
     def checked(self, content: object, started: Iterable[str] = ()) -> tuple[Prompt, ...]:
         """The prompts that the page sends; objects that are ``started`` may be corrected alone."""
@@ -132,16 +136,18 @@ class Clicker(AbstractContextManager):
                 check_depth(prompt, self.sequence.frame(i))
         return prompts
 
-    def save(self, content: object) -> None:
+    def save(self, content: object) -> str:
         """Check prompts as the page sends them, and write the file; :class:`BadInput` says what does not fit.
 
-        ``finish`` beside the objects ends the waiting for the page, which otherwise goes on.
+        ``finish`` beside the objects ends the waiting for the page, which otherwise goes on. Gives what is to be said
+        anew and why, "" where all was taken.
         """
         prompts = self.checked(content)
         save_prompts(self.path, prompts)
         self.prompts = prompts
         if isinstance(content, dict) and content.get("finish"):
             self._finished.set()
+        return ""
 
 
 def _plain(prompt: Prompt) -> dict[str, Any]:
@@ -254,8 +260,8 @@ class _Handler(BaseHTTPRequestHandler):
         return self._answer(json.dumps(answer).encode(), _JSON)
 
     def _save(self, content: object) -> dict[str, str]:
-        self.clicker.save(content)
-        return {"saved": str(self.clicker.path)}
+        again = self.clicker.save(content)
+        return {"saved": str(self.clicker.path), "again": again}
 
     def _answer(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
         self.send_response(status)

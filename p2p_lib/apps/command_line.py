@@ -20,6 +20,8 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
+from tqdm import tqdm
+
 from p2p_lib import __version__
 from p2p_lib.core.backends import DETECTORS, SEGMENTERS, TRACKERS
 from p2p_lib.core.errors import Doubt, P2PError, did_you_mean, in_a_line
@@ -55,7 +57,7 @@ SEQUENCE = arg(
     "sequence", metavar="SEQ", help="a folder, synthetic/NAME or NAME@SEED (bundled), or a name below $P2P_DATA"
 )
 JSON = arg("--json", action="store_true", help="JSON instead of a table")
-QUIET = arg("--quiet", action="store_true", help="no progress bar")
+QUIET = arg("--quiet", action="store_true", help="no progress bar, and no word on what is waited for")
 NO_BROWSER = arg("--no-browser", action="store_true", help="only say where the page is")
 
 
@@ -199,8 +201,8 @@ def again(info: Mapping[str, Any], out: Path, **changes: Any) -> str:
 
 
 def warn(line: object) -> None:
-    """Standard output is for results."""
-    print(line, file=sys.stderr)
+    """Standard output is for results. What a bar, or a line of what is waited for, has written makes room for it."""
+    tqdm.write(str(line), sys.stderr)
 
 
 def open_page(url: str) -> bool:

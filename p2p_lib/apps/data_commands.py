@@ -102,6 +102,7 @@ def _convert(a: argparse.Namespace) -> None:
         help="YCB models, for ycb_, in_hand and thin_ scenarios (default: procedural ones)",
     ),
     arg("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop"),
+    QUIET,
 )
 def _synth(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.sequence import SYNTHETIC
@@ -112,7 +113,7 @@ def _synth(a: argparse.Namespace) -> None:
         return
     if a.scenario is None or a.out is None:
         raise BadInput("synth", "no scenario or no --out", "SCENARIO --out DIR; p2p synth --list names the scenarios")
-    out = write_sequence(a.scenario.removeprefix(SYNTHETIC), a.out, a.seed, a.noise, a.models or "", a.bop)
+    out = write_sequence(a.scenario.removeprefix(SYNTHETIC), a.out, a.seed, a.noise, a.models or "", a.bop, not a.quiet)
     print(f"Written to {out}. Next: p2p run {out} --out RUN")
 
 

@@ -149,15 +149,22 @@ def _fuse(total, count, value, colour, first, depth_m, inside, rgbw, A, b, lo, h
     return touched
 
 
+def check_device(device: str) -> None:
+    """:class:`MissingBackend` where the configuration's device, ``cpu`` or one of torch's, is not to be had."""
+    if device == "cpu":
+        return
+    torch = load("torch", f"device {device}", "torch")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        fix = "Say --device cpu, or see environment.md for PyTorch with CUDA."
+        raise MissingBackend(f"device {device}", "PyTorch finds no CUDA device here", fix)
+
+
 class TorchGrid(CpuGrid):
     """The same as torch's tensors on one of its devices."""
 
     def __init__(self, size: tuple[int, ...], device: str):
-        torch = load("torch", f"device {device}", "torch")
-        if device.startswith("cuda") and not torch.cuda.is_available():
-            fix = "Say --device cpu, or see environment.md for PyTorch with CUDA."
-            raise MissingBackend(f"device {device}", "PyTorch finds no CUDA device here", fix)
-        self.device = torch.device(device)
+        check_device(device)
+        self.device = load("torch", f"device {device}", "torch").device(device)
         super().__init__(size)
 
     def full(self, size: tuple[int, ...], value: float) -> Any:

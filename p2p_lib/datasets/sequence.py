@@ -129,6 +129,7 @@ def open_sequence(
     seed: int | None = None,
     masks: str | Path | None = None,
     gaps: bool = False,
+    progress: bool = True,
 ) -> Sequence:
     """A sequence from a folder, a bundled one, or one below ``$P2P_DATA`` by its name alone.
 
@@ -143,6 +144,7 @@ def open_sequence(
     seed         of a synthetic scene whose name has none (default 0)
     masks        another folder of masks (a name inside the sequence, or a path); by default the dataset's own
     gaps         depth images may be missing: their frames cannot be read, all others can
+    progress     a terminal shows how far a synthetic scene is that has to be rendered first
 
     Raises :class:`MissingData` where files are not there and :class:`BadInput` where they do not fit.
     """
@@ -158,7 +160,7 @@ def open_sequence(
     if name.startswith(SYNTHETIC):
         render = import_module(_GENERATOR).scenario_dir
         scenario, seed = _scene(name, seed)
-        folder, format = render(scenario, seed), format or "ycbmultitrack"
+        folder, format = render(scenario, seed, progress=progress), format or "ycbmultitrack"
     else:
         seed = None
         folder, format = _find(path_or_name, format)

@@ -25,7 +25,7 @@ from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation.evidence import ON_M, drawn_m, gathered, on_surface, reprojected, surface_in_view
 from p2p_lib.evaluation.known_size import size_doubts
-from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, WHAT_RAN, rate
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
 from p2p_lib.evaluation.suspicions import Suspicion, median_of_known, suspicions
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Consistency:
             | {"unknown": self.unknown.get(name)}
             for name, numbers in self.objects.items()
         }
-        ran = {key: self.info.get(key) for key in WHAT_RAN}
+        ran = ran_with(self.info)
         return {"truth": None, "not_scored": self.not_scored or None, "objects": plain, "hz": self.hz, **ran}
 
     def as_frame(self) -> DataFrame:
@@ -93,7 +93,7 @@ class Consistency:
         """The same for people, with what each number says."""
         legend = [f"{head}: {says}" for head, says in HEADS.values()]
         hz = [f"{self.hz:.1f} Hz"] if self.hz is not None else []
-        ran = ", ".join(f"{key} {self.info.get(key)}" for key in WHAT_RAN)
+        ran = ", ".join(f"{key} {value}" for key, value in ran_with(self.info).items())
         without = f"Not scored: {self.not_scored}.\nWithout a model" if self.not_scored else "Without truth"
         title = f"{without}: how well the run agrees with what the camera saw (- where nothing was kept to tell)"
         return "\n".join([title, tables.as_text(self.as_frame()), *self.look_at(), *legend, SCALE, *hz, ran])

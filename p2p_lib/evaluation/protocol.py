@@ -43,6 +43,14 @@ NOT_TOLD = ("clicks", "first")
 WHAT_RAN = ("tracker", "masks", "segmenter", "preset", "seed")
 
 
+def ran_with(info: Mapping[str, Any]) -> dict[str, Any]:
+    """What a score says of the run that ``info`` is of; of one without any click, its masks are of memories."""
+    from_memory = (
+        (info.get("options") or {}).get("memory") and info.get("masks") == "clicks" and not info.get("prompts")
+    )
+    return {key: info.get(key) for key in WHAT_RAN} | ({"masks": "memory"} if from_memory else {})
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectScore:
     """One object's errors over its m scored frames, and their summary in percent.
@@ -92,7 +100,7 @@ class Evaluation:
         """Plain values, as ``p2p eval --json`` prints them: areas in percent, the mean is over objects."""
         objects = {name: score.as_dict() for name, score in self.objects.items()}
         mean = {key: float(np.mean([o[key] for o in objects.values()])) for key in HEADS}
-        what_ran = {key: self.info.get(key) for key in WHAT_RAN}
+        what_ran = ran_with(self.info)
         return {"objects": objects, "mean": mean, "hz": self.hz, "p95_ms": self.p95_ms, **what_ran, "align": self.align}
 
     def as_frame(self) -> DataFrame:
@@ -115,7 +123,7 @@ class Evaluation:
         lines += [f"{name}: not scored, {reason}" for name, reason in self.left_out.items()]
         if self.hz is not None:
             lines.append(f"{self.hz:.1f} Hz, 95 % of the frames within {self.p95_ms:.1f} ms")
-        ran = ", ".join(f"{key} {self.info.get(key)}" for key in WHAT_RAN)
+        ran = ", ".join(f"{key} {value}" for key, value in ran_with(self.info).items())
         return "\n".join(["AUC over 0 to 0.1 m, exact and in the VOC form", *lines, f"{ran}, aligned by {self.align}"])
 
 

@@ -8,6 +8,7 @@ import inspect
 import json
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -17,12 +18,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData, did_you_mean
 from p2p_lib.core.files import check_new
 from p2p_lib.core.paths import cache_dir
+from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.bop import write_models, write_scene
 from p2p_lib.datasets.sequence import SYNTHETIC, open_sequence
 from p2p_lib.datasets.ycbmultitrack import write_truth
@@ -47,11 +48,12 @@ _PER_OBJECT = ("masks", "models")
 _DONE = "scenario.json"
 
 
-def scenario_dir(name: str, seed: int = 0, **overrides: object) -> Path:
+def scenario_dir(name: str, seed: int = 0, *, progress: bool = True, **overrides: object) -> Path:
     """The folder of a synthetic sequence in the YCBMultiTrack layout, rendered first if the cache lacks it.
 
     ``overrides`` are the scenario's own parameters (``contrast``, ``frames``) or fields of
-    :class:`~p2p_lib.synthetic.noise.Sensor`. Raises :class:`BadInput` for an unknown name or parameter.
+    :class:`~p2p_lib.synthetic.noise.Sensor`. With ``progress`` a terminal shows how far rendering is. Raises
+    :class:`BadInput` for an unknown name or parameter.
     """
     own, sensor = _settings(name, seed, overrides)
     settings = {"name": name, "seed": int(seed), **own, "sensor": asdict(sensor), "generator": generator_version()}
@@ -62,13 +64,16 @@ def scenario_dir(name: str, seed: int = 0, **overrides: object) -> Path:
     with _alone(folder) as unfinished:
         if not (folder / _DONE).is_file():
             shutil.rmtree(folder, ignore_errors=True)
-            write_scenario(unfinished, SCENARIOS[name](seed, **own), sensor, seed, f"rendering synthetic/{name}")
+            how = {"title": f"rendering synthetic/{name}", "progress": progress and sys.stderr.isatty()}
+            write_scenario(unfinished, SCENARIOS[name](seed, **own), sensor, seed, **how)
             (unfinished / _DONE).write_text(json.dumps(settings, indent=1, sort_keys=True))
             os.rename(unfinished, folder)
     return folder
 
 
-def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, title: str = "rendering") -> None:
+def write_scenario(
+    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, title: str = "rendering", progress: bool = False
+) -> None:
     """Renders a scenario into ``folder``, which is made: colour, depth, and the truth per labelled body."""
     labelled = {k: body for k, body in enumerate(scenario.bodies, 1) if body.labelled}
     for name in ("rgb", "depth", *(f"{kind}/{body.name}" for kind in _PER_OBJECT for body in labelled.values())):
@@ -78,9 +83,7 @@ def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, 
     with ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0)))) as pool:
         frames = kept_frames(scenario.frames, sensor, np.random.default_rng([seed, 5]))
         done = pool.map(work, frames.tolist())
-        # On a terminal only, and only when it takes longer than a moment.
-        shown = {"unit": "frame", "delay": 2.0, "leave": False, "disable": None}
-        visible = list(tqdm(done, title, len(frames), **shown))
+        visible = list(progress_bar(title, len(frames), shown=progress, iterable=done, leave=False))
     np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
     np.savetxt(folder / "times.txt", frames / scenario.fps, fmt="%.6f")
     for k, body in labelled.items():
@@ -97,7 +100,13 @@ def write_scenario(folder: Path, scenario: Scenario, sensor: Sensor, seed: int, 
 
 
 def write_sequence(
-    name: str, out: str | Path, seed: int = 0, noise: str = "realsense", models: str | Path = "", bop: bool = False
+    name: str,
+    out: str | Path,
+    seed: int = 0,
+    noise: str = "realsense",
+    models: str | Path = "",
+    bop: bool = False,
+    progress: bool = False,
 ) -> Path:
     """What ``p2p synth`` does: a scenario as a YCBMultiTrack folder ``out``, which must not hold anything yet.
 
@@ -113,7 +122,7 @@ def write_sequence(
         raise BadInput("noise", repr(noise), "one of " + ", ".join(NOISE))
     check_new(out)
     scenario = SCENARIOS[name](seed, **own)
-    write_scenario(out, scenario, NOISE[noise], seed, f"rendering {name}")
+    write_scenario(out, scenario, NOISE[noise], seed, f"rendering {name}", progress)
     made = {"name": name, "seed": seed, "noise": noise, "sensor": asdict(NOISE[noise]), "objects": scenario.objects}
     (out / _DONE).write_text(json.dumps(made | {"generator": generator_version()}, indent=1, sort_keys=True) + "\n")
     if bop:

@@ -1,5 +1,5 @@
 // Runs the script of the click page without a browser: node click_probe.js PAGE, on standard input
-// {"session": what the server says, "steps": [["frame", i] | ["press", x, y, shift, x to, y to] | ["zoom", x, y] |
+// {"session": what the server says, "again": what it does not take, "steps": [["frame", i] | ["press", x, y, shift, x to, y to] | ["zoom", x, y] |
 // ["tool", paint or erase, radius] | ["stroke", [x, y], ...] | ["row" | "clear" | "remove", k] | ["rename", k, name] | ["undo" | "save" | "finish"]]}.
 // Prints what Save sends, and what was asked for masks. Only what the page asks of a browser is here.
 const fs = require("fs");
@@ -35,7 +35,7 @@ global.fetch = async (where, what) => {
     return { ok: true, json: async () => ({ masks, doubts: ["is it a table?"] }) };
   }
   sent = content;
-  return { ok: true, json: async () => ({ saved: "file" }) };
+  return { ok: true, json: async () => ({ saved: "file", again: given.again ?? "" }) };
 };
 const at = (x, y, shift) => (
   { clientX: 10 + 2 * x + 1, clientY: 20 + 2 * y + 1, shiftKey: shift, pointerId: 1, button: 0, preventDefault() {} }

@@ -28,9 +28,12 @@ from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.run import summary
 from tests.fixtures.sliding_board import DEPTH_M, H, K, W, write_sequence
+from tests.fixtures.terminal import left_on_it, shown_on_a_terminal
 
 FRAMES = 8
 #: Points alone: the rest of the method is tested elsewhere, and torch takes seconds to import.
+#: What a run waits for before its first frame, as it says.
+WAITS = ["Loading libraries", "Reading the sequence", "Loading compiled loops", "First masks"]
 POINTS_ALONE = ["--set", "method.surface=false", "--set", "method.graph=false", "--quiet"]
 
 
@@ -164,8 +167,19 @@ def test_progress_goes_where_it_does_not_disturb(sequence, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert f"{FRAMES}/{FRAMES}" in err and "object tracked" in err
     assert "frame/s" not in out and "\r" not in out
-    first, _ = err.splitlines()  # a terminal's bar would fill a log file
+    *waits, first, _ = err.splitlines()  # a terminal's bar would fill a log file
+    assert waits == [f"{what} ..." for what in WAITS]
     assert first == f"First masks of object in frame 0: {tmp_path / 'out' / 'first_masks.png'}" and "\r" not in err
+
+
+def test_on_a_terminal_what_is_waited_for_is_one_line_that_goes_away(sequence, tmp_path):
+    loud = [word for word in POINTS_ALONE if word != "--quiet"]
+    words = ["-m", "p2p_lib.apps.cli", "run", str(sequence), "--stop", "3", "--out"]
+    shown = shown_on_a_terminal(*words, str(tmp_path / "out"), *loud)
+    assert sorted(WAITS, key=shown.index) == WAITS and shown.startswith("\rLoading libraries ...")
+    masks, bar, end = left_on_it(shown)
+    assert masks.startswith("First masks of object") and "3/3" in bar and end == ""
+    assert shown_on_a_terminal(*words, str(tmp_path / "quiet"), *POINTS_ALONE) == ""
 
 
 def test_replacing_a_run_is_said(sequence, tmp_path, capsys):
@@ -531,8 +545,12 @@ def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys
 
 def test_a_scenario_is_known_by_the_name_that_run_takes(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr("p2p_lib.synthetic.write_sequence", lambda name, out, *more: made.append(name) or out)
-    assert cli.main(["synth", "synthetic/crossing", "--out", str(tmp_path)]) == 0 and made == ["crossing"]
+    monkeypatch.setattr(
+        "p2p_lib.synthetic.write_sequence", lambda name, out, *more: made.append((name, more[-1])) or out
+    )
+    for more in ([], ["--quiet"]):
+        assert cli.main(["synth", "synthetic/crossing", "--out", str(tmp_path), *more]) == 0
+    assert made == [("crossing", True), ("crossing", False)], "what it is, and whether progress is shown"
 
 
 def test_the_list_of_scenarios_has_no_markup(capsys):
@@ -746,8 +764,16 @@ def test_words_that_are_no_command_point_to_the_help(words, says, capsys):
     assert "See p2p" in err and err.rstrip().endswith("--help")
 
 
+@pytest.mark.parametrize("words", [["run", "nowhere", "--out", "x"], ["live", "--camera", "nowhere:Camera"]])
+def test_a_device_that_is_not_there_is_said_before_anything_is_waited_for(words, capsys, monkeypatch):
+    torch = pytest.importorskip("torch")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert cli.main([*words, "--device", "cuda", *["--quiet"] * (words[0] == "run")]) == 2
+    assert "device cuda: PyTorch finds no CUDA device here" in one_line(capsys, words[0])
+
+
 def test_debug_shows_where_it_went_wrong(sequence, tmp_path, capsys):
-    words = ["run", str(sequence), "--out", str(tmp_path / "out"), "--tracker", "nope"]
+    words = ["run", str(sequence), "--out", str(tmp_path / "out"), "--tracker", "nope", "--quiet"]
     assert cli.main([*words, "--debug"]) == 2
     err = capsys.readouterr().err
     assert err.startswith("Traceback") and "make_tracker" in err and "tracker: got 'nope'" in err
@@ -1073,8 +1099,9 @@ def test_signals(how, code, long, tmp_path):
 def test_as_a_process(tmp_path):
     process = p2p("run", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
     out, err = process.communicate(timeout=60)
-    assert (process.returncode, out) == (2, "") and err.count("\n") == 1
-    assert "nowhere: no such folder" in err and not (tmp_path / "out").exists()
+    *waits, said = err.splitlines()
+    assert (process.returncode, out, waits) == (2, "", [f"{what} ..." for what in WAITS[:2]])
+    assert "nowhere: no such folder" in said and not (tmp_path / "out").exists()
 
 
 # --- help --------------------------------------------------------------------------------------

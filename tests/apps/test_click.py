@@ -1,5 +1,6 @@
 """The page that collects clicks, through HTTP as a browser would use it, and the file of prompts it writes."""
 
+import html
 import http.client
 import json
 import re
@@ -91,7 +92,7 @@ def test_a_whole_visit(sequence, out):
         assert not clicker.wait(0) and not out.exists()
         assert post(clicker.url, {"objects": [one()]})[0] == 200 and out.exists() and not clicker.wait(0), "it goes on"
         status, answer = post(clicker.url, {"objects": [one(), one("bowl", 2, [(60, 40)])], "finish": True})
-        assert (status, answer) == (200, {"saved": str(out)}) and clicker.wait(0)
+        assert (status, answer) == (200, {"saved": str(out), "again": ""}) and clicker.wait(0)
         assert [p.name for p in clicker.prompts] == ["cup", "bowl"]
     cup, bowl = load_prompts(out)
     assert (cup.name, cup.frame, bowl.name, bowl.frame) == ("cup", 0, "bowl", 2)
@@ -217,15 +218,53 @@ def test_the_page_needs_nothing_from_elsewhere():
     assert "http" not in text.replace("http-equiv", "") and 'src="' not in text
 
 
-def visit(session: dict, *steps: list) -> dict:
+def visit(session: dict, *steps: list, again: str = "") -> dict:
     """What the page's own script makes of these steps of a user; nothing is known without node, which runs it."""
     if shutil.which("node") is None:
         pytest.skip("no node to run the page's script (Debian: apt-get install nodejs)")
-    given = json.dumps({"session": session, "steps": steps})
+    given = json.dumps({"session": session, "steps": steps, "again": again})
     probe = Path(__file__).with_name("click_probe.js")
     done = subprocess.run(["node", str(probe), str(PAGE)], input=given, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
+
+
+#: Instead of the server, and what it tells of the page in a window: what reaches beyond it, or another thing's place.
+LONG = """<script>const told = (where) => where === "session" ? SESSION : ANSWER;
+window.fetch = async (where) => ({ ok: true, json: async () => told(where) });
+setTimeout(() => $("save").onclick(), 500);
+setTimeout(() => {
+  const rows = [...$("objects").children], box = (of) => of.getBoundingClientRect(), wide = document.documentElement;
+  const found = { wide: wide.scrollWidth > wide.clientWidth, message: $("message").textContent };
+  found.rows = rows.map((row) => ({
+    text: row.children[1].textContent,
+    inside: [...row.children].every((part) => box(part).right <= box(row).right + 1 && box(part).width > 0),
+    cut: row.children[1].scrollWidth > row.children[1].clientWidth + 1,
+    beyond: $("message").scrollWidth > $("message").clientWidth + 1,
+  }));
+  document.body.insertAdjacentHTML("beforeend", "<pre id=probe>" + JSON.stringify(found) + "</pre>");
+}, 1500);
+</script>"""
+
+
+def test_long_names_fit_on_the_page(sequence, out, tmp_path, browser):
+    """Of objects, of the sequence and of the file, with and without places where they may be broken."""
+    names = ["a_very_long_name_of_an_object" * 3, "words of a name " * 6 + "end", "cup"]
+    save_prompts(out, [Prompt(name, 0, [[40, 30 + k]]) for k, name in enumerate(names)])
+    with Clicker(sequence, out) as clicker:
+        session = clicker.session() | {"sequence": "one_folder_below_another_" * 8}
+    given = {"SESSION": session, "ANSWER": {"masks": {}, "doubts": [], "saved": "/a_folder_below_another" * 8}}
+    script = LONG
+    for word, value in given.items():
+        script = script.replace(word, json.dumps(value))
+    page = tmp_path / "page.html"
+    page.write_text(PAGE.read_text().replace("<script>", script + "<script>", 1))
+    for width in (1200, 420):
+        shown = browser.dom(page, 4000, f"--window-size={width},900")
+        seen = json.loads(html.unescape(re.search(r"<pre id=.probe.>(.*?)</pre>", shown, re.DOTALL)[1]))
+        assert [row["text"] for row in seen["rows"]] == [*(f"{name}: frame 0" for name in names), "object"]
+        assert seen["message"].startswith("Saved to /a_folder") and not seen["wide"], width
+        assert all(row["inside"] and not row["cut"] and not row["beyond"] for row in seen["rows"]), (width, seen)
 
 
 def test_the_page_makes_prompts_of_clicks_boxes_and_later_frames(sequence, out):

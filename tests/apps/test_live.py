@@ -34,7 +34,7 @@ from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
 from p2p_lib.datasets import run_writer
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.keypoint_log import load_keypoints
-from p2p_lib.datasets.prompts import save_prompts
+from p2p_lib.datasets.prompts import run_lengths, save_prompts
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.consistency import consistency
@@ -578,6 +578,68 @@ def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
     assert [(p["frame"], p.get("negative")) for p in prompts] == [(2, None), (5, [[5, 5]])]
 
 
+class Told(list):
+    """In the place of a tracker: the prompts that it is told."""
+
+    def tell(self, prompt):
+        self.append(prompt)
+
+
+def test_clicks_are_of_the_image_that_is_shown(folder):
+    """Seconds later: the mask that was shown starts the object where nothing moved, and nothing where something has."""
+    sequence, told = open_sequence(folder), Told()
+    words = Words(None, print)
+    first, same, later = (sequence.frame(k) for k in (0, 0, 6))
+    same = Frame(3, 0.1, same.rgb, same.depth_m)
+    with LiveClicker(Scripted(sequence.camera), words) as page:
+        page.see(first, {})
+        page.session()
+        click = {"objects": [{"name": "board", "frame": 0, "points": [[64, 52], [50, 60]]}]}
+        shown = page.masks(click | {"frame": 0})["masks"]["board"]
+        page.see(same, {})
+        assert page.save(click) == ""
+        assert [prompt.frame for prompt in words.tell(told, 4)] == [4]
+        assert run_lengths(told[0].mask)["counts"] == shown
+        page.see(later, {})
+        assert page.save(click) == "The image has moved on at board: click again."
+        page.session()
+        with pytest.raises(BadInput, match="frame 6, the one that is shown"):
+            page.save(click)
+        assert page.save({"objects": [{"name": "board", "frame": 6, "points": [[76, 58]]}]}) == ""
+        assert len(words.tell(told, 7)) == 1
+
+
+def test_a_correction_is_of_the_image_that_is_shown(folder):
+    """Of each object by itself: what stands is told as it was clicked, what has moved is not."""
+    sequence, told = open_sequence(folder), Told()
+    first, later = sequence.frame(0), sequence.frame(6)
+    words, known = Words(None, print), {"board": None, "wall": None}
+    with LiveClicker(Scripted(sequence.camera), words) as page:
+        page.see(first, known)
+        page.session()
+        page.see(Frame(9, 0.3, later.rgb, later.depth_m), known)
+        said = [
+            {"name": "board", "frame": 0, "negative": [[64, 52]]},
+            {"name": "wall", "frame": 0, "negative": [[5, 5]]},
+        ]
+        assert page.save({"objects": said}) == "The image has moved on at board: click again."
+        words.tell(told, 10)
+        assert [(prompt.name, prompt.negative_px.tolist()) for prompt in told] == [("wall", [[5, 5]])]
+        page.session()
+        box = {"name": "board", "frame": 9, "box": [30, 20, 130, 110]}
+        assert page.save({"objects": [box]}) == "" and words.tell(told, 11)[0].box_px is not None
+
+
+def test_clicks_that_select_nothing_are_refused_on_the_page(folder, monkeypatch):
+    with LiveClicker(Scripted(open_sequence(folder).camera), Words(None, print)) as page:
+        page.see(open_sequence(folder).frame(0), {})
+        page.session()
+        nothing = {"board": np.zeros((H, W), bool)}
+        monkeypatch.setattr(page, "made", lambda prompts: (nothing, []))
+        with pytest.raises(BadInput, match="nothing found there"):
+            page.save({"objects": [{"name": "board", "frame": 0, "points": [[64, 52]]}]})
+
+
 def test_the_live_page_sends_clicks_and_forgets_them(scripted):
     page = LiveClicker(scripted, Words(None, print))
     with page:
@@ -586,6 +648,8 @@ def test_the_live_page_sends_clicks_and_forgets_them(scripted):
     seen = visit(session, ["add", "cup"], ["press", 50, 20], ["wait"], ["save"])
     assert seen["sent"] == {"objects": [{"name": "cup", "frame": 7, "points": [[50, 20]]}], "finish": False}
     assert (seen["message"], seen["rows"]) == ("Sent.", ["board", "cup: frame 7"]), "it stood meanwhile"
+    seen = visit(session, ["add", "cup"], ["press", 50, 20], ["save"], ["wait"], again="Click again.")
+    assert (seen["message"], seen["rows"]) == ("Click again.", ["board"]), "the newest image, without what was clicked"
     seen = visit(session, ["add", "cup"], ["press", 50, 20], ["save"], ["wait"], ["wait"], ["remove", 0])
     assert (seen["sent"], seen["rows"]) == ({"remove": "board"}, ["board"]), "what is tracked"
 

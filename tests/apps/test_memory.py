@@ -21,7 +21,7 @@ def learnt(tmp_path_factory):
     return out
 
 
-def test_each_object_is_kept_and_all_are_found_without_masks(learnt, tmp_path):
+def test_each_object_is_kept_and_all_are_found_without_masks(learnt, tmp_path, capsys):
     box, can = (learnt / "maps" / f"{name}.npz" for name in ("box", "can"))
     assert (
         load_memory(box).made_of["sequence"] == "synthetic/crossing" and box.stat().st_size + can.stat().st_size < 4e6
@@ -34,6 +34,10 @@ def test_each_object_is_kept_and_all_are_found_without_masks(learnt, tmp_path):
         T_obj_model = np.linalg.inv(before.objects[name].T_cam_obj[0]) @ before.objects[name].T_cam_model[0]
         off_m = (obj.T_cam_obj[3:] @ T_obj_model - obj.T_cam_model[3:])[:, :3, 3]
         assert np.linalg.norm(off_m, axis=1).max() < 0.01
+    assert main(["eval", str(tmp_path / "again"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["masks"] == "memory"
+    assert main(["eval", str(tmp_path / "again")]) == 0 and "masks memory" in capsys.readouterr().out
+    assert run.info["masks"] == "clicks", "which are all that an earlier version could resume"
 
 
 def test_before_a_camera_it_is_found_without_a_click(learnt, tmp_path, capsys):

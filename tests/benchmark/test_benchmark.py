@@ -276,6 +276,22 @@ def test_a_run_that_is_killed_leaves_no_semaphore(tmp_path):
     assert (ran.returncode, ran.stderr) == (0, "") and (tmp_path / "held").exists()
 
 
+def test_sigterm_ends_the_command_itself_and_nothing_is_left(plan, tmp_path):
+    """The real thing: a run is done, another one under way in a process of its own, and six are to come."""
+    words = ["benchmark", str(plan), "--out", str(tmp_path), "--jobs", "1"]
+    command = [sys.executable, "-m", "p2p_lib.apps.cli", *words]
+    ran = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 300
+    while not (list(tmp_path.glob("records/*.json")) and list(tmp_path.glob("runs/.*"))):
+        assert ran.poll() is None and time.monotonic() < deadline, ran.communicate()
+        time.sleep(0.01)
+    ran.send_signal(signal.SIGTERM)
+    out, err = ran.communicate(timeout=120)  # the end of its output is that of all its processes
+    assert ran.returncode == 128 + signal.SIGTERM and err.splitlines()[-1] == "p2p benchmark: interrupted", err
+    assert "semaphore" not in err and "Traceback" not in err
+    assert 1 <= len(list(tmp_path.glob("records/*.json"))) < 8 and " 0 failed, " in out
+
+
 def test_an_interrupted_plan_replaces_no_table_that_was_made(plan, tmp_path, monkeypatch, capsys):
     def interrupted(*_, **__):
         raise KeyboardInterrupt

@@ -263,7 +263,7 @@ def test_synthetic_sequences_open_by_name_with_their_seed(ycbmultitrack, monkeyp
     import p2p_lib.synthetic as synthetic
 
     monkeypatch.setattr(
-        synthetic, "scenario_dir", lambda name, seed: asked.append((name, seed)) or ycbmultitrack, raising=False
+        synthetic, "scenario_dir", lambda name, seed, **_: asked.append((name, seed)) or ycbmultitrack, raising=False
     )
     s = open_sequence("synthetic/crossing", seed=7)
     assert (s.name, s.format, asked) == ("synthetic/crossing", "ycbmultitrack", [("crossing", 7)])
@@ -281,7 +281,7 @@ def test_the_seed_of_a_run_is_no_seed_of_its_scene(ycbmultitrack, monkeypatch, t
     asked = []
     import p2p_lib.synthetic as synthetic
 
-    monkeypatch.setattr(synthetic, "scenario_dir", lambda name, seed: asked.append(seed) or ycbmultitrack)
+    monkeypatch.setattr(synthetic, "scenario_dir", lambda name, seed, **_: asked.append(seed) or ycbmultitrack)
     options = {"settings": {"method.surface": False, "method.graph": False}, "stop": 1, "progress": False}
     for sequence, name in (("synthetic/crossing", "0"), ("synthetic/crossing@3", "3")):
         info = load_run(run(sequence, tmp_path / name, seed=5, **options).path).info
