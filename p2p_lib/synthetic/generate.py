@@ -64,8 +64,8 @@ def scenario_dir(name: str, seed: int = 0, *, progress: bool = True, **overrides
     with _alone(folder) as unfinished:
         if not (folder / _DONE).is_file():
             shutil.rmtree(folder, ignore_errors=True)
-            how = {"title": f"rendering synthetic/{name}", "progress": progress and sys.stderr.isatty()}
-            write_scenario(unfinished, SCENARIOS[name](seed, **own), sensor, seed, **how)
+            title, shown = f"rendering synthetic/{name}", progress and sys.stderr.isatty()
+            write_scenario(unfinished, SCENARIOS[name](seed, **own), sensor, seed, title, shown)
             (unfinished / _DONE).write_text(json.dumps(settings, indent=1, sort_keys=True))
             os.rename(unfinished, folder)
     return folder
