@@ -177,8 +177,8 @@ def test_synthetic_sequences_are_rendered_and_played_as_a_camera(folder, monkeyp
         ("convert recording.mkv --out converted", "open3d"),
         ("export run --format model --out models", "open3d"),
         ("export run --format foundationpose --out demo", "open3d"),
-        ("run synthetic/crossing --stop 2 --device cuda --out cuda", "torch"),
-        ("run synthetic/crossing --stop 2 --masks sam2 --out sam2", "sam2"),
+        ("run synthetic/crossing --stop 2 --device cuda --out cuda --quiet", "torch"),
+        ("run synthetic/crossing --stop 2 --masks sam2 --out sam2 --quiet", "sam2"),
         ("benchmark trackers --quick --scheduler tcp://127.0.0.1:1 --out b --quiet", "dask"),
     ],
 )
