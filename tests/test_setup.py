@@ -261,6 +261,12 @@ def test_a_release_is_what_its_tag_says(tool, tmp_path):
     log.write_text(re.sub(rf"## {version} \(.*\)", f"## {version} (2026-01-31)", log.read_text()))
     assert list(release.problems(tmp_path, f"v{version}")) == []
     assert list(release.problems(tmp_path, "v9.9.9")) == [f"tag v9.9.9: expected v{version}"]
+    (tmp_path / "figures/tables").mkdir(parents=True)
+    (tmp_path / "figures/tables/runtime.json").write_text('{"earlier": true}')
+    assert list(release.problems(tmp_path, "")) == []
+    (old,) = release.problems(tmp_path, f"v{version}")
+    assert old.startswith("figures/tables/runtime.json: of earlier code")
+    (tmp_path / "figures/tables/runtime.json").write_text('{"code": "a"}')
     log.write_text(log.read_text().replace("(2026-01-31)", "(unreleased)"))
     (tmp_path / "CITATION.cff").write_text("version: 9.9.9\n")
     assert [line.split(":")[0] for line in release.problems(tmp_path, f"v{version}")] == [

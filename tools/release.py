@@ -1,8 +1,10 @@
 """Makes what a release consists of, and tries it: ``make release`` fills out/release. Nothing is published.
 
-A commit with a tag has to be what the tag says: ``v1.2.3`` for version 1.2.3, with a dated section of CHANGELOG.md.
+A commit with a tag has to be what the tag says: ``v1.2.3`` for version 1.2.3, with a dated section of CHANGELOG.md, and
+tables and figures of its own code.
 """
 
+import json
 import os
 import re
 import shutil
@@ -38,6 +40,9 @@ def problems(root, tag):
         yield f"CHANGELOG.md: section {version} is of '{section[1]}', expected a date as 2026-01-31"
     if tag and tag != f"v{version}":
         yield f"tag {tag}: expected v{version}"
+    for note in sorted((root / "figures").glob("**/*.json")) if tag else ():
+        if json.loads(note.read_text()).get("earlier"):
+            yield f"{note.relative_to(root)}: of earlier code or an earlier plan; p2p benchmark --stale --out DIR"
 
 
 def tag_of(root):
