@@ -40,13 +40,13 @@ CASES: tuple[tuple[str, ...], ...] = (
     ("synthetic/weak_texture", "--preset", "paper", "--tracker", "lk", "--stop", "120"),
     ("synthetic/crossing", "--tracker", "oracle", "--stop", "120"),
     ("redkitchen_table", "--masks", "clicks"),
-    ("desk_fast", "--masks", "clicks"),
+    ("desk_fast", "--prompts", "p2p_lib/benchmark/prompts/desk_fast.json"),
     ("YCBInEOAT/mustard0", "--masks", "first", "--stop", "150"),
 )
 ARRAYS = ("poses.npz", "keypoints.npz", "masks.npz")
 #: Of the library that is imported: prints its digest; is its command line.
 _DIGEST = "from p2p_lib.datasets.provenance import code_digest; print(code_digest())"
-_P2P = "import sys; from p2p_lib.apps.command_line import main; sys.exit(main())"
+_P2P = "import sys; from p2p_lib.apps.cli import main; sys.exit(main())"
 
 
 def of_commit(commit: str, folder: Path) -> Path:
