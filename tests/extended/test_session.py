@@ -9,18 +9,15 @@ import pytest
 from p2p_lib import open_sequence
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.memory import ObjectMemory, SurfaceMemory
 from p2p_lib.core.types import NOT_FOUND, Status, status_text, status_word
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.method import pipeline
 from p2p_lib.segmenters.anchored import builtin
+from tests.fixtures.made_memory import made_memory
 from tests.method.test_pipeline import CAMERA, HIDDEN, assert_same, film, quick, track
 
 FEW = 8
-_VOXELS = [np.arange(8, dtype=np.int32), *(np.ones((8, *of), np.float16) for of in ((), (), (3,), ()))]
-_SURFACE = SurfaceMemory(np.array(0.01), np.array(0.03), np.zeros(3), np.zeros(3, int), np.array([2, 2, 2]), *_VOXELS)
-_LANDMARK = np.zeros((1, 3)), np.zeros((1, 1, 1), np.uint8), np.ones(1)
-MEMORY = ObjectMemory("mug", *_LANDMARK, np.eye(4)[None], np.eye(6), np.array(0.01), _SURFACE)
+MEMORY = made_memory("mug")
 
 
 def followed(method: Point2Pose, frames) -> list:

@@ -16,7 +16,7 @@ def test_the_course_is_the_notebooks_in_their_order():
 
 
 def test_the_readme_says_the_same_of_each():
-    rows = re.findall(r"(?m)^\| `(\d\d_\w+)` \| (.*) \|$", (PROJECT / "README.md").read_text())
+    rows = re.findall(r"(?m)^\| \[`(\d\d_\w+)`\]\(\S+\) \| (.*) \|$", (PROJECT / "README.md").read_text())
     assert rows == [(one.name, one.shows) for one in LESSONS]
 
 
