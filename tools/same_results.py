@@ -51,7 +51,9 @@ _P2P = "import sys; from p2p_lib.apps.cli import main; sys.exit(main())"
 
 def of_commit(commit: str, folder: Path) -> Path:
     """The library of a commit, below ``folder``."""
-    packed = subprocess.run(["git", "-C", str(ROOT), "archive", commit, "p2p_lib"], check=True, capture_output=True)
+    packed = subprocess.run(
+        ["git", "-C", str(ROOT), "archive", commit, "p2p_lib", "data_manifests"], check=True, capture_output=True
+    )
     with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
         archive.extractall(folder, filter="data")
     return folder
