@@ -201,6 +201,7 @@ _ROWS = (
            _BUNDLED),
     _table("", "the same, scored from the first visible pixel on", "long_range_every_pixel", "-", "-", _BUNDLED),
     _table("-", "README's first tables", "readme", "-", "-", f"{_AND_MUSTARD}, 7-Scenes, TUM RGB-D"),
+    _table("-", "hard scenes, from three clicks", "hard_scenes", "-", "-", _BUNDLED),
     _table("-", "2D point trackers, and what of the built-in one is 2D alone", "trackers", "01", "-", _AND_MUSTARD),
     _table("-", "whose method: the paper's text and ours, by 2D tracker", "presets", "09", "-",
            f"{_AND_MUSTARD}, 7-Scenes"),
