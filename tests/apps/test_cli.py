@@ -701,6 +701,10 @@ BAD_WORDS = {
         ["export", "{done}", "--format", "tum", "--out", "{out}", "--min-confidence", "-0.1"],
         ["min_confidence", "-0.1"],
     ),
+    "labels of too much": (
+        ["export", "{done}", "--format", "bop-dataset", "--out", "{out}", "--min-confidence", "1"],
+        ["min_confidence", "got 1", "below 1"],
+    ),
     "no run": (["eval", "{seq}"], ["slide", "no run there", "p2p run SEQ --out"]),
     "eval nowhere": (["eval", "{seq}/none", "--json"], ["none", "no run there"]),
     "eval unknown model": (["eval", "{done}", "--models", "mug={seq}"], ["'mug'", "object"]),

@@ -70,6 +70,16 @@ def test_what_too_little_was_learnt_of_is_said_at_the_end(tmp_path, capsys):
     assert "No object was learnt well enough" in capsys.readouterr().err
 
 
+def test_so_it_is_before_a_camera(tmp_path, capsys):
+    clicks = {"objects": [{"name": "box", "frame": 0, "points": [[170, 245], [190, 220], [150, 270]]}]}
+    (tmp_path / "clicks.json").write_text(json.dumps(clicks))
+    words = ["--prompts", str(tmp_path / "clicks.json"), "--stop", "2", "--set", "method.surface=false"]
+    camera = ["live", "--camera", "folder:synthetic/crossing", "--rate", "5", "--backlog", "20"]
+    assert main([*camera, *words, "--out", str(tmp_path / "out")]) == 0
+    line = "box: no map was kept, by which --memory would find it: no surface"
+    assert line in capsys.readouterr().err.splitlines()
+
+
 def test_one_that_is_not_there_is_no_fault_of_the_data(learnt, tmp_path, capsys):
     """Everything is behind the board. That the sequence has truth, of others, is said as well."""
     save_memory(tmp_path / "cup.npz", replace(load_memory(learnt / "maps/box.npz"), name="cup"))
