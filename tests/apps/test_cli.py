@@ -565,7 +565,7 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     assert "$P2P_DATA is not set" in first and "--quick" in first and "nothing ran" in last
     assert cli.main(["benchmark", "--list"]) == 0
     first, *table = capsys.readouterr().out.splitlines()
-    assert any(re.match(r"\d+ of 19 plans can run here and now in full; \d+ of \d+ methods", line) for line in table)
+    assert any(re.match(r"\d+ of 20 plans can run here and now in full; \d+ of \d+ methods", line) for line in table)
     assert any(re.match(r"ycbineoat +0 of 63 +YCBInEOAT$", line) for line in table)
     assert any(re.match(r"sampling_embedded +18 of 30 ", line) for line in table)
     assert max(map(len, [first, *table])) <= 100
