@@ -24,7 +24,7 @@ ALONE = {
 }
 #: With what the adapters were last run.
 TRIED = {
-    "transformers": "5.23.0",
+    "transformers": "5.24.0",
     "torchvision": "0.28.0",
     "tapnet": "0.1.0 at c2cbab8 (July 2026)",
     "co-tracker": "3.0 at 82e02e8 (January 2025)",

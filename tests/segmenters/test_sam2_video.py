@@ -269,6 +269,17 @@ def test_a_mask_is_taken_as_it_is_and_the_network_goes_on_from_the_newest(model)
 
 
 @needs_transformers
+def test_it_answers_on_a_gpu_as_on_the_cpu(model, exact_cuda):
+    """Clicks, memory, and a mask that is given later."""
+    labels = []
+    for device in ("cuda", "cpu"):
+        segmenter = sam2_video.Sam2VideoSegmenter(model, CAMERA, device)
+        prompts = {0: [CUP], 3: [Prompt("pen", mask=mask_of(60, 40, 100, 90))]}
+        labels.append([segmenter.segment(frame, prompts.get(k, ())) for k, frame in enumerate(film(6))])
+    assert np.mean(np.array(labels[0]) == np.array(labels[1])) > 0.999
+
+
+@needs_transformers
 def test_the_pipeline_takes_it(model):
     method = Point2Pose(CAMERA, preset(), segmenter=sam2_video.Sam2VideoSegmenter(model, CAMERA))
     frames = film(4)

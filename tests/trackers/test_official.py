@@ -266,6 +266,25 @@ def test_cotracker_queries_are_in_the_frame_answered(cotracker_predictor, frames
         np.testing.assert_array_equal(tracker.track(frame).select(late).uv_px, fresh.track(frame).select(ids).uv_px)
 
 
+# --- on a GPU -----------------------------------------------------------------------------------
+
+
+ON = {
+    "tapir_model": lambda model, device: tapir.TapirTracker(model, device, size_px=256),
+    "tapnext_model": tapnextpp.tracker,
+    "cotracker_predictor": cotracker.tracker,
+}
+
+
+@pytest.mark.parametrize("model", ON)
+def test_it_answers_on_a_gpu_as_on_the_cpu(model, frames, request, exact_cuda):
+    make, network = ON[model], request.getfixturevalue(model)
+    told = {device: followed(make(network, device), frames[:10], later=UV[:2] + 7.0) for device in ("cuda", "cpu")}
+    check_values(told["cuda"], frames[:10])
+    for here, there in zip(told["cuda"], told["cpu"], strict=True):
+        np.testing.assert_allclose(here.astype(float), there.astype(float), atol=0.05)
+
+
 # --- from file to tracker ------------------------------------------------------------------------
 
 
