@@ -23,7 +23,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, status_text
 from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
-from p2p_lib.datasets.alignment import moving_scale
+from p2p_lib.datasets.alignment import misfit, moving_scale
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.models import find_models, given_models
@@ -93,10 +93,11 @@ def run(
     and is reported in the result.
     """
     options = replace(options or RunOptions(), **changes)
-    with waiting_for("Reading the sequence", progress):
+    doubts: list[str] = []
+    with waiting_for("Reading the sequence", progress), noted(doubts):
         job = _prepare(sequence, options, progress)
         sizes_m = lengths_m(options.sizes, job.objects)
-        _doubt_scale(job)
+        _doubt_depth(job)
         tracker = options.tracker
         if tracker == OracleTracker.name:  # which has to know the sequence
             tracker = OracleTracker(TrueScene.of(job.sequence, options.models), job.config.oracle, job.config.seed)
@@ -109,7 +110,7 @@ def run(
         _say_what_was_there(writer, say)
         if not writer.complete:
             prompts = [prompt for of_frame in job.prompts.values() for prompt in of_frame]
-            keeper = Keeper(writer, method, options.save_masks, prompts, sizes_m)
+            keeper = Keeper(writer, method, options.save_masks, prompts, sizes_m, doubts=doubts)
             _track(job, keeper, options.skip_bad, progress, say)
     interrupted = writer.info["stopped_by"] is not None
     if not writer.begun and not writer.earlier:
@@ -248,8 +249,8 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions, pro
     return _Job(source, config, sequence, frames, objects, masks, by_frame, memories)
 
 
-def _doubt_scale(job: _Job) -> None:
-    """Warn, before anything is tracked, where depth is not of one scale."""
+def _doubt_depth(job: _Job) -> None:
+    """Warn, before anything is tracked, where depth is not of one scale, or not registered to colour."""
     looked_at = np.unique(np.linspace(job.frames[0], job.frames[-1] - 1, 8).astype(int)) if len(job.frames) > 1 else ()
     try:
         pairs = [(job.sequence.frame(int(i)), job.sequence.frame(int(i) + 1)) for i in looked_at]
@@ -257,6 +258,8 @@ def _doubt_scale(job: _Job) -> None:
         return  # said when the run comes to that frame, with the poses before it kept
     if text := moving_scale(pairs):
         doubt("depth", text, f"Is each image scaled separately? See p2p check {job.source}")
+    elif pairs and (found := misfit([frame for frame, _ in pairs])) and found.doubt:
+        doubt("depth", *found.doubt)
 
 
 def _frame_range(count: int, start: int, stop: int | None) -> range:

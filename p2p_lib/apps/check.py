@@ -37,10 +37,8 @@ from p2p_lib.method.sampling import choose, usable_region
 
 #: Frames that are looked at, evenly spread.
 FRAMES = 12
-#: Of the image's width: an offset between depth and colour that does not matter, and a principal point off centre.
-OFFSET_SHARE, CENTRE_SHARE = 0.01, 0.1
-#: How much better depth must fit elsewhere to be called not registered: 1.05 at most on good sequences.
-GAIN = 1.2
+#: Of the image's width: a principal point off centre.
+CENTRE_SHARE = 0.1
 #: Ranges in metres of whatever is recorded in front of a depth camera.
 NEAREST_M, FARTHEST_M = 0.05, 20.0
 #: Horizontal and vertical angles of view of any RGB-D camera.
@@ -333,17 +331,13 @@ def _units(median_m: float, scale: float) -> str:
 
 def _registered(frames: list[Frame]) -> Finding:
     """Whether depth was registered to the colour camera."""
-    name, width = "registration", frames[0].shape[1]
-    found = misfit(frames, OFFSET_SHARE * width)
+    name, found = "registration", misfit(frames)
     if found is None:
         return Finding(name, Level.OPTIONAL, "too few edges in depth and colour to tell whether they agree")
-    if found.gain <= GAIN:
+    if found.doubt is None:
         return Finding(name, Level.OK, "edges of depth lie on edges of colour")
-    where = f"shifted by ({round(found.du_px):+d}, {round(found.dv_px):+d}) px"
-    size = f"{found.scale:.2f} times as large and " if abs(found.scale - 1) > 0.03 else ""
-    fix = "Register depth to colour when recording (`align` in the camera's software; p2p convert does for RealSense)."
-    text = f"depth is offset from colour: {size}{where}, its edges would fit {found.gain:.1f} times as well"
-    return Finding(name, Level.WRONG, text, fix)
+    text, fix = found.doubt
+    return Finding(name, Level.WRONG, f"depth is {text}", fix)
 
 
 def _no_masks(sequence: Sequence, drawn: bool, config: Config) -> Finding:

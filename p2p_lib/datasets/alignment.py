@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core.types import Frame
 
-#: Work is done at this width; offsets up to a tenth of it, and sizes, are tried.
+#: Work is done at this width, which images need to have; offsets up to a tenth of it, and sizes, are tried.
 WIDTH_PX = 320
 _REACH_PX = WIDTH_PX // 10
 SCALES = tuple(2.0 ** np.linspace(-0.5, 0.5, 11))
@@ -25,6 +25,10 @@ _STEP_M, _STEP_SHARE = 0.04, 0.03
 _MIN_EDGE_PX = 300
 #: How far a fit must stand out from those elsewhere, in their standard deviations, to be one at all.
 _MIN_CONTRAST = 3.5
+#: Of the image's width: an offset between depth and colour that does not matter.
+_OFFSET_SHARE = 0.01
+#: How much better depth must fit elsewhere to be called not registered: 1.05 at most on good sequences.
+_GAIN = 1.2
 
 #: A mask's outermost pixels are left out: no silhouette is that exact, and sensors blur depth there. Its rim is
 #: compared with what the mask holds within a distance of it.
@@ -48,13 +52,26 @@ class Misfit:
     dv_px: float
     gain: float
 
+    @property
+    def doubt(self) -> tuple[str, str] | None:
+        """What is wrong, in words, and what to do; None where depth is registered to colour."""
+        if self.gain <= _GAIN:
+            return None
+        where = f"shifted by ({round(self.du_px):+d}, {round(self.dv_px):+d}) px"
+        size = f"{self.scale:.2f} times as large and " if abs(self.scale - 1) > 0.03 else ""
+        text = f"offset from colour: {size}{where}, its edges would fit {self.gain:.1f} times as well"
+        how = "`align` in the camera's software; p2p convert does for RealSense"
+        return text, f"Register depth to colour when recording ({how})."
 
-def misfit(frames: Sequence[Frame], tolerance_px: float) -> Misfit | None:
-    """How depth lies on colour over some frames of one size; None where too few edges tell.
 
-    tolerance_px  an offset that still counts as registered: what is compared is the best fit within it
+def misfit(frames: Sequence[Frame]) -> Misfit | None:
+    """How depth lies on colour over some frames of one size; None where too few edges, or too few pixels, tell.
+
+    It is compared with the best fit within an offset that still counts as registered.
     """
-    shrink = min(1.0, WIDTH_PX / frames[0].shape[1])
+    shrink = WIDTH_PX / frames[0].shape[1]
+    if shrink > 1:
+        return None
     colours = [_shrunk(_colour_edges(frame.rgb), shrink) for frame in frames]
     spectra = [np.fft.rfft2(colour - colour.mean()) for colour in colours]
     depths = [_shrunk(_depth_edges(frame.depth_m), shrink) for frame in frames]
@@ -63,7 +80,7 @@ def misfit(frames: Sequence[Frame], tolerance_px: float) -> Misfit | None:
     fits = np.stack([_fit(depths, spectra, scale) for scale in SCALES])
     best = np.unravel_index(fits.argmax(), fits.shape)
     here = SCALES.index(1.0)
-    near = max(1, round(tolerance_px * shrink))
+    near = max(1, round(_OFFSET_SHARE * frames[0].shape[1] * shrink))
     as_is = fits[here, _REACH_PX - near : _REACH_PX + near + 1, _REACH_PX - near : _REACH_PX + near + 1].max()
     spread = fits[best[0]].std()
     if fits[best] - fits[best[0]].mean() <= _MIN_CONTRAST * spread:

@@ -395,7 +395,9 @@ def test_depth_whose_scale_moves_is_doubted_before_anything_is_tracked(sequence,
         cv2.imwrite(str(path), np.rint(depth * (1 + 0.06 * (k % 2))).astype(np.uint16))
     run(sequence, tmp_path / "out", "--stop", "4")
     first = capsys.readouterr().err.splitlines()[0]
-    assert re.match(r"p2p run: depth: all depth changes by [67] % from frame \d to \d\. .* See p2p check", first)
+    said = r"depth: all depth changes by [67] % from frame \d to \d\. .* See p2p check"
+    assert re.match(f"p2p run: {said}", first)
+    assert re.match(said, json.loads((tmp_path / "out/run.json").read_text())["doubts"][0])
 
 
 def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(sequence, tmp_path, capsys):

@@ -76,6 +76,18 @@ def test_clicks_along_something_thin_select_it_and_not_the_table(seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
+def test_clicks_on_tongs_do_not_select_the_table_between_their_arms(seed):
+    """Most of what lies between the clicks is table, and depth, noisy where things are black, tells nothing."""
+    tongs = cv2.line(np.zeros((240, 320), np.uint8), (128, 96), (142, 146), 1, 4)
+    tongs = cv2.line(tongs, (166, 98), (142, 146), 1, 5) > 0
+    frame = on_a_table(tongs, (25, 24, 26), np.ones(tongs.shape), seed)
+    noise_m = np.random.default_rng(seed).normal(0, 0.008, tongs.shape).astype(np.float32)
+    frame = replace(frame, depth_m=frame.depth_m + noise_m * tongs)
+    clicks = Prompt("tongs", points_px=[[129, 100], [142, 143], [163, 104]])
+    assert iou(segmenter().segment(frame, [clicks]) == 1, tongs) > 0.8
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_clicks_close_together_select_all_of_a_cover(seed):
     """Of a printed book, as flat as the table, a fifth lies between the clicks."""
     cover = rectangle(90, 70, 210, 180)

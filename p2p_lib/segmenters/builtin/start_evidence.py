@@ -49,14 +49,18 @@ _UNMEASURED = 0.8
 class Clicked:
     """Where the clicks on an object are, on a patch.
 
+    centres   (h, w) bool, their cells
     seeds     (h, w) bool, squares around them
     hull      (h, w) bool, their convex hull and the seeds
     extents   (h, w) distance from the hull, in extents of the clicks
+    beside    (h, w) bool, what is known to be beside the object, however near to the clicks
     """
 
+    centres: np.ndarray
     seeds: np.ndarray
     hull: np.ndarray
     extents: np.ndarray
+    beside: np.ndarray
 
     @classmethod
     def of(cls, patch: Patch, clicks_px: np.ndarray, z_m: float, scale: float = 1.0) -> Clicked:
@@ -69,17 +73,26 @@ class Clicked:
         least_m = _EXTENT_M if len(clicks_px) > 1 else _LONE_M
         extent = scale * max(float(np.ptp(at, 0).max()), least_m * patch.camera.fx / z_m / patch.cell_px)
         away = cv2.distanceTransform((~hull).astype(np.uint8), cv2.DIST_L2, 5)
-        return cls(seeds, hull, away / extent)
+        return cls(patch.dots(clicks_px, 0), seeds, hull, away / extent, np.zeros(patch.shape, bool))
+
+    def within(self, connected: np.ndarray) -> Clicked:
+        """Without what is not ``connected`` (h, w), if most clicks are: it is most of the hull of something thin."""
+        held = connected > 0
+        if held[self.centres].mean() <= 0.5:
+            return self
+        seeds = self.seeds & held | self.centres
+        return replace(self, seeds=seeds, hull=self.hull & held | seeds, beside=~held)
 
     def prior_beside(self, connected: np.ndarray) -> np.ndarray:
         """(h, w) log-odds by distance from the clicks; never against pixels whose ``connected`` (h, w) is positive."""
-        outside = np.clip(_BESIDE - _PER_EXTENT * self.extents, np.where(connected > 0, 0, _FAR), None)
+        least, most = np.where(connected > 0, 0, _FAR), np.where(self.beside, 0, _BESIDE)
+        outside = np.clip(_BESIDE - _PER_EXTENT * self.extents, least, most)
         return np.where(self.hull, _BETWEEN, outside).astype(np.float32)
 
     @property
     def near(self) -> np.ndarray:
         """(h, w) weight in the object's colours before it is cut out."""
-        return np.exp(-4 * self.extents)
+        return np.where(self.beside, 0, np.exp(-4 * self.extents))
 
     @property
     def beyond(self) -> np.ndarray:
@@ -144,7 +157,9 @@ def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
             log_odds[component] = _CONNECTED
     if height.plane is not None:
         other = (above & measured) | unlike(patch, height.plane)
-        component = components_touching(connected_components(other & (patch.smooth | ~measured)), clicked.seeds)
+        # Depth steps between two things; within what is flat, its noise alone does.
+        whole = other & (patch.smooth | ~measured | height.flat)
+        component = components_touching(connected_components(whole), clicked.seeds)
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
     return log_odds
