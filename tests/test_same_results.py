@@ -29,3 +29,16 @@ def test_tables_of_the_same_code_get_its_digest_and_say_what_was_compared(same, 
     assert json.loads((tmp_path / "tables/old.json").read_text()) == {"code": "x", "commit": "c"}
     note = json.loads((tmp_path / "tables/mine.json").read_text())
     assert note == {"code": "b", "commit": "c", "same_as": [{"code": "a", "runs compared": 12}]}
+
+
+def test_where_runs_from_clicks_differ_tables_without_them_stand(same, tmp_path):
+    notes = {
+        "readme": {"benchmark": "readme"},
+        "faults": {"benchmark": "faults"},
+        "rates": {"file": "runtime.csv"},
+        "of_readme": {"file": "readme.csv"},
+        "drawn": {"run": "2e4bd481b74b"},
+    }
+    for name, source in notes.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps({"code": "a", "sources": [source]}))
+    assert same.restamp(tmp_path, "a", "b", 12, clicks=False) == ["drawn.json", "faults.json", "rates.json"]
