@@ -18,7 +18,7 @@ from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.depth_offset import depth_offset_px, with_depth_moved
 from p2p_lib.segmenters.builtin.patch import Box, Patch, plane_heights, support_plane
-from p2p_lib.segmenters.builtin.start_evidence import Clicked, Height, by_connection, filled, tolerant
+from p2p_lib.segmenters.builtin.start_evidence import Clicked, Height, by_connection, filled, tolerant, unlike
 
 H, W = 60, 80
 CAMERA = Camera(300.0, 300.0, (W - 1) / 2, (H - 1) / 2, W, H)
@@ -102,7 +102,7 @@ def test_height_tells_what_stands_on_a_plane_from_the_plane():
     patch, clicked = block(0.05)
     height = Height.of(patch, clicked)
     assert not height.flat and (height.log_odds[22:38, 32:48] > 0).all() and (height.log_odds[:18] < -1).all()
-    connected = by_connection(patch, clicked, height)
+    connected = by_connection(patch, clicked, height, unlike(patch, height.plane))
     assert (connected[22:38, 32:48] > 0).all() and (connected[:18] < 0).all()
 
 
@@ -115,7 +115,8 @@ def test_what_lies_on_a_table_and_looks_unlike_it_is_one_thing():
     patch = patch_of(np.ones((H, W), np.float32))
     patch = replace(patch, rgb=np.clip(rgb + rng.normal(0, 2, rgb.shape), 0, 255).astype(np.uint8))
     clicked = Clicked.of(patch, np.array([[22.0, 28], [24, 30], [22, 31]]), 1.0)
-    connected = by_connection(patch, clicked, Height.of(patch, clicked))
+    height = Height.of(patch, clicked)
+    connected = by_connection(patch, clicked, height, unlike(patch, height.plane))
     assert (connected[29:31, 21:58] > 0).all()
     assert not (connected[:24] > 0).any() and not (connected[38:] > 0).any() and (connected[35] > 0).mean() < 0.1
 
@@ -124,7 +125,11 @@ def test_what_lies_on_a_table_and_looks_unlike_it_is_one_thing():
 def test_what_is_flat_is_not_told_by_height(height_m):
     patch, clicked = block(height_m)
     height = Height.of(patch, clicked)
-    assert height.flat and not height.log_odds.any() and not by_connection(patch, clicked, height).any()
+    assert (
+        height.flat
+        and not height.log_odds.any()
+        and not by_connection(patch, clicked, height, unlike(patch, height.plane)).any()
+    )
 
 
 def test_where_depth_ends_within_some_pixels_says_nothing():

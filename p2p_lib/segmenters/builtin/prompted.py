@@ -32,6 +32,7 @@ from p2p_lib.segmenters.builtin.start_evidence import (
     by_shares,
     filled,
     tolerant,
+    unlike,
 )
 
 #: Room around an object on top of ``config.margin``, which is too little for small ones, px.
@@ -116,18 +117,20 @@ class Cutter:
         cfg = self.config
         clicked = Clicked.of(patch, clicks_px, z_m, scale)
         height = Height.of(patch, clicked)
-        connected = by_connection(patch, clicked, height) + self._nearer_to_others(patch, clicked)
-        clicked = clicked.within(connected)
+        looks = unlike(patch, height.plane)
+        connected = by_connection(patch, clicked, height, looks) + self._nearer_to_others(patch, clicked)
+        clicked = clicked.within(looks) if height.flat else clicked
         prior = clicked.prior_beside(connected)
         x = self._cut_out(patch, clicked, prior, by_distance(patch, z_m, cfg) + height.log_odds + connected)
-        whole, there = np.zeros((2, *self.frame.shape), np.float32)
-        whole[patch.box.slices], there[patch.box.slices] = patch.up(x), patch.up(connected)
+        whole, there, other = np.zeros((3, *self.frame.shape), np.float32)
+        for image, values in ((whole, x), (there, connected), (other, looks)):
+            image[patch.box.slices] = patch.up(values)
         fits = self._room(*patch.ends_px(x > 0.5))
         patch = Patch.of(self.frame, fits, self.camera, replace(cfg, side_px=2 * cfg.side_px))
         connected = patch.down(there)
         clicked = Clicked.of(patch, clicks_px, z_m, scale)
         height = height.on(patch, clicked)
-        clicked = clicked.within(connected)
+        clicked = clicked.within(patch.down(other) > 0.5) if height.flat else clicked
         geometry = by_distance(patch, z_m, cfg) + height.log_odds + connected
         x = self._cut_out(patch, clicked, clicked.prior_beside(connected) / 2, geometry, patch.down(whole))
         mask, others = x > 0.5, patch.dots(self._others_px, _AROUND_PX)

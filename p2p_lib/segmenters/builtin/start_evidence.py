@@ -75,13 +75,12 @@ class Clicked:
         away = cv2.distanceTransform((~hull).astype(np.uint8), cv2.DIST_L2, 5)
         return cls(patch.dots(clicks_px, 0), seeds, hull, away / extent, np.zeros(patch.shape, bool))
 
-    def within(self, connected: np.ndarray) -> Clicked:
-        """Without what is not ``connected`` (h, w), if most clicks are: it is most of the hull of something thin."""
-        held = connected > 0
-        if held[self.centres].mean() <= 0.5:
+    def within(self, unlike: np.ndarray) -> Clicked:
+        """Without what looks like the support, which is most of the hull of a thin thing, unless most clicks do."""
+        if unlike[self.centres].mean() <= 0.5:
             return self
-        seeds = self.seeds & held | self.centres
-        return replace(self, seeds=seeds, hull=self.hull & held | seeds, beside=~held)
+        seeds = self.seeds & unlike | self.centres
+        return replace(self, seeds=seeds, hull=self.hull & unlike | seeds, beside=~unlike)
 
     def prior_beside(self, connected: np.ndarray) -> np.ndarray:
         """(h, w) log-odds by distance from the clicks; never against pixels whose ``connected`` (h, w) is positive."""
@@ -143,10 +142,10 @@ def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndar
     return np.where(far, -config.geometry_weight, 0).astype(np.float32)
 
 
-def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
+def by_connection(patch: Patch, clicked: Clicked, height: Height, looks: np.ndarray) -> np.ndarray:
     """Evidence for what depth connects with the clicks and is not their support, if it ends within the patch.
 
-    What is not the support stands above it or, as the handle of a fork on a table, does not look like it.
+    What is not the support stands above it or, as the handle of a fork on a table, ``looks`` (h, w) bool unlike it.
     """
     log_odds, measured = np.zeros(patch.shape, np.float32), patch.depth_m > 0
     above = np.zeros(patch.shape, bool) if height.flat else height.log_odds >= 0
@@ -156,21 +155,21 @@ def by_connection(patch: Patch, clicked: Clicked, height: Height) -> np.ndarray:
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = _CONNECTED
     if height.plane is not None:
-        other = (above & measured) | unlike(patch, height.plane)
-        # Depth steps between two things; within what is flat, its noise alone does.
-        whole = other & (patch.smooth | ~measured | height.flat)
-        component = components_touching(connected_components(whole), clicked.seeds)
+        other = (above & measured) | looks
+        component = components_touching(connected_components(other & (patch.smooth | ~measured)), clicked.seeds)
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
     return log_odds
 
 
-def unlike(patch: Patch, plane: np.ndarray) -> np.ndarray:
-    """(h, w) bool: what does not look like the support, a ``plane`` (4,), does around it.
+def unlike(patch: Patch, plane: np.ndarray | None) -> np.ndarray:
+    """(h, w) bool: what does not look like the support, a ``plane`` (4,), does around it; nothing without a support.
 
     A table's colour changes with the light: it is taken nearby. What lies on the table is in its plane, too: so it is
     taken again without what is off it.
     """
+    if plane is None:
+        return np.zeros(patch.shape, bool)
     height, lab = plane_heights(patch, plane), cv2.cvtColor(patch.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
     support = (patch.depth_m > 0) & (np.abs(height) < _FLAT_SIGMAS * patch.sigma_m + _FLAT_M)
     alike, squared_off = support, np.zeros(patch.shape, np.float32)
